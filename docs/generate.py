@@ -34,10 +34,11 @@ from sme_registry.spec import (
 )
 from sme_registry.spec.catalogue import entries
 from sme_registry.spec.descriptions import allowed, default_of, summary
+from sme_registry.spec.fields import symbol
 
 FOLDER = Path(__file__).parent
 _FIELDS = ("state_dim", "action_dim", "k", "r_min", "D", "complexity", "hidden_width")
-_SYMBOLS = ("S", "A", "k", "r_min", "D", "L", "H")
+_SYMBOLS = tuple(map(symbol, _FIELDS))
 _DOCUMENTS: dict[str, tuple[type[StrictModel], ...]] = {
     "Tasks": (SMESpec, TeamSpec, AgentSpec, SafetySpec, ObservationSpec),
     "Streams": (StreamSpec, Phase, Drift),

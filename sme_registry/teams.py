@@ -85,6 +85,11 @@ class TurnBasedTeam(OrderEnforcingWrapper):  # type: ignore[misc]
     def __init__(self, parallel: Any) -> None:
         super().__init__(parallel_to_aec_wrapper(parallel))
 
+    def _repr_html_(self) -> str:
+        """The card of the parallel environment, for notebooks."""
+        html: str = self.unwrapped._repr_html_()
+        return html
+
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.unwrapped!r})"
 

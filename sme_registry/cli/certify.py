@@ -19,17 +19,10 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
-from sme_registry.terminal import Table, err, out, print_json
+from sme_registry.terminal import err, out, print_json
 
 if TYPE_CHECKING:
     from sme_registry.task.certificate import Certificate
-
-_MARKS = {
-    "passed": "[green]passed[/]",
-    "warning": "[yellow]warning[/]",
-    "refused": "[red]refused[/]",
-    "reported": "[dim]reported[/]",
-}
 
 
 def certify(
@@ -107,29 +100,15 @@ def _phases(label: str, stream: StreamSpec) -> list[tuple[str, SMESpec]]:
 
 
 def _print_line(label: str, certificate: Certificate) -> None:
+    from sme_registry.task.certificate import MARKS, short
+
     notable = [*certificate.of("refused"), *certificate.of("warning")]
-    reasons = ", ".join(f"{check.name} {_number(check.value)}".rstrip() for check in notable)
-    out().print(
-        f"{_MARKS[certificate.outcome]}  {escape(label)}  [dim]{reasons}[/]", soft_wrap=True
-    )
-
-
-def _number(value: float | None, sign: str = "") -> str:
-    return "" if value is None else f"{sign}{value:.3g}"
+    reasons = ", ".join(f"{check.name} {short(check.value)}".rstrip() for check in notable)
+    out().print(f"{MARKS[certificate.outcome]}  {escape(label)}  [dim]{reasons}[/]", soft_wrap=True)
 
 
 def _print_certificate(label: str, certificate: Certificate) -> None:
-    rows = [
-        (
-            _MARKS[check.outcome],
-            f"[bold]{check.name}[/]",
-            _number(check.value),
-            ", ".join(filter(None, (_number(check.low, "≥ "), _number(check.high, "≤ ")))),
-        )
-        for check in certificate.checks
-    ]
-    columns = {"": "name", "check": "name", "value": "number", "passes in": "name"}
-    out().print(Table(f"Certificate of {escape(label)}", columns, rows))
+    out().print(certificate.table(f"Certificate of {escape(label)}"))
     out().print()
     for check in certificate.checks:
         out().print(f"[bold]{check.name}[/]: {escape(check.meaning)}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import enum
-import itertools
 import math
 from typing import Annotated, Any
 
@@ -24,15 +23,14 @@ from sme_registry.spec import (
     StudyFile,
     StudyPlan,
     Suite,
-    SuiteClass,
     SuiteFile,
-    TeamSpec,
+    cards,
     catalogue,
+    fields,
 )
 from sme_registry.spec.envelope import Envelope
 from sme_registry.spec.protocol import EvaluationProtocol
 from sme_registry.spec.resolve import known_specs, known_streams
-from sme_registry.spec.sme_spec import Setting
 from sme_registry.terminal import Table, out, print_json, print_pairs
 
 Schema = enum.StrEnum(
@@ -51,7 +49,6 @@ _SCHEMAS: dict[str, type[BaseModel]] = {
     "study": StudyPlan,
     "study-file": StudyFile,
 }
-_SHORT = len("sha256:") + 12  # characters of a digest that name a task
 
 
 def show(
@@ -127,34 +124,19 @@ def _show_document(name: str, document: Envelope | SMESpec, json: bool) -> None:
 def _show_task(document: SMESpec | EnvFile, json: bool) -> None:
     spec = document if isinstance(document, SMESpec) else document.spec
     facts = _facts(spec)
-    agents = _agents(spec)
+    agents = cards.agents(spec)
     if json:
         head = {} if isinstance(document, SMESpec) else summary(document)
         derived = facts | ({"agents": agents} if agents else {})
         print_json({**head, "spec": spec.to_dict(), "digest": spec.digest, "derived": derived})
         return
     title = spec.content_name if isinstance(document, SMESpec) else _title(document)
-    print_pairs(title, _fields(spec))
+    print_pairs(title, fields.values(spec))
     if agents:
         out().print()
-        out().print(_agents_table(agents))
+        out().print(cards.agents_table(agents))
     out().print()
     print_pairs("Derived", {"digest": spec.digest, **facts})
-
-
-def _fields(setting: Setting) -> dict[str, Any]:
-    """Every field for people: a team in words, the fields of other blocks by their dotted names."""
-    fields: dict[str, Any] = {}
-    every_field = setting.every_field()
-    for name in type(setting).model_fields:
-        value = every_field[name]
-        if name == "team" and setting.team is not None:
-            fields[name] = _team_summary(setting.team)
-        elif isinstance(value, dict):
-            fields |= {f"{name}.{key}": each for key, each in value.items() if each is not None}
-        else:
-            fields[name] = value
-    return fields
 
 
 def _facts(spec: SMESpec) -> dict[str, Any]:
@@ -193,7 +175,7 @@ def _spaces(spec: SMESpec) -> dict[str, str]:
     if spec.team is None:
         size = f"[{spec.observation_dim}] float32 in [0, 1]"
         return {
-            "observation": f"{size}: {_seen(spec)}, t/T, r_cum/k",
+            "observation": f"{size}: {fields.observed(spec)}",
             "action": f"[{spec.action_dim}] float32 in [0, 1]",
         }
     n, widest = len(spec.team.agents), max(agent.action_dim for agent in spec.team.agents)
@@ -206,90 +188,10 @@ def _spaces(spec: SMESpec) -> dict[str, str]:
     }
 
 
-def _seen(spec: SMESpec) -> str:
-    """What an observation begins with."""
-    parts = f"state and {spec.distractors} distractors" if spec.distractors else "state"
-    if spec.observation is None or spec.observation.mixing == "none":
-        return parts
-    return f"{spec.observation.mixing} mixing of {parts}"
-
-
-def _team_summary(team: TeamSpec) -> str:
-    n = len(team.agents)
-    return f"{n} agent{'s' * (n > 1)}, {team.reward} reward"
-
-
-def _agents(spec: SMESpec) -> list[dict[str, Any]]:
-    """Each agent's action channels, observed channels and reward; empty without a team."""
-    if spec.team is None:
-        return []
-    agents, first = [], 0
-    for agent in spec.team.agents:
-        observed = range(spec.state_dim) if agent.observes == "all" else agent.observes
-        agents.append(
-            {
-                "name": agent.name,
-                "action_channels": list(range(first, first + agent.action_dim)),
-                "observed_channels": list(observed),
-                "observation_dim": len(observed) + 2,
-                "rewarded_for": "all channels" if spec.team.reward == "team" else "own channels",
-            }
-        )
-        first += agent.action_dim
-    return agents
-
-
-def _agents_table(agents: list[dict[str, Any]]) -> Table:
-    wrapped = ("action channels", "observed state channels", "observation", "rewarded for")
-    rows = [
-        (
-            escape(agent["name"]),
-            _ranges(agent["action_channels"]),
-            _ranges(agent["observed_channels"]),
-            escape(f"[{agent['observation_dim']}]"),
-            agent["rewarded_for"],
-        )
-        for agent in agents
-    ]
-    return Table("Agents", {"agent": "name", **dict.fromkeys(wrapped, "text")}, rows)
-
-
-def _ranges(channels: list[int]) -> str:
-    """Increasing channels as ranges: `0–3, 6`."""
-    runs = itertools.groupby(enumerate(channels), lambda pair: pair[1] - pair[0])
-    ends = [(run[0][1], run[-1][1]) for run in (list(group) for _, group in runs)]
-    return ", ".join(str(low) if low == high else f"{low}–{high}" for low, high in ends)
-
-
 def _show_stream(file: StreamFile) -> None:
-    """A stream's phases: when each begins, and in what its task differs from the one before."""
-    stream, before, begins = file.stream, _fields(SMESpec()), 0
-    rows = []
-    for index, phase in enumerate(stream.phases):
-        fields = _fields(phase.spec)
-        changes = [f"{k}={_plain(v)}" for k, v in fields.items() if v != before.get(k)]
-        if phase.drift is not None:
-            to, count = _plain(phase.drift.rotation), phase.drift.increments
-            changes.append(f"rotation drifts to {to} in {count} increments")
-        text, digest = ", ".join(changes) or "none", phase.spec.digest[:_SHORT]
-        rows.append((str(index), f"{begins:,}", f"{phase.steps:,}", text, digest))
-        before, begins = fields, begins + phase.steps
-    columns = {"phase": "number", "begins at": "number", "steps": "number", "changes": "text"}
-    caption = "changes: from the phase before; of phase 0, from the default task"
-    out().print(Table(_title(file), {**columns, "digest": "name"}, rows, caption=caption))
+    out().print(cards.stream_table(file.stream, _title(file)))
     out().print()
-    facts = {
-        "cycles": stream.cycles,
-        "steps": f"{stream.steps:,}",
-        "phases end": {"episode": "at the next reset", "step": "at once"}[stream.switch],
-        "observes_phase": stream.observes_phase,
-        "digest": file.digest,
-    }
-    print_pairs("Stream", facts)
-
-
-def _plain(value: Any) -> Any:
-    return f"{value:.4g}" if isinstance(value, float) else value
+    print_pairs("Stream", cards.stream_facts(file.stream))
 
 
 def _show_suite(file: SuiteFile, json: bool) -> None:
@@ -314,7 +216,7 @@ def _show_suite(file: SuiteFile, json: bool) -> None:
     digests = [each.digest for each in (*suite.instances, *suite.stream_instances)]
     kind = "task" if suite.classes else "stream"
     if known_specs().keys() | known_streams().keys() >= set(digests):
-        out().print(f"To train on a {kind}: sme train {digests[0][:_SHORT]}", soft_wrap=True)
+        out().print(f"To train on a {kind}: sme train {digests[0][: cards.SHORT]}", soft_wrap=True)
     else:  # one outside the catalogue cannot be found by its digest
         out().print(f"To train on these {kind}s: sme study new plan.json -a PPO --suite FILE")
 
@@ -324,9 +226,9 @@ def _tasks_table(suite: Suite) -> Table:
     rows = [
         (
             member.name,
-            escape(_changes(member)),
+            escape(cards.in_words(fields.changes(member.setting))),
             "\n".join(str(seed) for seed in member.seeds),
-            "\n".join(spec.digest[:_SHORT] for spec in member.instances),
+            "\n".join(spec.digest[: cards.SHORT] for spec in member.instances),
         )
         for member in suite.classes
     ]
@@ -342,17 +244,11 @@ def _streams_table(suite: Suite) -> Table:
             str(member.stream.cycles),
             f"{member.stream.steps:,}",
             "\n".join(str(number) for number in member.draws),
-            "\n".join(stream.digest[:_SHORT] for stream in member.instances),
+            "\n".join(stream.digest[: cards.SHORT] for stream in member.instances),
         )
         for member in suite.streams
     ]
     return Table("", {"class": "name", **numbers, "stream": "name"}, rows)
-
-
-def _changes(member: SuiteClass) -> str:
-    """The fields that differ from the default: `k=10, r_min=0.5`."""
-    default = _fields(SMESpec())
-    return ", ".join(f"{k}={v}" for k, v in _fields(member.setting).items() if v != default.get(k))
 
 
 def _title(file: Envelope) -> str:

@@ -313,6 +313,12 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             self._record(self, (arguments.from_unit(action, self._rescaled), info))
         return end
 
+    def _repr_html_(self) -> str:
+        """A card for notebooks: spaces, episode and task."""
+        from sme_registry.envs import cards
+
+        return cards.html(self, self.observation_space, self.action_space, status=self._state)
+
     def __repr__(self) -> str:
         return f"{type(self).__name__}({title(self.document)})"
 

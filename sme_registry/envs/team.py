@@ -314,6 +314,15 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         info = infos.of_all_agents(done, 0, self._rescaled)
         self._record(self._joint_view(), (arguments.from_unit(joint[0], self._rescaled), info))
 
+    def _repr_html_(self) -> str:
+        """A card for notebooks: agents, episode and task."""
+        from sme_registry.envs import cards
+
+        status = "running" if self.agents else "ended" if self._begun else "created"
+        first = self.possible_agents[0]
+        spaces = self._observation_spaces[first], self._action_spaces[first]
+        return cards.html(self, *spaces, status=status)
+
     def __repr__(self) -> str:
         return f"SMETeamEnv({title(self.sme_spec)}, {len(self.possible_agents)} agents)"
 

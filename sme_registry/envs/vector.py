@@ -271,6 +271,13 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
             self._lanes = [Lane(self, lane, **shared) for lane in range(self.num_envs)]
         return self._lanes
 
+    def _repr_html_(self) -> str:
+        """A card for notebooks: spaces, episodes and task."""
+        from sme_registry.envs import cards
+
+        spaces = self.single_observation_space, self.single_action_space
+        return cards.html(self, *spaces, autoreset=self.autoreset_mode.value)
+
     def __repr__(self) -> str:
         return f"{type(self).__name__}({title(self.document)}, num_envs={self.num_envs})"
 

@@ -254,6 +254,12 @@ class EvaluationReport(ReportFile):
 
         return tables.of_regions(self)
 
+    def chart(self) -> str:
+        """Normalised regret over the regions as SVG: of the policy, its agents and references."""
+        from sme_registry.evaluation import charts
+
+        return charts.regret(self)
+
     def tables(self) -> list[Table]:
         """`table`, and those of safety, of distractors and of probes where there are any."""
         from sme_registry.evaluation import tables

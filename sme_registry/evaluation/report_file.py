@@ -59,11 +59,15 @@ class ReportFile(StrictModel):
         """All tables of the report."""
         return [self.table()]
 
-    def _repr_html_(self) -> str:
-        """The tables, for notebooks."""
-        from sme_registry.terminal.html import table_html
+    def chart(self) -> str:
+        """A curve as SVG; empty for a report without one."""
+        return ""
 
-        return "\n".join(map(table_html, self.tables()))
+    def _repr_html_(self) -> str:
+        """The curve and the tables, for notebooks."""
+        from sme_registry.terminal.html import card, table_html
+
+        return card(self.chart(), *map(table_html, self.tables()))
 
     def __str__(self) -> str:
         return "\n\n".join(map(as_text, self.tables()))

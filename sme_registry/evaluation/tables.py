@@ -54,7 +54,7 @@ def of_regions(report: EvaluationReport) -> Table:
         table.add_row(heading, style="italic")
         _add(table, f"  {escape(report.policy)}", report.regions, field, style="bold")
         for name, regions in report.references.items():
-            _add(table, f"  {LABELS.get(name, name)}", regions, field)
+            _add(table, f"  {LABELS.get(name, escape(name))}", regions, field)
         table.add_section()
     _add(table, "SD of r̃ over states", report.regions, "similarity_sd", style="bold")
     _add(table, "similarity decay", report.regions, "similarity_decay", ".1%", style="bold")
@@ -62,7 +62,7 @@ def of_regions(report: EvaluationReport) -> Table:
     _add(table, "actions clipped", report.regions, "clipped_share", ".1%", style="bold")
     for agent, own in report.agents.items():
         table.add_section()
-        _add(table, f"{agent}  r̃", own.regions, "similarity")
+        _add(table, f"{escape(agent)}  r̃", own.regions, "similarity")
         _add(table, "  normalised regret", own.regions, "normalised_regret")
         if linear := own.references.get("linear_least_squares"):
             label = f"  of {LABELS['linear_least_squares']}"

@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
@@ -30,7 +31,7 @@ from sme_registry.envs.types import Array, Mask, Observation
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.io import integer_in
 from sme_registry.registration import registered_or_new
-from sme_registry.spec import ActionRange, SMESpec, SpecLike, StreamLike
+from sme_registry.spec import ActionRange, SMESpec, SpecLike, StreamLike, StreamSpec
 from sme_registry.spec.catalogue import title
 
 StepResult: TypeAlias = tuple[Observation, npt.NDArray[np.float32], Mask, list[dict[str, Any]]]
@@ -182,7 +183,19 @@ class _BatchVecEnv(LanesVecEnv):
         lanes = f"num_envs={self.num_envs}"
         if self.num_envs != self.num_teams:
             lanes += f", {self.num_teams} teams of {len(self.agents)} agents"
-        return f"{type(self).__name__}({title(self._batch.document)}, {lanes})"
+        return f"{type(self).__name__}({title(self.document)}, {lanes})"
+
+    @property
+    def document(self) -> SMESpec | StreamSpec:
+        """What the lanes run: their spec, or a stream."""
+        return self._batch.document
+
+    def _repr_html_(self) -> str:
+        """A card for notebooks: spaces, episodes and task."""
+        from sme_registry.envs import cards
+
+        spaces = self.observation_space, self.action_space
+        return cards.html(self, *spaces, autoreset=AutoresetMode.SAME_STEP.value)
 
     def get_images(self) -> list[Frame]:
         """The frames of the chosen lanes or teams, each `[H, W, 3]` uint8; `render` tiles them.

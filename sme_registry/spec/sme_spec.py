@@ -374,14 +374,10 @@ class SMESpec(Setting, NamedDocument):
     seed: Seed = 0
 
     def _repr_html_(self) -> str:
-        """A card with every field that is set, and the digest, for notebooks."""
-        from sme_registry.spec import catalogue
-        from sme_registry.terminal.html import pairs_html
+        """A card for notebooks: symbols, values and meanings, the digest, and what is changed."""
+        from sme_registry.spec import cards
 
-        fields = {name: value for name, value in self.to_dict().items() if value is not None}
-        if self.team is not None:
-            fields["team"] = f"{len(self.team.agents)} agents, {self.team.reward} reward"
-        return pairs_html(catalogue.title(self), {**fields, "digest": self.digest})
+        return cards.html(self)
 
     def derive(self, **overrides: Any) -> SMESpec:
         """This spec with some fields changed: another task, with another digest.

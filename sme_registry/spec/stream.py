@@ -262,6 +262,12 @@ class StreamSpec(NamedDocument):
         pieces = tuple((piece.phase, piece.start) for piece in self.pieces)
         return pieces, self.cycle_steps, self.cycles, self.switch, self.observes_phase
 
+    def _repr_html_(self) -> str:
+        """A card for notebooks: the phases, and how their tasks differ."""
+        from sme_registry.spec import cards
+
+        return cards.html(self)
+
     def piece_at(self, lifetime: int) -> int:
         """The index of the piece in force after so many environment steps; the last one at the end.
 

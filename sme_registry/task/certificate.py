@@ -4,14 +4,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from sme_registry.task.draw import Array
 from sme_registry.task.streams import uniform
 from sme_registry.task.task import Task
 
+if TYPE_CHECKING:
+    from sme_registry.terminal import Table
+
 Outcome = Literal["passed", "warning", "refused", "reported"]
 _WORST_FIRST: tuple[Outcome, ...] = ("refused", "warning")
+
+MARKS = {
+    "passed": "[green]passed[/]",
+    "warning": "[yellow]warning[/]",
+    "refused": "[red]refused[/]",
+    "reported": "[dim]reported[/]",
+}
+"""The outcomes in colour, with Rich's markup."""
 
 INF = math.inf
 
@@ -67,6 +78,31 @@ class Certificate:
         """The checks with this outcome."""
         return tuple(check for check in self.checks if check.outcome == outcome)
 
+    def table(self, title: str, *, meanings: bool = False) -> Table:
+        """The checks as a table: outcome, name, value and range.
+
+        Args:
+          title: above it.
+          meanings: whether a column says what each check is about.
+        """
+        from rich.markup import escape
+
+        from sme_registry.terminal import Table
+
+        columns = {"": "name", "check": "name", "value": "number", "passes in": "name"}
+        table = Table(title, columns | ({"meaning": "text"} if meanings else {}))
+        for check in self.checks:
+            bounds = filter(None, (short(check.low, "≥ "), short(check.high, "≤ ")))
+            cells = MARKS[check.outcome], f"[bold]{check.name}[/]", short(check.value)
+            table.add_row(*cells, ", ".join(bounds), *([escape(check.meaning)] if meanings else []))
+        return table
+
+    def _repr_html_(self) -> str:
+        """A card for notebooks: the outcome, and every check with its meaning."""
+        from sme_registry.terminal.html import card, table_html
+
+        return card(table_html(self.table(f"{self.digest}\n{self.outcome}", meanings=True)))
+
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain JSON data."""
         return {
@@ -76,6 +112,11 @@ class Certificate:
             "passed": self.passed,
             "checks": [asdict(check) for check in self.checks],
         }
+
+
+def short(value: float | None, sign: str = "") -> str:
+    """A number of three digits after a sign, `≤ 0.8`; empty where there is none."""
+    return "" if value is None else f"{sign}{value:.3g}"
 
 
 def judged(

@@ -6,6 +6,7 @@ from sme_registry.terminal.numbers import duration, duration_range, fixed
 from sme_registry.terminal.output import err, failure, out, print_json, print_pairs
 from sme_registry.terminal.progress import Progress
 from sme_registry.terminal.prose import Answers, Paragraph
+from sme_registry.terminal.svg import Scale
 from sme_registry.terminal.tables import Table
 
 __all__ = [
@@ -13,6 +14,7 @@ __all__ = [
     "CommandGroup",
     "Paragraph",
     "Progress",
+    "Scale",
     "Table",
     "application",
     "duration",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import io
 import sys
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -304,12 +305,23 @@ def test_a_notebook_shows_a_reports_table_and_a_line_elsewhere(report):
     assert len(repr(report)) < 150
     assert f"WD regret {report.wd_regret:.3f}" in repr(report)
     html = report._repr_html_()
-    rows = html.split("<tr>")[1:]
+    rows = html.split("<tr")[1:]
     assert len(rows) == 1 + sum(row is not None for row in report.table().rows)
     assert all(row.count("</td>") == 7 for row in rows[1:])
     assert f"{report.regions[5].normalised_regret:.3f}" in html
     escaped = report.model_copy(update={"policy": "<b>[bold]"})._repr_html_()
     assert "&lt;b&gt;[bold] on SME" in escaped
+    assert "<b>[bold]" not in escaped
+
+
+def test_a_notebook_draws_a_reports_curve_beside_the_references(report):
+    chart = ElementTree.fromstring(report.chart())
+    labels = {each.text for each in chart.iter("text")}
+    assert {"policy", "optimal", "linear (LSQ)", "constant ½", "WD", "OOD 5"} <= labels
+    last = f"{report.regions[5].normalised_regret:.2f}"
+    assert f", {last}" in chart.attrib["aria-label"].split("policy: ")[1]
+    assert report.chart() in report._repr_html_()
+    assert len(report._repr_html_().encode()) < 20_000
 
 
 def test_printing_a_report_shows_its_table(report):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from html import escape
 
 import numpy as np
 import pytest
@@ -36,6 +37,17 @@ def test_the_papers_near_trivial_settings_warn_and_still_pass() -> None:
     assert certificate.passed
     assert certificate.outcome == "warning"
     assert check(certificate, "constant_policy_similarity").outcome == "warning"
+
+
+def test_a_notebook_shows_every_check_with_its_meaning() -> None:
+    certificate = certify(load("Complexity2"))
+    html = certificate._repr_html_()
+    assert f"{certificate.digest}<br>warning" in html
+    for each in certificate.checks:
+        assert f"<b>{each.name}</b>" in html
+        assert escape(each.meaning) in html
+    assert html.count('"name">warning<') == len(certificate.of("warning"))
+    assert len(html.encode()) < 20_000
 
 
 def test_a_trivial_target_is_refused() -> None:

@@ -2,29 +2,11 @@ import re
 from xml.etree import ElementTree
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from leaderboard.documents.result import Estimate
 from leaderboard.web.site import charts
 
-finite = st.floats(-1e6, 1e6)
 REGRET = {"optimal": 0.0, "constant": 1.0}
-
-
-@given(st.lists(finite, max_size=5))
-def test_a_scale_covers_every_value_with_round_ends(values):
-    scale = charts.Scale.covering(*values)
-    assert scale.low < scale.high
-    assert 2 <= len(scale.ticks) <= 8
-    for value in values:
-        margin = 1e-6 * (scale.high - scale.low)
-        assert scale.low - margin <= value <= scale.high + margin
-        assert 0.0 <= scale.part(value) <= 1.0
-
-
-def test_regret_of_good_entries_is_drawn_from_zero_to_one():
-    assert charts.Scale.covering(0.0, 1.0, 0.3).ticks == (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 @pytest.mark.parametrize(
