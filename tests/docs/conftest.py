@@ -1,4 +1,4 @@
-"""The site's extensions can be imported, and the site is built once for all tests."""
+"""What makes the site can be imported, and the site is built once for all tests."""
 
 import os
 import subprocess
@@ -9,7 +9,7 @@ import pytest
 from filelock import FileLock
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "docs" / "_extensions"))
+sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "docs" / "_extensions")]
 
 
 @pytest.fixture(scope="session")

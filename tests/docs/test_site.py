@@ -18,8 +18,9 @@ FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--
 WIDTHS = {"phone": 400, "desktop": 1280}
 SAMPLE = (
     "index", "tutorials/own_agents", "guides/studies", "guides/frameworks", "explanation/method",
-    "results/ablations_in_jax", "reference/catalogue", "reference/sme", "reference/schemas",
-    "reference/python/sme_registry", "reference/python/sme_registry.spec", "genindex",
+    "results/ablations_in_jax", "reference/catalogue", "reference/gallery", "reference/sme",
+    "reference/schemas", "reference/python/sme_registry", "reference/python/sme_registry.spec",
+    "genindex",
 )  # fmt: skip
 
 in_chromium = pytest.mark.skipif(

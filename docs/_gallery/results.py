@@ -1,0 +1,122 @@
+"""How PPO, TD3 and SAC did on the tasks of the catalogue, from the tables under docs/results.
+
+Studies train on other seeds of a setting, which is every field of a task but its seed. So a study
+counts for a task if it has the task's setting.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections import defaultdict
+from pathlib import Path
+from typing import NamedTuple
+
+from sme_registry.spec import Setting, SMESpec, SuiteFile, catalogue
+
+RESULTS = Path(__file__).parents[1] / "results"
+ALGORITHMS = ("PPO", "TD3", "SAC")
+
+
+class Study(NamedTuple):
+    """A table with one row a run.
+
+    Attributes:
+      table: its file, in the folder of results.
+      page: the page that describes it.
+      suite: that its tasks are of.
+      regions: the columns of normalised regret: the cube's, then the five shells'.
+    """
+
+    table: str
+    page: str
+    suite: str
+    regions: tuple[str, ...]
+
+
+class Level(NamedTuple):
+    """The normalised regret of an algorithm in `[runs]` runs: N₀, and N̄ over the shells."""
+
+    algorithm: str
+    steps: int
+    cube: list[float]
+    shells: list[float]
+    page: str
+
+
+class Life(NamedTuple):
+    """Metrics of an algorithm's lives in a stream: IQM and the ends of its interval."""
+
+    algorithm: str
+    lives: int
+    metrics: dict[str, tuple[float, float, float]]
+
+
+_NUMBERED = tuple(f"normalised_regret_{m}" for m in range(6))
+_NAMED = ("normalised_regret_wd", *(f"normalised_regret_ood_{m}" for m in range(1, 6)))
+# A setting has the rows of the first page that knows it.
+STUDIES = (
+    Study("ablations-in-jax/runs-20000.csv", "ablations_in_jax.md", "paper-ablations", _NUMBERED),
+    Study("ablations-in-jax/runs.csv", "ablations_in_jax.md", "paper-ablations", _NUMBERED),
+    Study("baselines.csv", "baselines.md", "smoke", _NAMED),
+)
+STREAMS, STREAM_PAGE = "continual/metrics.csv", "continual.md"
+
+
+def setting_of(spec: SMESpec) -> str:
+    """The digest of a task's setting."""
+    fields = spec.to_dict()
+    del fields["seed"]
+    return Setting.from_dict(fields).digest
+
+
+def levels() -> dict[str, list[Level]]:
+    """What is known of each setting, by its digest."""
+    found: dict[str, list[Level]] = {}
+    for study in STUDIES:
+        for setting, rows in _rows(study).items():
+            known = found.setdefault(setting, [])
+            if all(level.page == study.page for level in known):
+                known += rows
+    return found
+
+
+def lives() -> dict[str, list[Life]]:
+    """What is known of each stream of the catalogue, by its name without the version."""
+    found: dict[tuple[str, str], Life] = {}
+    for row in _table(STREAMS):
+        if row["region"] == "WD" and row["algorithm"] in ALGORITHMS:
+            key = row["class_name"], row["algorithm"]
+            life = found.setdefault(key, Life(row["algorithm"], int(row["runs"]), {}))
+            low, high = float(row["low"]), float(row["high"])
+            life.metrics[row["metric"]] = float(row["iqm"]), low, high
+    streams: dict[str, list[Life]] = defaultdict(list)
+    for (stream, _), life in found.items():
+        streams[stream].append(life)
+    return streams
+
+
+def _rows(study: Study) -> dict[str, list[Level]]:
+    """The levels of a study's table, by setting; the algorithms in order."""
+    settings = {
+        spec.digest: member.setting.digest
+        for member in catalogue.find(SuiteFile, study.suite).suite.classes
+        for spec in member.instances
+    }
+    found: dict[str, dict[tuple[str, int], Level]] = defaultdict(dict)
+    for row in _table(study.table):
+        algorithm = row.get("algorithm") or row["method"]
+        key = algorithm, int(row["steps"])
+        of_setting = found[settings[row["spec_digest"]]]
+        level = of_setting.setdefault(key, Level(*key, [], [], study.page))
+        cube, *shells = (float(row[column]) for column in study.regions)
+        level.cube.append(cube)
+        level.shells.append(sum(shells) / len(shells))
+    return {
+        setting: sorted(of.values(), key=lambda level: ALGORITHMS.index(level.algorithm))
+        for setting, of in found.items()
+    }
+
+
+def _table(name: str) -> list[dict[str, str]]:
+    with (RESULTS / name).open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
