@@ -1,23 +1,20 @@
-"""Draws docs/guides/explorer.png: the top of an explorer, by Chromium.
-
-python docs/explorer_picture.py runs/demo/explorer.html
-"""
+"""docs/guides/explorer.png: the top of an explorer, by Chromium."""
 
 from __future__ import annotations
 
 import shutil
-import sys
 from pathlib import Path
 
 from PIL import Image
-from playwright.sync_api import sync_playwright
 
-PICTURE = Path(__file__).parent / "guides" / "explorer.png"
+PICTURE = Path(__file__).parents[1] / "guides" / "explorer.png"
 _COLOURS = 256
 
 
-def main(page: Path) -> None:
-    """Open the page, move to a state outside the cube's centre, and save the picture."""
+def draw(page: Path) -> Path:
+    """Open a run's page, move to a state off the cube's centre, and save the picture."""
+    from playwright.sync_api import sync_playwright
+
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
             executable_path=shutil.which("chromium"), args=["--no-sandbox", "--disable-gpu"]
@@ -33,7 +30,4 @@ def main(page: Path) -> None:
         browser.close()
     picture = Image.open(PICTURE).convert("RGB")
     picture.quantize(_COLOURS).save(PICTURE, optimize=True)
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    return PICTURE
