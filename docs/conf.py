@@ -12,6 +12,7 @@ sys.path[:0] = [str(HERE.parent), str(HERE / "_extensions")]
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
 os.environ["PYTHONPATH"] = str(HERE.parent)
 os.environ["MPLBACKEND"] = "agg"
+os.environ["TTY_COMPATIBLE"] = "0"  # kernels force colours, which Pygments cannot read in tables
 os.environ["MINARI_DATASETS_PATH"] = "datasets"  # in the page's own folder, not the reader's
 
 from sme_registry.version import __version__  # noqa: E402

@@ -21,7 +21,6 @@ _STYLE = (
     ".sme-card table.sme-table{border-collapse:collapse;margin:.5em 0;color:inherit;width:auto}"
     ".sme-card table.sme-table caption{caption-side:top;text-align:left;padding:.2em .6em;"
     "color:inherit;font-size:1em;font-weight:normal;font-style:normal}"
-    ".sme-card table.sme-table caption::first-line{font-weight:bold}"
     ".sme-card table.sme-table tr>*{padding:.15em .6em;text-align:left;vertical-align:top;"
     "white-space:normal;max-width:30em}"
     ".sme-card table.sme-table tr>.text:last-child{min-width:12em}"
@@ -66,7 +65,7 @@ def table_html(table: Table) -> str:
         rest = f"<tr><td colspan={len(kinds)}>… {more:,} more</td></tr>"
         sections.append([rest])
     bodies = "".join(f"<tbody>{''.join(rows)}</tbody>" for rows in sections if rows)
-    title = f"<caption>{_text(table.title)}</caption>" if table.title else ""
+    title = _caption(_text(table.title)) if table.title else ""
     caption = f"<small>{_text(table.caption)}</small>" if table.caption else ""
     return f'<table class="sme-table">{title}{bodies}</table>{caption}'
 
@@ -77,7 +76,13 @@ def pairs_html(title: str, pairs: Mapping[str, Any]) -> str:
         f'<tr><th class="name">{escape(name)}</th><td>{escape(str(value))}</td></tr>'
         for name, value in pairs.items()
     )
-    return f'<table class="sme-table"><caption>{escape(title)}</caption>{rows}</table>'
+    return f'<table class="sme-table">{_caption(escape(title))}{rows}</table>'
+
+
+def _caption(html: str) -> str:
+    """The title of a table, its first line in bold."""
+    first, *rest = html.split("<br>", 1)
+    return f"<caption>{'<br>'.join([f'<b>{first}</b>', *rest])}</caption>"
 
 
 def _row(tag: str, cells: Any, kinds: list[str], row: Row | None = None) -> str:

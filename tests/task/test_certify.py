@@ -42,7 +42,7 @@ def test_the_papers_near_trivial_settings_warn_and_still_pass() -> None:
 def test_a_notebook_shows_every_check_with_its_meaning() -> None:
     certificate = certify(load("Complexity2"))
     html = certificate._repr_html_()
-    assert f"{certificate.digest}<br>warning" in html
+    assert f"{certificate.digest}</b><br>warning" in html
     for each in certificate.checks:
         assert f"<b>{each.name}</b>" in html
         assert escape(each.meaning) in html

@@ -17,6 +17,7 @@ def test_every_text_is_escaped() -> None:
 
 def test_bold_text_indentation_and_line_breaks_are_kept() -> None:
     html = table_html(Table("", {"a": "text"}, [("  [bold]x<y[/] z\n[red]new[/]",)]))
+    assert "<caption><b>one</b><br>two</caption>" in table_html(Table("one\ntwo", {"a": "name"}))
     assert "&nbsp;&nbsp;<b>x&lt;y</b> z<br>new" in html
 
 
