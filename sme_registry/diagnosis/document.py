@@ -110,6 +110,11 @@ def verdict_on(question: str, verdicts: Sequence[Verdict]) -> Verdict:
     raise UnknownNameError(f"question={question!r}: must be one of {', '.join(known)}.{hint}")
 
 
+def without_html(page: str) -> str:
+    """A page of Markdown for a notebook, which would otherwise run HTML in a name."""
+    return page.replace("<", "&lt;")
+
+
 class Diagnosis(StrictModel):
     """The diagnosis of one policy.
 
@@ -154,7 +159,7 @@ class Diagnosis(StrictModel):
         """The page, for notebooks."""
         from sme_registry.diagnosis.render import markdown
 
-        return markdown(self, ())
+        return without_html(markdown(self, ()))
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Self:

@@ -11,7 +11,7 @@ from typing import Literal
 
 from pydantic import JsonValue
 
-from sme_registry.diagnosis.document import Verdict, verdict_on
+from sme_registry.diagnosis.document import Verdict, verdict_on, without_html
 from sme_registry.spec import Digest, Integer, Real, SchemaVersion, StreamSpec, StrictModel, TupleOf
 
 __all__ = ["NetworkState", "PhaseDiagnosis", "PhaseOutcome", "StreamDiagnosis", "VisitDiagnosis"]
@@ -139,4 +139,4 @@ class StreamDiagnosis(StrictModel):
         """The page, for notebooks."""
         from sme_registry.diagnosis.stream_render import markdown
 
-        return markdown(self, ())
+        return without_html(markdown(self, ()))

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from pydantic import JsonValue
 
-from sme_registry.diagnosis.document import Level, Verdict, verdict_on
+from sme_registry.diagnosis.document import Level, Verdict, verdict_on, without_html
 from sme_registry.diagnosis.measurements import Measurements, Score
 from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.spec import Digest, Integer, Real, SchemaVersion, SMESpec, StrictModel, TupleOf
@@ -109,3 +109,9 @@ class TeamDiagnosis(StrictModel):
             hint = did_you_mean(name, by_name)
             raise UnknownNameError(f"agent={name!r}: must be one of {', '.join(by_name)}.{hint}")
         return by_name[name]
+
+    def _repr_markdown_(self) -> str:
+        """The page, for notebooks."""
+        from sme_registry.diagnosis.team_render import markdown
+
+        return without_html(markdown(self, ()))

@@ -378,6 +378,8 @@ def test_a_life_is_readable_at_every_width_and_in_a_pipe(width: int | None) -> N
     assert all(stream_sentence(verdict) in page for verdict in found.verdicts)
     assert "![which phases](which_phases.png)" in page
     assert found._repr_markdown_().startswith("# life on SME/")
+    named = found.model_copy(update={"name": "<script>"})
+    assert named._repr_markdown_().startswith("# &lt;script> on SME/")
 
 
 # --- runs, cells and the command ----------------------------------------------------------------

@@ -88,6 +88,13 @@ def test_a_team_in_a_pipe_has_short_lines(one_fails: TeamDiagnosis) -> None:
     assert max(map(len, lines)) <= 100
 
 
+def test_a_notebook_shows_the_page_of_a_team_and_runs_no_html(one_fails: TeamDiagnosis) -> None:
+    page = one_fails.model_copy(update={"name": "<script>"})._repr_markdown_()
+    assert page.startswith("# &lt;script> on ")
+    assert "<" not in page
+    assert one_fails.agents[0].name in page
+
+
 def test_the_agent_that_fails_is_to_blame(one_fails: TeamDiagnosis) -> None:
     blame = one_fails.verdict("blame")
     assert blame.answer == "yes"
