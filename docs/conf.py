@@ -13,7 +13,9 @@ os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.envir
 os.environ["PYTHONPATH"] = str(HERE.parent)
 os.environ["MPLBACKEND"] = "agg"
 os.environ["TTY_COMPATIBLE"] = "0"  # kernels force colours, which Pygments cannot read in tables
-os.environ["MINARI_DATASETS_PATH"] = "datasets"  # in the page's own folder, not the reader's
+# In the page's own folder, not the reader's: data sets, and the key for boards.
+os.environ["MINARI_DATASETS_PATH"] = "datasets"
+os.environ["XDG_CONFIG_HOME"] = "config"
 
 from sme_registry.version import __version__  # noqa: E402
 

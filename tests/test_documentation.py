@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import runpy
 import shlex
+import subprocess
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
@@ -46,22 +47,48 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(
         exec(compile(block, page, "exec"), namespace)
 
 
-def test_the_page_on_own_agents_works_from_training_to_the_board(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("name", "packages", "shorter"),
+    [
+        ("own_agents", "torch matplotlib onnx onnxruntime nacl", {"STEPS = 5_000": "STEPS = 200"}),
+        (
+            "sweep_figure",
+            "torch pandas IPython",
+            {"--agents jax": "", "-n 16000": "-n 500", "--seeds 5": "--seeds 1"},
+        ),
+        (
+            "continual_stream",
+            "torch pandas IPython",
+            {"--agents jax": "", "5_000": "500", "--seeds 5": "--seeds 1"},
+        ),
+    ],
+)
+def test_a_tutorial_works_from_top_to_bottom(
+    name: str,
+    packages: str,
+    shorter: dict[str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for package in ("torch", "matplotlib", "onnx", "onnxruntime", "nacl"):
+    for package in packages.split():
         pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "tutorials" / "own_agents.md").read_text()
-    assert "STEPS = 5_000" in page
+    page = (ROOT / "docs" / "tutorials" / f"{name}.md").read_text()
+    for full, short in shorter.items():
+        assert full in page
+        page = page.replace(full, short)
     namespace: dict[str, Any] = {"__name__": "page"}
-    for block in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S):
-        exec(compile(block.replace("STEPS = 5_000", "STEPS = 200"), "page", "exec"), namespace)
-    commands = re.findall(r"^(sme|sme-leaderboard) (.*)$", page, re.M)
-    assert len(commands) == 11
-    for program, command in commands:
-        output = run(program, command)
-        assert not command.startswith("rank") or "My DDPG" in output
+    for language, block in re.findall(r"^```(python|sh)\n(.*?)^```", page, re.M | re.S):
+        if language == "python":
+            exec(compile(block, "page", "exec"), namespace)
+        else:
+            for line in block.replace("\\\n", "").splitlines():
+                program, _, arguments = line.partition(" ")
+                if program in ("sme", "sme-leaderboard"):
+                    output = run(program, arguments)
+                    assert not arguments.startswith("rank") or "My DDPG" in output
+                else:
+                    subprocess.run(shlex.split(line), check=True)
 
 
 def test_the_page_on_the_leaderboard_leads_from_an_own_suite_to_a_rank(

@@ -3,7 +3,7 @@
 In a page of `docs/tutorials/`, each block
 
     ```python   is a cell,
-    ```sh       is a cell that runs its lines in a shell (`%%sh`),
+    ```sh       is a cell that runs its lines in a shell, up to one that fails (`%%sh -e`),
 
 and blocks in any other language stay as they are. So a tutorial reads well on GitHub, its blocks
 can be run by a test, and the site shows what they print and draw. A line above a block such as
@@ -28,6 +28,7 @@ from nbformat import NotebookNode, v4
 from sphinx.application import Sphinx
 
 from sme_registry.io import write_atomically
+from sme_registry.version import __version__
 
 FOLDER = "tutorials/"
 _HEADER = """---
@@ -45,11 +46,25 @@ _BLOCK = re.compile(
 _EXTRAS = re.compile(r"^<!-- extras: ([a-z, ]+?) -->$", re.M)
 _RELATIVE_LINK = re.compile(r"!?\[([^\]]*)\]\((?!https?:)[^)]*\)")
 _COMMENT = re.compile(r"^<!--.*?-->\n?", re.M | re.S)
-_INSTALL = """# Installs the package where it is missing.
+# The rule for readers is in docs/tutorials/installation.md: the package is on no index.
+_INSTALL = """# Installs the package where it is missing. Name what you have: the folder of a clone,
+# a wheel (sme_registry-{version}-py3-none-any.whl), or a Git address (git+https://…).
+SOURCE = "sme-registry"
+
 import importlib.util
+import os
+import pathlib
+import sys
 
 if importlib.util.find_spec("sme_registry") is None:
-    %pip install --quiet "sme-registry{extras}"
+    path = pathlib.Path(SOURCE).expanduser().resolve()
+    if "://" not in SOURCE and not path.exists():
+        raise FileNotFoundError(f"{{path}} is missing: set SOURCE to what you have.")
+    address = SOURCE if "://" in SOURCE else path.as_uri()
+    %pip install --quiet "sme-registry{extras} @ {{address}}"
+
+# So that cells find the package's commands where the environment of this Python is not active.
+os.environ["PATH"] = os.pathsep.join([str(pathlib.Path(sys.executable).parent), os.environ["PATH"]])
 """
 
 
@@ -71,7 +86,7 @@ def as_page(text: str, name: str) -> str:
 
 
 def _code(block: re.Match[str]) -> str:
-    shell = "%%sh\n" if block["language"] == "sh" else ""
+    shell = "%%sh -e\n" if block["language"] == "sh" else ""
     return shell + block["code"]
 
 
@@ -83,7 +98,9 @@ def _cell(block: re.Match[str]) -> str:
 def as_notebook(text: str) -> NotebookNode:
     """A tutorial as a notebook for Jupyter, without outputs."""
     extras = _EXTRAS.search(text)
-    install = _INSTALL.format(extras=f"[{extras[1].replace(' ', '')}]" if extras else "")
+    install = _INSTALL.format(
+        version=__version__, extras=f"[{extras[1].replace(' ', '')}]" if extras else ""
+    )
     title, _, rest = text.partition("\n")
     cells = [v4.new_markdown_cell(title), v4.new_code_cell(install), *_cells(rest)]
     for number, cell in enumerate(cells):

@@ -49,7 +49,7 @@ not run
 def test_blocks_of_a_tutorial_are_cells_and_others_stay():
     page = tutorial_cells.as_page(TUTORIAL, "name")
     assert "```{code-cell} python3\nx = 1\n```" in page
-    assert "```{code-cell} python3\n:tags: [hide-output]\n%%sh\nsme list\n```" in page
+    assert "```{code-cell} python3\n:tags: [hide-output]\n%%sh -e\nsme list\n```" in page
     assert "```text\nnot run\n```" in page
     assert page.startswith("---\n")
     assert tutorial_cells.as_page("# No code\n\n```text\n```\n", "name").startswith("# No code")
@@ -59,8 +59,8 @@ def test_a_tutorial_as_a_notebook_installs_first_and_has_the_same_cells():
     notebook = tutorial_cells.as_notebook(TUTORIAL)
     nbformat.validate(notebook)
     code = [cell.source for cell in notebook.cells if cell.cell_type == "code"]
-    assert '%pip install --quiet "sme-registry[plot,train]"' in code[0]
-    assert code[1:] == ["x = 1", "%%sh\nsme list"]
+    assert '%pip install --quiet "sme-registry[plot,train] @ {address}"' in code[0]
+    assert code[1:] == ["x = 1", "%%sh -e\nsme list"]
     text = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "markdown")
     assert "See teams and [a site](https://example.org)." in text
     assert "<!--" not in text
