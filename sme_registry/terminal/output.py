@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Any, TextIO
 
@@ -19,11 +20,17 @@ _UNLIMITED = 100_000  # columns: lines of a file or a pipe are never wrapped
 class _Console(Console):
     """Never wraps lines of output that is no terminal, and leaves broken pipes to `CommandGroup`.
 
-    Rich would wrap at 80 columns, and exit with code 1 if the pipe breaks.
+    Rich would wrap at 80 columns, and exit with code 1 if the pipe breaks. With FORCE_COLOR, which
+    Jupyter sets for the shell cells of a notebook, it would also draw bars into a pipe: colours are
+    possible there, but nothing that moves the cursor.
     """
 
     def __init__(self, file: TextIO) -> None:
         super().__init__(file=file, highlight=False)
+        if self.is_terminal and os.environ.get("FORCE_COLOR") and not file.isatty():
+            super().__init__(
+                file=file, highlight=False, force_terminal=False, color_system="standard"
+            )
         if not self.is_terminal:
             self.width = _UNLIMITED
 

@@ -9,6 +9,11 @@ import pytest
 from filelock import FileLock
 
 ROOT = Path(__file__).resolve().parents[2]
+PAGES = {
+    path.stem: text  # the tutorials that are notebooks
+    for path in sorted((ROOT / "docs" / "tutorials").glob("*.md"))
+    if "```python" in (text := path.read_text(encoding="utf-8"))
+}
 sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "docs" / "_extensions")]
 
 

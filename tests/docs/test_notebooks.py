@@ -13,7 +13,7 @@ import venv
 
 import pytest
 
-from tests.docs.conftest import ROOT
+from tests.docs.conftest import PAGES, ROOT
 
 pytest.importorskip("sphinx")
 
@@ -22,11 +22,6 @@ import tutorial_cells
 from IPython.core.inputtransformer2 import TransformerManager
 from packaging.requirements import Requirement
 
-PAGES = {
-    path.stem: text
-    for path in sorted((ROOT / "docs" / "tutorials").glob("*.md"))
-    if "```python" in (text := path.read_text(encoding="utf-8"))
-}
 EXECUTE = """
 import sys, nbclient, nbformat
 notebook = nbformat.read(sys.argv[1], 4)

@@ -11,16 +11,16 @@ import threading
 
 import pytest
 
-from tests.docs.conftest import ROOT
+from tests.docs.conftest import PAGES, ROOT
 
 CHROMIUM = shutil.which("chromium")
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
 WIDTHS = {"phone": 400, "desktop": 1280}
 SAMPLE = (
-    "index", "tutorials/own_agents", "guides/studies", "guides/frameworks", "explanation/method",
-    "results/ablations_in_jax", "reference/catalogue", "reference/gallery", "reference/sme",
-    "reference/schemas", "reference/python/sme_registry", "reference/python/sme_registry.spec",
-    "genindex",
+    "index", "tutorials/first_agent", "tutorials/sweep_figure", "tutorials/installation",
+    "guides/studies", "guides/frameworks", "explanation/method", "results/ablations_in_jax",
+    "reference/catalogue", "reference/gallery", "reference/sme", "reference/schemas",
+    "reference/python/sme_registry", "reference/python/sme_registry.spec", "genindex",
 )  # fmt: skip
 
 in_chromium = pytest.mark.skipif(
@@ -66,10 +66,11 @@ def test_every_page_of_the_sources_is_in_the_site(site):
 def test_a_schema_is_a_file_and_a_tutorial_a_notebook(site):
     schema = json.loads((site / "schemas" / "SMESpec.schema.json").read_text())
     assert schema["properties"]["k"]["minimum"] == 1
-    notebook = json.loads((site / "notebooks" / "own_agents.ipynb").read_text())
-    assert notebook["nbformat"] == 4
-    page = (site / "tutorials" / "own_agents.html").read_text()
-    assert "../notebooks/own_agents.ipynb" in page
+    for name in PAGES:
+        notebook = json.loads((site / "notebooks" / f"{name}.ipynb").read_text())
+        assert notebook["nbformat"] == 4
+        page = (site / "tutorials" / f"{name}.html").read_text()
+        assert f'href="../notebooks/{name}.ipynb" download' in page
 
 
 def test_names_and_commands_in_code_lead_to_their_reference(site):

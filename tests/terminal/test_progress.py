@@ -8,7 +8,7 @@ from itertools import pairwise
 import pytest
 from rich.console import Console
 
-from sme_registry.terminal import Progress, duration, duration_range
+from sme_registry.terminal import Progress, duration, duration_range, err
 
 
 def test_without_a_terminal_it_prints_lines() -> None:
@@ -137,3 +137,17 @@ def test_nothing_is_printed_where_nothing_is_to_be_shown_or_done() -> None:
     with Progress("scoring", 0, console=Console(file=text)):
         pass
     assert text.getvalue() == ""
+
+
+def test_in_a_pipe_colours_can_be_forced_but_not_bars(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Jupyter forces colours in the shell cells of a notebook."""
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    console = err()
+    console.print("[red]long[/]" + " long" * 40)
+    with Progress("training", 10, console=console) as progress:
+        progress.update(10)
+    first, second = capsys.readouterr().err.splitlines()
+    assert first.startswith("\x1b[31mlong\x1b[0m long")
+    assert second.startswith("training: 10 of 10 steps")
