@@ -11,7 +11,7 @@ from collections import defaultdict
 from pathlib import Path
 from typing import NamedTuple
 
-from sme_registry.spec import Setting, SMESpec, SuiteFile, catalogue
+from sme_registry.spec import Setting, SMESpec, StudyFile, SuiteClass, SuiteFile, catalogue
 
 RESULTS = Path(__file__).parents[1] / "results"
 ALGORITHMS = ("PPO", "TD3", "SAC")
@@ -23,13 +23,13 @@ class Study(NamedTuple):
     Attributes:
       table: its file, in the folder of results.
       page: the page that describes it.
-      suite: that its tasks are of.
-      regions: the columns of normalised regret: the cube's, then the five shells'.
+      tasks: the suite that its tasks are of, or the file of its plan.
+      regions: the columns of normalised regret: the cube's, then those of the shells.
     """
 
     table: str
     page: str
-    suite: str
+    tasks: str
     regions: tuple[str, ...]
 
 
@@ -51,13 +51,23 @@ class Life(NamedTuple):
     metrics: dict[str, tuple[float, float, float]]
 
 
-_NUMBERED = tuple(f"normalised_regret_{m}" for m in range(6))
-_NAMED = ("normalised_regret_wd", *(f"normalised_regret_ood_{m}" for m in range(1, 6)))
+_BY_REGION = tuple(f"normalised_regret_{m}" for m in range(6))
+_TOGETHER = ("wd_regret", "ood_regret")
+_LIMITS = "limits-and-distractors"
 # A setting has the rows of the first page that knows it.
 STUDIES = (
-    Study("ablations-in-jax/runs-20000.csv", "ablations_in_jax.md", "paper-ablations", _NUMBERED),
-    Study("ablations-in-jax/runs.csv", "ablations_in_jax.md", "paper-ablations", _NUMBERED),
-    Study("baselines.csv", "baselines.md", "smoke", _NAMED),
+    Study("ablations-in-jax/runs-20000.csv", "ablations_in_jax.md", "paper-ablations", _BY_REGION),
+    Study("ablations-in-jax/runs.csv", "ablations_in_jax.md", "paper-ablations", _BY_REGION),
+    Study("baselines.csv", "baselines.md", "smoke", _TOGETHER),
+    *(
+        Study(
+            f"{_LIMITS}/{name}.csv",
+            "limits_and_distractors.md",
+            f"{_LIMITS}/{name}-plan.json",
+            _TOGETHER,
+        )
+        for name in ("representation", "safety")
+    ),
 )
 STREAMS, STREAM_PAGE = "continual/metrics.csv", "continual.md"
 
@@ -97,14 +107,17 @@ def lives() -> dict[str, list[Life]]:
 
 def _rows(study: Study) -> dict[str, list[Level]]:
     """The levels of a study's table, by setting; the algorithms in order."""
-    settings = {
-        spec.digest: member.setting.digest
-        for member in catalogue.find(SuiteFile, study.suite).suite.classes
-        for spec in member.instances
-    }
+    classes: tuple[SuiteClass, ...]
+    if study.tasks.endswith(".json"):
+        classes = StudyFile.read(RESULTS / study.tasks).plan.classes
+    else:
+        classes = catalogue.find(SuiteFile, study.tasks).suite.classes
+    settings = {spec.digest: each.setting.digest for each in classes for spec in each.instances}
     found: dict[str, dict[tuple[str, int], Level]] = defaultdict(dict)
     for row in _table(study.table):
         algorithm = row.get("algorithm") or row["method"]
+        if algorithm not in ALGORITHMS:
+            continue
         key = algorithm, int(row["steps"])
         of_setting = found[settings[row["spec_digest"]]]
         level = of_setting.setdefault(key, Level(*key, [], [], study.page))

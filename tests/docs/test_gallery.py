@@ -121,7 +121,10 @@ def test_results_are_those_of_the_same_setting():
     assert np.mean(of("Complexity50")[-1].cube) == pytest.approx(0.923, abs=5e-4)
     plane = {each.algorithm: float(iqm(each.shells)) for each in of("Plane10")}
     assert plane == pytest.approx({"TD3": 0.411, "PPO": 0.673, "SAC": 0.229}, abs=5e-4)
-    assert of("HardDeep") == of("Team4") == []
+    safe = {each.algorithm: np.mean(each.cube) for each in of("Safety20")}
+    assert safe.keys() == {"PPO", "TD3", "SAC"}  # none of those that learn to respect limits
+    assert len(of("MixedNonlinear3")[0].cube) == 3
+    assert of("HardDeep") == of("Team4") == of("Safety05") == []
     lives = {life.algorithm: life for life in results.lives()["Switch5"]}
     assert lives["PPO"].lives == 3
     assert lives["PPO"].metrics["forgetting"][0] == pytest.approx(0.26, abs=5e-3)
