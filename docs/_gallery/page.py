@@ -33,6 +33,7 @@ _METRICS = {
     "forgetting": "forgetting",
     "plasticity_ratio": "plasticity ratio",
 }
+_JOINT, _FIXED = "\u2060", "\u00a0"  # narrow lines do not break at a dash, a × or a =
 _INTRODUCTION = """\
 # Gallery
 
@@ -111,7 +112,7 @@ def _facts(spec: SMESpec) -> str:
         facts["m"] = spec.distractors
     if spec.team is not None:
         facts["agents"] = len(spec.team.agents)
-    return ", ".join(f"{name} = {value:g}" for name, value in facts.items())
+    return ", ".join(f"{name}{_FIXED}={_FIXED}{value:g}" for name, value in facts.items())
 
 
 def _stream_facts(stream: StreamSpec) -> str:
@@ -138,7 +139,8 @@ def _task_tables(known: dict[str, Any], levels: list[results.Level]) -> list[str
         (REFERENCES[name], *map(_value, values)) for name, values in known["references"].items()
     ]
     for level in levels:
-        study = f"[{level.algorithm}]({_page(level.page)}), {level.steps:,} × {len(level.cube)}"
+        effort = _FIXED.join((f"{level.steps:,}", "×", f"{len(level.cube)}"))
+        study = f"[{level.algorithm}]({_page(level.page)}), {effort}"
         rows.append((study, _spread(level.cube), _spread(level.shells)))
     return [
         _table(("`sme certify`", known["outcome"]), certificate),
@@ -171,7 +173,7 @@ def _page(name: str) -> str:
 
 def _spread(values: list[float]) -> str:
     mean = sum(values) / len(values)
-    return f"{mean:.2f} ({min(values):.2f}–{max(values):.2f})"
+    return f"{mean:.2f} ({min(values):.2f}{_JOINT}–{_JOINT}{max(values):.2f})"
 
 
 def _ends(values: list[float]) -> str:
