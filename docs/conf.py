@@ -12,7 +12,6 @@ sys.path[:0] = [str(HERE.parent), str(HERE / "_extensions")]
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
 os.environ["PYTHONPATH"] = str(HERE.parent)
 os.environ["MPLBACKEND"] = "agg"
-os.environ["TTY_COMPATIBLE"] = "0"  # kernels force colours, which Pygments cannot read in tables
 # In the page's own folder, not the reader's: data sets, and the key for boards.
 os.environ["MINARI_DATASETS_PATH"] = "datasets"
 os.environ["XDG_CONFIG_HOME"] = "config"

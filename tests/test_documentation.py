@@ -56,6 +56,13 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(
             "torch pandas IPython",
             {"--agents jax": "", "-n 16000": "-n 500", "--seeds 5": "--seeds 1"},
         ),
+        ("offline_data", "torch minari matplotlib", {"20_000": "2_000", "steps=3_000": "steps=50"}),
+        pytest.param(
+            "teams",
+            "torch torchrl stable_baselines3",
+            {"--steps 4096": "--steps 2048", "total_frames=4_096": "total_frames=512"},
+            marks=pytest.mark.filterwarnings("ignore::DeprecationWarning"),  # TorchRL's own
+        ),
         (
             "continual_stream",
             "torch pandas IPython",

@@ -21,9 +21,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from functools import partialmethod
 from pathlib import Path
 
 import nbformat
+from nbclient import NotebookClient
 from nbformat import NotebookNode, v4
 from sphinx.application import Sphinx
 
@@ -137,4 +139,8 @@ def _on_read(app: Sphinx, name: str, source: list[str]) -> None:
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register with Sphinx: before `links`, so that notebooks get the page as it is written."""
     app.connect("source-read", _on_read, priority=300)
+    # Kernels send what a shell prints in pieces of 100 characters, which MyST-NB joins with line
+    # breaks. nbclient can merge them as they were printed, but MyST-NB passes no option on to it.
+    create = partialmethod(NotebookClient.__init__, coalesce_streams=True)
+    NotebookClient.__init__ = create  # type: ignore[assignment]
     return {"parallel_read_safe": True}

@@ -4,6 +4,7 @@ import importlib
 import inspect
 import re
 
+import nbclient
 import nbformat
 import numpy as np
 import numpy.typing as npt
@@ -65,6 +66,19 @@ def test_a_tutorial_as_a_notebook_installs_first_and_has_the_same_cells():
     assert "See teams and [a site](https://example.org)." in text
     assert "<!--" not in text
     assert nbformat.writes(notebook) == nbformat.writes(tutorial_cells.as_notebook(TUTORIAL))
+
+
+def test_long_lines_of_a_shell_stay_whole():
+    class App:
+        def connect(self, *_, **__):
+            pass
+
+    tutorial_cells.setup(App())
+    cell = nbformat.v4.new_code_cell("%%sh\nprintf '%0500d\\n' 7 8")
+    notebook = nbformat.v4.new_notebook(cells=[cell])
+    nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3").execute()
+    (output,) = notebook.cells[0].outputs
+    assert output.text == f"{7:0500}\n{8:0500}\n"
 
 
 def test_links_out_of_docs_lead_to_pages_of_the_site_or_nowhere():
