@@ -46,6 +46,7 @@ _BLOCK = re.compile(
     re.M | re.S,
 )
 _EXTRAS = re.compile(r"^<!-- extras: ([a-z, ]+?) -->$", re.M)
+_ALSO = re.compile(r"^<!-- also: ([a-z]+) -->$", re.M)
 _RELATIVE_LINK = re.compile(r"!?\[([^\]]*)\]\((?!https?:)[^)]*\)")
 _COMMENT = re.compile(r"^<!--.*?-->\n?", re.M | re.S)
 # The rule for readers is in docs/tutorials/installation.md: the package is on no index.
@@ -64,9 +65,12 @@ if importlib.util.find_spec("sme_registry") is None:
         raise FileNotFoundError(f"{{path}} is missing: set SOURCE to what you have.")
     address = SOURCE if "://" in SOURCE else path.as_uri()
     %pip install --quiet "sme-registry{extras} @ {{address}}"
-
+{also}
 # So that cells find the package's commands where the environment of this Python is not active.
 os.environ["PATH"] = os.pathsep.join([str(pathlib.Path(sys.executable).parent), os.environ["PATH"]])
+"""
+_INSTALL_ALSO = """if importlib.util.find_spec("{package}") is None:
+    %pip install --quiet {package}
 """
 
 
@@ -100,8 +104,11 @@ def _cell(block: re.Match[str]) -> str:
 def as_notebook(text: str) -> NotebookNode:
     """A tutorial as a notebook for Jupyter, without outputs."""
     extras = _EXTRAS.search(text)
+    also = _ALSO.search(text)
     install = _INSTALL.format(
-        version=__version__, extras=f"[{extras[1].replace(' ', '')}]" if extras else ""
+        version=__version__,
+        extras=f"[{extras[1].replace(' ', '')}]" if extras else "",
+        also=_INSTALL_ALSO.format(package=also[1]) if also else "",
     )
     title, _, rest = text.partition("\n")
     cells = [v4.new_markdown_cell(title), v4.new_code_cell(install), *_cells(rest)]

@@ -124,6 +124,8 @@ def baselines() -> dict[str, list[tuple[float, float, float]]]:
     page = (RESULTS / "baselines.md").read_text(encoding="utf-8")
     estimate = r"([\d.]+) \(([\d.]+) to ([\d.]+)\)"
     rows = re.findall(rf"^\| (\w+) \| {estimate} \| {estimate} \|", page, re.M)
+    if len(rows) != 3:
+        raise ValueError(f"baselines.md: {len(rows)} rows with two estimates, must be 3.")
     return {
         name: [(*map(float, numbers[i : i + 3]),) for i in (0, 3)]  # type: ignore[misc]
         for name, *numbers in rows

@@ -52,9 +52,10 @@ it asks of an agent, its optimal policy π*, and numbers to compare your own wit
 - **PPO, TD3 and SAC** were evaluated under `paper-v1`, with default hyperparameters (but PPO has
   `n_steps=2000` in streams and `gamma=0.9` under limits). The name links to the study; the steps of
   a run and the number of runs follow. N is the mean over runs (not the IQM of a board), with the
-  lowest and the highest. The runs are of other draws of the same settings, each with a seed of its
-  own; all other numbers are those of the id. Where there are limits, none of the three knows of
-  them, and the study says how often they are broken. A card without these rows has no results yet.
+  lowest and the highest. The runs are on several draws of the same settings, sometimes with the
+  id's own among them; all other numbers are those of the id. Where there are limits, none of the
+  three knows of them, and the study says how often they are broken. A card without these rows has
+  no results yet.
 """
 
 

@@ -1,7 +1,7 @@
 """How PPO, TD3 and SAC did on the tasks of the catalogue, from the tables under docs/results.
 
-Studies train on other seeds of a setting, which is every field of a task but its seed. So a study
-counts for a task if it has the task's setting.
+Studies train on several seeds of a setting, which is every field of a task but its seed. So a
+study counts for a task if it has the task's setting.
 """
 
 from __future__ import annotations

@@ -111,8 +111,8 @@ def verdict_on(question: str, verdicts: Sequence[Verdict]) -> Verdict:
 
 
 def without_html(page: str) -> str:
-    """A page of Markdown for a notebook, which would otherwise run HTML in a name."""
-    return page.replace("<", "&lt;")
+    """A page of Markdown for a notebook, which would run HTML, links and images in a name."""
+    return page.replace("<", "&lt;").replace("](", "]\\(")
 
 
 class Diagnosis(StrictModel):

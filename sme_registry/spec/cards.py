@@ -42,8 +42,8 @@ def difference(spec: SMESpec) -> str:
 
 
 def in_words(values: dict[str, Any]) -> str:
-    """`k=3, rotation=0.7854`."""
-    return ", ".join(f"{name}={_short(value)}" for name, value in values.items())
+    """`k=3, rotation=0.25`."""
+    return ", ".join(f"{name}={_exact(value)}" for name, value in values.items())
 
 
 def task_table(spec: SMESpec) -> Table:
@@ -55,9 +55,9 @@ def task_table(spec: SMESpec) -> Table:
         caption=spec.digest,
     )
     for row in fields.rows(spec):
-        cells = [escape(str(cell)) for cell in (row.symbol, row.name, _short(row.value))]
+        cells = [escape(str(cell)) for cell in (row.symbol, row.name, _exact(row.value))]
         if row.changed:
-            default = "none" if row.default is None else _short(row.default)
+            default = "none" if row.default is None else _exact(row.default)
             cells = [f"[bold]{cell}[/]" for cell in cells]
             cells[-1] += f"\ndefault {escape(str(default))}"
         table.add_row(*cells, escape(row.meaning))
@@ -113,7 +113,7 @@ def stream_table(stream: StreamSpec, title: str) -> Table:
     for index, phase in enumerate(stream.phases):
         changes = in_words(fields.changes(phase.spec, before))
         if phase.drift is not None:
-            to, count = _short(phase.drift.rotation), phase.drift.increments
+            to, count = _exact(phase.drift.rotation), phase.drift.increments
             drift = f"rotation drifts to {to} in {count} increments"
             changes = f"{changes}, {drift}" if changes else drift
         digest = phase.spec.digest[:SHORT]
@@ -135,5 +135,9 @@ def stream_facts(stream: StreamSpec) -> dict[str, Any]:
     }
 
 
-def _short(value: Any) -> Any:
-    return f"{value:.4g}" if isinstance(value, float) else value
+def _exact(value: Any) -> Any:
+    """A number without a needless `.0`, and with all its digits: tasks differ in the last."""
+    if not isinstance(value, float):
+        return value
+    short = f"{value:g}"
+    return short if float(short) == value else repr(value)

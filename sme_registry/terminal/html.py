@@ -81,6 +81,8 @@ def pairs_html(title: str, pairs: Mapping[str, Any]) -> str:
 
 def _caption(html: str) -> str:
     """The title of a table, its first line in bold."""
+    if not html:
+        return ""
     first, *rest = html.split("<br>", 1)
     return f"<caption>{'<br>'.join([f'<b>{first}</b>', *rest])}</caption>"
 

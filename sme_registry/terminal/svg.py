@@ -59,7 +59,7 @@ class Line(NamedTuple):
     """A line of a chart.
 
     Attributes:
-      label: at its end; empty for none.
+      label: at its end, of at most 17 characters; empty for none.
       values: one for each position on the x axis, finite.
       kind: "main" for what the chart is about, "other" for what stands beside it, "reference".
     """
@@ -90,7 +90,8 @@ def line_chart(title: str, positions: Sequence[str], lines: Sequence[Line], belo
 
     parts = [
         f'<path d="M{_LEFT:.0f} {y(tick):.1f}H{_RIGHT:.0f}" stroke="currentColor" '
-        f'stroke-opacity=".18"/>{_text(_LEFT - 6, y(tick) + 4, f"{tick:g}", "end")}'
+        'stroke-opacity=".18"/>'
+        + _text(_LEFT - 6, y(tick) + 4, f"{tick:g}".replace("-", "−"), "end")
         for tick in scale.ticks
     ]
     every = 1 + (len(positions) - 1) // _MAX_LABELS
@@ -143,5 +144,5 @@ def _text(x: float, y: float, text: str, anchor: str, *, bold: bool = False) -> 
     weight = ' font-weight="bold"' if bold else ""
     return (
         f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="currentColor"{weight}>'
-        f"{escape(text.replace('-', '−'))}</text>"
+        f"{escape(text)}</text>"
     )

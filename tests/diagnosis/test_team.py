@@ -89,9 +89,10 @@ def test_a_team_in_a_pipe_has_short_lines(one_fails: TeamDiagnosis) -> None:
 
 
 def test_a_notebook_shows_the_page_of_a_team_and_runs_no_html(one_fails: TeamDiagnosis) -> None:
-    page = one_fails.model_copy(update={"name": "<script>"})._repr_markdown_()
-    assert page.startswith("# &lt;script> on ")
+    page = one_fails.model_copy(update={"name": "<script>![i](http://e)"})._repr_markdown_()
+    assert page.startswith("# &lt;script>![i]\\(http://e) on ")
     assert "<" not in page
+    assert "](" not in page
     assert one_fails.agents[0].name in page
 
 

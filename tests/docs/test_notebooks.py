@@ -84,6 +84,11 @@ def test_the_first_cell_installs_from_a_git_address(monkeypatch, tmp_path):
     assert requirement(address, monkeypatch, tmp_path).url == address
 
 
+def test_the_first_cell_also_installs_what_no_extra_has():
+    assert install_cell("teams").count("%pip install --quiet torchrl\n") == 1
+    assert "torchrl" not in install_cell("first_agent")
+
+
 def test_a_source_that_does_not_exist_is_refused_with_what_to_do(monkeypatch, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"none\.whl is missing: set SOURCE"):
         requirement("none.whl", monkeypatch, tmp_path)

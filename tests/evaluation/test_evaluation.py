@@ -22,6 +22,7 @@ from sme_registry.errors import (
 )
 from sme_registry.evaluation import evaluation_observations, references, regions
 from sme_registry.evaluation.references import reference_policy
+from sme_registry.evaluation.report import AgentReport
 from sme_registry.spec import EvaluationProtocol, ProtocolFile
 from tests.evaluation.shown import observations
 
@@ -322,6 +323,17 @@ def test_a_notebook_draws_a_reports_curve_beside_the_references(report):
     assert f", {last}" in chart.attrib["aria-label"].split("policy: ")[1]
     assert report.chart() in report._repr_html_()
     assert len(report._repr_html_().encode()) < 20_000
+
+
+def test_the_curve_of_a_large_team_is_short_and_names_the_worst_agent(report):
+    agent = AgentReport(regions=report.regions, references=report.references)
+    agents = {f"agent_{i}": agent for i in range(256)}
+    worse = [each.model_copy(update={"normalised_regret": 3.0}) for each in report.regions]
+    agents["left-arm_of_the_team"] = agent.model_copy(update={"regions": worse})
+    chart = report.model_copy(update={"agents": agents}).chart()
+    assert len(chart.encode()) < 8_000
+    labels = {each.text for each in ElementTree.fromstring(chart).iter("text")}
+    assert {"left-arm_…, worst", "team"} <= labels
 
 
 def test_printing_a_report_shows_its_table(report):

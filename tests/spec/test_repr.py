@@ -41,6 +41,12 @@ def test_a_notebook_shows_a_streams_phases():
     html = sme_registry.load("Switch5")._repr_html_()
     assert html.count(">seed=") == 4
     assert "100,000" in html
+    assert "<b></b>" not in html
+
+
+def test_a_card_has_every_digit_of_a_number():
+    assert "r_min=0.123456789" in SMESpec(r_min=0.123456789)._repr_html_()
+    assert "k=5, r_min=0.5" in SMESpec(r_min=0.5, k=5)._repr_html_()
 
 
 def test_the_card_of_any_document_is_short():

@@ -46,6 +46,9 @@ def explorers_of(ledger: Ledger, file: StudyFile, models: Mapping[str, Path]) ->
         name = key.removeprefix("sha256:")[:_DIGITS]
         try:
             report = run_report(ledger.folder, key)
+        except SMEError:  # of another version: the page then lacks its regions
+            report = None
+        try:
             content = explorer_page(load_cell(ledger.folder, key), report=report)
         except SMEError:
             continue
