@@ -15,6 +15,7 @@ gives the cell MyST-NB's tags, separated by spaces: `hide-input`, `hide-output`,
 whose first cell installs the package where it is missing, with the extras that the page names:
 
     <!-- extras: plot,train -->
+    <!-- also: torchrl -->     a package that no extra has
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from functools import partialmethod
 from pathlib import Path
 
 import nbformat
+from docutils import nodes
 from nbclient import NotebookClient
 from nbformat import NotebookNode, v4
 from sphinx.application import Sphinx
@@ -48,6 +50,7 @@ _BLOCK = re.compile(
 _EXTRAS = re.compile(r"^<!-- extras: ([a-z, ]+?) -->$", re.M)
 _ALSO = re.compile(r"^<!-- also: ([a-z]+) -->$", re.M)
 _RELATIVE_LINK = re.compile(r"!?\[([^\]]*)\]\((?!https?:)[^)]*\)")
+_SHELL = "%%sh -e\n"
 _COMMENT = re.compile(r"^<!--.*?-->\n?", re.M | re.S)
 # The rule for readers is in docs/tutorials/installation.md: the package is on no index.
 _INSTALL = """# Installs the package where it is missing. Name what you have: the folder of a clone,
@@ -92,7 +95,7 @@ def as_page(text: str, name: str) -> str:
 
 
 def _code(block: re.Match[str]) -> str:
-    shell = "%%sh -e\n" if block["language"] == "sh" else ""
+    shell = _SHELL if block["language"] == "sh" else ""
     return shell + block["code"]
 
 
@@ -143,9 +146,18 @@ def _on_read(app: Sphinx, name: str, source: list[str]) -> None:
             write_atomically(folder / f"{file}.ipynb", nbformat.writes(as_notebook(text)) + "\n")
 
 
+def _on_doctree(app: Sphinx, doctree: nodes.document) -> None:
+    """Show shell cells as a reader types them: the first line is for the kernel."""
+    for block in list(doctree.findall(nodes.literal_block)):
+        text = block.astext()
+        if text.startswith(_SHELL):
+            block.replace_self(nodes.literal_block(text, text.removeprefix(_SHELL), language="sh"))
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register with Sphinx: before `links`, so that notebooks get the page as it is written."""
     app.connect("source-read", _on_read, priority=300)
+    app.connect("doctree-read", _on_doctree)
     # Kernels send what a shell prints in pieces of 100 characters, which MyST-NB joins with line
     # breaks. nbclient can merge them as they were printed, but MyST-NB passes no option on to it.
     create = partialmethod(NotebookClient.__init__, coalesce_streams=True)

@@ -93,7 +93,7 @@ def _ranking_table(rows: list[RankedRow], metric: Metric, board: BoardDocument) 
         caption.append("oracle-like: so close to π* that the method's code is requested")
     if board.practice:
         runs = "one run" if board.runs_to_rank == 1 else f"{board.runs_to_rank} runs"
-        caption.append(f"A practice board: {runs} in each class suffice for a rank.")
+        caption.append(f"A practice board: a rank needs {runs} in each class.")
     columns = {"rank": "number", "method": "text", "submitter": "text", "marks": "text"}
     if not any(map(_marks, entries)):
         del columns["marks"]

@@ -21,6 +21,8 @@ import links
 import python_reference
 import schema_files
 import tutorial_cells
+from docutils import nodes
+from docutils.utils import new_document
 from sphinx.util.typing import stringify_annotation
 
 import sme_registry
@@ -79,6 +81,16 @@ def test_long_lines_of_a_shell_stay_whole():
     nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3").execute()
     (output,) = notebook.cells[0].outputs
     assert output.text == f"{7:0500}\n{8:0500}\n"
+
+
+def test_shell_cells_are_shown_as_they_are_typed_in_a_terminal():
+    code = [nodes.literal_block(text, text) for text in ("%%sh -e\nsme list", "x = '%%sh -e'")]
+    page = new_document("page")
+    page += code
+    tutorial_cells._on_doctree(None, page)
+    shell, python = page.children
+    assert (shell.astext(), shell["language"]) == ("sme list", "sh")
+    assert python is code[1]
 
 
 def test_links_out_of_docs_lead_to_pages_of_the_site_or_nowhere():
