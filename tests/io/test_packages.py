@@ -146,8 +146,10 @@ def test_the_documentation_installs_existing_extras_from_a_clone() -> None:
     found = 0
     for page in pages:
         text = page.read_text()
-        assert "sme-registry[" not in text, f"{page}: nobody with a clone alone can install it"
-        for extras in re.findall(r"install [^\n`]*?\.\[([\w,]+)\]", text):
+        by_name = r"sme-registry\[([\w,]+)\]"
+        assert not re.search(rf"{by_name}(?! @ )", text), f"{page}: the package is on no index"
+        named = re.findall(rf"install [^\n`]*?\.\[([\w,]+)\]|{by_name}", text)
+        for extras in map("".join, named):
             found += 1
             assert set(extras.split(",")) <= EXTRAS.keys(), page
     assert found > 5
