@@ -8,23 +8,26 @@ from dataclasses import dataclass
 from typing import Any
 
 from sme_registry.spec import ObservationSpec, StudyPlan, SuiteClass
+from sme_registry.spec.fields import symbol
 
 ALL = "all classes"
 SEVERAL = "several axes"
-AXES = {
-    "state_dim": ("S", "state dimension S"),
-    "action_dim": ("A", "action dimension A"),
-    "k": ("k", "reward interval k"),
-    "r_min": ("r_min", "minimum reward r_min"),
-    "D": ("D", "survival threshold D"),
-    "complexity": ("L", "complexity L"),
-    "horizon": ("T", "horizon T"),
-    "hidden_width": ("H", "hidden width H"),
-    "rotation": ("θ", "rotation θ"),
-    "safety.tightness": ("τ", "tightness τ"),
-    "observation": ("observation", "observation"),
-    "policy_init": ("policy_init", "policy_init"),
+_AXES = {
+    "state_dim": "state dimension",
+    "action_dim": "action dimension",
+    "k": "reward interval",
+    "r_min": "minimum reward",
+    "D": "survival threshold",
+    "complexity": "complexity",
+    "horizon": "horizon",
+    "hidden_width": "hidden width",
+    "rotation": "rotation",
+    "safety.tightness": "tightness",
 }
+AXES = {field: (symbol(field), f"{words} {symbol(field)}") for field, words in _AXES.items()} | {
+    field: (field, field) for field in ("observation", "policy_init")
+}
+"""Symbol and name of each field that studies vary, in the order of reports."""
 
 
 @dataclass(frozen=True)
