@@ -82,12 +82,8 @@ def retention_map(
       MissingDependencyError: Matplotlib is not installed.
 
     Examples:
-      >>> from sme_registry.evaluation import evaluate_stream
       >>> from sme_registry.plots import retention_map
-      >>> phases = [{"spec": "Default", "steps": 100}, {"spec": "Complexity10", "steps": 100}]
-      >>> stream = sme_registry.StreamSpec(phases=phases)
-      >>> report = evaluate_stream(["linear", "linear"], stream, "quick-v1")
-      >>> figure = retention_map(report, "retention_map.png")
+      >>> figure = retention_map("runs/life", "retention_map.png")
     """
     reports = _runs(runs)
     agents = [report.region(region).agent for report in reports]
@@ -134,12 +130,8 @@ def performance_curve(
       As `retention_map`.
 
     Examples:
-      >>> from sme_registry.evaluation import evaluate_stream
       >>> from sme_registry.plots import performance_curve
-      >>> phases = [{"spec": "Default", "steps": 100}, {"spec": "Complexity10", "steps": 100}]
-      >>> stream = sme_registry.StreamSpec(phases=phases)
-      >>> report = evaluate_stream(["linear", "linear"], stream, "quick-v1")
-      >>> figure = performance_curve(report, "performance_curve.png")
+      >>> figure = performance_curve("runs/life", "performance_curve.png")
     """
     reports = _runs(runs)
     agents = [report.region(region).agent for report in reports]

@@ -1,20 +1,14 @@
 """The site as a reader sees it: built without a warning, whole without a network, at two widths."""
 
-import functools
 import html.parser
-import http.server
 import json
-import os
 import re
-import shutil
-import threading
 
 import pytest
 
+from tests.browser import launched, needs_chromium, serving_files
 from tests.docs.conftest import PAGES, ROOT
 
-CHROMIUM = shutil.which("chromium")
-FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
 WIDTHS = {"phone": 400, "desktop": 1280}
 SAMPLE = (
     "index", "tutorials/first_agent", "tutorials/sweep_figure", "tutorials/installation",
@@ -22,10 +16,6 @@ SAMPLE = (
     "reference/catalogue", "reference/gallery", "reference/sme", "reference/schemas",
     "reference/python/sme_registry", "reference/python/sme_registry.spec", "genindex",
 )  # fmt: skip
-
-in_chromium = pytest.mark.skipif(
-    CHROMIUM is None and not os.environ.get("CI"), reason="chromium is not installed"
-)
 
 
 class Loaded(html.parser.HTMLParser):
@@ -83,28 +73,17 @@ def test_names_and_commands_in_code_lead_to_their_reference(site):
 @pytest.fixture(scope="module")
 def chromium():
     sync_api = pytest.importorskip("playwright.sync_api")
-    assert CHROMIUM is not None, "CI=true and no chromium: apt-get install chromium"
     with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        browser = launched(playwright)
         yield browser
         browser.close()
-
-
-class _Handler(http.server.SimpleHTTPRequestHandler):
-    def log_message(self, *_):
-        pass
 
 
 @pytest.fixture(scope="module")
 def origin(site):
     """The address at which the site is served: a search reads pages, which a file may not do."""
-    handler = functools.partial(_Handler, directory=str(site))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield f"http://127.0.0.1:{server.server_port}/"
-        server.shutdown()
-        thread.join()
+    with serving_files(site) as address:
+        yield address
 
 
 @pytest.fixture
@@ -138,7 +117,7 @@ def opened(chromium, origin):
     assert problems == []
 
 
-@in_chromium
+@needs_chromium
 @pytest.mark.parametrize("width", WIDTHS)
 def test_no_page_is_wider_than_the_screen(origin, width, opened):
     page = opened("index", width)
@@ -154,7 +133,7 @@ def test_no_page_is_wider_than_the_screen(origin, width, opened):
     assert too_wide == {}
 
 
-@in_chromium
+@needs_chromium
 def test_search_finds_a_word_and_leads_to_its_page(opened):
     page = opened("index")
     page.get_by_role("textbox", name="Search").fill("plasticity")
@@ -163,7 +142,7 @@ def test_search_finds_a_word_and_leads_to_its_page(opened):
     assert "/guides/retention.html" in page.url
 
 
-@in_chromium
+@needs_chromium
 def test_dark_is_dark_and_light_is_light_and_a_button_changes_it(opened):
     def brightness(page):
         colour = page.evaluate("getComputedStyle(document.body).backgroundColor")

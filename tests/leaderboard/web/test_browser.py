@@ -1,9 +1,6 @@
 """The pages in a real browser: from files and from a server that forbids everything inline."""
 
-import functools
-import http.server
 import re
-import threading
 
 import pytest
 from playwright.sync_api import expect, sync_playwright
@@ -12,7 +9,7 @@ from leaderboard import intake
 from leaderboard.documents.board import hex_of
 from leaderboard.scoring.worker import run_scorer
 from leaderboard.web.site import write_site
-from tests.browser import launched, needs_chromium
+from tests.browser import launched, needs_chromium, serving_files
 from tests.leaderboard.conftest import tiny_board
 from tests.leaderboard.serving import serving
 from tests.leaderboard.web.site import boards
@@ -36,25 +33,11 @@ def written(tmp_path_factory):
         return write_site(store, folder / "site").parent, {k: hex_of(v) for k, v in ids.items()}
 
 
-class _Handler(http.server.SimpleHTTPRequestHandler):
-    def end_headers(self):
-        self.send_header("Content-Security-Policy", CSP)
-        self.send_header("X-Content-Type-Options", "nosniff")
-        super().end_headers()
-
-    def log_message(self, *_):
-        pass
-
-
 @pytest.fixture(scope="module")
 def served(written):
-    handler = functools.partial(_Handler, directory=str(written[0]))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield f"http://127.0.0.1:{server.server_port}/"
-        server.shutdown()
-        thread.join()
+    headers = {"Content-Security-Policy": CSP, "X-Content-Type-Options": "nosniff"}
+    with serving_files(written[0], headers) as address:
+        yield address
 
 
 @pytest.fixture(scope="module")
