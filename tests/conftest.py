@@ -1,13 +1,21 @@
-"""Shared by every test: Hypothesis draws the same examples on every run and machine."""
+"""Shared by every test: the same examples, threads and signals on every run and machine."""
 
 import os
+import signal
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from filelock import FileLock
 from hypothesis import settings
 
+# The workers share the cores. Read when NumPy, Torch and JAX are imported, here and in children.
+for library in ("OMP", "OPENBLAS", "MKL"):
+    os.environ[f"{library}_NUM_THREADS"] = "1"
+# A job in the background of a script ignores SIGINT, and so would every process started here.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # read when ONNX Runtime is imported
 # One compile cache for all workers of a test run.
 os.environ.setdefault(
@@ -18,6 +26,30 @@ settings.register_profile(
     "deterministic", derandomize=True, deadline=None, database=None, max_examples=50
 )
 settings.load_profile("deterministic")
+
+
+@pytest.fixture(scope="session")
+def once(
+    tmp_path_factory: pytest.TempPathFactory, worker_id: str
+) -> Callable[[str, Callable[[Path], Any]], Path]:
+    """`once(name, make)`: the folder that `make(folder)` filled, in one worker for all of them.
+
+    Nobody changes it: a test that writes works on a copy.
+    """
+    base = tmp_path_factory.getbasetemp()
+    shared = base if worker_id == "master" else base.parent
+
+    def made(name: str, make: Callable[[Path], Any]) -> Path:
+        folder, complete = shared / "once" / name, shared / "once" / f"{name}.complete"
+        folder.parent.mkdir(exist_ok=True)
+        with FileLock(folder.with_name(f"{name}.lock")):
+            if not complete.exists():
+                folder.mkdir(exist_ok=True)
+                make(folder)
+                complete.touch()
+        return folder
+
+    return made
 
 
 @pytest.fixture
