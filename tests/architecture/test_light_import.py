@@ -1,4 +1,4 @@
-"""`import sme_registry` is cheap: nothing heavy is loaded, and little time is taken."""
+"""`import sme_registry` is cheap: nothing heavy is loaded."""
 
 import json
 import os
@@ -9,7 +9,6 @@ HEAVY = {
     "torch", "jax", "ray", "matplotlib", "numba", "scipy.stats", "stable_baselines3", "pygame",
     "pandas", "h5py", "minari", "d3rlpy", "onnxruntime", "typer", "filelock", "jinja2",
 }  # fmt: skip
-CPU_SECONDS = 0.5
 
 
 def run(script):
@@ -36,13 +35,3 @@ def test_making_and_stepping_with_numpy_loads_nothing_heavy():
         "print(json.dumps(list(sys.modules)))"
     )
     assert not set(run(script)) & HEAVY
-
-
-def test_importing_the_package_costs_little_beyond_numpy_and_gymnasium():
-    script = (
-        "import json, time, numpy, gymnasium\n"
-        "begun = time.process_time()\n"
-        "import sme_registry\n"
-        "print(json.dumps(time.process_time() - begun))"
-    )
-    assert min(run(script) for _ in range(3)) < CPU_SECONDS

@@ -1,11 +1,13 @@
-"""Run every command of the installed package in this process, and print what happened as JSON.
+"""Run commands in this process as if some modules were missing, and print what happened as JSON.
 
-`test_extras.py` runs this with the interpreter of each environment, in an empty folder.
+`test_extras.py` runs this in an empty folder, and says on standard input which modules are missing,
+and which commands to run: none is every `--help` and all of ARGUMENTS.
 """
 
 from __future__ import annotations
 
 import contextlib
+import importlib.machinery
 import io
 import json
 import sys
@@ -88,18 +90,42 @@ def run(main: Any, program: str, arguments: tuple[str, ...]) -> dict[str, Any]:
     }
 
 
-def everything() -> Iterator[dict[str, Any]]:
+class Without(importlib.machinery.PathFinder):
+    """Finds what lies on the path but for some modules, as if their packages were not installed."""
+
+    missing: frozenset[str] = frozenset()
+
+    @classmethod
+    def find_spec(cls, fullname: str, path: Any = None, target: Any = None) -> Any:
+        if fullname.partition(".")[0] in cls.missing:
+            return None
+        return super().find_spec(fullname, path, target)
+
+
+def everything(chosen: list[str]) -> Iterator[dict[str, Any]]:
     import typer
 
     package = distribution("sme-registry")
     for script in package.entry_points.select(group="console_scripts"):
         main = script.load()
-        app = main.__globals__["app"]
-        for path in leaves(typer.main.get_command(app)):
+        if chosen:
+            # A task first: most commands read it.
+            names = [f"{script.name} new task.json", *chosen] if script.name == "sme" else chosen
+            for command in names:
+                program, *arguments = command.split()
+                if program == script.name:
+                    yield run(main, program, tuple(arguments))
+            continue
+        for path in leaves(typer.main.get_command(main.__globals__["app"])):
             yield run(main, script.name, (*path, "--help"))
         for arguments in ARGUMENTS[script.name]:
             yield run(main, script.name, tuple(arguments.split()))
 
 
 if __name__ == "__main__":
-    print(json.dumps(list(everything())))
+    request = json.load(sys.stdin)
+    Without.missing = frozenset(request["missing"])
+    sys.meta_path = [
+        Without if finder is importlib.machinery.PathFinder else finder for finder in sys.meta_path
+    ]
+    print(json.dumps(list(everything(request["commands"]))))

@@ -1,18 +1,18 @@
-"""The wheel with each extra alone: every command answers, in one line where a package is missing.
+"""With each extra alone, every command answers, in one line where a package is missing.
 
-An environment is a real one, but its packages are links to those of this environment: the closure
-of the extra's requirements and nothing else.
+An extra alone is this environment in which an import of any other package fails. The core's answers
+say which commands need which extra, and each extra then runs the commands that asked for it.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
-import sysconfig
 import tomllib
-import zipfile
+from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -24,84 +24,110 @@ ROOT = Path(__file__).parents[2]
 NAME = "sme-registry"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = [extra for extra in PROJECT["optional-dependencies"] if extra != "dev"]
-HINT = re.compile(rf"install .?{NAME}\[(\w+)\]")
+HINT = re.compile(r"pip install .*\[(\w+)\]")
 
 
-def closure(requirements: list[str], extra: str) -> set[str]:
-    """The installed distributions that these requirements of a package need."""
-    waiting = [(Requirement(text), extra) for text in requirements]
-    done: set[tuple[str, str]] = set()
-    names: set[str] = set()
+def closure(extra: str) -> set[str]:
+    """The installed distributions that the package with an extra needs."""
+    waiting = [(Requirement(f"{NAME}[{extra}]" if extra else NAME), "")]
+    visited: set[tuple[str, str]] = set()
     while waiting:
         requirement, chosen = waiting.pop()
         if requirement.marker and not requirement.marker.evaluate({"extra": chosen}):
             continue
-        for inner in ("", *requirement.extras):
-            if (requirement.name, inner) in done:
+        name = normalised(requirement.name)
+        for inner in {"", *requirement.extras} - {extra for n, extra in visited if n == name}:
+            visited.add((name, inner))
+            try:
+                needs = metadata.requires(name) or []
+            except metadata.PackageNotFoundError:  # an optional part that is not installed
                 continue
-            done.add((requirement.name, inner))
-            if requirement.name == NAME:
-                needs = requirements
-            else:
-                names.add(requirement.name)
-                try:
-                    needs = metadata.requires(requirement.name) or []
-                except metadata.PackageNotFoundError:  # an optional part that is not installed
-                    names.discard(requirement.name)
-                    continue
             waiting += [(Requirement(text), inner) for text in needs]
-    return names
+    return {name for name, _ in visited}
 
 
-def environment(folder: Path, wheel: Path, extra: str) -> Path:
-    """Create an environment with the wheel and an extra; returns its interpreter."""
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)
-    scheme = {"base": str(folder), "platbase": str(folder)}
-    site = Path(sysconfig.get_path("purelib", "venv", scheme))
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(site)
-        (record,) = (name for name in archive.namelist() if name.endswith("METADATA"))
-        requirements = metadata.PathDistribution(site / Path(record).parent).requires or []
-    for name in closure(requirements, extra):
-        distribution = metadata.distribution(name)
-        for top in {file.parts[0] for file in distribution.files or ()} - {"..", "__pycache__"}:
-            if not (site / top).exists():
-                (site / top).symlink_to(Path(str(distribution.locate_file(top))))
-    return folder / "bin" / "python"
+def normalised(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
 
 
-def outcomes(python: Path, folder: Path) -> list[dict[str, Any]]:
-    folder.mkdir()
-    script = str(Path(__file__).with_name("run_commands.py"))
+def missing(extra: str) -> list[str]:
+    """The modules of this environment that one with this extra alone would not have."""
+    present = closure(extra)
+    return [
+        module
+        for module, owners in metadata.packages_distributions().items()
+        if not present & {normalised(owner) for owner in owners}
+    ]
+
+
+def outcomes(extra: str, folder: Path, commands: list[str]) -> list[dict[str, Any]]:
+    """What every `--help`, or these commands, answer where only this extra is installed."""
+    folder.mkdir(parents=True)
+    request = json.dumps({"missing": missing(extra), "commands": commands})
+    script = Path(__file__).with_name("run_commands.py")
     settings = {
         "PATH": "/usr/bin:/bin",
         "HOME": str(folder),
         "OMP_NUM_THREADS": "1",
         "SME_BACKEND": "numpy",
+        "PYTHONPATH": str(ROOT),
+        "PYTHONDONTWRITEBYTECODE": os.environ.get("PYTHONDONTWRITEBYTECODE", ""),
     }
-    done = subprocess.run(
-        [python, "-W", "ignore", script], cwd=folder, env=settings, capture_output=True, text=True
+    process = subprocess.run(
+        [sys.executable, "-W", "ignore", script],
+        input=request,
+        cwd=folder,
+        env=settings,
+        capture_output=True,
+        text=True,
     )
-    assert done.returncode == 0, done.stderr
-    result: list[dict[str, Any]] = json.loads(done.stdout)
+    assert process.returncode == 0, process.stderr
+    result: list[dict[str, Any]] = json.loads(process.stdout)
     return result
 
 
-@pytest.mark.parametrize("extra", ["", *EXTRAS])
-def test_with_one_extra_every_command_answers_in_one_line(
-    extra: str, wheel: Path, tmp_path: Path
+def checked(outcome: dict[str, Any], extra: str) -> list[str]:
+    """The extras that an answer names, after the rules that hold for every answer."""
+    context = json.dumps(outcome, indent=1)
+    if outcome["command"].endswith("--help"):
+        assert outcome["code"] == 0, context
+        return []
+    assert outcome["code"] in (0, 1, 2), context
+    if outcome["code"] == 2:
+        assert outcome["err"].splitlines()[-1].startswith("error: "), context
+    named: list[str] = HINT.findall(outcome["err"])
+    assert set(named) <= {*EXTRAS} - {extra}, context
+    assert ("not installed" in outcome["err"]) == bool(named), context
+    return named
+
+
+@pytest.fixture(scope="module")
+def asked(once: Callable[[str, Callable[[Path], Any]], Path]) -> dict[str, list[str]]:
+    """For each extra the commands that asked for it where only the core is installed."""
+
+    def core(folder: Path) -> None:
+        asked: dict[str, list[str]] = {extra: [] for extra in EXTRAS}
+        for outcome in outcomes("", folder / "core", []):
+            for extra in checked(outcome, ""):
+                asked[extra].append(outcome["command"])
+        (folder / "asked.json").write_text(json.dumps(asked))
+
+    result: dict[str, list[str]] = json.loads((once("extras", core) / "asked.json").read_text())
+    return result
+
+
+def test_with_the_core_alone_commands_answer_and_name_their_extras(
+    asked: dict[str, list[str]],
 ) -> None:
-    python = environment(tmp_path / "venv", wheel, extra)
-    for outcome in outcomes(python, tmp_path / "work"):
-        context = json.dumps(outcome, indent=1)
-        if outcome["command"].endswith("--help"):
-            assert outcome["code"] == 0, context
-            continue
-        assert outcome["code"] in (0, 1, 2), context
-        if outcome["code"] == 2:
-            last = outcome["err"].splitlines()[-1]
-            assert last.startswith("error: "), context
-        for named in HINT.findall(outcome["err"]):
-            assert named in EXTRAS, context
-            assert named != extra, context
-        assert ("not installed" in outcome["err"]) == bool(HINT.search(outcome["err"])), context
+    needed = {extra for extra, commands in asked.items() if commands}
+    assert needed >= {"train", "plot", "studies", "offline", "leaderboard"}
+    assert "sme study plan smoke" in asked["train"]
+
+
+@pytest.mark.parametrize("extra", EXTRAS)
+def test_with_an_extra_alone_the_commands_that_asked_for_it_get_further(
+    extra: str, asked: dict[str, list[str]], tmp_path: Path
+) -> None:
+    if asked[extra]:
+        answers = outcomes(extra, tmp_path / "work", asked[extra])
+        assert any(not checked(outcome, extra) for outcome in answers)
