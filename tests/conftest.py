@@ -1,9 +1,11 @@
 """Shared by every test: the same examples, threads and signals on every run and machine."""
 
+import gc
 import os
 import signal
+import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,15 @@ settings.register_profile(
     "deterministic", derandomize=True, deadline=None, database=None, max_examples=50
 )
 settings.load_profile("deterministic")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _forgets_compiled_programs() -> Iterator[None]:
+    """The programs that a file compiled in JAX go with it: hundreds of them take gigabytes."""
+    yield
+    if jax := sys.modules.get("jax"):
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")
