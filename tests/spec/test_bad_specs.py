@@ -12,35 +12,23 @@ DEEP: object = []
 for _ in range(900):
     DEEP = [DEEP]
 
+# The largest valid value; the smallest is 1.
+INTEGERS = {
+    "state_dim": 2**20,
+    "action_dim": 2**20,
+    "k": 2**31 - 1,
+    "complexity": 10_000,
+    "horizon": 2**31 - 1,
+    "hidden_width": 4096,
+}
+ONE = {"action_dim": 4}
 BAD = [
     # fields, what the message must contain
-    ({"state_dim": 0}, ["state_dim=0: must be an integer in [1, 1048576].", "the default, 8."]),
-    ({"action_dim": -3}, ["action_dim=-3: must be an integer in [1, 1048576]."]),
-    (
-        {"k": 0},
-        ["k=0: must be an integer in [1, 2147483647].", "or leave it out for the default, 1."],
-    ),
-    ({"k": "10"}, ["k='10': must be an integer in"]),
-    ({"k": 1.0}, ["k=1.0: must be an integer in"]),
-    ({"k": True}, ["k=True: must be an integer in"]),
     ({"k": np.True_}, ["k=np.True_: must be an integer in"]),
-    ({"k": None}, ["k=None: must be an integer in"]),
     ({"k": 10**4000}, ["k=1000", "…: must be an integer in"]),
     ({"k": DEEP}, ["k=[[[", "must be an integer"]),
-    ({"complexity": 10_001}, ["complexity=10001: must be an integer in [1, 10000]."]),
-    ({"horizon": 0}, ["horizon=0: must be", "the default, 100."]),
-    ({"hidden_width": 0}, ["hidden_width=0: must be an integer in [1, 4096].", "default, 64."]),
-    ({"r_min": 1}, ["r_min=1: must be a finite number in [0, 1)."]),
-    ({"r_min": -1e-9}, ["r_min=-1e-09: must be a finite number in [0, 1)."]),
-    ({"r_min": float("nan")}, ["r_min=nan: must be a finite number in [0, 1)."]),
-    ({"D": float("inf")}, ["D=inf: must be a finite number in [0, 1)."]),
     ({"D": np.float32("nan")}, ["D=nan: must be a finite number"]),
-    ({"D": True}, ["D=True: must be a finite number"]),
-    ({"D": "0.5"}, ["D='0.5': must be a finite number"]),
-    (
-        {"policy_init": "unit"},
-        ["policy_init='unit': must be 'semi_orthogonal' or 'unit_variance'."],
-    ),
+    ({"policy_init": "unit"}, ["policy_init='unit': must be 'semi_orthogonal' or 'unit_variance'"]),
     ({"schema_version": 2}, ["schema_version=2: must be 1. Correct it, or leave it out"]),
     ({"schema_version": True}, ["schema_version=True: must be 1."]),
     ({"schema_version": 1.0}, ["schema_version=1.0: must be 1."]),
@@ -71,25 +59,25 @@ BAD = [
         ["team.agents.1.action_dim='2': must be an integer in [1, 1048576]."],
     ),
     (
-        {"team": {"agents": [{"action_dim": 4, "observs": "all"}]}},
+        {"team": {"agents": [ONE | {"observs": "all"}]}},
         ["team.agents.0.observs='all': unknown field.", "Did you mean 'observes'?"],
     ),
     (
-        {"team": {"agents": [{"action_dim": 4, "observes": [3, 1]}]}},
+        {"team": {"agents": [ONE | {"observes": [3, 1]}]}},
         ["team.agents.0.observes=[3, 1]: channels must be in increasing order", "Write [1, 3]."],
     ),
-    ({"team": {"agents": [{"action_dim": 4, "observes": []}]}}, ["observes=[]: must be 'all' or"]),
-    ({"team": {"agents": [{"action_dim": 4, "observes": [True]}]}}, ["observes=[True]: must be"]),
+    ({"team": {"agents": [ONE | {"observes": []}]}}, ["observes=[]: must be 'all' or"]),
+    ({"team": {"agents": [ONE | {"observes": [True]}]}}, ["observes=[True]: must be"]),
     (
-        {"team": {"agents": [{"action_dim": 4, "observes": np.arange(3)}]}},
+        {"team": {"agents": [ONE | {"observes": np.arange(3)}]}},
         ["team.agents.0.observes=array([0, 1, 2]): must be 'all' or a list"],
     ),
     (
-        {"team": {"agents": [{"action_dim": 4, "observes": [8]}]}},
+        {"team": {"agents": [ONE | {"observes": [8]}]}},
         ["team.agents.agent_0.observes=[8]: must be in [0, state_dim=8).", "Remove channel 8"],
     ),
     (
-        {"team": {"agents": [{"action_dim": 4, "name": "the pilot"}]}},
+        {"team": {"agents": [ONE | {"name": "the pilot"}]}},
         ["team.agents.0.name='the pilot': must be a word, '_' and a number, such as 'agent_0'"],
     ),
     (
@@ -97,7 +85,7 @@ BAD = [
         ["team.agents: the name 'agent_1' appears twice. Rename one of them."],
     ),
     (
-        {"team": {"agents": [{"action_dim": 4}], "reward": "shared"}},
+        {"team": {"agents": [ONE], "reward": "shared"}},
         ["team.reward='shared': must be 'individual' or 'team'."],
     ),
     *[
@@ -105,42 +93,27 @@ BAD = [
             {"safety": {"tightness": tightness}},
             [f"safety.tightness={tightness}: must be a finite number in (0, 0.5]. Correct it."],
         )
-        for tightness in (0, 0.0, -0.1, 0.51, 1, float("nan"), float("inf"), True)
+        for tightness in (0, -0.1, 0.51, float("nan"), True, None)
     ],
     ({"safety": {}}, ["safety.tightness: missing: must be a finite number in (0, 0.5]. Add it."]),
-    ({"safety": {"tightness": None}}, ["safety.tightness=None: must be a finite number in (0, "]),
+    ({"safety": 0.2}, ["safety: must be an object of named fields, got 0.2.", ": tightness."]),
+    ({"safety": {"tightness": 0.2, "tau": 0.2}}, ["safety.tau=0.2: unknown field.", "Rename or"]),
+    ({"safety": {"tightness": 0.2}, "D": 0.25}, ["D=0.25: must be 0 with safety", "Leave D or"]),
     (
-        {"safety": 0.2},
-        ["safety: must be an object of named fields, got 0.2. Known fields: tightness."],
+        {"safety": {"tightness": 0.2}, "team": {"agents": [ONE]}},
+        ["safety={'tightness': 0.2}: must be null in a task for a team", "Leave safety or team"],
     ),
     (
-        {"safety": {"tightness": 0.2, "tau": 0.2}},
-        ["safety.tau=0.2: unknown field. Known fields: tightness. Rename or remove it."],
-    ),
-    (
-        {"safety": {"tightness": 0.2}, "D": 0.25},
-        ["D=0.25: must be 0 with safety, because with early", "Leave D or safety out."],
-    ),
-    (
-        {"safety": {"tightness": 0.2}, "team": {"agents": [{"action_dim": 4}]}},
-        [
-            "safety={'tightness': 0.2}: must be null in a task for a team",
-            "Leave safety or team out",
-        ],
-    ),
-    (
-        {"observation": {"distractors": 2}, "team": {"agents": [{"action_dim": 4}]}},
+        {"observation": {"distractors": 2}, "team": {"agents": [ONE]}},
         ["observation={'distractors': 2,", "must be null in a task for a team (1 agent)"],
     ),
-    (
-        {"observation": {"distractors": -1}},
-        ["observation.distractors=-1: must be an integer in [0, 1048576].", "the default, 0."],
-    ),
-    (
-        {"observation": {"distractors": 2**20 + 1}},
-        ["observation.distractors=1048577: must be an integer in [0, 1048576]."],
-    ),
-    ({"observation": {"distractors": 8.0}}, ["observation.distractors=8.0: must be an integer"]),
+    *[
+        (
+            {"observation": {"distractors": distractors}},
+            [f"observation.distractors={distractors}: must be an integer in [0, 1048576]."],
+        )
+        for distractors in (-1, 2**20 + 1, 8.0)
+    ],
     (
         {"observation": {"distractors": 8, "dynamics": "random"}},
         ["observation.dynamics='random': must be 'noise' or 'autonomous' or 'driven' or null."],
@@ -154,33 +127,27 @@ BAD = [
             {"observation": {"mixing": "nonlinear", "mixing_depth": depth}},
             [f"observation.mixing_depth={depth}: must be an integer in [1, 3] or null."],
         )
-        for depth in (0, 4, 1.0, True)
+        for depth in (0, 4, True)
     ],
     *[
         (
-            {"observation": {"distractors": 2, "mixing": mixing, "mixing_depth": 2}},
-            ["observation.mixing_depth=2: needs mixing='nonlinear'. Leave mixing_depth out, or"],
+            {"observation": {"mixing": mixing} | fields},
+            [f"observation.{name}: needs {needs}. Leave {name.partition('=')[0]} out, or"],
         )
         for mixing in ("none", "orthogonal")
-    ],
-    *[
-        (
-            {"observation": {"dynamics": "driven", "mixing": mixing}},
-            ["observation.dynamics='driven': needs distractors > 0. Leave dynamics out, or set"],
+        for fields, name, needs in (
+            ({"distractors": 2, "mixing_depth": 2}, "mixing_depth=2", "mixing='nonlinear'"),
+            ({"dynamics": "driven"}, "dynamics='driven'", "distractors > 0"),
         )
-        for mixing in ("none", "orthogonal")
     ],
     *[
         (
             {"observation": observation},
             ["observation.distractors=0: with mixing='none' the agent would see the state as"],
         )
-        for observation in ({}, {"distractors": 0}, {"mixing": "none"})
+        for observation in ({}, {"mixing": "none"})
     ],
-    (
-        {"observation": "nonlinear"},
-        ["observation: must be an object of named fields, got 'nonlinear'.", "mixing_depth."],
-    ),
+    ({"observation": "nonlinear"}, ["observation: must be an object", "got 'nonlinear'."]),
     (
         {"observation": {"distractor": 8}},
         ["observation.distractor=8: unknown field.", "Did you mean 'distractors'?"],
@@ -188,15 +155,35 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("fields", "fragments"), BAD, ids=[str(b)[:50] for b, _ in BAD])
-def test_the_error_of_a_bad_field_names_value_range_and_fix(fields, fragments):
+def refusal(fields):
     with pytest.raises(SpecError) as caught:
         SMESpec.from_dict(fields)
     message = str(caught.value)
-    for fragment in fragments:
-        assert fragment in message
     assert len(message) < 500
     assert len(message.splitlines()) == 1
+    return message
+
+
+@pytest.mark.parametrize(("fields", "fragments"), BAD, ids=[str(b)[:50] for b, _ in BAD])
+def test_the_error_of_a_bad_field_names_value_range_and_fix(fields, fragments):
+    message = refusal(fields)
+    for fragment in fragments:
+        assert fragment in message
+
+
+@pytest.mark.parametrize("field", INTEGERS)
+def test_a_count_is_an_integer_in_its_range(field):
+    default = SMESpec.model_fields[field].default
+    for value in (0, -3, INTEGERS[field] + 1, "10", 1.0, True, None):
+        message = refusal({field: value})
+        assert f"{field}={value!r}: must be an integer in [1, {INTEGERS[field]}]." in message
+        assert message.endswith(f"or leave it out for the default, {default}.")
+
+
+@pytest.mark.parametrize("field", ["r_min", "D"])
+def test_a_threshold_is_a_finite_number_below_one(field):
+    for value in (1, -1e-9, float("nan"), float("inf"), True, "0.5"):
+        assert f"{field}={value!r}: must be a finite number in [0, 1)." in refusal({field: value})
 
 
 @pytest.mark.parametrize("document", [[], "x", 3, None, True])
@@ -205,13 +192,17 @@ def test_what_is_no_mapping_is_no_spec(document):
         SMESpec.from_dict(document)
 
 
-def test_all_errors_are_listed_at_once():
-    with pytest.raises(SpecError) as caught:
-        SMESpec.from_dict({"k": 0, "r_min": 2, "seeed": 1, "team": {"agents": [{"action_dim": 0}]}})
-    lines = str(caught.value).splitlines()
-    assert lines[0] == "SMESpec: "
-    fields = [line.strip().split(":")[0] for line in lines[1:]]
-    assert fields == ["k=0", "r_min=2", "team.agents.0.action_dim=0", "seeed=1"]
+def test_all_errors_are_listed_at_once_by_the_constructor_too():
+    fields = {"k": 0, "r_min": 2, "seeed": 1, "team": {"agents": [{"action_dim": 0}]}}
+    with pytest.raises(SpecError) as of_dict:
+        SMESpec.from_dict(fields)
+    with pytest.raises(SpecError) as of_constructor:
+        SMESpec(**fields)
+    assert str(of_constructor.value) == str(of_dict.value)
+    first, *lines = str(of_dict.value).splitlines()
+    assert first == "SMESpec: "
+    starts = [line.strip().split(":")[0] for line in lines]
+    assert starts == ["k=0", "r_min=2", "team.agents.0.action_dim=0", "seeed=1"]
 
 
 def test_the_source_of_a_document_begins_its_error():
@@ -219,30 +210,11 @@ def test_the_source_of_a_document_begins_its_error():
         SMESpec.from_dict({"k": 0}, "here.json")
 
 
-def test_the_constructor_raises_the_same_error_as_from_dict():
-    fields = {"k": 0, "team": {"agents": [{"action_dim": 0}]}}
-    with pytest.raises(SpecError) as of_dict:
-        SMESpec.from_dict(fields)
-    with pytest.raises(SpecError) as of_constructor:
-        SMESpec(**fields)
-    assert str(of_constructor.value) == str(of_dict.value)
-    assert str(of_dict.value).splitlines()[1:] == [
-        "  k=0: must be an integer in [1, 2147483647]. Correct it, or leave it out for the "
-        "default, 1.",
-        "  team.agents.0.action_dim=0: must be an integer in [1, 1048576]. Correct it.",
-    ]
-
-
 def test_deriving_refuses_as_parsing_does():
     with pytest.raises(SpecError, match=r"complexiti=3: unknown field\. Did you mean 'complexity'"):
         SMESpec().derive(complexiti=3)
     with pytest.raises(SpecError, match="D=1: must be a finite number in"):
         SMESpec().derive(D=1)
-
-
-def test_a_spec_error_is_also_a_value_error():
-    assert issubclass(SpecError, SMEError)
-    assert issubclass(SpecError, ValueError)
 
 
 @pytest.mark.parametrize(
@@ -293,11 +265,11 @@ def test_a_spec_error_is_also_a_value_error():
 def test_other_documents_are_refused_as_clearly(document, fields, fragment):
     with pytest.raises(SpecError) as caught:
         document.from_dict(fields)
+    assert isinstance(caught.value, SMEError) and isinstance(caught.value, ValueError)
     assert fragment in str(caught.value)
 
 
 def test_a_message_of_a_bad_field_is_plain_text_that_json_can_carry():
-    with pytest.raises(SpecError) as caught:
-        SMESpec.from_dict({"k": "\x00\u202e" * 50})
-    assert "\x00" not in str(caught.value)
-    assert json.dumps(str(caught.value))
+    message = refusal({"k": "\x00\u202e" * 50})
+    assert "\x00" not in message
+    assert json.dumps(message)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from html import escape
 
@@ -27,20 +28,21 @@ def with_layers(task: Task, *layers: Layer) -> Task:
     return dataclasses.replace(task, policies=(layers,))
 
 
+@functools.cache
+def certified(name: str) -> Certificate:
+    return certify(load(name))
+
+
 @pytest.mark.parametrize("name", ["Default", "Complexity10", "Plane10", "StateDim64", "HardSparse"])
 def test_sound_tasks_of_the_catalogue_pass_without_a_warning(name: str) -> None:
-    assert certify(load(name)).outcome == "passed"
+    assert certified(name).outcome == "passed"
 
 
-def test_the_papers_near_trivial_settings_warn_and_still_pass() -> None:
-    certificate = certify(load("Complexity2"))
+def test_near_trivial_settings_warn_and_still_pass_and_a_notebook_shows_why() -> None:
+    certificate = certified("Complexity2")
     assert certificate.passed
     assert certificate.outcome == "warning"
     assert check(certificate, "constant_policy_similarity").outcome == "warning"
-
-
-def test_a_notebook_shows_every_check_with_its_meaning() -> None:
-    certificate = certify(load("Complexity2"))
     html = certificate._repr_html_()
     assert f"{certificate.digest}</b><br>warning" in html
     for each in certificate.checks:
@@ -52,41 +54,38 @@ def test_a_notebook_shows_every_check_with_its_meaning() -> None:
 
 def test_a_trivial_target_is_refused() -> None:
     certificate = certify(SMESpec(state_dim=2, action_dim=2, complexity=3))
+    found = check(certificate, "constant_policy_similarity")
     assert not certificate.passed
-    assert check(certificate, "constant_policy_similarity").value > 0.9  # type: ignore[operator]
-    assert check(certificate, "constant_policy_similarity").outcome == "refused"
-
-
-def test_a_collapsed_action_channel_is_refused() -> None:
-    task = materialize(SMALL)
-    ((W, b),) = task.policies[0]
-    W, b = W.copy(), b.copy()
-    W[1] *= 0.05
-    b[1] *= 0.05
-    found = check(certify(with_layers(task, Layer(W, b))), "channel_spread")
+    assert found.value > 0.9  # type: ignore[operator]
     assert found.outcome == "refused"
 
 
-def test_rows_that_lose_an_actions_mass_are_refused() -> None:
-    task = materialize(SMALL)
-    broken = dataclasses.replace(task, W=task.W * (1 + 2.0**-29))
-    assert check(certify(broken), "transition_row_sums").outcome == "refused"
-
-
-def test_a_layer_that_is_not_orthogonal_is_refused() -> None:
+def broken(name: str) -> Task:
+    """A task that fails the check of this name."""
     task = materialize(SMALL)
     ((W, b),) = task.policies[0]
-    W = W.copy()
-    W[0, 0] += 1e-6
-    found = certify(with_layers(task, Layer(W, b)))
-    assert check(found, "layers_orthogonal").outcome == "refused"
+    if name == "transition_row_sums":
+        return dataclasses.replace(task, W=task.W * (1 + 2.0**-29))
+    if name == "distinct_states":
+        return dataclasses.replace(task, b=np.array([0.0, 0.25, 0.5]))
+    if name == "layers_centred":
+        return with_layers(task, Layer(W, b + 1e-6))
+    W, b = W.copy(), b.copy()
+    if name == "channel_spread":
+        W[1] *= 0.05
+        b[1] *= 0.05
+    else:
+        W[0, 0] += 1e-6
+    return with_layers(task, Layer(W, b))
 
 
-def test_a_layer_off_centre_is_refused() -> None:
-    task = materialize(SMALL)
-    ((W, b),) = task.policies[0]
-    found = certify(with_layers(task, Layer(W, b + 1e-6)))
-    assert check(found, "layers_centred").outcome == "refused"
+@pytest.mark.parametrize(
+    "name",
+    ["transition_row_sums", "distinct_states", "layers_centred", "channel_spread",
+     "layers_orthogonal"],
+)  # fmt: skip
+def test_a_task_that_breaks_a_rule_is_refused(name: str) -> None:
+    assert check(certify(broken(name)), name).outcome == "refused"
 
 
 @pytest.mark.parametrize("init", ["semi_orthogonal", "unit_variance"])
@@ -127,40 +126,31 @@ def test_lanes_that_merge_are_refused() -> None:
     assert found.value == pytest.approx(1 / 64)
 
 
-def test_a_dyadic_offset_collapses_and_is_refused() -> None:
-    task = materialize(SMALL)
-    broken = dataclasses.replace(task, b=np.array([0.0, 0.25, 0.5]))
-    assert check(certify(broken), "distinct_states").outcome == "refused"
-
-
 def test_states_in_float32_collapse_and_float64_do_not() -> None:
     class Float32(Task):
         def transition(self, s, a):  # type: ignore[no-untyped-def, override]
             y = (s + self.b + a @ self.W).astype(np.float32)
             return (np.float32(2) * np.abs(y - np.rint(y))).astype(np.float64)
 
-    task = materialize(SMESpec())
-    assert check(certify(task), "distinct_states").value == 1.0
-    assert check(certify(recast(task, Float32)), "distinct_states").outcome == "refused"
+    assert check(certified("Default"), "distinct_states").value == 1.0
+    found = certify(recast(materialize(SMESpec()), Float32))
+    assert check(found, "distinct_states").outcome == "refused"
 
 
 def test_the_linear_policy_is_reported_and_near_optimal_only_for_one_layer() -> None:
-    shallow = check(certify(load("Default")), "linear_policy_reward")
-    deep = check(certify(load("Complexity50")), "linear_policy_reward")
+    shallow = check(certified("Default"), "linear_policy_reward")
+    deep = check(certified("Complexity10"), "linear_policy_reward")
     assert shallow.outcome == deep.outcome == "reported"
     assert shallow.value == pytest.approx(0.87, abs=0.02)  # METHOD, section 2
-    assert deep.value < 0.3  # type: ignore[operator]
+    assert deep.value == pytest.approx(0.62, abs=0.02)
 
 
 def test_the_same_seed_gives_the_same_certificate_and_another_one_other_numbers() -> None:
-    assert certify(SMALL, seed=3) == certify(materialize(SMALL), seed=3)
-    assert certify(SMALL, seed=3).checks != certify(SMALL, seed=4).checks
-
-
-def test_measuring_does_not_depend_on_the_tasks_own_streams() -> None:
-    values = [check(certify(SMALL, seed=s), "uniform_states").value for s in range(12)]
+    certificates = [certify(SMALL, seed=seed) for seed in range(5)]
+    assert certify(materialize(SMALL), seed=3) == certificates[3]
+    values = [check(each, "uniform_states").value for each in certificates]
     assert max(values) < 2.6  # type: ignore[type-var]
-    assert len(set(values)) == 12
+    assert len(set(values)) == 5
 
 
 def test_a_team_and_a_single_channel_can_be_certified() -> None:
@@ -169,10 +159,10 @@ def test_a_team_and_a_single_channel_can_be_certified() -> None:
     assert certify(SMESpec(state_dim=1, action_dim=1)).passed
 
 
-@pytest.mark.parametrize("seed", [-1, 2**53, 0.5, "0", True])
-def test_a_seed_out_of_range_is_refused(seed: object) -> None:
-    with pytest.raises(OptionError, match="seed="):
-        certify(SMALL, seed=seed)  # type: ignore[arg-type]
+def test_a_seed_out_of_range_is_refused() -> None:
+    for seed in (-1, 2**53, 0.5, "0", True):
+        with pytest.raises(OptionError, match="seed="):
+            certify(SMALL, seed=seed)  # type: ignore[arg-type]
 
 
 def test_a_certificate_is_plain_json_that_names_every_bound() -> None:

@@ -24,7 +24,7 @@ def changed(scale: float = 1.0, shift: float = 0.0) -> Task:
     return dataclasses.replace(task, limiting=(*layers, Layer(W * scale, b * scale + shift)))
 
 
-@pytest.mark.parametrize("tightness", [0.05, 0.1, 0.2, 0.4, 0.5])
+@pytest.mark.parametrize("tightness", [0.05, 0.2, 0.5])
 def test_the_optimum_breaks_its_limits_in_the_share_that_the_tightness_says(
     tightness: float,
 ) -> None:
@@ -38,25 +38,16 @@ def test_the_optimum_breaks_its_limits_in_the_share_that_the_tightness_says(
     assert np.mean(shares) == pytest.approx(tightness, rel=0.15)  # SD over draws: at most 0.2 τ
 
 
-def test_a_sound_task_passes_and_only_one_with_safety_has_these_checks() -> None:
-    certificate = certify(SAFE)
+def test_a_sound_task_passes_with_the_price_of_what_its_safe_action_earns_less() -> None:
+    certificate, task = certify(SAFE), materialize(SAFE)
     assert certificate.outcome == "passed"
-    assert {each.name for each in certificate.checks} >= NAMES
-    assert not {each.name for each in certify(SMESpec()).checks} & NAMES
-
-
-def test_the_price_of_safety_is_what_the_safe_action_earns_less() -> None:
-    task = materialize(SAFE)
     s = np.random.default_rng(0).random((20_000, 8))
     price = np.mean(task.regret(s, task.safe_action(s)))
-    assert check(certify(SAFE), "price_of_safety").value == pytest.approx(price, abs=0.01)
-
-
-def test_in_more_states_than_channels_some_limit_is_broken() -> None:
-    certificate = certify(SAFE)
+    assert check(certificate, "price_of_safety").value == pytest.approx(price, abs=0.01)
     states = check(certificate, "states_with_a_broken_limit").value
     channels = check(certificate, "broken_limits").value
     assert channels < states < 4 * channels  # type: ignore[operator]
+    assert not {each.name for each in certify(SMESpec()).checks} & NAMES
 
 
 def test_limits_that_have_collapsed_are_refused() -> None:
@@ -74,9 +65,10 @@ def test_limits_that_never_or_too_often_bind_are_refused(shift: float, share: fl
 
 def test_policies_that_stay_near_the_middle_seldom_reach_their_limits() -> None:
     middling = SAFE.derive(complexity=2, policy_init="semi_orthogonal", safety={"tightness": 0.1})
-    assert check(certify(middling), "broken_limits").outcome == "refused"
     spread = middling.derive(policy_init="unit_variance")
-    assert check(certify(spread), "broken_limits").outcome == "passed"
+    for spec, outcome in ((middling, "refused"), (spread, "passed")):
+        broken, *_ = safety_checks(materialize(spec), 0, 4_000)
+        assert (broken.name, broken.outcome) == ("broken_limits", outcome)
 
 
 def test_a_layer_of_v_is_held_to_the_rules_of_the_layers_of_the_optimum() -> None:

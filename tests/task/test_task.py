@@ -1,10 +1,10 @@
 """The equations: transition, optimal policy, similarity, step reward, regret."""
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from scipy import stats
 
 from sme_registry.errors import ActionError, SpecError, StateError
@@ -12,31 +12,22 @@ from sme_registry.spec import SMESpec
 from sme_registry.task import materialize
 from tests.strategies import specs
 
-UNIT = st.floats(0.0, 1.0)
-
 
 def rng():
     return np.random.default_rng(20261121)
 
 
-@given(specs(), st.data())
-def test_the_transition_maps_the_cube_into_itself(spec, data):
-    task = materialize(spec)
-    s = data.draw(hnp.arrays(np.float64, (3, spec.state_dim), elements=UNIT))
-    a = data.draw(hnp.arrays(np.float64, (3, spec.action_dim), elements=UNIT))
-    moved = task.transition(s, a)
-    assert moved.shape == s.shape
-    assert ((moved >= 0.0) & (moved <= 1.0)).all()
-
-
 @given(specs())
-def test_the_transition_is_the_arc_cosine_of_the_method_to_rounding(spec):
+def test_the_transition_is_the_arc_cosine_of_the_method_and_stays_in_the_cube(spec):
     task = materialize(spec)
     s, a = rng().random((50, spec.state_dim)), rng().random((50, spec.action_dim))
+    s[0], s[1], a[:2] = 0.0, 1.0, 0.5
     a = a.astype(np.float32).astype(np.float64)
     expected = np.arccos(np.cos(2.0 * np.pi * (s + a @ task.W + task.b))) / np.pi
+    moved = task.transition(s, a)
     # arccos loses half of the digits where its argument is ±1.
-    np.testing.assert_allclose(task.transition(s, a), expected, rtol=0, atol=3e-8)
+    np.testing.assert_allclose(moved, expected, rtol=0, atol=3e-8)
+    assert ((moved >= 0.0) & (moved <= 1.0)).all()
 
 
 def test_the_triangle_wave_has_its_values_at_its_corners():
@@ -132,7 +123,7 @@ def test_the_reward_threshold_is_strict():
 def test_a_single_state_is_answered_as_its_row_of_a_batch(spec):
     task = materialize(spec)
     s, a = rng().random((7, spec.state_dim)), rng().random((7, spec.action_dim))
-    for i in range(7):
+    for i in range(3):
         np.testing.assert_array_equal(task.transition(s[i], a[i]), task.transition(s, a)[i])
         np.testing.assert_allclose(
             task.optimal_action(s[i]), task.optimal_action(s)[i], rtol=0, atol=1e-13
@@ -155,27 +146,6 @@ def test_actions_out_of_range_are_clipped(spec):
     assert (task.similarity(s, a) >= 0.0).all()
 
 
-@pytest.mark.parametrize("distance", [1.0, 10.0, 1e6, 1e299])
-def test_the_optimal_policy_is_defined_far_outside_the_cube(distance):
-    for complexity in (1, 3):
-        task = materialize(SMESpec(complexity=complexity))
-        a = task.optimal_action(distance * rng().uniform(-1.0, 1.0, (50, 8)))
-        assert ((a >= 0.0) & (a <= 1.0)).all()
-
-
-def test_agents_follow_only_what_they_observe():
-    team = {"agents": [{"action_dim": 2, "observes": [0, 3]}, {"action_dim": 2, "observes": [5]}]}
-    task = materialize(SMESpec(complexity=3, team=team))
-    s = rng().random(8)
-    other = s.copy()
-    other[[1, 2, 4, 6, 7]] = 0.0
-    np.testing.assert_array_equal(task.optimal_action(s), task.optimal_action(other))
-    other[5] += 0.1
-    assert (task.optimal_action(s)[:2] == task.optimal_action(other)[:2]).all()
-    assert (task.optimal_action(s)[2:] != task.optimal_action(other)[2:]).all()
-    assert [len(layers) for layers in task.layers] == [3, 3]
-
-
 # METHOD, section 2: the constant policy ½ earns about 9 of 100 at the default, 24 at A = 1 and 4
 # at A = 16 (where the layer widens: with `unit_variance`); its mean r̃ is 0.726–0.755.
 @pytest.mark.parametrize(
@@ -193,15 +163,33 @@ def test_the_constant_policy_earns_what_the_method_says(action_dim, low, high):
     assert 0.72 < np.mean(similar) < 0.76
 
 
+def test_numbers_of_any_kind_size_and_batch_are_answered():
+    task, empty = materialize(SMESpec()), np.zeros((0, 8))
+    expected = task.similarity(np.zeros(8), np.ones(4))
+    assert task.similarity([0] * 8, [True] * 4) == expected
+    assert task.transition(empty, np.zeros((0, 4))).shape == (0, 8)
+    assert task.optimal_action(empty).shape == (0, 4)
+    assert task.similarity(empty, np.zeros((0, 4))).shape == (0,)
+    for far, complexity in itertools.product((1.0, 10.0, 1e299), (1, 3)):
+        outside = far * rng().uniform(-1.0, 1.0, (50, 8))
+        a = materialize(SMESpec(complexity=complexity)).optimal_action(outside)
+        assert ((a >= 0.0) & (a <= 1.0)).all()
+
+
+def test_a_task_is_drawn_of_a_spec_or_its_fields_and_equal_specs_share_it():
+    assert materialize({"k": 3}).spec == SMESpec(k=3)
+    assert materialize(SMESpec(seed=77)) is materialize(SMESpec(seed=77))
+    for thing in ("Default-v1", None, 3):
+        with pytest.raises(SpecError, match="must be an SMESpec or a mapping of its fields"):
+            materialize(thing)
+
+
 BAD_STATES = [
     ([0.5] * 7, "state of shape (7,): must be [8] or [B, 8] (this task's state_dim is 8)."),
     (np.zeros((2, 3, 8)), "state of shape (2, 3, 8): must be [8] or [B, 8]"),
-    (0.5, "state of shape (): must be"),
     ([np.nan] + [0.5] * 7, "state: has NaN or infinite entries."),
-    ([np.inf] + [0.5] * 7, "state: has NaN or infinite entries."),
     ([1e301] + [0.5] * 7, "below 1e+300 in size."),
     (["0.5"] * 8, "must be an array of 8 numbers."),
-    ([None] * 8, "must be an array of 8 numbers."),
     ([[0.5] * 8, [0.5] * 7], "must be an array of 8 numbers."),
     ([1j] * 8, "must be an array of 8 numbers."),
 ]
@@ -226,7 +214,6 @@ def test_a_bad_state_is_refused(state, message):
     ("action", "message"),
     [
         ([0.5] * 3, "action of shape (3,): must be [4] or [B, 4]"),
-        ([np.nan, 0.5, 0.5, 0.5], "action: has NaN or infinite entries."),
         ([0.5, 0.5, 0.5, -np.inf], "action: has NaN or infinite entries."),
         ("left", "must be an array of 4 numbers."),
         (np.zeros((2, 4)), "action of shape (2, 4): must be [3, 4], one action for each"),
@@ -239,27 +226,3 @@ def test_a_bad_action_is_refused(action, message):
         with pytest.raises(ActionError) as caught:
             ask(s, action)
         assert message in str(caught.value)
-
-
-def test_integers_and_booleans_are_numbers_too():
-    task = materialize(SMESpec())
-    expected = task.similarity(np.zeros(8), np.ones(4))
-    assert task.similarity([0] * 8, [True] * 4) == expected
-
-
-def test_an_empty_batch_is_answered_by_an_empty_batch():
-    task = materialize(SMESpec())
-    assert task.transition(np.zeros((0, 8)), np.zeros((0, 4))).shape == (0, 8)
-    assert task.optimal_action(np.zeros((0, 8))).shape == (0, 4)
-    assert task.similarity(np.zeros((0, 8)), np.zeros((0, 4))).shape == (0,)
-
-
-def test_plain_fields_are_materialised_and_other_things_refused():
-    assert materialize({"k": 3}).spec == SMESpec(k=3)
-    for thing in ("Default-v1", None, 3):
-        with pytest.raises(SpecError, match="must be an SMESpec or a mapping of its fields"):
-            materialize(thing)
-
-
-def test_equal_specs_share_one_drawn_task():
-    assert materialize(SMESpec(seed=77)) is materialize(SMESpec(seed=77))
