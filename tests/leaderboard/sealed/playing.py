@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import httpx
 import numpy as np
-import numpy.typing as npt
 
 from leaderboard.documents.entry import SignedTicketRequest
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.season import Season
-from leaderboard.documents.submission import SignedManifest
-from leaderboard.intake import upload_header
+from leaderboard.documents.submission import Envelope, SignedManifest
+from leaderboard.errors import Rejection
+from leaderboard.intake import start_ticket, upload_header
+from leaderboard.sealed import Tickets
+from leaderboard.sealed.scores import score_ticket
 from leaderboard.store import Store
 from leaderboard.web import client
 from sme_registry import sealed
+from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import tiny_board
-from tests.leaderboard.sealing import MASTER, signed_request, tiny_season
+from tests.leaderboard.sealing import MASTER, NOTHING, signed_request, tiny_season
 
-Floats = npt.NDArray[np.float32]
+LANES = 4
+ROWS = 6 * 50
+"""Challenge states of an instance."""
 
 
 class Board(NamedTuple):
@@ -53,3 +60,89 @@ def online_board(folder: Path, limits: dict[str, int] | None = None, **fields: A
     with tiny_board(folder / "board", limits=limits or {}) as store:
         store.announce(season)
     return Board(folder / "board", season, secret)
+
+
+@contextlib.contextmanager
+def playing(board: Board) -> Iterator[Played]:
+    """A ticket of a board, whose season is stepped in this process."""
+    with Store.open(board.path) as store:
+        played = Played(board, store)
+        try:
+            yield played
+        finally:
+            played.tickets.close()
+
+
+class Played:
+    """An entrant of a board without a server."""
+
+    def __init__(self, board: Board, store: Store) -> None:
+        self.board, self.store = board, store
+        self.key = SigningKey.generate()
+        self.tickets = Tickets(store, board.secret)
+        self.take_ticket()
+
+    def take_ticket(self, nonce: int = 0) -> None:
+        """Start a ticket; what follows is of this one."""
+        self.request = self.board.request(self.key, nonce)
+        envelope = Envelope.read(self.request.to_bytes(), SignedTicketRequest)
+        self.number, _ = start_ticket(self.store, envelope, self.board.season.digest)
+        self.token = self.tickets.ticket(self.number).document.token
+
+    def restart(self) -> None:
+        """As after a kill: nothing but the files is left."""
+        self.tickets.close()
+        self.tickets = Tickets(self.store, self.board.secret)
+
+    @property
+    def folder(self) -> Path:
+        """Of the ticket."""
+        return self.store.season_folder(self.board.season.digest).ticket(self.number)
+
+    def status(self, instance: int = 0) -> sealed.InstanceStatus:
+        return self.tickets.status(self.number, self.token).instances[instance]
+
+    def start(self, lanes: int = LANES, instance: int = 0) -> bytes:
+        return self.tickets.start(self.number, self.token, instance, lanes)
+
+    def send(self, body: bytes, instance: int = 0) -> bytes:
+        return self.tickets.step(self.number, self.token, instance, body)
+
+    def step(self, number: int, value: float = 0.3, instance: int = 0, lanes: int = LANES) -> bytes:
+        return self.send(request(number, value, lanes), instance)
+
+    def finish(self, instance: int = 0) -> None:
+        self.tickets.finish(self.number, self.token, instance)
+
+    def answer(self, table: Any, instance: int = 0) -> bool:
+        data = table if isinstance(table, bytes) else sealed.pack_table(table)
+        journal = NOTHING
+        with contextlib.suppress(Rejection):  # as long as steps may follow
+            journal = self.tickets.journal_digest(self.number, self.token, instance)
+        signature = self.signature(data, journal, instance)
+        return self.tickets.answer(self.number, self.token, instance, data, signature)
+
+    def signature(self, data: bytes, journal: str, instance: int = 0) -> str:
+        """The entrant's, of these answers and this digest of the steps."""
+        signer = self.request.signer(self.key)
+        assert signer is not None
+        statement = sealed.Statement(
+            request=self.request.id,
+            ticket=self.number,
+            instance=instance,
+            answers=sha256_of(data),
+            journal=journal,
+        )
+        return signer.sign(statement)
+
+    def score(self) -> bool:
+        """Score the ticket, and log its result; False if it has one."""
+        season = self.board.season
+        result = score_ticket(self.store, season, MASTER, self.number)
+        return self.store.end_ticket(season.digest, self.number, result)
+
+
+def request(number: int, value: float = 0.3, lanes: int = LANES) -> bytes:
+    """The body of a request for steps whose actions are all the same."""
+    form = sealed.StepFormat(lanes, 2, 1)
+    return form.pack_request(number, np.full((lanes, 1), value, np.float32))

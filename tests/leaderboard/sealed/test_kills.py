@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.leaderboard.sealed.killing import LANES, step_through_kills
-from tests.leaderboard.sealed.playing import online_board
+from tests.leaderboard.sealed.killing import step_through_kills
+from tests.leaderboard.sealed.playing import LANES, online_board
 from tests.leaderboard.sealing import SETTING
 
 
 def test_entrants_go_on_when_their_server_is_killed(tmp_path: Path) -> None:
-    member = {"name": "deep", "setting": SETTING, "instances": 1, "budget": 150 * LANES}
+    member = {"name": "deep", "setting": SETTING, "instances": 1, "budget": 60 * LANES}
     board = online_board(tmp_path, classes=[member])
-    step_through_kills(board, tickets=3, requests=150, kills=2)
+    step_through_kills(board, tickets=3, requests=60, kills=1)

@@ -17,9 +17,9 @@ SPEC = SMESpec(state_dim=3, action_dim=2, complexity=5, horizon=4, seed=12)
 START = Start(SPEC, 5)
 
 
-def journal(path: Path, lanes: int, actions: np.ndarray) -> Journal:
+def journal(folder: Path, actions: np.ndarray) -> Journal:
     """A journal of actions `[requests, L, A]`."""
-    made = Journal.create(path / f"{len(actions)}.journal", lanes, 2)
+    made = Journal.create(folder / "0.journal", actions.shape[1], 2)
     for each in actions:
         made.append(each.astype("<f4").tobytes())
     return made
@@ -38,37 +38,35 @@ def regrets(actions: np.ndarray) -> np.ndarray:
     return np.array(rows)
 
 
-def test_the_curve_has_the_regret_of_each_part_relative_to_the_constant(tmp_path: Path) -> None:
-    actions = np.random.default_rng(1).random((250, 1, 2), dtype=np.float32)
-    measured = measured_steps(START, journal(tmp_path, 1, actions), 250)
-    rows = regrets(actions)
-    part = np.arange(250) * 100 // 250
-    curve = [rows[part == i, 0].sum() / rows[part == i, 1].sum() for i in range(100)]
+@pytest.mark.parametrize(("taken", "budget"), [(250, 250), (130, 250), (5, 8)])
+def test_the_curve_has_the_regret_of_each_part_relative_to_the_constant(
+    tmp_path: Path, taken: int, budget: int
+) -> None:
+    """Steps that were not taken count like the constant's."""
+    actions = np.random.default_rng(1).random((taken, 1, 2), dtype=np.float32)
+    measured = measured_steps(START, journal(tmp_path, actions), budget)
+    rows, parts = regrets(actions), min(budget, 100)
+    part = np.arange(budget) * parts // budget
+    curve = np.ones(parts)
+    for number in range(parts):
+        own = rows[part[:taken] == number]
+        if len(own):
+            share = len(own) / (part == number).sum()
+            curve[number] = share * own[:, 0].sum() / own[:, 1].sum() + 1.0 - share
     np.testing.assert_allclose(measured.learning_curve, curve, rtol=1e-12)
-    expected = rows[:, 0].sum() / rows[:, 1].sum()
-    assert measured.normalised_online_regret == pytest.approx(expected, rel=1e-12)
-    assert measured.steps == 250
-
-
-def test_steps_not_taken_count_like_the_constant(tmp_path: Path) -> None:
-    actions = np.random.default_rng(2).random((5, 1, 2), dtype=np.float32)
-    measured = measured_steps(START, journal(tmp_path, 1, actions), 8)
-    rows = regrets(actions)
-    np.testing.assert_allclose(
-        measured.learning_curve, [*(rows[:, 0] / rows[:, 1]), 1.0, 1.0, 1.0], rtol=1e-12
-    )
     ratio = rows[:, 0].sum() / rows[:, 1].sum()
-    assert measured.normalised_online_regret == pytest.approx((5 * ratio + 3) / 8, rel=1e-12)
+    expected = (taken * ratio + budget - taken) / budget
+    assert measured.normalised_online_regret == pytest.approx(expected, rel=1e-12)
+    assert measured.steps == taken
 
 
-def test_the_constant_has_a_regret_of_one_with_any_lanes(tmp_path: Path) -> None:
+def test_the_constant_has_a_regret_of_one_with_any_lanes_and_without_a_start(
+    tmp_path: Path,
+) -> None:
     half = np.full((6, 3, 2), 0.5, np.float32)
-    measured = measured_steps(START, journal(tmp_path, 3, half), 20)  # 18 of them can be taken
+    measured = measured_steps(START, journal(tmp_path, half), 20)  # 18 of them can be taken
     np.testing.assert_allclose(measured.learning_curve, [1.0] * 6, rtol=1e-12)
     assert measured.steps == 18
-
-
-def test_an_instance_that_was_never_started_is_the_constant_throughout() -> None:
-    measured = measured_steps(START, None, 1000)
-    assert (measured.steps, measured.normalised_online_regret) == (0, 1.0)
-    assert measured.learning_curve == (1.0,) * 100
+    never = measured_steps(START, None, 1000)
+    assert (never.steps, never.normalised_online_regret) == (0, 1.0)
+    assert never.learning_curve == (1.0,) * 100

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,38 +23,28 @@ from leaderboard.sealed.scores import score_ticket
 from leaderboard.store import Store
 from leaderboard.store.log import Log
 from sme_registry import sealed
-from tests.leaderboard.sealed.playing import Board, online_board
+from tests.leaderboard.sealed.playing import LANES, ROWS, Board, online_board, playing
 from tests.leaderboard.sealing import AFTERWARDS, MASTER, moment, move_clock, signed_request
-from tests.leaderboard.serving import serving
 
 
-def play(board: Board, key: SigningKey, level: float) -> None:
-    """A ticket whose actions are all of one level; it has ended and waits for its result."""
-    with serving(board.path, season_secrets=[board.secret]) as url:
-        ticket = board.ticket(url, key, nonce=int(100 * level))
-        for number in range(2):
-            instance = sealed.Instance(url, ticket, number, lanes=4)
-            instance.begin()
-            for _ in range(8):
-                instance.step(np.full((4, 1), level, np.float32))
-            answers = np.full((len(instance.challenge()), 1), level, np.float32)
-            instance.send_answers(answers)
-            instance.close()
-        with Store.open(board.path) as store:
-            deadline = time.monotonic() + 60
-            while store.ticket(board.season.digest, ticket.ticket).result is None:
-                assert time.monotonic() < deadline
-                time.sleep(0.1)
-
-
-@pytest.fixture
-def revealed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: SigningKey) -> Any:
-    board = online_board(tmp_path)
-    play(board, key, 0.5)
-    play(board, key, 0.25)
-    move_clock(monkeypatch)
-    with Store.open(board.path) as store:
-        store.reveal(Reveal(season=board.season.digest, master=MASTER.raw.hex()))
+@pytest.fixture(scope="module")
+def revealed(tmp_path_factory: pytest.TempPathFactory) -> Board:
+    """Two tickets, whose actions are all of one level. Nobody changes it."""
+    board = online_board(tmp_path_factory.mktemp("revealed"))
+    with playing(board) as played:
+        for number, level in ((1, 0.5), (2, 0.25)):
+            played.take_ticket(number - 1)
+            assert played.number == number
+            for instance in range(2):
+                played.start(instance=instance)
+                for count in range(1, 9):
+                    played.step(count, level, instance)
+                played.finish(instance)
+                played.answer(np.full((ROWS, 1), level), instance)
+            played.score()
+        with pytest.MonkeyPatch.context() as patch:
+            move_clock(patch)
+            played.store.reveal(Reveal(season=board.season.digest, master=MASTER.raw.hex()))
     return board
 
 
@@ -73,8 +63,9 @@ def test_a_season_of_tickets_is_replayed_and_every_one_of_them_counts(revealed: 
     assert row.value.interval is not None
 
 
-def test_altered_journals_and_answers_are_found(revealed: Board) -> None:
-    with Store.open(revealed.path, read_only=True) as store:
+def test_altered_journals_and_answers_are_found(revealed: Board, tmp_path: Path) -> None:
+    shutil.copytree(revealed.path, tmp_path / "board")
+    with Store.open(tmp_path / "board", read_only=True) as store:
         folder = store.season_folder(revealed.season.digest).ticket(1)
         files = [path for path in sorted(folder.iterdir()) if path.name != "ticket.json"]
         assert len(files) == 6  # a journal, answers and their signature of each instance
@@ -91,13 +82,13 @@ def test_altered_journals_and_answers_are_found(revealed: Board) -> None:
 
 
 def replace_answers(folder: Path) -> None:
-    (folder / "0.npy").write_bytes(sealed.pack_table(np.full((300, 1), 0.75)))
+    (folder / "0.npy").write_bytes(sealed.pack_table(np.full((ROWS, 1), 0.75)))
 
 
 def replace_journal(folder: Path) -> None:
     (folder / "0.journal").unlink()
-    journal = Journal.create(folder / "0.journal", 4, 1)
-    journal.append(np.full((4, 1), 0.75, "<f4").tobytes())
+    journal = Journal.create(folder / "0.journal", LANES, 1)
+    journal.append(np.full((LANES, 1), 0.75, "<f4").tobytes())
     journal.end()
 
 
@@ -107,26 +98,20 @@ def remove_signature(folder: Path) -> None:
 
 @pytest.mark.parametrize("replace", [replace_answers, replace_journal, remove_signature])
 def test_what_an_organiser_replaces_before_the_result_is_found(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    key: SigningKey,
-    replace: Callable[[Path], None],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, replace: Callable[[Path], None]
 ) -> None:
-    board = online_board(tmp_path)
-    with serving(board.path, season_secrets=[board.secret]) as url:
-        ticket = board.ticket(url, key)
-        with sealed.Instance(url, ticket, lanes=4) as instance:
-            instance.begin()
-            instance.step(np.full((4, 1), 0.5))
-            instance.send_answers(np.full((len(instance.challenge()), 1), 0.5))
-    move_clock(monkeypatch)
-    with Store.open(board.path) as store:
-        replace(store.season_folder(board.season.digest).ticket(1))
-        result = score_ticket(store, board.season, MASTER, 1)
-        store.end_ticket(board.season.digest, 1, result)
-        store.reveal(Reveal(season=board.season.digest, master=MASTER.raw.hex()))
+    with playing(online_board(tmp_path)) as played:
+        played.start()
+        played.step(1, 0.5)
+        played.finish()
+        played.answer(np.full((ROWS, 1), 0.5))
+        move_clock(monkeypatch)
+        replace(played.folder)
+        played.score()
+        season = played.board.season
+        played.store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
         with pytest.raises(TamperedError, match=r"tickets/1/0\.json: is not the entrant's"):
-            verify_season(store, board.season.id)
+            verify_season(played.store, season.id)
 
 
 def _lie(result: SealedResult, part: str) -> SealedResult:
@@ -170,17 +155,13 @@ def _lie(result: SealedResult, part: str) -> SealedResult:
     ],
 )
 def test_a_result_that_does_not_follow_is_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: SigningKey, part: str, message: str
+    revealed: Board, monkeypatch: pytest.MonkeyPatch, part: str, message: str
 ) -> None:
-    board = online_board(tmp_path)
-    with Store.open(board.path) as store:
-        store.start_ticket(signed_request(store, board.season, key))
-        move_clock(monkeypatch)
-        true = score_ticket(store, board.season, MASTER, 1)
-        store.end_ticket(board.season.digest, 1, _lie(true, part))
-        store.reveal(Reveal(season=board.season.digest, master=MASTER.raw.hex()))
+    with Store.open(revealed.path, read_only=True) as store:
+        stored = store.sealed_result
+        monkeypatch.setattr(store, "sealed_result", lambda row: _lie(stored(row), part))
         with pytest.raises(TamperedError, match=message):
-            verify_season(store, board.season.id)
+            verify_season(store, revealed.season.id)
 
 
 def logged(monkeypatch: pytest.MonkeyPatch, time: str, store: Store, *record: Any) -> None:
@@ -190,44 +171,40 @@ def logged(monkeypatch: pytest.MonkeyPatch, time: str, store: Store, *record: An
         store.record(*record)
 
 
-@pytest.mark.parametrize("days", [-2, 2])
-def test_a_ticket_of_a_season_that_is_not_open_is_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: SigningKey, days: float
-) -> None:
-    board = online_board(tmp_path)
-    with Store.open(board.path) as store:
-        monkeypatch.setattr(Log, "_refuse_wrong_clock", lambda *_: None)
-        folder = store.season_folder(board.season.digest)
-        request = signed_request(store, board.season, key)
-        path = folder.request(1)
-        logged(monkeypatch, moment(days), store, "ticket", request.id, request, path)
-        logged(monkeypatch, AFTERWARDS, store, *reveal(board, folder))
-        with pytest.raises(TamperedError, match=r"tickets/1/ticket\.json: was logged at"):
-            verify_season(store, board.season.id)
+def reveal(board: Board, folder: SeasonFolder) -> tuple[Any, ...]:
+    """What `Database.record` needs to log the reveal of a season."""
+    document = Reveal(season=board.season.digest, master=MASTER.raw.hex())
+    return "revealed", board.season.digest, document, folder.reveal
 
 
 @pytest.mark.parametrize(
-    ("fields", "number", "limit"),
-    [({}, 3, "2 tickets of a key"), ({"tickets": 1}, 2, "1 tickets of the season")],
+    ("fields", "days", "number", "message"),
+    [
+        ({}, -2, 1, "was logged at"),
+        ({}, 2, 1, "was logged at"),
+        ({}, 0, 3, "exceeds the 2 tickets of a key"),
+        ({"tickets": 1}, 0, 2, "exceeds the 1 tickets of the season"),
+    ],
 )
-def test_more_tickets_than_there_may_be_are_found(
+def test_tickets_that_the_terms_forbid_are_found(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     key: SigningKey,
     fields: dict[str, Any],
+    days: float,
     number: int,
-    limit: str,
+    message: str,
 ) -> None:
     board = online_board(tmp_path, **fields)
+    monkeypatch.setattr(Log, "_refuse_wrong_clock", lambda *_: None)
     with Store.open(board.path) as store:
         folder = store.season_folder(board.season.digest)
         for count in range(1, number + 1):
             request = signed_request(store, board.season, key, count)
             path = folder.request(count)
-            logged(monkeypatch, moment(0), store, "ticket", request.id, request, path)
+            logged(monkeypatch, moment(days), store, "ticket", request.id, request, path)
         logged(monkeypatch, AFTERWARDS, store, *reveal(board, folder))
-        message = rf"tickets/{number}/ticket\.json: exceeds the {limit}"
-        with pytest.raises(TamperedError, match=message):
+        with pytest.raises(TamperedError, match=rf"tickets/{number}/ticket\.json: {message}"):
             verify_season(store, board.season.id)
 
 
@@ -236,9 +213,9 @@ def test_a_ticket_that_ended_early_without_all_answers_is_found(
 ) -> None:
     board = online_board(tmp_path)
     with Store.open(board.path) as store:
-        folder = store.season_folder(board.season.digest)
         store.start_ticket(signed_request(store, board.season, key))
         store.end_ticket(board.season.digest, 1, score_ticket(store, board.season, MASTER, 1))
+        folder = store.season_folder(board.season.digest)
         logged(monkeypatch, AFTERWARDS, store, *reveal(board, folder))
         with pytest.raises(TamperedError, match="without all answers: must not be before"):
             verify_season(store, board.season.id)
@@ -253,9 +230,3 @@ def test_a_reveal_before_the_close_is_found(
         logged(monkeypatch, moment(0), store, *reveal(board, folder))
         with pytest.raises(TamperedError, match=r"reveal\.json: was logged at"):
             verify_season(store, board.season.id)
-
-
-def reveal(board: Board, folder: SeasonFolder) -> tuple[Any, ...]:
-    """What `Database.record` needs to log the reveal of a season."""
-    document = Reveal(season=board.season.digest, master=MASTER.raw.hex())
-    return "revealed", board.season.digest, document, folder.reveal

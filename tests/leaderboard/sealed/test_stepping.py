@@ -13,7 +13,7 @@ SEED = 2**255 + 3
 
 
 def test_steps_and_regret_are_those_of_single_environments() -> None:
-    lanes = Lanes(Start(SPEC, SEED), 3)
+    lanes, unmeasured = Lanes(Start(SPEC, SEED), 3), Lanes(Start(SPEC, SEED), 3)
     singles = [SMEEnv(SPEC) for _ in range(3)]
     first = [env.reset(seed=SEED + lane)[0] for lane, env in enumerate(singles)]
     np.testing.assert_array_equal(lanes.observation, first)
@@ -33,20 +33,10 @@ def test_steps_and_regret_are_those_of_single_environments() -> None:
             expected.append((observation, np.float32(reward), terminated, truncated, last))
             seen.add((terminated, truncated))
         steps, measured = lanes.step_with_regret(actions)
-        for got, wanted in zip(steps, zip(*expected, strict=True), strict=True):
+        plain = unmeasured.step(actions)
+        for got, same, wanted in zip(steps, plain, zip(*expected, strict=True), strict=True):
             np.testing.assert_array_equal(got, wanted)
+            np.testing.assert_array_equal(same, wanted)
         np.testing.assert_array_equal(lanes.observation, steps.observation)
         np.testing.assert_allclose(measured, (regret, half), rtol=1e-12)
     assert {(False, False), (True, False), (False, True)} <= seen
-
-
-def test_measuring_regret_does_not_change_the_steps() -> None:
-    one, two = Lanes(Start(SPEC, SEED), 2), Lanes(Start(SPEC, SEED), 2)
-    for actions in np.random.default_rng(2).random((30, 2, 2), dtype=np.float32):
-        steps, measured = one.step(actions), two.step_with_regret(actions)[0]
-        for got, wanted in zip(steps, measured, strict=True):
-            np.testing.assert_array_equal(got, wanted)
-
-
-def test_a_start_shows_nothing() -> None:
-    assert repr(Start(SPEC, SEED)) == "Start()"

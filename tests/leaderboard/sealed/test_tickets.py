@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import errno
 import os
 import pickle
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +15,10 @@ import numpy as np
 import pytest
 
 from leaderboard.documents.entry import SignedTicketRequest
-from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.master import Master
 from leaderboard.documents.submission import Envelope
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.intake import start_ticket
-from leaderboard.scoring.sealed import instances
 from leaderboard.sealed import Tickets
 from leaderboard.sealed import tickets as tickets_module
 from leaderboard.sealed.attendant import Attendant, _score
@@ -29,82 +27,39 @@ from leaderboard.sealed.scores import score_ticket
 from leaderboard.sealed.stepping import Lanes
 from leaderboard.sealed.ticket import RunningTicket
 from leaderboard.sealed.tickets import Clock
-from leaderboard.store import Store, played_bytes
+from leaderboard.store import played_bytes
 from leaderboard.store.files import to_bytes
+from sme_registry import materialize
 from sme_registry.io import sha256_of
-from sme_registry.sealed import Statement, StepFormat, pack_table, unpack_table
+from sme_registry.sealed import StepFormat, pack_table, unpack_table
 from tests.leaderboard.conftest import tiny_board
-from tests.leaderboard.sealed.playing import Board, online_board
+from tests.leaderboard.sealed.playing import LANES, ROWS, Played, online_board, playing, request
 from tests.leaderboard.sealing import MASTER, NOTHING, SETTING, moment, tiny_season
 
-LANES = 4
 WIRE = StepFormat(LANES, 2, 1)
-KEY = SigningKey.generate()
-ROWS = 6 * 50
-
-
-class Played:
-    """A board whose season is stepped in this process, and one ticket of it."""
-
-    def __init__(self, board: Board) -> None:
-        self.board = board
-        self.store = Store.open(board.path)
-        self.request = board.request(KEY)
-        envelope = Envelope.read(self.request.to_bytes(), SignedTicketRequest)
-        self.number, _ = start_ticket(self.store, envelope, board.season.digest)
-        self.open()
-        self.token = self.tickets.ticket(self.number).document.token
-
-    def open(self) -> None:
-        self.tickets = Tickets(self.store, self.board.secret)
-
-    def restart(self) -> None:
-        """As after a kill: nothing but the files is left."""
-        self.tickets.close()
-        self.open()
-
-    def start(self, lanes: int = LANES, instance: int = 0) -> bytes:
-        return self.tickets.start(self.number, self.token, instance, lanes)
-
-    def step(self, number: int, value: float = 0.3, instance: int = 0) -> bytes:
-        body = WIRE.pack_request(number, np.full((LANES, 1), value, np.float32))
-        return self.tickets.step(self.number, self.token, instance, body)
-
-    def finish(self, instance: int = 0) -> None:
-        self.tickets.finish(self.number, self.token, instance)
-
-    def answer(self, table: Any, instance: int = 0) -> bool:
-        data = table if isinstance(table, bytes) else pack_table(table)
-        journal = NOTHING
-        with contextlib.suppress(Rejection):  # as long as steps may follow
-            journal = self.tickets.journal_digest(self.number, self.token, instance)
-        signature = self.signature(data, journal, instance)
-        return self.tickets.answer(self.number, self.token, instance, data, signature)
-
-    def signature(self, data: bytes, journal: str, instance: int = 0) -> str:
-        """The entrant's, of these answers and this digest of the steps."""
-        signer = self.request.signer(KEY)
-        assert signer is not None
-        statement = Statement(
-            request=self.request.id,
-            ticket=self.number,
-            instance=instance,
-            answers=sha256_of(data),
-            journal=journal,
-        )
-        return signer.sign(statement)
-
-    @property
-    def used(self) -> int:
-        return self.tickets.status(self.number, self.token).instances[0].used
+HALF = np.full((ROWS, 1), 0.5, np.float32)
+WALL, UPTIME = time.time, time.monotonic
 
 
 @pytest.fixture
 def played(tmp_path: Path) -> Iterator[Played]:
-    ready = Played(online_board(tmp_path))
-    yield ready
-    ready.tickets.close()
-    ready.store.close()
+    with playing(online_board(tmp_path)) as ready:
+        yield ready
+
+
+def set_clocks(monkeypatch: pytest.MonkeyPatch, forward: float, passed: float = 0.0) -> None:
+    """Let so many hours pass, and set the wall clock so many hours forward."""
+    monkeypatch.setattr(time, "time", lambda: WALL() + 3600.0 * (forward + passed))
+    monkeypatch.setattr(time, "monotonic", lambda: UPTIME() + 3600.0 * passed)
+
+
+def fails(number: int) -> Callable[..., Any]:
+    """A call of the system that fails."""
+
+    def call(*_: Any, **__: Any) -> Any:
+        raise OSError(number, os.strerror(number))
+
+    return call
 
 
 def refused(code: str, *arguments: Any, **others: Any) -> str:
@@ -127,7 +82,7 @@ def test_a_restart_changes_no_answer(played: Played) -> None:
     following = played.step(6)
     played.restart()
     assert played.step(6) == following  # without a start
-    assert played.used == 6 * LANES
+    assert played.status().used == 6 * LANES
 
 
 def test_the_same_steps_cost_once_and_others_are_refused(played: Played) -> None:
@@ -140,87 +95,61 @@ def test_the_same_steps_cost_once_and_others_are_refused(played: Played) -> None
     refused("step_ahead", played.step, 4)
     refused("step_conflict", played.step, 0)
     assert played.step(2) == second
-    assert played.used == 2 * LANES
+    assert played.status().used == 2 * LANES
 
 
-def test_the_budget_is_exact(played: Played) -> None:
-    played.start(lanes=4)
-    for number in range(1, 17):
-        last = played.step(number)
-    assert played.used == 64
+@pytest.mark.parametrize(("lanes", "requests"), [(4, 16), (48, 1)])
+def test_the_budget_is_exact_and_lanes_that_do_not_divide_it_leave_a_rest(
+    played: Played, lanes: int, requests: int
+) -> None:
+    played.start(lanes)
+    for number in range(1, requests + 1):
+        last = played.step(number, lanes=lanes)
+    assert played.status().used == lanes * requests
     for _ in range(2):
-        assert played.step(16) == last
-        refused("budget_spent", played.step, 17)
+        assert played.step(requests, lanes=lanes) == last
+        refused("budget_spent", played.step, requests + 1, lanes=lanes)
         played.restart()
-    assert played.tickets.status(played.number, played.token).instances[0].phase == "answering"
+    assert played.status().phase == "answering"
 
 
-def test_lanes_that_do_not_divide_the_budget_leave_a_rest(played: Played) -> None:
-    wire = StepFormat(48, 2, 1)
-    played.start(lanes=48)
-    body = wire.pack_request(1, np.zeros((48, 1)))
-    played.tickets.step(played.number, played.token, 0, body)
-    body = wire.pack_request(2, np.zeros((48, 1)))
-    refused("budget_spent", played.tickets.step, played.number, played.token, 0, body)
-    assert played.tickets.status(played.number, played.token).instances[0].phase == "answering"
+@pytest.mark.parametrize(("budget", "most"), [(64, 64), (1000, 256)])
+def test_lanes_have_a_range_and_an_instance_keeps_them(
+    tmp_path: Path, budget: int, most: int
+) -> None:
+    member = {"name": "deep", "setting": SETTING, "instances": 1, "budget": budget}
+    with playing(online_board(tmp_path, classes=[member])) as played:
+        for lanes in (0, most + 1, 2**40):
+            refused("lanes_invalid", played.start, lanes)
+        played.start(most)
+        refused("start_conflict", played.start, most - 1)
+        played.restart()
+        refused("start_conflict", played.start, most - 1)
+        played.start(most)
 
 
-@pytest.mark.parametrize("lanes", [0, 65, 2**40])
-def test_lanes_have_a_range(played: Played, lanes: int) -> None:
-    refused("lanes_invalid", played.start, lanes)
-
-
-def test_a_large_budget_has_no_more_than_256_lanes(tmp_path: Path) -> None:
-    member = {"name": "deep", "setting": SETTING, "instances": 1, "budget": 1000}
-    played = Played(online_board(tmp_path, classes=[member]))
-    refused("lanes_invalid", played.start, 257)
-    played.start(256)
-    played.tickets.close()
-    played.store.close()
-
-
-def test_an_instance_keeps_its_lanes(played: Played) -> None:
-    played.start(4)
-    refused("start_conflict", played.start, 5)
-    played.restart()
-    refused("start_conflict", played.start, 5)
-    played.start(4)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_actions_must_be_finite(played: Played, value: float) -> None:
+def test_a_step_has_one_size_and_finite_actions_which_are_clipped(played: Played) -> None:
     played.start()
-    refused("step_invalid", played.step, 1, value)
-    assert played.used == 0
-
-
-def test_actions_outside_the_cube_are_clipped(played: Played) -> None:
-    played.start()
-    played.start(instance=1)
+    body = request(1)
+    for other in (b"\1", body[:7], body[:8], body[:-1], body + b"\0"):
+        refused("step_invalid", played.send, other)
+    for value in (np.nan, np.inf, -np.inf):
+        refused("step_invalid", played.step, 1, value)
+    assert played.status().used == 0
     high = played.step(1, 7.0)
     played.restart()
     assert played.step(1, 7.0) == high
-    assert played.used == LANES
-
-
-@pytest.mark.parametrize("size", [0, 7, 8, WIRE.request_bytes - 1, WIRE.request_bytes + 1])
-def test_a_step_has_one_size(played: Played, size: int) -> None:
-    played.start()
-    refused(
-        "step_invalid", played.tickets.step, played.number, played.token, 0, b"\1" + bytes(size)[1:]
-    )
-    assert played.used == 0
+    assert played.status().used == LANES
 
 
 def test_phases_follow_each_other(played: Played) -> None:
-    half = np.full((ROWS, 1), 0.5, np.float32)
     refused("instance_phase", played.step, 1)
     refused("instance_phase", played.tickets.challenge, played.number, played.token, 0)
-    refused("instance_phase", played.answer, half)
+    refused("instance_phase", played.answer, HALF)
     played.start()
     played.step(1)
     refused("instance_phase", played.tickets.challenge, played.number, played.token, 0)
-    refused("instance_phase", played.answer, half)
+    refused("instance_phase", played.answer, HALF)
     played.finish()
     played.finish()
     refused("instance_phase", played.step, 2)
@@ -228,49 +157,40 @@ def test_phases_follow_each_other(played: Played) -> None:
     refused("instance_phase", played.step, 2)
     states = unpack_table(played.tickets.challenge(played.number, played.token, 0), 4)
     assert len(states) == ROWS
-    assert played.answer(half)
-    assert not played.answer(half)
-    refused("answer_conflict", played.answer, half * 0.5)
+    assert played.answer(HALF)
+    assert not played.answer(HALF)
+    refused("answer_conflict", played.answer, HALF * 0.5)
     played.restart()
-    assert not played.answer(half)
+    assert not played.answer(HALF)
     refused("instance_phase", played.start)
     refused("instance_phase", played.step, 2)
     played.finish()
 
 
-@pytest.mark.parametrize(
-    ("table", "code"),
-    [
-        (np.full((ROWS - 1, 1), 0.5), "answer_shape"),
-        (np.full((ROWS, 2), 0.5), "answer_shape"),
-        (np.full((ROWS, 1), np.nan), "answer_not_finite"),
-        (b"", "answer_shape"),
-        (pickle.dumps(np.full((ROWS, 1), 0.5)), "answer_shape"),
-        (pack_table(np.full((ROWS, 1), 0.5)) + b"\0", "answer_shape"),
-    ],
-)
-def test_answers_have_one_form(played: Played, table: Any, code: str) -> None:
+def test_answers_have_one_form(played: Played) -> None:
     played.finish()
-    refused(code, played.answer, table)
-    assert played.answer(np.full((ROWS, 1), 0.5))
+    wide = np.full((ROWS, 2), 0.5)
+    for table in (HALF[1:], wide, b"", pickle.dumps(HALF), pack_table(HALF) + b"\0"):
+        refused("answer_shape", played.answer, table)
+    refused("answer_not_finite", played.answer, HALF * np.nan)
+    assert played.answer(HALF)
 
 
 def test_answers_need_a_signature_of_them_and_the_journal(played: Played) -> None:
     played.start()
     played.step(1)
     played.finish()
-    data = pack_table(np.full((ROWS, 1), 0.5))
+    data = pack_table(HALF)
     instance = played.tickets.ticket(played.number).instance(0)
     journal = instance.journal_digest()
-    body = WIRE.pack_request(1, np.full((LANES, 1), 0.3, np.float32))
-    assert journal == sha256_of(body)
+    assert journal == sha256_of(request(1))
     others = [
         "",
         "0" * 128,
         played.signature(data + b"x", journal),
         played.signature(data, NOTHING),
         played.signature(data, journal, instance=1),
-        KEY.sign("answers", played.request.id, played.request.board),
+        played.key.sign("answers", played.request.id, played.request.board),
     ]
     for other in others:
         refused("bad_signature", instance.answer, data, other)
@@ -279,68 +199,58 @@ def test_answers_need_a_signature_of_them_and_the_journal(played: Played) -> Non
     assert instance.is_signed
 
 
-def test_requests_older_than_signed_answers_need_no_signature(tmp_path: Path) -> None:
-    board = online_board(tmp_path)
-    with Store.open(board.path) as store:
-        request = board.request(KEY, answers_key=None)
-        assert "answers_key" not in request.to_dict()["ticket"]
-        number = store.start_ticket(request)
-        tickets = Tickets(store, board.secret)
-        instance = tickets.ticket(number).instance(0)
-        instance.finish()
-        assert instance.answer(pack_table(np.full((ROWS, 1), 0.5)), "")
-        assert instance.is_signed
-        result = score_ticket(store, board.season, Master.read(board.secret), number)
-        tickets.close()
+def test_requests_older_than_signed_answers_need_no_signature(played: Played) -> None:
+    old = played.board.request(played.key, 1, answers_key=None)
+    assert "answers_key" not in old.to_dict()["ticket"]
+    number = played.store.start_ticket(old)
+    instance = played.tickets.ticket(number).instance(0)
+    instance.finish()
+    assert instance.answer(pack_table(HALF), "")
+    assert instance.is_signed
+    result = score_ticket(played.store, played.board.season, MASTER, number)
     assert "signed" not in result.to_dict()["stepping"][0]
 
 
 def test_a_token_opens_one_ticket(played: Played) -> None:
-    request = Envelope.read(played.board.request(KEY, 1).to_bytes(), SignedTicketRequest)
-    other, _ = start_ticket(played.store, request, played.board.season.digest)
-    for number, token in ((other, played.token), (played.number, ""), (played.number, "é")):
-        tickets = played.tickets
-        refused("token_wrong", tickets.start, number, token, 0, 1)
-        refused("token_wrong", tickets.status, number, token)
-        refused("token_wrong", tickets.answer_bytes, number, token, 0)
-        refused("token_wrong", tickets.journal_digest, number, token, 0)
-        refused(
-            "token_wrong", tickets.answer, number, token, 0, pack_table(np.zeros((ROWS, 1))), ""
-        )
-    refused("ticket_unknown", played.tickets.start, 99, played.token, 0, 1)
-    refused("instance_unknown", played.tickets.start, played.number, played.token, 2, 1)
-
-
-def test_no_two_tickets_share_a_task(played: Played) -> None:
-    seeds = set()
-    for ticket in ("1", "2"):
-        for nonce in ("0" * 64, "1" * 64):
-            master = Master.read(played.board.secret)
-            seeds |= {
-                each.spec.seed for each in instances(played.board.season, master, ticket, nonce)
-            }
-    assert len(seeds) == 8
+    number, token, tickets = played.number, played.token, played.tickets
+    played.take_ticket(1)
+    for ticket, password in ((played.number, token), (number, ""), (number, "é")):
+        for call, *rest in (
+            (tickets.start, 0, 1),
+            (tickets.step, 0, request(1)),
+            (tickets.finish, 0),
+            (tickets.status,),
+            (tickets.refuse_challenge, 0),
+            (tickets.challenge, 0),
+            (tickets.journal_digest, 0),
+            (tickets.answer_bytes, 0),
+            (tickets.answer, 0, pack_table(HALF), ""),
+        ):
+            refused("token_wrong", call, ticket, password, *rest)
+    refused("ticket_unknown", tickets.start, 99, token, 0, 1)
+    refused("instance_unknown", tickets.start, number, token, 2, 1)
 
 
 def test_a_deadline_ends_everything(played: Played, monkeypatch: pytest.MonkeyPatch) -> None:
     played.start()
     played.step(1)
     assert played.tickets.over() == []
-    clock = tickets_module.time.time
-    monkeypatch.setattr(tickets_module.time, "time", lambda: clock() + 23.9 * 3600)
+    set_clocks(monkeypatch, 23.9)
     played.step(2)
-    monkeypatch.setattr(tickets_module.time, "time", lambda: clock() + 24.1 * 3600)
+    set_clocks(monkeypatch, 24.1)
     refused("ticket_ended", played.step, 3)
     refused("ticket_ended", played.start)
     refused("ticket_ended", played.finish)
-    refused("ticket_ended", played.answer, np.full((ROWS, 1), 0.5))
+    refused("ticket_ended", played.answer, HALF)
     assert played.tickets.status(played.number, played.token).phase == "ended"
+    set_clocks(monkeypatch, forward=-26, passed=25)  # set back, it extends no deadline
+    refused("ticket_ended", played.step, 3)
 
 
 def test_a_ticket_is_over_when_its_last_instance_is_answered(played: Played) -> None:
     for instance, over in ((0, []), (1, [played.number])):
         played.finish(instance)
-        played.answer(np.full((ROWS, 1), 0.5), instance)
+        played.answer(HALF, instance)
         assert played.tickets.over() == over
         phase = played.tickets.status(played.number, played.token).phase
         assert phase == ("ended" if over else "running")
@@ -349,39 +259,24 @@ def test_a_ticket_is_over_when_its_last_instance_is_answered(played: Played) -> 
 def test_an_altered_request_holds_up_no_other_ticket(
     played: Played, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    second = played.board.request(KEY, 1)
+    second = played.board.request(played.key, 1)
     played.store.start_ticket(second)
-    folder = played.store.season_folder(played.board.season.digest)
-    folder.request(played.number).write_bytes(second.to_bytes())
-    clock = tickets_module.time.time
-    monkeypatch.setattr(tickets_module.time, "time", lambda: clock() + 25 * 3600)
+    (played.folder / "ticket.json").write_bytes(second.to_bytes())
     played.restart()
+    set_clocks(monkeypatch, 0, passed=25)
     assert played.tickets.over() == [2]
 
 
 def test_a_clock_set_forward_ends_tickets_after_a_minute(
     played: Played, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    uptime, clock = tickets_module.time.monotonic, tickets_module.time.time
-
-    def over(hours: float, passed: float) -> list[int]:
-        monkeypatch.setattr(tickets_module.time, "monotonic", lambda: uptime() + passed)
-        monkeypatch.setattr(tickets_module.time, "time", lambda: clock() + hours * 3600 + passed)
+    def over(hours: float, seconds: float) -> list[int]:
+        set_clocks(monkeypatch, hours, seconds / 3600.0)
         return played.tickets.over()
 
     looks = ((25, 0.0), (25, 50.0), (0, 60.0), (25, 70.0), (25, 129.0))
     assert [over(*look) for look in looks] == [[]] * 5
     assert over(25, 131.0) == [played.number]
-
-
-def test_a_clock_set_back_extends_no_deadline(
-    played: Played, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    played.start()
-    uptime, clock = tickets_module.time.monotonic, tickets_module.time.time
-    monkeypatch.setattr(tickets_module.time, "monotonic", lambda: uptime() + 25 * 3600)
-    monkeypatch.setattr(tickets_module.time, "time", lambda: clock() - 3600)
-    refused("ticket_ended", played.step, 1)
 
 
 def test_the_clock_of_a_server_begins_no_earlier_than_the_log() -> None:
@@ -396,10 +291,10 @@ def test_a_closed_ticket_takes_nothing_from_requests_in_progress(played: Played)
     instance, other = played.tickets.ticket(played.number).instances
     played.finish()
     played.tickets.close_ticket(played.number)
-    refused("ticket_ended", instance.answer, pack_table(np.full((ROWS, 1), 0.5)), "")
+    refused("ticket_ended", instance.answer, pack_table(HALF), "")
     assert not instance.answered
     refused("ticket_ended", other.start, LANES)
-    refused("ticket_ended", other.step, WIRE.pack_request(1, np.zeros((LANES, 1))))
+    refused("ticket_ended", other.step, request(1))
     refused("ticket_ended", other.finish)
 
 
@@ -408,7 +303,7 @@ def test_steps_that_arrive_while_an_unplayed_ticket_is_closed_are_scored(
 ) -> None:
     def late(ticket: RunningTicket) -> None:
         ticket.instance(0).start(LANES)
-        ticket.instance(0).step(WIRE.pack_request(1, np.zeros((LANES, 1))))
+        ticket.instance(0).step(request(1))
         close(ticket)
 
     close = RunningTicket.close
@@ -417,29 +312,45 @@ def test_steps_that_arrive_while_an_unplayed_ticket_is_closed_are_scored(
     assert played.store.ticket(played.board.season.digest, played.number).result is None
 
 
+def test_tickets_that_nobody_played_score_one_without_a_process(
+    played: Played, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played.take_ticket(1)
+    played.start(lanes=48)
+    store, season = played.store, played.board.season
+    set_clocks(monkeypatch, 0, passed=25)
+    monkeypatch.delattr(Attendant, "_start")
+    evaluated = [score_ticket(store, season, MASTER, number) for number in (1, 2)]
+    Attendant(played.tickets).attend()
+    assert played.tickets.over() == []
+    assert [store.sealed_result(row) for row in store.entrants(season.digest)] == evaluated
+    # Nor does such a ticket keep its name from others.
+    assert store.holder_of_name(f"Tester {played.key.public[:8]}") is None
+
+
 def test_a_ticket_takes_nothing_while_it_is_scored_and_what_it_took_is_flushed(
     played: Played, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     played.start()
     played.step(1)
     flushed: list[int] = []
+    monkeypatch.setattr(os, "fdatasync", fails(errno.EIO))
+    played.tickets.sync()  # a disk that fails for a moment ends no server
     monkeypatch.setattr(os, "fdatasync", flushed.append)
-    attendant = Attendant(played.tickets)
-    attendant.attend()
+    Attendant(played.tickets).attend()
     assert len(flushed) == 1
-    clock = tickets_module.time.time
-    monkeypatch.setattr(tickets_module.time, "time", lambda: clock() + 25 * 3600)
-    played.restart()
+    set_clocks(monkeypatch, 0, passed=25)
     monkeypatch.setattr(Attendant, "_start", lambda _: None)
     Attendant(played.tickets).attend()
     instance = played.tickets.ticket(played.number).instance(0)
-    refused("ticket_ended", instance.step, WIRE.pack_request(2, np.zeros((LANES, 1))))
+    refused("ticket_ended", instance.step, request(2))
 
 
-class Failed:
-    """A process that has ended in vain."""
+class Ended:
+    """A process that has ended."""
 
-    exitcode = 1
+    def __init__(self, exitcode: int) -> None:
+        self.exitcode = exitcode
 
     def is_alive(self) -> bool:
         return False
@@ -448,29 +359,32 @@ class Failed:
         pass
 
 
-def test_tickets_that_could_not_be_scored_are_tried_again_after_a_pause_one_by_one(
-    played: Played, monkeypatch: pytest.MonkeyPatch
+@pytest.fixture
+def two_over(played: Played, monkeypatch: pytest.MonkeyPatch) -> Played:
+    """Two tickets that were played, and whose time is over."""
+    for nonce in (0, 1):
+        played.take_ticket(nonce)
+        played.start()
+        played.step(1)
+    set_clocks(monkeypatch, 0, passed=25)
+    return played
+
+
+def test_processes_that_die_are_started_again_after_a_pause_for_each_ticket_alone(
+    two_over: Played, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    played.store.start_ticket(played.board.request(KEY, 1))
-    for number in (1, 2):
-        instance = played.tickets.ticket(number).instance(0)
-        instance.start(LANES)
-        instance.step(WIRE.pack_request(1, np.zeros((LANES, 1))))
-    clock, uptime = tickets_module.time.time, tickets_module.time.monotonic
-    monkeypatch.setattr(tickets_module.time, "time", lambda: clock() + 25 * 3600)
-    played.restart()
     started: list[list[int]] = []
 
-    def start(attendant: Attendant) -> Failed:
+    def start(attendant: Attendant) -> Ended:
         started.append(attendant._numbers)
-        return Failed()
+        return Ended(1)
 
     monkeypatch.setattr(Attendant, "_start", start)
-    attendant = Attendant(played.tickets)
+    attendant = Attendant(two_over.tickets)
     attendant.attend()
     attendant.attend()
     assert started == [[1, 2]]
-    monkeypatch.setattr(tickets_module.time, "monotonic", lambda: uptime() + 2)
+    set_clocks(monkeypatch, 0, passed=25 + 2 / 3600)
     for _ in range(3):
         attendant.attend()
     assert started == [[1, 2], [1], [2]]
@@ -478,110 +392,103 @@ def test_tickets_that_could_not_be_scored_are_tried_again_after_a_pause_one_by_o
     assert len(started) == 3
 
 
-@pytest.mark.parametrize("fault", [False, True])
-def test_a_process_says_whether_all_tickets_were_scored(
-    played: Played, monkeypatch: pytest.MonkeyPatch, fault: bool
+def test_a_ticket_that_cannot_be_scored_holds_up_no_other_and_is_tried_again(
+    two_over: Played, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    played.start()
-    played.step(1)
-    played.tickets.close()
-    board, season = played.board, played.board.season
-    if fault:
-        folder = played.store.season_folder(season.digest).ticket(played.number)
-        (folder / "0.journal").write_bytes(b"no journal")
+    codes = []
+
+    def start(attendant: Attendant) -> Ended:
+        board, season = two_over.board, two_over.board.season.digest
+        with pytest.raises(SystemExit) as end:
+            _score(board.path, season, board.secret, attendant._numbers)
+        codes.append(int(end.value.code))
+        return Ended(codes[-1])
+
     monkeypatch.setattr("leaderboard.sealed.attendant.signal.signal", lambda *_: None)
-    with pytest.raises(SystemExit) as end:
-        _score(board.path, season.digest, board.secret, [played.number])
-    assert bool(end.value.code) is fault
-    row = played.store.ticket(season.digest, played.number)
-    assert (row.result is None) is fault
-
-
-def test_a_disk_that_fails_for_a_moment_ends_no_server(
-    played: Played, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    played.start()
-    played.step(1)
-
-    def fails(_: int) -> None:
-        raise OSError(errno.EIO, "Input/output error")
-
-    monkeypatch.setattr(os, "fdatasync", fails)
-    played.tickets.sync()
+    monkeypatch.setattr(Attendant, "_start", start)
+    attendant, broken = Attendant(two_over.tickets), two_over.folder.parent / "1" / "0.journal"
+    whole = broken.read_bytes()
+    broken.write_bytes(b"no journal")
+    attendant.attend()
+    assert two_over.tickets.over() == [1]
+    attendant.attend()
+    broken.write_bytes(whole)
+    set_clocks(monkeypatch, 0, passed=25 + 2 / 3600)
+    for _ in range(2):
+        attendant.attend()
+    assert two_over.tickets.over() == []
+    assert codes == [1, 0]
 
 
 def test_a_full_disk_costs_no_step(played: Played, monkeypatch: pytest.MonkeyPatch) -> None:
     played.start()
     first = played.step(1)
-
-    def full(handle: int, data: bytes) -> int:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(os, "write", full)
-    message = refused("storage_full", played.step, 2)
-    assert "No space left on device" in message
+    monkeypatch.setattr(os, "write", fails(errno.ENOSPC))
+    assert "No space left on device" in refused("storage_full", played.step, 2)
     monkeypatch.undo()
     assert played.step(1) == first
-    assert played.used == LANES
+    assert played.status().used == LANES
     played.step(2)
 
 
 @pytest.mark.parametrize("lanes", [1, LANES])
 def test_journals_and_answers_count_on_the_board(tmp_path: Path, lanes: int) -> None:
-    fields = {"name": "deep", "setting": SETTING, "instances": 1, "budget": 1024}
-    played = Played(online_board(tmp_path, classes=[fields]))
-    wire = StepFormat(lanes, 2, 1)
-    played.start(lanes)
-    for number in range(1, 1024 // lanes):  # the budget, but for its last request
-        body = wire.pack_request(number, np.ones((lanes, 1), np.float32))
-        played.tickets.step(played.number, played.token, 0, body)
-    played.finish()
-    played.answer(np.full((ROWS, 1), 0.5))
+    member = {"name": "deep", "setting": SETTING, "instances": 1, "budget": 1024}
+    with playing(online_board(tmp_path, classes=[member])) as played:
+        season = played.board.season
+        played.start(lanes)
+        for number in range(1, 1024 // lanes):  # the budget, but for its last request
+            played.step(number, lanes=lanes)
+        played.finish()
+        played.answer(HALF)
 
-    def written() -> int:
-        files = played.board.path.glob("seasons/*/tickets/1/0.*")
-        return sum(path.stat().st_size for path in files)
+        def written() -> int:
+            return sum(path.stat().st_size for path in played.folder.glob("0.*"))
 
-    def counted() -> int:
-        return played.store.total_bytes() - len(played.request.to_bytes())
+        def counted() -> int:
+            return played.store.total_bytes() - len(played.request.to_bytes())
 
-    assert 4 * 1000 < written() <= counted() == played_bytes(played.board.season)
-    result = score_ticket(played.store, played.board.season, MASTER, 1)
-    played.store.end_ticket(played.board.season.digest, 1, result)
-    assert written() < counted() < played_bytes(played.board.season) + len(to_bytes(result))
-    assert played_bytes(played.board.season, result) >= written()
+        assert 4 * 1000 < written() <= counted() == played_bytes(season)
+        played.score()
+        [row] = played.store.entrants(season.digest)
+        result = played.store.sealed_result(row)
+        assert written() < counted() < played_bytes(season) + len(to_bytes(result))
+        assert played_bytes(season, result) >= written()
 
 
 def test_no_ticket_starts_without_room_for_its_steps(tmp_path: Path) -> None:
-    fields = {"name": "deep", "setting": SETTING, "instances": 2, "budget": 4096}
-    room = played_bytes(tiny_season("sealed-online", classes=[fields])) * 3 // 2
-    played = Played(online_board(tmp_path, limits={"total_bytes": room}, classes=[fields]))
-    second = Envelope.read(played.board.request(KEY, 1).to_bytes(), SignedTicketRequest)
-    refused("quota", start_ticket, played.store, second, played.board.season.digest)
-    assert len(played.store.entrants(played.board.season.digest)) == 1
-    played.start()
-    for number in range(1, 64 // LANES + 1):
-        played.step(number)
-    result = score_ticket(played.store, played.board.season, MASTER, 1)
-    played.store.end_ticket(played.board.season.digest, 1, result)
-    assert start_ticket(played.store, second, played.board.season.digest) == (2, True)
+    member = {"name": "deep", "setting": SETTING, "instances": 2, "budget": 4096}
+    room = played_bytes(tiny_season("sealed-online", classes=[member])) * 3 // 2
+    board = online_board(tmp_path, limits={"total_bytes": room}, classes=[member])
+    with playing(board) as played:
+        second = Envelope.read(board.request(played.key, 1).to_bytes(), SignedTicketRequest)
+        refused("quota", start_ticket, played.store, second, board.season.digest)
+        assert len(played.store.entrants(board.season.digest)) == 1
+        played.start()
+        for number in range(1, 5):
+            played.step(number)
+        played.score()
+        assert start_ticket(played.store, second, board.season.digest) == (2, True)
 
 
-def test_answers_that_do_not_fit_the_disk_are_not_stored(
-    played: Played, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("confirmed", [False, True])
+def test_answers_that_do_not_reach_the_disk_are_sent_again(
+    played: Played, monkeypatch: pytest.MonkeyPatch, confirmed: bool
 ) -> None:
+    """They are not stored, or only the folder could not be synced: then they are confirmed."""
     played.finish()
-
-    def full(*_: Any, **__: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(os, "link", full)
-    half = np.full((ROWS, 1), 0.5)
-    refused("storage_full", played.answer, half)
+    if confirmed:
+        monkeypatch.setattr("leaderboard.sealed.instance.io.sync_folder", fails(errno.EIO))
+    else:
+        monkeypatch.setattr(os, "link", fails(errno.ENOSPC))
+    for _ in range(2):
+        refused("storage_full", played.answer, HALF)
     monkeypatch.undo()
-    played.restart()
-    assert played.tickets.status(played.number, played.token).instances[0].phase == "answering"
-    assert played.answer(half)
+    if not confirmed:
+        played.restart()
+        assert played.status().phase == "answering"
+    assert played.answer(HALF) is not confirmed
+    assert played.tickets.ticket(played.number).instance(0).answered
 
 
 def test_a_step_that_fails_after_it_was_recorded_is_answered_when_it_is_sent_again(
@@ -590,35 +497,18 @@ def test_a_step_that_fails_after_it_was_recorded_is_answered_when_it_is_sent_aga
     played.start()
     played.step(1)
 
-    def fails(*_: Any) -> None:
+    def runs_out(*_: Any) -> None:
         raise MemoryError
 
-    monkeypatch.setattr(Lanes, "step", fails)
+    monkeypatch.setattr(Lanes, "step", runs_out)
     with pytest.raises(MemoryError):
         played.step(2)
     monkeypatch.undo()
     answers = [played.step(2), played.step(3)]
     played.restart()
     assert played.step(3) == answers[1]
-    assert played.used == 3 * LANES
+    assert played.status().used == 3 * LANES
     assert np.isfinite(WIRE.unpack_steps(answers[0]).observation).all()
-
-
-def test_answers_whose_folder_could_not_be_synced_are_confirmed_when_they_are_sent_again(
-    played: Played, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    played.finish()
-
-    def fails(_: Path) -> None:
-        raise OSError(errno.EIO, "Input/output error")
-
-    half = np.full((ROWS, 1), 0.5)
-    monkeypatch.setattr("leaderboard.sealed.instance.io.sync_folder", fails)
-    for _ in range(2):
-        refused("storage_full", played.answer, half)
-    monkeypatch.undo()
-    assert not played.answer(half)
-    assert played.tickets.ticket(played.number).instance(0).answered
 
 
 def test_large_networks_take_more_memory_and_no_time_of_the_event_loop(
@@ -649,12 +539,9 @@ def test_instances_used_long_ago_leave_memory_and_go_on(
     assert not ticket.instance(1).is_ready
 
 
-def test_one_server_steps_a_season(played: Played) -> None:
+def test_one_server_that_has_the_master_steps_a_season(played: Played, tmp_path: Path) -> None:
     with pytest.raises(BoardError, match="another server steps it"):
         Tickets(played.store, played.board.secret)
-
-
-def test_a_master_must_be_that_of_a_season(played: Played, tmp_path: Path) -> None:
     other = Master.generate().write(tmp_path / "other.master")
     with pytest.raises(BoardError, match="the master of no sealed-online season"):
         Tickets(played.store, other)
@@ -668,21 +555,18 @@ def test_what_was_not_answered_scores_one(played: Played) -> None:
     played.start()
     played.step(1)
     played.finish()
-    hidden = next(instances(played.board.season, Master.read(played.board.secret), "1", "0" * 64))
+    hidden = played.tickets.ticket(played.number).hidden(0)
     states = unpack_table(played.tickets.challenge(played.number, played.token, 0), 4)
-    from sme_registry import materialize
-
-    best = materialize(hidden.spec).optimal_action(states[:, :2])
-    played.answer(best)
-    result = score_ticket(
-        played.store, played.board.season, Master.read(played.board.secret), played.number
-    )
+    played.answer(materialize(hidden.spec).optimal_action(states[:, :2]))
+    assert played.score()
+    assert not played.score()
+    [row] = played.store.entrants(played.board.season.digest)
+    result = played.store.sealed_result(row)
+    assert result is not None
     assert result.runs[0].wd_regret < 1e-6
     assert result.runs[1].wd_regret == result.runs[1].ood_decay == 1.0
     assert [each.steps for each in result.stepping] == [LANES, 0]
     assert result.stepping[1].normalised_online_regret == 1.0
     assert all(run.spec is run.evaluation_seed is None for run in result.runs)
-    assert played.store.end_ticket(played.board.season.digest, played.number, result)
-    assert not played.store.end_ticket(played.board.season.digest, played.number, result)
     played.restart()
     refused("ticket_ended", played.start)
