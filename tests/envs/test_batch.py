@@ -13,7 +13,7 @@ import pytest
 
 from sme_registry.envs.batch import Batch, BatchStep
 from sme_registry.envs.team import SMETeamEnv, observed_columns
-from sme_registry.errors import ActionError, ResourceLimitError
+from sme_registry.errors import ActionError
 from sme_registry.spec import SMESpec
 from sme_registry.task import materialize
 
@@ -47,7 +47,7 @@ def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     return str(request.param)
 
 
-@pytest.mark.parametrize("lanes", [1, 7, 65, 131])
+@pytest.mark.parametrize("lanes", [1, 131])
 @pytest.mark.parametrize("name", SPECS)
 def test_a_batch_is_the_loop_of_its_teams_over_whole_episodes(
     name: str, lanes: int, backend: str
@@ -93,35 +93,23 @@ def test_a_batch_is_the_loop_of_its_teams_over_whole_episodes(
     assert episodes >= 2 * len(watched)
 
 
-def test_a_refused_step_moves_nothing(backend: str) -> None:
+def test_a_refused_step_moves_nothing_and_copies_go_on_as_the_original(backend: str) -> None:
     task = materialize(SPECS["individual"])
     batch = Batch(task, 70)
     batch.begin(np.arange(70), batch.observe())
     good = np.full((70, 4), 0.4)
     batch.advance(good)
-    before = batch.observe()
-    for bad in (np.nan, np.inf, -np.inf):
-        actions = good.copy()
-        actions[68, 1] = bad
-        with pytest.raises(ActionError, match="NaN or infinite"):
-            batch.advance(actions)
+    before, broken = batch.observe(), good.copy()
+    broken[68, 1] = np.nan
+    # Other shapes are refused before machine code reads them.
+    for bad in (broken, good[:, :3], good[:69], good[0], np.full((70, 8), 0.4)):
+        with pytest.raises(ActionError, match=r"NaN or infinite|must be of shape"):
+            batch.advance(bad)
         np.testing.assert_array_equal(batch.observe(), before)
-    twin = Batch(task, 70)
-    twin.__setstate__(copy.deepcopy(batch.__getstate__()))
-    np.testing.assert_array_equal(batch.advance(good).observation, twin.advance(good).observation)
-
-
-def test_copies_go_on_as_the_original_does() -> None:
-    task = materialize(SPECS["individual"])
-    batch = Batch(task, 5)
-    batch.begin(np.arange(5), batch.observe())
-    batch.advance(np.full((5, 4), 0.4))
     copies = pickle.loads(pickle.dumps(batch)), copy.deepcopy(batch)
-    actions = np.full((5, 4), 0.6)
-    expected = batch.advance(actions)
+    expected = batch.advance(good)
     for twin in copies:
-        got = twin.advance(actions)
-        for one, other in zip(got, expected, strict=True):
+        for one, other in zip(twin.advance(good), expected, strict=True):
             np.testing.assert_array_equal(one, other)
 
 
@@ -131,69 +119,52 @@ def torch_tensor(array: Any) -> Any:
 
 HOLDERS: dict[str, Callable[[Any], Any]] = {
     "itself": lambda array: array,
-    "a slice": lambda array: array[..., 1:],
-    "a view of a view": lambda array: array.T[::2].reshape(-1, order="A")[:],
-    "other bytes": lambda array: array.view(np.uint8),
+    "a view of a slice": lambda array: array[..., 1:].T[:],
     "strides": lambda array: np.lib.stride_tricks.as_strided(array),
-    "memoryview": memoryview,
     "an array of a memoryview": lambda array: np.asarray(memoryview(array)),
     "pickle's buffer": pickle.PickleBuffer,
     "DLPack": np.from_dlpack,
-    "torch.from_numpy": torch_tensor,
     "a row of torch.from_numpy": lambda array: torch_tensor(array)[0],
 }
 
 
-@pytest.mark.parametrize("field", BatchStep._fields)
 @pytest.mark.parametrize("holder", HOLDERS)
-def test_no_step_writes_to_a_result_that_is_held(holder: str, field: str) -> None:
-    spec = SPECS["fragile"].derive(horizon=2)
-    if field == "limits":  # which teams have not
-        spec = SMESpec(safety={"tightness": 0.2})
-    batch, rng = Batch(materialize(spec), 5), np.random.default_rng(0)
-    agents = len(batch.task.names)
+def test_no_step_writes_to_a_result_that_is_held(holder: str) -> None:
+    for field in BatchStep._fields:
+        spec = SPECS["fragile"].derive(horizon=2)
+        if field == "limits":  # which teams have not
+            spec = SMESpec(safety={"tightness": 0.2})
+        batch, rng = Batch(materialize(spec), 5), np.random.default_rng(0)
+        accounts = np.zeros((5, len(batch.task.names)))
+        held, kept = [], []
+        for _ in range(8):
+            for keep in (False, True):  # some are dropped, so that arrays are recycled
+                batch.place(rng.random((5, 8)), rng.integers(0, 2, 5), accounts)
+                result = getattr(batch.advance(rng.random((5, 4))), field)
+                if keep:
+                    held.append(HOLDERS[holder](result))
+                    kept.append(bytes(np.asarray(held[-1])))
+            del result
+        assert [bytes(np.asarray(one)) for one in held] == kept, field
+        assert len(set(kept)) > 1
 
-    def step() -> Any:
-        batch.place(rng.random((5, 8)), rng.integers(0, 2, 5), np.zeros((5, agents)))
-        return getattr(batch.advance(rng.random((5, 4))), field)
 
-    held, kept = [], []
-    for _ in range(8):
-        step()  # dropped, so that arrays are recycled all the while
-        held.append(HOLDERS[holder](step()))
-        kept.append(bytes(np.asarray(held[-1])))
-    assert [bytes(np.asarray(one)) for one in held] == kept
-    assert len(set(kept)) > 1
-
-
-def test_a_result_that_nobody_holds_is_written_again() -> None:
+def test_a_result_that_nobody_holds_is_written_again_whatever_was_done_to_it() -> None:
     batch = Batch(materialize(SPECS["individual"]), 3)
     batch.begin(np.arange(3), batch.observe())
     action = np.full((3, 4), 0.4)
     first = batch.advance(action)
     arrays = [weakref.ref(value.base) for value in first]
-    del first
+    for value in first:
+        value.flags.writeable = False
+    del first, value
     again = batch.advance(action)
     assert [value.base for value in again] == [array() for array in arrays]
-
-
-def test_few_results_are_kept_of_many_that_were_held() -> None:
-    batch = Batch(materialize(SPECS["individual"]), 3)
-    batch.begin(np.arange(3), batch.observe())
-    held = [batch.advance(np.full((3, 4), 0.4)) for _ in range(20)]
+    assert all(value.flags.writeable for value in again)
+    held = [batch.advance(action) for _ in range(20)]
     arrays = [weakref.ref(step.observation.base) for step in held]
     del held
-    assert sum(array() is not None for array in arrays) == 3
-
-
-def test_what_is_done_to_a_result_ends_with_it() -> None:
-    batch = Batch(materialize(SPECS["individual"]), 3)
-    batch.begin(np.arange(3), batch.observe())
-    for _ in range(4):
-        step = batch.advance(np.full((3, 4), 0.4))
-        assert all(value.flags.writeable for value in step)
-        for value in step:
-            value.flags.writeable = False
+    assert sum(array() is not None for array in arrays) == 3  # few are kept of many
 
 
 @pytest.mark.parametrize(("lanes", "state_dim"), [(1, 8), (5, 1), (1, 1), (5, 8)])
@@ -202,23 +173,6 @@ def test_the_state_that_is_handed_out_is_a_copy(lanes: int, state_dim: int) -> N
     batch.begin(np.arange(lanes), batch.observe())
     before = batch.state
     batch.state[:] = -7.0
-    np.testing.assert_array_equal(batch.state, before)
-
-
-def test_a_batch_too_large_for_memory_is_refused() -> None:
-    with pytest.raises(ResourceLimitError, match="num_envs=1000000000"):
-        Batch(materialize(SPECS["individual"]), 10**9)
-
-
-@pytest.mark.parametrize("shape", [(2, 3), (3, 4), (2, 8), (8,)])
-def test_actions_of_another_shape_are_refused_before_machine_code_reads_them(
-    backend: str, shape: tuple[int, ...]
-) -> None:
-    batch = Batch(materialize(SPECS["one"]), 2)
-    batch.begin(np.arange(2), batch.observe())
-    before = batch.state
-    with pytest.raises(ActionError, match="must be of shape"):
-        batch.advance(np.full(shape, 0.5))
     np.testing.assert_array_equal(batch.state, before)
 
 

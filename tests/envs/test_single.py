@@ -6,7 +6,6 @@ import copy
 import pickle
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 
@@ -46,21 +45,16 @@ def test_rewards_are_paid_every_k_steps_and_at_the_end() -> None:
         [3 * share for share in pending]
     )
     assert [step[3] for step in steps] == [False] * 6 + [True]
-
-
-def test_with_k_beyond_the_horizon_all_is_paid_at_the_end() -> None:
     env = env_of(k=100, horizon=4)
     assert [earn(env, r)[1] for r in (1.0, 0.5, 0.25, 1.0)] == pytest.approx([0, 0, 0, 2.75])
 
 
-@pytest.mark.parametrize(
-    ("asked", "paid"), [(0.6, 0.6), (0.51, 0.51), (0.49, 0.0), (0.1, 0.0), (1.0, 1.0), (0.0, 0.0)]
-)
-def test_step_rewards_at_or_below_r_min_pay_nothing(asked: float, paid: float) -> None:
-    _, reward, _, _, info = earn(env_of(r_min=0.5), asked)
-    assert reward == pytest.approx(paid)
-    assert info["regret"] == pytest.approx(1.0 - paid)
-    assert info["similarity"] == pytest.approx(1 - (1 - asked) / 4 if asked else 0.7)
+def test_step_rewards_at_or_below_r_min_pay_nothing() -> None:
+    for asked, paid in ((1.0, 1.0), (0.51, 0.51), (0.49, 0.0), (0.0, 0.0)):
+        _, reward, _, _, info = earn(env_of(r_min=0.5), asked)
+        assert reward == pytest.approx(paid)
+        assert info["regret"] == pytest.approx(1.0 - paid)
+        assert info["similarity"] == pytest.approx(1 - (1 - asked) / 4 if asked else 0.7)
 
 
 def exactly_half(**fields: Any) -> tuple[Any, ...]:
@@ -75,12 +69,9 @@ def exactly_half(**fields: Any) -> tuple[Any, ...]:
     raise AssertionError("no state gives a reward of exactly one half")
 
 
-def test_r_min_is_strict() -> None:
+def test_a_step_reward_of_exactly_r_min_pays_nothing_and_of_exactly_D_survives() -> None:
     assert exactly_half(r_min=0.5)[1] == 0.0
     assert exactly_half(r_min=float(np.nextafter(0.5, 0)))[1] == 0.5
-
-
-def test_a_step_reward_of_exactly_D_survives() -> None:
     assert not exactly_half(D=0.5)[2]
     assert exactly_half(D=float(np.nextafter(0.5, 1)))[2]
 
@@ -115,26 +106,21 @@ def test_both_flags_are_set_on_one_step_and_truncation_pays() -> None:
     assert observation[-2] == 1.0
 
 
-def test_survival_is_tested_on_the_gated_reward() -> None:
+def test_survival_is_tested_on_the_gated_step_reward_not_on_the_payout() -> None:
     assert not earn(env_of(D=0.1), 0.4)[2]
     assert earn(env_of(D=0.1, r_min=0.6), 0.4)[2]
-
-
-def test_survival_is_tested_on_the_step_reward_not_on_the_payout() -> None:
     assert not earn(env_of(D=0.5, k=10), 1.0)[2]
 
 
-@pytest.mark.parametrize("action_range", ["unit", "symmetric"])
-def test_actions_outside_the_range_count_as_its_bounds(action_range: Any) -> None:
-    low = {"unit": 0.0, "symmetric": -1.0}[action_range]
-    seen = []
-    for action in ([low, 1.0], [low - 5.0, 1e30]):
-        env = SMEEnv("Plane1", action_range=action_range)
-        env.reset(seed=0)
-        seen.append((*env.step(np.array(action))[:2], *env.state))
-    assert [list(map(np.ndarray.tolist, map(np.asarray, s))) for s in seen[:1]] == [
-        list(map(np.ndarray.tolist, map(np.asarray, s))) for s in seen[1:]
-    ]
+@pytest.mark.parametrize(("action_range", "low"), [("unit", 0.0), ("symmetric", -1.0)])
+def test_actions_outside_the_range_count_as_its_bounds(action_range: Any, low: float) -> None:
+    inside, outside = (SMEEnv("Plane1", action_range=action_range) for _ in range(2))
+    inside.reset(seed=0)
+    outside.reset(seed=0)
+    expected, got = inside.step(np.array([low, 1.0])), outside.step(np.array([low - 5.0, 1e30]))
+    np.testing.assert_array_equal(got[0], expected[0])
+    assert got[1] == expected[1]
+    np.testing.assert_array_equal(outside.state, inside.state)
 
 
 def test_the_symmetric_range_is_the_same_task_rescaled() -> None:
@@ -180,41 +166,28 @@ def test_an_action_is_the_same_in_whatever_form_it_comes(same: Any) -> None:
     np.testing.assert_array_equal(plain.step(action)[0], other.step(same(action))[0])
 
 
-def test_whole_numbers_are_actions() -> None:
-    env = SMEEnv("Plane1")
-    env.reset(seed=0)
-    assert 0.0 <= env.step(np.array([0, 1]))[4]["similarity"] <= 1.0  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("action", "words"),
-    [
+@pytest.mark.parametrize("action_range", ["unit", "symmetric"])
+def test_an_unusable_action_is_refused_and_nothing_moves(action_range: Any) -> None:
+    env, untouched = (SMEEnv("Plane1", action_range=action_range) for _ in range(2))
+    for e in (env, untouched):
+        e.reset(seed=0)
+        e.step(np.full(2, 0.5, np.float32))
+    for action, words in (
         (np.array([np.nan, 0.5], np.float32), "NaN"),
         (np.array([np.inf, 0.5]), "infinite"),
         (np.zeros(3, np.float32), r"shape \(3,\): must be of shape \(2,\)"),
         (np.zeros((1, 2), np.float32), "shape"),
-        (np.zeros(0, np.float32), "shape"),
         (0.5, "shape"),
         (None, "numbers"),
         ("ab", "numbers"),
-        (["a", "b"], "numbers"),
         ([True, False], "numbers"),
         (np.array([True, False]), "numbers"),
         ([1j, 0], "numbers"),
         ([[0.1], [0.2, 0.3]], "array of shape"),
         ({"a": 1}, "numbers"),
-    ],
-)
-@pytest.mark.parametrize("action_range", ["unit", "symmetric"])
-def test_an_unusable_action_is_refused_and_nothing_moves(
-    action: Any, words: str, action_range: Any
-) -> None:
-    env, untouched = (SMEEnv("Plane1", action_range=action_range) for _ in range(2))
-    for e in (env, untouched):
-        e.reset(seed=0)
-        e.step(np.full(2, 0.5, np.float32))
-    with pytest.raises(ActionError, match=words):
-        env.step(action)
+    ):
+        with pytest.raises(ActionError, match=words):
+            env.step(action)
     good = np.full(2, 0.25, np.float32)
     np.testing.assert_array_equal(env.step(good)[0], untouched.step(good)[0])
 
@@ -237,14 +210,6 @@ def test_a_step_before_reset_or_after_the_end_is_refused() -> None:
         env.step(np.zeros(2, np.float32))
 
 
-def test_an_episode_begins_at_the_state_that_is_given() -> None:
-    env = SMEEnv("Plane1")
-    for state in ([0.25, 0.75], (0, 1), np.array([1.0, 0.0], np.float32)):
-        observation, _ = env.reset(options={"state": state})
-        assert observation.tolist() == [*map(float, state), 0.0, 0.0]
-        assert env.state.tolist() == [*map(float, state)]
-
-
 @pytest.mark.parametrize("make", [SMEEnv, SMETeamEnv, SMEVectorEnv])
 def test_infos_of_reset_and_step_have_the_same_keys_shapes_and_types(make: Any) -> None:
     env = make("Plane1")
@@ -264,41 +229,36 @@ def test_infos_of_reset_and_step_have_the_same_keys_shapes_and_types(make: Any) 
             assert np.isnan(at_reset[key]).all()
 
 
-def test_a_given_state_takes_nothing_from_the_generator() -> None:
+def test_a_given_state_begins_the_episode_and_takes_nothing_from_the_generator() -> None:
     first, second = SMEEnv("Plane1"), SMEEnv("Plane1")
-    first.reset(seed=0, options={"state": [0.5, 0.5]})
+    for state in ([0.25, 0.75], (0, 1), np.array([1.0, 0.0], np.float32)):
+        observation, _ = first.reset(seed=0, options={"state": state})
+        assert observation.tolist() == [*map(float, state), 0.0, 0.0]
+        assert first.state.tolist() == [*map(float, state)]
     second.reset(seed=0, options={"state": [0.1, 0.2]})
     np.testing.assert_array_equal(first.reset()[0], second.reset()[0])
     np.testing.assert_array_equal(first.reset(options={})[0], second.reset(options=None)[0])
 
 
-@pytest.mark.parametrize(
-    ("state", "words"),
-    [
-        ([0.5, 1.0000001], "outside"),
-        ([-1e-300, 0.5], "outside"),
-        ([np.nan, 0.5], "outside"),
-        ([0.5], "shape"),
-        ([[0.5, 0.5]], "shape"),
-        (["a", "b"], "shape"),
-        (None, "shape"),
-    ],
-)
-def test_a_state_that_cannot_begin_an_episode_is_refused(state: Any, words: str) -> None:
+def test_a_state_that_cannot_begin_an_episode_is_refused() -> None:
     env = SMEEnv("Plane1")
     env.reset(seed=0)
     env.step(np.zeros(2, np.float32))
-    before = env.state
-    twin = copy.deepcopy(env)
-    with pytest.raises(StateError, match=words):
-        env.reset(seed=9, options={"state": state})
-    np.testing.assert_array_equal(env.state, before)
-    np.testing.assert_array_equal(env.reset()[0], twin.reset()[0])  # nor has it been seeded
-
-
-def test_an_unknown_option_is_refused_with_the_nearest_known_one() -> None:
+    before, twin = env.state, copy.deepcopy(env)
+    for state, words in (
+        ([0.5, 1.0000001], "outside"),
+        ([-1e-300, 0.5], "outside"),
+        ([np.nan, 0.5], "outside"),
+        ([[0.5, 0.5]], "shape"),
+        (["a", "b"], "shape"),
+        (None, "shape"),
+    ):
+        with pytest.raises(StateError, match=words):
+            env.reset(seed=9, options={"state": state})
+        np.testing.assert_array_equal(env.state, before)
     with pytest.raises(OptionError, match=r"unknown option.*Did you mean 'state'"):
-        SMEEnv("Plane1").reset(options={"sate": [0, 0]})
+        env.reset(options={"sate": [0, 0]})
+    np.testing.assert_array_equal(env.reset()[0], twin.reset()[0])  # nor has it been seeded
 
 
 def test_rendering_without_a_mode_warns_and_gives_nothing() -> None:
@@ -310,7 +270,7 @@ def test_rendering_without_a_mode_warns_and_gives_nothing() -> None:
 
 def test_both_back_ends_walk_the_same_states(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("numba")
-    for name in ("Default", "HardFragile", "Complexity50", "StateDim32", "ActionDim16", "Plane10"):
+    for name in ("Default", "HardFragile", "StateDim32", "ActionDim16"):
         envs = []
         for backend in ("numba", "numpy"):
             monkeypatch.setenv("SME_BACKEND", backend)
@@ -351,23 +311,9 @@ def test_an_episode_pickled_under_one_back_end_goes_on_under_the_other(
         monkeypatch.setenv("SME_BACKEND", here)
 
 
-def test_a_made_environment_is_copied_with_its_wrappers() -> None:
-    env = gymnasium.make("SME/Interval5-v1")
-    env.reset(seed=0)
-    action = np.full(4, 0.5, np.float32)
-    env.step(action)
-    for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
-        mine = copy.deepcopy(env)
-        for _ in range(10):
-            np.testing.assert_array_equal(mine.step(action)[0], twin.step(action)[0])
-
-
-@pytest.mark.parametrize("seed", ["abc", 1.5, True, -1, [1], np.array([1])])
-def test_a_seed_that_cannot_be_used_is_refused(seed: Any) -> None:
-    with pytest.raises(OptionError, match=r"seed=.*integer of at least 0"):
-        SMEEnv("Plane1").reset(seed=seed)
-
-
-def test_numpys_integers_are_seeds() -> None:
-    first, second = SMEEnv("Plane1").reset(seed=7), SMEEnv("Plane1").reset(seed=np.int64(7))  # type: ignore[arg-type]
-    np.testing.assert_array_equal(first[0], second[0])
+def test_seeds_are_integers_of_at_least_0() -> None:
+    first, second = SMEEnv("Plane1"), SMEEnv("Plane1")
+    np.testing.assert_array_equal(first.reset(seed=7)[0], second.reset(seed=np.int64(7))[0])  # type: ignore[arg-type]
+    for seed in ("abc", 1.5, True, -1, [1], np.array([1])):
+        with pytest.raises(OptionError, match=r"seed=.*integer of at least 0"):
+            first.reset(seed=seed)  # type: ignore[arg-type]

@@ -61,34 +61,31 @@ def both_reset(batch: Any, singles: Any, mask: Any, seed: Any = None) -> list[An
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("switch", ["episode", "step"])
 def test_a_batch_of_lives_equals_its_singles_in_every_bit(switch: str, mode: str) -> None:
-    for fields in ({"observes_phase": True}, {}):
-        spec = stream(switch, **fields)
-        batch: Any = SMEStreamVectorEnv(spec, 5, autoreset_mode=mode)
-        makers = [functools.partial(SMEStreamEnv, spec)] * 5
-        singles: Any = SyncVectorEnv(makers, autoreset_mode=AutoresetMode(mode))
-        rng = np.random.default_rng(0)
-        apart = 0
-        for seed in (3, None):  # the second reset continues the lives
-            expect_same("reset", batch.reset(seed=seed), singles.reset(seed=seed))
-            for t in range(150):
-                tasks = batch.get_attr("task")
-                apart += len(set(map(id, tasks))) > 1
-                optimal = [
-                    task.optimal_action(s) for task, s in zip(tasks, batch.state, strict=True)
-                ]
-                share = rng.uniform(0.0, 0.6, (5, 1))
-                action = ((1 - share) * optimal + share * rng.random((5, 2))).astype(np.float32)
-                step = batch.step(action)
-                expect_same(f"step {t}", step, singles.step(action))
-                assert batch.observation_space.contains(step[0])
-                ended = step[2] | step[3]
-                if mode == "Disabled" and ended.any():
-                    expect_same("reset", *both_reset(batch, singles, ended))
-                if seed is not None and t in (20, 45):  # a new life in one lane
-                    one = np.arange(5) == t // 20
-                    expect_same("new life", *both_reset(batch, singles, one, [9] * 5))
-        assert step[4]["lifetime"].min() > spec.steps
-        assert apart > 10  # lanes that were in different pieces at once
+    spec = stream(switch, observes_phase=switch == "step")
+    batch: Any = SMEStreamVectorEnv(spec, 5, autoreset_mode=mode)
+    makers = [functools.partial(SMEStreamEnv, spec)] * 5
+    singles: Any = SyncVectorEnv(makers, autoreset_mode=AutoresetMode(mode))
+    rng = np.random.default_rng(0)
+    apart = 0
+    for seed in (3, None):  # the second reset continues the lives
+        expect_same("reset", batch.reset(seed=seed), singles.reset(seed=seed))
+        for t in range(150):
+            tasks = batch.get_attr("task")
+            apart += len(set(map(id, tasks))) > 1
+            optimal = [task.optimal_action(s) for task, s in zip(tasks, batch.state, strict=True)]
+            share = rng.uniform(0.0, 0.6, (5, 1))
+            action = ((1 - share) * optimal + share * rng.random((5, 2))).astype(np.float32)
+            step = batch.step(action)
+            expect_same(f"step {t}", step, singles.step(action))
+            assert batch.observation_space.contains(step[0])
+            ended = step[2] | step[3]
+            if mode == "Disabled" and ended.any():
+                expect_same("reset", *both_reset(batch, singles, ended))
+            if seed is not None and t in (20, 45):  # a new life in one lane
+                one = np.arange(5) == t // 20
+                expect_same("new life", *both_reset(batch, singles, one, [9] * 5))
+    assert step[4]["lifetime"].min() > spec.steps
+    assert apart > 10  # lanes that were in different pieces at once
 
 
 def test_a_phase_is_left_at_the_next_reset() -> None:
@@ -104,12 +101,13 @@ def test_a_phase_is_left_at_the_next_reset() -> None:
         assert got == phase
 
 
-def test_a_phase_is_left_at_once() -> None:
-    spec = stream("step", D=0.0)
-    env = SMEStreamEnv(spec)
-    env.reset(seed=0)
-    expected = [(i + 1, spec.pieces[spec.piece_at(i)].phase) for i in range(240)]
-    assert phases_seen(env, 240) == expected
+def test_a_phase_is_left_at_once_however_far_away_the_switch_is() -> None:
+    phases = [{"spec": SPEC, "steps": 700}, {"spec": SPEC | {"seed": 1}, "steps": 100}]
+    for spec in (stream("step", D=0.0), StreamSpec(phases=phases, switch="step")):
+        env, steps = SMEStreamEnv(spec), spec.steps + 20
+        env.reset(seed=0)
+        expected = [(i + 1, spec.pieces[spec.piece_at(i)].phase) for i in range(steps)]
+        assert phases_seen(env, steps) == expected
 
 
 def test_state_and_what_is_to_be_paid_carry_over_a_switch_within_an_episode() -> None:
@@ -152,7 +150,7 @@ def test_a_reset_continues_the_life_and_a_seed_begins_a_new_one() -> None:
 
 
 @pytest.mark.parametrize("switch", ["episode", "step"])
-@pytest.mark.parametrize(("lifetime", "phase"), [(36, 0), (37, 1), (61, 2), (91, 0), (400, 2)])
+@pytest.mark.parametrize(("lifetime", "phase"), [(36, 0), (61, 2), (400, 2)])
 def test_a_life_may_begin_after_some_steps(switch: str, lifetime: int, phase: int) -> None:
     spec, options = stream(switch, D=0.0), {"lifetime": lifetime}
     env, batch = SMEStreamEnv(spec), SMEStreamVectorEnv(spec, 2, autoreset_mode="SameStep")
@@ -234,13 +232,7 @@ def test_lanes_in_different_pieces_refuse_an_action_together() -> None:
         _ = twin.task
 
 
-@pytest.mark.parametrize("backend", ["numba", "numpy"])
-def test_copies_taken_in_mid_life_go_on_exactly(
-    backend: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if backend == "numba":
-        pytest.importorskip("numba")
-    monkeypatch.setenv("SME_BACKEND", backend)
+def test_copies_taken_in_mid_life_go_on_exactly() -> None:
     spec = stream("step", observes_phase=True)
     rng = np.random.default_rng(0)
     for env in (SMEStreamEnv(spec), SMEStreamVectorEnv(spec, 3, autoreset_mode="SameStep")):
@@ -293,13 +285,6 @@ def test_a_stream_of_one_phase_has_the_numbers_of_its_task() -> None:
             expect_same("info", {key: got[4][key] for key in expected[4]}, expected[4])
             if isinstance(env, SMEStreamEnv) and (got[2] or got[3]):
                 expect_same("reset", env.reset()[0], plain.reset()[0])
-
-
-def test_long_streams_are_looked_ahead_in_parts() -> None:
-    phases = [{"spec": SPEC, "steps": 700}, {"spec": SPEC | {"seed": 1}, "steps": 100}]
-    env = SMEStreamEnv(StreamSpec(phases=phases, switch="step"))
-    env.reset(seed=0)
-    assert phases_seen(env, 900) == [(i + 1, int(i >= 700)) for i in range(900)]
 
 
 def test_returned_arrays_are_fresh_and_writing_into_them_moves_nothing() -> None:

@@ -91,13 +91,6 @@ def test_lanes_that_are_not_reset_go_on_untouched(mode: str) -> None:
     assert second[0][1, 2] == np.float32(2 / 9)
 
 
-def test_a_masked_seed_seeds_only_the_lanes_of_the_mask() -> None:
-    env, single = plane(), SMEEnv("Plane1")
-    env.reset(seed=0)
-    observations, _ = env.reset(seed=40, options={"reset_mask": np.array([False, True, False])})
-    np.testing.assert_array_equal(observations[1], single.reset(seed=41)[0])
-
-
 def test_a_batch_begins_at_one_state_for_all_or_one_for_each() -> None:
     env = plane()
     env.reset(options={"state": [0.25, 0.5]})
@@ -123,10 +116,13 @@ def test_a_step_before_every_lane_has_begun_is_refused() -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("action_range", ["unit", "symmetric"])
-@pytest.mark.parametrize(
-    "bad",
-    [
+def test_unusable_actions_are_refused_and_no_lane_moves(mode: str) -> None:
+    symmetric = {"action_range": "symmetric"} if mode == "SameStep" else {}
+    env, untouched = (plane(mode, k=2, **symmetric) for _ in range(2))
+    for e in (env, untouched):
+        e.reset(seed=0)
+        e.step(HALF)
+    for bad in (
         np.full((3, 2), np.nan, np.float32),
         np.array([[0.5, 0.5], [0.5, 0.5], [0.5, -np.inf]]),
         np.zeros((2, 3)),
@@ -136,31 +132,19 @@ def test_a_step_before_every_lane_has_begun_is_refused() -> None:
         None,
         [[True, False]] * 3,
         [[0.1, 0.2], [0.3], [0.4, 0.5]],
-    ],
-    ids=["nan", "inf", "transposed", "one", "deep", "string", "none", "bool", "ragged"],
-)
-def test_unusable_actions_are_refused_and_no_lane_moves(
-    bad: Any, mode: str, action_range: Any
-) -> None:
-    env, untouched = (plane(mode, action_range=action_range, k=2) for _ in range(2))
-    for e in (env, untouched):
-        e.reset(seed=0)
-        e.step(HALF)
-    with pytest.raises(ActionError, match="action"):
-        env.step(bad)
+    ):
+        with pytest.raises(ActionError, match="action"):
+            env.step(bad)
     got, expected = env.step(HALF), untouched.step(HALF)
     for mine, other in zip(got[:4], expected[:4], strict=True):
         np.testing.assert_array_equal(mine, other)
 
 
-@pytest.mark.parametrize(
-    ("kwargs", "error", "words"),
-    [
-        ({"num_envs": 0}, OptionError, "num_envs=0"),
-        ({"num_envs": -1}, OptionError, "at least 1"),
+def test_a_batch_that_cannot_be_made_is_a_typed_error() -> None:
+    for kwargs, error, words in (
+        ({"num_envs": 0}, OptionError, "num_envs=0.*at least 1"),
         ({"num_envs": 2.0}, OptionError, "num_envs=2.0"),
         ({"num_envs": True}, OptionError, "num_envs=True"),
-        ({"num_envs": "3"}, OptionError, "num_envs='3'"),
         ({"num_envs": 2**40}, ResourceLimitError, "fewer lanes"),
         ({"autoreset_mode": "Sometimes"}, OptionError, "'NextStep', 'SameStep' or 'Disabled'"),
         ({"autoreset_mode": None}, OptionError, "autoreset_mode=None"),
@@ -168,21 +152,21 @@ def test_unusable_actions_are_refused_and_no_lane_moves(
         ({"render_lanes": [0]}, OptionError, "needs render_mode='rgb_array'"),
         ({"action_range": "wide"}, OptionError, "action_range='wide'"),
         ({"max_episode_steps": 5}, WrapperError, "horizon=5"),
-    ],
-)
-def test_a_batch_that_cannot_be_made_is_a_typed_error(
-    kwargs: dict[str, Any], error: type[Exception], words: str
-) -> None:
-    with pytest.raises(error, match=words):
-        SMEVectorEnv("Plane1", **{"num_envs": 2, **kwargs})
-    if not isinstance(kwargs.get("num_envs", 2), str):
-        with pytest.raises(error, match=words):
-            gymnasium.make_vec("SME/Plane1-v1", **{"num_envs": 2, **kwargs})
+    ):
+        for make in (SMEVectorEnv, gymnasium.make_vec):
+            name = "Plane1" if make is SMEVectorEnv else "SME/Plane1-v1"
+            with pytest.raises(error, match=words):
+                make(name, **{"num_envs": 2, **kwargs})  # type: ignore[operator]
+    with pytest.raises(OptionError, match="num_envs='3'"):
+        SMEVectorEnv("Plane1", num_envs="3")  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "words"),
-    [
+def test_options_and_seeds_that_cannot_be_used_are_refused_and_no_lane_moves() -> None:
+    env = plane()
+    env.reset(seed=0)
+    env.step(HALF)
+    before, twin = env.state, copy.deepcopy(env)
+    for options, error, words in (
         ({"state": [0.5, 1.5]}, StateError, "outside"),
         ({"state": [[0.5, 0.5]] * 2}, StateError, "shape"),
         ({"state": "abc"}, StateError, "shape"),
@@ -191,34 +175,27 @@ def test_a_batch_that_cannot_be_made_is_a_typed_error(
         ({"reset_mask": np.zeros(3, bool)}, OptionError, "at least one"),
         ({"reset_mask": np.ones(3)}, OptionError, "dtype bool"),
         ({"reset_maks": np.ones(3, bool)}, OptionError, "Did you mean 'reset_mask'"),
-    ],
-)
-def test_options_that_cannot_be_used_are_refused_and_no_lane_moves(
-    options: dict[str, Any], error: type[Exception], words: str
-) -> None:
-    env = plane()
-    env.reset(seed=0)
-    env.step(HALF)
-    before, twin = env.state, copy.deepcopy(env)
-    with pytest.raises(error, match=words):
-        env.reset(seed=9, options=options)
+    ):
+        with pytest.raises(error, match=words):
+            env.reset(seed=9, options=options)
+    for seed in ([1, 2], "abc", 1.5, True, [1, 2, 3.5], [1, 2, "c"], -1, [0, 0, -1]):
+        with pytest.raises(OptionError, match="seed"):
+            env.reset(seed=seed)  # type: ignore[arg-type]
     np.testing.assert_array_equal(env.state, before)
     np.testing.assert_array_equal(env.reset()[0], twin.reset()[0])  # nor has it been seeded
-
-
-@pytest.mark.parametrize(
-    "seed", [[1, 2], "abc", 1.5, True, [1, 2, 3.5], [1, 2, "c"], -1, [0, 0, -1]]
-)
-def test_a_seed_that_cannot_be_used_is_refused(seed: Any) -> None:
-    with pytest.raises(OptionError, match="seed"):
-        plane().reset(seed=seed)
+    first = SMEVectorEnv("Plane1", num_envs=np.int64(3)).reset(seed=np.array(5))[0]  # type: ignore[arg-type]
+    np.testing.assert_array_equal(first, env.reset(seed=5)[0])
+    one = np.array([False, True, False])  # a masked seed is of the lanes of the mask
+    again = env.reset(seed=40, options={"reset_mask": one})[0]
+    np.testing.assert_array_equal(again[[0, 2]], first[[0, 2]])
+    np.testing.assert_array_equal(again[1], SMEEnv("Plane1").reset(seed=41)[0])
 
 
 def test_both_back_ends_step_a_batch_through_the_same_states(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     pytest.importorskip("numba")
-    for name in ("Default", "HardFragile", "StateDim64", "ActionDim16"):
+    for name in ("HardFragile", "StateDim64", "ActionDim16"):
         envs = []
         for backend in ("numba", "numpy"):
             monkeypatch.setenv("SME_BACKEND", backend)
@@ -251,13 +228,6 @@ def test_a_pickled_batch_keeps_its_resting_lanes(mode: str) -> None:
     for _ in range(5):
         for got, expected in zip(twin.step(HALF)[:4], env.step(HALF)[:4], strict=True):
             np.testing.assert_array_equal(got, expected)
-
-
-def test_numpy_integers_serve_as_seed_and_number_of_lanes():
-    env = SMEVectorEnv("Default-v1", num_envs=np.int64(3))
-    assert env.num_envs == 3
-    first = env.reset(seed=np.array(5))[0]
-    np.testing.assert_array_equal(first, env.reset(seed=5)[0])
 
 
 @pytest.mark.parametrize("mode", MODES)
