@@ -5,11 +5,11 @@
     python -m tests.faults again tests/faults/x.jsonl --out tests/faults/y.jsonl
     python -m tests.faults show tests/faults/x.jsonl [tests/faults/y.jsonl]
 
-A fault is drawn by its statement: every statement of the paths (both packages, if none is named) is as
-likely as any other. It is planted in a copy of the tree, the tests that run its line are called there,
-the cheapest first and at most `--seconds` of them, and the first failure ends them. A verdict is written
-as soon as it is known, and an interrupted call goes on where it stopped. `again` plants the same faults,
-found by their text, under the tests of today.
+A fault is drawn by its statement: every statement of the paths (both packages, if none is named) is
+as likely as any other. It is planted in a copy of the tree, the tests that run its line are called
+there, the cheapest first and at most `--seconds` of them; the first failure ends them. A verdict
+is written as soon as it is known, and an interrupted call goes on where it stopped. `again` plants
+the same faults, found by their text, under the tests of today.
 
 Outside the suite: 80 faults take about an hour on one core.
 """
@@ -50,7 +50,7 @@ CALLS = {"min": "max", "max": "min", "any": "all", "all": "any", "minimum": "max
 
 @dataclass(frozen=True)
 class Fault:
-    """The text `before` at (line, column) of a file, replaced by `after`; `statement` is its line."""
+    """The text `before` at a place of a file, replaced by `after`; `statement` is its line."""
 
     path: str
     line: int
@@ -61,6 +61,9 @@ class Fault:
     verdict: str = ""
     by: str = ""
     seconds: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.path}:{self.line}  {self.before[:60]!r} -> {self.after[:60]!r}"
 
     @property
     def key(self) -> tuple[str, int, int, str, str]:
@@ -85,8 +88,10 @@ class Source:
 
     def statements(self) -> list[ast.stmt]:
         """All but docstrings, imports, definitions' own lines and what only type checkers read."""
-        skipped = (ast.Import, ast.ImportFrom, ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef,
-                   ast.Pass, ast.Try, ast.TypeAlias if hasattr(ast, "TypeAlias") else ast.Try)  # fmt: skip
+        skipped = (
+            *(ast.Import, ast.ImportFrom, ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef),
+            *(ast.Pass, ast.Try),
+        )
         return [
             node
             for node in ast.walk(self.tree)
@@ -114,7 +119,7 @@ class Source:
         text = self.segment(statement)
         effect = (
             (isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Call | ast.Await))
-            or isinstance(statement, ast.Raise | ast.AugAssign | ast.Continue | ast.Break | ast.Delete)
+            or isinstance(statement, ast.Raise | ast.AugAssign | ast.Continue | ast.Break)
             or (isinstance(statement, ast.Assign)
                 and isinstance(statement.targets[0], ast.Attribute | ast.Subscript))
         )  # fmt: skip
@@ -242,18 +247,25 @@ class Cover:
             self._relative(path): number
             for number, path in self._data.execute("select id, path from file")
         }
-        self.seconds: dict[str, float] = defaultdict(float)
-        self._ids: dict[tuple[str, str], str] = {}
+        contexts = self._data.execute("select context from context where context != ''")
+        self.names = {context.rpartition("|")[0] for (context,) in contexts}
+        self._seconds: dict[tuple[str, str], float] = defaultdict(float)
         for case in ElementTree.parse(folder / "seconds.xml").iter("testcase"):
-            *parts, last = case.get("classname", "").split(".")
-            file = "/".join([*parts, last]) + ".py"
-            self.seconds[f"{file}::{case.get('name')}"] += float(case.get("time", 0))
+            key = case.get("classname", ""), case.get("name", "")
+            self._seconds[key] += float(case.get("time", 0))
 
     @staticmethod
     def _relative(path: str) -> str:
         parts = Path(path).parts
         first = next(i for i, part in enumerate(parts) if part in PACKAGES)
         return "/".join(parts[first:])
+
+    def seconds(self, name: str) -> float:
+        """How long a test took, named as pytest names it: the report has dots and no ending."""
+        where, parameters = name.partition("[")[::2]
+        *parts, last = where.split("::")
+        test = f"{last}[{parameters}" if parameters else last
+        return self._seconds[".".join(parts).replace(".py", "").replace("/", "."), test]
 
     def tests(self, path: str, first: int, last: int) -> set[str]:
         """Those that ran a line of a range, or the file at all where the range runs at import."""
@@ -265,7 +277,7 @@ class Cover:
             " on context.id = line_bits.context_id where file_id = ?"
         )
         for context, bits in self._data.execute(query, [self._files.get(path, -1)]):
-            test = context.partition("|")[0]
+            test = context.rpartition("|")[0]
             if test:
                 anywhere.add(test)
                 if any(first <= number <= last for number in numbits_to_nums(bits)):
@@ -273,12 +285,12 @@ class Cover:
         return inside or anywhere or self._area(path)
 
     def _area(self, path: str) -> set[str]:
-        """The tests of the innermost folder of tests that mirrors the file's: for child processes."""
+        """The tests in the innermost folder that mirrors the file's: for child processes."""
         folder = Path(path).parent
         if folder.parts[0] == "sme_registry":
             folder = Path(*folder.parts[1:])
         while True:
-            here = {name for name in self.seconds if name.startswith(f"tests/{folder}/")}
+            here = {name for name in self.names if name.startswith(f"tests/{folder}/")}
             if here or folder == folder.parent:
                 return here
             folder = folder.parent
@@ -288,12 +300,13 @@ class Cover:
         rows = fault.before.count("\n")
         tests = self.tests(fault.path, fault.line, fault.line + rows)
         stem = Path(fault.path).stem
-        near = lambda name: stem not in name  # noqa: E731
+
+        def order(name: str) -> tuple[bool, bool, float, str]:
+            return self.seconds(name) > 1, stem not in name, self.seconds(name), name
+
         chosen, total = [], 0.0
-        for name in sorted(
-            tests, key=lambda name: (self.seconds[name] > 1, near(name), self.seconds[name], name)
-        ):
-            total += self.seconds[name] + 0.01
+        for name in sorted(tests, key=order):
+            total += self.seconds(name) + 0.01
             if chosen and total > seconds:
                 break
             chosen.append(name)
@@ -305,9 +318,9 @@ class Cover:
 
 def copied(folder: Path) -> None:
     """The tracked files of the working tree."""
-    names = subprocess.run(
-        ["git", "ls-files", "-co", "--exclude-standard", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout  # fmt: skip
+    command = ["git", "ls-files", "-co", "--exclude-standard", "-z"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    names = done.stdout
     for name in filter(None, names.split("\0")):
         if (ROOT / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -367,8 +380,7 @@ def judge(faults: list[Fault], arguments: argparse.Namespace) -> None:
             with out.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(asdict(judged), ensure_ascii=False) + "\n")
             print(f"{number:3}/{len(faults)} {judged.verdict:9} {judged.seconds:6} s  "
-                  f"{judged.path}:{judged.line}  {judged.before[:40]!r} -> {judged.after[:40]!r}"
-                  f"  {judged.by[:80]}", flush=True)  # fmt: skip
+                  f"{judged}  {judged.by[:80]}", flush=True)  # fmt: skip
     print(summary(read(out)))
 
 
@@ -401,9 +413,7 @@ def show(arguments: argparse.Namespace) -> None:
         print(f"{name}: {summary(faults)}")
         for fault in faults:
             if fault.verdict != "found":
-                print(
-                    f"  {fault.verdict} {fault.path}:{fault.line}  {fault.before!r} -> {fault.after!r}"
-                )
+                print(f"  {fault.verdict} {fault}")
 
 
 def main() -> None:
