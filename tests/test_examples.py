@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -13,11 +14,6 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 PPO_EXAMPLES = [example for example in EXAMPLES if example.stem.endswith("_ppo")]
-# None in sys.modules makes an import fail as if TorchRL were not installed.
-WITHOUT_TORCHRL = (
-    "import runpy, sys; sys.modules['tensordict'] = sys.modules['torchrl'] = None; "
-    "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
-)
 
 
 def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -30,19 +26,29 @@ def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize(
-    "example", sorted({*EXAMPLES} - {*PPO_EXAMPLES}), ids=lambda path: path.name
+    ("example", "arguments", "code", "message"),
+    [
+        *((path.name, ["--help"], 0, "usage:") for path in EXAMPLES if path not in PPO_EXAMPLES),
+        ("torchrl_team.py", [], 2, "tensordict is not installed. Run `pip install torchrl`."),
+        ("torchrl_team.py", ["--steps", "0"], 2, "--steps must be at least 1"),
+    ],
 )
-def test_help_works_without_optional_packages(example: Path) -> None:
-    done = run("-c", WITHOUT_TORCHRL, example, "--help")
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("usage:")
-
-
-def test_a_missing_torchrl_is_named_with_the_command_that_installs_it() -> None:
-    done = run("-c", WITHOUT_TORCHRL, ROOT / "examples" / "torchrl_team.py")
-    assert done.returncode == 2
-    assert "tensordict is not installed. Run `pip install torchrl`." in done.stderr
-    assert "Traceback" not in done.stderr
+def test_without_torchrl_an_example_helps_or_says_what_is_wrong(
+    example: str,
+    arguments: list[str],
+    code: int,
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for package in ("tensordict", "torchrl"):
+        monkeypatch.setitem(sys.modules, package, None)  # its import fails
+    monkeypatch.setattr(sys, "argv", [example, *arguments])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(ROOT / "examples" / example), run_name="__main__")
+    assert ended.value.code == code
+    printed = capsys.readouterr()
+    assert message in printed.out + printed.err
 
 
 @pytest.mark.parametrize("example", PPO_EXAMPLES, ids=lambda path: path.stem)
@@ -58,12 +64,6 @@ def test_ppo_of_a_framework_lowers_the_exact_regret(example: Path) -> None:
     before, after = (float(value) for value in re.findall(r"WD regret ([0-9.]+)", done.stdout))
     assert exploring[-1] < exploring[0]
     assert after < 0.8 * before
-
-
-def test_the_torchrl_example_rejects_invalid_options_first() -> None:
-    done = run("-c", WITHOUT_TORCHRL, ROOT / "examples" / "torchrl_team.py", "--steps", "0")
-    assert done.returncode == 2
-    assert "--steps must be at least 1" in done.stderr
 
 
 def test_the_torchrl_example_trains() -> None:
