@@ -17,7 +17,7 @@ from sme_registry.errors import ActionError, EpisodeError, OptionError, SpecErro
 
 pytest.importorskip("stable_baselines3")
 
-from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -64,11 +64,10 @@ def assert_same(got: Any, expected: Any) -> None:
         assert got == expected
 
 
-@pytest.mark.parametrize("action_range", ["symmetric", "unit"])
 @pytest.mark.parametrize(
-    "spec",
-    [HARD, BOTH, "Default", "Interval25", "HardFragile"],
-    ids=["hard", "both-flags", "Default", "Interval25", "HardFragile"],
+    ("spec", "action_range"),
+    [(HARD, "unit"), (BOTH, "symmetric"), ("HardFragile", "symmetric")],
+    ids=["hard", "both-flags", "HardFragile"],
 )
 def test_every_number_is_that_of_a_dummy_vec_env_of_singles(spec: Any, action_range: Any) -> None:
     ours = SMEVecEnv(spec, 3, action_range=action_range)
@@ -81,7 +80,7 @@ def test_every_number_is_that_of_a_dummy_vec_env_of_singles(spec: Any, action_ra
     rng = np.random.default_rng(0)
     low = ours.action_space.low[0]
     ends = 0
-    for _ in range(230):
+    for _ in range(120):
         optimal = ours.get_attr("task", 0)[0].optimal_action(np.array(ours.get_attr("state")))
         action = low + (1 - low) * (0.6 * optimal + 0.4 * rng.random(optimal.shape))
         got, expected = ours.step(action.astype(np.float32)), theirs.step(action.astype(np.float32))
@@ -104,9 +103,8 @@ def test_a_learner_sees_the_same_rollout_as_with_a_dummy_vec_env() -> None:
 @pytest.mark.parametrize(
     ("algorithm", "kwargs"),
     [
-        (PPO, {"n_steps": 64, "batch_size": 32, "n_epochs": 1}),
+        (PPO, {"n_steps": 32, "batch_size": 32, "n_epochs": 1}),
         (SAC, {"learning_starts": 20, "batch_size": 16, "buffer_size": 500}),
-        (TD3, {"learning_starts": 20, "batch_size": 16, "buffer_size": 500}),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
@@ -116,27 +114,14 @@ def test_sb3s_algorithms_learn_on_it(algorithm: Any, kwargs: dict[str, Any]) -> 
                       **kwargs)  # fmt: skip
     evaluated = EvalCallback(VecMonitor(SMEVecEnv("Default", 2, horizon=10)), n_eval_episodes=2,
                              eval_freq=20, verbose=0)  # fmt: skip
-    model.learn(256, callback=evaluated)
-    assert model.num_timesteps >= 256
+    model.learn(128, callback=evaluated)
+    assert model.num_timesteps >= 128
     assert all(episode["l"] == 10 for episode in model.ep_info_buffer)
-    assert len(model.ep_info_buffer) >= 24
+    assert len(model.ep_info_buffer) >= 12
     assert np.isfinite(evaluated.last_mean_reward)
 
 
-def test_the_optimum_earns_the_horizon_through_sb3s_own_evaluation() -> None:
-    class Optimum:
-        def predict(self, observation: Any, **_: Any) -> tuple[Any, None]:
-            state = observation[:, :-2].astype(np.float64)
-            return 2.0 * task.optimal_action(state) - 1.0, None
-
-    env = VecMonitor(SMEVecEnv("Complexity2", 4, k=7, horizon=20))
-    task = env.get_attr("task")[0]
-    mean, spread = evaluate_policy(Optimum(), env, n_eval_episodes=8)  # type: ignore[arg-type]
-    assert mean == pytest.approx(20.0, abs=1e-3)
-    assert spread == pytest.approx(0.0, abs=1e-3)
-
-
-def test_sb3s_wrappers_work_on_it_and_survive_pickling() -> None:
+def test_sb3s_wrappers_and_its_evaluation_work_on_it() -> None:
     env: Any = VecNormalize(VecFrameStack(VecCheckNan(VecMonitor(SMEVecEnv(HARD, 3))), 2))
     env.seed(0)
     env.reset()
@@ -149,21 +134,15 @@ def test_sb3s_wrappers_work_on_it_and_survive_pickling() -> None:
         assert all(("terminal_observation" in i) == d for i, d in zip(infos, dones, strict=True))
     assert episodes > 0
 
+    class Optimum:
+        def predict(self, observation: Any, **_: Any) -> tuple[Any, None]:
+            state = observation[:, :-2].astype(np.float64)
+            return 2.0 * task.optimal_action(state) - 1.0, None
 
-def test_a_pickled_copy_goes_on_as_the_original() -> None:
-    env = SMEVecEnv(HARD, 3)
-    env.seed(7)
-    env.reset()
-    env.set_attr("note", "mine", indices=[1])
-    rng = np.random.default_rng(0)
-    actions = rng.uniform(-1, 1, (40, 3, 4)).astype(np.float32)
-    for action in actions[:5]:
-        env.step(action)
-    twin = pickle.loads(pickle.dumps(env))
-    assert twin.get_attr("note", 1) == ["mine"]
-    for action in actions[5:]:
-        assert_same(twin.step(action), env.step(action))
-    assert_same(twin.get_attr("state"), env.get_attr("state"))
+    env = VecMonitor(SMEVecEnv("Complexity2", 4, k=7, horizon=20))
+    task = env.get_attr("task")[0]
+    mean, spread = evaluate_policy(Optimum(), env, n_eval_episodes=8)  # type: ignore[arg-type]
+    assert (mean, spread) == pytest.approx((20.0, 0.0), abs=1e-3)
 
 
 def test_attributes_and_methods_of_the_lanes_are_reached() -> None:
@@ -217,7 +196,8 @@ def test_infos_are_fresh_and_writing_into_what_is_returned_moves_nothing() -> No
     for e in (env, untouched):
         e.seed(0)
         e.reset()
-    for _ in range(40):
+    env.set_attr("note", "mine", indices=[1])
+    for t in range(40):
         action = rng.uniform(-1, 1, (3, 4)).astype(np.float32)
         got, expected = env.step(action), untouched.step(action)
         assert_same(got, expected)
@@ -227,6 +207,10 @@ def test_infos_are_fresh_and_writing_into_what_is_returned_moves_nothing() -> No
             info["optimal_action"][:] = 9.0
             info.get("terminal_observation", observations)[:] = 9.0
             info.clear()
+        if t == 5:
+            env = pickle.loads(pickle.dumps(env))  # goes on as the original
+            assert env.get_attr("note", 1) == ["mine"]
+    assert_same(env.get_attr("state"), untouched.get_attr("state"))
 
 
 def test_what_cannot_be_used_is_a_typed_error() -> None:
@@ -236,6 +220,8 @@ def test_what_cannot_be_used_is_a_typed_error() -> None:
         SMEVecEnv("Default", action_range="wide")  # type: ignore[arg-type]
     with pytest.raises(SpecError, match="complexity"):
         SMEVecEnv("Default", complexity=0)
+    with pytest.raises(SpecError, match="for a stream"):
+        SMEVecEnv("Switch5", 2, complexity=3)
     env = SMEVecEnv("Default", 2)
     with pytest.raises(EpisodeError, match="reset"):
         env.step(np.zeros((2, 4)))
@@ -249,14 +235,13 @@ def test_what_cannot_be_used_is_a_typed_error() -> None:
     env.step(np.zeros((2, 4)))
 
 
-@pytest.mark.parametrize("method", ["spawn"])
-def test_subprocess_workers_make_it_by_module_and_id(method: str) -> None:
+def test_subprocess_workers_make_it_by_module_and_id() -> None:
     kwargs: dict[str, Any] = {
         "n_envs": 2, "seed": 5, "env_kwargs": {"action_range": "symmetric", "horizon": 6, "k": 4}
     }  # fmt: skip
     workers = make_vec_env(
         "sme_registry:SME/Default-v1", vec_env_cls=SubprocVecEnv,
-        vec_env_kwargs={"start_method": method}, **kwargs,
+        vec_env_kwargs={"start_method": "spawn"}, **kwargs,
     )  # fmt: skip
     ours = SMEVecEnv("Default", 2, horizon=6, k=4)
     ours.seed(5)
@@ -286,17 +271,17 @@ def test_without_sb3_the_way_to_install_it_is_named() -> None:
 
 def test_frames_are_those_of_a_dummy_vec_env_of_singles() -> None:
     pytest.importorskip("pygame")
-    ours = SMEVecEnv(HARD, 3, render_mode="rgb_array")
-    few = SMEVecEnv(HARD, 3, render_mode="rgb_array", render_lanes=[1])
-    theirs = dummy(HARD, render_mode="rgb_array")
+    ours = SMEVecEnv(HARD, 2, render_mode="rgb_array")
+    few = SMEVecEnv(HARD, 2, render_mode="rgb_array", render_lanes=[1])
+    theirs = dummy(HARD, 2, render_mode="rgb_array")
     assert ours.render_mode == "rgb_array"
     assert ours.metadata["render_fps"] == 10
     for env in (ours, few, theirs):
         env.seed(3)
         env.reset()
     ours.action_space.seed(0)
-    for _ in range(15):
-        actions = np.stack([ours.action_space.sample() for _ in range(3)])
+    for _ in range(6):
+        actions = np.stack([ours.action_space.sample() for _ in range(2)])
         for env in (ours, few, theirs):
             env.step(actions)
         frames = ours.get_images()
@@ -344,10 +329,3 @@ def test_lives_of_a_stream_are_those_of_a_dummy_vec_env(switch: str) -> None:
     assert [info["phase"] for info in ours.reset_infos] == [0, 0, 0]
     assert ours.env_method("reset", indices=1, seed=0)[0][1]["lifetime"] == 0
     assert ours.get_attr("spec", 0)[0].id == f"SME/{stream.content_name}-v1"
-
-
-def test_sb3_learns_on_a_stream_by_name() -> None:
-    env = VecMonitor(SMEVecEnv("Switch5", 2))
-    PPO("MlpPolicy", env, n_steps=32, batch_size=16, n_epochs=1, device="cpu").learn(64)
-    with pytest.raises(SpecError, match="for a stream"):
-        SMEVecEnv("Switch5", 2, complexity=3)

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +19,7 @@ pytest.importorskip("stable_baselines3")
 
 import torch
 from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sme_registry.export import export_onnx
@@ -50,6 +47,16 @@ def same_weights(one: Any, other: Any) -> bool:
     return all(torch.equal(a, b) for a, b in pairs)
 
 
+def noting(costs: list[float]) -> Any:
+    """A callback that collects the cost of each step."""
+
+    def note(local: Any, _: Any) -> bool:
+        costs.extend(info["cost"] for info in local["infos"])
+        return True
+
+    return note
+
+
 def reloaded(model: Any, env: Any = None) -> Any:
     archive = io.BytesIO()
     model.save(archive)
@@ -59,13 +66,13 @@ def reloaded(model: Any, env: Any = None) -> Any:
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_without_a_multiplier_it_is_ppo_bit_for_bit(count: int) -> None:
-    plain = PPO("MlpPolicy", lanes(count), **SMALL).learn(400)
+    plain = PPO("MlpPolicy", lanes(count), **SMALL).learn(200)
     fixed = PPOLagrangian("MlpPolicy", lanes(count), multiplier_learning_rate=0.0, **SMALL)
-    assert same_weights(plain.policy, fixed.learn(400).policy)
+    assert same_weights(plain.policy, fixed.learn(200).policy)
     weighted = PPOLagrangian(
         "MlpPolicy", lanes(count), multiplier=1.0, multiplier_learning_rate=0.0, **SMALL
     )
-    assert not same_weights(plain.policy, weighted.learn(400).policy)
+    assert not same_weights(plain.policy, weighted.learn(200).policy)
     assert weighted.multiplier == 1.0
 
 
@@ -110,12 +117,7 @@ def test_a_multiplier_lowers_the_cost_and_the_critic_of_costs_learns() -> None:
     )
     untrained = {k: v.clone() for k, v in model.cost_critic.state_dict().items()}
     costs: list[float] = []
-
-    def note(local: Any, _: Any) -> bool:
-        costs.extend(info["cost"] for info in local["infos"])
-        return True
-
-    model.learn(5_000, callback=note)
+    model.learn(4_000, callback=noting(costs))
     assert np.mean(costs[-1000:]) < 0.5 * np.mean(costs[:1000])
     # With γ = 0.5 the costs from a state on are about twice its mean cost.
     values = model._cost_values(observations())
@@ -125,9 +127,11 @@ def test_a_multiplier_lowers_the_cost_and_the_critic_of_costs_learns() -> None:
     assert torch.equal(untrained["action_net.weight"], learned["action_net.weight"])
 
 
-def test_a_saved_model_keeps_its_multiplier_and_the_critic_of_costs() -> None:
+def test_a_saved_model_keeps_its_multiplier_and_critic_but_not_its_last_rollout() -> None:
     model = PPOLagrangian("MlpPolicy", lanes(), cost_limit=0.0, **SMALL).learn(200)
+    assert {"_costs", "_cut"} <= set(vars(model))
     again = reloaded(model, lanes())
+    assert not {"_costs", "_cut"} & set(vars(again))
     assert again.multiplier == model.multiplier > 0.0
     assert again.cost_limit == 0.0
     assert same_weights(again.cost_critic, model.cost_critic)
@@ -140,14 +144,10 @@ def test_projected_actions_never_cost_anything(action_range: Any) -> None:
     env = lanes(2, action_range=action_range)
     costs: list[float] = []
 
-    def note(local: Any, _: Any) -> bool:
-        costs.extend(info["cost"] for info in local["infos"])
-        return True
-
     model = PPOProjection("MlpPolicy", env, **SMALL)
     # Biased towards high actions, so that most of them would be above the limits.
     model.policy.action_net.bias.data += 1.0
-    model.learn(256, callback=note)
+    model.learn(256, callback=noting(costs))
     assert len(costs) >= 256
     assert max(costs) == 0.0
     task, seen = materialize(SPEC), observations()
@@ -163,41 +163,27 @@ def test_projected_actions_never_cost_anything(action_range: Any) -> None:
     assert np.array_equal(policy.act(seen), actions)
 
 
-def test_a_saved_model_leaves_its_last_rollout_out() -> None:
-    model = PPOLagrangian("MlpPolicy", lanes(), **SMALL).learn(64)
-    assert {"_costs", "_cut"} <= set(vars(model))
-    again = reloaded(model, lanes())
-    assert not {"_costs", "_cut"} & set(vars(again))
-    again.learn(64)
-
-
-def test_projected_actions_need_states_that_the_observation_shows() -> None:
-    distracted = SPEC.derive(observation={"distractors": 2})
-    PPOProjection("MlpPolicy", lanes(spec=distracted), **SMALL).learn(64)
+def test_projected_actions_need_observations_that_show_the_state() -> None:
+    for wrapper in (VecNormalize, lambda venv: VecFrameStack(venv, 2)):
+        with pytest.raises(OptionError, match=r"must be those of the environment itself, Box\(0\."):
+            PPOProjection("MlpPolicy", wrapper(lanes()))
     mixed = SPEC.derive(observation={"mixing": "orthogonal"})
     with pytest.raises(OptionError, match=r"mixing='orthogonal': must be 'none'"):
         PPOProjection("MlpPolicy", lanes(spec=mixed))
+    with pytest.raises(OptionError, match="has no `sme_spec`"):
+        PPOLagrangian("MlpPolicy", make_vec_env("Pendulum-v1"))
+    distracted = lanes(spec=SPEC.derive(observation={"distractors": 2}))
+    for env in (distracted, VecNormalize(lanes(), norm_obs=False)):
+        PPOProjection("MlpPolicy", env, **SMALL).learn(64)
 
 
-@pytest.mark.parametrize("wrapper", [VecNormalize, lambda venv: VecFrameStack(venv, 2)])
-def test_projected_actions_need_the_observations_of_the_environment_itself(wrapper: Any) -> None:
-    with pytest.raises(OptionError, match=r"must be those of the environment itself, Box\(0\.0"):
-        PPOProjection("MlpPolicy", wrapper(lanes()))
-    rewards_only = VecNormalize(lanes(), norm_obs=False)
-    PPOProjection("MlpPolicy", rewards_only, **SMALL).learn(64)
-
-
-def test_a_projection_goes_on_in_its_own_task_only() -> None:
+def test_a_projection_goes_on_in_its_own_task_only_and_is_not_exported(tmp_path: Path) -> None:
     model = PPOProjection("MlpPolicy", lanes(), **SMALL)
     model.set_env(lanes())
     tighter = SPEC.derive(safety={"tightness": 0.4})
     with pytest.raises(OptionError, match=r"set_env: the environment's task is sha256:.*load"):
         model.set_env(lanes(spec=tighter))
     assert reloaded(model, lanes(spec=tighter)).learn(64)
-
-
-def test_a_projection_is_not_exported_as_if_it_were_none(tmp_path: Path) -> None:
-    model = PPOProjection("MlpPolicy", lanes(), **SMALL)
     with pytest.raises(PolicyError, match="projection cannot be exported"):
         export_onnx(model, SPEC, tmp_path / "policy.onnx")
 
@@ -217,21 +203,15 @@ def test_a_task_without_limits_is_refused(algorithm: str, tmp_path: Path) -> Non
         check_task(cell(algorithm, spec=plain))
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "allowed"),
-    [
+def test_hyperparameters_are_known_by_name_and_in_their_range() -> None:
+    for name, value, allowed in (
         ("cost_limit", 1.5, r"in \[0, 1\]"),
         ("cost_limit", "0.1", r"in \[0, 1\]"),
         ("multiplier", -1.0, "of at least 0"),
         ("multiplier_learning_rate", math.nan, "of at least 0"),
-    ],
-)
-def test_hyperparameters_out_of_range_are_refused(name: str, value: Any, allowed: str) -> None:
-    with pytest.raises(OptionError, match=rf"^{name}=.*: must be a finite number {allowed}"):
-        PPOLagrangian("MlpPolicy", lanes(), **{name: value})
-
-
-def test_hyperparameters_are_known_by_name() -> None:
+    ):
+        with pytest.raises(OptionError, match=rf"^{name}=.*: must be a finite number {allowed}"):
+            PPOLagrangian("MlpPolicy", lanes(), **{name: value})
     check_hyperparameters("PPOLagrangian", {"cost_limit": 0.1, "n_steps": 64})
     with pytest.raises(OptionError, match=r"cost_limits: .*Did you mean 'cost_limit'"):
         check_hyperparameters("PPOLagrangian", {"cost_limits": 0.1})
@@ -303,52 +283,32 @@ def test_a_run_logs_and_draws_the_cost_of_its_episodes(algorithm: str, tmp_path:
     assert evaluate(str(result.model_path), SPEC, PROTOCOL).wd_regret == result.report.wd_regret
 
 
-_SCRIPT = """
-import sys
-from sme_registry import SMESpec
-from sme_registry.training import train
-spec = SMESpec(state_dim=3, action_dim=2, horizon=20, safety={"tightness": 0.2}, seed=5)
-train(spec, algorithm="PPOLagrangian", steps=100_000, folder=sys.argv[1], checkpoint_every=64,
-      hyperparameters={"n_steps": 64, "n_epochs": 1, "cost_limit": 0.0},
-      protocol={"states_per_region": 50}, progress=False)
-"""
+def test_a_stopped_run_resumes_with_its_multiplier(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings: dict[str, Any] = {
+        "algorithm": "PPOLagrangian", "folder": tmp_path / "run", "checkpoint_every": 64,
+        "protocol": PROTOCOL, "progress": False,
+    }  # fmt: skip
+    rounds, train_once = [], PPOLagrangian.train
 
+    def stop(model: Any) -> None:
+        rounds.append(model)
+        if len(rounds) == 4:
+            raise KeyboardInterrupt
+        train_once(model)
 
-def test_a_killed_run_resumes_with_its_multiplier(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    process = subprocess.Popen([sys.executable, "-c", _SCRIPT, str(folder)])
-    try:
-        deadline = time.monotonic() + 120
-        while time.monotonic() < deadline and process.poll() is None:
-            record = RunRecord.read(folder) if (folder / "run.json").exists() else None
-            if record is not None and record.steps_done >= 192:
-                break
-            time.sleep(0.05)
-    finally:
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-    record = RunRecord.read(folder)
+    hyperparameters = {"n_steps": 64, "n_epochs": 1, "cost_limit": 0.0}
+    monkeypatch.setattr(PPOLagrangian, "train", stop)
+    with pytest.raises(KeyboardInterrupt):
+        train(SPEC, steps=1000, hyperparameters=hyperparameters, **settings)
+    monkeypatch.setattr(PPOLagrangian, "train", train_once)
+    record = RunRecord.read(tmp_path / "run")
     assert record is not None
-    assert record.steps_done >= 192
-    before = checkpoint.load(PPOLagrangian, folder / "checkpoint.zip", lanes()).multiplier
-    assert before > 0.1
-    result = train(
-        SPEC,
-        algorithm="PPOLagrangian",
-        steps=record.steps_done + 64,
-        folder=folder,
-        checkpoint_every=64,
-        protocol=PROTOCOL,
-        progress=False,
-        resume=True,
-    )
+    assert 192 <= record.steps_done < 1000
+    stored = checkpoint.load(PPOLagrangian, tmp_path / "run" / "checkpoint.zip", lanes())
+    assert stored.multiplier > 0.1
+    result = train(SPEC, steps=record.steps_done + 64, resume=True, **settings)
     # It only rises, since the limit is 0.
-    assert PPOLagrangian.load(result.model_path).multiplier > before
+    assert PPOLagrangian.load(result.model_path).multiplier > stored.multiplier
     assert all(episode.safety is not None for episode in result.episodes)
-
-
-def test_an_environment_of_another_package_is_refused() -> None:
-    from stable_baselines3.common.env_util import make_vec_env
-
-    with pytest.raises(OptionError, match="has no `sme_spec`"):
-        PPOLagrangian("MlpPolicy", make_vec_env("Pendulum-v1"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -15,68 +16,50 @@ from sme_registry.testing import ConformanceError
 TASK = SMESpec(horizon=12, k=5, D=0.2, complexity=2)
 
 
-class Pays(SMEEnv):
-    """Pays a little too much at the end of each interval."""
+def stepping(change: Any, base: Any = SMEEnv) -> Any:
+    """An environment whose `step` returns something else: `change(env, *returned)`."""
 
-    def step(self, action: Any) -> Any:
-        observation, reward, terminated, truncated, info = super().step(action)
-        return observation, reward * (1 + 1e-9), terminated, truncated, info
+    class Faulty(base):
+        def step(self, action: Any) -> Any:
+            return change(self, *super().step(action))
 
-
-class Swallows(SMEEnv):
-    """Loses what is still to be paid when time runs out."""
-
-    def step(self, action: Any) -> Any:
-        observation, reward, terminated, truncated, info = super().step(action)
-        return observation, 0.0 if truncated else reward, terminated, truncated, info
+    return Faulty
 
 
-class Drifts(SMEEnv):
-    """Is off by one unit in the last place of one channel."""
+def resetting(change: Any) -> Any:
+    """An environment whose `reset` is `change(reset, seed, options)`."""
 
-    def step(self, action: Any) -> Any:
-        returned = super().step(action)
-        self._lane[LANE_STATE] = np.nextafter(self._lane[LANE_STATE], 0.5)
-        return returned
+    class Faulty(SMEEnv):
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            return change(super().reset, seed, options)
+
+    return Faulty
 
 
-class Reuses(SMEEnv):
+def changed_info(change: Any, base: Any = SMEEnv) -> Any:
+    """An environment whose `step` has another info: `change(env, info)`."""
+    return stepping(lambda env, *returned: (*returned[:4], change(env, returned[4])), base)
+
+
+def loses_the_last_payout(env: Any, seen: Any, reward: Any, *rest: Any) -> Any:
+    return seen, 0.0 if rest[1] else reward, *rest
+
+
+def drifts(env: Any, *returned: Any) -> Any:
+    """One channel of the state is off by one unit in the last place."""
+    env._lane[LANE_STATE] = np.nextafter(env._lane[LANE_STATE], 0.5)
+    return returned
+
+
+def reuses(env: Any, info: Any) -> Any:
     """Hands out the same info arrays at each step."""
-
-    def step(self, action: Any) -> Any:
-        *returned, info = super().step(action)
-        self.__dict__.setdefault("kept", info["optimal_action"])[:] = info["optimal_action"]
-        return *returned, {**info, "optimal_action": self.kept}
+    env.__dict__.setdefault("kept", info["optimal_action"])[:] = info["optimal_action"]
+    return {**info, "optimal_action": env.kept}
 
 
-class Leaks(SMEEnv):
-    """Has more in its info than was promised."""
-
-    def step(self, action: Any) -> Any:
-        *returned, info = super().step(action)
-        return *returned, {**info, "state": self.state}
-
-
-class SaysNothingAtReset(SMEEnv):
-    """Has no info at reset, where collectors expect the keys of a step."""
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        return super().reset(seed=seed, options=options)[0], {}
-
-
-class PythonNumbers(SMEEnv):
-    """Has numbers without a dtype in its info."""
-
-    def step(self, action: Any) -> Any:
-        *returned, info = super().step(action)
-        return *returned, {**info, "regret": float(info["regret"])}
-
-
-class Unseeded(SMEEnv):
-    """Ignores its seed."""
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        return super().reset(seed=None, options=options)
+def outside(reset: Any, seed: Any, options: Any) -> Any:
+    observation, info = reset(seed=seed, options=options)
+    return observation + np.float32(1.0), info
 
 
 class Forgets(SMEEnv):
@@ -94,58 +77,29 @@ class Shares(SMEEnv):
         return self
 
 
-class Outside(SMEEnv):
-    """Observes what its space does not hold."""
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        observation, info = super().reset(seed=seed, options=options)
-        return observation + np.float32(1.0), info
-
-
 class Warns(SMEEnv):
     """Has an observation space that Gymnasium warns of."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.observation_space = type(self.observation_space)(
-            -np.inf, np.inf, self.observation_space.shape, np.float32
-        )
+        box = self.observation_space
+        self.observation_space = type(box)(-np.inf, np.inf, box.shape, np.float32)
 
 
-class OffByOneBit(SMEVectorEnv):
-    """Its last lane is paid one unit in the last place too much."""
-
-    def step(self, actions: Any) -> Any:
-        observations, rewards, *rest = super().step(actions)
-        rewards[-1] = np.nextafter(rewards[-1], 9.0)
-        return observations, rewards, *rest
+def off_by_one_bit(env: Any, observations: Any, rewards: Any, *rest: Any) -> Any:
+    rewards[-1] = np.nextafter(rewards[-1], 9.0)
+    return observations, rewards, *rest
 
 
-class MislaysLast(SMEVectorEnv):
+def mislays_last(env: Any, observations: Any, *rest: Any) -> Any:
     """Gives the first observation of the next episode as the last of this one."""
-
-    def step(self, actions: Any) -> Any:
-        observations, *rest, infos = super().step(actions)
-        for lane in np.flatnonzero(infos.get("_final_obs", [])):
-            infos["final_obs"][lane] = observations[lane].copy()
-        return observations, *rest, infos
+    for lane in np.flatnonzero(rest[-1].get("_final_obs", [])):
+        rest[-1]["final_obs"][lane] = observations[lane].copy()
+    return observations, *rest
 
 
-class KeepsTheLastRegret(SMEVectorEnv):
-    """Has a regret of 0, not NaN, in lanes that were reset."""
-
-    def step(self, actions: Any) -> Any:
-        *rest, infos = super().step(actions)
-        return *rest, {k: np.nan_to_num(v) if k == "regret" else v for k, v in infos.items()}
-
-
-class EmptyFinals(SMEVectorEnv):
-    """Has the keys of last observations where no episode has ended."""
-
-    def step(self, actions: Any) -> Any:
-        *rest, infos = super().step(actions)
-        nothing = {"final_obs": np.full(3, None), "_final_obs": np.zeros(3, bool)}
-        return *rest, nothing | infos
+def keeps_the_last_regret(env: Any, infos: Any) -> Any:
+    return {key: np.nan_to_num(v) if key == "regret" else v for key, v in infos.items()}
 
 
 class CopiesLate(SMEVectorEnv):
@@ -156,26 +110,41 @@ class CopiesLate(SMEVectorEnv):
         self._batch._t = self._batch._t + 1
 
 
+EMPTY_FINALS = {"final_obs": np.full(3, None), "_final_obs": np.zeros(3, bool)}
+PAYS_TOO_MUCH = stepping(lambda env, seen, reward, *rest: (seen, reward * (1 + 1e-9), *rest))
+UNSEEDED = resetting(lambda reset, seed, options: reset(seed=None, options=options))
+NO_INFO = resetting(lambda reset, seed, options: (reset(seed=seed, options=options)[0], {}))
+LEAKS = changed_info(lambda env, info: {**info, "state": env.state})
+PYTHON_NUMBERS = changed_info(lambda env, info: {**info, "regret": float(info["regret"])})
+WITH_EMPTY_FINALS = changed_info(lambda env, infos: EMPTY_FINALS | infos, SMEVectorEnv)
+
+
+@functools.cache
+def passes(check: Any) -> None:
+    check(TASK)
+
+
 @pytest.mark.parametrize(
     ("check", "faulty", "words"),
     [
-        (testing.check_definition, Pays, "the reward"),
-        (testing.check_definition, Swallows, "the reward"),
-        (testing.check_definition, Drifts, "the next state"),
-        (testing.check_optimum, Swallows, "the optimum's return"),
-        (testing.check_info, Reuses, "later step reuses an array"),
-        (testing.check_info, Leaks, "keys"),
-        (testing.check_info, SaysNothingAtReset, "info at reset: the keys"),
-        (testing.check_info, PythonNumbers, "regret=.*must be a float64"),
-        (testing.check_determinism, Unseeded, "two runs of one seed"),
+        (testing.check_definition, PAYS_TOO_MUCH, "the reward"),
+        (testing.check_definition, stepping(loses_the_last_payout), "the reward"),
+        (testing.check_definition, stepping(drifts), "the next state"),
+        (testing.check_optimum, stepping(loses_the_last_payout), "the optimum's return"),
+        (testing.check_info, changed_info(reuses), "later step reuses an array"),
+        (testing.check_info, LEAKS, "keys"),
+        (testing.check_info, NO_INFO, "info at reset: the keys"),
+        (testing.check_info, PYTHON_NUMBERS, "regret=.*must be a float64"),
+        (testing.check_determinism, UNSEEDED, "two runs of one seed"),
         (testing.check_pickling, Forgets, "pickled copy of the single"),
         (testing.check_pickling, Shares, "deep copy of the single"),
-        (testing.check_gymnasium, Outside, "observation space"),
+        (testing.check_gymnasium, resetting(outside), "observation space"),
         (testing.check_gymnasium, Warns, "warns: .*infinity"),
+        (testing.check_sme, PAYS_TOO_MUCH, "the reward"),
     ],
 )
 def test_a_faulty_environment_is_seen(check: Any, faulty: type[SMEEnv], words: str) -> None:
-    check(TASK)
+    passes(check)
     with pytest.raises(ConformanceError, match=words):
         check(TASK, single=faulty)
 
@@ -183,29 +152,27 @@ def test_a_faulty_environment_is_seen(check: Any, faulty: type[SMEEnv], words: s
 @pytest.mark.parametrize(
     ("check", "faulty", "words"),
     [
-        (testing.check_vector, OffByOneBit, "NextStep, unit: step 1"),
-        (testing.check_vector, MislaysLast, "SameStep.*final_obs"),
-        (testing.check_vector, KeepsTheLastRegret, "regret: expected"),
-        (testing.check_vector, EmptyFinals, "NextStep, unit: step 1: the keys"),
+        (testing.check_vector, stepping(off_by_one_bit, SMEVectorEnv), "NextStep, unit: step 1"),
+        (testing.check_vector, stepping(mislays_last, SMEVectorEnv), "SameStep.*final_obs"),
+        (
+            testing.check_vector,
+            changed_info(keeps_the_last_regret, SMEVectorEnv),
+            "regret: expected",
+        ),
+        (testing.check_vector, WITH_EMPTY_FINALS, "NextStep, unit: step 1: the keys"),
         (testing.check_pickling, CopiesLate, "vector"),
     ],
 )
 def test_a_faulty_batch_is_seen(check: Any, faulty: type[SMEVectorEnv], words: str) -> None:
-    check(TASK)
+    passes(check)
     with pytest.raises(ConformanceError, match=words):
         check(TASK, vector=faulty)
 
 
 def test_an_env_spec_that_names_another_task_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    def other(spec: SMESpec, **kwargs: Any) -> Any:
-        return original(spec.derive(seed=99), **kwargs)
-
     original = testing.single.env_spec
-    monkeypatch.setattr(testing.single, "env_spec", other)
+    monkeypatch.setattr(
+        testing.single, "env_spec", lambda spec, **kw: original(spec.derive(seed=99), **kw)
+    )
     with pytest.raises(ConformanceError, match="the digest after EnvSpec"):
         testing.check_env_spec(TASK)
-
-
-def test_the_whole_kit_stops_at_the_first_fault() -> None:
-    with pytest.raises(ConformanceError, match="the reward"):
-        testing.check_sme(TASK, single=Pays)

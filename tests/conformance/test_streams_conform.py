@@ -21,7 +21,6 @@ from sme_registry.errors import (
 )
 from sme_registry.spec import StreamFile, catalogue
 from sme_registry.testing import ConformanceError
-from tests.conformance.test_identity import fresh_python
 
 NAMES = catalogue.names(StreamFile)
 SPEC = {"state_dim": 3, "action_dim": 2, "horizon": 9, "D": 0.3, "complexity": 2}
@@ -40,27 +39,26 @@ def short(**fields: Any) -> StreamSpec:
     return StreamSpec.from_dict({**SHORT.to_dict(), **fields})
 
 
-@pytest.mark.parametrize("observes_phase", [False, True])
-@pytest.mark.parametrize("switch", ["episode", "step"])
+@pytest.mark.parametrize(("switch", "observes_phase"), [("episode", False), ("step", True)])
 def test_streams_pass_the_conformance_kit(switch: str, observes_phase: bool) -> None:
     testing.check_stream(short(switch=switch, observes_phase=observes_phase))
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_stream_of_the_catalogue_has_its_ids(name: str) -> None:
-    stream = sme_registry.load(name, StreamSpec)
-    ids = [name, f"Stream{name}", catalogue.symmetric_name(name), f"{stream.content_name}-v1"]
-    for env_id in (f"SME/{each}" for each in ids):
-        env = gymnasium.make(env_id)
-        assert env.unwrapped.stream == stream
-        assert env.spec.id == env_id
-        assert env.spec.max_episode_steps == stream.horizon
-        assert env.action_space.low[0] == (-1.0 if "Symmetric" in env_id else 0.0)
-        again = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
-        assert again.unwrapped.stream == stream
-        assert again.spec.id == env_id
-    check_env(gymnasium.make(f"SME/{name}").unwrapped, skip_render_check=name != "Switch5-v1")
-    testing.check_env_spec(name)
+def test_streams_of_the_catalogue_have_their_ids() -> None:
+    for name in NAMES:
+        stream = sme_registry.load(name, StreamSpec)
+        ids = [name, f"Stream{name}", catalogue.symmetric_name(name), f"{stream.content_name}-v1"]
+        for env_id in (f"SME/{each}" for each in ids):
+            env = gymnasium.make(env_id)
+            assert env.unwrapped.stream == stream
+            assert env.spec.id == env_id
+            assert env.spec.max_episode_steps == stream.horizon
+            assert env.action_space.low[0] == (-1.0 if "Symmetric" in env_id else 0.0)
+            again = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
+            assert again.unwrapped.stream == stream
+            assert again.spec.id == env_id
+    check_env(gymnasium.make("SME/Switch5-v1").unwrapped)
+    testing.check_env_spec("Switch5-v1")
 
 
 def test_names_make_single_environments_and_native_batches() -> None:
@@ -73,15 +71,6 @@ def test_names_make_single_environments_and_native_batches() -> None:
     assert batch.single_action_space.low[0] == -1.0
     assert str(batch) == "SMEStreamVectorEnv(SME/Switch5-v1, num_envs=2)"
     assert repr(env.unwrapped) == "SMEStreamEnv(SME/Switch5-v1)"
-
-
-def test_a_module_and_an_id_make_a_stream_in_a_fresh_process() -> None:
-    digest = fresh_python(
-        "import gymnasium\n"
-        "env = gymnasium.make('sme_registry:SME/Switch5-v1')\n"
-        "print(env.unwrapped.stream.digest, end='')"
-    )
-    assert digest == sme_registry.load("Switch5", StreamSpec).digest
 
 
 def test_a_stream_of_ones_own_goes_by_content_or_by_a_registered_name() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,13 +11,13 @@ import pytest
 from pettingzoo.utils.conversions import aec_to_parallel, parallel_to_aec
 
 import sme_registry
-from sme_registry import SMESpec, teams, testing
+from sme_registry import SMESpec, testing
 from sme_registry.spec import catalogue
 from sme_registry.spec.envelope import EnvFile
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # importing PettingZoo's tests warns of their own module's age
-    from pettingzoo.test import api_test, max_cycles_test, render_test, seed_test
+    from pettingzoo.test import api_test, render_test, seed_test
 
 TEAMS = [file.versioned_name for file in catalogue.entries(EnvFile) if file.spec.team is not None]
 UNEQUAL = {
@@ -30,12 +29,8 @@ UNEQUAL = {
 }
 
 
-def test_the_catalogue_has_teams() -> None:
-    assert {"Team2-v1", "Team4-v1", "Team8-v1", "TeamBlind4-v1", "TeamShared4-v1"} <= set(TEAMS)
-
-
-@pytest.mark.parametrize("name", [*TEAMS, "Default-v1", "HardFragile-v1"])
-def test_every_team_passes_the_conformance_kit(name: str) -> None:
+@pytest.mark.parametrize("name", ["Team2", "TeamBlindShared4", "DuoDeep", "HardFragile"])
+def test_a_team_of_each_kind_passes_the_conformance_kit(name: str) -> None:
     testing.check_team(name)
 
 
@@ -44,30 +39,18 @@ def test_every_team_passes_the_conformance_kit(name: str) -> None:
     [
         {"horizon": 1, "action_dim": 2, "team": {"agents": [{"action_dim": 1}] * 2}},
         {"k": 3, "r_min": 0.2, "D": 0.3, "horizon": 10, "team": UNEQUAL},
-        {"k": 50, "horizon": 12, "complexity": 4, "team": {**UNEQUAL, "reward": "team"}},
-        {"D": 0.4, "team": {**UNEQUAL, "reward": "team"}, "seed": "0xabc"},
+        {"k": 50, "horizon": 12, "D": 0.4, "team": {**UNEQUAL, "reward": "team"}},
         {"team": {"agents": [{"name": "lone_7", "action_dim": 4, "observes": [1, 3]}]}},
     ],
-    ids=["short", "fragile", "deep", "shared", "lone"],
+    ids=["short", "fragile", "shared", "lone"],
 )
 def test_teams_at_the_edges_pass_the_conformance_kit(fields: dict[str, Any]) -> None:
     testing.check_team(fields)
 
 
-@pytest.mark.parametrize("name", ["Team4-v1", "TeamBlindShared4-v1"])
-def test_a_team_in_turns_by_make_aec_passes_pettingzoos_tests(name: str) -> None:
-    api_test(sme_registry.make_aec(name), num_cycles=300)
-    seed_test(lambda: sme_registry.make_aec(name))
-
-
-def test_the_horizon_is_what_pettingzoos_max_cycles_test_asks_for() -> None:
-    def with_horizon(make: Any) -> Any:
-        return lambda max_cycles: make("Team4", horizon=max_cycles)
-
-    module = SimpleNamespace(
-        parallel_env=with_horizon(teams.parallel_env), env=with_horizon(teams.env)
-    )
-    max_cycles_test(module)
+def test_a_team_in_turns_by_make_aec_passes_pettingzoos_tests() -> None:
+    api_test(sme_registry.make_aec("Team4-v1", horizon=20), num_cycles=100)
+    seed_test(lambda: sme_registry.make_aec("Team4-v1", horizon=20))
 
 
 def test_a_team_passes_pettingzoos_render_test(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,14 +59,14 @@ def test_a_team_passes_pettingzoos_render_test(monkeypatch: pytest.MonkeyPatch) 
     render_test(lambda render_mode: sme_registry.make_aec("Team2", render_mode=render_mode))
 
 
-@pytest.mark.parametrize("name", TEAMS)
-def test_a_team_is_in_pettingzoos_registry_by_name_and_by_content(name: str) -> None:
-    spec = sme_registry.load(name)
-    for env_id in (f"SME/{name}", f"SME/{spec.content_name}-v1"):
-        env = pettingzoo.make("parallel", env_id)
-        assert env.sme_spec == spec
-        assert pettingzoo.make("aec", env_id).unwrapped.sme_spec == spec
-        assert pettingzoo.make("parallel", env_id, seed=5).sme_spec == spec.derive(seed=5)
+def test_teams_are_in_pettingzoos_registry_by_name_and_by_content() -> None:
+    assert {"Team2-v1", "Team4-v1", "Team8-v1", "TeamBlind4-v1", "TeamShared4-v1"} <= set(TEAMS)
+    for name in TEAMS:
+        spec = sme_registry.load(name)
+        for env_id in (f"SME/{name}", f"SME/{spec.content_name}-v1"):
+            assert pettingzoo.make("parallel", env_id).sme_spec == spec
+            assert pettingzoo.make("aec", env_id).unwrapped.sme_spec == spec
+            assert pettingzoo.make("parallel", env_id, seed=5).sme_spec == spec.derive(seed=5)
 
 
 def test_single_agents_stay_out_of_pettingzoos_registry_and_teams_out_of_gymnasiums() -> None:
