@@ -1,16 +1,10 @@
 """Lives in streams whose faults are known, and the folders that training leaves of them."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 
 from sme_registry import SMESpec, StreamSpec
-from sme_registry.diagnosis import StreamDiagnosis, StreamSubject, diagnose
-from sme_registry.evaluation import StreamReport, dynamic_regret, evaluate_stream, resolve_protocol
+from sme_registry.diagnosis import StreamSubject, diagnose
+from sme_registry.evaluation import dynamic_regret, evaluate_stream, resolve_protocol
 from sme_registry.evaluation.policies import Perceptron
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.training import RunRecord, snapshots
@@ -21,57 +15,39 @@ PROTOCOL = {"states_per_region": 64, "epsilons": [0.5]}
 STEPS = 100  # of each phase
 
 
-def stream_of(phases: int, cycles: int = 1, **fields: Any) -> StreamSpec:
+def stream_of(phases, cycles=1, **fields):
     """Unrelated tasks of equal difficulty."""
     specs = [{"spec": SPEC.derive(seed=seed), "steps": STEPS} for seed in range(phases)]
     return StreamSpec(phases=specs, cycles=cycles, **fields)
 
 
-def optima(stream: StreamSpec) -> list[Any]:
+def optima(stream):
     """π* of each phase."""
     return [reference_policy("optimal", phase.spec) for phase in stream.phases]
 
 
-def report_of(
-    policies: Sequence[Any],
-    stream: StreamSpec,
-    regret: Sequence[float] | None = None,
-    fresh_regret: Sequence[float] | None = None,
-    **options: Any,
-) -> StreamReport:
+def report_of(policies, stream, regret=None, fresh_regret=None, **options):
     """The report of a life, whose visits have these online regrets."""
     options = {"protocol": PROTOCOL, "initial": "random", "name": "agent", **options}
     report = evaluate_stream(policies, stream, **options)
-    if regret is not None:
-        step = STEPS * np.arange(1, len(regret) + 1)
-        log = dynamic_regret(stream, step, np.array(regret), STEPS)
-        report = report.with_dynamic_regret(
-            log if fresh_regret is None else log.with_fresh(stream, fresh_regret)
-        )
-    return report
+    if regret is None:
+        return report
+    step = STEPS * np.arange(1, len(regret) + 1)
+    log = dynamic_regret(stream, step, np.array(regret), STEPS)
+    if fresh_regret is not None:
+        log = log.with_fresh(stream, fresh_regret)
+    return report.with_dynamic_regret(log)
 
 
-def diagnosis_of(report: StreamReport, networks: Any = None, **options: Any) -> StreamDiagnosis:
+def diagnosis_of(report, networks=None, **options):
     subject = StreamSubject("life", report, {"algorithm": "PPO"}, networks, **options)
-    found = diagnose(subject, states=128)
-    assert isinstance(found, StreamDiagnosis)
-    return found
+    return diagnose(subject, states=128)
 
 
-def network(
-    dead: int = 0, stuck: int = 0, scale: float = 1.0, same: bool = False, inputs: int = 5
-) -> Perceptron:
-    """20 hidden units of ReLU and 20 of tanh, of which some are dead or stuck at a bound.
-
-    Args:
-      dead: units of ReLU.
-      stuck: units of tanh.
-      scale: of all weights.
-      same: whether all units of tanh do the same.
-      inputs: of the network.
-    """
+def network(dead=0, stuck=0, scale=1.0, same=False):
+    """20 units of ReLU, some dead, and 20 of tanh, some stuck at a bound or all the same."""
     generator = np.random.default_rng(0)
-    W = [generator.normal(size=shape) * scale for shape in ((inputs, 20), (20, 20), (20, 2))]
+    W = [generator.normal(size=shape) * scale for shape in ((5, 20), (20, 20), (20, 2))]
     W[0] = np.abs(W[0])  # units of ReLU that are on
     W[1] *= 0.05
     if same:
@@ -80,7 +56,7 @@ def network(
     return Perceptron([(W[0], b[0], "relu"), (W[1], b[1], "tanh"), (W[2], np.zeros(2), "identity")])
 
 
-def model_of(uses: str, document: SMESpec | StreamSpec, seed: int = 0) -> Any:
+def model_of(uses, document, seed=0):
     """An untrained model of Stable-Baselines3."""
     settings = {"policy_kwargs": {"net_arch": [12, 8]}}
     return new_sb3_model(
@@ -88,7 +64,7 @@ def model_of(uses: str, document: SMESpec | StreamSpec, seed: int = 0) -> Any:
     )
 
 
-def write_run(folder: Path, stream: StreamSpec, uses: str = "jax:PPO") -> list[Any]:
+def write_run(folder, stream, uses):
     """A finished run of `sme train` whose models did not learn; returns these, by visit."""
     visits = stream.cycles * len(stream.phases)
     models = [model_of(uses, stream, seed) for seed in range(visits + 1)]

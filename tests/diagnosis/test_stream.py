@@ -1,12 +1,8 @@
 """Diagnoses of lives in streams: known faults are found, in runs, in cells and by the command."""
 
-from __future__ import annotations
-
 import json
 import random
 import shutil
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -39,7 +35,7 @@ from sme_registry.studies import run_study
 from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing
 from sme_registry.training import train
 from sme_registry.training.snapshots import Snapshots
-from tests.commands import refused, sme
+from tests.commands import good, refused
 from tests.diagnosis.lives import (
     PROTOCOL,
     SPEC,
@@ -57,220 +53,194 @@ from tests.geometry import assert_readable
 
 SETTINGS = {"n_steps": 50, "batch_size": 50, "policy_kwargs": {"net_arch": [12, 8]}}
 UNIFORM = np.random.default_rng(0).random((500, 5)).astype(np.float32)
+TWO, THREE, CYCLES = stream_of(2), stream_of(3), stream_of(2, cycles=2)
+FIRST, SECOND = optima(TWO)  # of phases 0 and 1 of each of them
+HALF = "constant"
 
 
-def answer(diagnosis: StreamDiagnosis, question: str) -> tuple[str, str]:
+def phases_of(*specs, cycles=1, **fields):
+    phases = [{"spec": spec, "steps": STEPS} for spec in specs]
+    return StreamSpec(phases=phases, cycles=cycles, **fields)
+
+
+def answer(diagnosis, question):
     verdict = diagnosis.verdict(question)
     return verdict.answer, verdict.reason
+
+
+def answer_to(question, policies, stream, *regrets, **options):
+    """The answer about a life with these policies at the ends of its visits."""
+    return answer(diagnosis_of(report_of(policies, stream, *regrets, **options)), question)
 
 
 # --- the network --------------------------------------------------------------------------------
 
 
-def test_dead_and_stuck_units_are_counted() -> None:
+def test_dead_and_stuck_units_are_counted():
     state = network_state(network(dead=5, stuck=3), UNIFORM)
-    assert state is not None
     assert state.hidden == (20, 20)
     assert state.dormant_units == pytest.approx(5 / 40)
     assert state.saturated_units == pytest.approx(3 / 40)
     assert state.inactive_units == pytest.approx(8 / 40)
-
-
-def test_a_layer_whose_outputs_are_all_0_is_dormant_and_has_rank_0() -> None:
     b = np.full(4, -1e3)
     dead = Perceptron([(np.ones((5, 4)), b, "relu"), (np.ones((4, 2)), np.zeros(2), "identity")])
     state = network_state(dead, UNIFORM)
-    assert state is not None
     assert (state.dormant_units, state.effective_rank) == (1.0, 0)
+    linear = Perceptron([(np.ones((5, 2)), np.zeros(2), "identity")])
+    assert network_state(linear, UNIFORM) is None  # it has no hidden layer
 
 
-def test_the_effective_rank_counts_directions_and_the_norm_all_weights() -> None:
+def test_the_effective_rank_counts_directions_and_the_norm_all_weights():
     full, same = (network_state(network(same=each), UNIFORM) for each in (False, True))
-    assert full is not None
-    assert same is not None
     assert same.effective_rank == 1
     assert 3 <= full.effective_rank <= 20
     weights = [W for W, _, _ in network().layers]
     assert full.weight_norm == pytest.approx(np.sqrt(sum((W**2).sum() for W in weights)))
-
-
-def test_the_effective_rank_is_that_of_kumar() -> None:
-    """Of a layer of identity, whose singular values are known: 8, 1, 1e-3, 1e-3."""
+    # The rank of Kumar et al., of a layer of identity, whose singular values are known.
     σ = np.array([8.0, 1.0, 1e-3, 1e-3])
     left = np.linalg.qr(np.random.default_rng(0).normal(size=(50, 4)))[0] * σ
     identity = Perceptron(
         [(np.eye(4), np.zeros(4), "identity"), (np.ones((4, 2)), np.zeros(2), "identity")]
     )
     state = network_state(identity, left.astype(np.float32))
-    assert state is not None
     assert state.effective_rank == 2  # 8 / 9.002 < 0.99 ≤ 9 / 9.002
-
-
-def test_a_linear_policy_has_no_hidden_layer() -> None:
-    linear = Perceptron([(np.ones((5, 2)), np.zeros(2), "identity")])
-    assert network_state(linear, UNIFORM) is None
 
 
 # --- verdicts on known lives --------------------------------------------------------------------
 
 
-def test_a_policy_that_is_overwritten_is_forgetting() -> None:
-    stream = stream_of(3)
-    found = diagnosis_of(report_of(optima(stream), stream, [0.3, 0.3, 0.3]))
-    assert answer(found, "forgetting") == ("yes", "phases_forgotten")
-    assert [row["phase"] for row in found.verdict("forgetting").evidence["phases"]] != [2]  # type: ignore[index, union-attr, call-overload]
+def test_a_policy_that_is_overwritten_is_forgetting():
+    found = diagnosis_of(report_of(optima(THREE), THREE, [0.3, 0.3, 0.3]))
+    verdict = found.verdict("forgetting")
+    assert (verdict.answer, verdict.reason) == ("yes", "phases_forgotten")
+    assert [row["phase"] for row in verdict.evidence["phases"]] == [0, 1]
     assert [phase.outcome for phase in found.phases] == ["forgotten", "forgotten", "retained"]
     assert answer(found, "failure to learn") == ("no", "every_visit_learnt")
-    assert found.forgetting == found.verdict("forgetting").evidence["forgetting"]
+    assert found.forgetting == verdict.evidence["forgetting"]
     assert "Learnt and forgotten: 2 of 3 phases (0 and 1)." in headline(found)
+    assert "learnt or not" not in headline(found)
 
 
-def test_a_phase_that_was_never_learnt_is_a_failure_and_not_forgetting() -> None:
-    specs = [SPEC, SPEC.derive(seed=2)]
-    stream = StreamSpec(phases=[{"spec": spec, "steps": STEPS} for spec in specs])
-    first = optima(stream)[0]
-    found = diagnosis_of(report_of([first, first], stream))
+def test_a_phase_that_was_never_learnt_is_a_failure_and_not_forgetting():
+    stream = phases_of(SPEC, SPEC.derive(seed=2))
+    found = diagnosis_of(report_of([FIRST, FIRST], stream))
     assert [phase.outcome for phase in found.phases] == ["retained", "not_learnt"]
     assert answer(found, "failure to learn") == ("yes", "visits_failed")
     assert answer(found, "forgetting") == ("no", "phases_retained")
-    nothing = diagnosis_of(report_of(["constant"] * 2, stream))
-    assert answer(nothing, "forgetting") == ("cannot tell", "nothing_to_forget")
-    last = diagnosis_of(report_of(["constant", optima(stream)[1]], stream))
-    assert answer(last, "forgetting") == ("cannot tell", "nothing_to_forget")
-
-
-def test_a_phase_counts_as_learnt_only_after_a_visit_of_its_own() -> None:
-    stream = stream_of(2, cycles=2)
-    first = optima(stream)[0]
-    found = diagnosis_of(report_of(["constant", first, "constant", "constant"], stream))
+    for life in ([HALF, HALF], [HALF, optima(stream)[1]]):
+        expected = ("cannot tell", "nothing_to_forget")
+        assert answer_to("forgetting", life, stream) == expected
+    # A phase counts as learnt only after a visit of its own.
+    found = diagnosis_of(report_of([HALF, FIRST, HALF, HALF], CYCLES))
     assert found.phases[0].outcome == "not_learnt"
 
 
-def test_fresh_agents_say_whether_the_life_or_the_task_is_the_cause_of_a_failure() -> None:
-    stream = stream_of(2)
-    policies = [optima(stream)[0], "constant"]
-    unlike = report_of(policies, stream, fresh=optima(stream))
-    alike = report_of(policies, stream, fresh=["constant", "constant"])
-    question = "failure to learn"
-    assert diagnosis_of(unlike).verdict(question).reason == "failed_unlike_fresh_agents"
-    assert diagnosis_of(alike).verdict(question).reason == "failed_as_fresh_agents"
-    assert answer(diagnosis_of(alike), "loss of plasticity")[1] == "fresh_agents_learnt_little"
+@pytest.mark.parametrize(
+    ("stream", "policies", "fresh", "reason"),
+    [
+        (TWO, [FIRST, HALF], [FIRST, SECOND], "failed_unlike_fresh_agents"),
+        (TWO, [FIRST, HALF], [HALF, HALF], "failed_as_fresh_agents"),
+        # Phase 0 is learnt by no agent, phase 1 by the fresh one alone.
+        (CYCLES, [HALF] * 4, [HALF, SECOND], "some_failed_unlike_fresh_agents"),
+        (CYCLES, [HALF, SECOND] * 2, [HALF, SECOND], "failed_as_fresh_agents"),
+        (CYCLES, [FIRST, HALF] * 2, [HALF, SECOND], "failed_unlike_fresh_agents"),
+        # Before the first visit there is no life, so that what it lacks is no fault of the life.
+        (CYCLES, [HALF, SECOND, FIRST, SECOND], [FIRST, SECOND], "failed_as_fresh_agents"),
+    ],
+)
+def test_fresh_agents_say_whether_the_life_or_the_task_is_the_cause_of_a_failure(
+    stream, policies, fresh, reason
+):
+    found = diagnosis_of(report_of(policies, stream, fresh=fresh))
+    verdict = found.verdict("failure to learn")
+    assert verdict.reason == reason
+    assert stream_sentence(verdict)
+    if fresh == [HALF, HALF]:
+        assert found.verdict("loss of plasticity").reason == "fresh_agents_learnt_little"
 
 
-def test_each_failed_visit_is_compared_with_the_fresh_agent_of_its_own_phase() -> None:
-    stream = stream_of(2, cycles=2)
-    first, second = optima(stream)
-    question = "failure to learn"
-
-    def reason(policies: list[Any], fresh: list[Any]) -> str:
-        verdict = diagnosis_of(report_of(policies, stream, fresh=fresh)).verdict(question)
-        assert stream_sentence(verdict)
-        return verdict.reason
-
-    # Phase 0 is learnt by no agent, phase 1 by the fresh one alone.
-    assert reason(["constant"] * 4, ["constant", second]) == "some_failed_unlike_fresh_agents"
-    assert reason(["constant", second] * 2, ["constant", second]) == "failed_as_fresh_agents"
-    assert reason([first, "constant"] * 2, ["constant", second]) == "failed_unlike_fresh_agents"
-    # Before the first visit there is no life, so that what it lacks is no fault of the life.
-    assert reason(["constant", second, first, second], [first, second]) == "failed_as_fresh_agents"
-
-
-def test_a_failure_that_is_hardly_worse_than_a_fresh_agent_s_is_not_blamed_on_the_life() -> None:
-    case = StreamCase(
-        stream_of(2),
-        [
-            VisitDiagnosis(
-                visit=v, phase=v, lifetime=(v + 1) * STEPS, steps=STEPS, dynamic_regret=None,
-                online_regret=None, normalised_regret=regret, network=None,
-            )
-            for v, regret in enumerate((0.5, 0.93))
-        ],
-        [
-            PhaseDiagnosis(
-                phase=j, outcome="retained", best_normalised_regret=0.5,
-                final_normalised_regret=0.5, initial_normalised_regret=None,
-                fresh_normalised_regret=fresh, fresh_online_regret=None, fresh_network=None,
-            )
-            for j, fresh in enumerate((0.5, 0.89))
-        ],
-        None,
+def visit_of(visit, phase, regret, dynamic=None, online=None, network=None):
+    return VisitDiagnosis(
+        visit=visit, phase=phase, lifetime=(visit + 1) * STEPS, steps=STEPS, dynamic_regret=dynamic,
+        online_regret=online, normalised_regret=regret, network=network,
     )  # fmt: skip
-    (verdict,) = (
-        each
-        for each in answer_all(STREAM_QUESTIONS, case, STREAM_THRESHOLDS)
-        if each.question == "failure_to_learn"
-    )
-    assert verdict.reason == "failed_as_fresh_agents"
 
 
-def test_forgetting_of_a_phase_that_was_never_learnt_is_said_to_be_that() -> None:
-    stream = stream_of(3)
-    first, second, _ = optima(stream)
+def phase_of(phase, best, final, fresh=None, online=None, network=None):
+    return PhaseDiagnosis(
+        phase=phase, outcome=outcome_of(best, final), best_normalised_regret=best,
+        final_normalised_regret=final, initial_normalised_regret=None,
+        fresh_normalised_regret=fresh, fresh_online_regret=online, fresh_network=network,
+    )  # fmt: skip
 
-    def away(observations: Any) -> Any:  # good in phase 1, and worse in phase 0 than before
-        best = second(observations)
-        return np.clip(best + 0.15 * (best - first(observations)), 0.0, 1.0)
 
-    found = diagnosis_of(report_of(["constant", second, away], stream))
+def test_a_failure_that_is_hardly_worse_than_a_fresh_agent_s_is_not_blamed_on_the_life():
+    visits = [visit_of(v, v, regret) for v, regret in enumerate((0.5, 0.93))]
+    phases = [phase_of(j, 0.5, 0.5, fresh) for j, fresh in enumerate((0.5, 0.89))]
+    case = StreamCase(TWO, visits, phases, None)
+    verdicts = answer_all(STREAM_QUESTIONS, case, STREAM_THRESHOLDS)
+    reasons = {verdict.question: verdict.reason for verdict in verdicts}
+    assert reasons["failure_to_learn"] == "failed_as_fresh_agents"
+
+
+def test_forgetting_of_a_phase_that_was_never_learnt_is_said_to_be_that():
+    def away(observations):  # good in phase 1, and worse in phase 0 than before
+        best = SECOND(observations)
+        return np.clip(best + 0.15 * (best - FIRST(observations)), 0.0, 1.0)
+
+    found = diagnosis_of(report_of([HALF, SECOND, away], THREE))
     assert [phase.outcome for phase in found.phases] == ["not_learnt", "retained", "not_learnt"]
-    assert found.forgetting is not None
     assert found.forgetting > 0.0
     assert answer(found, "forgetting") == ("no", "phases_retained")
     assert "(mean over earlier phases, learnt or not)" in headline(found)
     assert "earlier phases, learnt or not" in stream_sentence(found.verdict("forgetting"))
-    learnt = diagnosis_of(report_of(optima(stream), stream))
-    assert "learnt or not" not in headline(learnt)
 
 
-def test_the_visit_whose_regret_stands_out_is_named() -> None:
-    stream = stream_of(2, cycles=2)
-    life = fresh_per_phase(stream, optima(stream))
-    found = diagnosis_of(report_of(life, stream, [0.3, 0.3, 0.3, 0.6]))
-    verdict = found.verdict("costly visits")
-    assert (verdict.answer, verdict.reason) == ("yes", "some_visits_stand_out")
-    assert [row["visit"] for row in verdict.evidence["visits"]] == [3]  # type: ignore[index, union-attr, call-overload]
-    assert verdict.evidence["highest"]["other"] == pytest.approx(0.3)  # type: ignore[index, call-overload]
-    assert verdict.evidence["highest"]["share"] == pytest.approx(0.4)  # type: ignore[index, call-overload]
-    alike = diagnosis_of(report_of(life, stream, [0.3, 0.32, 0.34, 0.36]))
-    assert answer(alike, "costly visits") == ("no", "visits_alike")
-    fresh = optima(stream)
-    paired = report_of(life, stream, [0.3, 0.32, 0.34, 0.36], [0.29, 0.36], fresh=fresh)
-    compared = diagnosis_of(paired).verdict("costly visits")
+def test_the_visit_whose_regret_stands_out_is_named():
+    life, fresh = fresh_per_phase(CYCLES, [FIRST, SECOND]), [FIRST, SECOND]
+
+    def verdict(*regrets, **options):
+        report = report_of(life, CYCLES, *regrets, **options)
+        return diagnosis_of(report).verdict("costly visits")
+
+    one = verdict([0.3, 0.3, 0.3, 0.6])
+    assert (one.answer, one.reason) == ("yes", "some_visits_stand_out")
+    assert [row["visit"] for row in one.evidence["visits"]] == [3]
+    assert one.evidence["highest"]["other"] == pytest.approx(0.3)
+    assert one.evidence["highest"]["share"] == pytest.approx(0.4)
+    alike = verdict([0.3, 0.32, 0.34, 0.36])
+    assert (alike.answer, alike.reason) == ("no", "visits_alike")
+    compared = verdict([0.3, 0.32, 0.34, 0.36], [0.29, 0.36], fresh=fresh)
     assert compared.reason == "costlier_than_fresh"
-    assert [row["visit"] for row in compared.evidence["visits"]] == [2]  # type: ignore[index, union-attr, call-overload]
-    assert diagnosis_of(report_of(life, stream)).verdict("costly visits").answer == "cannot tell"
+    assert [row["visit"] for row in compared.evidence["visits"]] == [2]
+    assert verdict().answer == "cannot tell"
 
 
-def test_plasticity_is_lost_where_later_visits_learn_less() -> None:
-    stream = stream_of(2, cycles=2)
-    first, second = optima(stream)
-    fading = report_of([first, second, "constant", "constant"], stream)
-    assert answer(diagnosis_of(fading), "loss of plasticity") == ("yes", "later_visits_worse")
-    steady = report_of([first, second] * 2, stream)
-    assert answer(diagnosis_of(steady), "loss of plasticity") == ("no", "later_visits_as_good")
-    fresh = {"fresh": [first, second]}
-    below = report_of([first, "constant", first, "constant"], stream, **fresh)  # type: ignore[arg-type]
-    assert answer(diagnosis_of(below), "loss of plasticity") == ("yes", "below_fresh_agents")
-    as_good = report_of(["constant", second, first, second], stream, **fresh)  # type: ignore[arg-type]
-    assert answer(diagnosis_of(as_good), "loss of plasticity") == ("no", "as_fresh_agents")
+RELATED = phases_of(SPEC, SPEC.derive(rotation=0.5), cycles=2)
+HARDER = phases_of(SPEC, SPEC.derive(complexity=3), cycles=2)
 
 
-def test_without_fresh_agents_a_trend_needs_phases_of_equal_difficulty() -> None:
-    specs = [SPEC, SPEC.derive(complexity=3)]
-    harder = StreamSpec(phases=[{"spec": spec, "steps": STEPS} for spec in specs], cycles=2)
-    found = diagnosis_of(report_of(["constant"] * 4, harder))
-    assert answer(found, "loss of plasticity") == ("cannot tell", "phases_differ")
-    few = diagnosis_of(report_of(["constant"] * 2, stream_of(2)))
-    assert answer(few, "loss of plasticity") == ("cannot tell", "too_few_visits")
-    rotated = [SPEC, SPEC.derive(rotation=0.5)]
-    related = StreamSpec(phases=[{"spec": spec, "steps": STEPS} for spec in rotated], cycles=2)
-    nothing = diagnosis_of(report_of(["constant"] * 4, related))
-    assert answer(nothing, "loss of plasticity") == ("cannot tell", "nothing_learnt")
+@pytest.mark.parametrize(
+    ("stream", "policies", "fresh", "expected"),
+    [
+        (CYCLES, [FIRST, SECOND, HALF, HALF], None, ("yes", "later_visits_worse")),
+        (CYCLES, [FIRST, SECOND] * 2, None, ("no", "later_visits_as_good")),
+        (CYCLES, [FIRST, HALF] * 2, [FIRST, SECOND], ("yes", "below_fresh_agents")),
+        (CYCLES, [HALF, SECOND, FIRST, SECOND], [FIRST, SECOND], ("no", "as_fresh_agents")),
+        # Without fresh agents a trend needs phases of equal difficulty.
+        (HARDER, [HALF] * 4, None, ("cannot tell", "phases_differ")),
+        (TWO, [HALF] * 2, None, ("cannot tell", "too_few_visits")),
+        (RELATED, [HALF] * 4, None, ("cannot tell", "nothing_learnt")),
+    ],
+    ids=lambda value: value[1] if isinstance(value, tuple) else "",
+)
+def test_plasticity_is_lost_where_later_visits_learn_less(stream, policies, fresh, expected):
+    options = {} if fresh is None else {"fresh": fresh}
+    assert answer_to("loss of plasticity", policies, stream, **options) == expected
 
 
-def test_a_network_that_decays_is_found_against_the_first_visit_and_fresh_agents() -> None:
-    stream = stream_of(2)
-    report = report_of(["constant"] * 2, stream)
+def test_a_network_that_decays_is_found_against_the_first_visit_and_fresh_agents():
+    report = report_of([HALF] * 2, TWO)
     decayed = (network(), network(dead=10, same=True, scale=2.5))
     found = diagnosis_of(report, decayed, initial_network=network())
     assert answer(found, "dormant units") == ("yes", "units_became_inactive")
@@ -285,10 +255,10 @@ def test_a_network_that_decays_is_found_against_the_first_visit_and_fresh_agents
     assert answer(broken, "dormant units") == ("yes", "inactive_from_the_start")
 
 
-def test_a_life_of_one_visit_or_of_unknown_networks_cannot_be_compared() -> None:
-    one = diagnosis_of(report_of(["constant"], stream_of(1), [0.5]), (network(),))
+def test_a_life_of_one_visit_or_of_unknown_networks_cannot_be_compared():
+    one = diagnosis_of(report_of([HALF], stream_of(1), [0.5]), (network(),))
     assert {v.reason for v in one.verdicts if v.answer == "cannot tell"} == {"one_visit"}
-    unknown = diagnosis_of(report_of(["constant"] * 2, stream_of(2)), (None, None))
+    unknown = diagnosis_of(report_of([HALF] * 2, TWO), (None, None))
     assert answer(unknown, "dormant units") == ("cannot tell", "network_unknown")
     with pytest.raises(UnknownNameError, match="Did you mean 'forgetting'"):
         unknown.verdict("forgeting")
@@ -296,10 +266,8 @@ def test_a_life_of_one_visit_or_of_unknown_networks_cannot_be_compared() -> None
 
 # --- words --------------------------------------------------------------------------------------
 
-DECLARED = {(name, each) for name, rule in STREAM_QUESTIONS.items() for each in rule.reasons}
 
-
-def random_case(generator: random.Random) -> StreamCase:
+def random_case(generator):
     """A life of random numbers, with and without fresh agents, a log and networks."""
     P = generator.choice((1, 1, 2, 3))
     cycles = generator.choice((1, 2, 3))
@@ -310,11 +278,11 @@ def random_case(generator: random.Random) -> StreamCase:
     log, fresh, networks = (generator.random() < 0.6 for _ in range(3))
     low, high = generator.choice(((0.2, 0.4), (0.0, 1.3), (0.9, 1.2)))
 
-    def number(known: bool = True) -> Any:
+    def number(known=True):
         return generator.uniform(low, high) if known else None
 
-    def state() -> NetworkState | None:
-        if not networks:
+    def state(known=True):
+        if not (networks and known):
             return None
         dormant = generator.choice((0.05, 0.3, 0.6))
         return NetworkState(
@@ -322,31 +290,17 @@ def random_case(generator: random.Random) -> StreamCase:
             effective_rank=generator.choice((2, 7)), weight_norm=generator.choice((1.0, 9.0)),
         )  # fmt: skip
 
-    visits = [
-        VisitDiagnosis(
-            visit=v, phase=v % P, lifetime=(v + 1) * STEPS, steps=STEPS,
-            dynamic_regret=40.0 if log else None,
-            online_regret=generator.uniform(0.3, generator.choice((0.34, 0.9))) if log else None,
-            normalised_regret=number(), network=state(),
-        )
-        for v in range(V)
-    ]  # fmt: skip
-    phases = []
+    visits, phases = [], []
+    for v in range(V):
+        online = generator.uniform(0.3, generator.choice((0.34, 0.9))) if log else None
+        visits.append(visit_of(v, v % P, number(), 40.0 if log else None, online, state()))
     for j in range(P):
-        best, final = number(), number()
-        phases.append(
-            PhaseDiagnosis(
-                phase=j, outcome=outcome_of(best, final), best_normalised_regret=best,
-                final_normalised_regret=final, initial_normalised_regret=None,
-                fresh_normalised_regret=number(fresh),
-                fresh_online_regret=generator.uniform(0.3, 0.7) if fresh and log else None,
-                fresh_network=state() if fresh else None,
-            )
-        )  # fmt: skip
+        online = generator.uniform(0.3, 0.7) if fresh and log else None
+        phases.append(phase_of(j, number(), number(), number(fresh), online, state(fresh)))
     return StreamCase(stream, visits, phases, number(V > 1))
 
 
-def test_every_reason_is_reached_and_has_a_sentence() -> None:
+def test_every_reason_is_reached_and_has_a_sentence():
     generator, reached = random.Random(0), set()
     for _ in range(300):
         for verdict in answer_all(STREAM_QUESTIONS, random_case(generator), STREAM_THRESHOLDS):
@@ -354,26 +308,23 @@ def test_every_reason_is_reached_and_has_a_sentence() -> None:
             text = stream_sentence(verdict)
             assert text.endswith("."), text
             assert not any(bad in text for bad in ("None", " ,", " .", " ;", "( ", "..")), text
-    assert reached == DECLARED
+    declared = {(name, each) for name, rule in STREAM_QUESTIONS.items() for each in rule.reasons}
+    assert reached == declared
 
 
-def test_long_lists_are_cut_in_sentences_and_whole_in_data() -> None:
-    stream = stream_of(2, cycles=5)
-    found = diagnosis_of(report_of(["constant"] * 10, stream))
-    verdict = found.verdict("failure to learn")
-    assert len(verdict.evidence["failed"]) == 10  # type: ignore[arg-type]
+def test_long_lists_are_cut_in_sentences_and_whole_in_data():
+    verdict = diagnosis_of(report_of([HALF] * 10, stream_of(2, 5))).verdict("failure to learn")
+    assert len(verdict.evidence["failed"]) == 10
     assert "; and 6 more." in stream_sentence(verdict)
 
 
-@pytest.mark.parametrize("width", [60, 120, None])
-def test_a_life_is_readable_at_every_width_and_in_a_pipe(width: int | None) -> None:
-    stream = stream_of(3)
-    report = report_of(optima(stream), stream, [0.3, 0.4, 0.5], fresh=optima(stream))
+def test_a_life_is_readable_at_every_width_and_in_a_pipe():
+    report = report_of(optima(THREE), THREE, [0.3, 0.4, 0.5], fresh=optima(THREE))
     found = diagnosis_of(report, (network(), network(), None))
-    lines = printed(terminal(found), width)
-    assert width is None or max(map(len, lines)) <= width
-    shown = " ".join(" ".join(lines).split())
-    assert headline(found) in shown
+    for width in (60, 120, None):
+        lines = printed(terminal(found), width)
+        assert width is None or max(map(len, lines)) <= width
+        assert headline(found) in " ".join(" ".join(lines).split())
     page = markdown(found, ["which_phases.png"])
     assert all(stream_sentence(verdict) in page for verdict in found.verdicts)
     assert "![which phases](which_phases.png)" in page
@@ -384,91 +335,78 @@ def test_a_life_is_readable_at_every_width_and_in_a_pipe(width: int | None) -> N
 
 # --- runs, cells and the command ----------------------------------------------------------------
 
-
-def same_network(own: Perceptron | None, model: Any, hidden: str) -> bool:
-    """Whether a network has the first weights of a model's policy."""
-    assert own is not None
-    weights = dict(model.policy.named_parameters())[f"{hidden}.0.weight"].detach().numpy()
-    return np.array_equal(own.layers[0][0], weights.T)
-
-
-FIRST = {
+FIRST_LAYER = {
     "jax:PPO": "mlp_extractor.policy_net",
     "jax:TD3": "actor.mu",
     "jax:SAC": "actor.latent_pi",
 }
 
 
-@pytest.mark.parametrize("uses", FIRST)
-def test_the_networks_of_a_run_are_those_of_its_snapshots(tmp_path: Path, uses: str) -> None:
-    stream = stream_of(2, observes_phase=uses == "jax:TD3")
-    models = write_run(tmp_path, stream, uses)
+@pytest.mark.parametrize("uses", FIRST_LAYER)
+def test_the_networks_of_a_run_are_those_of_its_snapshots(tmp_path, uses):
+    models = write_run(tmp_path, stream_of(2, observes_phase=uses == "jax:TD3"), uses)
     life = load_run(tmp_path)
-    assert isinstance(life, StreamSubject)
-    assert life.networks is not None
     for own, model in zip((*life.networks, life.initial_network), models, strict=True):
-        assert same_network(own, model, FIRST[uses])
+        weights = dict(model.policy.named_parameters())[f"{FIRST_LAYER[uses]}.0.weight"]
+        np.testing.assert_array_equal(own.layers[0][0], weights.detach().numpy().T)
     found = diagnose(life, states=64)
-    assert [visit.network.hidden for visit in found.visits if visit.network] == [(12, 8)] * 2
+    assert [visit.network.hidden for visit in found.visits] == [(12, 8)] * 2
     assert found.plan["algorithm"] == uses.removeprefix("jax:")
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(tmp_path_factory):
     """A short life of PPO, as `sme train` leaves it."""
     folder = tmp_path_factory.mktemp("runs") / "life"
     train(
-        stream_of(3), algorithm="PPO", hyperparameters=SETTINGS, folder=folder, protocol=PROTOCOL,
+        THREE, algorithm="PPO", hyperparameters=SETTINGS, folder=folder, protocol=PROTOCOL,
         progress=False,
     )  # fmt: skip
     return folder
 
 
-def test_the_command_writes_a_page_its_data_and_its_figures(
-    run: Path, tmp_path: Path, figures: list[Any]
-) -> None:
+def test_the_command_writes_a_page_its_data_and_its_figures(run, tmp_path, laid_out):
     pytest.importorskip("matplotlib")
-    result = sme("diagnose", run, "--states", "64", "--out", tmp_path / "d")
-    assert result.exit_code == 0, result.output
+    result = good("diagnose", run, "--states", "64", "--out", tmp_path / "d")
     assert "Plasticity and the network" in result.stdout
     page = (tmp_path / "d" / "diagnosis.md").read_text()
     names = sorted(path.stem for path in (tmp_path / "d").glob("*.png"))
     assert names == ["network_by_visit", "what_is_retained", "which_phases"]
     assert all(f"]({name}.png)" in page for name in names)
-    for figure in figures:
+    assert len(laid_out) == 3
+    for figure in laid_out:
         assert_readable(figure)
     read = StreamDiagnosis.from_dict(json.loads((tmp_path / "d" / "diagnosis.json").read_text()))
-    assert read.stream_digest == stream_of(3).digest
+    assert read.stream_digest == THREE.digest
     assert all(visit.online_regret is not None for visit in read.visits)
     assert read.visits[2].network != read.visits[0].network != read.initial_network
-    shown = sme("diagnose", run, "--states", "64", "--json")
+    shown = good("diagnose", run, "--states", "64", "--json")
     assert json.loads(shown.stdout) == read.to_dict()
 
 
-def test_comparisons_and_probes_are_refused_for_lives(run: Path) -> None:
+def test_comparisons_and_probes_are_refused_for_lives(run):
     assert "on one task only" in refused("diagnose", run, "--probe-capacity")
     assert "on one task only" in refused("diagnose", run, "--against", run)
     with pytest.raises(OptionError, match="one task only"):
         diagnose(load_policy("constant", SMESpec()), against=load_run(run))
 
 
-def test_a_life_that_has_not_ended_or_lacks_files_is_refused(run: Path, tmp_path: Path) -> None:
+def test_a_life_that_has_not_ended_or_lacks_files_is_refused(run, tmp_path):
     folder = tmp_path / "copy"
     shutil.copytree(run, folder)
     (folder / "snapshots" / "visit-01.zip").unlink()
     assert "lacks visit-01.zip" in refused("diagnose", folder)
     report = StreamReport.read(folder / "stream.json")
-    other = report_of(["constant"] * 2, stream_of(2))
-    other.write(folder / "stream.json")
+    report_of([HALF] * 2, TWO).write(folder / "stream.json")
     shutil.copytree(run / "snapshots", folder / "snapshots", dirs_exist_ok=True)
     assert "is about the stream" in refused("diagnose", folder)
     (folder / "stream.json").unlink()
     assert "when it has ended" in refused("diagnose", folder)
     report.write(folder / "stream.json")
-    assert sme("diagnose", folder, "--states", "64", "--json").exit_code == 0
+    good("diagnose", folder, "--states", "64", "--json")
 
 
-def cell_of(stream: StreamSpec) -> Cell:
+def cell_of(stream):
     return Cell(
         spec=stream.phases[0].spec, stream=stream, uses="jax:PPO", hyperparameters={},
         action_range="symmetric", seed=0, steps=stream.steps, evaluations=4,
@@ -476,7 +414,8 @@ def cell_of(stream: StreamSpec) -> Cell:
     )  # fmt: skip
 
 
-def write_cell(study: Path, cell: Cell, report: Any, online_regret: float | None) -> str:
+def write_cell(study, cell, report, online_regret, model=None):
+    """The result of a cell in the folder of a study, and its model."""
     stem = cell.digest.removeprefix("sha256:")
     field = "report" if cell.stream is None else "stream_report"
     timing = Timing(total=1, training=1, environment=0, evaluation=0, steps_per_second=1)
@@ -484,30 +423,30 @@ def write_cell(study: Path, cell: Cell, report: Any, online_regret: float | None
         key=cell.digest, cell=cell, curve=LearningCurve(), timing=timing, versions={},
         online_regret=online_regret, **{field: report},
     )  # fmt: skip
-    (study / "cells").mkdir(parents=True, exist_ok=True)
+    for folder in ("cells", "models"):
+        (study / folder).mkdir(parents=True, exist_ok=True)
     (study / "cells" / f"{stem}.json").write_text(json.dumps(result.to_dict()))
+    if model is not None:
+        (study / "models" / f"{stem}.zip").write_bytes(saved_sb3(model))
     return stem
 
 
-def test_a_cell_is_diagnosed_with_its_fresh_agents(tmp_path: Path) -> None:
-    stream = stream_of(2)
-    cell = cell_of(stream)
-    key = write_cell(tmp_path, cell, report_of(["constant"] * 2, stream, [0.5, 0.6]), 0.55)
+def test_a_cell_is_diagnosed_with_its_fresh_agents(tmp_path):
+    cell = cell_of(TWO)
+    key = write_cell(tmp_path, cell, report_of([HALF] * 2, TWO, [0.5, 0.6]), 0.55)
     alone = load_cell(tmp_path, key[:12])
     assert isinstance(alone, StreamSubject)
     assert alone.networks is None
     assert diagnose(alone).verdict("dormant units").reason == "network_unknown"
-    assert [each.document for each in cell.fresh] == [phase.spec for phase in stream.phases]
-    for each, policy, regret in zip(cell.fresh, optima(stream), (0.5, 0.3), strict=True):
-        stem = write_cell(tmp_path, each, evaluate(policy, each.spec, PROTOCOL), regret)
-        (tmp_path / "models").mkdir(exist_ok=True)
-        (tmp_path / "models" / f"{stem}.zip").write_bytes(saved_sb3(model_of("jax:PPO", each.spec)))
-    kept = Snapshots(tmp_path / "models" / key, stream)
-    kept.write_initial(model_of("jax:PPO", stream, 9))
+    assert [each.document for each in cell.fresh] == [phase.spec for phase in TWO.phases]
+    for each, policy, regret in zip(cell.fresh, (FIRST, SECOND), (0.5, 0.3), strict=True):
+        report = evaluate(policy, each.spec, PROTOCOL)
+        write_cell(tmp_path, each, report, regret, model_of("jax:PPO", each.spec))
+    kept = Snapshots(tmp_path / "models" / key, TWO)
+    kept.write_initial(model_of("jax:PPO", TWO, 9))
     for visit in range(2):
-        kept.write(visit, model_of("jax:PPO", stream, visit))
-    result = sme("diagnose", tmp_path, "--cell", key[:12], "--states", "64", "--json")
-    assert result.exit_code == 0, result.output
+        kept.write(visit, model_of("jax:PPO", TWO, visit))
+    result = good("diagnose", tmp_path, "--cell", key[:12], "--states", "64", "--json")
     found = StreamDiagnosis.from_dict(json.loads(result.stdout))
     assert [phase.fresh_online_regret for phase in found.phases] == [0.5, 0.3]
     assert [phase.fresh_normalised_regret for phase in found.phases] == [0.0, 0.0]
@@ -516,59 +455,51 @@ def test_a_cell_is_diagnosed_with_its_fresh_agents(tmp_path: Path) -> None:
     assert found.verdict("weight growth").evidence["against"] == "fresh_agents"
 
 
-def test_a_life_of_a_study_that_kept_its_models_is_diagnosed(tmp_path: Path) -> None:
-    algorithm = {"name": "PPO", "uses": "PPO", "hyperparameters": SETTINGS}
-    fields = {
-        "streams": [{"name": "two", "stream": stream_of(2).to_dict()}],
-        "algorithms": [algorithm],
-        "seeds": 1,
-        "evaluations": 0,
-        "protocol": PROTOCOL,
-    }
-    plan = StudyPlan.from_dict(fields)
+def test_a_life_of_a_study_that_kept_its_models_is_diagnosed(tmp_path):
+    plan = StudyPlan.from_dict(
+        {
+            "streams": [{"name": "two", "stream": TWO.to_dict()}],
+            "algorithms": [{"name": "PPO", "uses": "PPO", "hyperparameters": SETTINGS}],
+            "seeds": 1,
+            "evaluations": 0,
+            "protocol": PROTOCOL,
+        }
+    )
     file = StudyFile(name="tiny", digest=plan.digest, plan=plan)
     run_study(file, tmp_path, executor="in-process", keep_models=True)
-    life = load_cell(tmp_path, plan.cells[0].cell.digest)
-    assert isinstance(life, StreamSubject)
-    found = diagnose(life, states=64)
+    found = diagnose(load_cell(tmp_path, plan.cells[0].cell.digest), states=64)
     assert all(visit.network is not None for visit in found.visits)
     assert all(phase.fresh_network is not None for phase in found.phases)
     assert None not in [phase.fresh_online_regret for phase in found.phases]
     assert found.verdict("costly visits").reason.endswith("_than_fresh")
 
 
-def test_a_life_that_is_a_fresh_agent_itself_is_not_compared_with_itself(tmp_path: Path) -> None:
-    drift = {"rotation": 1.0, "increments": 2}
-    stream = StreamSpec(phases=[{"spec": SPEC, "steps": STEPS, "drift": drift}])
-    key = write_cell(tmp_path, cell_of(stream), report_of(["constant"], stream, [0.5]), 0.5)
-    Snapshots(tmp_path / "models" / key, stream).write(0, model_of("jax:PPO", stream))
-    (tmp_path / "models" / f"{key}.zip").write_bytes(saved_sb3(model_of("jax:PPO", stream)))
-    found = diagnose(load_cell(tmp_path, key), states=64)
-    (phase,) = found.phases
+DRIFTING = {"spec": SPEC, "steps": STEPS, "drift": {"rotation": 1.0, "increments": 2}}
+
+
+def test_a_life_that_is_a_fresh_agent_itself_is_not_compared_with_itself(tmp_path):
+    stream = StreamSpec(phases=[DRIFTING])
+    model = model_of("jax:PPO", stream)
+    report = report_of([HALF], stream, [0.5])
+    key = write_cell(tmp_path, cell_of(stream), report, 0.5, model)
+    Snapshots(tmp_path / "models" / key, stream).write(0, model)
+    (phase,) = diagnose(load_cell(tmp_path, key), states=64).phases
     assert (phase.fresh_online_regret, phase.fresh_normalised_regret) == (None, None)
     assert phase.fresh_network is None
 
 
-def test_a_cell_whose_phase_observes_and_drifts_has_fresh_agents_of_that_phase(
-    tmp_path: Path,
-) -> None:
-    drift = {"rotation": 1.0, "increments": 2}
-    phases = [{"spec": SPEC, "steps": STEPS, "drift": drift}, {"spec": SPEC, "steps": STEPS}]
+def test_a_cell_whose_phase_observes_and_drifts_has_fresh_agents_of_that_phase(tmp_path):
+    phases = [DRIFTING, {"spec": SPEC, "steps": STEPS}]
     stream = StreamSpec(phases=phases, observes_phase=True)
     cell = cell_of(stream)
-    key = write_cell(tmp_path, cell, report_of(["constant"] * 2, stream), None)
+    key = write_cell(tmp_path, cell, report_of([HALF] * 2, stream), None)
     drifting, plain = cell.fresh
-    alone = report_of(["constant"], drifting.stream)  # type: ignore[arg-type]
-    for each, report in ((drifting, alone), (plain, evaluate("constant", SPEC, PROTOCOL))):
-        stem = write_cell(tmp_path, each, report, 0.5)
-        (tmp_path / "models").mkdir(exist_ok=True)
-        model = model_of("jax:PPO", each.document)
-        (tmp_path / "models" / f"{stem}.zip").write_bytes(saved_sb3(model))
-    life = load_cell(tmp_path, key)
-    assert isinstance(life, StreamSubject)
-    found = diagnose(life, states=64)
+    alone = report_of([HALF], drifting.stream)
+    for each, report in ((drifting, alone), (plain, evaluate(HALF, SPEC, PROTOCOL))):
+        stem = write_cell(tmp_path, each, report, 0.5, model_of("jax:PPO", each.document))
+    found = diagnose(load_cell(tmp_path, key), states=64)
     assert all(phase.fresh_network is not None for phase in found.phases)
     assert [phase.fresh_normalised_regret for phase in found.phases] == [1.0, 1.0]
-    (tmp_path / "cells" / f"{plain.digest.removeprefix('sha256:')}.json").write_text("{}")
+    (tmp_path / "cells" / f"{stem}.json").write_text("{}")
     with pytest.raises(OptionError, match="not the result of a cell"):
         load_cell(tmp_path, key)

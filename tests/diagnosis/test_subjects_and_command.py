@@ -1,39 +1,31 @@
 """Subjects, the command, and the files that it writes."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import shutil
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 import sme_registry
-from sme_registry.diagnosis import (
-    Diagnosis,
-    diagnose,
-    load_cell,
-    load_run,
-    render,
-)
-from sme_registry.errors import (
-    DigestMismatchError,
-    OptionError,
-    PolicyError,
-    UnknownNameError,
-)
+from sme_registry.diagnosis import Diagnosis, diagnose, load_cell, load_run, networks, render
+from sme_registry.errors import DigestMismatchError, OptionError, PolicyError, UnknownNameError
 from sme_registry.wrappers import RecordRegret
-from tests.commands import refused, sme
+from tests.commands import good, refused
 from tests.diagnosis.policies import SPEC, diagnosis_of, faults, shrunk
 from tests.geometry import assert_readable
 
+SHORT = ("--states", "256", "--episodes", "8")
 
-def test_what_cannot_be_diagnosed_is_rejected(tmp_path: Path) -> None:
+
+def shown(*arguments):
+    """What a short diagnosis prints as JSON."""
+    return json.loads(good("diagnose", *arguments, *SHORT, "--json").stdout)
+
+
+def test_what_cannot_be_diagnosed_is_rejected(tmp_path):
     with pytest.raises(OptionError, match="no such folder"):
         load_run(tmp_path / "absent")
     with pytest.raises(OptionError, match=r"run\.json"):
@@ -48,72 +40,60 @@ def test_what_cannot_be_diagnosed_is_rejected(tmp_path: Path) -> None:
         diagnosis_of(lambda observation: np.full((len(observation), 4), np.nan))
 
 
-# --- runs, cells and the command ----------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(tmp_path_factory):
     """A short training of PPO, as `sme train` leaves it."""
     pytest.importorskip("stable_baselines3")
     from sme_registry.training import train
 
     folder = tmp_path_factory.mktemp("runs") / "short"
-    protocol = {"states_per_region": 100}
-    train(SPEC, algorithm="PPO", steps=100, folder=folder, protocol=protocol, progress=False)
+    train(
+        SPEC, algorithm="PPO", hyperparameters={"n_steps": 240, "n_epochs": 1}, steps=240,
+        folder=folder, protocol={"states_per_region": 100}, progress=False,
+    )  # fmt: skip
     return folder
 
 
-def test_a_run_is_diagnosed_with_its_log_and_its_exploration(run: Path) -> None:
+def test_a_run_is_diagnosed_with_its_log_and_its_exploration(run):
     found = diagnose(load_run(run), states=256, episodes=8)
     assert found.plan["algorithm"] == "PPO"
     assert found.checkpoint_step is None
-    log, spread = found.measurements.training, found.measurements.exploration_sd
-    assert log is not None
-    assert log.rows == 102  # 2,048 steps of 20
-    assert spread is not None
+    assert found.measurements.training.rows == 12  # 240 steps of 20
+    spread = found.measurements.exploration_sd
     assert all(0.2 < sd < 0.5 for sd in spread)  # SD 1 in [−1, 1], clipped
 
 
-def test_an_unfinished_run_is_diagnosed_from_its_checkpoint(run: Path, tmp_path: Path) -> None:
+def test_an_unfinished_run_is_diagnosed_from_its_checkpoint(run, tmp_path):
     stopped = tmp_path / "stopped"
     shutil.copytree(run, stopped)
-    if not (stopped / "checkpoint.zip").exists():
-        (stopped / "model.zip").rename(stopped / "checkpoint.zip")
-    else:
-        (stopped / "model.zip").unlink()
-    assert load_run(stopped).checkpoint_step == 2048
+    (stopped / "model.zip").replace(stopped / "checkpoint.zip")
+    assert load_run(stopped).checkpoint_step == 240
     (stopped / "checkpoint.zip").unlink()
     assert "checkpoint.zip" in refused("diagnose", stopped)
 
 
-def test_the_command_writes_a_page_its_data_and_its_figures(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, figures: list[Any]
-) -> None:
+def test_the_command_writes_a_page_its_data_and_its_figures(run, tmp_path, monkeypatch, figures):
     pytest.importorskip("matplotlib")
-    from sme_registry.diagnosis import networks
-
-    monkeypatch.setattr(networks, "GRADIENT_STEPS", 100)
-    options = ("--states", "256", "--episodes", "8")
-    result = sme("diagnose", run, "--out", tmp_path / "d", "--probe-capacity", *options)
-    assert result.exit_code == 0, result.output
+    monkeypatch.setattr(networks, "GRADIENT_STEPS", 10)
+    folder = tmp_path / "d"
+    result = good("diagnose", run, "--out", folder, "--probe-capacity", *SHORT)
     assert "Why" in result.stdout
-    page = (tmp_path / "d" / "diagnosis.md").read_text()
-    names = sorted(path.name for path in (tmp_path / "d").glob("*.png"))
+    page = (folder / "diagnosis.md").read_text()
+    names = sorted(path.name for path in folder.glob("*.png"))
     assert len(names) == 5
     assert all(f"]({name})" in page for name in names)
-    assert all((tmp_path / "d" / name).with_suffix(".pdf").exists() for name in names)
-    for figure in figures:
+    assert all((folder / name).with_suffix(".pdf").exists() for name in names)
+    for figure in set(figures):
         assert_readable(figure)
-    read = Diagnosis.read(tmp_path / "d" / "diagnosis.json")
-    assert read.measurements.capacity is not None
+    read = Diagnosis.read(folder / "diagnosis.json")
     assert read.measurements.capacity.layers == (10, 64, 64, 4)
     assert all(render.sentence(verdict) in page for verdict in read.verdicts)
-    assert "--force" in refused("diagnose", run, "--out", tmp_path / "d")
-    again = sme("diagnose", run, "--out", tmp_path / "d", "--force", "--json", *options)
-    assert json.loads(again.stdout)["name"] == "short"
+    assert "--force" in refused("diagnose", run, "--out", folder)
+    monkeypatch.setattr("sme_registry.diagnosis.figures.draw", lambda *_: ())
+    assert shown(run, "--out", folder, "--force")["name"] == "short"
 
 
-def test_an_edited_diagnosis_is_rejected(tmp_path: Path) -> None:
+def test_an_edited_diagnosis_is_rejected(tmp_path):
     plain = diagnosis_of(shrunk, states=256).to_dict()
     plain["spec"]["seed"] = 7
     (tmp_path / "diagnosis.json").write_text(json.dumps(plain))
@@ -121,21 +101,18 @@ def test_an_edited_diagnosis_is_rejected(tmp_path: Path) -> None:
         Diagnosis.read(tmp_path / "diagnosis.json")
 
 
-def test_the_command_accepts_any_policy_with_its_task(tmp_path: Path) -> None:
-    options = ("--states", "256", "--episodes", "8", "--json")
-    result = sme("diagnose", "linear", "--task", "Default", "--set", "complexity=10", *options)
-    assert result.exit_code == 0, result.output
-    found = Diagnosis.from_dict(json.loads(result.stdout))
+def test_the_command_accepts_any_policy_with_its_task(tmp_path):
+    found = Diagnosis.from_dict(shown("linear", "--task", "Default", "--set", "complexity=10"))
     assert found.spec.complexity == 10
     assert "linear_only" in faults(found)
-    against = sme("diagnose", "linear", "-t", "Default", "--against", "constant", *options)
-    assert json.loads(against.stdout)["comparison"]["spec_fields"] == {}
+    against = shown("linear", "-t", "Default", "--against", "constant")
+    assert against["comparison"]["spec_fields"] == {}
     assert "--task Default" in refused("diagnose", "linear")
     assert "--task" in refused("diagnose", tmp_path, "--set", "k=1")
     assert "--cell" in refused("diagnose", tmp_path, "--cell", "a", "--task", "Default")
 
 
-def test_a_policy_of_ones_own_loop_is_diagnosed_with_its_log(tmp_path: Path) -> None:
+def test_a_policy_of_ones_own_loop_is_diagnosed_with_its_log(tmp_path):
     path = tmp_path / "episodes.csv"
     env = RecordRegret(sme_registry.make("Default", horizon=10), path)
     for episode in range(4):
@@ -144,11 +121,8 @@ def test_a_policy_of_ones_own_loop_is_diagnosed_with_its_log(tmp_path: Path) -> 
         while not ended:
             *_, ended, _ = env.step(env.action_space.sample())
     env.close()
-    options = ("--states", "256", "--episodes", "8", "--json")
-    result = sme("diagnose", "linear", "--task", "Default", "--log", path, *options)
-    assert result.exit_code == 0, result.output
-    training = Diagnosis.from_dict(json.loads(result.stdout)).measurements.training
-    assert training is not None
+    found = Diagnosis.from_dict(shown("linear", "--task", "Default", "--log", path))
+    training = found.measurements.training
     assert (training.rows, training.steps) == (4, 40)
     assert training.last_regret == pytest.approx(env.episodes[-1].regret)
     assert "--log" in refused("diagnose", tmp_path, "--log", path)
@@ -156,7 +130,7 @@ def test_a_policy_of_ones_own_loop_is_diagnosed_with_its_log(tmp_path: Path) -> 
     assert "columns must be" in refused("diagnose", "linear", "-t", "Default", "--log", path)
 
 
-def test_a_cell_of_a_study_is_found_by_the_first_digits_of_its_key(tmp_path: Path) -> None:
+def test_a_cell_of_a_study_is_found_by_the_first_digits_of_its_key(tmp_path):
     from sme_registry.spec.study import Cell
     from sme_registry.studies.engine.cell import run_cell
 
@@ -173,40 +147,31 @@ def test_a_cell_of_a_study_is_found_by_the_first_digits_of_its_key(tmp_path: Pat
         result = run_cell(cell, model_path=tmp_path / "models" / f"{key}.zip")
         (tmp_path / "cells" / f"{key}.json").write_text(json.dumps(result.to_dict()))
     linear = load_cell(tmp_path, keys[0][:12])
-    assert linear.log is not None
     assert linear.log.source == "evaluations"
     assert linear.plan["algorithm"] == "reference:linear"
-    options = ("--states", "256", "--episodes", "8", "--json")
-    trained = sme("diagnose", tmp_path, "--cell", keys[2], "--against", keys[1][:9], *options)
-    assert trained.exit_code == 0, trained.output
-    comparison = json.loads(trained.stdout)["comparison"]
+    comparison = shown(tmp_path, "--cell", keys[2], "--against", keys[1][:9])["comparison"]
     assert comparison["plan_fields"] == {"algorithm": ["TD3", "reference:constant"]}
     assert "0 of 3" in refused("diagnose", tmp_path, "--cell", "0123456789")
     with pytest.raises(UnknownNameError, match="6 or more digits"):
         load_cell(tmp_path, "")
     assert "--cell" in refused("diagnose", tmp_path)
     (tmp_path / "models" / f"{keys[2]}.zip").unlink()
-    without = refused("diagnose", tmp_path, "--cell", keys[2])
-    assert "--keep-models" in without
+    assert "--keep-models" in refused("diagnose", tmp_path, "--cell", keys[2])
     (tmp_path / "cells" / f"{keys[1]}.json").write_text("{}")
     assert "not the result of a cell" in refused("diagnose", tmp_path, "--cell", keys[1])
 
 
-def test_without_matplotlib_there_is_a_page_without_figures(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_matplotlib_there_is_a_page_without_figures(tmp_path, monkeypatch):
     find_spec = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name: None if name == "matplotlib" else find_spec(name)
     )
-    options = ("--states", "256", "--episodes", "8", "--out", str(tmp_path))
-    result = sme("diagnose", "constant", "--task", "Default", *options)
-    assert result.exit_code == 0, result.output
+    result = good("diagnose", "constant", "--task", "Default", *SHORT, "--out", tmp_path)
     assert "pip install" in result.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["diagnosis.json", "diagnosis.md"]
 
 
-def test_importing_the_diagnosis_imports_neither_torch_nor_matplotlib() -> None:
+def test_importing_the_diagnosis_imports_neither_torch_nor_matplotlib():
     code = (
         "import sys, sme_registry.diagnosis.figures; "
         "print([m for m in ('torch', 'matplotlib', 'stable_baselines3') if m in sys.modules])"
