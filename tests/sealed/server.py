@@ -13,9 +13,11 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
+import pytest
 
 from leaderboard.documents.keys import SigningKey
 from leaderboard.scoring.sealed import Instance, challenge, instances
+from leaderboard.sealed.attendant import Attendant
 from leaderboard.store import Store
 from sme_registry.envs import SMEVectorEnv
 from sme_registry.sealed import Ticket
@@ -24,35 +26,27 @@ from tests.leaderboard.sealing import MASTER
 from tests.leaderboard.serving import serving
 
 SETTING = {"state_dim": 3, "action_dim": 2, "complexity": 5, "hidden_width": 8, "horizon": 7}
+BUDGET = 1024
 CLASSES = [
-    {"name": "deep", "setting": SETTING, "instances": 2, "budget": 4096},
+    {"name": "deep", "setting": SETTING, "instances": 2, "budget": BUDGET},
     {"name": "short", "setting": SETTING, "instances": 1, "budget": 9},
 ]
-ROWS = 6 * 50
-"""Challenge states of an instance."""
 NONCE = 7
 
 
 @dataclass
 class Server:
-    """A served season, and one ticket of it.
+    """A served season, and one ticket of it."""
 
-    Attributes:
-      url: of the relay.
-      behind: of the board's own server.
-      board: the board, its season and the file of the master.
-      ticket: the last one that `start` got.
-      requests: methods and last parts of the paths, as they arrived at the relay.
-      faults: what happens to the next requests, one each: "lose request", "lose answer", "cut
-        answer", or a status such as "503"; then all is well.
-    """
-
-    behind: str
+    behind: str  # URL of the board's own server
     board: Board
-    url: str = ""
+    url: str = ""  # of the relay
     ticket: Ticket = field(init=False)
     requests: list[str] = field(default_factory=list)
+    """Methods and last parts of the paths, as they arrived at the relay."""
     faults: list[str] = field(default_factory=list)
+    """What happens to the next requests, one each: "lose request", "lose answer", "cut answer", or
+    a status such as "503"; then all is well."""
 
     def start(self) -> None:
         """Get a new ticket, as another entrant."""
@@ -89,13 +83,15 @@ class Server:
 
 @contextlib.contextmanager
 def serving_season(folder: Path) -> Iterator[Server]:
-    """A board in a folder, served with a relay by threads of this process."""
+    """A board in a folder, served with a relay by threads of this process; it scores nothing."""
     board = online_board(folder, classes=CLASSES)
-    with serving(board.path, season_secrets=[board.secret]) as url:
-        server = Server(url, board)
-        with _relay(server):
-            server.start()
-            yield server
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Attendant, "_start", lambda _: None)
+        with serving(board.path, season_secrets=[board.secret]) as url:
+            server = Server(url, board)
+            with _relay(server):
+                server.start()
+                yield server
 
 
 @contextlib.contextmanager

@@ -22,17 +22,10 @@ from sme_registry.sb3 import SMEVecEnv
 from sme_registry.sealed.sb3 import SealedVecEnv
 from sme_registry.sealed.wire import Steps
 from sme_registry.training.learners import new_learner
-from tests.sealed.server import ROWS, Server, serving_season
+from tests.leaderboard.sealed.playing import ROWS
+from tests.sealed.server import BUDGET, Server, serving_season
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")
@@ -83,23 +76,25 @@ def test_an_episode_that_terminates_at_the_horizon_is_not_cut(server, monkeypatc
     assert [info["TimeLimit.truncated"] for info in infos] == [False, True, False]
 
 
-@pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
-def test_this_project_s_trainers_learn_and_their_models_answer(server, algorithm):
+@pytest.mark.parametrize(
+    ("algorithm", "settings"),
+    [("PPO", {"n_steps": 16, "batch_size": 64, "n_epochs": 1}), ("SAC", {"learning_starts": 48})],
+)
+def test_this_project_s_trainers_learn_and_their_models_answer(server, algorithm, settings):
     env = SealedVecEnv(server.url, server.ticket, 0, 4)
-    settings = {"n_steps": 32, "batch_size": 64} if algorithm == "PPO" else {}
-    model = new_learner(algorithm, env, seed=0, steps=256, hyperparameters=settings)
-    model.learn(256)
-    assert env.instance.number == 64
+    model = new_learner(algorithm, env, seed=0, steps=64, hyperparameters=settings)
+    model.learn(64)
+    assert env.instance.number == 16
     sealed.answer(server.url, server.ticket, model, 0)
     assert server.answers(0).shape == (ROWS, 2)
     with pytest.raises(SealedError, match="instance_phase"):  # no more steps after the answers
-        model.learn(256)
+        model.learn(64)
 
 
 def test_sb3_takes_the_single_environment(server):
     env = Monitor(sealed.make(server.url, server.ticket, 1, action_range="symmetric"))
-    PPO("MlpPolicy", env, n_steps=32, batch_size=32, device="cpu").learn(64)
-    assert env.unwrapped.instance.number == 64
+    PPO("MlpPolicy", env, n_steps=16, batch_size=16, n_epochs=1, device="cpu").learn(16)
+    assert env.unwrapped.instance.number == 16
 
 
 def test_a_loop_of_one_file_learns(server, monkeypatch):
@@ -129,11 +124,11 @@ def test_the_page_on_seasons_leads_from_a_ticket_to_its_end(server, tmp_path, mo
     page = page.split("## Taking part online")[1]
     [block] = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
     assert "n_steps=256" in block
-    block = block.replace("n_steps=256", "n_steps=256, n_epochs=1")
+    block = block.replace("n_steps=256", f"n_steps={BUDGET // 8}, n_epochs=1")
     exec(compile(block.replace("https://board.example", server.url), "page", "exec"), {})
     with sealed.Instance(server.url, server.ticket) as first:
         used = [each.used for each in first.status().instances]
-        assert used == [4096, 4096, 8]
+        assert used == [BUDGET, BUDGET, 8]
         command = re.search(r"^sme-leaderboard (answer .*)$", page, re.M)[1]
         words = shlex.split(command.replace("https://board.example", server.url))
         result = CliRunner().invoke(app, words)

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.master import Master
 from leaderboard.scoring.sealed import instances
 from leaderboard.sealed.attendant import Attendant
 from leaderboard.sealed.scores import score_ticket
@@ -21,7 +20,8 @@ from leaderboard.sealed.ticket import RunningTicket
 from leaderboard.store import Store
 from sme_registry import SMEError, materialize, sealed
 from sme_registry.io import sha256_of
-from tests.leaderboard.sealed.playing import Board, online_board
+from tests.leaderboard.sealed.playing import LANES, Board, online_board, playing, request
+from tests.leaderboard.sealing import MASTER
 from tests.leaderboard.serving import serving
 
 KEY = SigningKey.generate()
@@ -29,13 +29,12 @@ KEY = SigningKey.generate()
 
 def secrets_of(board: Board, store: Store) -> list[bytes]:
     """What must not be found: master, seeds and digests as texts and bytes, the task's numbers."""
-    master = Master.read(board.secret)
     row = store.ticket(board.season.digest, 1)
-    ticket = RunningTicket(store, board.season, master, row)
+    ticket = RunningTicket(store, board.season, MASTER, row)
     nonce = store.request_of(row).ticket.nonce
-    texts = [master.raw.hex()]
-    raw = [master.raw]
-    for number, hidden in enumerate(instances(board.season, master, "1", nonce)):
+    texts = [MASTER.raw.hex()]
+    raw = [MASTER.raw]
+    for number, hidden in enumerate(instances(board.season, MASTER, "1", nonce)):
         start = ticket.start(number)
         digits = str(hidden.spec.seed)[2:]
         texts += [digits, str(int(digits, 16)), hidden.spec.digest.removeprefix("sha256:")]
@@ -49,21 +48,19 @@ def secrets_of(board: Board, store: Store) -> list[bytes]:
 
 def everything(url: str, board: Board, client: httpx.Client) -> Iterator[httpx.Response]:
     """The answers to every request of an entrant, and to a refused one of each kind."""
-    request = board.request(KEY)
-    started = board.send(url, request, KEY)
+    signed = board.request(KEY)
+    started = board.send(url, signed, KEY)
     yield started
     ticket = sealed.Ticket.from_dict(started.json())
-    signer = request.signer(KEY)
+    signer = signed.signer(KEY)
     assert signer is not None
     token = {"Authorization": sealed.bearer(ticket.token)}
-    wire = sealed.StepFormat(4, 2, 1)
 
     def at(action: str) -> str:
         return url + sealed.instance_path(board.season.id, 1, 0, action)
 
     def step(number: int, value: float = 0.5) -> httpx.Response:
-        body = wire.pack_request(number, np.full((4, 1), value, np.float32))
-        return client.post(at("steps"), content=body, headers=token)
+        return client.post(at("steps"), content=request(number, value), headers=token)
 
     yield client.get(f"{url}/api/seasons")
     yield client.get(f"{url}/api/seasons/{board.season.id}")
@@ -89,8 +86,8 @@ def everything(url: str, board: Board, client: httpx.Client) -> Iterator[httpx.R
         answers=sha256_of(answers),
         journal=journal.json()["journal"],
     )
-    signed = f"answers?signature={signer.sign(statement)}"
-    yield client.put(at(signed), content=answers, headers=token)
+    last = f"answers?signature={signer.sign(statement)}"
+    yield client.put(at(last), content=answers, headers=token)
     yield client.get(url + sealed.ticket_path(board.season.id, 1), headers=token)
 
 
@@ -112,7 +109,7 @@ def test_no_answer_file_or_log_holds_a_secret(
         statuses = [each.status_code for each in everything(url, board, client)]
     assert set(statuses) == {200, 201, 400, 403, 409, 422}
     with Store.open(board.path) as store:
-        result = score_ticket(store, board.season, Master.read(board.secret), 1)
+        result = score_ticket(store, board.season, MASTER, 1)
         store.end_ticket(board.season.digest, 1, result)
         searched = secrets_of(board, store)
     parts = {f"answer {i}": part for i, part in enumerate(answered)}
@@ -128,21 +125,17 @@ def test_no_answer_file_or_log_holds_a_secret(
 def test_answers_to_steps_have_one_form(tmp_path: Path) -> None:
     """The same head and size, whether episodes end or not, in any task."""
     board = online_board(tmp_path)
-    wire = sealed.StepFormat(4, 2, 1)
-    heads = set()
+    size, heads = sealed.StepFormat(LANES, 2, 1).answer_bytes, set()
     with serving(board.path, season_secrets=[board.secret]) as url, httpx.Client() as client:
         for nonce in range(2):
             ticket = board.ticket(url, KEY, nonce)
             token = {"Authorization": sealed.bearer(ticket.token)}
-
-            def at(action: str, ticket: sealed.Ticket = ticket) -> str:
-                return url + sealed.instance_path(board.season.id, ticket.ticket, 0, action)
-
-            client.post(at("start?lanes=4"), headers=token)
+            at = url + sealed.instance_path(board.season.id, ticket.ticket, 0, "")
+            client.post(at + "start?lanes=4", headers=token)
             for number in range(1, 17):
-                body = wire.pack_request(number, np.full((4, 1), number / 16))
-                answer = client.post(at("steps"), content=body, headers=token)
-                assert len(answer.content) == wire.answer_bytes
+                body = request(number, number / 16)
+                answer = client.post(at + "steps", content=body, headers=token)
+                assert len(answer.content) == size
                 heads.add(tuple((k, v) for k, v in answer.headers.raw if k.lower() != b"date"))
     assert len(heads) == 1
 
@@ -165,15 +158,11 @@ def test_a_fault_is_logged_without_its_text(caplog: pytest.LogCaptureFixture) ->
 
 
 def test_what_holds_a_secret_shows_none(tmp_path: Path) -> None:
-    board = online_board(tmp_path)
-    with serving(board.path, season_secrets=[board.secret]) as url:
-        board.ticket(url, KEY)
-    with Store.open(board.path) as store:
-        searched = secrets_of(board, store)
-        master = Master.read(board.secret)
-        ticket = RunningTicket(store, board.season, master, store.ticket(board.season.digest, 1))
-        shown = [repr(each) for each in (master, ticket, ticket.start(0), ticket.hidden(0))]
-        shown += [repr(ticket.instance(0)), repr(ticket.document)]
-    assert not any(each in text.encode() for text in shown for each in searched)
+    with playing(online_board(tmp_path)) as played:
+        searched = secrets_of(played.board, played.store)
+        ticket = played.tickets.ticket(played.number)
+        holders = (MASTER, ticket, ticket.start(0), ticket.hidden(0), ticket.instance(0))
+        shown = [repr(each).encode() for each in (*holders, ticket.document)]
+    assert not any(each in text for text in shown for each in searched)
     with pytest.raises(TypeError, match="pickle"):
         pickle.dumps(ticket)
