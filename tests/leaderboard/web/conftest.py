@@ -1,0 +1,13 @@
+"""Shared by tests of the web application."""
+
+import os
+
+import pytest
+
+
+@pytest.fixture(scope="package", autouse=True)
+def _no_fsync():
+    """A loss of power is not what these tests are about; tests of the store are."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
+        yield
