@@ -119,38 +119,35 @@ def test_a_class_is_the_mean_over_its_instances_and_the_method_the_mean_over_cla
         )
 
 
-ATTACKS: dict[str, tuple[Regrets, dict[str, int]]] = {
-    "failed runs on one instance": ({**EVEN, TWO[1]: [None] * 5}, {}),
-    "one failed run on one instance": ({**EVEN, TWO[0]: [0.2] * 9, TWO[1]: [None]}, {}),
-    "the constant policy on one instance": ({**EVEN, TWO[1]: [1.0] * 5}, {}),
-    "one poor run on one instance": ({**EVEN, TWO[0]: [0.2] * 9, TWO[1]: [1.0]}, {}),
-    "many runs on the easy instance": ({**EVEN, TWO[0]: [0.2] * 100, TWO[1]: [1.0] * 5}, {}),
-    "a class given up": ({**EVEN, **dict.fromkeys(THREE, [None] * 4)}, {}),
-    "one instance of three given up": ({**EVEN, THREE[0]: [None] * 4}, {}),
-}
+EVEN_REGRETS = {"wd_regret": 0.2, "ood_regret": 0.2 + 0.1 * np.mean(LEVELS[1:])}
+ATTACKS: list[tuple[Regrets, float, bool]] = [
+    # What is given up, its share of the method, and whether its runs failed or score 1 inside.
+    ({**EVEN, TWO[1]: [None] * 5}, 1 / 4, True),
+    ({**EVEN, TWO[0]: [0.2] * 9, TWO[1]: [None]}, 1 / 4, True),
+    ({**EVEN, TWO[1]: [1.0] * 5}, 1 / 4, False),
+    ({**EVEN, TWO[0]: [0.2] * 100, TWO[1]: [1.0]}, 1 / 4, False),
+    ({**EVEN, **dict.fromkeys(THREE, [None] * 4)}, 1 / 2, True),
+    ({**EVEN, THREE[0]: [None] * 4}, 1 / 6, True),
+]
 
 
-@pytest.mark.parametrize("name", ATTACKS)
-@pytest.mark.parametrize("metric", ["wd_regret", "ood_regret"])
-def test_what_is_given_up_costs_its_whole_share(name: str, metric: str) -> None:
-    regrets, unlisted = ATTACKS[name]
-    share = {"class": 1 / 2, "three": 1 / 6}.get(name.split()[1 if "class" in name else 3], 1 / 4)
-
-    lost = theta(scored(regrets, unlisted), metric) - theta(scored(EVEN), metric)
-
-    mean = 0.2 if metric == "wd_regret" else 0.2 + 0.1 * np.mean(LEVELS[1:])
-    worst = 1.0 if None in [each for v in regrets.values() for each in v] else 1.0 + mean - 0.2
-    assert lost == pytest.approx(share * (worst - mean))
+@pytest.mark.parametrize(("regrets", "share", "failed"), ATTACKS)
+def test_what_is_given_up_costs_its_whole_share(
+    regrets: Regrets, share: float, failed: bool
+) -> None:
+    result, even = scored(regrets), scored(EVEN)
+    for metric, mean in EVEN_REGRETS.items():
+        lost = theta(result, metric) - theta(even, metric)
+        worst = 1.0 if failed else 1.0 + mean - 0.2
+        assert lost == pytest.approx(share * (worst - mean))
 
 
 @pytest.mark.parametrize("on_one", [0, 1])
-@pytest.mark.parametrize("unlisted", [0, 1, 7, 50])
-def test_too_few_listed_runs_on_an_instance_earn_no_good_rank(on_one: int, unlisted: int) -> None:
+def test_too_few_listed_runs_on_an_instance_earn_no_good_rank(on_one: int) -> None:
     regrets = {**EVEN, TWO[1]: [0.2] * on_one or [None]}
-    result = scored(regrets, {"two": unlisted})
-
-    others = theta(scored(EVEN))
-    assert not result.enough_runs or theta(result) > others + 0.05
+    for unlisted in (0, 1, 7, 50):
+        result = scored(regrets, {"two": unlisted})
+        assert not result.enough_runs or theta(result) > theta(scored(EVEN)) + 0.05
 
 
 def test_each_instance_needs_its_share_of_the_runs() -> None:
@@ -205,7 +202,7 @@ def flat(regrets: dict[str, list[float]]) -> list[RunScore]:
     return [run(spec, [each] * 6) for spec, values in regrets.items() for each in values]
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=30)
 @given(RUNS, st.sampled_from(SPECS), st.integers(1, 20), st.sampled_from(METRICS[:3]))
 def test_giving_up_an_instance_costs_what_was_learned_there(
     regrets: dict[str, list[float]], spec: str, failures: int, metric: str
@@ -223,7 +220,7 @@ def test_giving_up_an_instance_costs_what_was_learned_there(
     assert lost == pytest.approx(share * learned, abs=1e-9)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=30)
 @given(st.integers(1, 6), st.data())
 def test_leaving_runs_out_never_improves_a_method_with_as_many_runs_on_each_instance(
     count: int, data: st.DataObject
@@ -244,21 +241,6 @@ def test_leaving_runs_out_never_improves_a_method_with_as_many_runs_on_each_inst
         assert theta(chosen, metric) >= theta(honest, metric) - 1e-9, metric
 
 
-def test_omitting_the_runs_with_the_largest_decay_improves_no_metric() -> None:
-    slopes = [0.1 * number for number in range(1, 9)]
-    runs = [
-        run(spec, [0.2 + slope * level for level in LEVELS]) for spec in SPECS for slope in slopes
-    ]
-    withheld = [
-        each if each.regret_slope < 0.45 else failed_run(BOARD.protocol, each.class_name, each.spec)
-        for each in runs
-    ]
-    honest, chosen = (result_of(BOARD, ID, each, {}) for each in (runs, withheld))
-
-    for metric in METRICS:
-        assert theta(honest, metric) < theta(chosen, metric), metric
-
-
 # Intervals
 
 
@@ -277,21 +259,24 @@ def drawn(seed: int, counts: Sequence[int]) -> list[RunScore]:
     ]
 
 
-def test_neither_the_id_nor_the_order_of_runs_changes_an_interval() -> None:
+def test_the_protocol_seeds_an_interval_and_neither_id_nor_order_of_runs_changes_it() -> None:
     runs = drawn(0, [5, 5, 4, 4, 4])
     result = result_of(BOARD, ID, runs, {})
 
-    for number in range(5):
+    for number in range(3):
         shuffled = np.random.default_rng(number).permutation(len(runs))
         other = result_of(BOARD, f"sha256:{number:064x}", [runs[i] for i in shuffled], {})
         for metric in METRICS:
             assert ends(other, metric) == pytest.approx(ends(result, metric), abs=1e-12)
+    protocol = EvaluationProtocol(states_per_region=61)
+    other = BOARD.model_copy(update={"protocol": protocol})
+    assert ends(result) != ends(result_of(other, ID, runs, {}))
 
 
 def test_a_small_change_of_a_run_changes_an_interval_little() -> None:
     runs = drawn(1, [5, 5, 4, 4, 4])
     widths = []
-    for number in range(20):
+    for number in range(10):
         rng = np.random.default_rng(number)
         nudged = [
             run(each.spec, [N + 1e-6 * rng.random() for N in each.normalised_regret])
@@ -303,26 +288,13 @@ def test_a_small_change_of_a_run_changes_an_interval_little() -> None:
     assert max(widths) - min(widths) < 1e-5
 
 
-def test_suite_and_protocol_seed_the_intervals() -> None:
-    runs = drawn(2, [5, 5, 4, 4, 4])
-    protocol = EvaluationProtocol(states_per_region=61)
-    other = BOARD.model_copy(update={"protocol": protocol})
-
-    assert ends(result_of(BOARD, ID, runs, {})) != ends(result_of(other, ID, runs, {}))
-
-
 def test_single_runs_of_several_instances_have_a_wide_interval_and_lone_ones_none() -> None:
     single = result_of(BOARD, ID, drawn(3, [1] * 5), {})
     low, high = ends(single)
     assert low < theta(single) < high
 
-    lone = BOARD.model_copy(
-        update={
-            "suite": Suite.from_dict(
-                {"classes": [{"name": "two", "setting": SETTING, "seeds": [0]}]}
-            )
-        }
-    )
+    suite = {"classes": [{"name": "two", "setting": SETTING, "seeds": [0]}]}
+    lone = BOARD.model_copy(update={"suite": Suite.from_dict(suite)})
     result = result_of(lone, ID, [run(TWO[0], 0.5)], {})
     assert ends(result) is None
     assert result.scores.wd_regret.ends == (theta(result),) * 2
@@ -330,10 +302,7 @@ def test_single_runs_of_several_instances_have_a_wide_interval_and_lone_ones_non
 
 
 def test_no_interval_of_a_regret_reaches_below_zero() -> None:
-    regrets = {spec: [0.0, 0.0, 0.9, 0.0] for spec in SPECS}
-    result = scored(regrets)
-    low, _ = ends(result)
-    assert low == 0.0
+    assert ends(scored({spec: [0.0, 0.0, 0.9, 0.0] for spec in SPECS}))[0] == 0.0
     assert ends(result_of(BOARD, ID, drawn(4, [4] * 5), {}), "ood_decay")[0] < 0.0
 
 
@@ -355,7 +324,7 @@ def test_no_interval_of_a_regret_reaches_below_zero() -> None:
         (0.051, 0.051, False, False),
     ],
 )
-def testis_oracle_like_is_little_regret_in_a_region_or_as_little_outside_as_inside(
+def test_oracle_like_is_little_regret_in_a_region_or_as_little_outside_as_inside(
     wd: float, ood: float, expected: bool, by_rules_1: bool
 ) -> None:
     values = {
@@ -373,7 +342,7 @@ def testis_oracle_like_is_little_regret_in_a_region_or_as_little_outside_as_insi
     assert is_oracle_like(scores, 1) is by_rules_1
 
 
-def test_oneis_oracle_like_run_marks_a_method() -> None:
+def test_one_oracle_like_run_marks_a_method() -> None:
     level = Estimate(value=0.4, low=0.4, high=0.4)
     scores = Scores(**dict.fromkeys(METRICS, level), normalised_regret=(level, level))
     run = failed_run(BOARD.protocol, "two", None)

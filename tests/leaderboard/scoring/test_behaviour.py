@@ -84,6 +84,11 @@ def refused(*policies: Policy, spec: SMESpec = SPEC) -> bool:
     return False
 
 
+def alike(one: str, other: str) -> bool:
+    x, y = (sketch.numbers(sketch.to_bytes(each)) for each in (one, other))
+    return sketch.alike(x[0], y).tolist() == sketch.alike(y[0], x).tolist() == [0]
+
+
 ORIGINAL = network(0)
 COPIES = {
     "the same": ORIGINAL,
@@ -94,12 +99,24 @@ COPIES = {
 
 
 @pytest.mark.parametrize("name", COPIES)
-def test_one_policy_in_other_bytes_is_one_run(name: str) -> None:
-    assert refused(policy(ORIGINAL), policy(COPIES[name]))
+def test_one_policy_in_other_bytes_is_one_run_and_has_a_like_sketch(name: str) -> None:
+    copy = policy(COPIES[name])
+    with pytest.raises(Rejection, match=r"of runs\.1 in the same states") as caught:
+        observed(policy(network(1)), policy(ORIGINAL), copy)
+    assert caught.value.code == "run_repeated"
+
+    (one,), (other,) = observed(policy(ORIGINAL)), observed(copy, submission="two")
+    assert one != other  # other states
+    assert alike(one, other)
 
 
-def test_independent_trainings_are_runs() -> None:
-    assert not refused(*(policy(network(seed)) for seed in range(6)))
+def test_independent_trainings_are_runs_with_unlike_sketches() -> None:
+    policies = [policy(network(seed)) for seed in range(6)]
+    sketches = observed(*policies)
+    pairs = [(one, other) for i, one in enumerate(sketches) for other in sketches[:i]]
+    assert not any(alike(*pair) for pair in pairs)
+    weak = [policy([W, b, 0.02 * V]) for W, b, V in map(network, range(4))]  # hardly trained
+    assert not refused(*weak)
 
 
 def test_a_copy_that_differs_only_outside_the_cube_is_refused() -> None:
@@ -110,13 +127,6 @@ def test_a_copy_that_differs_only_outside_the_cube_is_refused() -> None:
     assert refused(policy(ORIGINAL), other_outside)
 
 
-def test_the_error_names_the_other_run() -> None:
-    with pytest.raises(Rejection, match=r"of runs\.1 in the same states") as caught:
-        observed(policy(network(1)), policy(ORIGINAL), policy(COPIES["permuted"]))
-
-    assert caught.value.code == "run_repeated"
-
-
 def test_the_same_policy_on_another_instance_is_no_repetition() -> None:
     behaviours = Behaviours(PROTOCOL, "one")
     for spec in (SPEC, plane(complexity=2)):
@@ -125,6 +135,7 @@ def test_the_same_policy_on_another_instance_is_no_repetition() -> None:
 
 def test_near_optimal_copies_are_refused_and_near_optimal_networks_are_not() -> None:
     assert refused(OPTIMUM, lambda o: OPTIMUM(o) + FLOOR / 2)
+    assert alike(*(observed(OPTIMUM, submission=name)[0] for name in ("one", "two")))
     wave = [lambda o, k=k: OPTIMUM(o) + 2e-3 * np.sin(9 * o[:, :2] + k) for k in range(3)]
     assert not refused(*wave)
 
@@ -136,14 +147,6 @@ def test_runs_that_collapsed_to_one_constant_are_no_repetition() -> None:
     assert observed(*corner, *almost) == [""] * 8
 
 
-def test_hardly_trained_networks_are_runs() -> None:
-    def weak(seed: int) -> Policy:
-        W, b, V = network(seed)
-        return policy([W, b, 0.02 * V])
-
-    assert not refused(*map(weak, range(4)))
-
-
 def test_a_saturated_policy_that_depends_on_the_state_is_compared() -> None:
     def bang(o: Numbers) -> Numbers:
         return (o[:, :2] > 0.4) * 1.0
@@ -152,29 +155,6 @@ def test_a_saturated_policy_that_depends_on_the_state_is_compared() -> None:
 
 
 # Sketches
-
-
-def alike(one: str, other: str) -> bool:
-    x, y = (sketch.numbers(sketch.to_bytes(each)) for each in (one, other))
-    return sketch.alike(x[0], y).tolist() == sketch.alike(y[0], x).tolist() == [0]
-
-
-@pytest.mark.parametrize("name", COPIES)
-def test_copies_have_like_sketches_in_other_submissions(name: str) -> None:
-    (one,), (other,) = (
-        observed(policy(weights), submission=submission)
-        for submission, weights in (("one", ORIGINAL), ("two", COPIES[name]))
-    )
-
-    assert one != other  # other states
-    assert alike(one, other)
-
-
-def test_independent_trainings_have_unlike_sketches() -> None:
-    sketches = [observed(policy(network(k)), submission=f"{k}")[0] for k in range(8)]
-
-    pairs = [(one, other) for i, one in enumerate(sketches) for other in sketches[:i]]
-    assert not any(alike(*pair) for pair in pairs)
 
 
 def test_no_policy_hides_behind_the_states_of_another_submission() -> None:
@@ -194,12 +174,6 @@ def test_no_policy_hides_behind_the_states_of_another_submission() -> None:
         return np.where(known, 0.5, policy(ORIGINAL)(o))
 
     (other,) = observed(hiding, submission="two")
-    assert alike(one, other)
-
-
-def test_the_optimum_is_like_the_optimum() -> None:
-    (one,), (other,) = (observed(OPTIMUM, submission=name) for name in ("one", "two"))
-
     assert alike(one, other)
 
 

@@ -1,3 +1,5 @@
+"""The metrics of a run, the intervals over runs, and the ranks that intervals allow."""
+
 from __future__ import annotations
 
 import math
@@ -7,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import trim_mean
 
-from benchmarks.interval_coverage import CLASSES, DISTRIBUTIONS, RUNS, simulate
+from benchmarks.interval_coverage import DISTRIBUTIONS, simulate
 from leaderboard.scoring.metrics import run_metrics
 from leaderboard.scoring.ranking import rank_ranges
 from sme_registry import statistics
@@ -16,11 +18,6 @@ from sme_registry.statistics import aggregate as theta
 from sme_registry.statistics import stratified_bootstrap as bootstrap
 
 LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
-
-
-def runs_of(classes: int, runs: int, metrics: int = 1, seed: int = 0) -> dict[str, Array]:
-    rng = np.random.default_rng(seed)
-    return {f"class{index}": rng.lognormal(size=(runs, metrics)) for index in range(classes)}
 
 
 # One run
@@ -46,25 +43,17 @@ def test_slope_is_that_of_the_least_squares_line() -> None:
     assert slope == pytest.approx(np.polynomial.Polynomial.fit(LEVELS, regret, 1).convert().coef[1])
 
 
-@pytest.mark.parametrize("levels", [LEVELS, (0.0, 0.1, 0.3, 0.7)])
-def test_the_constant_policy_has_no_decay_slope_or_points_at_all(
-    levels: tuple[float, ...],
-) -> None:
-    actual = run_metrics((1.0,) * len(levels), (0.75,) * len(levels), levels)
-
-    assert actual == {
-        "wd_regret": 1.0,
-        "ood_regret": 1.0,
-        "ood_decay": 0.0,
-        "regret_slope": 0.0,
-        "similarity_loss": 0.0,
-    }
-
-
-def test_a_run_without_a_policy_scores_one_in_every_metric() -> None:
-    actual = run_metrics((1.0,) * 6, None, LEVELS)
-
-    assert actual == {
+def test_a_constant_policy_has_no_decay_and_a_run_without_a_policy_loses_all_points() -> None:
+    for levels in (LEVELS, (0.0, 0.1, 0.3, 0.7)):
+        constant = run_metrics((1.0,) * len(levels), (0.75,) * len(levels), levels)
+        assert constant == {
+            "wd_regret": 1.0,
+            "ood_regret": 1.0,
+            "ood_decay": 0.0,
+            "regret_slope": 0.0,
+            "similarity_loss": 0.0,
+        }
+    assert run_metrics((1.0,) * 6, None, LEVELS) == {
         "wd_regret": 1.0,
         "ood_regret": 1.0,
         "ood_decay": 1.0,
@@ -76,20 +65,13 @@ def test_a_run_without_a_policy_scores_one_in_every_metric() -> None:
 # Over runs
 
 
-def test_iqm_of_ten_runs_is_the_mean_of_the_middle_six() -> None:
-    assert iqm([9, 100, 1, 2, 3, 4, 5, 6, -50, 7]) == pytest.approx((2 + 3 + 4 + 5 + 6 + 7) / 6)
+def test_iqm_is_scipys_trimmed_mean() -> None:
+    for runs in range(1, 30):
+        values = np.random.default_rng(runs).normal(size=(runs, 3))
+        np.testing.assert_allclose(iqm(values), trim_mean(values, 0.25, axis=0), rtol=1e-13)
 
 
-@pytest.mark.parametrize("runs", range(1, 30))
-def test_iqm_is_scipys_trimmed_mean(runs: int) -> None:
-    values = np.random.default_rng(runs).normal(size=(runs, 3))
-
-    np.testing.assert_allclose(iqm(values), trim_mean(values, 0.25, axis=0), rtol=1e-13)
-
-
-def test_failing_one_class_of_six_moves_theta_ten_times_as_far_as_the_pooled_iqm(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_failing_one_class_of_six_moves_theta_ten_times_as_far_as_the_pooled_iqm() -> None:
     rng = np.random.default_rng(0)
     honest = {str(index): rng.normal(0.33, 0.03, size=(10, 1)) for index in range(6)}
     gave_up = {**honest, "0": np.ones((10, 1))}
@@ -97,21 +79,14 @@ def test_failing_one_class_of_six_moves_theta_ten_times_as_far_as_the_pooled_iqm
     def pooled(classes: dict[str, Array]) -> float:
         return float(iqm(np.concatenate(list(classes.values())))[0])
 
-    ours = float(theta(gave_up)[0] - theta(honest)[0])
-    theirs = pooled(gave_up) - pooled(honest)
-
-    with capsys.disabled():
-        print(
-            f"\ngiving up one class of six: θ moves by {ours:.3f}, the pooled IQM by {theirs:.3f}"
-        )
-    assert ours == pytest.approx(0.11, abs=0.01)
-    assert theirs == pytest.approx(0.01, abs=0.005)
+    assert theta(gave_up)[0] - theta(honest)[0] == pytest.approx(0.11, abs=0.01)
+    assert pooled(gave_up) - pooled(honest) == pytest.approx(0.01, abs=0.005)
 
 
 # Intervals
 
 
-@pytest.mark.parametrize("n", [3, 10, 13, 24])
+@pytest.mark.parametrize("n", [3, 13, 24])
 def test_the_interval_is_the_one_that_sorting_every_sample_gives(n: int) -> None:
     runs = np.random.default_rng(2).lognormal(size=(n, 2))
     bits = statistics._stream("seed", "only")
@@ -125,23 +100,6 @@ def test_the_interval_is_the_one_that_sorting_every_sample_gives(n: int) -> None
 
     np.testing.assert_allclose(low, iqm(runs) - arm, rtol=1e-12)
     np.testing.assert_allclose(high, iqm(runs) + arm, rtol=1e-12)
-
-
-def test_intervals_honour_their_seed() -> None:
-    classes = runs_of(3, 10)
-
-    first, again, other = (bootstrap(classes, 500, seed) for seed in ("a", "a", "b"))
-
-    np.testing.assert_array_equal(first, again)
-    assert not np.array_equal(first, other)
-
-
-def test_intervals_of_a_seed_are_the_same_on_every_machine() -> None:
-    low, high = bootstrap(
-        {"a": np.arange(10.0)[:, None] ** 2, "b": np.ones((4, 1))}, 1000, "sha256:0"
-    )
-
-    assert (low[0], high[0]) == pytest.approx((-1.8855890, 26.0522557), abs=1e-6)
 
 
 def test_all_metrics_are_of_the_same_resampled_runs() -> None:
@@ -169,8 +127,9 @@ def test_runs_that_agree_leave_no_interval_and_one_run_adds_none() -> None:
 
 
 def test_an_interval_contains_its_score() -> None:
-    for seed in range(50):
-        classes = runs_of(2, 3, metrics=4, seed=seed)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        classes = {name: rng.lognormal(size=(3, 4)) for name in ("one", "two")}
         low, high = bootstrap(classes, 100, "a")
         assert (low <= theta(classes)).all()
         assert (theta(classes) <= high).all()
@@ -178,18 +137,12 @@ def test_an_interval_contains_its_score() -> None:
 
 @pytest.mark.parametrize(
     ("name", "instances"),
-    [
-        *[(name, 1) for name in ("normal", "lognormal(1)", "two humps 80:20", "20 % failed")],
-        *[(name, instances) for name in ("normal", "20 % failed") for instances in (2, 10)],
-    ],
+    [("lognormal(1)", 1), ("two humps 80:20", 1), ("20 % failed", 2), ("normal", 10)],
 )
 def test_intervals_cover_the_truth_and_do_not_separate_equal_methods(
-    name: str, instances: int, capsys: pytest.CaptureFixture[str]
+    name: str, instances: int
 ) -> None:
-    actual = simulate(DISTRIBUTIONS[name], repetitions=400, draws=1000, instances=instances)
-
-    with capsys.disabled():
-        print(f"\n{name}, {RUNS} runs on {instances} instances in {CLASSES} classes: {actual}")
+    actual = simulate(DISTRIBUTIONS[name], repetitions=400, draws=500, instances=instances)
     # Three standard errors of what 400 methods, or 200 pairs of them, can show.
     slack = 3 * math.sqrt(0.93 * 0.07 / 400)
     assert actual.coverage_of_mean >= 0.93 - slack
@@ -199,10 +152,10 @@ def test_intervals_cover_the_truth_and_do_not_separate_equal_methods(
 
 
 def test_the_bootstrap_of_many_runs_needs_little_memory() -> None:
-    classes = runs_of(1, 1000, metrics=11)
+    classes = {"one": np.random.default_rng(0).lognormal(size=(1000, 11))}
 
     tracemalloc.start()
-    bootstrap(classes, 10_000, "a")
+    bootstrap(classes, 4000, "a")
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
 
@@ -226,13 +179,8 @@ def test_ranks_match_counting_every_pair() -> None:
         assert (actual[0] <= actual[1]).all()
 
 
-def test_intervals_that_touch_share_a_rank() -> None:
+def test_intervals_that_touch_share_a_rank_and_no_entries_have_none() -> None:
     first, last = rank_ranges([0.1, 0.2, 0.5], [0.2, 0.3, 0.6])
-
     assert list(zip(first.tolist(), last.tolist(), strict=True)) == [(1, 2), (1, 2), (3, 3)]
-
-
-def test_no_entries_have_no_ranks() -> None:
     first, last = rank_ranges([], [])
-
     assert len(first) == len(last) == 0

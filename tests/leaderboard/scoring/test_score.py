@@ -1,3 +1,5 @@
+"""`score_submission`: numbers, flags and rejections of real policies in the sandbox."""
+
 from __future__ import annotations
 
 import glob
@@ -7,8 +9,8 @@ import signal
 import sys
 import types
 from collections.abc import Callable
+from dataclasses import dataclass
 from importlib import metadata
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ from leaderboard.artefact.reference import constant_onnx, optimal_onnx
 from leaderboard.artefact.sandbox import MAX_ROUNDING, Observations
 from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.result import METRICS, Result
+from leaderboard.documents.result import METRICS, Estimate, Result
 from leaderboard.documents.submission import Submission
 from leaderboard.errors import BoardError
 from leaderboard.scoring import score as score_module
@@ -53,6 +55,9 @@ BOARD = BoardDocument(
     runs_to_rank=2,
     draws=200,
 )
+ONE = BOARD.model_copy(update={"suite": Suite.from_dict({"classes": [SUITE.classes[1].to_dict()]})})
+"""The deep instance alone."""
+
 Policy = Callable[[SMESpec], bytes] | bytes | None
 
 
@@ -66,10 +71,10 @@ def score(
     specs: list[str] | None = None,
     opened: list[str] | None = None,
     board: BoardDocument = BOARD,
-    **fields: Any,
+    runs_started: dict[str, int] | None = None,
 ) -> Result:
     """Score these policies on the suite's instances in order, again from the first one on."""
-    instances = SUITE.instances
+    instances = board.suite.instances
     data: dict[str, bytes] = {}
     runs = []
     for index, policy in enumerate(policies):
@@ -81,21 +86,18 @@ def score(
             artefact = {"sha256": sha256_of(content), "size": len(content)}
         digest = specs[index] if specs else spec.digest
         runs.append({"spec": digest, "seed": index, "steps": 10, "artefact": artefact})
+    listed = {
+        member.name: sum(run["spec"] in {spec.digest for spec in member.instances} for run in runs)
+        for member in board.suite.classes
+    }
     submission = Submission.from_dict(
         {
-            "suite": BOARD.suite_reference,
+            "suite": board.suite_reference,
             "method": {"name": "m", "version": "1", "family": "f", "knowledge": "generic"},
             "submitter": {"name": "s", "key": KEY.public},
             "created": "2026-11-21T09:30:00Z",
             "runs": runs,
-            **fields,
-            "runs_started": {
-                member.name: sum(
-                    run["spec"] in {spec.digest for spec in member.instances} for run in runs
-                )
-                for member in SUITE.classes
-            }
-            | fields.get("runs_started", {}),
+            "runs_started": listed | (runs_started or {}),
         }
     )
 
@@ -108,6 +110,123 @@ def score(
 
 
 LINEAR = as_bytes(models.linear())
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A submission with a failed run and three that are not listed, and what `progress` heard."""
+
+    result: Result
+    progress: list[tuple[int, int]]
+
+
+@pytest.fixture(scope="module")
+def scored() -> Scored:
+    calls: list[tuple[int, int]] = []
+    result = score(
+        *(LINEAR, None, LINEAR),
+        runs_started={"shallow": 4, "deep": 1},
+        progress=lambda done, total: calls.append((done, total)),
+    )
+    return Scored(result, calls)
+
+
+def test_the_seed_is_the_first_53_bits_of_the_three_digests() -> None:
+    bits = bin(int(hashlib.sha256(b"p\ns\na").hexdigest(), 16))[2:].zfill(256)
+    assert evaluation_seed("p", "s", "a") == int(bits[:53], 2)
+    assert len({evaluation_seed(*digests) for digests in ("psa", "qsa", "pta", "psb")}) == 4
+
+
+def estimates(result: Result) -> list[Estimate]:
+    assert result.scores is not None
+    regrets = (result.scores.wd_regret, result.scores.ood_regret)
+    return [*regrets, *result.scores.normalised_regret]
+
+
+def test_a_copy_of_the_optimal_policy_scores_zero_and_is_flagged() -> None:
+    # What an open board cannot tell: the specs are public, and so is π*. It shows performance,
+    # never learning; all that the board can do is to ask for code.
+    result = score(optimal_onnx, board=ONE)
+    assert all(0.0 <= estimate.value < 1e-6 for estimate in estimates(result))
+    assert result.oracle_like
+
+
+def test_the_constant_policy_scores_one_and_has_no_decay_or_sketch() -> None:
+    result = score(constant_onnx, board=ONE)
+    assert {estimate.value for estimate in estimates(result)} == {1.0}
+    assert result.scores is not None
+    assert result.scores.ood_decay.value == result.scores.regret_slope.value == 0.0
+    assert not result.oracle_like
+    assert result.runs[0].sketch == ""
+
+
+def test_a_run_has_the_numbers_that_anyone_can_recompute(scored: Scored) -> None:
+    W = numpy_helper.to_array(models.linear().graph.initializer[0])
+    for index in (0, 2):
+        run, spec = scored.result.runs[index], SUITE.instances[index]
+        seed = evaluation_seed(BOARD.protocol.digest, spec.digest, sha256_of(LINEAR))
+        report = evaluate(
+            lambda observations: observations @ W,
+            spec,
+            EvaluationProtocol(states_per_region=60, seed=seed),
+        )
+        regret = [region.normalised_regret for region in report.regions]
+        similarity = [region.similarity for region in report.regions]
+        assert run.evaluation_seed == seed
+        assert run.normalised_regret == pytest.approx(regret, abs=1e-6)
+        assert run.similarity == pytest.approx(similarity, abs=1e-6)
+        assert run.ood_regret == pytest.approx(np.mean(regret[1:]), abs=1e-6)
+        assert run.similarity_loss == pytest.approx(
+            100 * (similarity[0] - np.mean(similarity[1:])), abs=1e-4
+        )
+        assert run.sketch  # by which copies are found
+
+
+def test_a_result_is_the_same_each_time_whatever_else_is_loaded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    first = score(LINEAR, board=ONE)
+    monkeypatch.setitem(sys.modules, "torch", types.ModuleType("torch"))
+    again = score(LINEAR, board=ONE)
+
+    def without_rounding(result: Result) -> Result:  # random numbers measure it
+        runs = tuple(run.model_copy(update={"rounding": None}) for run in result.runs)
+        return result.model_copy(update={"runs": runs})
+
+    assert without_rounding(first) == without_rounding(again)
+    assert {"sme_registry", "python", "numpy", "onnxruntime"} <= set(first.versions)
+    assert first.versions["onnxruntime"] == metadata.version("onnxruntime")
+
+
+def test_a_result_records_the_isolation_and_the_effect_of_rounding_and_reads_back(
+    scored: Scored,
+) -> None:
+    result = scored.result
+    assert result.isolation == available_isolation()
+    assert [run.rounding is None for run in result.runs] == [False, True, False]
+    assert all(0.0 < run.rounding <= MAX_ROUNDING for run in result.runs if run.rounding)
+    plain = result.to_dict()
+    assert Result.from_dict(plain) == result
+    assert "rounding" not in plain["runs"][1]
+    del plain["isolation"]  # fields younger than the first results are left out at their defaults
+    assert "isolation" not in Result.from_dict(plain).to_dict()
+
+
+def test_failed_and_unlisted_runs_score_one(scored: Scored) -> None:
+    result = scored.result
+    shallow, deep = result.classes
+    assert (shallow.runs, shallow.submitted) == (4, 1)
+    assert (deep.runs, deep.submitted) == (1, 1)
+    assert [run.artefact is None for run in result.runs] == [False, True, False]
+    failed = result.runs[1]
+    assert failed.normalised_regret == (1.0,) * 6
+    assert failed.similarity is failed.evaluation_seed is None
+    assert failed.sketch == ""
+    assert [getattr(failed, name) for name in METRICS] == [1.0, 1.0, 1.0, 1.0, 100.0]
+    # The unlisted runs are one on each instance: [N, 1] and [1, 1].
+    assert shallow.wd_regret == pytest.approx((result.runs[0].wd_regret + 3.0) / 4.0)
+    # The states of every policy are counted.
+    assert scored.progress == [(60 * region, 60 * 12) for region in range(1, 13)]
 
 
 def hidden_units(order: list[int], factor: float = 1.0) -> bytes:
@@ -126,150 +245,50 @@ def hidden_units(order: list[int], factor: float = 1.0) -> bytes:
     return as_bytes(models.model(nodes, tensors))
 
 
-def test_one_policy_in_several_files_is_refused_and_both_runs_are_named() -> None:
-    original, permuted = hidden_units(list(range(8))), hidden_units(list(range(8))[::-1])
-    rescaled = hidden_units(list(range(8)), 0.3)
-    assert len({original, permuted, rescaled}) == 3
-    for copy in (permuted, rescaled):
-        result = score(original, LINEAR, LINEAR, copy)
-
-        assert (result.status, result.code) == ("rejected", "run_repeated")
-        assert result.message.startswith("runs.3 (class shallow")
-        assert "runs.0 in the same states" in result.message
+def test_one_policy_in_two_files_is_refused_and_both_runs_are_named() -> None:
+    original, copy = hidden_units(list(range(8))), hidden_units(list(range(8))[::-1], 0.3)
+    assert original != copy
+    result = score(original, None, None, copy)
+    assert (result.status, result.code) == ("rejected", "run_repeated")
+    assert result.message.startswith("runs.3 (class shallow")
+    assert "runs.0 in the same states" in result.message
 
 
-def test_runs_carry_sketches_by_which_copies_are_found() -> None:
-    result = score(LINEAR, constant_onnx, None)
-
-    assert [bool(run.sketch) for run in result.runs] == [True, False, False]
-
-
-def without_rounding(result: Result) -> Result:
-    """The result without what random numbers measured."""
-    runs = tuple(run.model_copy(update={"rounding": None}) for run in result.runs)
-    return result.model_copy(update={"runs": runs})
-
-
-def test_the_seed_is_the_first_53_bits_of_the_three_digests() -> None:
-    bits = bin(int(hashlib.sha256(b"p\ns\na").hexdigest(), 16))[2:].zfill(256)
-
-    assert evaluation_seed("p", "s", "a") == int(bits[:53], 2)
-
-
-def test_each_of_the_three_digests_moves_the_seed() -> None:
-    seeds = {evaluation_seed(*digests) for digests in ("psa", "qsa", "pta", "psb")}
-
-    assert len(seeds) == 4
-
-
-def test_a_copy_of_the_optimal_policy_scores_zero_and_is_flagged() -> None:
-    # What an open board cannot tell: the specs are public, and so is π*. It shows performance,
-    # never learning; all that the board can do is to ask for code.
-    result = score(optimal_onnx, optimal_onnx, optimal_onnx)
-
-    assert result.status == "scored"
-    assert result.scores is not None
-    for estimate in (
-        result.scores.wd_regret,
-        result.scores.ood_regret,
-        *result.scores.normalised_regret,
-    ):
-        assert 0.0 <= estimate.low <= estimate.value <= estimate.high < 1e-6
-    assert result.oracle_like
-
-
-def test_the_constant_policy_scores_one_and_has_no_decay() -> None:
-    result = score(constant_onnx, constant_onnx, constant_onnx)
-
-    assert result.scores is not None
-    for estimate in (
-        result.scores.wd_regret,
-        result.scores.ood_regret,
-        *result.scores.normalised_regret,
-    ):
-        assert (estimate.low, estimate.value, estimate.high) == (1.0, 1.0, 1.0)
-    assert result.scores.ood_decay.value == result.scores.regret_slope.value == 0.0
-    assert not result.oracle_like
-
-
-def test_a_run_has_the_numbers_that_anyone_can_recompute() -> None:
-    W = numpy_helper.to_array(models.linear().graph.initializer[0])
-
-    result = score(LINEAR, LINEAR, LINEAR)
-
-    for run, spec in zip(result.runs, SUITE.instances, strict=True):
-        seed = evaluation_seed(BOARD.protocol.digest, spec.digest, sha256_of(LINEAR))
-        report = evaluate(
-            lambda observations: observations @ W,
-            spec,
-            EvaluationProtocol(states_per_region=60, seed=seed),
-        )
-        regret = [region.normalised_regret for region in report.regions]
-        similarity = [region.similarity for region in report.regions]
-        assert run.evaluation_seed == seed
-        assert run.normalised_regret == pytest.approx(regret, abs=1e-6)
-        assert run.similarity == pytest.approx(similarity, abs=1e-6)
-        assert run.ood_regret == pytest.approx(np.mean(regret[1:]), abs=1e-6)
-        assert run.similarity_loss == pytest.approx(
-            100 * (similarity[0] - np.mean(similarity[1:])), abs=1e-4
-        )
-
-
-def test_a_result_is_the_same_each_time_and_reads_back() -> None:
-    first, again = score(LINEAR, LINEAR, None), score(LINEAR, LINEAR, None)
-
-    assert without_rounding(first) == without_rounding(again)
-    assert Result.from_dict(first.to_dict()) == first
-
-
-def test_a_result_records_the_isolation_the_runtime_and_the_effect_of_rounding() -> None:
-    scored, rejected = score(LINEAR, LINEAR, None), score(b"not a model", None, LINEAR)
-
-    for result in (scored, rejected):
+def test_what_its_documents_show_rejects_a_submission_before_scoring() -> None:
+    opened: list[str] = []
+    other = SMESpec(state_dim=2, action_dim=2, seed=77).digest
+    for result, code, fact in [
+        (score(*[LINEAR] * 6, opened=opened), "duplicate_run", "runs.3"),
+        (
+            score(None, None, None, specs=[SUITE.instances[0].digest, other, other]),
+            *("unknown_spec", other),
+        ),
+        (score(None, None), "missing_run", "class deep"),
+        (
+            score(LINEAR, LINEAR, LINEAR, opened=opened, runs_started={"deep": 10**12}),
+            *("schema", "runs_started=1000000000002: must be at most 1,000"),
+        ),
+    ]:
+        assert (result.status, result.code) == ("rejected", code)
+        assert fact in result.message
         assert result.isolation == available_isolation()
         assert {"sme_registry", "python", "numpy"} <= set(result.versions)
-    assert scored.versions["onnxruntime"] == metadata.version("onnxruntime")
-    assert [run.rounding is None for run in scored.runs] == [False, False, True]
-    assert all(0.0 < run.rounding <= MAX_ROUNDING for run in scored.runs[:2])
-
-
-def test_fields_younger_than_the_first_results_are_left_out_at_their_defaults() -> None:
-    plain = score(LINEAR, LINEAR, None).to_dict()
-    assert "rounding" not in plain["runs"][2]
-    del plain["isolation"]
-    assert "isolation" not in Result.from_dict(plain).to_dict()
-
-
-def test_failed_and_unlisted_runs_score_one() -> None:
-    result = score(LINEAR, None, LINEAR, runs_started={"shallow": 4, "deep": 1})
-
-    shallow, deep = result.classes
-    assert (shallow.runs, shallow.submitted) == (4, 1)
-    assert (deep.runs, deep.submitted) == (1, 1)
-    assert [run.artefact is None for run in result.runs] == [False, True, False]
-    failed = result.runs[1]
-    assert failed.normalised_regret == (1.0,) * 6
-    assert failed.similarity is failed.evaluation_seed is None
-    assert [getattr(failed, name) for name in METRICS] == [1.0, 1.0, 1.0, 1.0, 100.0]
-    # The unlisted runs are one on each instance: [N, 1] and [1, 1].
-    assert shallow.wd_regret == pytest.approx((result.runs[0].wd_regret + 3.0) / 4.0)
-
-
-def test_progress_counts_the_states_of_every_policy() -> None:
-    calls: list[tuple[int, int]] = []
-
-    score(LINEAR, None, LINEAR, progress=lambda done, total: calls.append((done, total)))
-
-    assert calls == [(60 * region, 60 * 12) for region in range(1, 13)]
-
-
-def test_a_policy_that_is_listed_twice_on_one_instance_is_rejected_before_scoring() -> None:
-    opened: list[str] = []
-
-    result = score(*[LINEAR] * 6, opened=opened)
-
-    assert (result.status, result.code) == ("rejected", "duplicate_run")
     assert opened == []
+
+
+LARGE = models.tensor("large", np.float32(10_000.0))
+AMPLIFYING = models.squashed(
+    [models.node("Add", "y large", "shifted"), models.node("Sub", "shifted large", "a")], [LARGE]
+)
+DEPENDENT_OUTSIDE = models.squashed(
+    [
+        models.node("Sub", "o far", "d"),
+        models.node("Relu", "d", "r"),  # 0 for every state within ε = 0.6
+        models.node("ReduceMean", "r", "m", keepdims=1),  # over the batch
+        models.node("Add", "y m", "a"),
+    ],
+    [models.tensor("far", np.float32(1.3))],
+)
 
 
 @pytest.mark.parametrize(
@@ -278,36 +297,19 @@ def test_a_policy_that_is_listed_twice_on_one_instance_is_rejected_before_scorin
         (b"not a model", "onnx_malformed"),
         (as_bytes(models.squashed([models.node("Log", "y", "a")])), "run_not_finite"),
         (as_bytes(models.model([models.node("Abs", "o", "a")])), "run_output"),
+        (as_bytes(AMPLIFYING), "run_rounding"),
+        (as_bytes(DEPENDENT_OUTSIDE), "run_batch_dependent"),
     ],
+    ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_a_rejected_artefact_rejects_the_submission_and_is_named(policy: bytes, code: str) -> None:
-    result = score(LINEAR, policy, LINEAR)
-
+    result = score(None, policy, LINEAR)
     assert (result.status, result.code) == ("rejected", code)
     assert result.message.startswith(
         f"runs.1 (class shallow, spec {SUITE.instances[1].digest}, artefact {sha256_of(policy)}): "
     )
     assert result.scores is None
     assert result.runs == ()
-
-
-def test_dependence_on_the_batch_in_an_outer_region_is_detected() -> None:
-    far = models.tensor("far", np.float32(1.3))
-    policy = as_bytes(
-        models.squashed(
-            [
-                models.node("Sub", "o far", "d"),
-                models.node("Relu", "d", "r"),  # 0 for every state within ε = 0.6
-                models.node("ReduceMean", "r", "m", keepdims=1),  # over the batch
-                models.node("Add", "y m", "a"),
-            ],
-            [far],
-        )
-    )
-
-    result = score(policy, None, None)
-
-    assert (result.status, result.code) == ("rejected", "run_batch_dependent")
 
 
 class Recorder:
@@ -400,60 +402,18 @@ def test_dependence_on_the_batch_in_the_last_one_alone_is_detected() -> None:
             ],
         )
     )
-    board = BOARD.model_copy(update={"protocol": EvaluationProtocol(states_per_region=8692)})
-
-    result = score(policy, None, None, board=board)
-
+    board = ONE.model_copy(update={"protocol": EvaluationProtocol(states_per_region=8692)})
+    result = score(policy, board=board)
     assert (result.status, result.code) == ("rejected", "run_batch_dependent")
 
 
-def test_a_policy_that_amplifies_rounding_is_rejected() -> None:
-    large = models.tensor("large", np.float32(10_000.0))
-    policy = as_bytes(
-        models.squashed(
-            [models.node("Add", "y large", "shifted"), models.node("Sub", "shifted large", "a")],
-            [large],
-        )
-    )
-
-    result = score(LINEAR, policy, LINEAR)
-
-    assert (result.status, result.code) == ("rejected", "run_rounding")
-
-
-def test_an_instance_of_another_suite_is_refused() -> None:
-    other = SMESpec(state_dim=2, action_dim=2, seed=77).digest
-
-    result = score(None, None, None, specs=[SUITE.instances[0].digest, other, other])
-
-    assert result.code == "unknown_spec"
-    assert other in result.message
-
-
-def test_a_class_without_runs_is_refused() -> None:
-    result = score(None, None)
-
-    assert result.code == "missing_run"
-    assert "class deep" in result.message
-
-
-def test_too_many_started_runs_are_rejected_before_scoring() -> None:
-    opened: list[str] = []
-
-    result = score(LINEAR, LINEAR, LINEAR, opened=opened, runs_started={"deep": 10**12})
-
-    assert result.code == "schema"
-    assert "runs_started=1000000000002: must be at most 1,000" in result.message
-    assert opened == []
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, OSError])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
 def test_errors_of_the_scorer_do_not_reject_the_submission(error: type[BaseException]) -> None:
     def stop(done: int, total: int) -> None:
         raise error
 
     with pytest.raises(error):
-        score(LINEAR, LINEAR, LINEAR, progress=stop)
+        score(LINEAR, board=ONE, progress=stop)
 
 
 def children() -> list[int]:
@@ -473,16 +433,4 @@ def test_a_sandbox_ended_from_outside_does_not_reject_the_submission() -> None:
             os.kill(child, signal.SIGKILL)
 
     with pytest.raises(BoardError, match="not caused by the model"):
-        score(LINEAR, LINEAR, LINEAR, progress=end_it)
-
-
-def test_versions_are_of_packages_that_the_numbers_depend_on(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    alone = score(LINEAR, None, None)
-    monkeypatch.setitem(sys.modules, "torch", types.ModuleType("torch"))
-
-    with_torch = score(LINEAR, None, None)
-
-    assert {"sme_registry", "python", "numpy", "onnxruntime"} <= set(alone.versions)
-    assert with_torch.versions == alone.versions
+        score(LINEAR, board=ONE, progress=end_it)

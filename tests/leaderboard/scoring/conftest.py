@@ -1,0 +1,126 @@
+"""One scored board for the tests of `verify`, and how its owner could forge it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from leaderboard.documents.board import Folder
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.result import Result, RunScore
+from leaderboard.documents.submission import SignedSubmission
+from leaderboard.scoring.aggregation import never_listed, result_of
+from leaderboard.scoring.worker import run_scorer
+from leaderboard.store import LogEntry, Store, digest_of
+from sme_registry.io import to_json
+from tests.leaderboard.artefact import models
+from tests.leaderboard.conftest import (
+    linear_onnx,
+    put_policy,
+    put_submission,
+    signed_withdrawal,
+    tiny_board,
+    tiny_submission,
+)
+
+STEADY, FAILED, SENSITIVE, REFUSED, WAITING = range(5)
+"""The entries of `board`: its log opens, receives four, has four results, loses `FAILED`, which is
+withdrawn, and receives the last. `FAILED` has a run that failed and one that it does not list."""
+
+
+def sensitive_onnx() -> bytes:
+    """A policy that adds and subtracts a number so large that the actions lose their last bits."""
+    model = models.model(
+        [
+            models.node("MatMul", "o W", "y"),
+            models.node("Add", "y large", "shifted"),
+            models.node("Sub", "shifted large", "a"),
+        ],
+        [
+            models.tensor("W", np.full((4, 1), 0.1, np.float32)),
+            models.tensor("large", np.float32(200.0)),
+        ],
+        inputs=[models.value("o", "B", 4)],
+        outputs=[models.value("a", "B", 1)],
+    )
+    return bytes(model.SerializeToString(deterministic=True))
+
+
+def make_board(folder: Path) -> None:
+    path, key = folder / "board", SigningKey.generate()
+    with tiny_board(path) as store:
+        put_policy(store, key, linear_onnx(0), 0)
+        (run,) = tiny_submission(store, key, 1)[0].submission.to_dict()["runs"]
+        failed = {**run, "seed": 7, "artefact": None}
+        withdrawn = put_submission(store, key, 1, runs=[run, failed], runs_started={"Tiny": 3})
+        put_policy(store, key, sensitive_onnx(), 2)
+        put_policy(store, key, linear_onnx(0, observation_dim=9), 3)
+        run_scorer(path)
+        assert [row.status for row in store.entries()] == [*["scored"] * 3, "rejected"]
+        store.withdraw(signed_withdrawal(store, withdrawn.id, key))
+        put_submission(store, key, 4)
+        assert store.head.sequence == 10
+
+
+@pytest.fixture
+def board(once: Callable[..., Path], tmp_path: Path) -> Path:
+    """A copy of the scored board."""
+    whole = once("leaderboard-scored", make_board)
+    return Path(shutil.copytree(whole / "board", tmp_path / "board"))
+
+
+def ids(board: Path) -> list[str]:
+    with Store.open(board, read_only=True) as store:
+        return [row.id for row in store.entries()]
+
+
+def result_on(board: Path, number: int) -> Result:
+    path = Folder(board).result(ids(board)[number])
+    return Result.from_dict(json.loads(path.read_text()))
+
+
+def with_runs(board: Path, result: Result, runs: Sequence[RunScore], **fields: Any) -> Result:
+    """A result whose scores follow from these runs."""
+    folder = Folder(board)
+    signed = json.loads(folder.submission(result.submission).read_text())
+    submission = SignedSubmission.from_dict(signed).submission
+    unlisted = fields.pop("unlisted", never_listed(folder.read(), submission))
+    return result_of(
+        *(folder.read(), result.submission, runs, result.versions),
+        unlisted=unlisted,
+        isolation=result.isolation,
+    )
+
+
+def forge(board: Path, result: Result) -> Path:
+    """Replace a result and sign the log again, as the board's owner can; the result's file."""
+    path = Folder(board).result(result.submission)
+    path.write_text(to_json(result.to_dict()))
+    resign(board, Folder(board).signing_key())
+    return path
+
+
+def resign(board: Path, key: SigningKey, start: int = 1) -> None:
+    """Write the log again from an entry on, chain and signatures right, documents as they are."""
+    folder = Folder(board)
+    previous = LogEntry.from_dict(json.loads(folder.log_entry(start - 1).read_text()))
+    for path in sorted(folder.log.glob("*.json"))[start:]:
+        entry = LogEntry.from_dict(json.loads(path.read_text()))
+        document: dict[str, Any] = {}
+        if entry.event == "result":
+            result = Result.from_dict(json.loads(folder.result(entry.subject).read_text()))
+            document = {"document": digest_of(result)}
+        if entry.event == "received":
+            text = folder.submission(entry.subject).read_text()
+            document = {"document": digest_of(SignedSubmission.from_dict(json.loads(text)))}
+        entry = entry.model_copy(update={"previous": previous.digest, **document})
+        signature = key.sign("log", entry.signed_digest)
+        previous = entry.model_copy(update={"signature": signature})
+        path.write_text(to_json(previous.to_dict()))
+    folder.index.unlink(missing_ok=True)
