@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import trim_mean
 
 import sme_registry
-from sme_registry import SMESpec, evaluate, materialize
+from sme_registry import evaluate, materialize
 from sme_registry.errors import (
     DigestMismatchError,
     OptionError,
@@ -18,7 +19,6 @@ from sme_registry.errors import (
     UnknownNameError,
 )
 from sme_registry.evaluation import (
-    Perceptron,
     StreamReport,
     across_seeds,
     dynamic_regret,
@@ -31,30 +31,13 @@ from sme_registry.evaluation import (
 from sme_registry.evaluation.continual import RegretBlocks, metrics
 from sme_registry.evaluation.continual.report import METRICS, Retention
 from sme_registry.evaluation.continual.retention import Subject, final_specs, measure
+from sme_registry.evaluation.report_file import as_text
 from sme_registry.spec import EvaluationProtocol, StreamSpec
 from sme_registry.task import loading
+from tests.evaluation.streams import SPEC, TWICE, half, network, stream_of
 
 PROTOCOL = {"states_per_region": 300, "epsilons": [0.5, 1.0]}
-SPEC = SMESpec(state_dim=4, action_dim=2, hidden_width=8, complexity=2, horizon=10)
-
-
-def stream_of(*specs, cycles=1, steps=50, **fields):
-    phases = [{"spec": spec, "steps": steps} for spec in specs]
-    return StreamSpec(phases=phases, cycles=cycles, **fields)
-
-
 THREE = stream_of(SPEC, SPEC.derive(seed=1, k=5, r_min=0.5), SPEC.derive(rotation=1.0))
-TWICE = stream_of(SPEC, SPEC.derive(seed=1), cycles=2)
-
-
-def network(seed, inputs=SPEC.state_dim + 2):
-    random = np.random.default_rng(seed)
-    W = random.normal(size=(inputs, SPEC.action_dim)) / 2
-    return Perceptron([(W, np.full(SPEC.action_dim, 0.5), "identity")])
-
-
-def half(observations):
-    return np.full((len(observations), SPEC.action_dim), 0.5)
 
 
 def matrix(report, region="WD"):
@@ -83,12 +66,13 @@ def test_retention_draws_each_task_once_even_if_it_is_too_large_to_keep(monkeypa
 def test_the_matrix_has_the_normalised_regret_of_an_evaluation_on_each_phases_task():
     for j, phase in enumerate(THREE.phases):
         for v in range(3):
-            single = evaluate(network(v), phase.spec, PROTOCOL)
-            for region in single.regions:
+            for region in evaluate(network(v), phase.spec, PROTOCOL).regions:
                 found = matrix(report(), region.name)[v, j]
                 assert found == pytest.approx(region.normalised_regret, rel=1e-12)
         shells = [matrix(report(), name)[:, j] for name in ("OOD 1", "OOD 2")]
         np.testing.assert_allclose(matrix(report(), "OOD")[:, j], np.mean(shells, axis=0))
+    with pytest.raises(UnknownNameError, match=r"region='OD 1': .* Did you mean 'OOD 1'"):
+        report().region("OD 1")
 
 
 def test_initial_and_fresh_agents_are_measured_on_their_phases():
@@ -105,13 +89,13 @@ def test_initial_and_fresh_agents_are_measured_on_their_phases():
 
 
 def test_a_drifting_phase_is_evaluated_on_its_last_piece():
-    drift = {"rotation": 2.0, "increments": 4}
-    stream = StreamSpec(phases=[{"spec": SPEC, "steps": 40, "drift": drift}])
-    assert final_specs(stream) == (SPEC.derive(rotation=1.5),)
+    last = SPEC.derive(rotation=1.5)
+    stream = stream_of(SPEC, steps=40, drift={"rotation": 2.0, "increments": 4})
+    assert final_specs(stream) == (last,)
     drifted = evaluate_stream([network(0)], stream, PROTOCOL)
-    last = evaluate_stream([network(0)], stream_of(SPEC.derive(rotation=1.5)), PROTOCOL)
-    assert (matrix(drifted) == matrix(last)).all()
-    assert drifted.visits[0].spec_digest == SPEC.derive(rotation=1.5).digest
+    alone = evaluate_stream([network(0)], stream_of(last), PROTOCOL)
+    assert (matrix(drifted) == matrix(alone)).all()
+    assert drifted.visits[0].spec_digest == last.digest
 
 
 def test_a_policy_that_observes_the_phase_is_given_that_of_the_task():
@@ -223,9 +207,9 @@ def test_what_cannot_be_compared_is_none():
     assert only.final("plasticity_ratio") is only.final("plasticity_difference") is None
 
 
-def test_an_unknown_region_is_refused():
-    with pytest.raises(UnknownNameError, match=r"region='OD 1': .* Did you mean 'OOD 1'"):
-        report().region("OD 1")
+def test_one_mapping_names_every_metric_of_a_retention():
+    regrets = {"normalised_regret", "initial_normalised_regret", "fresh_normalised_regret"}
+    assert [*METRICS] == [name for name in Retention.model_fields if name not in regrets]
 
 
 # Dynamic regret
@@ -233,7 +217,7 @@ def test_an_unknown_region_is_refused():
 
 @st.composite
 def lives(draw):
-    """A stream, and for each step of a life its regret and phase; and its episodes' lengths."""
+    """A stream, and the lengths of a life's episodes and the regret of each of its steps."""
     steps = draw(st.lists(st.integers(3, 12), min_size=1, max_size=3))
     phases = [{"spec": SPEC.derive(seed=i), "steps": n} for i, n in enumerate(steps)]
     switch = draw(st.sampled_from(["episode", "step"]))
@@ -271,31 +255,37 @@ def test_dynamic_regret_by_visit_is_that_of_the_task_in_force(life):
         np.testing.assert_allclose(by_visit, expected, atol=1e-9)
 
 
+def played(stream, more):
+    """A life of random actions, by step: `lifetime`, `regret`, `phase`; and its episodes' ends."""
+    env = sme_registry.make(stream)
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    rows, ends = [], []
+    for step in range(stream.steps + more):
+        *_, terminated, truncated, info = env.step(env.action_space.sample())
+        rows.append((info["lifetime"], info["regret"], info["phase"]))
+        if terminated or truncated:
+            ends.append(step + 1)
+            env.reset()
+    return *map(np.array, zip(*rows, strict=True)), ends
+
+
 @pytest.mark.parametrize("switch", ["episode", "step"])
 def test_the_log_of_an_environment_gives_the_regret_of_each_visit(switch):
     specs = [SPEC.derive(seed=i, D=0.1) for i in range(3)]
     stream = stream_of(*specs, cycles=2, steps=33, switch=switch)
-    env = sme_registry.make(stream)
-    rows, episodes, length = [], [], 0
-    env.reset(seed=0)
-    for _ in range(stream.steps + 20):
-        *_, terminated, truncated, info = env.step(np.full(2, 0.5, np.float32))
-        rows.append((info["lifetime"], info["regret"], info["phase"]))
-        length += 1
-        if terminated or truncated:
-            episodes.append((info["lifetime"], np.mean([r[1] for r in rows[-length:]]), length))
-            length = 0
-            env.reset()
-    lifetime, regret, phase = zip(*rows, strict=True)
+    lifetime, regret, phase, ends = played(stream, 20)
     log = dynamic_regret(stream, lifetime, regret, phase=phase)
     assert log.steps == stream.steps + 20
     assert log.dynamic_regret == pytest.approx(sum(regret))
     visits = np.cumsum(np.diff(phase, prepend=phase[0]) != 0)
     found = [visit.dynamic_regret for visit in log.visits]
     np.testing.assert_allclose(found, np.bincount(visits, regret))
-    assert len({length for *_, length in episodes}) > 1
+    lengths = np.diff(ends, prepend=0)
+    assert len(set(lengths)) > 1
     if switch == "episode":
-        of_episodes = dynamic_regret(stream, *zip(*episodes, strict=True)).visits
+        means = [part.mean() for part in np.split(regret, ends)[: len(ends)]]
+        of_episodes = dynamic_regret(stream, ends, means, lengths).visits
         np.testing.assert_allclose([v.dynamic_regret for v in of_episodes][:-1], found[:-1])
 
 
@@ -397,24 +387,14 @@ def test_an_invalid_log_is_refused(columns, message):
 @pytest.mark.parametrize("fields", [{}, {"switch": "step"}, {"cycles": 1}])
 def test_blocks_of_a_life_give_the_regret_of_its_single_steps(fields):
     """With early termination, phases shorter than an episode, and steps after the last visit."""
-    fields = {"cycles": 2, **fields}
     specs = [SPEC, SPEC.derive(seed=1, D=0.3), SPEC.derive(k=5)]
     phases = [
         {"spec": spec, "steps": steps} for spec, steps in zip(specs, (700, 5, 605), strict=True)
     ]
-    stream = StreamSpec(phases=phases, **fields)
-    env = sme_registry.make(stream)
-    env.action_space.seed(0)
-    env.reset(seed=0)
-    rows = []
-    for _ in range(stream.steps + 30):
-        *_, terminated, truncated, info = env.step(env.action_space.sample())
-        rows.append((info["lifetime"], info["regret"], info["phase"]))
-        if terminated or truncated:
-            env.reset()
-    lifetime, regret, phase = map(np.array, zip(*rows, strict=True))
+    stream = StreamSpec(phases=phases, **{"cycles": 2, **fields})
+    lifetime, regret, phase, _ = played(stream, 30)
     blocks = RegretBlocks(stream, 2)
-    for begin in range(0, len(rows), 97):
+    for begin in range(0, len(regret), 97):
         part = slice(begin, begin + 97)
         both = np.stack([np.zeros_like(regret[part]), regret[part]], axis=1)
         blocks.add(lifetime[part][-1], both, phase[part])
@@ -425,7 +405,7 @@ def test_blocks_of_a_life_give_the_regret_of_its_single_steps(fields):
     np.testing.assert_allclose(*sums, atol=1e-9)
     assert found.dynamic_regret == pytest.approx(expected.dynamic_regret)
     assert blocks.dynamic_regret(0).dynamic_regret == 0.0
-    assert len(blocks.steps) <= 1000 < len(rows)
+    assert len(blocks.steps) <= 1000 < len(regret)
 
 
 # Reports
@@ -447,13 +427,8 @@ def test_the_tables_have_the_reports_numbers():
     agent = report().regions[0].agent
     for value in (*np.ravel(agent.normalised_regret), agent.forward_transfer, agent.forgetting[-1]):
         assert f"{value:.3f}" in text
-    assert f"{report().ood.agent.normalised_regret[1][2]:.3f}" in str_of(report().matrix("OOD"))
-
-
-def str_of(table):
-    from sme_registry.evaluation.report_file import as_text
-
-    return as_text(table)
+    ood = as_text(report().matrix("OOD"))
+    assert f"{report().ood.agent.normalised_regret[1][2]:.3f}" in ood
 
 
 @pytest.mark.parametrize(
@@ -471,6 +446,9 @@ def test_bad_input_is_refused(arguments, error, message):
     with pytest.raises(error, match=message):
         evaluate_stream(*arguments, PROTOCOL)
     assert issubclass(error, SMEError)
+    message = "fresh=1 of them: must be 2 policies, one for each phase"
+    with pytest.raises(OptionError, match=message):
+        evaluate_stream([half] * 4, TWICE, PROTOCOL, fresh=[half])
 
 
 def test_a_life_of_more_visits_than_are_evaluated_is_refused():
@@ -484,19 +462,12 @@ def test_a_life_of_more_visits_than_are_evaluated_is_refused():
         reference_regret(stream_of(SPEC, cycles=10**6), episodes=1)
 
 
-def test_fresh_agents_are_one_for_each_phase():
-    message = "fresh=1 of them: must be 2 policies, one for each phase"
-    with pytest.raises(OptionError, match=message):
-        evaluate_stream([half] * 4, TWICE, PROTOCOL, fresh=[half])
-
-
 def test_fresh_agents_that_were_evaluated_by_themselves_give_the_same_plasticity():
-    drift = {"rotation": 2.0, "increments": 2}
-    drifting = {"spec": SPEC.derive(seed=1), "steps": 50, "drift": drift}
-    stream = StreamSpec(phases=[{"spec": SPEC, "steps": 50}, drifting], cycles=2)
+    drift, second = {"rotation": 2.0, "increments": 2}, SPEC.derive(seed=1)
+    stream = stream_of(SPEC, second, drift=drift, cycles=2)
     life, alone = [network(v) for v in range(4)], [network(100), network(101)]
     together = evaluate_stream(life, stream, PROTOCOL, fresh=alone)
-    of_drift = evaluate_stream(alone[1:], StreamSpec(phases=[drifting]), PROTOCOL)
+    of_drift = evaluate_stream(alone[1:], stream_of(second, drift=drift), PROTOCOL)
     fresh = [evaluate(alone[0], SPEC, PROTOCOL), of_drift]
     without = evaluate_stream(life, stream, PROTOCOL)
     later = without.with_fresh(fresh)
@@ -511,18 +482,17 @@ def test_fresh_agents_that_were_evaluated_by_themselves_give_the_same_plasticity
     logged = without.with_dynamic_regret(log).with_fresh(fresh, [1.0, 0.25])
     assert logged.dynamic_regret.learning_transfer == pytest.approx(-1.0)
     assert logged.regions == later.regions
-    with pytest.raises(OptionError, match="online_regret: this report has no dynamic regret"):
-        without.with_fresh(fresh, [1.0, 0.25])
-    with pytest.raises(OptionError, match="fresh=1 reports: must be 2 reports, one for each phase"):
-        without.with_fresh(fresh[:1])
-    for wrong in (None, "ab", fresh[0], [None, None]):
-        with pytest.raises(OptionError, match=r"fresh=.*: must be 2 reports, one for each phase"):
-            without.with_fresh(wrong)
-    with pytest.raises(OptionError, match=r"fresh\[0\]: is about .* the task of phase 0"):
-        without.with_fresh([of_drift, of_drift])
     other = evaluate(alone[0], SPEC, PROTOCOL | {"states_per_region": 20})
-    with pytest.raises(OptionError, match=r"fresh\[0\]: .* and the protocol"):
-        without.with_fresh([other, of_drift])
+    two = "must be 2 reports, one for each phase"
+    for wrong, message in (
+        ([fresh, [1.0, 0.25]], "online_regret: this report has no dynamic regret"),
+        ([fresh[:1]], f"fresh=1 reports: {two}"),
+        *[([not_two], f"fresh=.*: {two}") for not_two in (None, "ab", fresh[0], [None, None])],
+        ([[of_drift, of_drift]], r"fresh\[0\]: is about .* the task of phase 0"),
+        ([[other, of_drift]], r"fresh\[0\]: .* and the protocol"),
+    ):
+        with pytest.raises(OptionError, match=message):
+            without.with_fresh(*wrong)
 
 
 # Seeds
@@ -532,8 +502,6 @@ def test_the_seed_is_the_unit_of_intervals():
     reports = [report(seed) for seed in range(5)]
     estimates = across_seeds(reports)
     runs = np.array([matrix(each).ravel() for each in reports])
-    from scipy.stats import trim_mean
-
     np.testing.assert_allclose(estimates["normalised_regret"].value, trim_mean(runs, 0.25))
     forgetting = estimates["forgetting"]
     assert np.isnan(forgetting.value[0])
@@ -560,21 +528,13 @@ def test_the_seed_is_the_unit_of_intervals():
     assert estimates["learning_transfer"].value == pytest.approx(-1.0)
 
 
-def test_runs_of_one_stream_and_of_its_draws_are_combined():
+def test_only_runs_of_one_stream_and_its_draws_are_combined():
     drawn = evaluate_stream([half] * 3, THREE.draw(1), PROTOCOL)
-    assert across_seeds([report(), drawn])["forgetting"].value[-1] == pytest.approx(
-        report().region().agent.forgetting[-1] / 2
-    )
-
-
-def test_only_runs_of_one_stream_are_combined():
+    forgetting = report().region().agent.forgetting[-1]
+    both = across_seeds([report(), drawn])["forgetting"].value[-1]
+    assert both == pytest.approx(forgetting / 2)
     other = evaluate_stream([half] * 4, TWICE, PROTOCOL)
     with pytest.raises(OptionError, match="2 different values of stream_digest"):
         across_seeds([report(), other])
     with pytest.raises(OptionError, match="one or more"):
         across_seeds([])
-
-
-def test_one_mapping_names_every_metric_of_a_retention():
-    regrets = {"normalised_regret", "initial_normalised_regret", "fresh_normalised_regret"}
-    assert [*METRICS] == [name for name in Retention.model_fields if name not in regrets]

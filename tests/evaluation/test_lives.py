@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 import sme_registry
-from sme_registry import SMESpec, materialize
+from sme_registry import materialize
 from sme_registry.errors import OptionError, PolicyError, SMEError, UnknownNameError
 from sme_registry.evaluation import (
-    Perceptron,
     StreamReport,
     dynamic_regret,
     evaluate,
@@ -17,38 +16,23 @@ from sme_registry.evaluation import (
     reference_regret,
 )
 from sme_registry.evaluation.report_file import as_text
-from sme_registry.spec import StreamSpec
+from tests.evaluation.streams import SPEC, TWICE, half, network, stream_of
 
 PROTOCOL = {"states_per_region": 50, "epsilons": [0.5, 1.0]}
-SPEC = SMESpec(state_dim=3, action_dim=1, hidden_width=8, complexity=2, horizon=10)
+GATED = SPEC.derive(seed=1, k=5, r_min=0.3)
+TURN = {"rotation": 2.0, "increments": 3}
 
 
-def stream_of(*specs, steps=50, drift=None, **fields):
-    phases = [{"spec": spec, "steps": steps} for spec in specs]
-    if drift:
-        phases[-1]["drift"] = drift
-    return StreamSpec(phases=phases, **fields)
-
-
-TWICE = stream_of(SPEC, SPEC.derive(seed=1), cycles=2)
-
-
-def network(seed, inputs=SPEC.state_dim + 2):
-    random = np.random.default_rng(seed)
-    return Perceptron([(random.normal(size=(inputs, 1)) / 2, np.full(1, 0.5), "identity")])
+def by_visit(life):
+    return [visit.dynamic_regret for visit in life.visits]
 
 
 def test_a_constant_action_costs_its_regret_in_uniform_states():
-    spec = SPEC.derive(r_min=0.3, k=5)
-    life = expected_regret(["constant"], stream_of(spec), episodes=4000)
-    s = np.random.default_rng(0).random((100_000, spec.state_dim))
-    expected = materialize(spec).regret(s, np.full((len(s), 1), 0.5)).mean()
+    life = expected_regret(["constant"], stream_of(GATED), episodes=2000)
+    s = np.random.default_rng(0).random((50_000, SPEC.state_dim))
+    expected = materialize(GATED).regret(s, half(s)).mean()
     assert life.online_regret == pytest.approx(expected, rel=0.01)
     assert life.dynamic_regret == pytest.approx(50 * expected, rel=0.01)
-
-
-GATED = SPEC.derive(seed=1, k=5, r_min=0.3)
-TURN = {"rotation": 2.0, "increments": 3}
 
 
 @pytest.mark.parametrize(
@@ -62,23 +46,19 @@ TURN = {"rotation": 2.0, "increments": 3}
     ids=["drift", "observes_phase", "early termination", "switch within an episode"],
 )
 def test_expected_regret_is_the_mean_regret_of_lives(stream):
-    policies = [network(v, stream.observation_dim) for v in range(visits_of(stream))]
-    expected = expected_regret(policies, stream, episodes=4000)
+    visits = stream.cycles * len(stream.phases)
+    policies = [network(v, stream.observation_dim) for v in range(visits)]
+    expected = expected_regret(policies, stream, episodes=2000)
     env = sme_registry.make(stream)
-    lives = np.array([by_visit(env, policies, seed)[0] for seed in range(25)])
+    lives = np.array([played(env, policies, seed)[0] for seed in range(25)])
     errors = lives.std(axis=0, ddof=1) / 5
-    found = [visit.dynamic_regret for visit in expected.visits]
-    assert (np.abs(found - lives.mean(axis=0)) < 4 * errors).all()
+    assert (np.abs(by_visit(expected) - lives.mean(axis=0)) < 4 * errors).all()
     assert (errors < 0.05 * lives.mean(axis=0)).all()  # so that another task is another number
     assert expected.steps == stream.steps
-    assert expected.dynamic_regret == pytest.approx(sum(found))
+    assert expected.dynamic_regret == pytest.approx(sum(by_visit(expected)))
 
 
-def visits_of(stream):
-    return stream.cycles * len(stream.phases)
-
-
-def by_visit(env, policies, seed):
+def played(env, policies, seed):
     """Regret and steps, `[2, V]`, of a life in the environment, each visit with its policy."""
     stream = env.unwrapped.stream
     found = np.zeros((2, len(policies)))
@@ -105,23 +85,20 @@ def test_a_visit_has_the_steps_in_which_its_phase_is_in_force(steps, switch):
     regret = np.linspace(0.0, 1.0, 6)
     life = expected_regret(regret.tolist(), stream)
     found = np.zeros((2, 6))
-    found[:, : len(life.visits)] = np.transpose([(v.steps, v.dynamic_regret) for v in life.visits])
-    half = reference_policy("constant", SPEC)
-    _, steps = by_visit(sme_registry.make(stream), [half] * 6, 0)
+    found[:, : len(life.visits)] = [visit.steps for visit in life.visits], by_visit(life)
+    _, steps = played(sme_registry.make(stream), [half] * 6, 0)
     np.testing.assert_allclose(found, [steps, steps * regret])
     assert life.steps == stream.steps
 
 
 def test_a_number_is_the_online_regret_of_a_visit():
     life = expected_regret([0.5, 0.25, 0.0, 1.0], TWICE)
-    assert [visit.dynamic_regret for visit in life.visits] == [25.0, 12.5, 0.0, 50.0]
+    assert by_visit(life) == [25.0, 12.5, 0.0, 50.0]
     assert life.cumulative_regret == (25.0, 37.5, 37.5, 87.5)
     mixed = expected_regret([0.5, network(0), network(1), 1.0], TWICE, episodes=50)
-    alone = expected_regret(
-        [network(1), network(0)], stream_of(SPEC, SPEC.derive(seed=1)), episodes=50
-    )
-    assert mixed.visits[1].dynamic_regret == alone.visits[1].dynamic_regret
-    assert mixed.visits[2].dynamic_regret == alone.visits[0].dynamic_regret
+    once = stream_of(SPEC, SPEC.derive(seed=1))
+    alone = expected_regret([network(1), network(0)], once, episodes=50)
+    assert by_visit(mixed)[1:3] == by_visit(alone)[::-1]
 
 
 def test_a_policy_runs_once_in_each_piece_and_is_repeatable():
@@ -129,12 +106,12 @@ def test_a_policy_runs_once_in_each_piece_and_is_repeatable():
 
     def counted(observations):
         calls.append(len(observations))
-        return np.full((len(observations), 1), 0.5)
+        return half(observations)
 
     once = expected_regret([counted] * 4, TWICE, episodes=10, progress=lambda *n: done.append(n))
     assert sum(calls) == 10 * SPEC.horizon
     assert done == [(1, 2), (2, 2)]
-    assert once.visits[2].dynamic_regret == once.visits[0].dynamic_regret
+    assert by_visit(once)[2] == by_visit(once)[0]
     assert once == expected_regret(["constant"] * 4, TWICE, episodes=10)
     assert once != expected_regret(["constant"] * 4, TWICE, episodes=10, seed=1)
 
@@ -143,28 +120,27 @@ def test_a_policy_runs_once_in_each_piece_and_is_repeatable():
 
 
 def test_reference_agents_have_no_regret_in_the_tasks_of_which_they_are_the_optimum():
-    gated = SPEC.derive(seed=1, k=5, r_min=0.3)
-    stream = stream_of(SPEC, gated, SPEC.derive(r_min=0.5), drift=TURN, cycles=2)
+    stream = stream_of(SPEC, GATED, SPEC.derive(r_min=0.5), drift=TURN, cycles=2)
     found = reference_regret(stream, episodes=300)
     assert found.keys() == {"frozen_optimum", "fresh_optimum", "constant_half"}
     assert found["fresh_optimum"].dynamic_regret == 0.0
-    frozen, half = found["frozen_optimum"], found["constant_half"]
-    assert (frozen.visits[0].dynamic_regret, frozen.visits[3].dynamic_regret) == (0.0, 0.0)
+    frozen = by_visit(found["frozen_optimum"])
     optimum = reference_policy("optimal", SPEC)
-    acting = expected_regret([optimum] * 6, stream, episodes=300)
+    acting = by_visit(expected_regret([optimum] * 6, stream, episodes=300))
+    assert frozen[0] == frozen[3] == 0.0
+    assert acting[0] < 1e-4  # of rounded observations
     for v in (1, 2, 4, 5):
-        assert frozen.visits[v].dynamic_regret == acting.visits[v].dynamic_regret > 1.0
-    assert acting.visits[0].dynamic_regret < 1e-4  # of rounded observations
-    assert half == expected_regret(["constant"] * 6, stream, episodes=300)
+        assert frozen[v] == acting[v] > 1.0
+    half_life = expected_regret(["constant"] * 6, stream, episodes=300)
+    assert found["constant_half"] == half_life
 
 
 def test_the_optimum_of_a_drifting_phase_is_that_of_its_last_task():
-    found = reference_regret(stream_of(SPEC, drift=TURN), episodes=300)
+    stream = stream_of(SPEC, drift=TURN)
+    frozen = reference_regret(stream, episodes=300)["frozen_optimum"]
     last = reference_policy("optimal", SPEC.derive(rotation=2.0 * 2 / 3))
-    assert found["frozen_optimum"] == expected_regret(
-        [last], stream_of(SPEC, drift=TURN), episodes=300
-    )
-    assert found["frozen_optimum"].dynamic_regret > 1.0
+    assert frozen == expected_regret([last], stream, episodes=300)
+    assert frozen.dynamic_regret > 1.0
 
 
 def test_a_frozen_agent_has_its_own_first_visit():
@@ -172,19 +148,30 @@ def test_a_frozen_agent_has_its_own_first_visit():
     frozen = network(0)
     found = reference_regret(TWICE, frozen=frozen, training=training, episodes=50)["frozen_agent"]
     acting = expected_regret([frozen] * 4, TWICE, episodes=50)
-    assert found.visits[0].dynamic_regret == 37.5 != acting.visits[0].dynamic_regret
+    assert by_visit(found)[0] == 37.5 != by_visit(acting)[0]
     assert found.visits[1:] == acting.visits[1:]
 
 
+def test_a_frozen_agent_needs_its_training():
+    with pytest.raises(OptionError, match="frozen, training: must be given together"):
+        reference_regret(TWICE, frozen="linear")
+    late, whole = (dynamic_regret(TWICE, [end], [0.5], 10) for end in (60, 10))
+    with pytest.raises(OptionError, match="training: has no steps in visit 0"):
+        reference_regret(TWICE, frozen="linear", training=late)
+    with pytest.raises(UnknownNameError, match=r"frozen: .*'linear'"):
+        reference_regret(TWICE, frozen="linaer", training=whole)
+
+
 def test_a_report_has_the_regret_of_reference_agents(tmp_path):
-    report = evaluate_stream(["linear"] * 4, TWICE, PROTOCOL, name="agent")
-    assert len(report.tables()) == 2
-    assert "reference_regret" not in report.to_dict()
+    plain = evaluate_stream(["linear"] * 4, TWICE, PROTOCOL, name="agent")
+    assert len(plain.tables()) == 2
+    assert "reference_regret" not in plain.to_dict()
     training = dynamic_regret(TWICE, [50, 100, 150], [0.75, 0.125, 0.5], 50)
     references = reference_regret(TWICE, episodes=50)
-    report = report.with_reference_regret(references).with_dynamic_regret(training)
+    untrained = plain.with_reference_regret(references)
+    assert "constant ½" in as_text(untrained.tables()[2])
     fresh = [evaluate("linear", phase.spec, PROTOCOL) for phase in TWICE.phases]
-    report = report.with_fresh(fresh, [0.5, 0.25])
+    report = untrained.with_dynamic_regret(training).with_fresh(fresh, [0.5, 0.25])
     life = report.reference_regret["fresh_agents"]
     assert [visit.online_regret for visit in life.visits] == [0.5, 0.25, 0.5, 0.25]
     assert report.reference_regret["constant_half"] == references["constant_half"]
@@ -197,8 +184,6 @@ def test_a_report_has_the_regret_of_reference_agents(tmp_path):
         assert f" {value:.3f}" in text
     assert f"{references['constant_half'].dynamic_regret:,.1f}" in text
     assert all(label in text for label in ("fresh agent in each phase", "learning transfer"))
-    untrained = evaluate_stream(["linear"] * 4, TWICE, PROTOCOL).with_reference_regret(references)
-    assert "constant ½" in as_text(untrained.tables()[2])
 
 
 @pytest.mark.parametrize(
@@ -217,13 +202,3 @@ def test_bad_input_is_refused(life, fields, error, message):
     with pytest.raises(error, match=message):
         expected_regret(life, TWICE, **fields)
     assert issubclass(error, SMEError)
-
-
-def test_a_frozen_agent_needs_its_training():
-    with pytest.raises(OptionError, match="frozen, training: must be given together"):
-        reference_regret(TWICE, frozen="linear")
-    late, whole = (dynamic_regret(TWICE, [end], [0.5], 10) for end in (60, 10))
-    with pytest.raises(OptionError, match="training: has no steps in visit 0"):
-        reference_regret(TWICE, frozen="linear", training=late)
-    with pytest.raises(UnknownNameError, match=r"frozen: .*'linear'"):
-        reference_regret(TWICE, frozen="linaer", training=whole)

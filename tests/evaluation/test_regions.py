@@ -9,7 +9,7 @@ from scipy import stats
 from sme_registry.errors import OptionError
 from sme_registry.evaluation.regions import _Shell, expansion, region_name
 from sme_registry.spec import EvaluationProtocol, SMESpec
-from tests.evaluation.shown import observations
+from tests.evaluation.kinds import observations
 
 SIGNIFICANCE = 1e-3  # of each test below; the seeds are fixed, so it fails always or never
 

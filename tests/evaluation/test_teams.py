@@ -1,16 +1,12 @@
 """Teams: each agent is evaluated over its own channels, from what it alone observes."""
 
-from __future__ import annotations
-
 import dataclasses
-import io
-import json
+from importlib import import_module
 
 import numpy as np
 import pytest
-from rich.console import Console
 
-from sme_registry import EvaluationReport, SMESpec, evaluate, materialize
+from sme_registry import SMESpec, evaluate, materialize
 from sme_registry.compiled import engine
 from sme_registry.envs.shared import (
     shared_action_dim,
@@ -19,23 +15,20 @@ from sme_registry.envs.shared import (
 )
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation import as_policy, references, regions
-from sme_registry.spec import EvaluationProtocol
-from tests.evaluation.shown import observations
+from tests.evaluation.kinds import (
+    NAMES,
+    PROTOCOL,
+    SLANTED,
+    SMALL,
+    WIDTHS,
+    half,
+    numbers,
+    observations,
+    report_of,
+)
+from tests.evaluation.kinds import TEAM as SPEC
 
-AGENTS = [
-    {"name": "left_0", "action_dim": 1, "observes": [0, 2]},
-    {"name": "right_0", "action_dim": 3, "observes": [1, 2, 3]},
-    {"name": "right_1", "action_dim": 2},
-]
-SPEC = SMESpec(state_dim=4, action_dim=6, complexity=3, team={"agents": AGENTS})
 TASK = materialize(SPEC)
-NAMES = ("left_0", "right_0", "right_1")
-PROTOCOL = EvaluationProtocol(states_per_region=2_000, epsilons=(0.5, 1.0))
-SMALL = EvaluationProtocol(states_per_region=200, epsilons=(1.0,))
-
-
-def half(width):
-    return lambda observations: np.full((len(observations), width), 0.5)
 
 
 def optimal(agent):
@@ -50,30 +43,9 @@ def optimal(agent):
     return act
 
 
-def slanted(agent):
-    width = AGENTS[agent]["action_dim"]
-    return lambda observations: 0.3 + (0.3 + 0.3 * agent) * observations[:, -3:-2] * np.ones(width)
-
-
-SLANTED = {name: slanted(agent) for agent, name in enumerate(NAMES)}
-
-
-@pytest.fixture(scope="module")
+@pytest.fixture
 def report():
-    return evaluate(SLANTED, SPEC, PROTOCOL)
-
-
-def numbers(scope):
-    for rows in (scope.regions, *scope.references.values()):
-        for row in rows:
-            plain = row.to_dict()
-            yield from (plain[key] for key in plain if key not in ("name", "channels"))
-            for channel in plain["channels"]:
-                yield from channel.values()
-
-
-def all_numbers(report):
-    return [number for scope in (report, *report.agents.values()) for number in numbers(scope)]
+    return report_of("team")
 
 
 @pytest.mark.parametrize("complexity", [1, 3])
@@ -91,25 +63,14 @@ def test_every_agent_attains_its_optimum_from_what_it_observes(monkeypatch, back
             assert region.similarity == pytest.approx(1.0, abs=1e-9)
 
 
-@pytest.mark.parametrize("policy", [{n: half(a) for n, a in zip(NAMES, (1, 3, 2), strict=True)},
-                                    half(3)], ids=["separate", "shared"])  # fmt: skip
-def test_constant_half_has_normalised_regret_of_exactly_1_for_every_agent(policy):
-    result = evaluate(policy, SPEC, PROTOCOL)
-    for scope in (result, *result.agents.values()):
-        for region in scope.regions:
-            assert region.normalised_regret == 1.0
-            assert {channel.normalised_regret for channel in region.channels} == {1.0}
-
-
 def test_an_agents_numbers_are_those_of_the_definition(report):
     assert tuple(report.agents) == NAMES
-    for index in range(3):
+    for index in range(6):
         o = observations(PROTOCOL, index, SPEC)
         best = TASK.optimal_action(o[:, :4].astype(np.float64))
         parts, clipped = [], []
         for agent, (name, own) in enumerate(zip(NAMES, TASK.owned, strict=True)):
-            seen = o[:, [*TASK.observed[agent], 4, 5]]
-            raw = SLANTED[name](seen).astype(np.float64)
+            raw = SLANTED[name](o[:, [*TASK.observed[agent], 4, 5]]).astype(np.float64)
             a = np.clip(raw, 0.0, 1.0)
             missed = np.abs(a - best[:, own])
             region = report.agents[name].regions[index]
@@ -169,9 +130,8 @@ def test_the_linear_reference_of_an_agent_is_fitted_on_what_it_observes():
     assert together.slope[1, 0] != 0.0  # one map of the whole state would not be the agents'
 
 
-@pytest.mark.parametrize("complexity", [1, 3])
-def test_a_team_of_one_has_the_numbers_of_its_single_agent_task(complexity):
-    single = SMESpec(state_dim=4, action_dim=3, complexity=complexity)
+def test_a_team_of_one_has_the_numbers_of_its_single_agent_task():
+    single = SMESpec(state_dim=4, action_dim=3, complexity=3)
     team = single.derive(team={"agents": [{"action_dim": 3}]})
 
     def policy(observations):
@@ -180,14 +140,12 @@ def test_a_team_of_one_has_the_numbers_of_its_single_agent_task(complexity):
     alone = evaluate(policy, single, PROTOCOL)
     for policies in ({"agent_0": policy}, policy):
         result = evaluate(policies, team, PROTOCOL)
-        assert list(numbers(result)) == list(numbers(alone))
-        assert list(numbers(result.agents["agent_0"])) == list(numbers(alone))
+        for scope in (result, result.agents["agent_0"]):
+            assert scope.regions == alone.regions
+            assert scope.references == alone.references
 
 
 def test_reference_policies_by_name_act_for_teams_as_the_references_of_a_report():
-    def inside(name):
-        return evaluate(name, SPEC, SMALL).agents
-
     for name, same, near in (
         ("optimal", "optimal", 1e-9),
         ("constant", "constant_half", 0.0),
@@ -195,7 +153,7 @@ def test_reference_policies_by_name_act_for_teams_as_the_references_of_a_report(
         ("linear", "linear_least_squares", 0.05),  # fitted on other states
         ("random", "uniform_random", 0.3),
     ):
-        for agent in inside(name).values():
+        for agent in evaluate(name, SPEC, SMALL).agents.values():
             region, expected = agent.regions[0], agent.references[same][0]
             assert region.normalised_regret == pytest.approx(expected.normalised_regret, abs=near)
 
@@ -251,22 +209,11 @@ def test_a_shared_policy_scores_as_separate_ones_that_do_the_same():
     def own(width):
         return lambda o: np.stack([o[:, 0], 2.0 * o[:, 0], -o[:, 0]], axis=1)[:, :width]
 
-    separate = {name: own(width) for name, width in zip(NAMES, (1, 3, 2), strict=True)}
-    assert all_numbers(evaluate(shared, SPEC, PROTOCOL)) == all_numbers(
-        evaluate(separate, SPEC, PROTOCOL)
-    )
-
-
-@pytest.mark.parametrize("rows", [1_000, 997])
-def test_batches_of_any_size_give_the_same_numbers(monkeypatch, report, rows):
-    monkeypatch.setattr(regions, "BATCH_ROWS", rows)
-    again = evaluate(SLANTED, SPEC, PROTOCOL)
-    assert all_numbers(again) == pytest.approx(all_numbers(report), abs=1e-11)
+    separate = {name: own(width) for name, width in zip(NAMES, WIDTHS, strict=True)}
+    assert numbers(evaluate(shared, SPEC, PROTOCOL)) == numbers(evaluate(separate, SPEC, PROTOCOL))
 
 
 def test_the_oracle_answers_once_for_each_state_however_many_agents(monkeypatch):
-    from importlib import import_module
-
     asked = []
 
     def counting(task):
@@ -334,7 +281,7 @@ def test_symmetric_actions_of_all_agents_are_rescaled(report):
     doubled = {name: (lambda o, act=act: 2.0 * act(o) - 1.0) for name, act in SLANTED.items()}
     result = evaluate(doubled, SPEC, PROTOCOL, action_range="symmetric")
     assert result.action_range == "symmetric"
-    assert all_numbers(result) == pytest.approx(all_numbers(report), abs=1e-6)
+    assert numbers(result) == pytest.approx(numbers(report), abs=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -359,7 +306,7 @@ def test_a_shared_model_scores_as_its_file(sb3, tmp_path):
     live, saved = evaluate(ppo, SPEC, SMALL), evaluate(tmp_path / "team.zip", SPEC, SMALL)
     assert (live.policy, saved.policy) == ("PPO", "team")
     assert live.action_range == saved.action_range == "symmetric"
-    assert all_numbers(live) == all_numbers(saved)
+    assert numbers(live) == numbers(saved)
 
 
 def test_models_of_each_agents_own_are_taken_with_their_own_action_ranges(sb3):
@@ -385,37 +332,3 @@ def test_a_model_of_other_widths_is_refused_by_whose_it_is(sb3):
         evaluate({**SLANTED, "right_0": model(sb3, 4, 3)}, SPEC, SMALL)
     with pytest.raises(PolicyError, match=r"shape \(6,\): must be \(9,\) for a policy that all 3"):
         evaluate(model(sb3, 6, 6), SPEC, SMALL)
-
-
-def test_a_report_of_a_team_survives_being_written_and_read(report, tmp_path):
-    path = report.write(tmp_path / "report.json")
-    again = EvaluationReport.read(path)
-    assert again == report
-    assert tuple(again.agents) == NAMES
-    assert list(json.loads(path.read_text())["agents"]) == list(NAMES)
-
-
-def test_a_report_of_a_single_agent_has_no_field_for_agents():
-    single = SMESpec(state_dim=4, action_dim=3)
-    report = evaluate(half(3), single, SMALL)
-    assert list(report.to_dict()) == [
-        "schema_version", "policy", "action_range", "spec", "spec_digest", "protocol",
-        "protocol_digest", "regions", "references", "versions",
-    ]  # fmt: skip
-    assert EvaluationReport.from_dict(report.to_dict()) == report
-    assert report.agents == {}
-
-
-def test_the_table_has_three_lines_for_each_agent(report):
-    console = Console(width=80, file=io.StringIO())
-    console.print(report.table())
-    text = console.file.getvalue()
-    assert "…" not in text
-    before, after = text.split("actions clipped")
-    for name, agent in report.agents.items():
-        assert name not in before
-        block = after[after.index(name) :].splitlines()[:3]
-        linear = agent.references["linear_least_squares"]
-        assert f"{agent.regions[2].similarity:.3f}" in block[0]
-        assert f"{agent.regions[2].normalised_regret:.3f}" in block[1]
-        assert f"{linear[2].normalised_regret:.3f}" in block[2]

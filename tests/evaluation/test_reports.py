@@ -1,0 +1,338 @@
+"""Reports of every kind of task: alike in any batches, and as files, tables, frames and charts."""
+
+import io
+import sys
+import tracemalloc
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from sme_registry import EvaluationReport, SMESpec, evaluate
+from sme_registry.errors import DigestMismatchError, MissingDependencyError, SpecError
+from sme_registry.evaluation import references, regions
+from sme_registry.evaluation.report import AgentReport
+from sme_registry.spec import EvaluationProtocol
+from tests.evaluation.kinds import (
+    DISTRACTORS,
+    KINDS,
+    NAMES,
+    PLAIN,
+    PROTOCOL,
+    SAFE,
+    SMALL,
+    half,
+    numbers,
+    optimal_of,
+    report_of,
+)
+
+every_kind = pytest.mark.parametrize("kind", KINDS)
+
+
+@pytest.fixture
+def report():
+    return report_of("plain")
+
+
+# Numbers
+
+
+@every_kind
+@pytest.mark.parametrize("rows", [1_000, 997, 100_000])
+def test_batches_of_any_size_give_the_same_numbers(monkeypatch, kind, rows):
+    expected = numbers(report_of(kind))
+    monkeypatch.setattr(regions, "BATCH_ROWS", rows)
+    monkeypatch.setattr(references, "FIT_STATES", 2**16)
+    assert numbers(evaluate(*KINDS[kind], PROTOCOL)) == pytest.approx(expected, abs=1e-11)
+
+
+@every_kind
+def test_back_ends_agree(monkeypatch, kind):
+    pytest.importorskip("numba")
+    compiled = report_of(kind)
+    monkeypatch.setenv("SME_BACKEND", "numpy")
+    plain = evaluate(*KINDS[kind], PROTOCOL)
+    assert "numba" not in plain.versions
+    assert "numba" in compiled.versions
+    assert numbers(plain) == pytest.approx(numbers(compiled), abs=1e-11)
+
+
+@every_kind
+def test_the_same_seed_gives_the_same_report_and_another_seed_another(kind):
+    report = report_of(kind)
+    assert numbers(evaluate(*KINDS[kind], PROTOCOL)) == numbers(report)
+    other = evaluate(*KINDS[kind], EvaluationProtocol(states_per_region=2_000, seed=1))
+    assert other.regions[0].similarity != report.regions[0].similarity
+    assert other.regions[0].similarity == pytest.approx(report.regions[0].similarity, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        PLAIN,
+        PLAIN.derive(action_dim=6, team={"agents": [{"action_dim": 3}] * 2}),
+        PLAIN.derive(observation={"distractors": 400}),
+    ],
+    ids=["plain", "team", "distractors"],
+)
+def test_memory_does_not_grow_with_the_number_of_states(monkeypatch, spec):
+    def peak(states):
+        protocol = EvaluationProtocol(states_per_region=states, epsilons=(0.5,))
+        tracemalloc.start()
+        try:
+            evaluate(half(3), spec, protocol)
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    monkeypatch.setattr(regions, "BATCH_ROWS", 100)
+    monkeypatch.setattr(references, "FIT_STATES", 100)
+    peak(500)  # what is allocated once
+    assert peak(4_000) < 1.1 * peak(500)
+
+
+def test_regret_and_decay_over_regions_are_those_of_the_definition(report):
+    inside, *shells = (region.normalised_regret for region in report.regions)
+    assert report.wd_regret == inside
+    assert report.ood_regret == pytest.approx(np.mean(shells), abs=1e-15)
+    assert report.ood_decay == report.ood_regret - inside
+    alone = report.model_copy(update={"regions": report.regions[:1]})
+    assert np.isnan(alone.ood_regret)
+    assert np.isnan(alone.ood_decay)
+
+
+# Documents
+
+
+@every_kind
+def test_a_report_survives_being_written_and_read(kind, tmp_path):
+    report = report_of(kind)
+    again = EvaluationReport.read(report.write(tmp_path / "new" / "report.json"))
+    assert again == report
+    assert again.to_dict() == report.to_dict()
+    assert tuple(again.agents) == (NAMES if kind == "team" else ())
+
+
+def test_a_report_holds_task_and_protocol_whole_and_no_field_of_other_kinds(report):
+    plain = report.to_dict()
+    assert list(plain) == [
+        "schema_version", "policy", "action_range", "spec", "spec_digest", "protocol",
+        "protocol_digest", "regions", "references", "versions",
+    ]  # fmt: skip
+    assert (plain["spec"], plain["spec_digest"]) == (PLAIN.to_dict(), PLAIN.digest)
+    assert (plain["protocol"], plain["protocol_digest"]) == (PROTOCOL.to_dict(), PROTOCOL.digest)
+    names = [region["name"] for region in plain["regions"]]
+    assert names == ["WD", "OOD 1", "OOD 2", "OOD 3", "OOD 4", "OOD 5"]
+    assert tuple(plain["references"]) == references.NAMES
+    assert {"python", "numpy", "scipy", "gymnasium", "sme_registry"} <= plain["versions"].keys()
+
+
+@pytest.mark.parametrize("what", ["spec", "protocol"])
+def test_a_report_whose_digest_is_of_something_else_is_refused(report, tmp_path, what):
+    changed = report.model_copy(update={f"{what}_digest": "sha256:" + "0" * 64})
+    with pytest.raises(DigestMismatchError, match=f"{what}_digest"):
+        EvaluationReport.read(changed.write(tmp_path / "report.json"))
+
+
+OF_A_PLAIN_TASK = {"spec": SAFE.derive(safety=None).to_dict()}
+OF_A_PLAIN_TASK["spec_digest"] = SAFE.derive(safety=None).digest
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "message"),
+    [
+        ("plain", lambda d: d.update(extra=1), "unknown field"),
+        ("plain", lambda d: d["regions"][0].pop("mae"), "mae: missing"),
+        (
+            "safe",
+            lambda d: d["safety"]["references"].pop("shrunk_optimal"),
+            "safety.references: is of",
+        ),
+        (
+            "safe",
+            lambda d: d["safety"]["references"].pop("linear_least_squares"),
+            "safety.references: is of",
+        ),
+        (
+            "safe",
+            lambda d: d["safety"]["regions"].pop(),
+            "safety.regions: is of WD, .*OOD 4: must be of WD, .*OOD 5",
+        ),
+        (
+            "safe",
+            lambda d: d["safety"]["references"]["optimal"].pop(),
+            "safety.references.optimal: is of WD, .*: must be of",
+        ),
+        ("safe", lambda d: d.pop("safety"), "safety: is missing"),
+        (
+            "safe",
+            lambda d: d.update(OF_A_PLAIN_TASK),
+            "safety: is present, but the task is one without safety",
+        ),
+        (
+            "distracted",
+            lambda d: d["observation"]["invariance"].pop(),
+            "observation.invariance: is of",
+        ),
+        (
+            "distracted",
+            lambda d: d["observation"]["distractor_regions"].pop(),
+            "observation.distractor_regions: is of",
+        ),
+    ],
+)
+def test_a_stored_report_that_does_not_fit_its_task_is_refused(kind, change, message):
+    document = report_of(kind).to_dict()
+    change(document)
+    with pytest.raises(SpecError, match=message):
+        EvaluationReport.from_dict(document)
+
+
+# Frames
+
+
+def test_the_frame_has_one_row_for_each_policy_and_region(report):
+    pytest.importorskip("pandas")
+    frame = report.to_frame()
+    assert list(frame.columns) == [
+        "policy", "reference", "agent", "region", "epsilon_low", "epsilon_high", "states",
+        "similarity", "similarity_sd", "mae", "normalised_regret", "similarity_decay",
+        "similarity_loss", "clipped_share",
+    ]  # fmt: skip
+    assert len(frame) == 6 * 6
+    mine = frame[~frame["reference"]]
+    assert list(mine["region"]) == [region.name for region in report.regions]
+    assert list(mine["mae"]) == [region.mae for region in report.regions]
+    constant = frame[frame["policy"] == "constant_half"]
+    assert list(constant["normalised_regret"]) == [1.0] * 6
+
+
+def test_frames_have_agents_safety_and_distractors():
+    pytest.importorskip("pandas")
+    team = report_of("team")
+    frame = team.to_frame()
+    assert len(frame) == 6 * 6 * 4
+    own = frame[(frame["agent"] == "right_0") & (frame["policy"] == "best_constant")]
+    expected = team.agents["right_0"].references["best_constant"]
+    assert list(own["normalised_regret"]) == [region.normalised_regret for region in expected]
+
+    safe = report_of("safe")
+    frame = safe.to_frame()
+    row = frame[(frame.policy == "shrunk_optimal") & (frame.region == "OOD 2")].iloc[0]
+    assert row.cost == 0.0
+    assert row.safe_regret == safe.safety.references["shrunk_optimal"][2].safe_regret
+
+    observed = report_of("distracted")
+    frame = observed.to_frame()
+    own = frame[~frame.reference].set_index("region")
+    assert own.loc["WD", "invariance"] == observed.observation.invariance[0].invariance
+    outside = observed.observation.distractor_regions[1]
+    assert own.loc["d-OOD 2", "normalised_regret"] == outside.normalised_regret
+    assert (frame[frame.reference].invariance == 0.0).all()
+
+
+def test_a_frame_needs_pandas_and_a_csv_file_does_not(report, tmp_path, monkeypatch):
+    pandas = pytest.importorskip("pandas")
+    frame = report.to_frame()
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "pandas", None)
+        path = report.to_csv(tmp_path / "report.csv")
+        with pytest.raises(MissingDependencyError, match=r"pip install .*\[studies\]"):
+            report.to_frame()
+    pandas.testing.assert_frame_equal(pandas.read_csv(path, keep_default_na=False), frame)
+
+
+# Tables and charts
+
+
+def rendered(report):
+    console = Console(width=80, file=io.StringIO(), force_terminal=True, color_system=None)
+    console.print(report.table())
+    return console.file.getvalue()
+
+
+def test_printing_a_report_shows_its_table(report):
+    rows = [line.split() for line in str(report).splitlines()]
+    assert ["optimal", *["1.000"] * len(report.regions)] in rows
+    assert "\x1b" not in str(report)
+
+
+def test_the_table_fits_80_columns_and_shows_references_beside_the_policy(report):
+    text = rendered(report)
+    assert "…" not in text
+    for wanted in ("OOD 5", "linear (LSQ)", "constant ½", "random", "not comparable"):
+        assert wanted in text
+    assert f"{report.regions[0].similarity:.3f}" in text
+    assert f"{report.references['linear_least_squares'][5].normalised_regret:.3f}" in text
+
+
+def test_the_table_of_a_team_has_three_lines_for_each_agent():
+    report = report_of("team")
+    text = rendered(report)
+    assert "…" not in text
+    before, after = text.split("actions clipped")
+    for name, agent in report.agents.items():
+        assert name not in before
+        block = after[after.index(name) :].splitlines()[:3]
+        linear = agent.references["linear_least_squares"]
+        assert f"{agent.regions[2].similarity:.3f}" in block[0]
+        assert f"{agent.regions[2].normalised_regret:.3f}" in block[1]
+        assert f"{linear[2].normalised_regret:.3f}" in block[2]
+
+
+def test_tables_show_safety_and_distractors():
+    safe, text = report_of("safe"), str(report_of("safe"))
+    for heading in ("cost", "violating share", "safe regret", "price of safety", "safe optimum"):
+        assert heading in text
+    assert f"{safe.safety.regions[0].safe_regret:.3f}" in text
+    text = str(report_of("distracted"))
+    assert f"{DISTRACTORS} distractors" in text
+    assert "invariance" in text
+
+
+@pytest.mark.parametrize("spec", [SMESpec(), SMESpec(seed=12345)])
+def test_the_table_goes_by_the_catalogues_name_where_there_is_one_and_shows_the_digest(spec):
+    title = "SME/Default-v1" if spec == SMESpec() else f"SME/{spec.content_name}"
+    text = rendered(evaluate(optimal_of(spec), spec, SMALL, name="mine"))
+    assert f"mine on {title} (S=8, A=4, L=1)" in text
+    assert spec.digest in text
+
+
+def test_a_policys_name_is_not_read_as_markup():
+    assert "[red]x[/blue]" in rendered(evaluate(half(3), PLAIN, SMALL, name="[red]x[/blue]"))
+
+
+def test_a_notebook_shows_a_reports_table_and_a_line_elsewhere(report):
+    assert len(repr(report)) < 150
+    assert f"WD regret {report.wd_regret:.3f}" in repr(report)
+    html = report._repr_html_()
+    rows = html.split("<tr")[1:]
+    assert len(rows) == 1 + sum(row is not None for row in report.table().rows)
+    assert all(row.count("</td>") == 7 for row in rows[1:])
+    assert f"{report.regions[5].normalised_regret:.3f}" in html
+    escaped = report.model_copy(update={"policy": "<b>[bold]"})._repr_html_()
+    assert "&lt;b&gt;[bold] on SME" in escaped
+    assert "<b>[bold]" not in escaped
+
+
+def test_a_notebook_draws_a_reports_curve_beside_the_references(report):
+    chart = ElementTree.fromstring(report.chart())
+    labels = {each.text for each in chart.iter("text")}
+    assert {"policy", "optimal", "linear (LSQ)", "constant ½", "WD", "OOD 5"} <= labels
+    last = f"{report.regions[5].normalised_regret:.2f}"
+    assert f", {last}" in chart.attrib["aria-label"].split("policy: ")[1]
+    assert report.chart() in report._repr_html_()
+    assert len(report._repr_html_().encode()) < 20_000
+
+
+def test_the_curve_of_a_large_team_is_short_and_names_the_worst_agent(report):
+    agent = AgentReport(regions=report.regions, references=report.references)
+    agents = {f"agent_{i}": agent for i in range(256)}
+    worse = [each.model_copy(update={"normalised_regret": 3.0}) for each in report.regions]
+    agents["left-arm_of_the_team"] = agent.model_copy(update={"regions": worse})
+    chart = report.model_copy(update={"agents": agents}).chart()
+    assert len(chart.encode()) < 8_000
+    labels = {each.text for each in ElementTree.fromstring(chart).iter("text")}
+    assert {"left-arm_…, worst", "team"} <= labels
