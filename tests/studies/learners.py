@@ -23,14 +23,7 @@ class Blend:
         self._env, self._task = env, materialize(env.sme_spec)
         rng = np.random.default_rng(seed)
         spec = env.sme_spec
-        axes = {
-            "state_dim": np.log2(spec.state_dim / 8),
-            "action_dim": np.log2(spec.action_dim / 4),
-            "k": np.log10(spec.k),
-            "r_min": spec.r_min,
-            "D": spec.D,
-            "complexity": np.log10(spec.complexity),
-        }
+        axes = {"k": np.log10(spec.k), "r_min": spec.r_min, "complexity": np.log10(spec.complexity)}
         floor = sum(cost * max(0.0, float(axes[axis])) for axis, cost in costs.items())
         self._floor = min(0.95, 0.05 + max(0.0, floor) + 0.1 * rng.beta(1.0, 4.0))
         self._half_life = half_life * rng.uniform(0.7, 1.4)

@@ -1,70 +1,97 @@
-"""Figures of a study: their axes and captions."""
+"""Figures of a study, by what is drawn in them: readable, whole, on scales that compare."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pandas as pd
 import pytest
 
-from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.report.analysis import Analysis, analyse
+from sme_registry.studies.report.analysis import Analysis
+from tests.studies.finished import analysed
 
 pytest.importorskip("matplotlib")
 
-from sme_registry.studies.report.figures import curves, differences, panels
+from sme_registry.studies.report.figures import curves, differences, draw_figures, panels
+from sme_registry.studies.report.figures.maps import draw_regions
+from sme_registry.studies.report.figures.scale import Scale, spacing
+from tests.geometry import assert_readable
+from tests.studies.report.test_report import FIGURES
 
 
-@pytest.fixture(scope="module")
-def analysis(finished: Path) -> Analysis:
-    ledger = Ledger(finished)
-    file = ledger.plan_file()
-    assert file is not None
-    return analyse(file, ledger.results(), draws=50)
+def with_algorithms(analysis: Analysis, names: list[str]) -> Analysis:
+    """The analysis as if Alpha had been trained under each of these names."""
+
+    def renamed(table: pd.DataFrame) -> pd.DataFrame:
+        alpha = table[table.algorithm == "Alpha"]
+        return pd.concat([alpha.assign(algorithm=name) for name in names], ignore_index=True)
+
+    tables = ("results", "runs", "regions", "levels", "contrasts", "aggregates", "profiles",
+              "learning_curves")  # fmt: skip
+    pair = {"first": names[0], "second": names[1]}
+    return dataclasses.replace(
+        analysis, algorithms=tuple(names), learners=tuple(names),
+        improvements=analysis.improvements[:1].assign(**pair),
+        differences=analysis.differences.assign(**pair),
+        **{table: renamed(getattr(analysis, table)) for table in tables},
+    )  # fmt: skip
 
 
-@pytest.fixture
-def limits(monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, float]]:
-    """The y limits of every panel that is drawn."""
-    drawn: list[tuple[float, float]] = []
-    real = panels.panel_grid
+def test_figures_of_eight_algorithms_with_long_names_are_readable_and_whole(
+    analysis: Analysis, drawn: list[Any]
+) -> None:
+    levels = analysis.levels.copy()  # the worst is in the last panel, and far above the others
+    worst = (levels.class_name == "plane") & (levels.algorithm == "Alpha")
+    levels.loc[worst, ["iqm", "low", "high"]] = 1.7, 1.5, 1.9
+    names = [f"PPO (learning_rate = 0.000{i}, n_steps = 256)" for i in range(1, 9)]
+    many = with_algorithms(dataclasses.replace(analysis, levels=levels), names)
+    pictures, _ = draw_figures(many, ("png",), {})
+    assert {picture.name for picture in pictures} == FIGURES
+    figures = dict(zip([picture.name for picture in pictures], drawn, strict=True))
+    for name, figure in figures.items():
+        assert_readable(figure)
+        for axes in figure.axes:
+            (left, right), (bottom, top) = sorted(axes.get_xlim()), sorted(axes.get_ylim())
+            for line in axes.lines:
+                if line.get_transform() == axes.transData:
+                    for x, y in line.get_xydata():
+                        assert left <= x <= right, name
+                        assert bottom <= y <= top, name
+    assert {axes.get_ylim()[0] for axes in figures["wd-regret"].axes} == {0.0}
 
-    @contextlib.contextmanager
-    def spy(*arguments: Any, **options: Any) -> Iterator[panels.Grid]:
-        with real(*arguments, **options) as grid:
-            yield grid
-            drawn.extend(axes.get_ylim() for axes in grid.panels)
 
-    monkeypatch.setattr(panels, "panel_grid", spy)
-    return drawn
+def test_a_heat_map_has_one_scale_that_covers_its_values_and_prints_them(
+    analysis: Analysis, drawn: list[Any]
+) -> None:
+    regions = analysis.regions.assign(similarity=np.linspace(0.91, 0.96, len(analysis.regions)))
+    draw_regions(dataclasses.replace(analysis, regions=regions), ("png",))
+    (figure,) = drawn
+    maps = [axes for axes in figure.axes if axes.images]
+    assert len(maps) == len(analysis.algorithms)
+    assert {axes.images[0].get_clim() for axes in maps} == {(0.9, 1.0)}
+    first = maps[0].images[0].get_array()[0, 0]
+    assert maps[0].texts[0].get_text() == f"{first:.3f}".removeprefix("0")
+    assert any("colours from 0.90 to 1.00" in axes.get_xlabel() for axes in figure.axes)
 
 
-def unlearnt(analysis: Analysis) -> Analysis:
-    """With regrets between 0.98 and 1."""
+def test_curves_and_levels_near_1_have_headroom(analysis: Analysis, drawn: list[Any]) -> None:
     rows = analysis.learning_curves
     names = ["q25", "median", "q75"]
     squeezed = rows.assign(**{name: 0.98 + 0.02 * (rows[name] % 1.0) for name in names})
     squeezed.loc[squeezed.index[::3], "q75"] = 1.0
-    levels = analysis.levels.copy()
-    levels[["iqm", "linear"]] = 0.999
-    levels[["low", "high"]] = [0.99, 1.0]
-    return dataclasses.replace(analysis, learning_curves=squeezed, levels=levels)
-
-
-def test_curves_of_all_algorithms_have_headroom_and_one_scale(analysis: Analysis, limits) -> None:
-    (picture,) = differences.draw_class_curves(unlearnt(analysis), ["png"])
-    ((low, high),) = set(limits)
+    levels = analysis.levels.assign(iqm=0.999, linear=0.999, low=0.99, high=1.0)
+    unlearnt = dataclasses.replace(analysis, learning_curves=squeezed, levels=levels)
+    (picture,) = differences.draw_class_curves(unlearnt, ["png"])
+    assert "each a running median over 2 evaluations" in picture.caption
+    ((low, high),) = {axes.get_ylim() for axes in drawn[0].axes if axes.get_visible()}
     assert 0.9 < low < 0.98
     assert high - 1.0 > 0.03 * (high - low)
-    assert "each a running median over 2 evaluations" in picture.caption
-
-
-def test_regret_from_zero_has_headroom(analysis: Analysis, limits) -> None:
-    list(curves.draw_regret(unlearnt(analysis), ["png"]))
-    for low, high in limits:
+    assert len(list(curves.draw_regret(unlearnt, ["png"]))) == 2
+    shown = [axes for figure in drawn[1:] for axes in figure.axes if axes.get_visible()]
+    for low, high in {axes.get_ylim() for axes in shown}:
         assert low == 0.0
         assert high - 1.0 > 0.03
 
@@ -75,10 +102,33 @@ def test_levels_of_one_state_dimension_are_comparable(analysis: Analysis) -> Non
     assert panels.epsilon_remark(alike) == ""
 
 
-def test_an_axis_with_a_single_class_has_no_figure(finished: Path) -> None:
-    ledger = Ledger(finished)
-    file = ledger.plan_file()
-    assert file is not None
-    keys = [p.cell.digest for p in file.plan.cells if p.class_name in ("default", "k-25")]
-    pictures = curves.draw_learning_curves(analyse(file, ledger.results(keys), draws=50), ["png"])
+def test_an_axis_with_a_single_class_has_no_figure(finished: Path, drawn: list[Any]) -> None:
+    two = analysed(finished, lambda planned: planned.class_name not in ("default", "k-25"))
+    pictures = curves.draw_learning_curves(two, ["png"])
     assert [picture.name for picture in pictures] == ["learning-curves-k"]
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([1, 2, 5, 10], "log"),
+        ([2, 4, 8, 16], "log"),
+        ([0.25, 0.5, 0.75], "linear"),
+        ([0, 0.1, 1], "linear"),
+        ([1, 10], "linear"),
+        (["individual", "team"], "nominal"),
+        ([True, False], "nominal"),
+        ([], "nominal"),
+    ],
+)
+def test_an_axis_has_the_scale_on_which_its_values_are_evenly_spaced(
+    values: list[Any], expected: str
+) -> None:
+    assert spacing(values) == expected
+
+
+def test_marks_next_to_each_other_have_equal_distances_everywhere() -> None:
+    scale = Scale.of([1, 2, 5, 10], 4)
+    ratios = scale.shifted(np.array(scale.at), 0.5) / np.array(scale.at)
+    assert np.allclose(ratios, np.sqrt(2.0))
+    assert Scale.of(["a", "b"], 2).at == (0.0, 1.0)
