@@ -32,7 +32,7 @@ from leaderboard.scoring.sealed import instances, score_run, sealed_result
 from leaderboard.scoring.season import by_key, counting, score_entries, season_rankings
 from leaderboard.sealed import verify_season
 from leaderboard.store import Store
-from sme_registry import evaluate, materialize
+from sme_registry import materialize
 from sme_registry.datasets import SealedDataset
 from sme_registry.errors import SMEError
 from sme_registry.evaluation import evaluate_many
@@ -64,11 +64,14 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def season(published: Path) -> Season:
+    return read_season(published)
+
+
 def challenges(folder: Path) -> list[np.ndarray]:
-    season = read_season(folder)
-    return [
-        unpack_table(challenge_path(folder, hidden).read_bytes(), 4) for hidden in season.hidden
-    ]
+    hidden = read_season(folder).hidden
+    return [unpack_table(challenge_path(folder, each).read_bytes(), 4) for each in hidden]
 
 
 def enter(
@@ -103,13 +106,28 @@ def optima(season: Season, folder: Path) -> list[np.ndarray]:
     ]
 
 
+def reveal(store: Store, season: Season) -> None:
+    store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
+
+
+def false_season(store: Store, terms: Terms) -> Season:
+    """A season of an organiser's own making, announced though it is over, and revealed."""
+    season = terms.commit(MASTER)
+    path = store.season_folder(season.digest)
+    with store.transaction():
+        store.record("season", season.digest, season, path.season)
+    reveal(store, season)
+    return season
+
+
 def test_a_season_is_generated_from_its_plan_and_its_master(
-    published: Path, tmp_path: Path
+    season: Season, published: Path, tmp_path: Path
 ) -> None:
-    season = read_season(published)
     assert season.is_committed_to(MASTER)
     assert check_published(season, published) == 2
     assert create_season(read_plan(plan()), MASTER, tmp_path / "again") == season
+    assert season.versions["numpy"] == np.__version__
+    assert {"sme_registry", "python", "scipy"} <= set(season.versions)
     other = create_season(read_plan(plan()), Master(bytes(32)), tmp_path / "other")
     mine = {(each.data, each.challenge) for each in season.published}
     assert not mine & {(each.data, each.challenge) for each in other.published}
@@ -119,10 +137,11 @@ def test_a_season_is_generated_from_its_plan_and_its_master(
     assert create_season(online, MASTER, tmp_path / "online").published == ()
 
 
-def test_nothing_published_tells_a_secret(published: Path) -> None:
-    season = read_season(published)
+def test_nothing_published_tells_a_secret(season: Season, published: Path) -> None:
     secrets = {MASTER.raw.hex()}
     for instance in instances(season, MASTER):
+        seeds = (instance.spec.seed, instance.protocol.seed, recipe(instance, MASTER).seed)
+        assert len(set(seeds)) == 3
         secrets |= {str(instance.spec.seed)[2:], instance.spec.digest[7:]}
         secrets |= {str(instance.protocol.seed), instance.spec.content_name}
         secrets |= {MASTER.seed(instance.place, "data")[2:]}
@@ -132,33 +151,31 @@ def test_nothing_published_tells_a_secret(published: Path) -> None:
         assert MASTER.raw not in content
 
 
-def test_an_altered_publication_is_named(published: Path, tmp_path: Path) -> None:
-    season = create_season(read_plan(plan()), MASTER, tmp_path / "copy")
+def test_an_altered_publication_is_named(season: Season, published: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(published, copy)
     first, second = season.hidden
-    path = challenge_path(tmp_path / "copy", first)
+    path = challenge_path(copy, first)
     whole = path.read_bytes()
     path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
     with pytest.raises(BoardError, match=r"deep-0\.npy: has the digest"):
-        check_published(season, tmp_path / "copy")
+        check_published(season, copy)
     path.write_bytes(whole)
-    target = dataset_path(tmp_path / "copy", season.id, second)
-    data = SealedDataset.read(dataset_path(tmp_path / "copy", season.id, first))
-    for file in (target / "data").iterdir():
-        file.unlink()
-    (target / "data").rmdir()
-    target.rmdir()
-    data.write(f"sealed/{season.id}/deep-1-v0", tmp_path / "copy" / "datasets")
+    target = dataset_path(copy, season.id, second)
+    shutil.rmtree(target)
+    shutil.copytree(dataset_path(copy, season.id, first), target)
     with pytest.raises(BoardError, match="deep-1-v0: has the digest"):
-        check_published(season, tmp_path / "copy")
+        check_published(season, copy)
+    fields = season.to_dict()
+    fields["classes"][0]["data"]["transitions"] = 301
+    with pytest.raises(BoardError, match=r"has \(300, 4, 1\) .* must have \(301, 4, 1\)"):
+        check_published(Season.from_dict(fields), published)
 
 
-def test_answers_must_fit_a_board() -> None:
+def test_answers_must_fit_a_board_and_somebody_must_be_able_to_have_a_rank() -> None:
     refuse_large_answers(tiny_terms(), 10_000)
     with pytest.raises(BoardError, match=r"classes\.deep: its answers have"):
         refuse_large_answers(tiny_terms(), 1000)
-
-
-def test_somebody_must_be_able_to_have_a_rank() -> None:
     refuse_unrankable(tiny_terms(), 2)
     refuse_unrankable(tiny_terms("sealed-online"), 4)
     with pytest.raises(BoardError, match=r"classes\.deep: a key has at most 2 runs"):
@@ -186,8 +203,7 @@ def test_the_plan_in_the_documentation_is_one() -> None:
     assert read_plan(online).published == ()
 
 
-def test_a_season_is_scored_ranked_and_replayed(store, key, published, later) -> None:
-    season = read_season(published)
+def test_a_season_is_scored_ranked_and_replayed(store, key, season, published, later) -> None:
     store.announce(season)
     friend = SigningKey.generate()
     enter(store, season, key, optima(season, published), method=method("Best"))
@@ -201,7 +217,7 @@ def test_a_season_is_scored_ranked_and_replayed(store, key, published, later) ->
     with pytest.raises(Rejection, match="season_not_closed"):
         score_entries(store, season.id)
     later()
-    store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
+    reveal(store, season)
     assert [row.entrant.id for row in counting(store, season)] == [last, family, failed]
     assert score_entries(store, season.id) == 3
     assert score_entries(store, season.id) == 0
@@ -215,18 +231,22 @@ def test_a_season_is_scored_ranked_and_replayed(store, key, published, later) ->
     report = verify_season(store, season.id)
     assert (report.instances, report.rounded, report.entries, report.results) == (2, 0, 6, 3)
     assert by_key(store, season) == {key.public: (1, 3), friend.public: (2, 3)}
+    [first, *_] = store.entrants(season.digest)
+    store.rank(failed_result(season, first.entrant.id))
+    name = rf"{first.entrant.id[7:]}\.json: is of an entry that does not"
+    with pytest.raises(TamperedError, match=name):
+        verify_season(store, season.id)
 
 
 def test_entries_share_the_optimum_of_an_instance(
-    store, key, published, later, monkeypatch: pytest.MonkeyPatch
+    store, key, season, published, later, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    season = read_season(published)
     store.announce(season)
     for share in (0.25, 0.5, 0.75):
         answers = [share * each for each in optima(season, published)]
         enter(store, season, key, answers, method=method(f"Share {share}"))
     later()
-    store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
+    reveal(store, season)
     passes = []
 
     def counted(policies: Any, *arguments: Any) -> Any:
@@ -250,68 +270,52 @@ def test_entries_share_the_optimum_of_an_instance(
     assert together.runs[0].normalised_regret == alone.normalised_regret
 
 
-def test_a_score_is_that_of_the_open_board(store, key, published, later) -> None:
-    season = read_season(published)
+def test_a_replay_finds_scores_that_do_not_follow(store, key, season, published, later) -> None:
+    """The organiser, who holds the board's key, publishes another score."""
     store.announce(season)
-
-    def policy(observations: np.ndarray) -> np.ndarray:
-        return np.clip(1.4 * observations[:, 1:2] - 0.1, 0, 1)
-
-    enter(store, season, key, [policy(each) for each in challenges(published)])
+    enter(store, season, key, halves(published))
     later()
-    store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
+    reveal(store, season)
+    with pytest.raises(BoardError, match="1 of 1 entries that count have no result"):
+        verify_season(store, season.id)
+    rank = store.rank
+
+    def better(result: Any) -> bool:
+        run = result.runs[0]
+        regrets = (0.5 * run.normalised_regret[0], *run.normalised_regret[1:])
+        lower = run.model_copy(update={"normalised_regret": regrets})
+        return rank(result.model_copy(update={"runs": (lower, *result.runs[1:])}))
+
+    store.rank = better
     score_entries(store, season.id)
-    [row] = store.entrants(season.digest)
-    result = store.sealed_result(row)
-    assert result is not None
-    for run, instance in zip(result.runs, instances(season, MASTER), strict=True):
-        report = evaluate(policy, instance.spec, instance.protocol)
-        expected = [region.normalised_regret for region in report.regions]
-        assert run.normalised_regret == pytest.approx(expected, abs=1e-6)
+    with pytest.raises(TamperedError, match=r"runs\.0: scored again, it differs"):
+        verify_season(store, season.id)
 
 
-def test_a_replay_finds_scores_and_data_that_do_not_follow(tmp_path: Path, key, published, later):
-    """The organiser, who holds the board's key, publishes another score or other data."""
-    season = read_season(published)
-    with tiny_board(tmp_path / "board") as store:
-        store.announce(season)
-        enter(store, season, key, halves(published))
-        later()
-        store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
-        with pytest.raises(BoardError, match="1 of 1 entries that count have no result"):
-            verify_season(store, season.id)
-        rank = store.rank
-
-        def better(result: Any) -> bool:
-            run = result.runs[0]
-            regrets = (0.5 * run.normalised_regret[0], *run.normalised_regret[1:])
-            lower = run.model_copy(update={"normalised_regret": regrets})
-            return rank(result.model_copy(update={"runs": (lower, *result.runs[1:])}))
-
-        store.rank = better  # type: ignore[method-assign]
-        score_entries(store, season.id)
-        with pytest.raises(TamperedError, match=r"runs\.0: scored again, it differs"):
-            verify_season(store, season.id)
-
-    fields = season.terms.to_dict()
-    fields["published"][1]["data"] = fields["published"][0]["data"]
-    with tiny_board(tmp_path / "other") as store:
-        false = type(season.terms).from_dict(fields).commit(MASTER)
-        monkey_open(store, false)
+@pytest.mark.parametrize("part", ["data", "challenge"])
+def test_a_replay_finds_what_was_published_and_does_not_follow(
+    store: Store, tmp_path: Path, season: Season, published: Path, later: Any, part: str
+) -> None:
+    fields, copy = season.terms.to_dict(), tmp_path / "copy"
+    fields["published"][1][part] = fields["published"][0][part]
+    shutil.copytree(published, copy)
+    later()
+    false = false_season(store, Terms.from_dict(fields))
+    if part == "data":
         with pytest.raises(BoardError, match="--published FOLDER"):
             verify_season(store, false.id)
-        other = dataset_path(tmp_path / "copy", false.id, list(false.hidden)[1])
-        shutil.copytree(published, tmp_path / "copy")
+        other = dataset_path(copy, false.id, list(false.hidden)[1])
         shutil.rmtree(other)
         shutil.copytree(other.with_name("deep-0-v0"), other)
-        with pytest.raises(TamperedError, match="published: deep 1"):
-            verify_season(store, false.id, published=tmp_path / "copy")
+    with pytest.raises(TamperedError, match="published: deep 1"):
+        verify_season(store, false.id, published=copy)
 
 
-def test_another_machines_rounding_is_told_from_other_data(tmp_path, published, later) -> None:
+def test_another_machines_rounding_is_told_from_other_data(
+    tmp_path: Path, season: Season, published: Path, later: Any
+) -> None:
     """As if the organiser's processor had rounded rewards otherwise than this one."""
     later()
-    season = read_season(published)
     folder = tmp_path / "copy"
     shutil.copytree(published, folder)
     fields = season.terms.to_dict()
@@ -322,58 +326,21 @@ def test_another_machines_rounding_is_told_from_other_data(tmp_path, published, 
         shutil.rmtree(path)
         data.write(f"sealed/{season.id}/deep-{number}-v0", folder / "datasets")
         fields["published"][number]["data"] = data.digest
-    for instances_, message in ((1, None), (2, "published: deep 1")):
-        terms = {**fields, "published": fields["published"][:instances_]}
-        terms["classes"][0]["instances"] = instances_
-        rounded = type(season.terms).from_dict(terms).commit(MASTER)
-        with tiny_board(tmp_path / str(instances_)) as store:
-            monkey_open(store, rounded)
+    for count in (1, 2):  # the first rounds otherwise, the second has other data
+        terms = {**fields, "published": fields["published"][:count]}
+        terms["classes"][0]["instances"] = count
+        with tiny_board(tmp_path / str(count)) as store:
+            false_season(store, Terms.from_dict(terms))
             with pytest.raises(BoardError, match=r"deep-0: .* --published FOLDER"):
                 verify_season(store, season.id)
             with pytest.raises(BoardError, match="Download it again"):
                 verify_season(store, season.id, published=published)
-            if message is None:
+            if count == 1:
                 report = verify_season(store, season.id, published=folder)
                 assert (report.instances, report.rounded) == (1, 1)
-                continue
-            with pytest.raises(TamperedError, match=message):
-                verify_season(store, season.id, published=folder)
-
-
-def test_a_data_set_of_another_size_than_promised_is_refused(
-    tmp_path: Path, published: Path
-) -> None:
-    season = read_season(published)
-    fields = season.to_dict()
-    fields["classes"][0]["data"]["transitions"] = 301
-    with pytest.raises(BoardError, match=r"has \(300, 4, 1\) .* must have \(301, 4, 1\)"):
-        check_published(Season.from_dict(fields), published)
-
-
-def test_a_season_has_the_versions_that_it_was_generated_with(published: Path) -> None:
-    versions = read_season(published).versions
-    assert versions["numpy"] == np.__version__
-    assert {"sme_registry", "python", "scipy"} <= set(versions)
-
-
-def monkey_open(store: Store, season: Season) -> None:
-    """Announces a season that is over, and reveals it."""
-    path = store.season_folder(season.digest)
-    with store.transaction():
-        store.record("season", season.digest, season, path.season)
-    store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
-
-
-def test_a_rank_needs_the_runs_of_the_board(tmp_path: Path, key, published, later) -> None:
-    season = read_season(published)
-    with tiny_board(tmp_path / "board", runs_to_rank=3) as store:
-        store.announce(season)
-        enter(store, season, key, [None, None])
-        later()
-        store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
-        score_entries(store, season.id)
-        [row] = season_rankings(store, season, "wd_regret")["generic"]
-    assert (row.ranks, row.reason) == ("", "too_few_runs")
+            else:
+                with pytest.raises(TamperedError, match="published: deep 1"):
+                    verify_season(store, season.id, published=folder)
 
 
 @pytest.mark.parametrize(("needed", "reason"), [(1, ""), (2, "too_few_runs")])
@@ -394,10 +361,10 @@ def test_the_class_with_the_fewest_runs_decides_on_a_rank(
         store.announce(season)
         enter(store, season, key, [None] * 4)
         later()
-        store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
+        reveal(store, season)
         score_entries(store, season.id)
         [row] = season_rankings(store, season, "wd_regret")["generic"]
-    assert row.reason == reason
+    assert (row.reason, row.ranks) == (reason, "" if reason else "1")
 
 
 @pytest.mark.parametrize(("needed", "reason"), [(4, ""), (5, "too_few_runs")])
@@ -431,9 +398,8 @@ def test_an_entry_after_the_close_counts_nowhere(store, key, later) -> None:
 
 @pytest.mark.parametrize("fault", ["signature", "board"])
 def test_a_replay_finds_entries_that_their_key_has_not_signed(
-    store, key, published, later, fault: str
+    store: Store, key: SigningKey, season: Season, later: Any, fault: str
 ) -> None:
-    season = read_season(published)
     store.announce(season)
     signed = signed_entry(store, season, key, [None, None])
     if fault == "board":
@@ -442,44 +408,10 @@ def test_a_replay_finds_entries_that_their_key_has_not_signed(
         signed = signed.model_copy(update={"signature": "0" * 128})
     store.enter(signed)
     later()
-    store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
+    reveal(store, season)
     score_entries(store, season.id)
     with pytest.raises(TamperedError, match="its signature does not match the entrant's key"):
         verify_season(store, season.id)
-
-
-def test_a_replay_finds_the_result_of_an_entry_that_does_not_count(
-    store, key, published, later
-) -> None:
-    season = read_season(published)
-    store.announce(season)
-    first, last = (
-        enter(store, season, key, [None, None], statement=note) for note in ("first", "last")
-    )
-    later()
-    store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
-    assert score_entries(store, season.id) == 1
-    assert verify_season(store, season.id).results == 1
-    store.rank(failed_result(season, first))
-    with pytest.raises(TamperedError, match=rf"{first[7:]}\.json: is of an entry that does not"):
-        verify_season(store, season.id)
-    assert first != last
-
-
-def test_a_replay_finds_challenge_states_that_do_not_follow(store, published, later) -> None:
-    fields = read_season(published).terms.to_dict()
-    fields["published"][1]["challenge"] = fields["published"][0]["challenge"]
-    false = Terms.from_dict(fields).commit(MASTER)
-    later()
-    monkey_open(store, false)
-    with pytest.raises(TamperedError, match="published: deep 1"):
-        verify_season(store, false.id, published=published)
-
-
-def test_a_data_set_is_not_drawn_with_the_seed_of_its_task() -> None:
-    for instance in instances(tiny_terms(), MASTER):
-        seeds = (instance.spec.seed, instance.protocol.seed, recipe(instance, MASTER).seed)
-        assert len(set(seeds)) == 3
 
 
 def test_tickets_of_each_method_have_scores_of_their_own(store, key) -> None:
