@@ -84,8 +84,10 @@ def test_each_episode_has_its_mean_regret(tmp_path: Path) -> None:
     assert [each.regret for each in read] == pytest.approx([each.regret for each in env.episodes])
 
 
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
-@pytest.mark.parametrize("kind", ["native", "sync"])
+@pytest.mark.parametrize(
+    ("kind", "mode"),
+    [("native", "NextStep"), ("native", "SameStep"), ("sync", "NextStep"), ("sync", "Disabled")],
+)
 def test_a_vector_records_the_same_episodes_in_every_mode(kind: str, mode: str) -> None:
     lanes, mode_ = 3, AutoresetMode(mode)
     taken = actions(lanes)
@@ -146,7 +148,9 @@ def test_it_stands_beside_gymnasiums_statistics() -> None:
     assert {"r", "regret"} <= set(info["episode"])
 
 
-def test_a_file_that_exists_is_kept_unless_forced(tmp_path: Path) -> None:
+def test_a_file_that_exists_is_kept_unless_forced_and_other_environments_refused(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "episodes.csv"
     path.write_text("mine")
     with pytest.raises(OptionError, match=r"already exists.*force=True"):
@@ -154,9 +158,6 @@ def test_a_file_that_exists_is_kept_unless_forced(tmp_path: Path) -> None:
     assert path.read_text() == "mine"
     RecordRegret(sme_registry.make(SPEC), path, force=True).close()
     assert path.read_text().startswith("episode,step,")
-
-
-def test_another_environment_is_refused_at_its_first_step() -> None:
     env = RecordRegret(gymnasium.make("Pendulum-v1"))
     env.reset(seed=0)
     with pytest.raises(OptionError, match="info has no 'regret'"):
@@ -254,14 +255,14 @@ def test_recorded_episodes_have_their_cost(kind: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("tightness", "channels", "above", "share"),
-    [(0.5, 64, 3e-5, 1.0), (0.005, 1, 0.0, 0.0), (0.005, 1, 2e-6, 1.0), (0.2, 200, 0.0, 0.0)],
+    [(0.005, 1, 0.0, 0.0), (0.005, 1, 2e-6, 1.0), (0.2, 200, 0.0, 0.0)],
 )
 def test_steps_above_a_limit_by_more_than_rounding_are_violations(
     tightness: float, channels: int, above: float, share: float
 ) -> None:
     spec = SMESpec(
         action_dim=channels,
-        horizon=50,
+        horizon=20,
         safety={"tightness": tightness},
         policy_init="unit_variance",
     )
@@ -288,14 +289,12 @@ def test_steps_above_a_limit_by_more_than_rounding_are_violations(
 
 
 def test_a_task_without_limits_has_no_costs() -> None:
-    with pytest.raises(OptionError, match=r"^StepWithCost: needs a task with limits"):
-        StepWithCost(sme_registry.make(SPEC))
-    with pytest.raises(OptionError, match=r"^VectorStepWithCost: needs a task with limits"):
-        VectorStepWithCost(sme_registry.make_vec(SPEC, 2))
-    with pytest.raises(OptionError, match=r"^StepWithCost: .* has no `sme_spec`"):
-        StepWithCost(gymnasium.make("Pendulum-v1"))
-    vector = gymnasium.vector.SyncVectorEnv([lambda: sme_registry.make(LIMITED)])
-    with pytest.raises(
-        OptionError, match=r"^VectorStepWithCost: .* vector of sme_registry\.make_vec"
+    vector = SyncVectorEnv([lambda: sme_registry.make(LIMITED)])
+    for wrapper, env, words in (
+        (StepWithCost, sme_registry.make(SPEC), "needs a task with limits"),
+        (VectorStepWithCost, sme_registry.make_vec(SPEC, 2), "needs a task with limits"),
+        (StepWithCost, gymnasium.make("Pendulum-v1"), ".* has no `sme_spec`"),
+        (VectorStepWithCost, vector, r".* vector of sme_registry\.make_vec"),
     ):
-        VectorStepWithCost(vector)
+        with pytest.raises(OptionError, match=f"^{wrapper.__name__}: {words}"):
+            wrapper(env)  # type: ignore[operator]

@@ -33,23 +33,17 @@ def test_a_terminal_is_told_while_it_waits(monkeypatch: pytest.MonkeyPatch) -> N
     assert terminal.getvalue().count("\n") == 1
 
 
-def test_a_terminal_that_does_not_wait_is_told_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
-    monkeypatch.setattr(notice, "_PATIENCE", 3600.0)
-    with notice.compiling():
-        pass
-    for thread in threading.enumerate():
-        if isinstance(thread, threading.Timer):
-            thread.join(60)
-    assert terminal.getvalue() == ""
-
-
-def test_a_log_is_told_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    log = io.StringIO()
-    monkeypatch.setattr(sys, "stderr", log)
-    monkeypatch.delitem(sys.modules, "ipykernel", raising=False)
-    monkeypatch.setattr(notice, "_PATIENCE", 0.0)
-    with notice.compiling():
-        assert not any(isinstance(each, threading.Timer) for each in threading.enumerate())
-    assert log.getvalue() == ""
+def test_a_log_and_a_terminal_that_does_not_wait_are_told_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for stream, patience in ((Terminal(), 3600.0), (io.StringIO(), 0.0)):
+        monkeypatch.setattr(sys, "stderr", stream)
+        monkeypatch.delitem(sys.modules, "ipykernel", raising=False)
+        monkeypatch.setattr(notice, "_PATIENCE", patience)
+        timers = set(threading.enumerate())
+        with notice.compiling():
+            timers = set(threading.enumerate()) - timers
+            assert bool(timers) == (patience > 0.0)
+        for timer in timers:
+            timer.join(60)
+        assert stream.getvalue() == ""

@@ -3,6 +3,7 @@
 The numbers are made by `python -m tests.golden.regenerate`.
 """
 
+import importlib.util
 import json
 
 import numpy as np
@@ -14,7 +15,6 @@ from tests.compiled.stepping import Lane
 from tests.golden import regenerate
 
 STEPS = json.loads((regenerate.FOLDER / "one_step.json").read_text())
-CASES = [(name, i) for name, cases in STEPS.items() for i in range(len(cases))]
 
 
 def numbers(hexes):
@@ -27,28 +27,24 @@ def test_the_golden_tasks_are_those_of_the_command():
     assert sum(0.0 < reward < 1.0 for reward in rewards) >= len(STEPS)
 
 
-@pytest.mark.parametrize(("name", "index"), CASES)
-def test_the_definition_takes_the_golden_step(name, index):
-    case, task = STEPS[name][index], load_task(name)
-    s, a = numbers(case["state"]), numbers(case["action"])
-    np.testing.assert_array_equal(task.transition(s, a), numbers(case["next_state"]))
-    np.testing.assert_allclose(task.optimal_action(s), case["optimal_action"], rtol=0, atol=1e-9)
-    assert task.similarity(s, a) == pytest.approx(case["similarity"], rel=0, abs=1e-9)
-    assert task.step_reward(s, a) == pytest.approx(case["step_reward"], rel=0, abs=1e-8)
-
-
-@pytest.mark.parametrize("backend", ["numba", "numpy"])
-@pytest.mark.parametrize(("name", "index"), CASES)
-def test_every_engine_takes_the_golden_step(name, index, backend):
-    if backend == "numba":
-        pytest.importorskip("numba")
-    case, task = STEPS[name][index], load_task(name)
-    lane = Lane(task, engine(task, backend), numbers(case["state"]))
-    done = lane.step(numbers(case["action"]))
-    np.testing.assert_array_equal(done.state, numbers(case["next_state"]))
-    np.testing.assert_allclose(done.optimal_action, case["optimal_action"], rtol=0, atol=1e-9)
-    assert done.similarity == pytest.approx(case["similarity"], rel=0, abs=1e-9)
-    assert done.step_reward == pytest.approx(case["step_reward"], rel=0, abs=1e-8)
+@pytest.mark.parametrize("name", STEPS)
+def test_the_definition_and_every_engine_take_the_golden_steps(name):
+    task, engines = load_task(name), ["numpy"]
+    if importlib.util.find_spec("numba"):
+        engines.append("numba")
+    for case in STEPS[name]:
+        s, a = numbers(case["state"]), numbers(case["action"])
+        np.testing.assert_array_equal(task.transition(s, a), numbers(case["next_state"]))
+        best, similarity = task.optimal_action(s), task.similarity(s, a)
+        found = [(best, similarity, task.step_reward(s, a))]
+        for backend in engines:
+            done = Lane(task, engine(task, backend), s).step(a)
+            np.testing.assert_array_equal(done.state, numbers(case["next_state"]))
+            found.append((done.optimal_action, done.similarity, done.step_reward))
+        for best, similarity, step_reward in found:
+            np.testing.assert_allclose(best, case["optimal_action"], rtol=0, atol=1e-9)
+            assert similarity == pytest.approx(case["similarity"], rel=0, abs=1e-9)
+            assert step_reward == pytest.approx(case["step_reward"], rel=0, abs=1e-8)
 
 
 def test_the_command_refuses_to_change_what_is_released(tmp_path, monkeypatch, capsys):

@@ -32,6 +32,10 @@ def test_a_lock_is_exclusive_until_it_is_released(tmp_path):
     lock.release()
     lock.release()
     assert file_lock(path) is not None
+    path.write_text("content")
+    with file_lock(path):
+        assert path.read_text() == "content"
+    assert path.read_text() == "content"
 
 
 def test_a_lock_of_a_killed_process_is_free(tmp_path):
@@ -66,11 +70,3 @@ def test_a_lock_that_cannot_be_made_is_an_error_and_not_a_held_lock(tmp_path):
         with pytest.raises(OptionError, match="cannot be locked"):
             file_lock(path)
         assert not is_locked(path)
-
-
-def test_locking_keeps_the_content_of_the_file(tmp_path):
-    path = tmp_path / "lock"
-    path.write_text("content")
-    with file_lock(path):
-        assert path.read_text() == "content"
-    assert path.read_text() == "content"

@@ -66,12 +66,10 @@ def test_this_machine_has_memory_to_spare():
     assert 0 < available_memory() < os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
-def test_without_a_list_of_memory_all_of_the_machine_counts(monkeypatch, tmp_path):
+def test_without_control_groups_or_a_list_of_memory_all_of_the_machine_counts(
+    monkeypatch, tmp_path
+):
     monkeypatch.setattr(memory, "_PROC", tmp_path)
     assert available_memory() == os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-
-
-def test_without_control_groups_the_available_memory_counts(monkeypatch, tmp_path):
     (tmp_path / "meminfo").write_text("MemTotal: 256 kB\nMemAvailable: 64 kB\n")
-    monkeypatch.setattr(memory, "_PROC", tmp_path)
     assert available_memory() == 64 * 1024

@@ -9,35 +9,20 @@ import shlex
 import tomllib
 from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 import sme_registry
 from sme_registry.errors import MissingDependencyError
 from sme_registry.io import install_command, missing_dependency, packages, require_packages
-from tests.wheel.test_extras import NAME, closure
+from tests.wheel.test_extras import closure, normalised
 
 ROOT = Path(sme_registry.__file__).parents[1]
 
 
 def requirement(command: str) -> str:
     return shlex.split(command)[-1]
-
-
-@pytest.fixture
-def installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> object:
-    """Records where the package was installed from, as pip does."""
-    monkeypatch.setattr(packages, "_SOURCE", tmp_path / "site-packages")
-
-    def install(origin: dict[str, object] | None) -> None:
-        class Distribution:
-            def read_text(self, name: str) -> str | None:
-                assert name == "direct_url.json"
-                return None if origin is None else json.dumps(origin)
-
-        monkeypatch.setattr(packages.metadata, "distribution", lambda name: Distribution())
-
-    return install
 
 
 def test_in_a_clone_the_command_names_the_clone(
@@ -50,32 +35,24 @@ def test_in_a_clone_the_command_names_the_clone(
     assert "-e" in shlex.split(install_command("plot"))
 
 
-@pytest.mark.parametrize(
-    ("origin", "expected"),
-    [
+def test_a_copy_is_installed_again_from_its_origin(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "my clone").mkdir()
+    git = {"vcs_info": {"vcs": "git", "commit_id": "0" * 40}}
+    for origin, expected in (
         (None, "sme-registry[plot]"),
-        (
-            {"url": "file:///a%20b/sme.whl", "archive_info": {}},
-            "sme-registry[plot] @ file:///a%20b/sme.whl",
-        ),
-        (
-            {"url": "https://host/sme.git", "vcs_info": {"vcs": "git", "commit_id": "0" * 40}},
-            "sme-registry[plot] @ git+https://host/sme.git",
-        ),
+        ({"url": "file:///a%20b/sme.whl"}, "sme-registry[plot] @ file:///a%20b/sme.whl"),
+        ({"url": "https://host/sme.git", **git}, "sme-registry[plot] @ git+https://host/sme.git"),
         ({"url": "file:///removed", "dir_info": {}}, "sme-registry[plot]"),
-    ],
-)
-def test_a_copy_is_installed_again_from_its_origin(installed, origin, expected) -> None:
-    installed(origin)
-    assert requirement(install_command("plot")) == expected
-
-
-def test_a_copy_from_a_clone_is_installed_again_from_the_clone(installed, tmp_path: Path) -> None:
-    clone = tmp_path / "my clone"
-    clone.mkdir()
-    installed({"url": clone.as_uri(), "dir_info": {}})
-    assert requirement(install_command("plot")) == f"{clone}[plot]"
-    assert "-e" not in shlex.split(install_command("plot"))
+        ({"url": (tmp_path / "my clone").as_uri(), "dir_info": {}}, f"{tmp_path}/my clone[plot]"),
+    ):
+        # As pip records it, in direct_url.json.
+        recorded = SimpleNamespace(read_text=lambda name: origin and json.dumps(origin))  # noqa: B023
+        monkeypatch.setattr(packages, "_SOURCE", tmp_path / "site-packages")
+        monkeypatch.setattr(packages.metadata, "distribution", lambda name: recorded)  # noqa: B023
+        assert requirement(install_command("plot")) == expected
+        assert "-e" not in shlex.split(install_command("plot"))
 
 
 def test_missing_packages_are_named_with_the_extra_and_the_alternative() -> None:
@@ -107,15 +84,14 @@ def test_a_failed_import_is_explained_by_the_extra_that_has_the_module() -> None
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 
 
-def plain(name: str) -> str:
-    return name.lower().replace("_", "-")
-
-
 def hints() -> list[tuple[str, str, list[str]]]:
     """Every place in the code that names an extra: where, the extra, the modules that it lacks."""
     found = []
     for path in (*ROOT.glob("sme_registry/**/*.py"), *ROOT.glob("leaderboard/**/*.py")):
-        for node in ast.walk(ast.parse(path.read_text())):
+        text = path.read_text()
+        if "require_packages(" not in text and "install_command(" not in text:
+            continue
+        for node in ast.walk(ast.parse(text)):
             if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name):
                 continue
             where = f"{path.relative_to(ROOT)}:{node.lineno}"
@@ -131,14 +107,13 @@ def hints() -> list[tuple[str, str, list[str]]]:
 
 @pytest.mark.skipif(not packages._extras(), reason="reads the extras of the installed package")
 def test_every_hint_names_an_extra_that_has_the_missing_module() -> None:
-    requirements, distributions = metadata.requires(NAME) or [], metadata.packages_distributions()
-    found = hints()
+    distributions, found = metadata.packages_distributions(), hints()
     assert len(found) > 20
+    assert {extra for _, extra, _ in found} <= EXTRAS.keys()
+    needed = {extra: closure(extra) for _, extra, modules in found if modules}
     for where, extra, modules in found:
-        assert extra in EXTRAS, where
         for module in modules:
-            needed = {plain(name) for name in closure(requirements, extra)}
-            assert needed & {plain(name) for name in distributions[module]}, (where, module)
+            assert needed[extra] & set(map(normalised, distributions[module])), (where, module)
 
 
 def test_the_documentation_installs_existing_extras_from_a_clone() -> None:

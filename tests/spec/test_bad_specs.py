@@ -265,7 +265,8 @@ def test_deriving_refuses_as_parsing_does():
 def test_other_documents_are_refused_as_clearly(document, fields, fragment):
     with pytest.raises(SpecError) as caught:
         document.from_dict(fields)
-    assert isinstance(caught.value, SMEError) and isinstance(caught.value, ValueError)
+    assert isinstance(caught.value, SMEError)
+    assert isinstance(caught.value, ValueError)
     assert fragment in str(caught.value)
 
 

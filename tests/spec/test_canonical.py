@@ -20,15 +20,12 @@ def number(bits: str) -> float:
     return struct.unpack(">d", bytes.fromhex(bits))[0]
 
 
-def test_all_published_files_are_here():
+def test_published_documents_have_their_published_canonical_bytes():
     assert NAMES == ["arrays", "french", "structures", "unicode", "values", "weird"]
-    assert len(NUMBERS) == 26
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_published_documents_have_their_published_canonical_bytes(name):
-    given = (VECTORS / "input" / f"{name}.json").read_bytes()
-    assert rfc8785.dumps(parse_json(given)) == (VECTORS / "output" / f"{name}.json").read_bytes()
+    for name in NAMES:
+        given = (VECTORS / "input" / f"{name}.json").read_bytes()
+        expected = (VECTORS / "output" / f"{name}.json").read_bytes()
+        assert rfc8785.dumps(parse_json(given)) == expected
 
 
 def test_the_example_in_the_standard_has_its_printed_bytes():
@@ -36,15 +33,14 @@ def test_the_example_in_the_standard_has_its_printed_bytes():
     assert rfc8785.dumps(given) == bytes.fromhex((VECTORS / "sample.hex").read_text())
 
 
-@pytest.mark.parametrize(("bits", "text"), [pair for pair in NUMBERS if pair[1] != "error"])
-def test_published_numbers_have_their_published_form(bits, text):
-    assert rfc8785.dumps(number(bits)) == text.encode()
-
-
-@pytest.mark.parametrize("bits", [pair[0] for pair in NUMBERS if pair[1] == "error"])
-def test_numbers_that_are_not_finite_have_no_canonical_form(bits):
-    with pytest.raises(rfc8785.FloatDomainError):
-        rfc8785.dumps(number(bits))
+def test_published_numbers_have_their_published_form():
+    assert len(NUMBERS) == 26
+    for bits, text in NUMBERS:
+        if text == "error":  # not finite
+            with pytest.raises(rfc8785.FloatDomainError):
+                rfc8785.dumps(number(bits))
+        else:
+            assert rfc8785.dumps(number(bits)) == text.encode()
 
 
 def test_the_digest_is_the_hash_of_every_field_in_canonical_form():

@@ -32,33 +32,21 @@ def public_documents() -> list[type[StrictModel]]:
 
 
 DOCUMENTS = public_documents()
-
-
-def test_the_documents_are_those_of_several_packages():
-    names = {kind.__name__ for kind in DOCUMENTS}
-    assert {"SMESpec", "StreamSpec", "StudyPlan", "DatasetRecipe", "RunRecord"} <= names
-    assert len(names) > 40
+assert len(DOCUMENTS) > 40
 
 
 @pytest.mark.parametrize("kind", DOCUMENTS, ids=lambda kind: kind.__name__)
-def test_every_field_is_described_in_help_and_schema_with_one_text(kind):
-    schema = kind.model_json_schema()
-    schema = schema["$defs"][kind.__name__] if "$ref" in schema else schema
+def test_every_field_is_described_in_help_and_schema_with_one_text_and_range(kind):
+    root = kind.model_json_schema()
+    schema = root["$defs"][kind.__name__] if "$ref" in root else root
+    assert "Attributes:" not in schema.get("description", "")
     for name, field in kind.model_fields.items():
+        entry = schema["properties"][name]
         assert field.description, name
-        assert schema["properties"][name]["description"] == field.description
+        assert entry["description"] == field.description
         shown = re.search(rf"^  {name}: ((?:.|\n    )*)", kind.__doc__, re.M)
         assert shown, name
         assert " ".join(shown[1].split()).startswith(field.description), name
-    assert "Attributes:" not in schema.get("description", "")
-
-
-@pytest.mark.parametrize("kind", DOCUMENTS, ids=lambda kind: kind.__name__)
-def test_the_range_in_words_is_that_of_the_json_schema(kind):
-    root = kind.model_json_schema()
-    schema = root["$defs"][kind.__name__] if "$ref" in root else root
-    for name, field in kind.model_fields.items():
-        entry = schema["properties"][name]
         options = [
             option for each in entry.get("anyOf", [entry]) for option in each.get("anyOf", [each])
         ]
