@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import itertools
 
-import pytest
-
 from leaderboard.documents.keys import SigningKey, verifies
 
 DIGEST, BOARD, OTHER = "sha256:" + "1" * 64, "a" * 64, "b" * 64
@@ -77,14 +75,14 @@ def test_a_signature_is_for_one_document_purpose_and_board() -> None:
     assert not verifies(SigningKey.generate().public, signature, "submission", DIGEST, BOARD)
 
 
-@pytest.mark.parametrize("public", small_order_keys())
-def test_keys_of_small_order_sign_nothing(public: str) -> None:
+def test_keys_of_small_order_sign_nothing() -> None:
     """With such a key, R = S·B and R + h·A agree for every document whose h is a multiple of 8."""
     zero = "0" * 64
-    for R in [encode(point) for point in small_order_points()]:
-        for number in range(8):
-            digest = f"sha256:{number:064x}"
-            assert not verifies(public, R + zero, "submission", digest, BOARD)
+    signatures = [encode(point) + zero for point in small_order_points()]
+    digests = [f"sha256:{number:064x}" for number in range(8)]
+    for case in itertools.product(small_order_keys(), signatures, digests):
+        public, signature, digest = case
+        assert not verifies(public, signature, "submission", digest, BOARD), case
 
 
 def test_a_key_with_a_part_of_small_order_signs_nothing() -> None:
@@ -105,6 +103,6 @@ def test_a_key_with_a_part_of_small_order_signs_nothing() -> None:
                 assert verifies(public, signature.hex(), "submission", digest, BOARD) == expected
 
 
-@pytest.mark.parametrize("public", ["", "0" * 64, "f" * 64, "x" * 64, "0" * 63])
-def test_what_is_no_key_signs_nothing(public: str) -> None:
-    assert not verifies(public, "0" * 128, "submission", DIGEST, BOARD)
+def test_what_is_no_key_signs_nothing() -> None:
+    for public in ("", "0" * 64, "f" * 64, "x" * 64, "0" * 63):
+        assert not verifies(public, "0" * 128, "submission", DIGEST, BOARD)

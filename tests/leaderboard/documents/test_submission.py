@@ -66,15 +66,12 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_the_signature_is_verified_before_the_content_is_validated(name: str) -> None:
+def test_content_is_validated_after_its_signature_and_answered_shortly(name: str) -> None:
     data = text(HOSTILE[name], signed=False)
     assert len(data) <= MAX_BYTES
     refused = rejection(data)
     assert (refused.code, len(refused.message) < 200) == ("bad_signature", True)
 
-
-@pytest.mark.parametrize("name", HOSTILE)
-def test_a_signed_document_gets_a_short_answer(name: str) -> None:
     refused = rejection(text(HOSTILE[name]))
     assert refused.code == "schema"
     assert len(refused.message.encode()) < 4000
@@ -134,17 +131,15 @@ def test_the_id_is_known_before_the_content_is_validated() -> None:
     assert envelope.open().to_bytes() == SignedSubmission.read(text(PLAIN)).to_bytes()
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda plain: plain.pop("statement"),
-        lambda plain: plain["training"].pop("library"),
-        lambda plain: plain.pop("schema_version"),
-        lambda plain: plain["runs"][0].pop("artefact"),
-    ],
-)
-def test_a_signature_covers_every_field(change: Callable[[dict[str, Any]], Any]) -> None:
+def test_a_signature_covers_every_field() -> None:
     """The board keeps the whole document, which its signature must still fit."""
-    plain = changed()
-    change(plain)
-    assert rejection(text(plain)).code == "schema"
+    removals: list[Callable[[dict[str, Any]], Any]] = [
+        lambda plain: plain.pop("statement"),
+        lambda plain: plain.pop("schema_version"),
+        lambda plain: plain["training"].pop("library"),
+        lambda plain: plain["runs"][0].pop("artefact"),
+    ]
+    for remove in removals:
+        plain = changed()
+        remove(plain)
+        assert rejection(text(plain)).code == "schema"
