@@ -1,9 +1,5 @@
 """Random networks as policies of a task, in several forms."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 
 from sme_registry import SMESpec, materialize
@@ -12,11 +8,11 @@ from sme_registry.evaluation import OfflinePolicy, Perceptron
 HIDDEN = 24
 
 
-def arrays(*shape: int, seed: int = 0, scale: float = 0.5) -> Any:
+def arrays(*shape, seed=0, scale=0.5):
     return np.random.default_rng((*shape, seed)).normal(scale=scale, size=shape).astype(np.float32)
 
 
-def perceptron(spec: SMESpec, activation: str = "tanh", squashed: bool = False) -> Perceptron:
+def perceptron(spec, activation="tanh", squashed=False):
     """A random network for a task's observations and actions."""
     n, A = spec.observation_dim, spec.action_dim
     layers = [
@@ -29,7 +25,7 @@ def perceptron(spec: SMESpec, activation: str = "tanh", squashed: bool = False) 
     return Perceptron(layers, np.full(A, -1.0, np.float32), np.ones(A, np.float32))
 
 
-def fitted(spec: SMESpec, squashed: bool = False, agent: int = 0) -> Perceptron:
+def fitted(spec, squashed=False, agent=0):
     """The same with a last layer that makes it a fair policy; of a team, for one agent."""
     task = materialize(spec)
     S, m, own = spec.state_dim, spec.distractors, task.owned[agent]
@@ -47,12 +43,12 @@ def fitted(spec: SMESpec, squashed: bool = False, agent: int = 0) -> Perceptron:
     return Perceptron(layers, network.low, network.high)
 
 
-def offline(spec: SMESpec) -> OfflinePolicy:
+def offline(spec):
     n, A = spec.observation_dim, spec.action_dim
     return OfflinePolicy([(arrays(HIDDEN, n), arrays(HIDDEN)), (arrays(A, HIDDEN), arrays(A))])
 
 
-def observations(spec: SMESpec, points: Any) -> Any:
+def observations(spec, points):
     """What a policy sees in points (s, d, t/T, r_cum/k), by the task's own methods."""
     task, S, m = materialize(spec), spec.state_dim, spec.distractors
     seen = points[:, :S]

@@ -1,18 +1,12 @@
 """Pages in a real browser: their numbers are Python's, and every control does what it says."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from playwright.sync_api import expect, sync_playwright
 
 from sme_registry import SMESpec, load, materialize
 from sme_registry.diagnosis import load_policy
-from sme_registry.evaluation import EvaluationReport, evaluate
+from sme_registry.evaluation import evaluate
 from sme_registry.explorer import write_explorer
 from tests.browser import launched, needs_chromium
 from tests.explorer.networks import fitted, observations, offline, perceptron
@@ -22,10 +16,12 @@ expect.set_options(timeout=30_000)
 
 TOLERANCE = 1e-5
 HOSTILE = "</script><img src=x onerror=alert(1)><b>bold"
+SPEC = SMESpec(state_dim=4, action_dim=2, complexity=2)
+TASK = materialize(SPEC)
 
 
 @pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
+def chromium():
     with sync_playwright() as playwright:
         browser = launched(playwright)
         yield browser
@@ -33,13 +29,11 @@ def chromium() -> Iterator[Any]:
 
 
 @pytest.fixture
-def opened(chromium: Any) -> Iterator[Callable[..., Any]]:
+def opened(chromium):
     """Opens pages, and fails where one complained or asked for anything but itself."""
-    contexts: list[Any] = []
-    problems: list[str] = []
-    requests: list[str] = []
+    contexts, problems, requests = [], [], []
 
-    def open_(path: Path, width: int = 1280, **options: Any) -> Any:
+    def open_(path, width=1280, **options):
         context = chromium.new_context(viewport={"width": width, "height": 900}, **options)
         contexts.append(context)
         page = context.new_page()
@@ -48,8 +42,7 @@ def opened(chromium: Any) -> Iterator[Callable[..., Any]]:
         page.on("dialog", lambda dialog: (problems.append("a dialog"), dialog.dismiss()))
         page.on("request", lambda request: requests.append(request.url))
         page.goto(path.as_uri())
-        ready(page)
-        return page
+        return ready(page)
 
     yield open_
     for context in contexts:
@@ -59,18 +52,18 @@ def opened(chromium: Any) -> Iterator[Callable[..., Any]]:
     assert len(requests) == len(contexts)
 
 
-def ready(page: Any) -> Any:
+def ready(page):
     # Not `wait_for_function`, which evaluates text, as the page forbids.
     expect(page.locator("html")).to_have_attribute("data-ready", "true")
     return page
 
 
-def written(tmp_path: Path, spec: SMESpec, policy: Any = None, **options: Any) -> Path:
+def written(folder, spec, policy=None, **options):
     subject = spec if policy is None else load_policy(policy, spec, name="the policy")
-    return write_explorer(tmp_path / "page.html", subject, episodes=8, **options)
+    return write_explorer(folder / "page.html", subject, episodes=8, **options)
 
 
-def points_of(shown: dict[str, Any]) -> Any:
+def points_of(shown):
     """The points of a map `[n², inputs]`, as the page says where it lies."""
     n, (i, j) = shown["n"], shown["axes"]
     points = np.tile(shown["point"], (n * n, 1))
@@ -79,7 +72,7 @@ def points_of(shown: dict[str, Any]) -> Any:
     return points
 
 
-def set_slider(page: Any, name: str, value: float) -> None:
+def set_slider(page, name, value):
     page.get_by_role("slider", name=name, exact=True).evaluate(
         "(slider, value) => { slider.value = value; slider.dispatchEvent(new Event('input')); }",
         str(value),
@@ -87,39 +80,43 @@ def set_slider(page: Any, name: str, value: float) -> None:
     ready(page)
 
 
+def map_of(page):
+    """What the page shows, and its points."""
+    ready(page)
+    shown = page.evaluate("explorer.map()")
+    return shown, points_of(shown)
+
+
+def choose(page, label, option):
+    page.get_by_label(label).select_option(option)
+    return map_of(page)
+
+
 @pytest.mark.parametrize(
     ("name", "action_range"),
     [
-        ("Default", "unit"),
         ("Complexity50", "symmetric"),
         ("MinReward50", "unit"),
         ("Team2", "unit"),
         ("HardSafeMixed", "symmetric"),
     ],
 )
-def test_a_map_is_the_tasks_regret(
-    name: str, action_range: str, tmp_path: Path, opened: Callable[..., Any]
-) -> None:
+def test_a_map_is_the_tasks_regret(name, action_range, tmp_path, opened):
     spec = load(name, SMESpec)
     if spec.team is None:
-        policy: Any = fitted(spec, squashed=action_range == "symmetric")
+        policy = fitted(spec, squashed=action_range == "symmetric")
     else:
         policy = {each.name: fitted(spec, agent=i) for i, each in enumerate(spec.team.agents)}
     subject = load_policy(policy, spec, action_range=action_range)
     page = opened(write_explorer(tmp_path / "page.html", subject, episodes=8))
     set_slider(page, "state channel 3", 0.8)
     set_slider(page, "time t/T", 0.25)
-    page.get_by_label("Across").select_option("s4")
-    ready(page)
-    shown = page.evaluate("explorer.map()")
-    assert shown["n"] == 101
-    assert shown["axes"] == [3, 1]
-    assert shown["low"] == [-0.5, -0.5]
-    assert shown["high"] == [1.5, 1.5]
+    shown, points = choose(page, "Across", "s4")
+    assert (shown["n"], shown["axes"]) == (101, [3, 1])
+    assert (shown["low"], shown["high"]) == ([-0.5, -0.5], [1.5, 1.5])
     assert shown["point"][2] == 0.8
 
-    points, task = points_of(shown), materialize(spec)
-    s = points[:, : spec.state_dim]
+    task, s = materialize(spec), points[:, : spec.state_dim]
     a = np.clip(subject.policy(observations(spec, points)), 0.0, 1.0)
     regret = task.regret(s, a)
     assert 0.05 < regret.mean() < 0.99
@@ -131,20 +128,21 @@ def test_a_map_is_the_tasks_regret(
     optimal = np.reshape(here["optimal"], (len(some), -1))
     np.testing.assert_allclose(optimal, task.optimal_action(some[:, : spec.state_dim]), atol=1e-6)
     if spec.safety is not None:
-        page.get_by_label("Show").select_option("cost")
-        cost = page.evaluate("explorer.map()")["values"]
+        cost = choose(page, "Show", "cost")[0]["values"]
         np.testing.assert_allclose(cost, task.cost(s, a), atol=TOLERANCE)
-        page.get_by_label("Show").select_option("safe regret")
-        safe = page.evaluate("explorer.map()")["values"]
+        safe = choose(page, "Show", "safe regret")[0]["values"]
         expected = task.step_reward(s, task.safe_action(s)) - task.step_reward(s, a)
         np.testing.assert_allclose(safe, expected, atol=TOLERANCE)
 
 
-def test_every_control_is_reached_and_used_by_keyboard(
-    tmp_path: Path, opened: Callable[..., Any]
-) -> None:
-    spec = SMESpec(state_dim=4, action_dim=2, complexity=2)
-    page = opened(written(tmp_path, spec, fitted(spec)))
+@pytest.fixture(scope="module")
+def page_file(tmp_path_factory):
+    """The page of a policy whose network is known."""
+    return written(tmp_path_factory.mktemp("page"), SPEC, fitted(SPEC))
+
+
+def test_every_control_is_reached_and_used_by_keyboard(page_file, opened):
+    page = opened(page_file)
     page.keyboard.press("Tab")
     expect(page.get_by_role("link", name="Skip to the map")).to_be_focused()
     surface = page.get_by_role("application", name="Map")
@@ -157,20 +155,17 @@ def test_every_control_is_reached_and_used_by_keyboard(
     before = page.locator("#reading").inner_text()
     page.keyboard.press("ArrowRight")
     page.keyboard.press("Shift+ArrowUp")
-    point = page.evaluate("explorer.map()")["point"]
-    assert point[:2] == pytest.approx([0.52, 0.7])
+    assert map_of(page)[0]["point"][:2] == pytest.approx([0.52, 0.7])
     assert page.locator("#reading").inner_text() != before
     expect(page.get_by_role("status")).to_contain_text("s1 = 0.52, s2 = 0.70")
     for _ in range(4):
         page.keyboard.press("Shift+ArrowUp")
     expect(page.get_by_role("status")).to_contain_text("outside the cube, at ε = 1.00")
 
-    slider = page.get_by_role("slider", name="state channel 3", exact=True)
-    values = page.evaluate("explorer.map()")["values"]
-    slider.focus()
+    values = map_of(page)[0]["values"]
+    page.get_by_role("slider", name="state channel 3", exact=True).focus()
     page.keyboard.press("ArrowRight")
-    ready(page)
-    shown = page.evaluate("explorer.map()")
+    shown, _ = map_of(page)
     assert shown["point"][2] == pytest.approx(0.51)
     assert shown["values"] != values
     tree = page.locator("body").aria_snapshot()
@@ -179,90 +174,65 @@ def test_every_control_is_reached_and_used_by_keyboard(
         assert f"- {role}:" not in tree, "a control without a name"
 
 
-def test_the_map_follows_its_controls(tmp_path: Path, opened: Callable[..., Any]) -> None:
-    spec = SMESpec(state_dim=4, action_dim=2, complexity=2)
-    page = opened(written(tmp_path, spec, fitted(spec)))
-    task = materialize(spec)
-    page.get_by_label("Show").select_option("optimal action")
-    page.get_by_label("Action channel").select_option("2")
-    shown = page.evaluate("explorer.map()")
-    optimal = task.optimal_action(points_of(shown)[:, :4])
+def test_the_map_follows_its_controls(page_file, opened):
+    page = opened(page_file)
+    choose(page, "Show", "optimal action")
+    shown, points = choose(page, "Action channel", "2")
+    optimal = TASK.optimal_action(points[:, :4])
     np.testing.assert_allclose(shown["values"], optimal[:, 1], atol=1e-8)
     set_slider(page, "Beyond the cube, ε", 0.4)
-    shown = page.evaluate("explorer.map()")
-    assert shown["low"] == pytest.approx([-0.2, -0.2])
-    page.get_by_label("Show").select_option("regret")
-    page.get_by_label("Policy").select_option("constant ½")
-    ready(page)
-    shown = page.evaluate("explorer.map()")
-    s = points_of(shown)[:, :4]
-    np.testing.assert_allclose(
-        shown["values"], task.regret(s, np.full((len(s), 2), 0.5)), atol=1e-8
-    )
+    assert map_of(page)[0]["low"] == pytest.approx([-0.2, -0.2])
+    choose(page, "Show", "regret")
+    shown, points = choose(page, "Policy", "constant ½")
+    regret = TASK.regret(points[:, :4], np.full((len(points), 2), 0.5))
+    np.testing.assert_allclose(shown["values"], regret, atol=1e-8)
     box = page.locator("#surface").bounding_box()
     page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 0.25 * box["height"])
-    assert page.evaluate("explorer.map()")["point"][:2] == pytest.approx([0.85, 0.85], abs=0.02)
+    assert map_of(page)[0]["point"][:2] == pytest.approx([0.85, 0.85], abs=0.02)
     page.get_by_role("button", name="Centre").click()
-    ready(page)
-    assert page.evaluate("explorer.map()")["point"][:2] == [0.5, 0.5]
+    assert map_of(page)[0]["point"][:2] == [0.5, 0.5]
 
 
-def test_a_policy_of_an_unknown_network_is_sampled_and_the_page_says_so(
-    tmp_path: Path, opened: Callable[..., Any]
-) -> None:
-    spec = SMESpec(state_dim=4, action_dim=2, complexity=2)
-
-    def act(o: Any) -> Any:
+def test_a_policy_of_an_unknown_network_is_sampled_and_the_page_says_so(tmp_path, opened):
+    def act(o):
         return np.abs(np.sin(3.0 * o[:, [0, 2]]))
 
-    page = opened(written(tmp_path, spec, act, channels=[(1, 2), (3, 2)]))
+    page = opened(written(tmp_path, SPEC, act, channels=[(1, 2), (3, 2)]))
+    last = page.get_by_role("slider", name="state channel 4", exact=True)
     expect(page.locator("#notice")).to_contain_text("sampled over s1 and s2; s3 and s2")
-    expect(page.get_by_role("slider", name="state channel 4", exact=True)).to_be_disabled()
+    expect(last).to_be_disabled()
     expect(page.get_by_role("slider", name="state channel 2", exact=True)).to_be_enabled()
     for across in ("s1", "s3"):
-        page.get_by_label("Across").select_option(across)
-        ready(page)
-        shown = page.evaluate("explorer.map()")
-        points = points_of(shown)
-        regret = materialize(spec).regret(points[:, :4], act(observations(spec, points)))
+        shown, points = choose(page, "Across", across)
+        regret = TASK.regret(points[:, :4], act(observations(SPEC, points)))
         np.testing.assert_allclose(shown["values"], regret, atol=TOLERANCE)
-    page.get_by_label("Policy").select_option("linear (LSQ)")
-    ready(page)
+    choose(page, "Policy", "linear (LSQ)")
     expect(page.locator("#notice")).to_be_hidden()
-    expect(page.get_by_role("slider", name="state channel 4", exact=True)).to_be_enabled()
+    expect(last).to_be_enabled()
 
 
-def test_a_task_of_one_channel_has_a_map_over_time(
-    tmp_path: Path, opened: Callable[..., Any]
-) -> None:
+def test_a_task_of_one_channel_has_a_map_over_time(tmp_path, opened):
     spec = SMESpec(state_dim=1, action_dim=1)
-    page = opened(written(tmp_path, spec, offline(spec)))
-    shown = page.evaluate("explorer.map()")
-    assert shown["axes"] == [0, 1]
-    assert shown["low"] == [-0.5, 0]
+    shown, _ = map_of(opened(written(tmp_path, spec, offline(spec))))
+    assert (shown["axes"], shown["low"]) == ([0, 1], [-0.5, 0])
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1280, 360])
-def test_no_page_is_wider_than_the_screen(
-    width: int, scheme: str, tmp_path: Path, opened: Callable[..., Any]
-) -> None:
+def test_no_page_is_wider_than_the_screen(tmp_path, opened):
     spec = load("HardSafeMixed", SMESpec)
     policy = perceptron(spec)
     report = evaluate(policy, spec, {"states_per_region": 200})
-    assert isinstance(report, EvaluationReport)
     path = written(tmp_path, spec, policy, report=report)
-    page = opened(path, width, color_scheme=scheme)
-    wide, screen = page.evaluate("[document.documentElement.scrollWidth, window.innerWidth]")
-    assert screen == width
-    assert wide <= screen
-    headings = page.get_by_role("heading", level=2).all_inner_texts()
-    assert {"Inside and outside the cube", "What the layers keep"} <= set(headings)
-    colour = page.evaluate("getComputedStyle(document.body).backgroundColor")
-    assert (int(colour.split("(")[1].split(",")[0]) > 128) == (scheme == "light")
+    for width, scheme in ((1280, "light"), (360, "dark")):
+        page = opened(path, width, color_scheme=scheme)
+        wide, screen = page.evaluate("[document.documentElement.scrollWidth, window.innerWidth]")
+        assert wide <= screen == width
+        headings = page.get_by_role("heading", level=2).all_inner_texts()
+        assert {"Inside and outside the cube", "What the layers keep"} <= set(headings)
+        colour = page.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert (int(colour.split("(")[1].split(",")[0]) > 128) == (scheme == "light")
 
 
-def test_a_hostile_name_is_a_name(tmp_path: Path, opened: Callable[..., Any]) -> None:
+def test_a_hostile_name_is_a_name(tmp_path, opened):
     spec = SMESpec(state_dim=2, action_dim=1).named(HOSTILE)
     subject = load_policy(perceptron(spec), spec, name=HOSTILE)
     page = opened(write_explorer(tmp_path / "page.html", subject, episodes=8))
@@ -271,11 +241,11 @@ def test_a_hostile_name_is_a_name(tmp_path: Path, opened: Callable[..., Any]) ->
     expect(page.locator("#reading")).to_contain_text(HOSTILE)
 
 
-def test_the_page_may_load_and_run_nothing_else(tmp_path: Path, chromium: Any) -> None:
+def test_the_page_may_load_and_run_nothing_else(page_file, chromium):
     page = chromium.new_page()
-    heard: list[str] = []
+    heard = []
     page.on("console", lambda message: heard.append(message.text))
-    page.goto(written(tmp_path, SMESpec(state_dim=2, action_dim=1)).as_uri())
+    page.goto(page_file.as_uri())
     ready(page)
     assert heard == []
     for code in (

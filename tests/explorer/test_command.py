@@ -1,63 +1,53 @@
 """`sme explore`: what it writes where, what it refuses, and what a page holds."""
 
-from __future__ import annotations
-
 import json
 import re
-from pathlib import Path
-from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 import sme_registry
-from sme_registry import SMESpec, load
-from sme_registry.cli import app
-from sme_registry.diagnosis import load_policy, load_run
+from sme_registry import SMESpec, load, materialize
+from sme_registry.diagnosis import StreamSubject, load_policy, load_run
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import evaluate
+from sme_registry.evaluation.policies import saved_sb3
+from sme_registry.evaluation.rollouts import rollouts
 from sme_registry.explorer import FILE, facts, run_report, write_explorer
 from sme_registry.explorer.page import json_in_html
+from sme_registry.task import streams
 from sme_registry.training import Episode, RunRecord
 from sme_registry.training.episodes import EpisodeLog
+from tests.commands import good, refused
 from tests.explorer.networks import fitted, offline
 
 SPEC = SMESpec(state_dim=3, action_dim=2)
 
 
-def explored(*arguments: str) -> Any:
-    return CliRunner().invoke(app, ["explore", *arguments], env={"COLUMNS": "200"})
-
-
-def data_of(page: Path) -> Any:
+def data_of(page):
     match = re.search(r'<script type="application/json" id="data">(.*?)</script>', page.read_text())
-    assert match
     return json.loads(match[1])
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     sme_registry.save(SPEC, "small.json", name="small")
     offline(SPEC).save("actor.npz")
     return tmp_path
 
 
-def test_a_task_and_a_policy_become_pages(here: Path) -> None:
-    assert explored("small.json").exit_code == 0
+def test_a_task_and_a_policy_become_pages(here):
+    good("explore", "small.json")
     page = here / "small-explorer.html"
     data = data_of(page)
     assert (data["name"], data["title"], data["digest"]) == (None, "small", SPEC.digest)
     assert [each["name"] for each in data["policies"]] == ["linear (LSQ)", "constant ½"]
-
-    again = explored("small.json")
-    assert again.exit_code == 2
-    assert "already exists. Use --force" in again.stderr
-    assert explored("small.json", "--set", "k=5", "--force").exit_code == 0
+    assert "already exists. Use --force" in " ".join(refused("explore", "small.json").split())
+    good("explore", "small.json", "--set", "k=5", "--force")
     assert data_of(page)["task"]["k"] == 5
 
-    result = explored("actor.npz", "--task", "small.json", "--out", "a/b.html", "--episodes", "4")
-    assert result.exit_code == 0
+    options = ("--task", "small.json", "--out", "a/b.html", "--episodes", "4")
+    good("explore", "actor.npz", *options)
     data = data_of(here / "a" / "b.html")
     policy = data["policies"][0]
     assert (policy["name"], policy["of"]) == ("actor", "observation")
@@ -85,21 +75,15 @@ def test_a_task_and_a_policy_become_pages(here: Path) -> None:
         (["small.json", "--set", "state_dim=600"], "must be at most 512"),
     ],
 )
-def test_what_it_refuses(arguments: list[str], message: str, here: Path) -> None:
+def test_what_it_refuses(arguments, message, here):
     before = set(here.iterdir())
-    result = explored(*arguments)
-    assert result.exit_code == 2
-    assert message in " ".join(result.stderr.split())
+    assert message in " ".join(refused("explore", *arguments).split())
     assert set(here.iterdir()) == before
 
 
-def test_a_run_has_its_learning_curve_and_its_evaluation(tmp_path: Path) -> None:
-    pytest.importorskip("stable_baselines3")
-    from stable_baselines3 import PPO
-
-    from sme_registry.evaluation.policies import saved_sb3
-
-    model = PPO("MlpPolicy", sme_registry.make(SPEC, action_range="symmetric"), seed=0)
+def test_a_run_has_its_learning_curve_and_its_evaluation(tmp_path):
+    sb3 = pytest.importorskip("stable_baselines3")
+    model = sb3.PPO("MlpPolicy", sme_registry.make(SPEC, action_range="symmetric"), seed=0)
     (tmp_path / "model.zip").write_bytes(saved_sb3(model))
     protocol = {"states_per_region": 50}
     report = evaluate(model, SPEC, protocol, action_range="symmetric")
@@ -114,8 +98,8 @@ def test_a_run_has_its_learning_curve_and_its_evaluation(tmp_path: Path) -> None
         protocol=report.protocol, protocol_digest=report.protocol_digest, versions={},
     ).write(tmp_path)  # fmt: skip
 
-    assert explored(str(tmp_path)).exit_code == 0
-    assert explored(str(tmp_path)).exit_code == 0  # it follows from the run, and is replaced
+    good("explore", tmp_path)
+    good("explore", tmp_path)  # it follows from the run, and is replaced
     data = data_of(tmp_path / FILE)
     assert data["name"] == "PPO"
     assert data["policies"][0]["of"] == "observation"
@@ -130,16 +114,11 @@ def test_a_run_has_its_learning_curve_and_its_evaluation(tmp_path: Path) -> None
     assert (tmp_path / FILE).read_bytes() == first  # equal runs, equal bytes
 
 
-def test_the_regret_over_the_episode_is_that_of_rollouts() -> None:
-    from sme_registry import materialize
-    from sme_registry.evaluation.rollouts import rollouts
-    from sme_registry.task import streams
-
+def test_the_regret_over_the_episode_is_that_of_rollouts():
     subject = load_policy(fitted(SPEC), SPEC)
     over_time = facts(SPEC, subject, episodes=16)["episode"]
     starts = streams.uniform(0, "explorer/starts", 16 * 3).reshape(16, 3)
-    assert not isinstance(subject, tuple)
-    runs = rollouts(subject.policy, materialize(SPEC), starts)  # type: ignore[union-attr]
+    runs = rollouts(subject.policy, materialize(SPEC), starts)
     assert sum(over_time["mean"]) / SPEC.horizon == pytest.approx(runs.regret.mean(), abs=1e-5)
     ended = load("Survival50", SMESpec)
     short = facts(ended, load_policy(fitted(ended), ended), episodes=16)["episode"]
@@ -147,14 +126,12 @@ def test_the_regret_over_the_episode_is_that_of_rollouts() -> None:
     assert short["mean"][-1] is None
 
 
-def test_text_of_others_cannot_end_the_data() -> None:
+def test_text_of_others_cannot_end_the_data():
     text = "</script><!-- & \u2028 ½"
     assert re.search("[<>&\u2028]", json_in_html({"name": text})) is None
     assert json.loads(json_in_html([text])) == [text]
 
 
-def test_a_life_in_a_stream_has_no_page(tmp_path: Path) -> None:
-    from sme_registry.diagnosis import StreamSubject
-
+def test_a_life_in_a_stream_has_no_page(tmp_path):
     with pytest.raises(OptionError, match="is a life in a stream"):
-        write_explorer(tmp_path / "x.html", StreamSubject("life", None))  # type: ignore[arg-type]
+        write_explorer(tmp_path / "x.html", StreamSubject("life", None))

@@ -1,14 +1,9 @@
 """Programs compute what the task and the policies compute, and nothing that they do not know."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
-from sme_registry import SMESpec, export_onnx, load, materialize
+from sme_registry import SMESpec, export_onnx, load, make, materialize
 from sme_registry.diagnosis import load_policy
 from sme_registry.errors import ResourceLimitError
 from sme_registry.evaluation import as_policy
@@ -18,15 +13,16 @@ from sme_registry.explorer.graph import GraphNode, program_of_graph
 from sme_registry.explorer.program import MAX_WEIGHTS, MAX_WIDTH, ProgramBuilder
 from tests.explorer.networks import arrays, observations, offline, perceptron
 
+SPEC = SMESpec(state_dim=3, action_dim=2)
 TASKS = ["Default", "Complexity50", "Safety20", "MixedLinear", "HardSafeMixed", "TeamBlind4"]
 
 
-def points(spec: SMESpec, rows: int = 64) -> Any:
+def points(spec, rows=64):
     return 2.0 * np.random.default_rng(3).random((rows, networks.point_width(spec))) - 0.5
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_the_optimum_and_the_limits_are_the_tasks_own(name: str) -> None:
+def test_the_optimum_and_the_limits_are_the_tasks_own(name):
     task = materialize(load(name, SMESpec))
     x = points(task.spec)
     s = x[:, : task.spec.state_dim]
@@ -40,7 +36,7 @@ def test_the_optimum_and_the_limits_are_the_tasks_own(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["Default", "MixedLinear", "HardSafeMixed", "Distract8Noise"])
-def test_a_policy_sees_what_the_task_shows(name: str) -> None:
+def test_a_policy_sees_what_the_task_shows(name):
     task = materialize(load(name, SMESpec))
     x = points(task.spec)
     seen = networks.observe(task)(x)
@@ -48,12 +44,13 @@ def test_a_policy_sees_what_the_task_shows(name: str) -> None:
     assert np.array_equal(seen, seen.astype(np.float32))
 
 
-def of(policy: Any, spec: SMESpec, **options: Any) -> Any:
-    prepared = load_policy(policy, spec, **options).policy
-    return prepared, networks.policy_program(prepared, spec)
+def program_of(policy, **options):
+    return networks.policy_program(load_policy(policy, SPEC, **options).policy, SPEC)
 
 
-def same_actions(prepared: Any, program: Any, spec: SMESpec) -> None:
+def same_actions(prepared, spec=SPEC):
+    """The program of a policy acts as the policy."""
+    program = networks.policy_program(prepared, spec)
     assert program is not None
     seen = points(spec).astype(np.float32)
     expected = np.clip(prepared(seen), 0.0, 1.0)
@@ -61,49 +58,42 @@ def same_actions(prepared: Any, program: Any, spec: SMESpec) -> None:
     np.testing.assert_allclose(np.clip(program(seen), 0.0, 1.0), expected, atol=networks.TOLERANCE)
 
 
+def known(policy, **options):
+    same_actions(load_policy(policy, SPEC, **options).policy)
+
+
 @pytest.mark.parametrize("action_range", ["unit", "symmetric"])
 @pytest.mark.parametrize("activation", ["identity", "relu", "tanh", "sigmoid", "silu", "elu"])
-def test_arrays_are_known(activation: str, action_range: str) -> None:
-    spec = SMESpec(state_dim=3, action_dim=2)
-    policy = perceptron(spec, activation, squashed=action_range == "symmetric")
-    same_actions(*of(policy, spec, action_range=action_range), spec)
+def test_arrays_are_known(activation, action_range):
+    policy = perceptron(SPEC, activation, squashed=action_range == "symmetric")
+    known(policy, action_range=action_range)
 
 
-def test_an_offline_policy_is_known() -> None:
-    spec = SMESpec(state_dim=3, action_dim=2)
-    same_actions(*of(offline(spec), spec), spec)
+def test_an_offline_policy_is_known():
+    known(offline(SPEC))
 
 
 @pytest.mark.parametrize("name", ["PPO", "SAC", "TD3"])
-def test_models_of_stable_baselines3_are_known(name: str, tmp_path: Path) -> None:
+def test_models_of_stable_baselines3_are_known(name, tmp_path):
     sb3 = pytest.importorskip("stable_baselines3")
-    from sme_registry import make
-
-    spec = SMESpec(state_dim=3, action_dim=2)
-    model = getattr(sb3, name)("MlpPolicy", make(spec, action_range="symmetric"), seed=0)
+    model = getattr(sb3, name)("MlpPolicy", make(SPEC, action_range="symmetric"), seed=0)
     shake(model.policy)
     model.save(tmp_path / "model.zip")
-    same_actions(*of(tmp_path / "model.zip", spec), spec)
+    known(tmp_path / "model.zip")
 
 
 @pytest.mark.parametrize("kind", ["perceptron", "module", "normalised"])
-def test_onnx_files_are_known(kind: str, tmp_path: Path) -> None:
+def test_pytorch_modules_and_onnx_files_are_known(kind, tmp_path):
     pytest.importorskip("onnxruntime")
-    spec = SMESpec(state_dim=3, action_dim=2)
-    policy: Any = perceptron(spec, "silu")
-    if kind != "perceptron":
-        policy = module(spec, kind)
-    path = export_onnx(policy, spec, tmp_path / "actor.onnx")
-    same_actions(*of(path, spec), spec)
+    if kind == "perceptron":
+        policy = perceptron(SPEC, "silu")
+    else:
+        policy = module(SPEC, kind)
+        known(policy)
+    known(export_onnx(policy, SPEC, tmp_path / "actor.onnx"))
 
 
-@pytest.mark.parametrize("kind", ["module", "normalised"])
-def test_pytorch_modules_are_known(kind: str) -> None:
-    spec = SMESpec(state_dim=3, action_dim=2)
-    same_actions(*of(module(spec, kind), spec), spec)
-
-
-def module(spec: SMESpec, kind: str) -> Any:
+def module(spec, kind):
     torch = pytest.importorskip("torch")
     nn = torch.nn
     torch.manual_seed(0)
@@ -117,7 +107,7 @@ def module(spec: SMESpec, kind: str) -> Any:
     return made
 
 
-def shake(network: Any) -> None:
+def shake(network):
     """A fresh network acts almost constantly."""
     import torch
 
@@ -126,44 +116,40 @@ def shake(network: Any) -> None:
         parameter.data += 0.4 * torch.randn_like(parameter)
 
 
-def test_a_function_is_unknown_and_so_is_what_its_layers_do_not_say() -> None:
-    spec = SMESpec(state_dim=3, action_dim=2)
-    assert of(lambda o: np.sin(o[:, :2]), spec)[1] is None
-    assert of(reference_policy("linear", spec), spec)[1] is None
-
-    class Different(type(perceptron(spec))):  # type: ignore[misc]
-        def __call__(self, o: Any) -> Any:
+def test_a_function_is_unknown_and_so_is_what_its_layers_do_not_say():
+    class Different(type(perceptron(SPEC))):
+        def __call__(self, o):
             return 1.0 - super().__call__(o)
 
-    assert of(Different(perceptron(spec).layers), spec)[1] is None
+    linear = reference_policy("linear", SPEC)
+    for policy in (lambda o: np.sin(o[:, :2]), linear, Different(perceptron(SPEC).layers)):
+        assert program_of(policy) is None
 
 
 @pytest.mark.parametrize("name", ["Team2", "TeamBlind4"])
 @pytest.mark.parametrize("shared", [True, False])
-def test_teams_are_known(name: str, shared: bool) -> None:
+def test_teams_are_known(name, shared):
     spec = load(name, SMESpec)
-    assert spec.team is not None
     agents, S = spec.team.agents, spec.state_dim
     if shared:
-        policy: Any = perceptron(SMESpec(state_dim=S + len(agents), action_dim=2))
+        policy = perceptron(SMESpec(state_dim=S + len(agents), action_dim=2))
     else:
         policy = {}
         for index, agent in enumerate(agents):
             width = S if agent.observes == "all" else len(agent.observes)
             shape = SMESpec(state_dim=width, action_dim=agent.action_dim, seed=index)
             policy[agent.name] = perceptron(shape, ["tanh", "relu"][index % 2])
-    prepared = as_policy(policy, spec)
-    same_actions(prepared, networks.policy_program(prepared, spec), spec)
+    same_actions(as_policy(policy, spec), spec)
 
 
-def graph(*nodes: GraphNode, **constants: Any) -> Any:
+def graph(*nodes, **constants):
     return program_of_graph(nodes, constants, "o", "a", 5)
 
 
 DENSE = GraphNode("Gemm", ("o", "W", "b"), ("a",), {"transB": 1})
 
 
-def test_a_graph_is_understood_in_full_or_not_at_all() -> None:
+def test_a_graph_is_understood_in_full_or_not_at_all():
     W, b, x = arrays(2, 5), arrays(2), arrays(7, 5)
     program = graph(DENSE, W=W, b=b)
     np.testing.assert_allclose(program(x), x @ W.T + b, rtol=1e-6)
@@ -186,7 +172,7 @@ def test_a_graph_is_understood_in_full_or_not_at_all() -> None:
     assert graph(DENSE, W=np.full((2, 5), np.nan, np.float32), b=b) is None
 
 
-def test_a_graph_cannot_grow_without_end() -> None:
+def test_a_graph_cannot_grow_without_end():
     doubled = [
         GraphNode("Concat", (f"x{i}", f"x{i}"), (f"x{i + 1}",), {"axis": 1}) for i in range(40)
     ]
@@ -194,7 +180,7 @@ def test_a_graph_cannot_grow_without_end() -> None:
     assert graph(start, *doubled, GraphNode("Identity", ("x40",), ("a",), {})) is None
 
 
-def test_a_network_too_large_for_a_page_is_refused() -> None:
+def test_a_network_too_large_for_a_page_is_refused():
     build = ProgramBuilder(3, "this")
     W = np.zeros((8, MAX_WEIGHTS // 16))
     build.dense(0, W, np.zeros(8))
