@@ -21,8 +21,7 @@ SPEC = SMESpec.from_dict({**FIELDS, "seed": 3})
 
 @pytest.fixture(scope="module")
 def family() -> ModuleType:
-    torch = pytest.importorskip("torch")
-    torch.set_num_threads(1)
+    pytest.importorskip("torch")
     name = "season_family"
     found = importlib.util.spec_from_file_location(name, FOLDER / "family.py")
     assert found is not None
@@ -35,7 +34,7 @@ def family() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def data() -> SealedDataset:
-    recipe = {"behaviours": [{"kind": "mixture", "nu": 0.5}], "transitions": 3000, "seed": 1}
+    recipe = {"behaviours": [{"kind": "mixture", "nu": 0.5}], "transitions": 1500, "seed": 1}
     return SealedDataset.collect(DatasetRecipe.from_dict({"spec": SPEC.to_dict(), **recipe}))
 
 
@@ -75,7 +74,7 @@ def test_the_family_is_fitted_to_a_data_set(
     import torch
 
     torch.manual_seed(0)
-    monkeypatch.setattr(family, "OFFLINE_STEPS", 400)
+    monkeypatch.setattr(family, "OFFLINE_STEPS", 200)
     guess = family.learn(data, SPEC, seed=0)
     states = np.random.default_rng(0).random((500, SPEC.state_dim + 2)).astype(np.float32)
     optimum = materialize(SPEC).optimal_action(states[:, :-2].astype(float))

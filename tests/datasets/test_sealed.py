@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -56,31 +57,15 @@ def test_an_episode_that_ends_at_the_horizon_is_truncated_also_where_it_terminat
     assert (short.terminations & short.truncations)[ends].any()
 
 
-def test_it_is_read_back_bit_for_bit(dataset: SealedDataset, tmp_path: Path) -> None:
+def test_it_is_read_back_bit_for_bit_by_us_and_by_minari(
+    dataset: SealedDataset, tmp_path: Path
+) -> None:
     path = dataset.write(ID, tmp_path)
     assert SealedDataset.read(path).digest == dataset.digest
     assert SealedDataset.collect(RECIPE).digest == dataset.digest
     other = SealedDataset.collect(RECIPE.model_copy(update={"seed": 1}))
     assert other.digest != dataset.digest
-
-
-def test_data_sets_agree_up_to_rounding(dataset: SealedDataset) -> None:
-    rounded = dataclasses.replace(dataset, rewards=dataset.rewards + 1e-14)
-    assert dataset.agrees_with(rounded)
-    assert rounded.digest != dataset.digest
-    shorter = {name: column[:-1] for name, column in dataset.columns().items()}
-    ends = dataset.truncations.copy()
-    ends[0] ^= True
-    for other in (
-        dataclasses.replace(dataset, rewards=dataset.rewards + 1e-5),
-        dataclasses.replace(dataset, truncations=ends),
-        SealedDataset(**shorter),
-    ):
-        assert not dataset.agrees_with(other)
-
-
-def test_minari_loads_it(dataset: SealedDataset, tmp_path: Path) -> None:
-    loaded = minari.MinariDataset(dataset.write(ID, tmp_path) / "data")
+    loaded = minari.MinariDataset(path / "data")
     assert loaded.total_steps == 90
     assert loaded.env_spec is None
     episodes = list(loaded.iterate_episodes())
@@ -88,6 +73,20 @@ def test_minari_loads_it(dataset: SealedDataset, tmp_path: Path) -> None:
     rewards = np.concatenate([episode.rewards for episode in episodes])
     np.testing.assert_array_equal(rewards, dataset.rewards)
     assert episodes[0].observations.shape == (len(episodes[0]) + 1, 4)
+
+
+def test_data_sets_agree_up_to_rounding(dataset: SealedDataset) -> None:
+    rounded = dataclasses.replace(dataset, rewards=dataset.rewards + 1e-14)
+    assert dataset.agrees_with(rounded)
+    assert rounded.digest != dataset.digest
+    ends = dataset.truncations.copy()
+    ends[0] ^= True
+    for other in (
+        dataclasses.replace(dataset, rewards=dataset.rewards + 1e-5),
+        dataclasses.replace(dataset, truncations=ends),
+        SealedDataset(**{name: column[:-1] for name, column in dataset.columns().items()}),
+    ):
+        assert not dataset.agrees_with(other)
 
 
 def test_nothing_in_the_files_tells_the_task(dataset: SealedDataset, tmp_path: Path) -> None:
@@ -134,57 +133,40 @@ def _external(group: h5py.Group, secret: Path) -> None:
     group.create_dataset("observations", shape=(2, 4), dtype="f4", external=[(str(secret), 0, 32)])
 
 
-def _huge(group: h5py.Group, secret: Path) -> None:
-    group.create_dataset("observations", shape=(10**11, 4), dtype="f4", chunks=(1000, 4))
-
-
-def _chunked(group: h5py.Group, secret: Path) -> None:
-    group.create_dataset("observations", data=np.zeros((2, 4), "f4"), chunks=(2, 4))
-
-
-def _unwritten(group: h5py.Group, secret: Path) -> None:
-    group.create_dataset("observations", shape=(2, 4), dtype="f4")
-
-
-def _references(group: h5py.Group, secret: Path) -> None:
-    group.create_dataset("observations", data=[group.ref, group.ref], dtype=h5py.ref_dtype)
-
-
-def _texts(group: h5py.Group, secret: Path) -> None:
-    group.create_dataset("observations", shape=(2,), dtype=h5py.string_dtype())
-
-
-def _unaligned(group: h5py.Group, secret: Path) -> None:
-    group.create_dataset("observations", data=np.zeros((7, 4), "f4"))
-
-
-def _doubles(group: h5py.Group, secret: Path) -> None:
-    group.create_dataset("observations", data=np.zeros((2, 4), "f8"))
-
-
 def _linked(group: h5py.Group, secret: Path) -> None:
     with h5py.File(secret.with_suffix(".hdf5"), "w") as other:
         other["private"] = np.ones((2, 4), "f4")
     group["observations"] = h5py.ExternalLink(str(secret.with_suffix(".hdf5")), "private")
 
 
-def _plain(group: h5py.Group, secret: Path) -> None:
-    group.create_dataset("observations", data=np.zeros((2, 4), "f4"))
+def _references(group: h5py.Group, secret: Path) -> None:
+    group.create_dataset("observations", data=[group.ref, group.ref], dtype=h5py.ref_dtype)
+
+
+def _made(**options: Any) -> Callable[[h5py.Group, Path], None]:
+    """Observations that are created with these options."""
+    return lambda group, _: group.create_dataset("observations", **options)
+
+
+def stranger(folder: Path) -> h5py.File:
+    """The file of a data set that somebody else has written."""
+    (folder / "data").mkdir()
+    return h5py.File(folder / "data" / "main_data.hdf5", "w")
 
 
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
         (_external, "observations: float32"),
-        (_huge, "observations: float32"),
-        (_chunked, "observations: float32"),
-        (_unwritten, "observations: float32"),
+        (_made(shape=(10**11, 4), dtype="f4", chunks=(1000, 4)), "observations: float32"),
+        (_made(data=np.zeros((2, 4), "f4"), chunks=(2, 4)), "observations: float32"),
+        (_made(shape=(2, 4), dtype="f4"), "observations: float32"),  # no bytes were written
         (_references, "observations: object"),
-        (_texts, "observations: object"),
-        (_unaligned, "observations are float32"),
-        (_doubles, "observations are float64"),
+        (_made(shape=(2,), dtype=h5py.string_dtype()), "observations: object"),
+        (_made(data=np.zeros((7, 4), "f4")), "observations are float32"),
+        (_made(data=np.zeros((2, 4), "f8")), "observations are float64"),
         (_linked, "observations: is a link"),
-        (_plain, None),
+        (_made(data=np.zeros((2, 4), "f4")), None),
     ],
 )
 def test_a_strangers_file_is_read_only_as_it_would_be_written(
@@ -192,8 +174,7 @@ def test_a_strangers_file_is_read_only_as_it_would_be_written(
 ) -> None:
     secret = tmp_path / "private.txt"
     secret.write_bytes(b"a private file of the entrant ...")
-    (tmp_path / "data").mkdir()
-    with h5py.File(tmp_path / "data" / "main_data.hdf5", "w") as file:
+    with stranger(tmp_path) as file:
         group = file.create_group("episode_0")
         fault(group, secret)
         group["actions"] = np.zeros((1, 1), "f4")
@@ -208,8 +189,7 @@ def test_a_strangers_file_is_read_only_as_it_would_be_written(
 
 def test_an_episode_that_is_a_link_is_not_followed(dataset: SealedDataset, tmp_path: Path) -> None:
     private = dataset.write(ID, tmp_path / "private") / "data" / "main_data.hdf5"
-    (tmp_path / "data").mkdir()
-    with h5py.File(tmp_path / "data" / "main_data.hdf5", "w") as file:
+    with stranger(tmp_path) as file:
         file["episode_0"] = h5py.ExternalLink(str(private), "episode_0")
     with pytest.raises(MalformedDocumentError, match="episode_0: is a link"):
         SealedDataset.read(tmp_path)
@@ -228,8 +208,7 @@ def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
 
 
 def test_episodes_that_share_their_bytes_do_not_multiply(tmp_path: Path) -> None:
-    (tmp_path / "data").mkdir()
-    with h5py.File(tmp_path / "data" / "main_data.hdf5", "w") as file:
+    with stranger(tmp_path) as file:
         group = file.create_group("episode_0")
         group["observations"] = np.zeros((20_001, 4), "f4")
         group["actions"] = np.zeros((20_000, 1), "f4")

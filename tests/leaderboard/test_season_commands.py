@@ -102,41 +102,40 @@ def test_a_class_that_a_table_solves_is_warned_of() -> None:
         assert ("Warning: classes.deep: a table of the nearest states" in made.stderr) == warned
 
 
-def test_a_policy_is_asked_and_stays_at_home(season: Path) -> None:
-    for name in ("deep-0", "deep-1"):
-        Path(f"{name}.npy").write_bytes(pack_table(challenge(season, name)[:, :1]))
-    arrays = good("enter", "board", season, "{name}.npy", *ENTER).strip()
+def entered(*arguments: str | Path) -> list[np.ndarray | None]:
+    """The answers of an entry that is sent."""
+    id = good("enter", "board", "autumn", *arguments, *ENTER).strip()
+    with Store.open("board", read_only=True) as store:
+        row = store.entrant(id)
+        assert row is not None
+        answers = store.entry_of(row).entry.answers
+        return [
+            None if each is None else unpack_table(store.objects.read(each.sha256), 1)
+            for each in answers
+        ]
+
+
+def test_files_policies_and_constants_are_entered_as_actions(season: Path) -> None:
+    names = ("deep-0", "deep-1")
+    shown = [
+        unpack_table((season / "challenges" / f"{name}.npy").read_bytes(), 4) for name in names
+    ]
+    for name, states in zip(names, shown, strict=True):
+        Path(f"{name}.npy").write_bytes(pack_table(states[:, :1]))
+    for states, actions in zip(shown, entered("{name}.npy"), strict=True):
+        np.testing.assert_array_equal(actions, states[:, :1])
     Path("deep-0.onnx").write_bytes(linear_onnx(0))
-    asked = good("enter", "board", season, "{name}.onnx", "--failed", "deep-1", *ENTER).strip()
-    with Store.open("board", read_only=True) as store:
-        first, second = store.entrants(read_season(season).digest)
-        [answer, nothing] = store.entry_of(second).entry.answers
-        assert (first.entrant.id, second.entrant.id, nothing) == (arrays, asked, None)
-        assert answer is not None
-        actions = unpack_table(store.objects.read(answer.sha256), 1)
-    expected = np.clip(0.1 * challenge(season, "deep-0").sum(axis=1, keepdims=True), 0, 1)
+    actions, nothing = entered("{name}.onnx", "--failed", "deep-1")
+    expected = np.clip(0.1 * shown[0].sum(axis=1, keepdims=True), 0, 1)
     np.testing.assert_allclose(actions, expected, atol=1e-6)
-
-
-def test_a_constant_is_entered_for_all_instances_at_once(season: Path) -> None:
-    good("enter", "board", season, "constant_half", *ENTER)
-    with Store.open("board", read_only=True) as store:
-        [row] = store.entrants(read_season(season).digest)
-        for answer in store.entry_of(row).entry.answers:
-            assert answer is not None
-            assert np.unique(unpack_table(store.objects.read(answer.sha256), 1)).tolist() == [0.5]
-
-
-def challenge(season: Path, name: str) -> np.ndarray:
-    return unpack_table((season / "challenges" / f"{name}.npy").read_bytes(), 4)
-
-
-def test_wrong_arguments_of_an_entry_are_named(season: Path) -> None:
-    assert "must contain {name}" in fails(2, "enter", "board", season, "x.onnx", *ENTER)
-    assert "must be one of deep-0, deep-1" in fails(
-        2, "enter", "board", season, "{name}.npy", "--failed", "deep-2", *ENTER
-    )
-    assert "cannot be read" in fails(2, "enter", "board", season, "missing-{name}.npy", *ENTER)
+    assert nothing is None
+    for actions in entered("constant_half"):
+        np.testing.assert_array_equal(actions, np.full((300, 1), 0.5))
+    enter = ("enter", "board", season)
+    assert "must contain {name}" in fails(2, *enter, "x.onnx", *ENTER)
+    wrong = fails(2, *enter, "{name}.npy", "--failed", "deep-2", *ENTER)
+    assert "must be one of deep-0, deep-1" in wrong
+    assert "cannot be read" in fails(2, *enter, "missing-{name}.npy", *ENTER)
 
 
 def test_an_entry_is_sent_to_a_served_board(season: Path) -> None:

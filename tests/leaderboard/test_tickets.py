@@ -8,25 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from leaderboard.cli import app
 from leaderboard.cli.options import KEY_VARIABLE
 from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import BoardError
+from leaderboard.sealed.attendant import Attendant
 from leaderboard.store import Store
 from leaderboard.web import client
 from sme_registry.sealed import Instance, Ticket
 from tests.leaderboard.sealed.playing import Board, online_board
 from tests.leaderboard.serving import serving
-
-SEASON = "sealed-online"
-
-
-def command(code: int, *arguments: str | Path) -> str:
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert result.exit_code == code, result.output
-    return result.output
+from tests.leaderboard.test_cli import board_command, fails
 
 
 @pytest.fixture
@@ -34,19 +26,30 @@ def board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Board:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "160")
     monkeypatch.setenv(KEY_VARIABLE, str(tmp_path / "my.key"))
-    command(0, "keygen")
+    SigningKey.generate().write("my.key")
     return online_board(tmp_path)
 
 
 @pytest.fixture
-def url(board: Board) -> Iterator[str]:
+def url(board: Board, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    monkeypatch.setattr(Attendant, "_start", lambda _: None)  # nothing is scored
     with serving(board.path, season_secrets=[board.secret]) as url:
         yield url
 
 
-def start(code: int, url: str, *more: str | Path) -> str:
+def start(code: int, url: str, *more: str | Path, season: str = "sealed-online") -> str:
+    """What the command writes that starts a ticket."""
     names = "--method", "PPO", "--submitter", "A Lab"
-    return command(code, "ticket", url, SEASON, *names, *more)
+    return command(code, "ticket", url, season, *names, *more)
+
+
+def command(code: int, *arguments: str | Path) -> str:
+    """What a command writes that ends with this exit code."""
+    if code:
+        return fails(code, *arguments)
+    result = board_command(*arguments)
+    assert result.exit_code == 0, result.output
+    return result.output
 
 
 def policy(observations: np.ndarray) -> np.ndarray:
@@ -135,10 +138,9 @@ def test_an_interrupted_request_gets_the_same_ticket(
 
 
 def test_refusals_have_stable_codes(url: str) -> None:
-    output = command(1, "ticket", url, "summer", "--method", "PPO", "--submitter", "A Lab")
-    assert "season_unknown" in output
+    assert "season_unknown" in start(1, url, season="summer")
     assert not Path("ticket.json.request").exists()
-    assert "season=" in command(2, "ticket", url, "../x", "--method", "PPO", "--submitter", "A")
+    assert "season=" in start(2, url, season="../x")
     start(0, url)
     plain = Ticket.read("ticket.json").to_dict() | {"token": "00" * 32}
     Ticket.from_dict(plain).write("other.json")

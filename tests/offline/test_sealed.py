@@ -6,13 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from sme_registry.cli import app
 from sme_registry.datasets import DatasetRecipe, SealedDataset, collect
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.offline import OfflinePolicy, train_offline, train_sealed
 from sme_registry.task import materialize
+from tests.commands import good, refused
 from tests.offline.sets import TINY
 
 RECIPE = DatasetRecipe.from_dict(
@@ -45,29 +44,23 @@ def test_the_policy_is_that_of_the_same_rows_with_their_task(dataset, algorithm)
     assert hidden.about == about  # and no digest of a spec
 
 
-def test_the_progress_is_reported_of_all_steps(dataset) -> None:
+def test_the_progress_is_reported_of_all_steps_and_faults_are_named(dataset) -> None:
     calls: list[tuple[int, int]] = []
     longer = {**SHORT, "steps": 60}
     train_sealed(dataset, algorithm="bc", progress=lambda *done: calls.append(done), **longer)
     assert calls == [(50, 60), (60, 60)]
-
-
-def test_the_command_writes_a_policy(dataset, tmp_path: Path) -> None:
-    folder = dataset.write("sealed/autumn/deep-0-v0", tmp_path)
-    target = tmp_path / "deep-0.npz"
-    arguments = ["offline", "sealed", str(folder), "-o", str(target), "-n", "20", "--set"]
-    result = CliRunner().invoke(app, [*arguments, "hidden=[16]", "--batch-size", "32"])
-    assert result.exit_code == 0, result.output
-    policy, expected = OfflinePolicy.load(target), train_sealed(dataset, **SHORT)
-    np.testing.assert_array_equal(
-        policy(dataset.observations[:8]), expected(dataset.observations[:8])
-    )
-    again = CliRunner().invoke(app, [*arguments, "hidden=[16]"])
-    assert again.exit_code == 2
-
-
-def test_faults_are_named(dataset) -> None:
     with pytest.raises(UnknownNameError):
         train_sealed(dataset, algorithm="ppo")
     with pytest.raises(OptionError, match="batch_size"):
         train_sealed(dataset, batch_size=201)
+
+
+def test_the_command_writes_a_policy(dataset, tmp_path: Path) -> None:
+    folder, target = dataset.write("sealed/autumn/deep-0-v0", tmp_path), tmp_path / "deep-0.npz"
+    command = ["offline", "sealed", folder, "-o", target, "-n", "20", "--batch-size", "32"]
+    good(*command, "--set", "hidden=[16]")
+    policy, expected = OfflinePolicy.load(target), train_sealed(dataset, **SHORT)
+    np.testing.assert_array_equal(
+        policy(dataset.observations[:8]), expected(dataset.observations[:8])
+    )
+    assert str(target) in refused(*command).replace("\n", "")
