@@ -9,7 +9,8 @@ import re
 import signal
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -63,6 +64,14 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, d
         yield url, ids
 
 
+@pytest.fixture(scope="module")
+def refusing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Store]]:
+    """The URL of a tiny board for requests that are refused, and the board."""
+    path = tmp_path_factory.mktemp("refusing") / "board"
+    with tiny_board(path) as store, serving(path) as url:
+        yield url, store
+
+
 @pytest.fixture
 def url(store: Store) -> Iterator[str]:
     """The URL of the tiny board of `store`."""
@@ -87,10 +96,23 @@ def put(
     return HTTP.put(f"{url}/api/objects/{hex_of(digest)}", content=data, headers=headers)
 
 
-def raw(url: str, request: bytes, patience: float = 60.0) -> bytes:
-    """What a server answers to these bytes, until it closes the connection."""
+def put_head(url: str, key: SigningKey, data: bytes, length: int, more: str = "") -> bytes:
+    """The head of an upload that states a length."""
+    header = authorization(url, key, sha256_of(data))
+    return (
+        f"PUT /api/objects/{hex_of(sha256_of(data))} HTTP/1.1\r\nHost: x\r\n{more}"
+        f"Authorization: {header}\r\nContent-Length: {length}\r\n\r\n"
+    ).encode()
+
+
+def connected(url: str) -> socket.socket:
     parts = urlsplit(url)
-    with socket.create_connection((parts.hostname, parts.port), patience) as connection:
+    return socket.create_connection((parts.hostname, parts.port), 60)
+
+
+def raw(url: str, request: bytes) -> bytes:
+    """What a server answers to these bytes, until it closes the connection."""
+    with connected(url) as connection:
         connection.sendall(request)
         answer = b""
         while chunk := connection.recv(2**16):
@@ -110,74 +132,40 @@ def files_of(store: Store) -> list[str]:
 # Pages.
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        "/",
-        "/index.html",
-        "/ood_regret",
-        "/ood_decay.html",
-        "/compare",
-        "/log",
-        "/method",
-        "/board.csv",
-    ],
-)
-def test_pages_are_served(published: tuple[str, dict[str, str]], path: str) -> None:
-    answer = HTTP.get(published[0] + path, headers=BROWSER)
-    assert answer.status_code == 200
-    assert len(answer.content) > 500
+def test_pages_and_what_they_link_are_served(published: tuple[str, dict[str, str]]) -> None:
+    paths = ("/index.html", "/ood_regret", "/ood_decay.html", "/compare", "/log", "/method")
+    with httpx.Client(base_url=published[0], timeout=60) as client:
+        for path in (*paths, "/board.csv", "/"):
+            answer = client.get(path, headers=BROWSER)
+            assert answer.status_code == 200
+            assert len(answer.content) > 500
+        links = set(re.findall(r'(?:href|src)="([^"#?]+)', answer.text))
+        local = {link for link in links if "://" not in link}
+        assert len(local) > 10
+        assert [link for link in local if client.get(link).status_code != 200] == []
 
 
-def test_a_submissions_page_shows_its_method(published: tuple[str, dict[str, str]]) -> None:
+def test_pages_show_methods_and_a_name_with_a_script_as_text(
+    published: tuple[str, dict[str, str]],
+) -> None:
     url, ids = published
-    answer = HTTP.get(f"{url}/submissions/{hex_of(ids['sac'])}")
-    assert answer.status_code == 200
-    assert "<h1><bdi>SAC</bdi>" in answer.text
-
-
-def test_every_link_of_the_board_leads_somewhere(published: tuple[str, dict[str, str]]) -> None:
-    url, _ = published
-    links = set(re.findall(r'(?:href|src)="([^"#?]+)', HTTP.get(url).text))
-    local = {link for link in links if "://" not in link}
-    assert len(local) > 10
-    with httpx.Client(base_url=url, timeout=60) as client:
-        broken = [link for link in local if client.get(link).status_code != 200]
-    assert broken == []
-
-
-def test_a_name_with_a_script_is_shown_as_text(published: tuple[str, dict[str, str]]) -> None:
-    url, ids = published
+    assert "<h1><bdi>SAC</bdi>" in HTTP.get(f"{url}/submissions/{hex_of(ids['sac'])}").text
     for path in ("", f"/submissions/{hex_of(ids['hostile'])}"):
         page = HTTP.get(url + path).text
         assert "x&lt;b&gt;y" in page
-        assert "<script>alert" not in page
-
-
-@pytest.mark.parametrize(
-    "path", ["/", "/nowhere", "/api/board", "/api/nowhere", "/%2e%2e/board.key", "/healthz"]
-)
-def test_every_answer_has_the_security_headers(
-    published: tuple[str, dict[str, str]], path: str
-) -> None:
-    headers = HTTP.get(published[0] + path).headers
-    policy = headers["Content-Security-Policy"]
-    assert "default-src 'none'" in policy
-    assert "frame-ancestors 'none'" in policy
-    assert "unsafe" not in policy
-    assert headers["X-Content-Type-Options"] == "nosniff"
-    assert headers["Referrer-Policy"] == "no-referrer"
-    assert "Set-Cookie" not in headers
-
-
-def test_pages_hold_no_inline_script_or_style(published: tuple[str, dict[str, str]]) -> None:
-    url, ids = published
-    for path in ("/", "/compare", "/log", f"/submissions/{hex_of(ids['hostile'])}"):
-        page = HTTP.get(url + path).text
-        assert "<style" not in page
-        assert " style=" not in page
         assert "<script>" not in page
-        assert "<script src=" in page or "<script" not in page
+
+
+def test_every_answer_has_the_security_headers(published: tuple[str, dict[str, str]]) -> None:
+    for path in ("/", "/nowhere", "/api/board", "/api/nowhere", "/%2e%2e/board.key", "/healthz"):
+        headers = HTTP.get(published[0] + path).headers
+        policy = headers["Content-Security-Policy"]
+        assert "default-src 'none'" in policy
+        assert "frame-ancestors 'none'" in policy
+        assert "unsafe" not in policy
+        assert headers["X-Content-Type-Options"] == "nosniff"
+        assert headers["Referrer-Policy"] == "no-referrer"
+        assert "Set-Cookie" not in headers
 
 
 def test_an_unchanged_board_is_not_sent_twice(tmp_path: Path) -> None:
@@ -248,36 +236,18 @@ def test_a_waiting_entry_shows_the_faults_that_postponed_it(tmp_path: Path) -> N
     assert PublicView.from_dict(view).to_dict() == view
 
 
-def test_while_a_board_prepares_an_entry_that_was_scored_first_shows_no_scores(
-    store: Store,
-) -> None:
-    """Several scorers may finish an entry before the reference rows."""
-    id = boards.submit(store, SigningKey.generate(), "Early", [0.123] * 6, spread=0.0)
-    intake.submit_references(store)
-    with serving(store.folder.path) as url:
-        page = HTTP.get(f"{url}/submissions/{hex_of(id)}.html").text
-    assert "the scores are withheld" in page
-    assert "0.123" not in page
-
-
-def test_data_of_a_new_board_are_announced_only_by_a_server_that_scores(
+def test_what_does_not_last_is_announced_only_by_a_server_that_scores(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    intake.submit_references(store)
     monkeypatch.setattr(app, "background_scorers", lambda *_: contextlib.nullcontext())
+    with serving(store.folder.path, score_workers=1) as url:  # a reference row is missing
+        assert "refresh" not in HTTP.get(url, headers=BROWSER).text
+    intake.submit_references(store)
     for workers in (0, 1):
         with serving(store.folder.path, score_workers=workers) as url:
             answer = HTTP.get(f"{url}/api/board", headers=JSON)
         assert refusal(answer) == (503, "not_publishable")
         assert ("Retry-After" in answer.headers) == (workers == 1)
-
-
-def test_a_reference_that_is_missing_promises_no_reload(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(app, "background_scorers", lambda *_: contextlib.nullcontext())
-    with serving(store.folder.path, score_workers=1) as url:
-        assert "refresh" not in HTTP.get(url, headers=BROWSER).text
 
 
 def test_the_pages_say_how_to_submit_at_the_configured_address(tmp_path: Path) -> None:
@@ -302,18 +272,20 @@ def test_the_pages_say_how_to_submit_at_the_configured_address(tmp_path: Path) -
     assert "evil" not in known + unknown + copy
 
 
-@pytest.mark.parametrize(
-    "url",
-    ["board.example", "ftp://x", "https://x/$(id)", 'https://x"', "https://x/a b", "https://"],
-)
-def test_a_public_address_is_a_plain_url(store: Store, url: str) -> None:
+def test_serve_refuses_what_it_cannot_do(store: Store) -> None:
+    path = store.folder.path
+    for url in ("board.example", "ftp://x", "https://x/$(id)", 'https://x"', "https://x/a b"):
+        with pytest.raises(OptionError, match="url="):
+            serve(path, port=0, workers=0, url=url)
     with pytest.raises(OptionError, match="url="):
-        serve(store.folder.path, port=0, workers=0, url=url)
-
-
-def test_no_policy_is_scored_where_it_could_read_the_master_of_a_season(store: Store) -> None:
-    with pytest.raises(OptionError, match="unsafe_no_sandbox=True"):
-        serve(store.folder.path, port=0, unsafe_no_sandbox=True, season_secrets=["a.master"])
+        serve(path, port=0, workers=0, url="https://")
+    with pytest.raises(OptionError, match="unsafe_no_sandbox=True"):  # policies could read it
+        serve(path, port=0, unsafe_no_sandbox=True, season_secrets=["a.master"])
+    with (
+        socket.create_server(("127.0.0.1", 0)) as taken,
+        pytest.raises(BoardError, match="cannot listen here"),
+    ):
+        serve(path, port=taken.getsockname()[1], workers=0)
 
 
 def test_a_browser_gets_a_page_for_an_unknown_address(
@@ -324,8 +296,6 @@ def test_a_browser_gets_a_page_for_an_unknown_address(
     assert page.status_code == 404
     assert page.headers["Content-Type"].startswith("text/html")
     assert "not_found" in page.text
-    assert refusal(HTTP.get(f"{url}/nowhere")) == (404, "not_found")
-    assert refusal(HTTP.get(f"{url}/api/nowhere", headers=BROWSER)) == (404, "not_found")
 
 
 # Reading by the API.
@@ -366,18 +336,42 @@ def test_a_board_is_not_served_without_bubblewrap_unless_told(
     app.create_app(store.folder.path, score_workers=1, isolation="process")
 
 
-@pytest.mark.parametrize("metric", ["wd_regret", "ood_regret", "ood_decay"])
-def test_the_ranking_as_json_is_sorted(published: tuple[str, dict[str, str]], metric: str) -> None:
-    board = HTTP.get(f"{published[0]}/api/board", params={"metric": metric}).json()
-    values = [row["scores"][metric]["value"] for row in board["rows"]]
-    assert board["metric"] == metric
-    assert values == sorted(values)
-    assert len(values) > 5
+def test_the_ranking_as_json_is_sorted(published: tuple[str, dict[str, str]]) -> None:
+    for metric in ("wd_regret", "ood_regret", "ood_decay"):
+        board = HTTP.get(f"{published[0]}/api/board", params={"metric": metric}).json()
+        values = [row["scores"][metric]["value"] for row in board["rows"]]
+        assert board["metric"] == metric
+        assert values == sorted(values)
+        assert len(values) > 5
 
 
-def test_an_unknown_metric_is_rejected(published: tuple[str, dict[str, str]]) -> None:
-    answer = HTTP.get(f"{published[0]}/api/board", params={"metric": "reward"})
-    assert refusal(answer) == (400, "bad_request")
+DIGITS = ("0" * 63, "0" * 65, "A" * 64, "g" * 64, "sha256:" + "0" * 64, "٠" * 64, "x")
+ZEROS = "0" * 64
+
+
+@pytest.mark.parametrize(
+    ("path", "status", "code"),
+    [
+        ("/nowhere", 404, "not_found"),
+        ("/api/nowhere", 404, "not_found"),
+        *((path, 404, "not_found") for path in ("/board.key", "/index.sqlite")),
+        *((path, 404, "not_found") for path in ("/log/00000000.json", "/static/../board.key")),
+        ("/api/board?metric=reward", 400, "bad_request"),
+        *((f"/api/log?start={x}", 400, "bad_request") for x in ("-1", "x", "1e3", "9" * 400, "١")),
+        (f"/api/submissions/{ZEROS}", 404, "unknown_submission"),
+        *((f"/api/objects/{digits}", 400, "unsafe_name") for digits in DIGITS),
+        *((f"/api/submissions/{digits}", 400, "unsafe_name") for digits in DIGITS),
+        ("POST /api/board", 405, "method_not_allowed"),
+        (f"DELETE /api/objects/{ZEROS}", 405, "method_not_allowed"),
+    ],
+)
+def test_what_cannot_be_answered_has_its_code(
+    published: tuple[str, dict[str, str]], path: str, status: int, code: str
+) -> None:
+    method, _, path = path.rpartition(" ")
+    accept = BROWSER if path.startswith("/api/") else {}
+    answer = HTTP.request(method or "GET", published[0] + path, headers=accept)
+    assert refusal(answer) == (status, code)
 
 
 def test_the_log_is_served_in_consecutive_parts(published: tuple[str, dict[str, str]]) -> None:
@@ -388,12 +382,6 @@ def test_the_log_is_served_in_consecutive_parts(published: tuple[str, dict[str, 
     assert whole["entries"][0]["event"] == "opened"
     assert tail["entries"] == whole["entries"][5:]
     assert HTTP.get(f"{url}/api/log", params={"start": 99999}).json()["entries"] == []
-
-
-@pytest.mark.parametrize("start", ["-1", "x", "1e3", "9" * 400, "١"])
-def test_an_invalid_start_is_rejected(published: tuple[str, dict[str, str]], start: str) -> None:
-    answer = HTTP.get(f"{published[0]}/api/log", params={"start": start})
-    assert refusal(answer) == (400, "bad_request")
 
 
 def test_a_submission_is_served_with_its_result(published: tuple[str, dict[str, str]]) -> None:
@@ -413,37 +401,39 @@ def test_a_submission_is_served_with_its_result(published: tuple[str, dict[str, 
 
 
 def test_scores_are_withheld_until_the_references_are_right(url: str, store: Store) -> None:
+    """Several scorers may finish an entry before the reference rows."""
     key = SigningKey.generate()
-    scored = boards.submit(store, key, "PPO", [0.2] * 6)
+    scored = boards.submit(store, key, "PPO", [0.123] * 6, spread=0.0)
     code = ("onnx_op", "node 3: op_type='Loop': must be one of the list.")
     rejected = boards.submit(store, key, "Broken", None, rejected=code)
+
+    def view(id: str = scored) -> Json:
+        return dict(HTTP.get(f"{url}/api/submissions/{hex_of(id)}").json())
+
     assert refusal(HTTP.get(url, headers=JSON)) == (503, "not_publishable")
-    view = HTTP.get(f"{url}/api/submissions/{hex_of(scored)}").json()
-    assert (view["status"], view["result"]) == ("scored", None)
-    assert "reference row 'optimal': missing" in view["withheld"]
-    assert "0.2" not in json.dumps(view)
-    view = HTTP.get(f"{url}/api/submissions/{hex_of(rejected)}").json()
-    assert (view["status"], view["result"]["code"]) == ("rejected", "onnx_op")
+    assert (view()["status"], view()["result"]) == ("scored", None)
+    assert "reference row 'optimal': missing" in view()["withheld"]
+    assert "0.123" not in json.dumps(view())
+    assert (view(rejected)["status"], view(rejected)["result"]["code"]) == ("rejected", "onnx_op")
 
-    for name, level in (("optimal", 0.0), ("constant", 1.0)):
-        board_key = store.folder.signing_key()
-        boards.submit(store, board_key, name, [level] * 6, family="reference", spread=0.0)
-    view = HTTP.get(f"{url}/api/submissions/{hex_of(scored)}").json()
-    assert view["result"]["scores"]["normalised_regret"][0]["value"] > 0
-    assert view["withheld"] == ""
+    intake.submit_references(store)
+    page = HTTP.get(f"{url}/submissions/{hex_of(scored)}.html").text
+    assert "the scores are withheld" in page
+    assert "0.123" not in page
 
-
-def test_an_unknown_submission_has_its_code(published: tuple[str, dict[str, str]]) -> None:
-    answer = HTTP.get(f"{published[0]}/api/submissions/{'0' * 64}")
-    assert refusal(answer) == (404, "unknown_submission")
+    for level in (0.0, 1.0):
+        boards.score(store, [level] * 6)
+    assert view()["result"]["scores"]["normalised_regret"][0]["value"] == pytest.approx(0.123)
+    assert view()["withheld"] == ""
 
 
 # Paths.
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
+def test_a_path_that_leaves_the_folder_is_rejected(
+    published: tuple[str, dict[str, str]],
+) -> None:
+    for path in (
         "/../board.key",
         "/static/../../board.key",
         "/static/..%2f..%2fboard.key",
@@ -454,39 +444,12 @@ def test_an_unknown_submission_has_its_code(published: tuple[str, dict[str, str]
         "/static/board.css%00.html",
         "/\\..\\board.key",
         "/%0d%0aSet-Cookie:x",
-    ],
-)
-def test_a_path_that_leaves_the_folder_is_rejected(
-    published: tuple[str, dict[str, str]], path: str
-) -> None:
-    answer = raw(
-        published[0], f"GET {path} HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n".encode()
-    )
-    assert answer.startswith(b"HTTP/1.1 400 ")
-    assert b'"code":"unsafe_name"' in answer
-    assert b"frame-ancestors" in answer
-
-
-@pytest.mark.parametrize(
-    "digits", ["0" * 63, "0" * 65, "A" * 64, "g" * 64, "sha256:" + "0" * 64, "٠" * 64, "x"]
-)
-@pytest.mark.parametrize("where", ["objects", "submissions"])
-def test_an_invalid_digest_is_rejected(
-    published: tuple[str, dict[str, str]], where: str, digits: str
-) -> None:
-    answer = HTTP.get(f"{published[0]}/api/{where}/{digits}")
-    assert refusal(answer) == (400, "unsafe_name")
-
-
-def test_board_files_are_not_served(published: tuple[str, dict[str, str]]) -> None:
-    for path in ("/board.key", "/index.sqlite", "/log/00000000.json", "/static/../board.key"):
-        assert HTTP.get(published[0] + path).status_code == 404
-
-
-def test_an_unsupported_method_is_rejected(published: tuple[str, dict[str, str]]) -> None:
-    url, _ = published
-    for method, path in (("POST", "/api/board"), ("DELETE", f"/api/objects/{'0' * 64}")):
-        assert refusal(HTTP.request(method, url + path)) == (405, "method_not_allowed")
+    ):
+        request = f"GET {path} HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n"
+        answer = raw(published[0], request.encode())
+        assert answer.startswith(b"HTTP/1.1 400 "), path
+        assert b'"code":"unsafe_name"' in answer
+        assert b"frame-ancestors" in answer
 
 
 # Uploads.
@@ -546,33 +509,31 @@ def test_an_artefact_is_public_once_it_is_scored(tmp_path: Path, key: SigningKey
         assert downloads(sha256_of(policy)) == {(200, ""), (200, policy.decode())}
 
 
-def test_the_policies_of_reference_rows_are_public(url: str, store: Store) -> None:
-    (optimal, _) = intake.submit_references(store)
-    (run,) = store.submission(optimal).submission.runs
-    assert run.artefact is not None
-    answer = HTTP.get(f"{url}/api/objects/{hex_of(run.artefact.sha256)}")
-    assert sha256_of(answer.content) == run.artefact.sha256
-
-
-def test_an_artefact_is_verified_again_only_if_its_file_changes(
+def test_policies_of_reference_rows_are_public_and_verified_again_only_if_their_file_changes(
     url: str, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (optimal, _) = intake.submit_references(store)
     (run,) = store.submission(optimal).submission.runs
     assert run.artefact is not None
-    path, file = f"{url}/api/objects/{hex_of(run.artefact.sha256)}", store.folder.object
+    digest = run.artefact.sha256
+    path, file = f"{url}/api/objects/{hex_of(digest)}", store.folder.object(digest)
+    with ThreadPoolExecutor(8) as pool:  # as many readers at once
+        contents = [answer.content for answer in pool.map(HTTP.get, [path] * 8)]
+    assert {sha256_of(content) for content in contents} == {digest}
+
     computed = []
+    file_digest = hashlib.file_digest
 
     def counted(*arguments: Any) -> Any:
         computed.append(arguments)
         return file_digest(*arguments)
 
-    file_digest = hashlib.file_digest
     monkeypatch.setattr(hashlib, "file_digest", counted)
+    file.touch()
     assert [HTTP.get(path).status_code for _ in range(3)] == [200, 200, 200]
     assert len(computed) == 1
-    file(run.artefact.sha256).chmod(0o644)
-    file(run.artefact.sha256).write_bytes(b"rotten")
+    file.chmod(0o644)
+    file.write_bytes(b"rotten")
     assert refusal(HTTP.get(path)) == (500, "internal")
     assert len(computed) == 2
 
@@ -584,48 +545,41 @@ def test_bytes_of_another_digest_are_refused(url: str, store: Store, key: Signin
     assert files_of(store) == before
 
 
-def test_an_upload_without_a_signature_is_refused(url: str, key: SigningKey) -> None:
-    path = f"{url}/api/objects/{hex_of(sha256_of(b'x'))}"
+def test_an_upload_without_a_signature_or_signed_at_another_time_is_refused(
+    refusing: tuple[str, Store], key: SigningKey
+) -> None:
+    url, _ = refusing
+    digest = sha256_of(b"x")
+    signed = authorization(url, key, digest)
+    forged = signed.replace(key.public, SigningKey.generate().public)
     other = authorization(url, key, sha256_of(b"y"))
-    forged = authorization(url, key, sha256_of(b"x")).replace(
-        key.public, SigningKey.generate().public
-    )
-    for header in (None, "", "Bearer x", other, forged, "SME-Ed25519 " + "x" * 10_000):
-        headers = {} if header is None else {"Authorization": header}
-        answer = HTTP.put(path, content=b"x", headers=headers)
-        assert refusal(answer) == (403, "bad_signature")
+    for header in ("", "Bearer x", other, forged, "SME-Ed25519 " + "x" * 10_000):
+        assert refusal(put(url, key, b"x", Authorization=header)) == (403, "bad_signature")
+    answer = HTTP.put(f"{url}/api/objects/{hex_of(digest)}", content=b"x")
+    assert refusal(answer) == (403, "bad_signature")
+
+    now = datetime.datetime.now(datetime.UTC)
+    times = [utc(now + datetime.timedelta(minutes=minutes)) for minutes in (-11, 11, 10**6)]
+    for time_ in (*times, "2026-02-31T00:00:00Z"):
+        header = authorization(url, key, digest, time_)
+        assert refusal(put(url, key, b"x", Authorization=header)) == (403, "stale_time")
 
 
-@pytest.mark.parametrize("minutes", [-11, 11, 10**6])
-def test_an_upload_signed_at_another_time_is_refused(
-    url: str, key: SigningKey, minutes: int
+def test_what_is_too_large_is_refused_by_its_length_or_as_soon_as_it_is(
+    refusing: tuple[str, Store], key: SigningKey
 ) -> None:
-    moment = datetime.datetime.now(datetime.UTC) + datetime.timedelta(minutes=minutes)
-    header = authorization(url, key, sha256_of(b"x"), utc(moment))
-    assert refusal(put(url, key, b"x", Authorization=header)) == (403, "stale_time")
-
-
-def test_an_upload_signed_at_an_impossible_time_is_rejected(url: str, key: SigningKey) -> None:
-    header = authorization(url, key, sha256_of(b"x"), "2026-02-31T00:00:00Z")
-    assert refusal(put(url, key, b"x", Authorization=header)) == (403, "stale_time")
-
-
-def test_an_upload_that_is_too_large_is_refused_by_its_length(
-    store: Store, key: SigningKey, url: str
-) -> None:
+    url, store = refusing
     limit = store.document.limits.artefact_bytes
-    header = authorization(url, key, sha256_of(b"x"))
-    start = time.process_time()  # the server is a thread of this process
-    answer = raw(
-        url,
-        (
-            f"PUT /api/objects/{hex_of(sha256_of(b'x'))} HTTP/1.1\r\nHost: x\r\n"
-            f"Authorization: {header}\r\nContent-Length: {limit + 1}\r\n\r\n"
-        ).encode(),
-    )
-    assert answer.startswith(b"HTTP/1.1 413 ")
-    assert b'"code":"too_large"' in answer
-    assert time.process_time() - start < CPU_SECONDS
+    head = b"POST /api/submissions HTTP/1.1\r\nHost: x\r\nContent-Length: 1000000000\r\n\r\n"
+    for request in (
+        put_head(url, key, b"x", limit + 1),
+        head + b" " * (64 * 2**10 + 1),  # the rest never comes
+    ):
+        start = time.process_time()  # the server is a thread of this process
+        answer = raw(url, request)
+        assert time.process_time() - start < CPU_SECONDS
+        assert answer.startswith(b"HTTP/1.1 413 ")
+        assert b'"code":"too_large"' in answer
 
 
 def test_an_upload_without_a_length_is_stopped_at_the_limit(
@@ -633,26 +587,15 @@ def test_an_upload_without_a_length_is_stopped_at_the_limit(
 ) -> None:
     with tiny_board(tmp_path / "b", limits={"artefact_bytes": 100_000}) as store:
         before = files_of(store)
+        small, large = b"y" * 5000, b"x" * 200_000
         with serving(store.folder.path) as url:
-
-            def endless() -> Iterator[bytes]:
-                for _ in range(40):
-                    yield b"x" * 5000
-
-            digest = sha256_of(b"x" * 200_000)
-            headers = {"Authorization": authorization(url, key, digest)}
-            answer = HTTP.put(
-                f"{url}/api/objects/{hex_of(digest)}", content=endless(), headers=headers
-            )
-            assert refusal(answer) == (413, "too_large")
-            small = b"y" * 5000
-            headers = {"Authorization": authorization(url, key, sha256_of(small))}
-            answer = HTTP.put(
-                f"{url}/api/objects/{hex_of(sha256_of(small))}",
-                content=iter([small]),
-                headers=headers,
-            )
-            assert answer.status_code == 201
+            for data, status in ((large, 413), (small, 201)):
+                headers = {"Authorization": authorization(url, key, sha256_of(data))}
+                pieces = (data[start : start + 5000] for start in range(0, len(data), 5000))
+                path = f"{url}/api/objects/{hex_of(sha256_of(data))}"
+                answer = HTTP.put(path, content=pieces, headers=headers)
+                assert answer.status_code == status
+                assert status == 201 or refusal(answer) == (413, "too_large")
         store.folder.object(sha256_of(small)).unlink()
         assert files_of(store) == before
 
@@ -661,14 +604,9 @@ def test_a_false_length_leaves_nothing_behind(url: str, store: Store, key: Signi
     before = files_of(store)
     data = b"z" * 1000
     for length in (999, 1001):
-        head = (
-            f"PUT /api/objects/{hex_of(sha256_of(data))} HTTP/1.1\r\nHost: x\r\n"
-            f"Authorization: {authorization(url, key, sha256_of(data))}\r\n"
-            f"Connection: close\r\nContent-Length: {length}\r\n\r\n"
-        )
-        parts = urlsplit(url)
-        with socket.create_connection((parts.hostname, parts.port), 60) as connection:
-            connection.sendall(head.encode() + data)
+        head = put_head(url, key, data, length, "Connection: close\r\n")
+        with connected(url) as connection:
+            connection.sendall(head + data)
             connection.shutdown(socket.SHUT_WR)
             answer = connection.recv(2**16)
         assert answer.startswith(b"HTTP/1.1 4") or answer == b""
@@ -680,58 +618,35 @@ def test_uploads_that_are_slow_or_broken_off_leave_nothing_behind(
     store: Store, key: SigningKey
 ) -> None:
     before = files_of(store)
-    with serving(store.folder.path, upload_seconds=2.0) as url:
-        head = (
-            f"PUT /api/objects/{hex_of(sha256_of(b'z'))} HTTP/1.1\r\nHost: x\r\n"
-            f"Authorization: {authorization(url, key, sha256_of(b'z'))}\r\n"
-            "Content-Length: 1000000\r\n\r\n"
-        ).encode() + b"z" * 70_000
-        parts = urlsplit(url)
-        with socket.create_connection((parts.hostname, parts.port), 60) as connection:
-            connection.sendall(head)  # broken off
-        answer = raw(url, head)  # and slow
+    with serving(store.folder.path, upload_seconds=1.0) as url:
+        request = put_head(url, key, b"z", 1_000_000) + b"z" * 70_000
+        with connected(url) as connection:
+            connection.sendall(request)  # broken off
+        answer = raw(url, request)  # and slow
         assert answer.startswith(b"HTTP/1.1 408 ")
         assert b'"code":"too_slow"' in answer
         assert files_of(store) == before
         assert put(url, key, b"good").status_code == 201  # and it holds none of the quota
 
 
-def test_the_quota_of_a_key_counts_uploads_in_progress(tmp_path: Path, key: SigningKey) -> None:
-    limits = {"upload_bytes_per_day": 1000, "artefact_bytes": 600}
-    with tiny_board(tmp_path / "b", limits=limits) as store, serving(store.folder.path) as url:
-        head = (
-            f"PUT /api/objects/{hex_of(sha256_of(b'z'))} HTTP/1.1\r\nHost: x\r\n"
-            f"Authorization: {authorization(url, key, sha256_of(b'z'))}\r\n"
-            "Content-Length: 600\r\n\r\n"
-        ).encode()
-        parts = urlsplit(url)
-        with socket.create_connection((parts.hostname, parts.port), 60) as connection:
-            connection.sendall(head + b"z")
-            deadline = time.monotonic() + 5
-            while True:  # until the server has read the head
-                answer = put(url, key, bytes(401))
-                if answer.status_code == 429 or time.monotonic() > deadline:
-                    break
-                store.folder.object(sha256_of(bytes(401))).unlink()
-            assert refusal(answer) == (429, "quota")
-            assert put(url, SigningKey.generate(), bytes(401)).status_code == 201
-
-
-def test_the_quota_of_a_key_is_kept(tmp_path: Path, key: SigningKey) -> None:
-    limits = {"upload_bytes_per_day": 1000}
-    with tiny_board(tmp_path / "b", limits=limits) as store, serving(store.folder.path) as url:
-        assert put(url, key, bytes(600)).status_code == 201
-        assert refusal(put(url, key, bytes(500))) == (429, "quota")
+def test_quotas_of_keys_and_of_the_board_count_uploads_in_progress(
+    tmp_path: Path, key: SigningKey
+) -> None:
+    limits = {"upload_bytes_per_day": 1000, "artefact_bytes": 600, "total_bytes": 1700}
+    with (
+        tiny_board(tmp_path / "b", limits=limits) as store,
+        serving(store.folder.path) as url,
+        connected(url) as connection,
+    ):
+        connection.sendall(put_head(url, key, b"z", 600, "Expect: 100-continue\r\n"))
+        assert connection.recv(100).startswith(b"HTTP/1.1 100 ")  # there is room for it
+        assert refusal(put(url, key, bytes(401))) == (429, "quota")
         assert put(url, key, bytes(400)).status_code == 201
-        assert put(url, SigningKey.generate(), bytes(500)).status_code == 201
-
-
-def test_the_quota_of_the_board_is_kept(tmp_path: Path, key: SigningKey) -> None:
-    limits = {"total_bytes": 1000}
-    with tiny_board(tmp_path / "b", limits=limits) as store, serving(store.folder.path) as url:
-        assert put(url, key, bytes(600)).status_code == 201
-        answer = put(url, SigningKey.generate(), bytes(500))
-        assert refusal(answer) == (429, "quota")
+        other = SigningKey.generate()
+        assert put(url, other, bytes(500)).status_code == 201
+        third = SigningKey.generate()
+        assert refusal(put(url, third, bytes(201))) == (429, "quota")
+        assert put(url, third, bytes(200)).status_code == 201
 
 
 # Submissions and withdrawals.
@@ -762,84 +677,48 @@ def test_a_submission_is_accepted_once(url: str, store: Store, key: SigningKey) 
     assert [entry.id for entry in store.entries()] == [signed.id]
 
 
-Break = Callable[[Json], Any]
+NEVER = "sha256:" + "1" * 64
 
 
-def _without(*names: str) -> Break:
-    def change(plain: Json) -> None:
-        for name in names:
-            del plain[name]
-
-    return change
-
-
-def _set(name: str, value: Any) -> Break:
-    def change(plain: Json) -> None:
-        plain[name] = value
-
-    return change
-
-
-def _more_runs(plain: Json) -> None:
-    plain["runs"] = plain["runs"] * 2
-
-
-def _of_suite(plain: Json) -> None:
-    plain["suite"] = {"name": "other-v1", "digest": "sha256:" + "1" * 64}
-
-
-def _of_spec(plain: Json) -> None:
-    plain["runs"][0]["spec"] = "sha256:" + "1" * 64
-
-
-def _started_fewer(plain: Json) -> None:
-    plain["runs_started"] = dict.fromkeys(plain["runs_started"], 0)
-
-
-def _artefact_elsewhere(plain: Json) -> None:
-    plain["runs"][0]["artefact"]["sha256"] = "sha256:" + "1" * 64
-
-
-def _artefact_larger(plain: Json) -> None:
-    plain["runs"][0]["artefact"]["size"] += 1
-
-
-def _named(name: str) -> Break:
-    def change(plain: Json) -> None:
-        plain["method"]["name"] = name
-
-    return change
+def changed(plain: Json, path: str, value: Any) -> None:
+    """Set what is at a path, such as `runs.0.spec`; None removes it."""
+    *names, last = path.split(".")
+    for name in names:
+        plain = plain[int(name)] if name.isdigit() else plain[name]
+    if value is None:
+        del plain[last]
+    else:
+        plain[last] = value
 
 
 @pytest.mark.parametrize(
-    ("change", "code"),
+    ("path", "value", "code"),
     [
-        (_set("score", 0.0), "schema"),
-        (_without("method"), "schema"),
-        (_set("statement", "x" * 2001), "schema"),
-        (_set("created", "yesterday"), "schema"),
-        (_set("created", "2020-01-01T00:00:00Z"), "stale_time"),
-        (_set("created", "2120-01-01T00:00:00Z"), "stale_time"),
-        (_set("created", "2026-02-31T00:00:00Z"), "schema"),
-        (_set("track", "sealed"), "schema"),
-        (_of_suite, "unknown_suite"),
-        (_of_spec, "unknown_spec"),
-        (_more_runs, "duplicate_run"),
-        (_started_fewer, "missing_run"),
-        (_named("<script>alert(1)</script>"), "unsafe_name"),
-        (_named("=HYPERLINK(1)"), "unsafe_name"),
-        (_artefact_elsewhere, "artefact_missing"),
-        (_artefact_larger, "artefact_digest"),
+        ("score", 0.0, "schema"),
+        ("method", None, "schema"),
+        ("statement", "x" * 2001, "schema"),
+        ("created", "yesterday", "schema"),
+        ("created", "2020-01-01T00:00:00Z", "stale_time"),
+        ("created", "2120-01-01T00:00:00Z", "stale_time"),
+        ("created", "2026-02-31T00:00:00Z", "schema"),
+        ("track", "sealed", "schema"),
+        ("suite", {"name": "other-v1", "digest": NEVER}, "unknown_suite"),
+        ("runs.0.spec", NEVER, "unknown_spec"),
+        ("runs", "twice", "duplicate_run"),
+        ("runs_started.Tiny", 0, "missing_run"),
+        ("method.name", "<script>alert(1)</script>", "unsafe_name"),
+        ("method.name", "=HYPERLINK(1)", "unsafe_name"),
+        ("runs.0.artefact.sha256", NEVER, "artefact_missing"),
+        ("runs.0.artefact.size", 1, "artefact_digest"),
     ],
 )
 def test_an_invalid_submission_has_its_code(
-    url: str, store: Store, key: SigningKey, change: Break, code: str
+    refusing: tuple[str, Store], key: SigningKey, path: str, value: Any, code: str
 ) -> None:
+    url, store = refusing
     plain = uploaded(url, store, key).submission.to_dict()
-    change(plain)
-    start = time.process_time()  # the server is a thread of this process
+    changed(plain, path, plain["runs"] * 2 if value == "twice" else value)
     answer = post(url, _signed_anyway(plain, key, store.document.key))
-    assert time.process_time() - start < CPU_SECONDS
     assert (answer.json()["code"], 400 <= answer.status_code < 500) == (code, True)
     assert set(answer.json()) == {"code", "message"}
     assert store.entries() == []
@@ -874,8 +753,9 @@ def _signed_anyway(plain: Json, key: SigningKey, board: str) -> bytes:
     ],
 )
 def test_a_body_that_is_no_submission_has_its_code(
-    url: str, store: Store, text: bytes, status: int, code: str
+    refusing: tuple[str, Store], text: bytes, status: int, code: str
 ) -> None:
+    url, store = refusing
     start = time.process_time()  # the server is a thread of this process
     answer = post(url, text)
     assert time.process_time() - start < CPU_SECONDS
@@ -883,16 +763,10 @@ def test_a_body_that_is_no_submission_has_its_code(
     assert store.entries() == []
 
 
-def test_a_body_is_refused_as_soon_as_it_is_too_large(url: str) -> None:
-    head = b"POST /api/submissions HTTP/1.1\r\nHost: x\r\nContent-Length: 1000000000\r\n\r\n"
-    answer = raw(url, head + b" " * (64 * 2**10 + 1))  # the rest never comes
-    assert answer.startswith(b"HTTP/1.1 413 ")
-    assert b'"code":"too_large"' in answer
-
-
 def test_a_changed_submission_is_not_the_signed_one(
-    url: str, store: Store, key: SigningKey
+    refusing: tuple[str, Store], key: SigningKey
 ) -> None:
+    url, store = refusing
     plain = uploaded(url, store, key).to_dict()
     plain["submission"]["statement"] = "changed afterwards"
     assert refusal(post(url, json.dumps(plain).encode())) == (403, "bad_signature")
@@ -910,14 +784,6 @@ def test_the_submission_quota_states_when_it_frees_up(tmp_path: Path, key: Signi
             assert f"after {utc(tomorrow)}" in answer.json()["message"]
             other = SigningKey.generate()
             assert post(url, uploaded(url, store, other, 4).to_bytes()).status_code == 202
-
-
-def test_the_queue_of_a_board_has_a_limit(tmp_path: Path, key: SigningKey) -> None:
-    with tiny_board(tmp_path / "b", limits={"waiting_submissions": 1}) as store:
-        put_submission(store, key, 1)
-        with serving(store.folder.path) as url:
-            answer = post(url, uploaded(url, store, SigningKey.generate(), 2).to_bytes())
-            assert refusal(answer) == (429, "quota")
 
 
 def test_a_withdrawal_by_the_submitter_is_final(url: str, store: Store, key: SigningKey) -> None:
@@ -938,19 +804,15 @@ def test_a_withdrawal_by_the_submitter_is_final(url: str, store: Store, key: Sig
     assert view["withdrawal"] == valid.to_dict()
 
 
-@pytest.mark.parametrize(
-    ("text", "status", "code"),
-    [
-        (b"{", 400, "not_json"),
-        (b"{}", 422, "schema"),
-        (b"[" * 60_000, 400, "not_json"),
-        (b" " * 70_000, 413, "too_large"),
-    ],
-)
-def test_a_body_that_is_no_withdrawal_has_its_code(
-    url: str, text: bytes, status: int, code: str
-) -> None:
-    assert refusal(HTTP.post(f"{url}/api/withdrawals", content=text)) == (status, code)
+def test_a_body_that_is_no_withdrawal_has_its_code(refusing: tuple[str, Store]) -> None:
+    for text, expected in {
+        b"{": (400, "not_json"),
+        b"{}": (422, "schema"),
+        b"[" * 60_000: (400, "not_json"),
+        b" " * 70_000: (413, "too_large"),
+    }.items():
+        answer = HTTP.post(f"{refusing[0]}/api/withdrawals", content=text)
+        assert refusal(answer) == expected
 
 
 # Faults, and `serve`.
@@ -979,47 +841,34 @@ def test_every_code_of_the_server_is_explained() -> None:
     assert not set(HTTP_CODES) & set(CODES)
 
 
-@pytest.mark.parametrize("signal_name", ["SIGINT", "SIGTERM"])
-def test_serve_runs_scorers_and_stops_cleanly(
-    tmp_path: Path, key: SigningKey, signal_name: str
-) -> None:
+def test_serving_outlives_its_scorers_and_stops_cleanly(tmp_path: Path) -> None:
     with tiny_board(tmp_path / "board") as store:
         intake.submit_references(store)
         with serving_process(store.folder.path, workers=1) as (url, process):
-            deadline = time.monotonic() + 60
-            while store.queue.waiting() and time.monotonic() < deadline:
-                assert process.poll() is None
-                time.sleep(0.05)
-            assert HTTP.get(url).status_code == 200
-            children = _children(process.pid)
-            assert len(children) >= 2
-            process.send_signal(getattr(signal, signal_name))
-            _, err = process.communicate(timeout=20)
-        assert (process.returncode, err) == (0, "")
-        # Multiprocessing's own tracker ends by itself, a moment after those that it watched.
-        deadline = time.monotonic() + 30
-        while [child for child in children if _is_alive(child)] and time.monotonic() < deadline:
-            time.sleep(0.05)
-        assert not [child for child in children if _is_alive(child)]
-
-
-def test_serving_outlives_its_scorers(tmp_path: Path) -> None:
-    with tiny_board(tmp_path / "board") as store:
-        intake.submit_references(store)
-        with serving_process(store.folder.path, workers=1) as (url, process):
-            killed, deadline = 0, time.monotonic() + 60
-            while store.queue.waiting() and time.monotonic() < deadline:
-                if killed < 3 and store.queue.claimed():
-                    for child in _children(process.pid):
+            killed, deadline = [], time.monotonic() + 300
+            while store.queue.waiting():
+                assert time.monotonic() < deadline
+                if not killed and store.queue.claimed():
+                    killed = [child for child in _children(process.pid) if _may_be_killed(child)]
+                    for child in killed:
                         with contextlib.suppress(ProcessLookupError):
                             os.kill(child, signal.SIGKILL)
-                    killed += 1
                 health = HTTP.get(f"{url}/healthz")
                 assert health.status_code == 200
                 assert health.json()["scoring"] in ("waiting", "fault", "ok")
-            assert killed == 3
+                time.sleep(0.2)
+            assert killed
             assert HTTP.get(f"{url}/healthz").json()["scoring"] == "ok"
             assert HTTP.get(url).status_code == 200
+            children = _children(process.pid)
+            assert len(children) >= 2
+            process.send_signal(signal.SIGINT)
+            _, err = process.communicate(timeout=60)
+        assert (process.returncode, err) == (0, "")
+        # Multiprocessing's own tracker ends by itself, a moment after those that it watched.
+        while [child for child in children if _is_alive(child)]:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
 
 
 def _children(pid: int) -> list[int]:
@@ -1031,16 +880,16 @@ def _children(pid: int) -> list[int]:
     return descendants
 
 
+def _may_be_killed(pid: int) -> bool:
+    """A scorer, or what it started; without its tracker, `multiprocessing` writes warnings."""
+    try:
+        return b"resource_tracker" not in Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return False
+
+
 def _is_alive(pid: int) -> bool:
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
-
-
-def test_serve_reports_an_address_in_use(store: Store) -> None:
-    with (
-        socket.create_server(("127.0.0.1", 0)) as taken,
-        pytest.raises(BoardError, match="cannot listen here"),
-    ):
-        serve(store.folder.path, port=taken.getsockname()[1], workers=0)
