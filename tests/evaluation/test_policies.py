@@ -127,17 +127,6 @@ def test_an_unusable_name_is_refused(name, error, message):
         evaluated(name)
 
 
-def test_an_offline_policy_scores_as_its_file(tmp_path):
-    layers = [(np.full((2, 5), 0.3, np.float32), np.zeros(2, np.float32))]
-    policy = OfflinePolicy(layers, {"algorithm": "bc"})
-    path = policy.save(tmp_path / "policy.npz")
-    live, saved = evaluated(policy), evaluated(str(path))
-    assert (live.policy, saved.policy) == ("bc", "policy")
-    assert saved.regions == live.regions
-    with pytest.raises(PolicyError, match=r"its observations have shape \(5,\): must be \(10,\)"):
-        evaluate(path, "Default", PROTOCOL)
-
-
 def test_a_prepared_policy_is_accepted_as_it_is():
     prepared = as_policy(constant(-0.5, 1.0), SPEC, action_range="symmetric", name="mine")
     again = as_policy(prepared, SPEC)
