@@ -75,7 +75,7 @@ def finish(folder: Path) -> None:
             ledger.write(CellFailure(key=cell.digest, cell=cell, **error))
 
 
-def analysed(folder: Path, leave_out: Choice = lambda planned: False, draws: int = 50) -> Analysis:
+def analysed(folder: Path, leave_out: Choice = lambda planned: False, draws: int = 300) -> Analysis:
     """The tables of a folder's runs, except for those left out."""
     ledger = Ledger(folder)
     file = plan_file(ledger)
