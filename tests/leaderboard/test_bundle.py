@@ -11,8 +11,9 @@ import pytest
 
 from leaderboard.artefact.reference import constant_onnx, optimal_onnx
 from leaderboard.bundle import Bundle, make_bundle
+from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, MAX_BYTES, Training
+from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, MAX_BYTES, Submission, Training
 from leaderboard.errors import Rejection
 from sme_registry import SMESpec, save
 from sme_registry.errors import OptionError, PolicyError, SMEError, SpecError
@@ -38,14 +39,18 @@ def row(spec, policy, seed=0, steps=10):
     return {"spec": spec.digest, "policy": policy, "steps": steps, "seed": seed}
 
 
-@pytest.fixture
-def table(tmp_path):
+def write_table(folder):
     """A table of one run on each instance, the last of which failed, and its two policies."""
-    folder = tmp_path / "runs"
-    folder.mkdir()
     (folder / "a0.onnx").write_bytes(optimal_onnx(A0))
     (folder / "a1.onnx").write_bytes(optimal_onnx(A1))
     return rewritten(folder / "runs.json", [row(A0, "a0.onnx"), row(A1, "a1.onnx"), row(B0, None)])
+
+
+@pytest.fixture
+def table(tmp_path):
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    return write_table(folder)
 
 
 def rewritten(table, rows):
@@ -58,14 +63,25 @@ def made(folder, *runs, **kwargs):
     return make_bundle(folder, runs=runs, **kwargs)
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A bundle; nobody changes it."""
+    return made(
+        tmp_path_factory.mktemp("whole") / "bundle", write_table(tmp_path_factory.mktemp("runs"))
+    )
+
+
 @pytest.fixture
-def bundle(tmp_path, table):
-    return made(tmp_path / "bundle", table)
+def bundle(tmp_path, whole):
+    return Bundle.read(shutil.copytree(whole.folder, tmp_path / "bundle"))
 
 
-def artefact_path(bundle, index=0):
-    digest = bundle.signed.submission.runs[index].artefact.sha256
-    return bundle.folder / "artefacts" / f"{digest.removeprefix('sha256:')}.onnx"
+def digest_of(bundle, index=0):
+    return bundle.signed.submission.runs[index].artefact.sha256
+
+
+def artefact_path(bundle):
+    return bundle.folder / "artefacts" / f"{hex_of(digest_of(bundle))}.onnx"
 
 
 def refused(code, match, act, *arguments, **kwargs):
@@ -77,86 +93,66 @@ def refused(code, match, act, *arguments, **kwargs):
 # --- reading -----------------------------------------------------------------------------------
 
 
-def test_a_bundle_reads_as_it_was_made(bundle):
-    read = Bundle.read(str(bundle.folder))
-    assert read == bundle
-    assert read.signed.id == bundle.signed.submission.digest
-    for run, spec in zip(read.signed.submission.runs[:2], (A0, A1), strict=True):
+def test_a_table_becomes_a_signed_submission_that_reads_as_it_was_made(whole):
+    read = Bundle.read(str(whole.folder))
+    assert read == whole
+    submission = read.signed.submission
+    assert read.signed.id == submission.digest
+    for run, spec in zip(submission.runs[:2], (A0, A1), strict=True):
         assert read.artefact(run.artefact.sha256) == optimal_onnx(spec)
+    assert (submission.suite.name, submission.suite.digest) == ("two-v1", SUITE.digest)
+    assert submission.submitter.key == KEY.public
+    assert (submission.method.name, submission.method.family) == ("Mine", "Mine")
+    assert [run.spec for run in submission.runs] == [A0.digest, A1.digest, B0.digest]
+    assert submission.runs[2].artefact is None
+    assert submission.runs_started == {"A": 2, "B": 1}
+    assert submission.training == Training()
+    names = {path.stem for path in (whole.folder / "artefacts").iterdir()}
+    assert names == {hashlib.sha256(optimal_onnx(spec)).hexdigest() for spec in (A0, A1)}
 
 
-def test_a_folder_without_a_submission_is_refused(tmp_path):
-    with pytest.raises(OptionError, match="contains no submission"):
-        Bundle.read(tmp_path)
-    with pytest.raises(OptionError, match="contains no submission"):
-        Bundle.read(tmp_path / "absent")
-
-
-def test_a_changed_submission_is_refused(bundle):
+def test_a_missing_or_changed_submission_is_refused(tmp_path, bundle):
+    for folder in (tmp_path, tmp_path / "absent"):
+        with pytest.raises(OptionError, match="contains no submission"):
+            Bundle.read(folder)
     path = bundle.folder / "submission.json"
     path.write_text(path.read_text().replace('"Mine"', '"Yours"'))
     refused("bad_signature", "invalid for this submission", Bundle.read, bundle.folder)
 
 
-def test_a_submission_above_the_limit_is_not_read_to_its_end(bundle):
-    with (bundle.folder / "submission.json").open("r+b") as stream:
-        stream.truncate(2**40)  # a hole: reading it whole would never end
-    refused(
-        "too_large",
-        f"^too_large: submission.json: must be at most {MAX_BYTES:,} bytes. List",
-        Bundle.read,
-        bundle.folder,
-    )
+def test_a_file_above_its_limit_is_not_read_to_its_end(bundle):
+    path = bundle.folder / "submission.json"
+    for large in (path, artefact_path(bundle)):
+        with large.open("r+b") as stream:
+            stream.truncate(2**40)  # a hole: reading it whole would never end
+    match = f"^too_large: submission.json: must be at most {MAX_BYTES:,} bytes. List"
+    refused("too_large", match, Bundle.read, bundle.folder)
+    match = f"at most {MAX_ARTEFACT_BYTES:,} bytes. Submit a smaller network."
+    refused("too_large", match, bundle.artefact, digest_of(bundle))
 
 
-def test_an_artefact_that_no_run_names_is_refused(bundle):
+def test_an_artefact_that_no_run_names_or_that_is_missing_is_refused(bundle):
     for digest in ("sha256:" + "0" * 64, "../../etc/passwd", "sha256:../../../etc/passwd"):
         refused("artefact_missing", "no run of the submission names it", bundle.artefact, digest)
-
-
-def test_a_missing_artefact_is_refused(bundle):
-    digest = bundle.signed.submission.runs[0].artefact.sha256
     artefact_path(bundle).unlink()
-    refused("artefact_missing", "is missing from the bundle", bundle.artefact, digest)
+    missing = ("artefact_missing", "is missing from the bundle")
+    refused(*missing, bundle.artefact, digest_of(bundle))
     shutil.rmtree(bundle.folder / "artefacts")
-    refused("artefact_missing", "is missing from the bundle", bundle.artefact, digest)
+    refused(*missing, bundle.artefact, digest_of(bundle))
 
 
-@pytest.mark.parametrize("change", [lambda data: data[:-1], lambda data: data[:-1] + b"\xff"])
-def test_changed_bytes_are_refused(bundle, change):
+def test_bytes_that_are_not_the_signed_ones_are_refused(bundle):
     path = artefact_path(bundle)
-    path.write_bytes(change(path.read_bytes()))
-    digest = bundle.signed.submission.runs[0].artefact.sha256
-    refused("artefact_digest", "must be .* bytes of sha256:", bundle.artefact, digest)
-
-
-def test_a_size_that_is_not_the_artefacts_is_refused(bundle):
-    run = bundle.signed.submission.runs[0]
-    lying = run.model_copy(update={"artefact": run.artefact.model_copy(update={"size": 5})})
-    submission = bundle.signed.submission.model_copy(
-        update={"runs": (lying, *bundle.signed.submission.runs[1:])}
-    )
-    changed = Bundle(bundle.folder, submission.signed(KEY))
-    refused("artefact_digest", "must be 5 bytes", changed.artefact, run.artefact.sha256)
-
-
-def test_an_artefact_above_the_limit_is_not_read_to_its_end(bundle):
-    with artefact_path(bundle).open("r+b") as stream:
-        stream.truncate(2**40)
-    digest = bundle.signed.submission.runs[0].artefact.sha256
-    refused(
-        "too_large",
-        f"at most {MAX_ARTEFACT_BYTES:,} bytes. Submit a smaller network.",
-        bundle.artefact,
-        digest,
-    )
-
-
-@pytest.fixture(params=["relative to folders", "by path"])
-def reading(request, monkeypatch):
-    """Each test that takes it runs with and without the calls that Windows lacks."""
-    if request.param == "by path":
-        monkeypatch.setattr(os, "supports_dir_fd", set())
+    data = path.read_bytes()
+    for changed in (data[:-1], data[:-1] + b"\xff"):
+        path.write_bytes(changed)
+        match = "must be .* bytes of sha256:"
+        refused("artefact_digest", match, bundle.artefact, digest_of(bundle))
+    path.write_bytes(data)
+    submission = bundle.signed.submission.to_dict()
+    submission["runs"][0]["artefact"]["size"] = 5
+    lying = Bundle(bundle.folder, Submission.from_dict(submission).signed(KEY))
+    refused("artefact_digest", "must be 5 bytes", lying.artefact, digest_of(bundle))
 
 
 def replaced_by_link(path, target):
@@ -180,52 +176,37 @@ def replaced_by_nowhere(path, target):
     path.symlink_to(target / "absent")
 
 
-@pytest.mark.parametrize(
-    "replace", [replaced_by_link, replaced_by_folder, replaced_by_pipe, replaced_by_nowhere]
-)
-def test_only_regular_files_are_read(bundle, tmp_path, reading, replace):
-    assert Bundle.read(bundle.folder) == bundle
-    digest = bundle.signed.submission.runs[0].artefact.sha256
-    replace(artefact_path(bundle), tmp_path / "elsewhere" / "policy.onnx")
-    refused("artefact_path", "must be a regular file inside the bundle", bundle.artefact, digest)
-    replace(bundle.folder / "submission.json", tmp_path / "elsewhere" / "submission.json")
-    refused("artefact_path", "must be a regular file", Bundle.read, bundle.folder)
-
-
-def test_a_folder_of_artefacts_that_is_a_link_is_refused(bundle, tmp_path, reading):
+@pytest.mark.parametrize("has_dir_fd", [True, False])
+def test_only_regular_files_are_read(tmp_path, whole, monkeypatch, has_dir_fd):
+    if not has_dir_fd:  # the calls that Windows lacks
+        monkeypatch.setattr(os, "supports_dir_fd", set())
+    match = "must be a regular file inside the bundle"
+    for replace in (replaced_by_link, replaced_by_folder, replaced_by_pipe, replaced_by_nowhere):
+        home = tmp_path / replace.__name__
+        bundle = Bundle.read(shutil.copytree(whole.folder, home / "bundle"))
+        assert bundle.signed == whole.signed
+        replace(artefact_path(bundle), home / "elsewhere" / "policy.onnx")
+        refused("artefact_path", match, bundle.artefact, digest_of(bundle))
+        replace(bundle.folder / "submission.json", home / "elsewhere" / "submission.json")
+        refused("artefact_path", match, Bundle.read, bundle.folder)
+    bundle = Bundle.read(shutil.copytree(whole.folder, tmp_path / "bundle"))
     replaced_by_link(bundle.folder / "artefacts", tmp_path / "elsewhere" / "artefacts")
-    digest = bundle.signed.submission.runs[0].artefact.sha256
-    refused("artefact_path", "must be a regular file inside the bundle", bundle.artefact, digest)
+    refused("artefact_path", match, bundle.artefact, digest_of(bundle))
 
 
 # --- making ------------------------------------------------------------------------------------
 
 
-def test_a_table_becomes_a_signed_submission(bundle):
-    submission = bundle.signed.submission
-    assert submission.suite.name == "two-v1"
-    assert submission.suite.digest == SUITE.digest
-    assert submission.submitter.key == KEY.public
-    assert (submission.method.name, submission.method.family) == ("Mine", "Mine")
-    assert [run.spec for run in submission.runs] == [A0.digest, A1.digest, B0.digest]
-    assert submission.runs[2].artefact is None
-    assert submission.runs_started == {"A": 2, "B": 1}
-    assert submission.training == Training()
-    names = {path.stem for path in (bundle.folder / "artefacts").iterdir()}
-    assert names == {hashlib.sha256(optimal_onnx(spec)).hexdigest() for spec in (A0, A1)}
-
-
-def test_more_runs_may_have_been_started(tmp_path, table):
-    assert made(tmp_path / "b", table, runs_started={"B": 7}).signed.submission.runs_started == {
-        "A": 2,
-        "B": 7,
-    }
-
-
-def test_progress_counts_the_runs(tmp_path, table):
+def test_progress_counts_the_runs_and_more_may_have_been_started(tmp_path, table):
     seen = []
-    made(tmp_path / "bundle", table, progress=lambda *counts: seen.append(counts))
+    bundle = made(
+        tmp_path / "bundle",
+        table,
+        runs_started={"B": 7},
+        progress=lambda *counts: seen.append(counts),
+    )
     assert seen == [(1, 3), (2, 3), (3, 3)]
+    assert bundle.signed.submission.runs_started == {"A": 2, "B": 7}
 
 
 def test_specs_of_a_table_may_be_ids_digests_or_paths(tmp_path, table):
@@ -277,37 +258,39 @@ def test_trained_runs_are_exported_with_their_records(tmp_path, trained, failed)
     assert sorted(path.name for path in bundle.folder.iterdir()) == ["artefacts", "submission.json"]
 
 
-def test_a_saved_model_may_stand_in_a_table(tmp_path, trained, table):
+def test_a_saved_model_may_stand_in_a_table_and_facts_that_are_given_are_taken(
+    tmp_path, trained, table
+):
     shutil.copy(trained / "A2C" / "0" / "model.zip", table.parent)
     rows = [row(A0, "model.zip", 7), row(A1, None), row(B0, None)]
-    bundle = made(tmp_path / "bundle", rewritten(table, rows))
-    assert bundle.artefact(bundle.signed.submission.runs[0].artefact.sha256)
-
-
-def test_facts_that_are_given_are_taken(tmp_path, trained, failed):
     facts = Training(library="own", hyperparameters="own", hardware="a laptop")
-    bundle = made(tmp_path / "bundle", trained, failed, training=facts)
+    bundle = made(tmp_path / "bundle", rewritten(table, rows), training=facts)
+    assert bundle.artefact(digest_of(bundle))
     assert bundle.signed.submission.training == facts
 
 
-def test_facts_are_cut_to_what_a_submission_holds(tmp_path, trained, failed):
+def test_records_of_runs_are_cut_and_unfinished_repeated_or_missing_runs_refused(
+    tmp_path, trained, failed
+):
     copied = shutil.copytree(trained, tmp_path / "copied")
     folder = copied / "A2C" / "0"
-    record = RunRecord.read(folder)
-    record.updated(hyperparameters={"x": "x" * 3000}, versions={"torch": "y" * 300}).write(folder)
-    facts = made(tmp_path / "bundle", copied, failed).signed.submission.training
-    assert len(facts.hyperparameters) == 2000
+    long = {"hyperparameters": {"x": "x" * 3000}, "versions": {"torch": "y" * 300}}
+    RunRecord.read(folder).updated(**long).write(folder)
+    facts = made(tmp_path / "long", copied, failed).signed.submission.training
+    assert len(facts.hyperparameters) == 2000  # what a submission holds
     assert len(facts.library) == 200
 
-
-def test_a_run_that_has_not_finished_is_refused(tmp_path, trained):
-    copied = shutil.copytree(trained, tmp_path / "runs")
-    folder = copied / "A2C" / "0"
     RunRecord.read(folder).updated(status="running").write(folder)
     nothing_is_left(tmp_path, OptionError, "0: contains an unfinished run", copied)
     RunRecord.read(folder).updated(status="finished").write(folder)
     (folder / "model.zip").unlink()
     nothing_is_left(tmp_path, OptionError, "0: contains an unfinished run", copied)
+
+    match = r"A2C/0: seed=3: .*A2C/0 has the same"
+    nothing_is_left(tmp_path, Rejection, match, trained, trained, failed)
+    match = f"missing_run: runs: none on {A0.digest}.*policy null"
+    nothing_is_left(tmp_path, Rejection, match, trained, failed, algorithm="TD3")
+    assert made(tmp_path / "bundle", trained, failed, algorithm="a2c")
 
 
 # --- what cannot be made leaves nothing --------------------------------------------------------
@@ -369,10 +352,10 @@ def test_a_policy_above_the_limit_is_refused(tmp_path, table):
     nothing_is_left(tmp_path, Rejection, "too_large: .*runs.json, run 1", table)
 
 
-@pytest.mark.parametrize("path", ["absent", "absent.json", "empty"])
-def test_a_path_that_is_no_run_is_refused(tmp_path, path):
+def test_a_path_that_is_no_run_is_refused(tmp_path):
     (tmp_path / "empty").mkdir()
-    nothing_is_left(tmp_path, OptionError, f"runs='.*{path}': must be", tmp_path / path)
+    for path in ("absent", "absent.json", "empty"):
+        nothing_is_left(tmp_path, OptionError, f"runs='.*{path}': must be", tmp_path / path)
 
 
 @pytest.mark.parametrize(
@@ -380,79 +363,58 @@ def test_a_path_that_is_no_run_is_refused(tmp_path, path):
     [
         ({"method": "<b>"}, Rejection, "unsafe_name: method.name"),
         ({"submitter": ""}, SpecError, "submitter.name=''"),
-        (
-            {"code": "http://plain.org"},
-            SpecError,
-            "code='http://plain.org': must be an https:",
-        ),
+        ({"code": "http://plain.org"}, SpecError, "code='http://plain.org': must be an https:"),
         ({"code": 3}, SpecError, "code=3: must be an https:// link"),
         ({"code": "https://a b"}, SpecError, "code='https://a b': must be an https:// link"),
         ({"code": "https://" + "a" * 293}, SpecError, "code='https://a+…: must be .* at most 300"),
         ({"runs_started": {"C": 1}}, Rejection, "missing_run: runs_started.C"),
         ({"runs_started": {"A": 1}}, Rejection, "missing_run: runs_started.A=1"),
         ({"knowledge": "all"}, SpecError, "knowledge='all'"),
+        ({"runs": 600}, Rejection, "too_large: submission.json: .* List fewer runs"),
     ],
 )
 def test_what_the_board_would_refuse_is_refused_before_exporting(
     tmp_path, table, fields, error, match
 ):
-    seen = []
+    seen, fields = [], dict(fields)
+    count = fields.pop("runs", 0) // 3
+    if count:
+        rows = [row(spec, "a0.onnx", seed) for spec in SUITE.instances for seed in range(count)]
+        rewritten(table, rows)
     nothing_is_left(
         tmp_path, error, match, table, progress=lambda *counts: seen.append(counts), **fields
     )
     assert seen == []
 
 
-def test_a_submission_of_too_many_runs_is_refused_before_exporting(tmp_path, table):
-    rows = [row(spec, "a0.onnx", seed) for spec in SUITE.instances for seed in range(200)]
-    seen = []
-    nothing_is_left(
-        tmp_path,
-        Rejection,
-        "too_large: submission.json: .* List fewer runs",
-        rewritten(table, rows),
-        progress=lambda *counts: seen.append(counts),
-    )
-    assert seen == []
-
-
-def test_an_existing_bundle_is_replaced_only_with_force(tmp_path, table, bundle):
+def test_an_existing_bundle_is_replaced_only_with_force_and_as_a_whole(tmp_path, table, bundle):
     with pytest.raises(OptionError, match="bundle already exists"):
         made(bundle.folder, table, method="Other")
+    (table.parent / "a1.onnx").write_bytes(b"no model")
+    with pytest.raises(Rejection):
+        made(bundle.folder, table, force=True)
     assert Bundle.read(bundle.folder) == bundle
+    write_table(table.parent)
     again = made(bundle.folder, table, method="Other", force=True)
     assert Bundle.read(bundle.folder).signed == again.signed != bundle.signed
     assert {path.name for path in tmp_path.iterdir()} == {"runs", "bundle"}
 
 
-def test_a_bundle_that_was_there_stays_where_making_another_fails(table, bundle):
-    (table.parent / "a1.onnx").write_bytes(b"no model")
-    with pytest.raises(Rejection):
-        made(bundle.folder, table, force=True)
+def test_what_is_no_bundle_is_never_replaced(tmp_path, table, bundle):
+    file, folder, link = (tmp_path / name for name in ("file", "folder", "link"))
+    file.write_text("all of it")
+    folder.mkdir()
+    (folder / "thesis.tex").write_text("all of it")
+    link.symlink_to(bundle.folder)
+    for target in (file, folder, link):
+        match = f"{target.name}: is not a bundle, or contains other files"
+        with pytest.raises(OptionError, match=match):
+            made(target, table, force=True)
+    assert link.is_symlink()
     assert Bundle.read(bundle.folder) == bundle
-
-
-@pytest.mark.parametrize("kind", ["folder", "file", "link"])
-def test_what_is_no_bundle_is_never_replaced(tmp_path, table, bundle, kind):
-    target = tmp_path / "mine"
-    if kind == "folder":
-        target.mkdir()
-        (target / "thesis.tex").write_text("all of it")
-    elif kind == "file":
-        target.write_text("all of it")
-    else:
-        target.symlink_to(bundle.folder)
-    with pytest.raises(OptionError, match="mine: is not a bundle, or contains other files"):
-        made(target, table, force=True)
-    assert target.is_symlink() == (kind == "link")
-    assert Bundle.read(bundle.folder) == bundle
-    assert kind != "folder" or (target / "thesis.tex").read_text() == "all of it"
-
-
-def test_a_folder_that_cannot_be_written_to_is_refused(tmp_path, table):
-    (tmp_path / "file").write_text("in the way")
+    assert file.read_text() == (folder / "thesis.tex").read_text() == "all of it"
     with pytest.raises(SMEError, match="cannot be written"):
-        made(tmp_path / "file" / "bundle", table)
+        made(file / "bundle", table)
 
 
 def test_the_constant_policy_may_stand_for_two_instances_of_one_width(tmp_path, table):
@@ -491,19 +453,15 @@ def test_the_runs_of_a_study_are_submitted_with_their_records(tmp_path, study):
     assert "stable_baselines3" in submission.training.library
     assert submission.training.hyperparameters.startswith("A2C, default hyperparameters")
     assert made(tmp_path / "same", study, algorithm="a2c").signed.submission.runs
-
-
-def test_a_study_that_is_not_finished_or_has_no_such_algorithm_is_refused(tmp_path, study):
     with pytest.raises(OptionError, match=r"4 of 4 runs are not finished"):
-        made(tmp_path / "bundle", study, algorithm="Other")
+        made(tmp_path / "other", study, algorithm="Other")
     with pytest.raises(OptionError, match=r"algorithm='TD3': .* has runs of A2C"):
-        made(tmp_path / "bundle", study, algorithm="TD3")
-    assert not (tmp_path / "bundle").exists()
+        made(tmp_path / "other", study, algorithm="TD3")
+    assert not (tmp_path / "other").exists()
 
 
 def test_a_failed_run_of_a_study_is_submitted_without_a_policy(tmp_path, study):
-    copy = tmp_path / "copy"
-    shutil.copytree(study, copy)
+    copy = shutil.copytree(study, tmp_path / "copy")
     result = next((copy / "cells").iterdir())
     cell = CellResult.from_dict(json.loads(result.read_text()))
     failure = CellFailure(key=cell.key, cell=cell.cell, error="diverged", traceback="", versions={})
@@ -513,22 +471,6 @@ def test_a_failed_run_of_a_study_is_submitted_without_a_policy(tmp_path, study):
     runs = made(tmp_path / "bundle", copy).signed.submission.runs
     failed = [run for run in runs if run.artefact is None]
     assert [(run.spec, run.seed) for run in failed] == [(cell.cell.spec.digest, cell.cell.seed)]
-
-
-def test_a_study_without_models_is_refused(tmp_path, study):
-    copy = tmp_path / "copy"
-    shutil.copytree(study, copy)
     shutil.rmtree(copy / "models")
     with pytest.raises(OptionError, match="--keep-models"):
-        made(tmp_path / "bundle", copy)
-
-
-def test_an_algorithm_selects_among_the_folders_of_trained_runs(tmp_path, trained, failed):
-    with pytest.raises(Rejection, match=f"missing_run: runs: none on {A0.digest}.*policy null"):
-        made(tmp_path / "bundle", trained, failed, algorithm="TD3")
-    assert made(tmp_path / "bundle", trained, failed, algorithm="a2c")
-
-
-def test_a_run_that_is_listed_twice_is_named_by_its_source(tmp_path, trained, failed):
-    with pytest.raises(Rejection, match=r"A2C/0: seed=3: .*A2C/0 has the same"):
-        made(tmp_path / "bundle", trained, trained, failed)
+        made(tmp_path / "without", copy)
