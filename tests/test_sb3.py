@@ -32,11 +32,21 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sme_registry.sb3 import SMETeamVecEnv, SMEVecEnv
+from sme_registry.testing.comparing import expect_same
 
 # Ends early and late, pays late, and its lanes drift apart.
 HARD = sme_registry.SMESpec(horizon=12, k=5, D=0.2, r_min=0.1, complexity=2, seed=4)
 # Many a last step is terminated and truncated at once, or either alone.
 BOTH = sme_registry.SMESpec(horizon=2, k=5, D=0.5)
+DRIVEN = sme_registry.SMESpec(
+    horizon=20, D=0.2, observation={"distractors": 5, "dynamics": "driven", "mixing": "nonlinear"}
+)
+
+
+def assert_same(got: Any, expected: Any) -> None:
+    """Equal in every bit and type."""
+    expect_same("ours", got, expected)
+    expect_same("theirs", expected, got)
 
 
 def dummy(spec: Any = HARD, lanes: int = 3, **kwargs: Any) -> DummyVecEnv:
@@ -44,30 +54,10 @@ def dummy(spec: Any = HARD, lanes: int = 3, **kwargs: Any) -> DummyVecEnv:
     return DummyVecEnv([lambda: sme_registry.make(spec, **kwargs)] * lanes)
 
 
-def assert_same(got: Any, expected: Any) -> None:
-    """Equal in every bit and type."""
-    assert type(got) is type(expected)
-    if isinstance(got, np.ndarray):
-        assert got.dtype == expected.dtype
-        np.testing.assert_array_equal(got, expected)
-    elif isinstance(got, dict):
-        assert got.keys() == expected.keys()
-        for key in got:
-            assert_same(got[key], expected[key])
-    elif isinstance(got, list | tuple):
-        assert len(got) == len(expected)
-        for mine, other in zip(got, expected, strict=True):
-            assert_same(mine, other)
-    elif isinstance(got, np.generic):
-        np.testing.assert_array_equal(got, expected)
-    else:
-        assert got == expected
-
-
 @pytest.mark.parametrize(
     ("spec", "action_range"),
-    [(HARD, "unit"), (BOTH, "symmetric"), ("HardFragile", "symmetric")],
-    ids=["hard", "both-flags", "HardFragile"],
+    [(HARD, "unit"), (BOTH, "symmetric"), ("HardSafeMixed", "symmetric"), (DRIVEN, "symmetric")],
+    ids=["hard", "both-flags", "HardSafeMixed", "driven"],
 )
 def test_every_number_is_that_of_a_dummy_vec_env_of_singles(spec: Any, action_range: Any) -> None:
     ours = SMEVecEnv(spec, 3, action_range=action_range)
@@ -87,7 +77,12 @@ def test_every_number_is_that_of_a_dummy_vec_env_of_singles(spec: Any, action_ra
         assert_same(got, expected)
         assert_same(ours.reset_infos, theirs.reset_infos)
         ends += int(got[2].sum())
-    assert ends >= 6
+        assert_same(ours.get_attr("distractors"), theirs.get_attr("distractors"))
+    assert ends >= 3
+    for env in (ours, theirs):
+        env.set_options({"state": np.full(8, 0.5)})
+        if spec is DRIVEN:
+            env.set_options({"distractors": np.full(5, 0.5)})
     assert_same(ours.reset(), theirs.reset())
 
 

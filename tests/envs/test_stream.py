@@ -287,23 +287,6 @@ def test_a_stream_of_one_phase_has_the_numbers_of_its_task() -> None:
                 expect_same("reset", env.reset()[0], plain.reset()[0])
 
 
-def test_returned_arrays_are_fresh_and_writing_into_them_moves_nothing() -> None:
-    spec = stream("step", D=0.0, observes_phase=True)
-    for make in (SMEStreamEnv, functools.partial(SMEStreamVectorEnv, num_envs=2)):
-        env, clean = make(spec), make(spec)
-        env.reset(seed=0)
-        clean.reset(seed=0)
-        action = np.full(env.action_space.shape, 0.4, np.float32)
-        for _ in range(90):
-            step, expected = env.step(action), clean.step(action)
-            expect_same("step", step, expected)
-            for array in (step[0], *step[4].values()):
-                if isinstance(array, np.ndarray) and array.ndim:
-                    array[...] = 1
-            if isinstance(env, SMEStreamEnv) and expected[3]:
-                expect_same("reset", env.reset(), clean.reset())
-
-
 @pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
 def test_fields_of_specs_are_refused_with_the_way_to_another_stream(make: Any) -> None:
     with pytest.raises(UnexpectedKeywordError, match=r"'complexity' for a stream.*spec\.derive"):

@@ -35,13 +35,9 @@ def words(text: str) -> str:
     return f" {' '.join(re.sub('[│╭╮╰╯─]', ' ', text).split())} "
 
 
-@pytest.mark.parametrize("width", [80, 200])
 @pytest.mark.parametrize(("program", "path", "command"), COMMANDS)
-def test_help_shows_its_source_unchanged(
-    program: str, path: tuple[str, ...], command: Any, width: int
-) -> None:
-    settings = {"COLUMNS": str(width)}
-    result = CliRunner().invoke(APPS[program], [*path, "--help"], env=settings)
+def test_help_shows_its_source_unchanged(program: str, path: tuple[str, ...], command: Any) -> None:
+    result = CliRunner().invoke(APPS[program], [*path, "--help"], env={"COLUMNS": "80"})
     shown = words(result.stdout)
     source = inspect.getdoc(command.callback) if path and not hasattr(command, "commands") else None
     for paragraph in (source or Text.from_markup(command.help).plain).split("\n\n"):
@@ -52,14 +48,11 @@ def test_help_shows_its_source_unchanged(
             assert f" {word} " in shown  # a longer word would be cut: use a shorter one
 
 
-def test_examples_are_lines_without_empty_ones_between() -> None:
+def test_examples_are_lines_without_empty_ones_between_and_a_suggestion_has_one_mark() -> None:
     lines = CliRunner().invoke(sme, ["list", "--help"], env={"COLUMNS": "80"}).stdout.splitlines()
     start = lines.index(next(line for line in lines if line.strip() == "Examples:"))
     examples = [line.strip() for line in lines[start + 1 : start + 5]]
     assert [text.partition(" ")[0] for text in examples] == ["", "sme", "sme", "sme"]
-
-
-def test_a_suggestion_ends_with_one_mark() -> None:
     message = CliRunner().invoke(sme, ["shwo"]).stderr
     assert "Did you mean 'show'? See `sme --help`." in message
 

@@ -15,13 +15,10 @@ def test_every_text_is_escaped() -> None:
     assert html.count("&lt;script&gt;") == 8
 
 
-def test_bold_text_indentation_and_line_breaks_are_kept() -> None:
+def test_bold_text_indentation_line_breaks_and_sections_are_kept() -> None:
     html = table_html(Table("", {"a": "text"}, [("  [bold]x<y[/] z\n[red]new[/]",)]))
     assert "<caption><b>one</b><br>two</caption>" in table_html(Table("one\ntwo", {"a": "name"}))
     assert "&nbsp;&nbsp;<b>x&lt;y</b> z<br>new" in html
-
-
-def test_a_bold_row_and_sections_are_marked() -> None:
     table = Table("", {"a": "name", "b": "number"})
     table.add_row("one", "1", style="bold")
     table.add_section()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -11,52 +12,46 @@ from rich.console import Console
 from sme_registry.terminal import Progress, duration, duration_range, err
 
 
-def test_without_a_terminal_it_prints_lines() -> None:
-    text = io.StringIO()
+def test_without_a_terminal_it_prints_lines_and_in_one_it_draws_a_bar() -> None:
+    text, bar, silent = io.StringIO(), io.StringIO(), io.StringIO()
     with Progress("training", 10, console=Console(file=text, width=200)) as progress:
         progress.update(4, "note")
         progress.update(10, "note")
     (line,) = text.getvalue().splitlines()
     assert line.startswith("training: 10 of 10 steps")
     assert line.endswith("done · note")
-
-
-def test_in_a_terminal_it_draws_a_bar() -> None:
-    text = io.StringIO()
-    console = Console(file=text, force_terminal=True, width=160)
+    console = Console(file=bar, force_terminal=True, width=160)
     with Progress("training", 10, console=console) as progress:
         progress.update(10, "mean regret 0.5")
-    assert "mean regret 0.5" in text.getvalue()
-    assert "10 of 10 steps" in text.getvalue()
+    assert "mean regret 0.5" in bar.getvalue()
+    assert "10 of 10 steps" in bar.getvalue()
+    with Progress("training", 10, console=Console(file=silent), enabled=False) as progress:
+        progress.update(10)
+    with Progress("scoring", 0, console=Console(file=silent)):
+        pass
+    assert silent.getvalue() == ""
 
 
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [(0.4, "0 s"), (59, "59 s"), (61, "1 min 1 s"), (7500, "2 h 5 min"), (302_400, "3.5 days")],
-)
-def test_durations_are_in_words(seconds: float, words: str) -> None:
-    assert duration(seconds) == words
-
-
-def test_two_equal_bounds_are_one_duration() -> None:
+def test_durations_are_in_words() -> None:
+    for seconds, words in (
+        (0.4, "0 s"), (59, "59 s"), (61, "1 min 1 s"), (7500, "2 h 5 min"), (302_400, "3.5 days"),
+    ):  # fmt: skip
+        assert duration(seconds) == words
     assert duration_range(60, 60.2) == "1 min 0 s"
     assert duration_range(60, 7500) == "1 min 0 s to 2 h 5 min"
 
 
-class Clock:
-    """Time as a test sets it."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.now = 0.0
-        monkeypatch.setattr("sme_registry.terminal.progress.time.monotonic", lambda: self.now)
-
-
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    return Clock(monkeypatch)
+def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """Time as a test sets it."""
+    clock = SimpleNamespace(now=0.0)
+    monkeypatch.setattr("sme_registry.terminal.progress.time.monotonic", lambda: clock.now)
+    return clock
 
 
-def test_what_precedes_the_first_steps_is_shown_at_once_and_slows_no_estimate(clock: Clock) -> None:
+def test_what_precedes_the_first_steps_is_shown_at_once_and_slows_no_estimate(
+    clock: SimpleNamespace,
+) -> None:
     text = io.StringIO()
     with Progress("training", 100, console=Console(file=text, width=200)) as progress:
         progress.prepare("compiling …")
@@ -77,43 +72,43 @@ def test_what_precedes_the_first_steps_is_shown_at_once_and_slows_no_estimate(cl
     ]
 
 
-@pytest.mark.parametrize(("unit", "one"), [("steps", "step"), ("entries", "entry")])
-def test_a_slow_rate_names_one_of_the_unit(clock: Clock, unit: str, one: str) -> None:
-    text = io.StringIO()
-    with Progress("scoring", 10, console=Console(file=text, width=200), unit=unit) as progress:
-        for done in (1, 2):
-            clock.now += 30.0
-            progress.update(done)
-    assert f"30 s per {one} " in text.getvalue()
+def test_a_slow_rate_names_one_of_the_unit(clock: SimpleNamespace) -> None:
+    for unit, one in (("steps", "step"), ("entries", "entry")):
+        text = io.StringIO()
+        with Progress("scoring", 10, console=Console(file=text, width=200), unit=unit) as progress:
+            for done in (1, 2):
+                clock.now += 30.0
+                progress.update(done)
+        assert f"30 s per {one} " in text.getvalue()
 
 
-@pytest.mark.parametrize(("hours", "most"), [(0.05, 7), (1, 20), (24, 25), (24 * 30, 30)])
+@pytest.mark.parametrize(("hours", "most"), [(0.05, 7), (1, 20), (24 * 30, 30)])
 def test_a_log_stays_short_however_long_the_job_takes(
-    clock: Clock, hours: float, most: int
+    clock: SimpleNamespace, hours: float, most: int
 ) -> None:
     text, seconds = io.StringIO(), int(hours * 3600)
     with Progress("training", seconds, console=Console(file=text, width=200)) as progress:
-        for second in range(0, seconds + 1, max(1, seconds // 20_000)):
+        for second in range(0, seconds + 1, max(1, seconds // 10_000)):
             clock.now = float(second)
             progress.update(second)
     lines = text.getvalue().splitlines()
     assert 5 <= len(lines) <= most
     done = [int(line.split()[1].replace(",", "")) for line in lines]
-    assert done[0] <= max(10, seconds // 10_000)  # the first line comes early
+    assert done[0] <= max(10, seconds // 5_000)  # the first line comes early
     steps = [later - earlier for earlier, later in pairwise(done)]
     assert max(steps) <= max(120, 0.11 * seconds)  # no long silence
 
 
-def test_a_job_that_stands_still_prints_ever_less(clock: Clock) -> None:
+def test_a_job_that_stands_still_prints_ever_less(clock: SimpleNamespace) -> None:
     text = io.StringIO()
     with Progress("study", 9, console=Console(file=text, width=200)) as progress:
-        for second in range(100_000):
+        for second in range(0, 100_000, 10):
             clock.now = float(second)
             progress.update(1)
     assert len(text.getvalue().splitlines()) <= 15
 
 
-def test_running_parts_are_named_in_a_line(clock: Clock) -> None:
+def test_running_parts_are_named_in_a_line(clock: SimpleNamespace) -> None:
     text = io.StringIO()
     console = Console(file=text, width=200)
     with Progress("study", 9, unit="cells", console=console, seconds_left=lambda: 61.0) as progress:
@@ -128,15 +123,6 @@ def test_running_parts_are_named_in_a_line(clock: Clock) -> None:
     )
     assert expected + "(compiling), and 2 more" in text.getvalue()
     assert "cell 4" not in text.getvalue().splitlines()[-1]
-
-
-def test_nothing_is_printed_where_nothing_is_to_be_shown_or_done() -> None:
-    text = io.StringIO()
-    with Progress("training", 10, console=Console(file=text), enabled=False) as progress:
-        progress.update(10)
-    with Progress("scoring", 0, console=Console(file=text)):
-        pass
-    assert text.getvalue() == ""
 
 
 def test_in_a_pipe_colours_can_be_forced_but_not_bars(
