@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sme_registry import evaluate, materialize
+from sme_registry import evaluate, make, materialize
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation import Perceptron, regions
 from sme_registry.evaluation.observation import probe_layers
@@ -80,30 +80,24 @@ def test_invariance_is_that_of_the_definition(report):
         assert each.invariance == pytest.approx(0.2 / 3 / half, rel=0.03)
 
 
-def test_distractors_outside_the_cube_leave_the_states_inside(report):
+def test_distractors_outside_the_cube_leave_the_states_inside_and_are_scored_by_the_definition():
     shown = []
-    evaluate(lambda o: shown.append(o[:, :-2]) or ignorant(o), SPEC, PROTOCOL)
+    report = evaluate(lambda o: shown.append(o) or distracted(o), SPEC, PROTOCOL)
     # In WD: the states, other distractors, and distractors in each of the shells.
-    inside, other, *outside = shown[:4]
+    inside, other, *outside = (o[:, :-2] for o in shown[:4])
     np.testing.assert_array_equal(inside[:, :S], other[:, :S])
     assert (inside[:, S:] != other[:, S:]).all()
-    for x, (low, high) in zip(outside, PROTOCOL.edges[1:], strict=True):
+    optimal = materialize(SPEC).optimal_action(drawn(0)[0])
+    half = np.abs(0.5 - optimal).mean()
+    scores = report.observation.distractor_regions
+    assert [region.name for region in scores] == ["d-OOD 1", "d-OOD 2"]
+    for x, (low, high), score in zip(outside, PROTOCOL.edges[1:], scores, strict=True):
         np.testing.assert_array_equal(x[:, :S], inside[:, :S])
         E = expansion(x[:, S:].astype(np.float64))
         assert ((low < E) & (high >= E)).all()
-    names = [region.name for region in report.observation.distractor_regions]
-    assert names == ["d-OOD 1", "d-OOD 2"]
-
-
-def test_regret_with_distractors_outside_is_that_of_the_definition():
-    shown = []
-    report = evaluate(lambda o: shown.append(o) or distracted(o), SPEC, PROTOCOL)
-    optimal = materialize(SPEC).optimal_action(drawn(0)[0])
-    for o, region in zip(shown[2:4], report.observation.distractor_regions, strict=True):
-        missed = np.abs(np.clip(distracted(o), 0.0, 1.0) - optimal).mean()
-        assert region.mae == pytest.approx(missed, abs=1e-7)
-        half = np.abs(0.5 - optimal).mean()
-        assert region.normalised_regret == pytest.approx(missed / half, abs=1e-6)
+        missed = np.abs(np.clip(distracted(x), 0.0, 1.0) - optimal).mean()
+        assert score.mae == pytest.approx(missed, abs=1e-7)
+        assert score.normalised_regret == pytest.approx(missed / half, abs=1e-6)
 
 
 @pytest.mark.parametrize("mixing", ["none", "orthogonal", "nonlinear"])
@@ -179,93 +173,85 @@ def test_a_nonlinear_mixing_is_what_a_linear_map_cannot_undo():
     assert 0.85 < seen.distractor_r2 < 0.97
 
 
-def test_torch_modules_and_models_have_the_probes_of_their_layers():
+def module(forward, *layers):
+    """A PyTorch module of these layers, whose forward pass calls them as it likes."""
     torch = pytest.importorskip("torch")
-    sb3 = pytest.importorskip("stable_baselines3")
-    gym = pytest.importorskip("gymnasium")
 
-    class Functional(torch.nn.Module):
+    class Module(torch.nn.Module):
         def __init__(self):
             super().__init__()
-            self.first, self.second = torch.nn.Linear(S + M + 2, 7), torch.nn.Linear(7, 6)
-            self.mean, self.spread = torch.nn.Linear(6, A), torch.nn.Linear(6, A)
+            self.layers = torch.nn.ModuleList(layers)
 
         def forward(self, o):
-            h = torch.relu(self.second(torch.tanh(self.first(o))))
-            return self.mean(h) + 0.0 * self.spread(h)
+            return forward(o, *self.layers)
 
+    return Module()
+
+
+def test_torch_modules_have_the_probes_of_their_layers():
+    torch = pytest.importorskip("torch")
+    Linear = torch.nn.Linear
     torch.manual_seed(0)
-    module = Functional()
-    probes = evaluate(module, SPEC, PROTOCOL).observation.probes
+    first, second, mean = Linear(S + M + 2, 7), Linear(7, 6), Linear(6, A)
+
+    def forward(o, first, second, mean, spread):
+        h = torch.relu(second(torch.tanh(first(o))))
+        return mean(h) + 0.0 * spread(h)
+
+    chain = module(forward, first, second, mean, Linear(6, A))
+    probes = evaluate(chain, SPEC, PROTOCOL).observation.probes
     assert [(probe.layer, probe.units) for probe in probes] == [(0, S + M), (1, 7), (2, 6)]
     arrays = [
         (layer.weight.T.detach().numpy(), layer.bias.detach().numpy(), activation)
-        for layer, activation in (
-            (module.first, "tanh"), (module.second, "relu"), (module.mean, "identity"),
-        )
-    ]  # fmt: skip
+        for layer, activation in ((first, "tanh"), (second, "relu"), (mean, "identity"))
+    ]
     same = evaluate(Perceptron(arrays), SPEC, PROTOCOL).observation.probes
     for one, other in zip(probes, same, strict=True):
         assert one.state_r2 == pytest.approx(other.state_r2, abs=1e-5)
         assert one.distractor_r2 == pytest.approx(other.distractor_r2, abs=1e-5)
 
-    class Spaces(gym.Env):
-        observation_space = gym.spaces.Box(0.0, 1.0, (SPEC.observation_dim,))
-        action_space = gym.spaces.Box(0.0, 1.0, (A,))
 
-    for algorithm, widths in (("PPO", [64, 64]), ("SAC", [256, 256]), ("TD3", [400, 300])):
-        space = {"action_space": gym.spaces.Box(-1.0, 1.0, (A,))} if algorithm != "PPO" else {}
-        env = type("Env", (Spaces,), space)()
-        model = getattr(sb3, algorithm)("MlpPolicy", env, seed=0, device="cpu")
-        probes = evaluate(model, SPEC, PROTOCOL).observation.probes
-        assert [probe.units for probe in probes] == [S + M, *widths]
-        assert all(-0.1 < probe.state_r2 <= 1.0 for probe in probes)
+@pytest.mark.parametrize(
+    ("name", "widths"), [("PPO", [64, 64]), ("SAC", [256, 256]), ("TD3", [400, 300])]
+)
+def test_models_have_the_probes_of_their_layers(name, widths):
+    sb3 = pytest.importorskip("stable_baselines3")
+    action_range = "unit" if name == "PPO" else "symmetric"
+    env = make(SPEC, action_range=action_range)
+    model = getattr(sb3, name)("MlpPolicy", env, seed=0, device="cpu")
+    probes = evaluate(model, SPEC, PROTOCOL).observation.probes
+    assert [probe.units for probe in probes] == [S + M, *widths]
+    assert all(-0.1 < probe.state_r2 <= 1.0 for probe in probes)
 
 
 def test_torch_modules_whose_linear_layers_form_no_chain_have_no_probes():
     torch = pytest.importorskip("torch")
-    nn = torch.nn
-    entries = SPEC.observation_dim
+    nn, entries = torch.nn, SPEC.observation_dim
 
-    class Tokens(nn.Module):  # each entry of the observation is a row
-        def __init__(self):
-            super().__init__()
-            self.embed, self.head = nn.Linear(1, 4), nn.Linear(4 * entries, A)
+    def mlp():
+        return nn.Sequential(nn.Linear(entries, 8), nn.ReLU(), nn.Linear(8, A))
 
-        def forward(self, o):
-            return torch.sigmoid(self.head(self.embed(o[..., None]).flatten(1)))
+    def tokens(o, embed, head):  # each entry of the observation is a row
+        return torch.sigmoid(head(embed(o[..., None]).flatten(1)))
 
-    class Rows(nn.Module):  # one call for each state
-        def __init__(self):
-            super().__init__()
-            self.network = nn.Sequential(nn.Linear(entries, 8), nn.ReLU(), nn.Linear(8, A))
+    def rows(o, network):  # one call for each state
+        return torch.stack([network(row) for row in o])
 
-        def forward(self, o):
-            return torch.stack([self.network(row) for row in o])
+    def branches(o, one, other, head):  # the second one's input is no output of the first
+        return head(torch.relu(torch.cat([one(o[:, :M]), other(o[:, M : 2 * M])], dim=1)))
 
-    class Branches(nn.Module):  # the second one's input is no output of the first
-        def __init__(self):
-            super().__init__()
-            self.state, self.distractors = nn.Linear(M, M), nn.Linear(M, M)
-            self.head = nn.Linear(2 * M, A)
-
-        def forward(self, o):
-            h = [self.state(o[:, :M]), self.distractors(o[:, M : 2 * M])]
-            return self.head(torch.relu(torch.cat(h, dim=1)))
-
-    class Towers(nn.Module):  # two networks side by side
-        def __init__(self):
-            super().__init__()
-            self.one, self.other = (
-                nn.Sequential(nn.Linear(entries, 8), nn.ReLU(), nn.Linear(8, A)) for _ in range(2)
-            )
-
-        def forward(self, o):
-            return self.one(o) + self.other(o)
+    def towers(o, one, other):  # two networks side by side
+        return one(o) + other(o)
 
     protocol = EvaluationProtocol(states_per_region=64, epsilons=(0.5,))
-    for module in (Tokens(), Rows(), Branches(), Towers()):
-        assert evaluate(module, SPEC, protocol).observation.probes == (), type(module).__name__
+    for forward, *layers in (
+        (tokens, nn.Linear(1, 4), nn.Linear(4 * entries, A)),
+        (rows, mlp()),
+        (branches, nn.Linear(M, M), nn.Linear(M, M), nn.Linear(2 * M, A)),
+        (towers, mlp(), mlp()),
+    ):
+        policy = module(forward, *layers)
+        assert evaluate(policy, SPEC, protocol).observation.probes == (), forward.__name__
 
 
 def test_a_policy_for_another_width_is_refused():

@@ -98,21 +98,18 @@ def test_only_the_agent_whose_policy_changes_has_other_numbers(report):
     assert other.regions != report.regions
 
 
-def test_the_teams_channels_are_the_agents_own_in_order(report):
-    for name, rows in {"": report.regions, **report.references}.items():
-        for index, region in enumerate(rows):
-            agents = report.agents.values()
-            own = [agent.references[name] if name else agent.regions for agent in agents]
-            assert region.channels == sum((rows[index].channels for rows in own), ())
-
-
-def test_every_agent_has_every_reference_in_every_region(report):
+def test_every_agent_has_every_reference_and_the_teams_channels_are_theirs_in_order(report):
     for agent in report.agents.values():
         assert tuple(agent.references) == references.NAMES
         assert all(row.normalised_regret == 0.0 for row in agent.references["optimal"])
         assert all(row.normalised_regret == 1.0 for row in agent.references["constant_half"])
         inside = {name: rows[0].normalised_regret for name, rows in agent.references.items()}
         assert 0.0 < inside["linear_least_squares"] < inside["best_constant"] <= 1.0
+    for name, rows in {"": report.regions, **report.references}.items():
+        for index, region in enumerate(rows):
+            agents = report.agents.values()
+            own = [agent.references[name] if name else agent.regions for agent in agents]
+            assert region.channels == sum((rows[index].channels for rows in own), ())
 
 
 def test_the_linear_reference_of_an_agent_is_fitted_on_what_it_observes():
@@ -171,7 +168,17 @@ def test_agents_of_a_team_may_have_policies_by_name():
             evaluate(prepared, other, SMALL)
 
 
-def test_a_shared_policy_is_asked_for_each_agent_with_its_shared_observation():
+def test_a_shared_policy_observes_what_its_agent_does_and_which_it_is():
+    joint = np.array([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8]], np.float32)
+    expected = [
+        [0.1, 0.0, 0.3, 0.0, 0.5, 0.6, 1, 0, 0],
+        [0.0, 0.2, 0.3, 0.4, 0.5, 0.7, 0, 1, 0],
+        [0.1, 0.2, 0.3, 0.4, 0.5, 0.8, 0, 0, 1],
+    ]
+    shown = shared_observation(TASK, joint)
+    assert shown.dtype == np.float32
+    np.testing.assert_array_equal(shown, np.array([expected], np.float32))
+    assert (shared_observation_dim(TASK), shared_action_dim(TASK)) == (9, 3)
     seen = []
 
     def policy(observations):
@@ -186,19 +193,6 @@ def test_a_shared_policy_is_asked_for_each_agent_with_its_shared_observation():
         expected = shared_observation(TASK, joint)
         for agent in range(3):
             np.testing.assert_array_equal(seen[3 * index + agent], expected[:, agent])
-
-
-def test_a_shared_observation_hides_what_the_agent_does_not_observe():
-    joint = np.array([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8]], np.float32)
-    expected = [
-        [0.1, 0.0, 0.3, 0.0, 0.5, 0.6, 1, 0, 0],
-        [0.0, 0.2, 0.3, 0.4, 0.5, 0.7, 0, 1, 0],
-        [0.1, 0.2, 0.3, 0.4, 0.5, 0.8, 0, 0, 1],
-    ]
-    shown = shared_observation(TASK, joint)
-    assert shown.dtype == np.float32
-    np.testing.assert_array_equal(shown, np.array([expected], np.float32))
-    assert (shared_observation_dim(TASK), shared_action_dim(TASK)) == (9, 3)
 
 
 def test_a_shared_policy_scores_as_separate_ones_that_do_the_same():
