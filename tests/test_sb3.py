@@ -86,15 +86,6 @@ def test_every_number_is_that_of_a_dummy_vec_env_of_singles(spec: Any, action_ra
     assert_same(ours.reset(), theirs.reset())
 
 
-def test_a_learner_sees_the_same_rollout_as_with_a_dummy_vec_env() -> None:
-    seen = []
-    for env in (SMEVecEnv(HARD, 2), dummy(HARD, 2)):
-        model = PPO("MlpPolicy", env, n_steps=32, batch_size=16, n_epochs=1, seed=1, device="cpu")
-        model.learn(64)
-        seen.append({name: array.numpy() for name, array in model.policy.state_dict().items()})
-    assert_same(seen[0], seen[1])
-
-
 @pytest.mark.parametrize(
     ("algorithm", "kwargs"),
     [

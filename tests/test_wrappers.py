@@ -33,9 +33,9 @@ def actions(lanes: int = 1) -> Any:
     return np.random.default_rng(4).random((STEPS, lanes, 1), dtype=np.float32)
 
 
-def by_hand(env: Any, taken: Any) -> list[tuple[float, ...]]:
+def by_hand(env: Any, taken: Any, seed: int = 0) -> list[tuple[float, ...]]:
     """Return, length, mean regret, mean similarity and end of each episode."""
-    env.reset(seed=0)
+    env.reset(seed=seed)
     episodes: list[tuple[float, ...]] = []
     rows: list[tuple[float, ...]] = []
     for action in taken:
@@ -117,20 +117,9 @@ def test_a_vector_records_the_same_episodes_in_every_mode(kind: str, mode: str) 
         in_infos += int(ended.sum())
     expected = []
     for lane in range(lanes):
-        env = sme_registry.make(SPEC)
-        seeded = _Seeded(env, lane)
-        expected += by_hand(seeded, used[lane])
+        expected += by_hand(sme_registry.make(SPEC), used[lane], seed=lane)
     assert in_infos == len(recorded.episodes) == len(expected)
     np.testing.assert_allclose(sorted(as_rows(recorded)), sorted(expected), atol=1e-9)
-
-
-class _Seeded(gymnasium.Wrapper[Any, Any, Any, Any]):
-    def __init__(self, env: Any, seed: int) -> None:
-        super().__init__(env)
-        self._seed = seed
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        return self.env.reset(seed=None if seed is None else self._seed)
 
 
 def test_it_stands_beside_gymnasiums_statistics() -> None:

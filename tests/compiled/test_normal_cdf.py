@@ -7,8 +7,6 @@ from scipy.special import ndtr
 pytest.importorskip("numba")
 from numba import njit
 
-from sme_registry.compiled import kernels
-from sme_registry.compiled import normal_cdf as table
 from sme_registry.compiled.normal_cdf import CELLS_PER_UNIT, LIMIT, normal_cdf
 
 BOUND = 3e-15
@@ -51,19 +49,3 @@ def test_its_values_stay_in_the_unit_interval_and_never_fall_by_more_than_roundi
     y = phi(x)
     assert ((y >= 0.0) & (y <= 1.0)).all()
     assert np.diff(y).min() > -BOUND
-
-
-def test_vectors_have_the_bits_of_scalars():
-    x = np.random.default_rng(2).normal(size=(50, 67)) * 4.0
-    v = np.clip(x, -LIMIT, LIMIT)
-    cell = (v * CELLS_PER_UNIT + (LIMIT * CELLS_PER_UNIT + 0.5)).astype(int)
-    d = v - (cell / CELLS_PER_UNIT - LIMIT)
-    coefficients = table._TABLE.reshape(-1, table.STRIDE)[:, np.argsort(table._ORDER)]
-    t = np.moveaxis(coefficients[cell], -1, 0)
-    d2 = d * d
-    low = (t[0] + t[1] * d) + (t[2] + t[3] * d) * d2
-    high = (t[4] + t[5] * d) + (t[6] + t[7] * d) * d2
-    expected = low + high * (d2 * d2)
-    np.testing.assert_array_equal(phi(x.ravel()).reshape(x.shape), expected)
-    kernels.add_and_normal_cdf(x, np.zeros(67))
-    np.testing.assert_array_equal(x, expected)

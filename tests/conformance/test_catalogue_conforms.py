@@ -39,7 +39,6 @@ def test_every_catalogue_entry_has_an_id_by_name_and_one_by_content() -> None:
         spec = sme_registry.load(name)
         for env_id in (f"SME/{name}", f"SME/{spec.content_name}-v1"):
             env = gymnasium.make(env_id)
-            assert env.spec is not None
             assert env.spec.id == env_id
             assert env.unwrapped.sme_spec == spec
             sent = gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -66,16 +65,3 @@ def test_frames_need_a_mode_a_reset_and_lanes_that_exist() -> None:
     for lanes in ([3], [-1], [0.5], 1, "0", []):
         with pytest.raises(OptionError, match="render_lanes"):
             drawn(render_lanes=lanes)
-
-
-def test_a_video_of_a_batch_is_recorded(tmp_path: Any) -> None:
-    pytest.importorskip("moviepy")
-    env = gymnasium.wrappers.vector.RecordVideo(
-        gymnasium.make_vec("SME/Default-v1", num_envs=2, horizon=4, render_mode="rgb_array"),
-        str(tmp_path),
-    )
-    env.reset(seed=0)
-    for _ in range(6):
-        env.step(env.action_space.sample())
-    env.close()
-    assert list(tmp_path.glob("*.mp4"))

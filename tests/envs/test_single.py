@@ -136,34 +136,23 @@ def test_the_symmetric_range_is_the_same_task_rescaled() -> None:
         )
 
 
-@pytest.mark.parametrize("action_range", ["unit", "symmetric"])
-def test_the_optimal_action_in_info_has_no_regret_when_played_back(action_range: Any) -> None:
-    env = SMEEnv("Complexity10", action_range=action_range)
-    env.reset(seed=0)
-    for _ in range(10):
-        optimal = copy.deepcopy(env).step(np.zeros(4, np.float32))[4]["optimal_action"]
-        assert env.step(optimal)[4]["regret"] == pytest.approx(0.0, abs=1e-12)
-
-
-@pytest.mark.parametrize(
-    "same",
-    [
-        lambda a: a.tolist(),
-        lambda a: a.astype(np.float64),
-        lambda a: np.repeat(a, 3)[::3],
-        lambda a: a[::-1].copy()[::-1],
-        lambda a: np.array([a, a]).T.copy()[:, 0],
-        lambda a: a.astype(">f4"),
-        lambda a: a.view(np.ma.MaskedArray),
-    ],
-    ids=["list", "float64", "strided", "reversed", "column", "big-endian", "masked"],
-)
-def test_an_action_is_the_same_in_whatever_form_it_comes(same: Any) -> None:
+def test_an_action_is_the_same_in_whatever_form_it_comes() -> None:
     action = np.array([0.125, 0.75, 0.5, 0.25], np.float32)
     plain, other = SMEEnv("Default"), SMEEnv("Default")
     plain.reset(seed=0)
     other.reset(seed=0)
-    np.testing.assert_array_equal(plain.step(action)[0], other.step(same(action))[0])
+    for same in (
+        action.tolist(),
+        action.astype(np.float64),
+        np.repeat(action, 3)[::3],
+        action[::-1].copy()[::-1],
+        np.array([action, action]).T.copy()[:, 0],
+        action.astype(">f4"),
+        action.view(np.ma.MaskedArray),
+    ):
+        np.testing.assert_array_equal(plain.step(action)[0], other.step(same)[0])
+    whole = np.array([0, 1, 0, 1])
+    np.testing.assert_array_equal(plain.step(whole.astype("f4"))[0], other.step(whole)[0])
 
 
 @pytest.mark.parametrize("action_range", ["unit", "symmetric"])
@@ -193,21 +182,15 @@ def test_an_unusable_action_is_refused_and_nothing_moves(action_range: Any) -> N
 
 
 def test_a_step_before_reset_or_after_the_end_is_refused() -> None:
-    for render_mode in (None, "rgb_array"):
-        if render_mode:
-            pytest.importorskip("pygame")
-        env = SMEEnv("Plane1", horizon=2, render_mode=render_mode)
-        for action in (np.zeros(2, np.float32), np.zeros(2), [0, 0]):
-            with pytest.raises(EpisodeError, match="has not begun"):
-                env.step(action)  # type: ignore[arg-type]
+    env = SMEEnv("Plane1", horizon=2)
+    actions: Any = np.zeros(2, np.float32), np.zeros(2), [0, 0]
+    for message in ("has not begun", "has ended"):
+        for action in actions:
+            with pytest.raises(EpisodeError, match=message):
+                env.step(action)
         env.reset()
         for _ in range(2):
             env.step(np.zeros(2, np.float32))
-        for action in (np.zeros(2, np.float32), np.zeros(2), [0, 0]):
-            with pytest.raises(EpisodeError, match="has ended"):
-                env.step(action)  # type: ignore[arg-type]
-        env.reset()
-        env.step(np.zeros(2, np.float32))
 
 
 @pytest.mark.parametrize("make", [SMEEnv, SMETeamEnv, SMEVectorEnv])
@@ -268,47 +251,26 @@ def test_rendering_without_a_mode_warns_and_gives_nothing() -> None:
         assert env.render() is None
 
 
-def test_both_back_ends_walk_the_same_states(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("numba")
-    for name in ("Default", "HardFragile", "StateDim32", "ActionDim16"):
-        envs = []
-        for backend in ("numba", "numpy"):
-            monkeypatch.setenv("SME_BACKEND", backend)
-            envs.append(SMEEnv(name, k=3, r_min=0.1, D=0.0, horizon=60))
-            envs[-1].reset(seed=0)
-        rng, (fast, plain) = np.random.default_rng(0), envs
-        for _ in range(60):
-            optimal = plain.task.optimal_action(plain.state)
-            action = (0.7 * optimal + 0.3 * rng.random(optimal.shape)).astype(np.float32)
-            got, expected = fast.step(action), plain.step(action)
-            np.testing.assert_array_equal(fast.state, plain.state)
-            np.testing.assert_allclose(got[0], expected[0], rtol=0, atol=1e-7)
-            assert got[1] == pytest.approx(expected[1], abs=3e-12)
-            assert got[2:4] == expected[2:4]
-            for key in expected[4]:
-                np.testing.assert_allclose(got[4][key], expected[4][key], rtol=0, atol=3e-12)
-
-
-@pytest.mark.parametrize("here", ["numba", "numpy"])
+@pytest.mark.parametrize("name", ["Complexity10", "HardSafeMixed", "Distract32Driven"])
 def test_an_episode_pickled_under_one_back_end_goes_on_under_the_other(
-    here: str, monkeypatch: pytest.MonkeyPatch
+    name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("numba")
-    there = {"numba": "numpy", "numpy": "numba"}[here]
-    monkeypatch.setenv("SME_BACKEND", here)
-    for make in (SMEEnv, lambda name: sme_registry.make_vec(name, 3)):
-        env: Any = make("Complexity10")
-        env.reset(seed=0)
-        action = np.full(env.action_space.shape, 0.25, np.float32)
-        env.step(action)
-        monkeypatch.setenv("SME_BACKEND", there)
-        moved = pickle.loads(pickle.dumps(env))
-        for _ in range(120):
-            if env.step(action)[3] is True:
-                break
-            moved.step(action)
-            np.testing.assert_array_equal(env.state, moved.state)
-        monkeypatch.setenv("SME_BACKEND", here)
+    for here, there in (("numba", "numpy"), ("numpy", "numba")):
+        for make in (SMEEnv, lambda name, **kw: sme_registry.make_vec(name, 3, **kw)):
+            monkeypatch.setenv("SME_BACKEND", here)
+            env: Any = make(name, D=0.0, horizon=12)
+            env.reset(seed=0)
+            action = np.full(env.action_space.shape, 0.25, np.float32)
+            env.step(action)
+            monkeypatch.setenv("SME_BACKEND", there)
+            moved = pickle.loads(pickle.dumps(env))
+            for _ in range(11):
+                got, expected = moved.step(action), env.step(action)
+                np.testing.assert_array_equal(env.state, moved.state)
+                np.testing.assert_array_equal(env.distractors, moved.distractors)
+                for key in expected[4]:
+                    np.testing.assert_allclose(got[4][key], expected[4][key], atol=3e-12)
 
 
 def test_seeds_are_integers_of_at_least_0() -> None:

@@ -28,14 +28,18 @@ def changed(scale: float = 1.0, shift: float = 0.0) -> Task:
 def test_the_optimum_breaks_its_limits_in_the_share_that_the_tightness_says(
     tightness: float,
 ) -> None:
-    shares = []
+    shares, prices = [], []
     for seed in range(10):
         task = materialize(SAFE.derive(safety={"tightness": tightness}, seed=seed))
-        broken, uniformity, *_ = safety_checks(task, 0, 4_000)
+        broken, uniformity, *_, price = safety_checks(task, 0, 4_000)
         assert (broken.low, broken.high) == (0.5 * tightness, 1.5 * tightness)
         assert uniformity.outcome == "passed"
         shares.append(broken.value)
+        prices.append(price.value)
     assert np.mean(shares) == pytest.approx(tightness, rel=0.15)  # SD over draws: at most 0.2 τ
+    if tightness == 0.2:
+        assert price.name == "price_of_safety"
+        assert np.mean(prices) == pytest.approx(0.105, abs=0.02)  # METHOD, section 8
 
 
 def test_a_sound_task_passes_with_the_price_of_what_its_safe_action_earns_less() -> None:

@@ -177,18 +177,12 @@ def test_the_same_spec_is_the_same_task_bit_for_bit_and_cannot_be_written_to():
             mine[...] = 0.0
 
 
-def test_counted_words_are_those_of_splitmix64():
+def test_counted_numbers_are_those_of_splitmix64_whatever_is_drawn_with_them():
     # Published for the seed 1234567: https://rosettacode.org/wiki/Pseudo-random_numbers/Splitmix64
-    published = [
-        6457827717110365317, 3203168211198807973, 9817491932198370423,
-        4593380528125082431, 16408922859458223821,
-    ]  # fmt: skip
+    published = [6457827717110365317, 3203168211198807973, 9817491932198370423]
     with np.errstate(over="ignore"):
-        places = np.uint64(1234567) + streams.GOLDEN * np.arange(1, 6, dtype=np.uint64)
+        places = np.uint64(1234567) + streams.GOLDEN * np.arange(1, 4, dtype=np.uint64)
     assert streams.mixed_bits(places).tolist() == published
-
-
-def test_counted_numbers_do_not_depend_on_what_is_drawn_with_them():
     keys, first = np.array([5, 2**52 - 1, 0], np.uint64), np.array([1, 900, 7], np.uint64)
     together = streams.counted(keys, first, 40)
     assert ((together > 0) & (together < 1)).all()

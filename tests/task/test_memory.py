@@ -93,9 +93,8 @@ def test_the_limit_can_be_set_higher_and_lower(monkeypatch):
     assert memory.limit_bytes() == 4 * 2**30
 
 
-@pytest.mark.parametrize("text", ["", "0", "-1", "nan", "1e300", "4 GiB"])
-def test_a_limit_that_is_no_positive_number_is_refused(monkeypatch, text):
-    monkeypatch.setenv("SME_MEMORY_LIMIT_GIB", text)
-    with pytest.raises(OptionError) as caught:
-        materialize(SMESpec())
-    assert f"SME_MEMORY_LIMIT_GIB={text!r}: must be a positive number of GiB" in str(caught.value)
+def test_a_limit_that_is_no_positive_number_is_refused(monkeypatch):
+    for text in ("", "0", "-1", "nan", "1e300", "4 GiB"):
+        monkeypatch.setenv("SME_MEMORY_LIMIT_GIB", text)
+        with pytest.raises(OptionError, match=f"_GIB={text!r}: must be a positive number of GiB"):
+            materialize(SMESpec())

@@ -12,8 +12,6 @@ from sme_registry.errors import ActionError, StateError
 from sme_registry.task import materialize
 from tests.strategies import SAFETY, spec_fields
 
-DEEP = SMESpec(complexity=3, policy_init="unit_variance", safety={"tightness": 0.2})
-
 
 @st.composite
 def safe_tasks(draw):
@@ -78,18 +76,6 @@ def test_without_safety_nothing_is_limited():
     np.testing.assert_array_equal(task.limit(s), 1.0)
     np.testing.assert_array_equal(task.cost(s, a), 0.0)
     np.testing.assert_array_equal(task.safe_action(s), task.optimal_action(s))
-
-
-def test_the_optimum_breaks_limits_in_a_share_of_the_tightness_and_pays_for_safety():
-    # METHOD, section 8: at τ = .2 the share is .196–.200 and the price of safety .10–.11.
-    shares, prices = [], []
-    for seed in range(12):
-        task = materialize(DEEP.derive(seed=seed))
-        s = np.random.default_rng(seed).random((4_000, 8))
-        shares.append((task.optimal_action(s) > task.limit(s)).mean())
-        prices.append(task.regret(s, task.safe_action(s)).mean())
-    assert np.mean(shares) == pytest.approx(0.2, abs=0.02)
-    assert np.mean(prices) == pytest.approx(0.105, abs=0.02)
 
 
 def test_limits_do_not_depend_on_the_optimum_the_tightness_or_a_rotation():

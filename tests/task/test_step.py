@@ -1,13 +1,9 @@
 """Episodes by the definition: payouts, ends, and the optimum that earns the maximal return."""
 
-import gymnasium
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import sme_registry
-from sme_registry.spec import SMESpec
 from sme_registry.task import materialize, observe, step
 from tests.strategies import specs
 
@@ -44,23 +40,6 @@ def test_the_optimum_earns_exactly_the_horizon(spec):
     assert all((done.similarity == 1.0).all() for done in steps)
 
 
-@given(st.integers(1, 12), st.sampled_from([0.0, 0.5, 0.999]), st.integers(1, 30))
-def test_the_optimum_earns_exactly_the_horizon_in_the_environment(k, r_min, horizon):
-    env = sme_registry.make(
-        SMESpec(state_dim=3, action_dim=2, k=k, r_min=r_min, D=r_min, horizon=horizon),
-        disable_env_checker=True,
-    )
-    env.reset(seed=1)
-    earned, ended = 0.0, False
-    while not ended:
-        best = env.unwrapped.task.optimal_action(env.unwrapped.state)
-        _, reward, terminated, ended, info = env.step(best)
-        earned += reward
-        assert not terminated
-        assert info["regret"] < 1e-12
-    assert earned == pytest.approx(horizon, abs=1e-10)
-
-
 @given(specs())
 def test_what_is_earned_is_paid_every_k_steps_and_at_the_horizon_and_shown_till_then(spec):
     task = materialize(spec)
@@ -94,22 +73,3 @@ def test_a_batch_is_its_single_lanes_bit_for_bit(spec, B):
         single = step(task, s[lane], t[lane], r_cum[lane], a[lane])
         for field in whole._fields:
             np.testing.assert_array_equal(getattr(whole, field)[lane], getattr(single, field))
-
-
-def test_the_environment_follows_the_definition():
-    spec = SMESpec(state_dim=5, action_dim=3, k=4, r_min=0.2, complexity=2, horizon=20, seed=9)
-    task, env = materialize(spec), gymnasium.make(sme_registry.env_spec(spec))
-    random = np.random.default_rng(3)
-    env.reset(seed=5)
-    s, r_cum = env.unwrapped.state[None], np.zeros((1, 1))
-    for t in range(20):
-        a = np.clip(mixed(task)(s, random), 0.0, 1.0).astype(np.float32)
-        done = step(task, s, np.array([t]), r_cum, a.astype(np.float64))
-        seen, reward, terminated, truncated, info = env.step(a[0])
-        np.testing.assert_array_equal(env.unwrapped.state, done.state[0])
-        np.testing.assert_array_equal(seen[:5], done.state[0].astype(np.float32))
-        np.testing.assert_allclose(info["optimal_action"], done.optimal_action[0], atol=1e-12)
-        assert reward == pytest.approx(done.reward[0, 0], abs=1e-12)
-        assert info["accumulated_reward"] == pytest.approx(done.accumulated_reward[0, 0], abs=1e-12)
-        assert (terminated, truncated) == (bool(done.terminated[0]), bool(done.truncated[0]))
-        s, r_cum = done.state, done.accumulated_reward

@@ -37,16 +37,6 @@ def test_the_triangle_wave_has_its_values_at_its_corners():
         assert task.transition([y - b], [0.0])[0] == pytest.approx(folded, abs=1e-15)
 
 
-def test_random_actions_keep_uniform_states_uniform():
-    task = materialize(SMESpec(state_dim=4, action_dim=3, seed=2))
-    random = rng()
-    s = random.random((20_000, 4))
-    for _ in range(25):
-        s = task.transition(s, random.random((20_000, 3)))
-    for channel in s.T:
-        assert stats.kstest(channel, "uniform").pvalue > 0.001
-
-
 @given(specs())
 def test_the_transition_is_lipschitz_in_state_and_action_jointly(spec):
     task = materialize(spec)
