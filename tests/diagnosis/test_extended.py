@@ -248,7 +248,7 @@ def test_the_page_the_terminal_and_the_data_have_limits_distractors_and_layers(t
 
 def test_the_capacity_probe_sees_what_the_agent_sees(monkeypatch):
     pytest.importorskip("torch")
-    monkeypatch.setattr(networks, "GRADIENT_STEPS", 500)
+    monkeypatch.setattr(networks, "GRADIENT_STEPS", 1000)  # it tells how far it is
     subject = load_policy(network(), EXTENDED)
     measured = diagnose(subject, states=64, episodes=8, probe_capacity=True).measurements
     assert measured.capacity.layers == (EXTENDED.observation_dim, 16, EXTENDED.action_dim)
