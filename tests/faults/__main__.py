@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import itertools
 import json
 import os
 import random
@@ -77,14 +78,15 @@ class Source:
         self.path = path
         self.text = (ROOT / path).read_text(encoding="utf-8")
         self.lines = self.text.splitlines(keepends=True)
+        self._starts = [0, *itertools.accumulate(map(len, self.lines))]
         self.tree = ast.parse(self.text)
 
     def offset(self, line: int, column: int) -> int:
-        before = "".join(self.lines[: line - 1])
-        return len(before) + len(self.lines[line - 1].encode()[:column].decode())
+        return self._starts[line - 1] + len(self.lines[line - 1].encode()[:column].decode())
 
     def segment(self, node: ast.AST) -> str:
-        return ast.get_source_segment(self.text, node) or ""
+        start = self.offset(node.lineno, node.col_offset)  # type: ignore[attr-defined]
+        return self.text[start : self.offset(node.end_lineno, node.end_col_offset)]  # type: ignore[attr-defined]
 
     def statements(self) -> list[ast.stmt]:
         """All but docstrings, imports, definitions' own lines and what only type checkers read."""
@@ -185,7 +187,7 @@ def _is_text(node: ast.AST) -> bool:
     return literal or isinstance(node, ast.JoinedStr)
 
 
-def own_expressions(statement: ast.stmt) -> Iterator[ast.AST]:
+def own_expressions(statement: ast.stmt) -> Iterator[ast.expr]:
     """The expressions of a statement that are of no statement inside it, annotations apart."""
     waiting: list[ast.AST] = [
         child
@@ -197,7 +199,8 @@ def own_expressions(statement: ast.stmt) -> Iterator[ast.AST]:
     while waiting:
         node = waiting.pop()
         if not isinstance(node, ast.JoinedStr):  # the segments in f-strings are not where they say
-            yield node
+            if isinstance(node, ast.expr):
+                yield node
             waiting += ast.iter_child_nodes(node)
 
 
@@ -216,8 +219,9 @@ def draw(paths: list[str], seed: int, count: int) -> list[Fault]:
     rng.shuffle(places)
     drawn: list[Fault] = []
     for source, statement in places:
-        faults = source.faults(statement)
-        if faults and len(drawn) < count:
+        if len(drawn) == count:
+            break
+        if faults := source.faults(statement):
             drawn.append(rng.choice(faults))
     return drawn
 
@@ -334,7 +338,7 @@ def call(tree: Path, tests: list[str], limit: float) -> tuple[str, str]:
     listing.write_text("\n".join(tests))
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", f"@{listing}"]
     process = subprocess.Popen(
-        command, cwd=tree, env={**os.environ, "PYTHONPATH": str(tree)}, start_new_session=True,
+        command, cwd=tree, env={**os.environ, "PYTHONPATH": str(tree)}, process_group=0,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, text=True,
     )  # fmt: skip
     try:
