@@ -6,8 +6,6 @@ import http.client
 import pickle
 import socket
 import ssl
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -30,10 +28,8 @@ from sme_registry.evaluation.references import NAMES, SHORT_NAMES
 from sme_registry.sealed import Instance, Ticket, actions_in, connection
 from sme_registry.spec import Setting
 from tests.leaderboard.sealed.playing import ROWS
-from tests.leaderboard.serving import serving
 from tests.sealed.server import BUDGET, Server, serving_season
 
-ROOT = Path(__file__).resolve().parents[2]
 WAYS_TO_FAIL = ["lose request", "lose answer", "cut answer", "503", "507"]
 
 
@@ -166,53 +162,6 @@ def test_another_process_goes_on_where_one_was_killed(server):
         killed.step(parts[0])
 
 
-STEPPING = """
-import itertools, sys
-import numpy as np
-from sme_registry import sealed
-
-url, ticket = sys.argv[1:]
-env = sealed.make_vec(url, ticket, 0, 2)
-env.reset()
-for number in itertools.count(env.instance.number + 1):
-    env.step(np.random.default_rng(number).random((2, 2), dtype=np.float32))
-    print(number, flush=True)
-"""
-
-
-def test_a_killed_process_loses_no_step_and_takes_none_twice(server, tmp_path: Path):
-    path = server.ticket.write(tmp_path / "ticket.json")
-    arguments = [sys.executable, "-c", STEPPING, server.url, str(path)]
-    with subprocess.Popen(arguments, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
-        for count in range(1, 11):
-            assert int(process.stdout.readline()) == count
-        process.kill()
-        printed = max(10, *map(int, process.stdout.read().split()), 0)
-    resumed = Instance(server.url, path, 0, 2)
-    observation = resumed.begin()
-    assert resumed.number in (printed, printed + 1)  # the last one may be carried out, unprinted
-    assert resumed.status().instances[0].used == 2 * resumed.number
-    here = server.local(0, 2)
-    for number in range(1, resumed.number + 1):
-        expected = here.step(np.random.default_rng(number).random((2, 2), dtype=np.float32))[0]
-    assert np.array_equal(observation, expected)
-
-
-def test_a_board_that_is_started_again_goes_on(tmp_path: Path, waits: list[float]):
-    with serving_season(tmp_path) as first:
-        here, hidden = first.local(0, 2), sealed.make_vec(first.url, first.ticket, 0, 2)
-        hidden.reset()
-        for actions in random_actions(2, 5):
-            here.step(actions)
-            hidden.step(actions)
-        board, ticket = first.board, first.ticket
-    with serving(board.path, season_secrets=[board.secret]) as url:
-        resumed = sealed.make_vec(url, ticket, 0, 2)
-        assert np.array_equal(resumed.reset()[0], here._batch.observe())
-        for actions in random_actions(2, 5):
-            assert np.array_equal(here.step(actions)[0], resumed.step(actions)[0])
-
-
 def test_after_an_interrupted_step_a_reset_goes_on(server, monkeypatch):
     hidden = sealed.make_vec(server.behind, server.ticket, 0, 2)  # the relay is a client, too
     hidden.reset()
@@ -233,16 +182,16 @@ def test_after_an_interrupted_step_a_reset_goes_on(server, monkeypatch):
     assert np.array_equal(hidden.step(third)[0], here.step(third)[0])
 
 
-def test_the_lanes_of_an_instance_stay_the_same(server):
+def test_refusals_have_the_server_s_codes(server):
     Instance(server.url, server.ticket, 0, 2).begin()
-    with pytest.raises(SealedError, match="start_conflict") as caught:
+    with pytest.raises(SealedError, match="start_conflict") as caught:  # its lanes stay the same
         Instance(server.url, server.ticket, 0, 3).begin()
     assert caught.value.code == "start_conflict"
     with pytest.raises(OptionError, match=r"lanes=257: must be an integer in \[1, 256\]"):
         Instance(server.url, server.ticket, 0, 257)
-
-
-def test_a_spent_budget_has_an_error_of_its_own(server):
+    another_s = Ticket.from_dict({**server.ticket.to_dict(), "token": "cd" * 32})
+    with pytest.raises(SealedError, match="token_wrong"):
+        sealed.make(server.url, another_s).reset()
     hidden = sealed.make_vec(server.url, server.ticket, 2, 2)
     hidden.reset()
     for _ in range(4):
@@ -250,8 +199,7 @@ def test_a_spent_budget_has_an_error_of_its_own(server):
     with pytest.raises(BudgetSpentError) as caught:
         hidden.step(np.zeros((2, 2)))
     assert pickle.loads(pickle.dumps(caught.value)).code == "budget_spent"
-    assert hidden.instance.number == 4
-    assert hidden.instance.steps_left == 1
+    assert (hidden.instance.number, hidden.instance.steps_left) == (4, 1)
 
 
 def test_invalid_actions_are_not_sent(server):
@@ -273,12 +221,6 @@ def test_steps_need_a_reset_and_resets_have_no_options(server):
     with pytest.raises(PolicyError):  # nor does a policy that cannot be used end the stepping
         sealed.answer(server.url, server.ticket, "missing.zip")
     assert server.requests == []
-
-
-def test_another_s_token_is_refused(server):
-    stranger = Ticket.from_dict({**server.ticket.to_dict(), "token": "cd" * 32})
-    with pytest.raises(SealedError, match="token_wrong"):
-        sealed.make(server.url, stranger).reset()
 
 
 def connect(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
@@ -306,33 +248,18 @@ def test_a_certificate_that_is_not_trusted_is_not_tried_again(server, waits, mon
     assert waits == []
 
 
-def test_a_connection_that_the_server_has_closed_is_replaced_at_once(server, waits):
+def test_a_server_that_stops_is_waited_for_until_patience_ends(server, waits, monkeypatch):
     hidden = sealed.make(server.url, server.ticket)
     hidden.reset()
     server.faults = ["lose request"]
     hidden.step(np.zeros(2))
-    assert waits == []
-
-
-def test_an_answer_that_is_too_long_is_not_read_to_its_end(server, monkeypatch):
-    monkeypatch.setattr(connection, "_JSON_BYTES", 10)
-    path = sealed.ticket_path(server.ticket.season, server.ticket.ticket)
-    with pytest.raises(SealedError, match=r"wire: .* answered with more than 20 bytes"):
-        connection.Connection(server.url, server.ticket.token).request("GET", path, most=20)
-
-
-def test_a_server_that_stops_is_waited_for(server, waits):
-    hidden = sealed.make(server.url, server.ticket)
-    hidden.reset()
-    server.faults = ["503"] * 20
+    assert waits == []  # a connection that the server has closed is replaced at once
+    server.faults = ["503"] * 10
     hidden.step(np.zeros(2))
-    assert len(waits) == 20
+    assert len(waits) == 10
     assert waits[0] <= 0.1
     assert 7.5 <= waits[-1] <= 15.0
-    assert len(set(waits[-5:])) == 5  # clients of one server do not come back together
-
-
-def test_patience_ends(server, waits, monkeypatch):
+    assert len(set(waits[-2:])) == 2  # clients of one server do not come back together
     hidden = sealed.make(server.url, server.ticket, patience=3.0)
     hidden.reset()
     clock = iter(range(1000))
@@ -342,7 +269,14 @@ def test_patience_ends(server, waits, monkeypatch):
         hidden.step(np.zeros(2))
     server.faults = []
     hidden.step(np.zeros(2))  # nothing is lost
-    assert hidden.instance.number == 1
+    assert hidden.instance.number == 3
+
+
+def test_an_answer_that_is_too_long_is_not_read_to_its_end(server, monkeypatch):
+    monkeypatch.setattr(connection, "_JSON_BYTES", 10)
+    path = sealed.ticket_path(server.ticket.season, server.ticket.ticket)
+    with pytest.raises(SealedError, match=r"wire: .* answered with more than 20 bytes"):
+        connection.Connection(server.url, server.ticket.token).request("GET", path, most=20)
 
 
 def test_answers_are_the_policy_s_actions_in_the_challenge_states(server, tmp_path: Path):

@@ -33,8 +33,8 @@ def revealed(tmp_path_factory: pytest.TempPathFactory) -> Board:
     board = online_board(tmp_path_factory.mktemp("revealed"))
     with playing(board) as played:
         for number, level in ((1, 0.5), (2, 0.25)):
-            played.take_ticket(number - 1)
-            assert played.number == number
+            if played.number < number:
+                played.take_ticket(number)
             for instance in range(2):
                 played.start(instance=instance)
                 for count in range(1, 9):

@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 from leaderboard.documents.entry import SignedTicketRequest
 from leaderboard.documents.master import Master
@@ -71,46 +73,72 @@ def refused(code: str, *arguments: Any, **others: Any) -> str:
     return caught.value.message
 
 
-def test_a_restart_changes_no_answer(played: Played) -> None:
-    played.start()
-    answers = [played.step(number, number / 10) for number in range(1, 6)]
-    played.restart()
-    begun = WIRE.unpack_begun(played.start())
-    assert begun.number == 5
-    np.testing.assert_array_equal(begun.observation, WIRE.unpack_steps(answers[-1]).observation)
-    assert played.step(5, 0.5) == answers[-1]
-    following = played.step(6)
-    played.restart()
-    assert played.step(6) == following  # without a start
-    assert played.status().used == 6 * LANES
+@pytest.fixture(scope="module")
+def many(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Played]:
+    """A board on which one key may take many tickets."""
+    folder, fields = tmp_path_factory.mktemp("many"), {"tickets": 1000, "tickets_per_key": 1000}
+    with playing(online_board(folder, {"submissions_per_day": 1000}, **fields)) as ready:
+        yield ready
 
 
-def test_the_same_steps_cost_once_and_others_are_refused(played: Played) -> None:
-    played.start()
-    first = played.step(1)
-    assert played.step(1) == first
-    refused("step_conflict", played.step, 1, 0.4)
-    second = played.step(2)
-    refused("step_conflict", played.step, 1)
-    refused("step_ahead", played.step, 4)
-    refused("step_conflict", played.step, 0)
-    assert played.step(2) == second
-    assert played.status().used == 2 * LANES
+EVENTS = ("step", "again", "other", "ahead", "start", "restart", "release")
+FAULTS = ("full disk", "no memory")
 
 
-@pytest.mark.parametrize(("lanes", "requests"), [(4, 16), (48, 1)])
-def test_the_budget_is_exact_and_lanes_that_do_not_divide_it_leave_a_rest(
-    played: Played, lanes: int, requests: int
+@settings(max_examples=25)
+@given(
+    events=st.lists(st.sampled_from(("step", *EVENTS, *FAULTS)), min_size=5, max_size=30),
+    lanes=st.sampled_from([4, 20, 48]),
+)
+@example(events=["step", "restart", "again", "full disk", "no memory", "again"], lanes=4)
+@example(events=[*["step"] * 17, "again", "restart", "again", "step"], lanes=4)
+def test_each_step_is_taken_once_whatever_happens(
+    many: Played, events: list[str], lanes: int
 ) -> None:
-    played.start(lanes)
-    for number in range(1, requests + 1):
-        last = played.step(number, lanes=lanes)
-    assert played.status().used == lanes * requests
-    for _ in range(2):
-        assert played.step(requests, lanes=lanes) == last
-        refused("budget_spent", played.step, requests + 1, lanes=lanes)
-        played.restart()
-    assert played.status().phase == "answering"
+    many.take_ticket(many.number)
+    here, form = Lanes(many.tickets.ticket(many.number).start(0), lanes), StepFormat(lanes, 2, 1)
+    taken, last, most = 0, b"", 64 // lanes
+    many.start(lanes)
+    for event in events:
+        level = 0.03 * (taken + 1)
+        if event == "restart":
+            many.restart()
+        elif event == "release":
+            many.tickets.ticket(many.number).instance(0).release()
+        elif event == "start":
+            begun = form.unpack_begun(many.start(lanes))
+            assert begun.number == taken
+            np.testing.assert_array_equal(begun.observation, here.observation)
+        elif event == "again":
+            if taken:
+                assert many.step(taken, 0.03 * taken, lanes=lanes) == last
+        elif event == "other":
+            refused("step_conflict", many.step, taken, 0.99, lanes=lanes)
+        elif event == "ahead":
+            refused("step_ahead", many.step, taken + 2, lanes=lanes)
+        elif taken == most:
+            refused("budget_spent", many.step, taken + 1, level, lanes=lanes)
+        elif event == "full disk":
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(os, "write", fails(errno.ENOSPC))
+                message = refused("storage_full", many.step, taken + 1, level, lanes=lanes)
+            assert "No space left on device" in message
+        else:
+            taken, last = taken + 1, form.pack_steps(here.step(np.full((lanes, 1), level, "f4")))
+            if event == "no memory":  # after the step was recorded
+                many.start(lanes)
+                with pytest.MonkeyPatch.context() as patch:
+                    patch.setattr(Lanes, "step", runs_out)
+                    with pytest.raises(MemoryError):
+                        many.step(taken, level, lanes=lanes)
+            assert many.step(taken, level, lanes=lanes) == last
+        status = many.status()
+        assert (status.requests, status.used) == (taken, lanes * taken)
+        assert status.phase == ("answering" if taken == most else "stepping")
+
+
+def runs_out(*_: Any) -> None:
+    raise MemoryError
 
 
 @pytest.mark.parametrize(("budget", "most"), [(64, 64), (1000, 256)])
@@ -122,9 +150,9 @@ def test_lanes_have_a_range_and_an_instance_keeps_them(
         for lanes in (0, most + 1, 2**40):
             refused("lanes_invalid", played.start, lanes)
         played.start(most)
-        refused("start_conflict", played.start, most - 1)
-        played.restart()
-        refused("start_conflict", played.start, most - 1)
+        for _ in range(2):
+            refused("start_conflict", played.start, most - 1)
+            played.restart()
         played.start(most)
 
 
@@ -362,8 +390,9 @@ class Ended:
 @pytest.fixture
 def two_over(played: Played, monkeypatch: pytest.MonkeyPatch) -> Played:
     """Two tickets that were played, and whose time is over."""
-    for nonce in (0, 1):
-        played.take_ticket(nonce)
+    for number in (1, 2):
+        if played.number < number:
+            played.take_ticket(number)
         played.start()
         played.step(1)
     set_clocks(monkeypatch, 0, passed=25)
@@ -418,17 +447,6 @@ def test_a_ticket_that_cannot_be_scored_holds_up_no_other_and_is_tried_again(
         attendant.attend()
     assert two_over.tickets.over() == []
     assert codes == [1, 0]
-
-
-def test_a_full_disk_costs_no_step(played: Played, monkeypatch: pytest.MonkeyPatch) -> None:
-    played.start()
-    first = played.step(1)
-    monkeypatch.setattr(os, "write", fails(errno.ENOSPC))
-    assert "No space left on device" in refused("storage_full", played.step, 2)
-    monkeypatch.undo()
-    assert played.step(1) == first
-    assert played.status().used == LANES
-    played.step(2)
 
 
 @pytest.mark.parametrize("lanes", [1, LANES])
@@ -491,52 +509,28 @@ def test_answers_that_do_not_reach_the_disk_are_sent_again(
     assert played.tickets.ticket(played.number).instance(0).answered
 
 
-def test_a_step_that_fails_after_it_was_recorded_is_answered_when_it_is_sent_again(
+def test_instances_used_long_ago_leave_memory_and_large_networks_take_more_of_it(
     played: Played, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def ready() -> list[bool]:
+        instances = played.tickets.ticket(played.number).instances
+        return [each.is_ready for each in instances]
+
+    monkeypatch.setattr(tickets_module, "MOST_HELD_LANES", 150)
     played.start()
+    played.start(instance=1)
+    assert ready() == [False, True]
     played.step(1)
-
-    def runs_out(*_: Any) -> None:
-        raise MemoryError
-
-    monkeypatch.setattr(Lanes, "step", runs_out)
-    with pytest.raises(MemoryError):
-        played.step(2)
-    monkeypatch.undo()
-    answers = [played.step(2), played.step(3)]
+    assert ready() == [True, False]
     played.restart()
-    assert played.step(3) == answers[1]
-    assert played.status().used == 3 * LANES
-    assert np.isfinite(WIRE.unpack_steps(answers[0]).observation).all()
-
-
-def test_large_networks_take_more_memory_and_no_time_of_the_event_loop(
-    played: Played, monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setattr(SteppedInstance, "weights", 2**20)
     monkeypatch.setattr(tickets_module, "MOST_HELD_LANES", 2**21 // 100)
     played.start()
-    assert played.tickets.ticket(played.number).instance(0).is_ready
+    assert ready() == [True, False]
     played.start(instance=1)
-    ticket = played.tickets.ticket(played.number)
-    assert [each.is_ready for each in ticket.instances] == [False, True]
-    monkeypatch.setattr(SteppedInstance, "weights", 2**22)
-    assert not ticket.instance(1).is_ready
-
-
-def test_instances_used_long_ago_leave_memory_and_go_on(
-    played: Played, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tickets_module, "MOST_HELD_LANES", 150)
-    played.start()
-    first = [played.step(1, 0.2), played.step(2, 0.9)]
-    played.start(instance=1)
-    ticket = played.tickets.ticket(played.number)
-    assert not ticket.instance(0).is_ready
-    assert ticket.instance(1).is_ready
-    assert played.step(2, 0.9) == first[1]
-    assert not ticket.instance(1).is_ready
+    assert ready() == [False, True]
+    monkeypatch.setattr(SteppedInstance, "weights", 2**22)  # no steps in the event loop
+    assert ready() == [False, False]
 
 
 def test_one_server_that_has_the_master_steps_a_season(played: Played, tmp_path: Path) -> None:
