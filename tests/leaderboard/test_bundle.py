@@ -280,7 +280,9 @@ def test_records_of_runs_are_cut_and_unfinished_repeated_or_missing_runs_refused
     assert len(facts.hyperparameters) == 2000  # what a submission holds
     assert len(facts.library) == 200
 
-    RunRecord.read(folder).updated(status="running").write(folder)
+    RunRecord.read(folder).updated(independent=True).write(folder)
+    nothing_is_left(tmp_path, OptionError, "0: has a model for each agent", copied)
+    RunRecord.read(folder).updated(independent=False, status="running").write(folder)
     nothing_is_left(tmp_path, OptionError, "0: contains an unfinished run", copied)
     RunRecord.read(folder).updated(status="finished").write(folder)
     (folder / "model.zip").unlink()

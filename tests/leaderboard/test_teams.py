@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,12 @@ from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import Rejection, TamperedError
 from leaderboard.scoring import ranking, score
+from leaderboard.scoring.rescore import rescore
 from leaderboard.scoring.verify import verify
-from leaderboard.scoring.worker import run_scorers
+from leaderboard.scoring.worker import run_scorer
 from leaderboard.store import Store
 from leaderboard.web.site import write_site
 from sme_registry import EvaluationProtocol, SMESpec
-from sme_registry.errors import OptionError
 from sme_registry.spec import Suite, SuiteFile
 from tests.leaderboard.conftest import linear_onnx
 
@@ -42,7 +43,6 @@ SUITE = Suite.from_dict(
 )
 FILE = SuiteFile(name="mixed", version=1, digest=SUITE.digest, suite=SUITE)
 TEAM: SMESpec = SUITE.instances[0]
-ALONE: SMESpec = SUITE.instances[2]
 FIELDS: dict[str, Any] = {
     "title": "Teams",
     "suite_name": "mixed-v1",
@@ -55,13 +55,6 @@ FIELDS: dict[str, Any] = {
 DOCUMENT = BoardDocument(key="0" * 64, **FIELDS)
 KEY = SigningKey.generate()
 WIDTHS = (6, 2)  # s, t/T, r_cum/k and two one-hot entries; the widest agent's channels
-
-
-@pytest.fixture
-def board(tmp_path: Path) -> Path:
-    with Store.create(tmp_path / "board", **FIELDS) as store:
-        intake.submit_references(store)
-    return tmp_path / "board"
 
 
 def bundle(folder: Path, team: bytes) -> Path:
@@ -86,17 +79,26 @@ def bundle(folder: Path, team: bytes) -> Path:
     return made.folder
 
 
+@pytest.fixture(scope="module")
+def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A board whose references and shared policy are scored; nobody changes it."""
+    folder = tmp_path_factory.mktemp("teams")
+    with Store.create(folder / "board", **FIELDS) as store:
+        intake.submit_references(store)
+        intake.submit_bundle(store, bundle(folder / "mine", linear_onnx(400, *WIDTHS)), KEY)
+    run_scorer(folder / "board")
+    return folder / "board"
+
+
 def test_a_board_of_teams_scores_a_shared_policy_and_each_agent(
     board: Path, tmp_path: Path
 ) -> None:
-    folder = bundle(tmp_path / "mine", linear_onnx(400, *WIDTHS))
-    with Store.open(board) as store:
-        id = intake.submit_bundle(store, folder, KEY)
-    run_scorers(board, 1)
-    assert verify(board, rescore=3).rescored == 3
     with Store.open(board, read_only=True) as store:
         ranking.refuse_unpublishable(store.entries())  # the references of teams score 0 and 1
+        id = next(row.id for row in store.entries() if not row.reference)
+        assert rescore(store, id) == []
         result = store.result(id)
+        write_site(store, tmp_path / "site")
     assert result is not None
     team, failed, alone = result.runs
     assert [agent.name for agent in team.agents] == ["scout_0", "driver_0"]
@@ -104,22 +106,25 @@ def test_a_board_of_teams_scores_a_shared_policy_and_each_agent(
     low, high = sorted(agent.normalised_regret[0] for agent in team.agents)
     assert low < team.normalised_regret[0] < high
     assert (failed.agents, alone.agents) == ((), ())
-
-    write_site(Store.open(board, read_only=True), tmp_path / "site")
     page = (tmp_path / f"site/submissions/{id.removeprefix('sha256:')}.html").read_text()
     assert page.count("<bdi>driver_0</bdi>") == 1
 
 
-def evaluate_optimum() -> None:
-    machine = score._Machine(available_isolation())
-    data, digest = optimal_onnx(TEAM), "sha256:" + "0" * 64
-    score._evaluate(DOCUMENT, TEAM, data, digest, lambda *_: None, machine, lambda _: "")
+def test_an_altered_agent_is_found(board: Path, tmp_path: Path) -> None:
+    assert verify(board).results == 3
+    copy = shutil.copytree(board, tmp_path / "board")
+    results = sorted((copy / "results").iterdir())
+    path = next(path for path in results if "driver_0" in path.read_text())
+    path.write_text(path.read_text().replace("driver_0", "driver_9", 1))
+    with pytest.raises(TamperedError, match=path.name):
+        verify(copy)
 
 
-def test_no_agent_receives_state_channels_that_it_does_not_observe(
+def test_agents_receive_what_they_observe_and_their_rows_are_checked_in_every_region(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     seen: list[sandbox.Observations] = []
+    checked: list[tuple[float, ...]] = []
     call = sandbox.Sandbox.__call__
 
     def recorded(self: sandbox.Sandbox, observations: sandbox.Observations) -> sandbox.Actions:
@@ -127,53 +132,23 @@ def test_no_agent_receives_state_channels_that_it_does_not_observe(
         return call(self, observations)
 
     monkeypatch.setattr(sandbox.Sandbox, "__call__", recorded)
-    evaluate_optimum()
+    monkeypatch.setattr(
+        sandbox.Sandbox, "check_rows", lambda self, seen, rows: checked.append(tuple(seen[0, -2:]))
+    )
+    machine = score._Machine(available_isolation())
+    data, digest = optimal_onnx(TEAM), "sha256:" + "0" * 64
+    score._evaluate(DOCUMENT, TEAM, data, digest, lambda *_: None, machine, lambda _: "")
+
     rows = np.concatenate(seen)
     scout = rows[:, 4] == 1.0
     assert scout.any()
     assert not rows[scout, 1].any()  # scout_0 observes the first channel only
     assert rows[~scout, 1].any()
     np.testing.assert_array_equal(rows[:, 4] + rows[:, 5], 1.0)
-
-
-def test_the_rows_of_every_agent_are_checked_in_every_region(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    checked: list[tuple[float, ...]] = []
-    monkeypatch.setattr(
-        sandbox.Sandbox, "check_rows", lambda self, seen, rows: checked.append(tuple(seen[0, -2:]))
-    )
-    evaluate_optimum()
-    regions = [checked[first : first + 2] for first in range(0, len(checked), 2)]
-    assert len(regions) == 6  # the random batch is the last one, because there is one
-    assert all(region == [(1.0, 0.0), (0.0, 1.0)] for region in regions)
+    # In each of the six regions the random batch is the last one, because there is one.
+    assert checked == [(1.0, 0.0), (0.0, 1.0)] * 6
 
 
 def test_a_policy_of_other_widths_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(Rejection, match="onnx_interface"):
         bundle(tmp_path / "mine", linear_onnx(400, 4, 3))
-
-
-def test_an_altered_agent_is_found(board: Path, tmp_path: Path) -> None:
-    with Store.open(board) as store:
-        intake.submit_bundle(store, bundle(tmp_path / "mine", linear_onnx(400, *WIDTHS)), KEY)
-    run_scorers(board, 1)
-    results = sorted((board / "results").iterdir())
-    path = next(path for path in results if "driver_0" in path.read_text())
-    path.write_text(path.read_text().replace("driver_0", "driver_9", 1))
-    with pytest.raises(TamperedError, match=path.name):
-        verify(board)
-
-
-def test_a_run_of_independent_agents_is_refused(tmp_path: Path) -> None:
-    from sme_registry.training import train
-
-    train(
-        TEAM, algorithm="PPO", steps=32, folder=tmp_path / "run", num_envs=1, independent=True,
-        protocol={"states_per_region": 10}, progress=False,
-    )  # fmt: skip
-    with pytest.raises(OptionError, match="a model for each agent"):
-        make_bundle(
-            tmp_path / "bundle", suite=FILE, key=SigningKey.generate(), runs=[tmp_path / "run"],
-            method="M", submitter="S",
-        )  # fmt: skip

@@ -108,7 +108,6 @@ EVEN: Regrets = {**dict.fromkeys(TWO, [0.2] * 5), **dict.fromkeys(THREE, [0.2] *
 def test_a_class_is_the_mean_over_its_instances_and_the_method_the_mean_over_classes() -> None:
     values = [[0.1], [0.2, 0.3, 0.4, 0.9], [0.5] * 7, [0.6], [0.7, 0.0]]
     result = scored(dict(zip(SPECS, values, strict=True)))
-
     means = [float(iqm(each)) for each in values]
     classes = [np.mean(means[:2]), np.mean(means[2:])]
     assert [each.wd_regret for each in result.classes] == pytest.approx(classes)
@@ -166,7 +165,6 @@ def test_each_instance_needs_its_share_of_the_runs() -> None:
 def test_unlisted_runs_count_on_the_instances_with_the_fewest_runs() -> None:
     runs = [run(spec, 0.2) for spec in (TWO[0], TWO[1], TWO[1], *THREE)]
     unlisted = never_listed(BOARD, started(runs, {"two": 4, "three": 2}))
-
     assert [each.spec for each in unlisted] == [TWO[0], TWO[0], TWO[1], TWO[0], *THREE[:2]]
     assert all(each.artefact is None and each.wd_regret == 1.0 for each in unlisted)
     result = result_of(BOARD, ID, runs, {}, unlisted=unlisted)
@@ -182,7 +180,6 @@ def test_earlier_rules_pool_the_runs_of_a_class_and_list_all() -> None:
     runs = [run(spec, regret) for spec in SPECS for regret in (0.1, 0.2, 0.4, 0.9)]
     unlisted = never_listed(earlier, started(runs, {"two": 1}))
     result = result_of(earlier, ID, runs, {}, unlisted=unlisted)
-
     assert result.runs == (*runs, *unlisted)
     assert [each.spec for each in unlisted] == [None]
     pooled = [iqm([0.1, 0.2, 0.4, 0.9] * 2 + [1.0]), iqm([0.1, 0.2, 0.4, 0.9] * 3)]
@@ -213,7 +210,6 @@ def test_giving_up_an_instance_costs_what_was_learned_there(
     honest, gave_up = (
         result_of(board, ID, [*rest, *own], {}) for own in (flat({spec: regrets[spec]}), failed)
     )
-
     learned = 1.0 - (float(iqm(regrets[spec])) if metric != "ood_decay" else 0.0)
     share = 1 / 4 if spec in TWO else 1 / 6
     lost = theta(gave_up, metric) - theta(honest, metric)
@@ -233,10 +229,8 @@ def test_leaving_runs_out_never_improves_a_method_with_as_many_runs_on_each_inst
         "two": sum(left[spec] for spec in TWO),
         "three": sum(left[spec] for spec in THREE),
     }
-
     honest = result_of(board, ID, flat(values), {})
     chosen = result_of(board, ID, kept, {}, unlisted=never_listed(board, started(kept, missing)))
-
     for metric in METRICS:
         assert theta(chosen, metric) >= theta(honest, metric) - 1e-9, metric
 
@@ -262,7 +256,6 @@ def drawn(seed: int, counts: Sequence[int]) -> list[RunScore]:
 def test_the_protocol_seeds_an_interval_and_neither_id_nor_order_of_runs_changes_it() -> None:
     runs = drawn(0, [5, 5, 4, 4, 4])
     result = result_of(BOARD, ID, runs, {})
-
     for number in range(3):
         shuffled = np.random.default_rng(number).permutation(len(runs))
         other = result_of(BOARD, f"sha256:{number:064x}", [runs[i] for i in shuffled], {})
@@ -284,7 +277,6 @@ def test_a_small_change_of_a_run_changes_an_interval_little() -> None:
         ]
         low, high = ends(result_of(BOARD, ID, nudged, {}), "ood_decay")
         widths.append(high - low)
-
     assert max(widths) - min(widths) < 1e-5
 
 
@@ -292,7 +284,6 @@ def test_single_runs_of_several_instances_have_a_wide_interval_and_lone_ones_non
     single = result_of(BOARD, ID, drawn(3, [1] * 5), {})
     low, high = ends(single)
     assert low < theta(single) < high
-
     suite = {"classes": [{"name": "two", "setting": SETTING, "seeds": [0]}]}
     lone = BOARD.model_copy(update={"suite": Suite.from_dict(suite)})
     result = result_of(lone, ID, [run(TWO[0], 0.5)], {})
@@ -336,7 +327,6 @@ def test_oracle_like_is_little_regret_in_a_region_or_as_little_outside_as_inside
     }
     estimates = {name: Estimate(value=x, low=x, high=x) for name, x in values.items()}
     assert tuple(values) == METRICS
-
     scores = Scores(**estimates, normalised_regret=(estimates["wd_regret"],) * 2)
     assert is_oracle_like(scores, 2) is expected
     assert is_oracle_like(scores, 1) is by_rules_1
@@ -347,7 +337,6 @@ def test_one_oracle_like_run_marks_a_method() -> None:
     scores = Scores(**dict.fromkeys(METRICS, level), normalised_regret=(level, level))
     run = failed_run(BOARD.protocol, "two", None)
     near = run.model_copy(update={"wd_regret": 0.005})
-
     assert not is_oracle_like(scores, 2, [run])
     assert is_oracle_like(scores, 2, [run, near])
     assert not is_oracle_like(scores, 1, [run, near])

@@ -104,7 +104,6 @@ def test_one_policy_in_other_bytes_is_one_run_and_has_a_like_sketch(name: str) -
     with pytest.raises(Rejection, match=r"of runs\.1 in the same states") as caught:
         observed(policy(network(1)), policy(ORIGINAL), copy)
     assert caught.value.code == "run_repeated"
-
     (one,), (other,) = observed(policy(ORIGINAL)), observed(copy, submission="two")
     assert one != other  # other states
     assert alike(one, other)
@@ -143,7 +142,6 @@ def test_near_optimal_copies_are_refused_and_near_optimal_networks_are_not() -> 
 def test_runs_that_collapsed_to_one_constant_are_no_repetition() -> None:
     corner = [lambda o, k=k: np.full((len(o), 2), [1.0 + k, -3.0 - k]) for k in range(5)]
     almost = [lambda o, k=k: 0.3 + CONSTANT * np.sin(o[:, :2] + k) for k in range(3)]
-
     assert observed(*corner, *almost) == [""] * 8
 
 
@@ -181,7 +179,6 @@ def test_a_sketch_is_a_function_of_policy_protocol_instance_and_submission() -> 
     one, again = (observed(policy(ORIGINAL))[0] for _ in range(2))
     elsewhere = Behaviours(PROTOCOL.model_copy(update={"seed": 1}), "one")
     other = elsewhere.observe("runs.0", SPEC, policy(ORIGINAL))
-
     assert one == again
     assert not sketch.differ(one, again, 0.0)
     assert sketch.differ(one, other, 1e-9)

@@ -27,7 +27,6 @@ def test_metrics_of_a_run_match_a_calculation_by_hand() -> None:
     actual = run_metrics(
         (0.1, 0.2, 0.3, 0.4, 0.5, 0.6), (0.95, 0.9, 0.85, 0.8, 0.75, 0.7), levels=LEVELS
     )
-
     assert actual["wd_regret"] == 0.1
     assert actual["ood_regret"] == pytest.approx((0.2 + 0.3 + 0.4 + 0.5 + 0.6) / 5)
     assert actual["ood_decay"] == pytest.approx(0.4 - 0.1)
@@ -37,9 +36,7 @@ def test_metrics_of_a_run_match_a_calculation_by_hand() -> None:
 
 def test_slope_is_that_of_the_least_squares_line() -> None:
     regret = np.random.default_rng(1).random(6)
-
     slope = run_metrics(tuple(regret), tuple(1 - regret), LEVELS)["regret_slope"]
-
     assert slope == pytest.approx(np.polynomial.Polynomial.fit(LEVELS, regret, 1).convert().coef[1])
 
 
@@ -95,18 +92,14 @@ def test_the_interval_is_the_one_that_sorting_every_sample_gives(n: int) -> None
     drawn = math.sqrt(n / (n - 1)) * (iqm(samples.swapaxes(0, 1)) - iqm(runs))
     lowest, highest = np.quantile(drawn, [0.025, 0.975], axis=0)
     arm = np.maximum(-lowest, highest)
-
     low, high = bootstrap({"only": runs}, 300, "seed")
-
     np.testing.assert_allclose(low, iqm(runs) - arm, rtol=1e-12)
     np.testing.assert_allclose(high, iqm(runs) + arm, rtol=1e-12)
 
 
 def test_all_metrics_are_of_the_same_resampled_runs() -> None:
     runs = np.random.default_rng(3).normal(size=(10, 1))
-
     low, high = bootstrap({"a": np.concatenate([runs, 2 * runs + 1], axis=1)}, 500, "a")
-
     assert low[1] == pytest.approx(2 * low[0] + 1)
     assert high[1] == pytest.approx(2 * high[0] + 1)
 
@@ -115,13 +108,11 @@ def test_classes_are_resampled_apart() -> None:
     runs = np.random.default_rng(4).normal(size=(10, 1))
     (low,), (high,) = bootstrap({"a": runs}, 4000, "a")
     (low_of_two,), (high_of_two,) = bootstrap({"a": runs, "b": runs}, 4000, "a")
-
     assert (high_of_two - low_of_two) / (high - low) == pytest.approx(2**-0.5, rel=0.1)
 
 
 def test_runs_that_agree_leave_no_interval_and_one_run_adds_none() -> None:
     low, high = bootstrap({"agree": np.ones((10, 2)), "one": np.full((1, 2), 0.5)}, 500, "a")
-
     np.testing.assert_array_equal(low, [0.75, 0.75])
     np.testing.assert_array_equal(high, [0.75, 0.75])
 
@@ -153,12 +144,10 @@ def test_intervals_cover_the_truth_and_do_not_separate_equal_methods(
 
 def test_the_bootstrap_of_many_runs_needs_little_memory() -> None:
     classes = {"one": np.random.default_rng(0).lognormal(size=(1000, 11))}
-
     tracemalloc.start()
     bootstrap(classes, 4000, "a")
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-
     assert most < 64 * 2**20
 
 
@@ -172,9 +161,7 @@ def test_ranks_match_counting_every_pair() -> None:
         low, high = ends.T
         first = [1 + sum(other < own for other in high) for own in low]
         last = [len(low) - sum(other > own for other in low) for own in high]
-
         actual = rank_ranges(low, high)
-
         assert (actual[0].tolist(), actual[1].tolist()) == (first, last)
         assert (actual[0] <= actual[1]).all()
 

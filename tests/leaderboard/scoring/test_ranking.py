@@ -157,7 +157,6 @@ def test_a_policy_made_worse_inside_the_cube_stays_below_the_original() -> None:
     assert (row.value.value, row.value.low) == pytest.approx((0.2, 0.19))
     assert sabotaged.scores is not None
     assert sabotaged.scores.ood_decay.value == pytest.approx(-0.14)  # as scored
-
     honest = entry(4, scores(0.2, 0.29, 0.01))  # better in every outer region
     steep = entry(3, scores(0.1, 0.4, 0.01))
     assert by_decay(steep, honest) == [(4, 1, 1), (3, 2, 2)]
@@ -197,7 +196,6 @@ def test_the_latest_entry_of_a_key_with_the_same_method_and_version_is_ranked() 
     other_version = entry(5, scores(0.3, 0.3), method="PPO", version="2")
     other_key = entry(6, scores(0.4, 0.3), method="PPO", version="1", key="1" * 64)
     entries = [first, again, other_version, other_key]
-
     assert reasons(*entries) == {3: "superseded", 4: "", 5: "", 6: ""}
     withdrawn = replace(again, status="withdrawn")
     assert reasons(first, withdrawn, other_version, other_key) == {3: "", 5: "", 6: ""}

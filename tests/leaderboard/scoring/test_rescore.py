@@ -53,7 +53,6 @@ def test_the_draw_is_unpredictable_and_its_seed_repeats_it(
     assert {report.rescored for report in reports} == {1}
     assert verify(board, rescore="all").rescored == 4
     assert verify(board).rescore_seed is None
-
     names = [str(number) for number in range(100)]
     assert draw(names, 5, 1) == draw(names, 5, 1) != draw(names, 5, 2)
     assert draw(names, 5, 1) == sorted(draw(names, 5, 1), key=int)

@@ -349,7 +349,6 @@ def test_a_random_batch_and_the_last_of_each_region_are_checked() -> None:
     chosen = [
         (int(rows[0, 0]), int(rows[0, 2])) for rows in checks(40, [800, 800, 800, 100]).checked
     ]
-
     assert {region for region, first in chosen if first == 2400} == set(range(40))
     others = [first for _, first in chosen if first != 2400]
     assert set(others) == {0, 800, 1600}
@@ -361,7 +360,6 @@ def test_a_random_batch_and_the_last_of_each_region_are_checked() -> None:
 
 def test_rounding_is_measured_in_random_states_of_each_region() -> None:
     regions = checks(3, [800, 800, 800, 100]).rounded
-
     assert [sorted({*rows[:, 0].tolist()}) for rows in regions] == [[0], [1], [2]]
     numbers = [set(rows[:, 2].tolist()) for rows in regions]
     assert [len(each) for each in numbers] == [ROUNDING_STATES] * 3
@@ -371,7 +369,6 @@ def test_rounding_is_measured_in_random_states_of_each_region() -> None:
 
 def test_every_agent_is_checked_in_the_same_states() -> None:
     recorder = checks(2, [600, 600, 50], agents=2)
-
     for rows in recorder.rounded:
         first, second = (rows[rows[:, 1] == agent, 2] for agent in (0, 1))
         np.testing.assert_array_equal(first, second)

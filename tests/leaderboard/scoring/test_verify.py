@@ -253,7 +253,6 @@ def test_a_file_that_the_log_does_not_name_is_named_or_counted(board):
     alter(path, lambda plain: plain["submission"]["method"].update(name="Better"))
     assert first_altered(board) == where(board, path)
     path.unlink()
-
     result = folder.result(known[STEADY]).read_bytes()
     for path in (folder.result(known[WAITING]), board / "results" / "note.json"):
         path.write_bytes(result)
