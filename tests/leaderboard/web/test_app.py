@@ -9,7 +9,6 @@ import re
 import signal
 import socket
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,6 @@ from leaderboard.documents.result import Result
 from leaderboard.documents.submission import SignedSubmission, utc
 from leaderboard.errors import BoardError
 from leaderboard.public_view import PublicView
-from leaderboard.store import Store
 from leaderboard.web import app
 from leaderboard.web.errors import HTTP_CODES, STATUSES
 from leaderboard.web.serve import serve
@@ -55,7 +53,7 @@ BROWSER = {"Accept": "text/html,application/xhtml+xml"}
 
 
 @pytest.fixture(scope="module")
-def published(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, dict[str, str]]]:
+def published(tmp_path_factory):
     """The URL of a board with entries of every kind, and their ids. Tests only read it."""
     path = tmp_path_factory.mktemp("published") / "board"
     with boards.create(path) as store:
@@ -65,7 +63,7 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, d
 
 
 @pytest.fixture(scope="module")
-def refusing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Store]]:
+def refusing(tmp_path_factory):
     """The URL of a tiny board for requests that are refused, and the board."""
     path = tmp_path_factory.mktemp("refusing") / "board"
     with tiny_board(path) as store, serving(path) as url:
@@ -73,13 +71,13 @@ def refusing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, St
 
 
 @pytest.fixture
-def url(store: Store) -> Iterator[str]:
+def url(store):
     """The URL of the tiny board of `store`."""
     with serving(store.folder.path) as url:
         yield url
 
 
-def refusal(answer: httpx.Response) -> tuple[int, str]:
+def refusal(answer):
     assert answer.headers["Content-Type"] == "application/json"
     body = answer.json()
     assert set(body) == {"code", "message"}
@@ -88,15 +86,13 @@ def refusal(answer: httpx.Response) -> tuple[int, str]:
     return answer.status_code, body["code"]
 
 
-def put(
-    url: str, key: SigningKey, data: bytes, digest: str | None = None, **more: Any
-) -> httpx.Response:
+def put(url, key, data, digest=None, **more):
     digest = digest or sha256_of(data)
     headers = {"Authorization": authorization(url, key, digest), **more}
     return HTTP.put(f"{url}/api/objects/{hex_of(digest)}", content=data, headers=headers)
 
 
-def put_head(url: str, key: SigningKey, data: bytes, length: int, more: str = "") -> bytes:
+def put_head(url, key, data, length, more=""):
     """The head of an upload that states a length."""
     header = authorization(url, key, sha256_of(data))
     return (
@@ -105,12 +101,12 @@ def put_head(url: str, key: SigningKey, data: bytes, length: int, more: str = ""
     ).encode()
 
 
-def connected(url: str) -> socket.socket:
+def connected(url):
     parts = urlsplit(url)
     return socket.create_connection((parts.hostname, parts.port), 60)
 
 
-def raw(url: str, request: bytes) -> bytes:
+def raw(url, request):
     """What a server answers to these bytes, until it closes the connection."""
     with connected(url) as connection:
         connection.sendall(request)
@@ -120,7 +116,7 @@ def raw(url: str, request: bytes) -> bytes:
         return answer
 
 
-def files_of(store: Store) -> list[str]:
+def files_of(store):
     """Everything under the board's folder but the index, which SQLite keeps busy."""
     return sorted(
         str(path.relative_to(store.folder.path))
@@ -132,7 +128,7 @@ def files_of(store: Store) -> list[str]:
 # Pages.
 
 
-def test_pages_and_what_they_link_are_served(published: tuple[str, dict[str, str]]) -> None:
+def test_pages_and_what_they_link_are_served(published):
     paths = ("/index.html", "/ood_regret", "/ood_decay.html", "/compare", "/log", "/method")
     with httpx.Client(base_url=published[0], timeout=60) as client:
         for path in (*paths, "/board.csv", "/"):
@@ -145,9 +141,7 @@ def test_pages_and_what_they_link_are_served(published: tuple[str, dict[str, str
         assert [link for link in local if client.get(link).status_code != 200] == []
 
 
-def test_pages_show_methods_and_a_name_with_a_script_as_text(
-    published: tuple[str, dict[str, str]],
-) -> None:
+def test_pages_show_methods_and_a_name_with_a_script_as_text(published):
     url, ids = published
     assert "<h1><bdi>SAC</bdi>" in HTTP.get(f"{url}/submissions/{hex_of(ids['sac'])}").text
     for path in ("", f"/submissions/{hex_of(ids['hostile'])}"):
@@ -156,7 +150,7 @@ def test_pages_show_methods_and_a_name_with_a_script_as_text(
         assert "<script>" not in page
 
 
-def test_every_answer_has_the_security_headers(published: tuple[str, dict[str, str]]) -> None:
+def test_every_answer_has_the_security_headers(published):
     for path in ("/", "/nowhere", "/api/board", "/api/nowhere", "/%2e%2e/board.key", "/healthz"):
         headers = HTTP.get(published[0] + path).headers
         policy = headers["Content-Security-Policy"]
@@ -168,7 +162,7 @@ def test_every_answer_has_the_security_headers(published: tuple[str, dict[str, s
         assert "Set-Cookie" not in headers
 
 
-def test_an_unchanged_board_is_not_sent_twice(tmp_path: Path) -> None:
+def test_an_unchanged_board_is_not_sent_twice(tmp_path):
     with (
         boards.create(tmp_path / "board", classes=1) as store,
         serving(store.folder.path) as url,
@@ -185,7 +179,7 @@ def test_an_unchanged_board_is_not_sent_twice(tmp_path: Path) -> None:
     assert "New" in grown.text
 
 
-def test_a_board_without_references_shows_nothing(url: str) -> None:
+def test_a_board_without_references_shows_nothing(url):
     for path in ("/", "/ood_regret", "/log", "/api/board"):
         answer = HTTP.get(url + path, headers=JSON)
         assert refusal(answer) == (503, "not_publishable")
@@ -197,7 +191,7 @@ def test_a_board_without_references_shows_nothing(url: str) -> None:
     assert HTTP.get(f"{url}/static/board.css").status_code == 200
 
 
-def test_a_new_board_says_that_it_prepares_and_how_to_submit(store: Store) -> None:
+def test_a_new_board_says_that_it_prepares_and_how_to_submit(store):
     intake.submit_references(store)
     key = SigningKey.generate()
     waiting = boards.submit(store, key, "Early", None)
@@ -219,7 +213,7 @@ def test_a_new_board_says_that_it_prepares_and_how_to_submit(store: Store) -> No
         assert HTTP.get(f"{url}/submissions/x").status_code == 404
 
 
-def test_a_waiting_entry_shows_the_faults_that_postponed_it(tmp_path: Path) -> None:
+def test_a_waiting_entry_shows_the_faults_that_postponed_it(tmp_path):
     with boards.create(tmp_path / "board", classes=1) as store:
         id = boards.submit(store, SigningKey.generate(), "Unlucky", None)
         paths = ("/", f"/submissions/{hex_of(id)}.html")
@@ -236,9 +230,7 @@ def test_a_waiting_entry_shows_the_faults_that_postponed_it(tmp_path: Path) -> N
     assert PublicView.from_dict(view).to_dict() == view
 
 
-def test_what_does_not_last_is_announced_only_by_a_server_that_scores(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_does_not_last_is_announced_only_by_a_server_that_scores(store, monkeypatch):
     monkeypatch.setattr(app, "background_scorers", lambda *_: contextlib.nullcontext())
     with serving(store.folder.path, score_workers=1) as url:  # a reference row is missing
         assert "refresh" not in HTTP.get(url, headers=BROWSER).text
@@ -250,7 +242,7 @@ def test_what_does_not_last_is_announced_only_by_a_server_that_scores(
         assert ("Retry-After" in answer.headers) == (workers == 1)
 
 
-def test_the_pages_say_how_to_submit_at_the_configured_address(tmp_path: Path) -> None:
+def test_the_pages_say_how_to_submit_at_the_configured_address(tmp_path):
     """Never at the address that a request's Host header claims."""
     forged = {**BROWSER, "Host": "evil.example"}
     with boards.create(tmp_path / "board", classes=1) as store:
@@ -272,7 +264,7 @@ def test_the_pages_say_how_to_submit_at_the_configured_address(tmp_path: Path) -
     assert "evil" not in known + unknown + copy
 
 
-def test_serve_refuses_what_it_cannot_do(store: Store) -> None:
+def test_serve_refuses_what_it_cannot_do(store):
     path = store.folder.path
     for url in ("board.example", "ftp://x", "https://x/$(id)", 'https://x"', "https://x/a b"):
         with pytest.raises(OptionError, match="url="):
@@ -288,9 +280,7 @@ def test_serve_refuses_what_it_cannot_do(store: Store) -> None:
         serve(path, port=taken.getsockname()[1], workers=0)
 
 
-def test_a_browser_gets_a_page_for_an_unknown_address(
-    published: tuple[str, dict[str, str]],
-) -> None:
+def test_a_browser_gets_a_page_for_an_unknown_address(published):
     url, _ = published
     page = HTTP.get(f"{url}/nowhere", headers=BROWSER)
     assert page.status_code == 404
@@ -301,8 +291,8 @@ def test_a_browser_gets_a_page_for_an_unknown_address(
 # Reading by the API.
 
 
-def test_the_health_check_says_whether_scoring_works(url: str, store: Store) -> None:
-    def scoring() -> str:
+def test_the_health_check_says_whether_scoring_works(url, store):
+    def scoring():
         answer = HTTP.get(f"{url}/healthz")
         assert answer.status_code == 200
         assert answer.json()["status"] == "ok"
@@ -321,8 +311,8 @@ def test_the_health_check_says_whether_scoring_works(url: str, store: Store) -> 
 
 @pytest.mark.parametrize("program", [None, "#!/bin/sh\nexit 1\n"], ids=["missing", "broken"])
 def test_a_board_is_not_served_without_bubblewrap_unless_told(
-    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str | None
-) -> None:
+    store, tmp_path, monkeypatch, program
+):
     folder = tmp_path / "bin"
     folder.mkdir()
     if program is not None:
@@ -336,7 +326,7 @@ def test_a_board_is_not_served_without_bubblewrap_unless_told(
     app.create_app(store.folder.path, score_workers=1, isolation="process")
 
 
-def test_the_ranking_as_json_is_sorted(published: tuple[str, dict[str, str]]) -> None:
+def test_the_ranking_as_json_is_sorted(published):
     for metric in ("wd_regret", "ood_regret", "ood_decay"):
         board = HTTP.get(f"{published[0]}/api/board", params={"metric": metric}).json()
         values = [row["scores"][metric]["value"] for row in board["rows"]]
@@ -365,16 +355,14 @@ ZEROS = "0" * 64
         (f"DELETE /api/objects/{ZEROS}", 405, "method_not_allowed"),
     ],
 )
-def test_what_cannot_be_answered_has_its_code(
-    published: tuple[str, dict[str, str]], path: str, status: int, code: str
-) -> None:
+def test_what_cannot_be_answered_has_its_code(published, path, status, code):
     method, _, path = path.rpartition(" ")
     accept = BROWSER if path.startswith("/api/") else {}
     answer = HTTP.request(method or "GET", published[0] + path, headers=accept)
     assert refusal(answer) == (status, code)
 
 
-def test_the_log_is_served_in_consecutive_parts(published: tuple[str, dict[str, str]]) -> None:
+def test_the_log_is_served_in_consecutive_parts(published):
     url, _ = published
     whole = HTTP.get(f"{url}/api/log").json()
     tail = HTTP.get(f"{url}/api/log", params={"start": 5}).json()
@@ -384,7 +372,7 @@ def test_the_log_is_served_in_consecutive_parts(published: tuple[str, dict[str, 
     assert HTTP.get(f"{url}/api/log", params={"start": 99999}).json()["entries"] == []
 
 
-def test_a_submission_is_served_with_its_result(published: tuple[str, dict[str, str]]) -> None:
+def test_a_submission_is_served_with_its_result(published):
     url, ids = published
     scored = HTTP.get(f"{url}/api/submissions/{hex_of(ids['sac'])}").json()
     rejected = HTTP.get(f"{url}/api/submissions/{hex_of(ids['rejected'])}").json()
@@ -400,14 +388,14 @@ def test_a_submission_is_served_with_its_result(published: tuple[str, dict[str, 
     assert read.id == ids["sac"]
 
 
-def test_scores_are_withheld_until_the_references_are_right(url: str, store: Store) -> None:
+def test_scores_are_withheld_until_the_references_are_right(url, store):
     """Several scorers may finish an entry before the reference rows."""
     key = SigningKey.generate()
     scored = boards.submit(store, key, "PPO", [0.123] * 6, spread=0.0)
     code = ("onnx_op", "node 3: op_type='Loop': must be one of the list.")
     rejected = boards.submit(store, key, "Broken", None, rejected=code)
 
-    def view(id: str = scored) -> Json:
+    def view(id=scored):
         return dict(HTTP.get(f"{url}/api/submissions/{hex_of(id)}").json())
 
     assert refusal(HTTP.get(url, headers=JSON)) == (503, "not_publishable")
@@ -430,9 +418,7 @@ def test_scores_are_withheld_until_the_references_are_right(url: str, store: Sto
 # Paths.
 
 
-def test_a_path_that_leaves_the_folder_is_rejected(
-    published: tuple[str, dict[str, str]],
-) -> None:
+def test_a_path_that_leaves_the_folder_is_rejected(published):
     for path in (
         "/../board.key",
         "/static/../../board.key",
@@ -455,7 +441,7 @@ def test_a_path_that_leaves_the_folder_is_rejected(
 # Uploads.
 
 
-def test_an_artefact_is_uploaded_once(url: str, store: Store, key: SigningKey) -> None:
+def test_an_artefact_is_uploaded_once(url, store, key):
     data = linear_onnx(1)
     assert put(url, key, data).status_code == 201
     assert put(url, key, data).status_code == 200
@@ -463,11 +449,11 @@ def test_an_artefact_is_uploaded_once(url: str, store: Store, key: SigningKey) -
     assert store.uploaded_bytes(key.public, "2000-01-01T00:00:00Z") == len(data)
 
 
-def test_an_artefact_is_public_once_it_is_scored(tmp_path: Path, key: SigningKey) -> None:
+def test_an_artefact_is_public_once_it_is_scored(tmp_path, key):
     """Until then, and if it is never scored, it might as well not exist."""
     with boards.create(tmp_path / "board", classes=1) as store, serving(store.folder.path) as url:
 
-        def downloads(digest: str) -> set[tuple[int, str]]:
+        def downloads(digest):
             path = f"{url}/api/objects/{hex_of(digest)}"
             head, get = HTTP.head(path, headers=JSON), HTTP.get(path, headers=JSON)
             assert head.headers["Content-Length"] == get.headers["Content-Length"]
@@ -510,8 +496,8 @@ def test_an_artefact_is_public_once_it_is_scored(tmp_path: Path, key: SigningKey
 
 
 def test_policies_of_reference_rows_are_public_and_verified_again_only_if_their_file_changes(
-    url: str, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    url, store, monkeypatch
+):
     (optimal, _) = intake.submit_references(store)
     (run,) = store.submission(optimal).submission.runs
     assert run.artefact is not None
@@ -524,7 +510,7 @@ def test_policies_of_reference_rows_are_public_and_verified_again_only_if_their_
     computed = []
     file_digest = hashlib.file_digest
 
-    def counted(*arguments: Any) -> Any:
+    def counted(*arguments):
         computed.append(arguments)
         return file_digest(*arguments)
 
@@ -538,16 +524,14 @@ def test_policies_of_reference_rows_are_public_and_verified_again_only_if_their_
     assert len(computed) == 2
 
 
-def test_bytes_of_another_digest_are_refused(url: str, store: Store, key: SigningKey) -> None:
+def test_bytes_of_another_digest_are_refused(url, store, key):
     before = files_of(store)
     answer = put(url, key, b"these", digest=sha256_of(b"others"))
     assert refusal(answer) == (422, "artefact_digest")
     assert files_of(store) == before
 
 
-def test_an_upload_without_a_signature_or_signed_at_another_time_is_refused(
-    refusing: tuple[str, Store], key: SigningKey
-) -> None:
+def test_an_upload_without_a_signature_or_signed_at_another_time_is_refused(refusing, key):
     url, _ = refusing
     digest = sha256_of(b"x")
     signed = authorization(url, key, digest)
@@ -565,9 +549,7 @@ def test_an_upload_without_a_signature_or_signed_at_another_time_is_refused(
         assert refusal(put(url, key, b"x", Authorization=header)) == (403, "stale_time")
 
 
-def test_what_is_too_large_is_refused_by_its_length_or_as_soon_as_it_is(
-    refusing: tuple[str, Store], key: SigningKey
-) -> None:
+def test_what_is_too_large_is_refused_by_its_length_or_as_soon_as_it_is(refusing, key):
     url, store = refusing
     limit = store.document.limits.artefact_bytes
     head = b"POST /api/submissions HTTP/1.1\r\nHost: x\r\nContent-Length: 1000000000\r\n\r\n"
@@ -582,9 +564,7 @@ def test_what_is_too_large_is_refused_by_its_length_or_as_soon_as_it_is(
         assert b'"code":"too_large"' in answer
 
 
-def test_an_upload_without_a_length_is_stopped_at_the_limit(
-    tmp_path: Path, key: SigningKey
-) -> None:
+def test_an_upload_without_a_length_is_stopped_at_the_limit(tmp_path, key):
     with tiny_board(tmp_path / "b", limits={"artefact_bytes": 100_000}) as store:
         before = files_of(store)
         small, large = b"y" * 5000, b"x" * 200_000
@@ -600,7 +580,7 @@ def test_an_upload_without_a_length_is_stopped_at_the_limit(
         assert files_of(store) == before
 
 
-def test_a_false_length_leaves_nothing_behind(url: str, store: Store, key: SigningKey) -> None:
+def test_a_false_length_leaves_nothing_behind(url, store, key):
     before = files_of(store)
     data = b"z" * 1000
     for length in (999, 1001):
@@ -614,9 +594,7 @@ def test_a_false_length_leaves_nothing_behind(url: str, store: Store, key: Signi
     assert files_of(store) == before
 
 
-def test_uploads_that_are_slow_or_broken_off_leave_nothing_behind(
-    store: Store, key: SigningKey
-) -> None:
+def test_uploads_that_are_slow_or_broken_off_leave_nothing_behind(store, key):
     before = files_of(store)
     with serving(store.folder.path, upload_seconds=1.0) as url:
         request = put_head(url, key, b"z", 1_000_000) + b"z" * 70_000
@@ -629,9 +607,7 @@ def test_uploads_that_are_slow_or_broken_off_leave_nothing_behind(
         assert put(url, key, b"good").status_code == 201  # and it holds none of the quota
 
 
-def test_quotas_of_keys_and_of_the_board_count_uploads_in_progress(
-    tmp_path: Path, key: SigningKey
-) -> None:
+def test_quotas_of_keys_and_of_the_board_count_uploads_in_progress(tmp_path, key):
     limits = {"upload_bytes_per_day": 1000, "artefact_bytes": 600, "total_bytes": 1700}
     with (
         tiny_board(tmp_path / "b", limits=limits) as store,
@@ -652,13 +628,11 @@ def test_quotas_of_keys_and_of_the_board_count_uploads_in_progress(
 # Submissions and withdrawals.
 
 
-def post(url: str, text: bytes) -> httpx.Response:
+def post(url, text):
     return HTTP.post(f"{url}/api/submissions", content=text)
 
 
-def uploaded(
-    url: str, store: Store, key: SigningKey, number: int = 0, **fields: Any
-) -> SignedSubmission:
+def uploaded(url, store, key, number=0, **fields):
     """A tiny submission whose artefacts are uploaded."""
     signed, artefacts = tiny_submission(store, key, number, **fields)
     for data in artefacts.values():
@@ -666,7 +640,7 @@ def uploaded(
     return signed
 
 
-def test_a_submission_is_accepted_once(url: str, store: Store, key: SigningKey) -> None:
+def test_a_submission_is_accepted_once(url, store, key):
     signed = uploaded(url, store, key)
     first, second = post(url, signed.to_bytes()), post(url, signed.to_bytes())
     assert (first.status_code, second.status_code) == (202, 200)
@@ -680,7 +654,7 @@ def test_a_submission_is_accepted_once(url: str, store: Store, key: SigningKey) 
 NEVER = "sha256:" + "1" * 64
 
 
-def changed(plain: Json, path: str, value: Any) -> None:
+def changed(plain, path, value):
     """Set what is at a path, such as `runs.0.spec`; None removes it."""
     *names, last = path.split(".")
     for name in names:
@@ -712,9 +686,7 @@ def changed(plain: Json, path: str, value: Any) -> None:
         ("runs.0.artefact.size", 1, "artefact_digest"),
     ],
 )
-def test_an_invalid_submission_has_its_code(
-    refusing: tuple[str, Store], key: SigningKey, path: str, value: Any, code: str
-) -> None:
+def test_an_invalid_submission_has_its_code(refusing, key, path, value, code):
     url, store = refusing
     plain = uploaded(url, store, key).submission.to_dict()
     changed(plain, path, plain["runs"] * 2 if value == "twice" else value)
@@ -724,7 +696,7 @@ def test_an_invalid_submission_has_its_code(
     assert store.entries() == []
 
 
-def _signed_anyway(plain: Json, key: SigningKey, board: str) -> bytes:
+def _signed_anyway(plain, key, board):
     """A submission signed rightly, whatever it holds."""
     import rfc8785
 
@@ -752,9 +724,7 @@ def _signed_anyway(plain: Json, key: SigningKey, board: str) -> bytes:
         (b'{"runs": [' + b"{}," * 10**6 + b"{}]}", 413, "too_large"),
     ],
 )
-def test_a_body_that_is_no_submission_has_its_code(
-    refusing: tuple[str, Store], text: bytes, status: int, code: str
-) -> None:
+def test_a_body_that_is_no_submission_has_its_code(refusing, text, status, code):
     url, store = refusing
     start = time.process_time()  # the server is a thread of this process
     answer = post(url, text)
@@ -763,16 +733,14 @@ def test_a_body_that_is_no_submission_has_its_code(
     assert store.entries() == []
 
 
-def test_a_changed_submission_is_not_the_signed_one(
-    refusing: tuple[str, Store], key: SigningKey
-) -> None:
+def test_a_changed_submission_is_not_the_signed_one(refusing, key):
     url, store = refusing
     plain = uploaded(url, store, key).to_dict()
     plain["submission"]["statement"] = "changed afterwards"
     assert refusal(post(url, json.dumps(plain).encode())) == (403, "bad_signature")
 
 
-def test_the_submission_quota_states_when_it_frees_up(tmp_path: Path, key: SigningKey) -> None:
+def test_the_submission_quota_states_when_it_frees_up(tmp_path, key):
     with tiny_board(tmp_path / "b", limits={"submissions_per_day": 2}) as store:
         put_submission(store, key, 1)
         put_submission(store, key, 2)
@@ -786,7 +754,7 @@ def test_the_submission_quota_states_when_it_frees_up(tmp_path: Path, key: Signi
             assert post(url, uploaded(url, store, other, 4).to_bytes()).status_code == 202
 
 
-def test_a_withdrawal_by_the_submitter_is_final(url: str, store: Store, key: SigningKey) -> None:
+def test_a_withdrawal_by_the_submitter_is_final(url, store, key):
     signed = uploaded(url, store, key)
     post(url, signed.to_bytes())
     path = f"{url}/api/withdrawals"
@@ -804,7 +772,7 @@ def test_a_withdrawal_by_the_submitter_is_final(url: str, store: Store, key: Sig
     assert view["withdrawal"] == valid.to_dict()
 
 
-def test_a_body_that_is_no_withdrawal_has_its_code(refusing: tuple[str, Store]) -> None:
+def test_a_body_that_is_no_withdrawal_has_its_code(refusing):
     for text, expected in {
         b"{": (400, "not_json"),
         b"{}": (422, "schema"),
@@ -818,9 +786,7 @@ def test_a_body_that_is_no_withdrawal_has_its_code(refusing: tuple[str, Store]) 
 # Faults, and `serve`.
 
 
-def test_an_internal_fault_is_logged_and_not_shown(
-    url: str, store: Store, key: SigningKey, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_internal_fault_is_logged_and_not_shown(url, store, key, caplog):
     signed = put_submission(store, key)
     store.folder.submission(signed.id).write_bytes(b"rotten")
     answer = HTTP.get(f"{url}/api/submissions/{hex_of(signed.id)}")
@@ -830,7 +796,7 @@ def test_an_internal_fault_is_logged_and_not_shown(
     assert any("failed" in record.message and record.exc_info for record in caplog.records)
 
 
-def test_every_code_of_the_server_is_explained() -> None:
+def test_every_code_of_the_server_is_explained():
     from leaderboard import web
     from leaderboard.errors import CODES
 
@@ -841,7 +807,7 @@ def test_every_code_of_the_server_is_explained() -> None:
     assert not set(HTTP_CODES) & set(CODES)
 
 
-def test_serving_outlives_its_scorers_and_stops_cleanly(tmp_path: Path) -> None:
+def test_serving_outlives_its_scorers_and_stops_cleanly(tmp_path):
     with tiny_board(tmp_path / "board") as store:
         intake.submit_references(store)
         with serving_process(store.folder.path, workers=1) as (url, process):
@@ -871,7 +837,7 @@ def test_serving_outlives_its_scorers_and_stops_cleanly(tmp_path: Path) -> None:
             time.sleep(0.05)
 
 
-def _children(pid: int) -> list[int]:
+def _children(pid):
     """All processes under this one."""
     descendants = []
     for task in Path(f"/proc/{pid}/task").iterdir():
@@ -880,7 +846,7 @@ def _children(pid: int) -> list[int]:
     return descendants
 
 
-def _may_be_killed(pid: int) -> bool:
+def _may_be_killed(pid):
     """A scorer, or what it started; without its tracker, `multiprocessing` writes warnings."""
     try:
         return b"resource_tracker" not in Path(f"/proc/{pid}/cmdline").read_bytes()
@@ -888,7 +854,7 @@ def _may_be_killed(pid: int) -> bool:
         return False
 
 
-def _is_alive(pid: int) -> bool:
+def _is_alive(pid):
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:

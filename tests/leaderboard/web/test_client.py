@@ -3,18 +3,13 @@ from __future__ import annotations
 import http.server
 import json
 import threading
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import SignedSubmission
 from leaderboard.errors import BoardError, Rejection
-from leaderboard.store import Store
 from leaderboard.web import client
 from sme_registry.errors import OptionError
 from tests.leaderboard.conftest import tiny_board, tiny_submission
@@ -22,19 +17,17 @@ from tests.leaderboard.serving import serving
 
 
 @pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def quick(monkeypatch):
     monkeypatch.setattr(client, "_WAITS", (0.01, 0.01))
 
 
 @pytest.fixture
-def url(store: Store) -> Iterator[str]:
+def url(store):
     with serving(store.folder.path) as url:
         yield url
 
 
-def bundle_of(
-    folder: Path, store: Store, key: SigningKey, number: int = 0, **fields: Any
-) -> tuple[Path, SignedSubmission]:
+def bundle_of(folder, store, key, number=0, **fields):
     """A bundle's folder of a tiny submission."""
     signed, artefacts = tiny_submission(store, key, number, **fields)
     (folder / "artefacts").mkdir(parents=True)
@@ -44,16 +37,13 @@ def bundle_of(
     return folder, signed
 
 
-Script = Callable[[str, str], tuple[int, bytes] | None]
-
-
 @contextmanager
-def scripted(script: Script) -> Iterator[tuple[str, list[str]]]:
+def scripted(script):
     """A server with scripted answers (None: it hangs up); yields its URL and its requests."""
     asked: list[str] = []
 
     class Handler(http.server.BaseHTTPRequestHandler):
-        def answer(self) -> None:
+        def answer(self):
             asked.append(f"{self.command} {self.path}")
             self.rfile.read(int(self.headers.get("Content-Length", 0)))
             answer = script(self.command, self.path)
@@ -68,7 +58,7 @@ def scripted(script: Script) -> Iterator[tuple[str, list[str]]]:
 
         do_GET = do_HEAD = do_PUT = do_POST = answer
 
-        def log_message(self, *_: object) -> None:
+        def log_message(self, *_):
             pass
 
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
@@ -81,46 +71,26 @@ def scripted(script: Script) -> Iterator[tuple[str, list[str]]]:
             thread.join()
 
 
-def test_a_bundle_arrives_whole_and_once(
-    tmp_path: Path, url: str, store: Store, key: SigningKey
-) -> None:
+def test_a_bundle_arrives_whole_and_once_and_has_a_status(tmp_path, url, store, key):
     folder, signed = bundle_of(tmp_path / "bundle", store, key)
-    seen: list[tuple[int, int]] = []
+    with pytest.raises(Rejection, match="unknown_submission"):
+        client.status(url, signed.id)
+    seen = []
     assert client.submit(url, folder, key, progress=lambda *at: seen.append(at)) == signed.id
     assert client.submit(url + "/", folder, key) == signed.id
     assert seen == [(1, 1)]
     assert [entry.id for entry in store.entries()] == [signed.id]
-    for run in signed.submission.runs:
-        assert run.artefact is not None
-        assert store.objects.has(run.artefact.sha256)
-
-
-def test_the_status_is_that_of_the_board(
-    tmp_path: Path, url: str, store: Store, key: SigningKey
-) -> None:
-    folder, signed = bundle_of(tmp_path / "bundle", store, key)
-    with pytest.raises(Rejection, match="unknown_submission"):
-        client.status(url, signed.id)
-    client.submit(url, folder, key)
+    assert all(store.objects.has(run.artefact.sha256) for run in signed.submission.runs)
     assert client.status(url, signed.id)["status"] == "waiting"
-    client.withdraw(url, signed.id, key, "a bug")
-    assert client.status(url, hex_of(signed.id))["status"] == "withdrawn"
-    withdrawal = store.withdrawal(signed.id)
-    assert withdrawal is not None
-    assert withdrawal.withdrawal.reason == "a bug"
-
-
-def test_another_key_cannot_withdraw(
-    tmp_path: Path, url: str, store: Store, key: SigningKey
-) -> None:
-    folder, signed = bundle_of(tmp_path / "bundle", store, key)
-    client.submit(url, folder, key)
     with pytest.raises(Rejection) as caught:
         client.withdraw(url, signed.id, SigningKey.generate())
     assert caught.value.code == "bad_signature"
+    client.withdraw(url, signed.id, key, "a bug")
+    assert client.status(url, hex_of(signed.id))["status"] == "withdrawn"
+    assert store.withdrawal(signed.id).withdrawal.reason == "a bug"
 
 
-def test_a_rejection_has_the_boards_code_and_message(tmp_path: Path, key: SigningKey) -> None:
+def test_a_rejection_has_the_boards_code_and_message(tmp_path, key):
     with tiny_board(tmp_path / "b", limits={"upload_bytes_per_day": 10}) as store:
         folder, _ = bundle_of(tmp_path / "bundle", store, key)
         with serving(store.folder.path) as url, pytest.raises(Rejection) as caught:
@@ -129,39 +99,28 @@ def test_a_rejection_has_the_boards_code_and_message(tmp_path: Path, key: Signin
     assert "within 24 hours" in caught.value.message
 
 
-def test_bytes_are_sent_even_if_the_board_has_them(
-    tmp_path: Path, store: Store, key: SigningKey
-) -> None:
+def test_bytes_are_sent_even_if_the_board_has_them_and_lost_requests_are_repeated(
+    tmp_path, store, key
+):
     folder, signed = bundle_of(tmp_path / "bundle", store, key)
-    answers = {
-        "GET": definition(store),
-        "PUT": (200, b"{}"),
-        "POST": (202, json.dumps({"id": signed.id}).encode()),
-    }
-    with scripted(lambda method, _: answers[method]) as (url, asked):
-        client.submit(url, folder, key)
-    assert [line.split()[0] for line in asked] == ["GET", "PUT", "POST"]
+    posted = 202, json.dumps({"id": signed.id}).encode()
+    for get, put, post in (
+        ([definition(store)], [(200, b"{}")], [posted]),
+        ([None, definition(store)], [None, (503, b"<html>"), (201, b"{}")], [None, posted]),
+    ):
+        answers = {"GET": iter(get), "PUT": iter(put), "POST": iter(post)}
+        with scripted(lambda method, _, answers=answers: next(answers[method])) as (url, asked):
+            assert client.submit(url, folder, key) == signed.id
+        methods = [line.split()[0] for line in asked]
+        assert methods == ["GET"] * len(get) + ["PUT"] * len(put) + ["POST"] * len(post)
 
 
-def test_lost_requests_are_repeated(tmp_path: Path, store: Store, key: SigningKey) -> None:
-    folder, signed = bundle_of(tmp_path / "bundle", store, key)
-    answers = {
-        "GET": iter([None, definition(store)]),
-        "PUT": iter([None, (503, b"<html>"), (201, b"{}")]),
-        "POST": iter([None, (202, json.dumps({"id": signed.id}).encode())]),
-    }
-    with scripted(lambda method, _: next(answers[method])) as (url, asked):
-        assert client.submit(url, folder, key) == signed.id
-    methods = [line.split()[0] for line in asked]
-    assert methods == ["GET"] * 2 + ["PUT"] * 3 + ["POST"] * 2
-
-
-def definition(store: Store) -> tuple[int, bytes]:
+def definition(store):
     """A board's answer for its definition."""
     return 200, json.dumps(store.document.to_dict()).encode()
 
 
-def test_an_unreachable_board_is_reported(tmp_path: Path, store: Store, key: SigningKey) -> None:
+def test_an_unreachable_board_is_reported(tmp_path, store, key):
     folder, _ = bundle_of(tmp_path / "bundle", store, key)
     with scripted(lambda *_: None) as (url, asked), pytest.raises(BoardError, match="reached"):
         client.submit(url, folder, key)
@@ -170,7 +129,7 @@ def test_an_unreachable_board_is_reported(tmp_path: Path, store: Store, key: Sig
         client.status(url, "0" * 64)
 
 
-def test_a_rejected_request_is_not_repeated(store: Store, key: SigningKey) -> None:
+def test_a_rejected_request_is_not_repeated(store, key):
     no = json.dumps({"code": "quota", "message": "none left"}).encode()
     with (
         scripted(lambda method, _: definition(store) if method == "GET" else (429, no)) as (
@@ -195,13 +154,13 @@ def test_a_rejected_request_is_not_repeated(store: Store, key: SigningKey) -> No
         (200, b"[" * 100_000),
     ],
 )
-def test_a_server_that_is_no_board_is_reported(status: int, body: bytes, key: SigningKey) -> None:
+def test_a_server_that_is_no_board_is_reported(status, body):
     with scripted(lambda *_: (status, body)) as (url, _), pytest.raises(BoardError) as caught:
         client.status(url, "0" * 64)
     assert str(caught.value).isprintable()
 
 
-def test_an_endless_answer_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_endless_answer_is_cut_off(monkeypatch):
     monkeypatch.setattr(client, "_MAX_ANSWER", 1000)
     with (
         scripted(lambda *_: (200, b" " * 5000)) as (url, _),
@@ -210,12 +169,9 @@ def test_an_endless_answer_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
         client.status(url, "0" * 64)
 
 
-def test_an_invalid_url_is_rejected() -> None:
+def test_an_invalid_url_or_id_is_rejected(key):
     with pytest.raises(OptionError, match="url="):
         client.status("http://board.example", "0" * 64)
-
-
-def test_an_invalid_id_is_rejected(key: SigningKey) -> None:
     for id in ("", "x", "sha256:" + "0" * 63, "../" * 30):
         with pytest.raises(OptionError, match="id="):
             client.status("http://127.0.0.1:1", id)
@@ -223,9 +179,7 @@ def test_an_invalid_id_is_rejected(key: SigningKey) -> None:
             client.withdraw("http://127.0.0.1:1", id, key)
 
 
-def test_an_artefact_that_was_changed_is_not_sent(
-    tmp_path: Path, store: Store, key: SigningKey
-) -> None:
+def test_an_artefact_that_was_changed_is_not_sent(tmp_path, store, key):
     folder, _ = bundle_of(tmp_path / "bundle", store, key)
     for path in (folder / "artefacts").iterdir():
         path.write_bytes(bytes(path.stat().st_size))

@@ -9,7 +9,6 @@ import shutil
 import socket
 import subprocess
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -18,7 +17,6 @@ import numpy as np
 import pytest
 
 from leaderboard.documents.keys import SigningKey
-from leaderboard.store import Store
 from leaderboard.web import client, limits, serve
 from leaderboard.web.connections import Connections
 from leaderboard.web.seasons import SeasonRoutes
@@ -38,18 +36,18 @@ pytestmark = pytest.mark.skipif(
 
 
 @pytest.fixture
-def board(tmp_path: Path) -> Iterator[Store]:
+def board(tmp_path):
     with boards.create(tmp_path / "board", classes=1) as store:
         yield store
 
 
 @pytest.fixture
-def connections() -> Connections:
+def connections():
     return Connections(proxies=[serve._network("127.0.0.1")])
 
 
 @pytest.fixture
-def url(tmp_path: Path, board: Store, connections: Connections) -> Iterator[str]:
+def url(tmp_path, board, connections):
     """The URL of nginx in front of the board."""
     with (
         serving(board.folder.path, connections) as upstream,
@@ -59,7 +57,7 @@ def url(tmp_path: Path, board: Store, connections: Connections) -> Iterator[str]
 
 
 @contextlib.contextmanager
-def proxied(folder: Path, upstream: str) -> Iterator[str]:
+def proxied(folder, upstream):
     """Nginx with the example's configuration, but for addresses and TLS; yields its URL."""
     assert NGINX is not None, "CI=true and no nginx: apt-get install nginx-light"
     with socket.create_server(("127.0.0.1", 0)) as free:
@@ -88,7 +86,7 @@ def proxied(folder: Path, upstream: str) -> Iterator[str]:
         process.wait(PATIENCE)
 
 
-def wait_for(port: int, process: subprocess.Popen[bytes]) -> None:
+def wait_for(port, process):
     deadline = time.monotonic() + PATIENCE
     while True:
         assert process.poll() is None, "nginx ended"
@@ -99,9 +97,7 @@ def wait_for(port: int, process: subprocess.Popen[bytes]) -> None:
         time.sleep(0.02)
 
 
-def test_a_submission_passes_through_nginx(
-    url: str, board: Store, tmp_path: Path, key: SigningKey
-) -> None:
+def test_a_submission_passes_through_nginx(url, board, tmp_path, key):
     folder, signed = bundle_of(tmp_path / "bundle", board, key)
     assert client.submit(url, folder, key) == signed.id
     assert client.status(url, signed.id)["status"] == "waiting"
@@ -112,9 +108,7 @@ def test_a_submission_passes_through_nginx(
     assert too_large.status_code == 413
 
 
-def test_the_board_knows_the_clients_of_nginx_and_believes_nobody_else(
-    url: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_board_knows_the_clients_of_nginx_and_believes_nobody_else(url, monkeypatch):
     seen: list[str] = []
     monkeypatch.setattr(limits, "counted_address", lambda host: seen.append(host) or "")
     with httpx.Client(transport=httpx.HTTPTransport(local_address="127.0.0.2")) as other:
@@ -123,7 +117,7 @@ def test_the_board_knows_the_clients_of_nginx_and_believes_nobody_else(
     assert seen == ["127.0.0.2"] * 2
 
 
-def test_only_steps_have_a_high_rate_and_no_body_is_larger_than_an_artefact() -> None:
+def test_only_steps_have_a_high_rate_and_no_body_is_larger_than_an_artefact():
     text = CONFIGURATION.read_text()
     [location] = re.findall(r"location ~ (\S+) \{[^}]*zone=board_steps", text)
     assert text.count("zone=board_steps burst") == 1
@@ -137,9 +131,7 @@ def test_only_steps_have_a_high_rate_and_no_body_is_larger_than_an_artefact() ->
     assert {int(size) for size in re.findall(r"client_max_body_size (\d+)m;", text)} == {2, 9}
 
 
-def test_steps_pass_through_nginx_without_the_application(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_steps_pass_through_nginx_without_the_application(tmp_path, monkeypatch):
     season = online_board(tmp_path)
     with (
         serving(season.path, season_secrets=[season.secret]) as upstream,
@@ -153,9 +145,7 @@ def test_steps_pass_through_nginx_without_the_application(
         assert instance.status().instances[0].used == 12
 
 
-def test_silent_and_slow_clients_of_nginx_do_not_reach_the_board(
-    url: str, connections: Connections
-) -> None:
+def test_silent_and_slow_clients_of_nginx_do_not_reach_the_board(url, connections):
     parts = urlsplit(url)
     half = [
         b"",

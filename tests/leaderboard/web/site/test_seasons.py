@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 
 from leaderboard import intake
-from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Stepping
-from leaderboard.documents.season import Reveal, Season
+from leaderboard.documents.season import Reveal
 from leaderboard.scoring.metrics import failed_run
 from leaderboard.scoring.sealed import sealed_result
-from leaderboard.store import Store
 from leaderboard.web.site import Pages, write_site
 from tests.leaderboard.sealing import MASTER, move_clock, signed_entry, signed_request, tiny_season
 from tests.leaderboard.web.site import boards, test_pages
@@ -23,14 +18,14 @@ HOSTILE = "Autumn <script>alert(1)</script>"
 OFFLINE, ONLINE = tiny_season(id="autumn", title=HOSTILE), tiny_season("sealed-online", id="winter")
 
 
-def result(season: Season, subject: str) -> object:
+def result(season, subject):
     runs = [failed_run(season.protocol, each.member.name, None) for each in season.hidden]
     curve = Stepping(steps=64, normalised_online_regret=0.625, learning_curve=(1.0, 0.75, 0.125))
     steps = [curve] * len(runs) if season is ONLINE else []
     return sealed_result(season, subject, runs, {}, 100, steps)
 
 
-def entry(store: Store, key: SigningKey, knowledge: str = "generic", note: str = "") -> str:
+def entry(store, key, knowledge="generic", note=""):
     method = {"name": f"Mine {knowledge}", "version": "1", "family": "x", "knowledge": knowledge}
     signed = signed_entry(store, OFFLINE, key, [None, None], method=method, statement=note)
     store.enter(signed)
@@ -38,29 +33,29 @@ def entry(store: Store, key: SigningKey, knowledge: str = "generic", note: str =
 
 
 @pytest.fixture
-def board(tmp_path: Path) -> Iterator[Store]:
+def board(tmp_path):
     with boards.create(tmp_path / "board") as store:
         yield store
 
 
-def page(store: Store, path: str) -> Page:
+def page(store, path):
     content = Pages(store).read(path)
     assert content is not None
     return Page(content.decode())
 
 
-def served_page(store: Store, path: str) -> Page:
+def served_page(store, path):
     content = Pages(store, address="http://board.test").read(path)
     assert content is not None
     return Page(content.decode())
 
 
-def test_a_board_without_seasons_has_no_page_of_them(board: Store) -> None:
+def test_a_board_without_seasons_has_no_page_of_them(board):
     assert Pages(board).read("seasons.html") is None
     assert "Seasons" not in page(board, "index.html").words
 
 
-def test_the_page_of_a_season_before_and_after_its_reveal(board, key, monkeypatch) -> None:
+def test_the_page_of_a_season_before_and_after_its_reveal(board, key, monkeypatch):
     board.announce(OFFLINE)
     entry(board, key, note="an earlier one")
     last, fitted = entry(board, key), entry(board, key, "family")
@@ -91,7 +86,7 @@ def test_the_page_of_a_season_before_and_after_its_reveal(board, key, monkeypatc
     assert after.words.count("too few runs") == 2  # of the ten that this board needs
 
 
-def test_a_tickets_learning_curve_is_shown_when_it_ends(board, key) -> None:
+def test_a_tickets_learning_curve_is_shown_when_it_ends(board, key):
     board.announce(ONLINE)
     request = signed_request(board, ONLINE, key)
     board.start_ticket(request)
@@ -109,7 +104,7 @@ def test_a_tickets_learning_curve_is_shown_when_it_ends(board, key) -> None:
 
 def test_a_season_is_shown_before_the_boards_reference_rows_but_not_its_scores(
     tmp_path, key, monkeypatch
-) -> None:
+):
     monkeypatch.setattr(boards, "submit", lambda *args, **fields: None)
     with boards.create(tmp_path / "board", classes=1) as board:
         intake.submit_references(board)
@@ -125,7 +120,7 @@ def test_a_season_is_shown_before_the_boards_reference_rows_but_not_its_scores(
     assert [link for link in links if not link.startswith(("../", "#"))] == []
 
 
-def test_a_result_is_read_once_however_often_the_page_is(board, key, monkeypatch) -> None:
+def test_a_result_is_read_once_however_often_the_page_is(board, key, monkeypatch):
     board.announce(ONLINE)
     for number in (1, 2):
         request = signed_request(board, ONLINE, key, number)
@@ -134,16 +129,14 @@ def test_a_result_is_read_once_however_often_the_page_is(board, key, monkeypatch
     first = page(board, "seasons/winter.html")
     assert first.words.count("0.625") == 2
 
-    def read(row: object) -> None:
+    def read(row):
         raise AssertionError("it is known")
 
     monkeypatch.setattr(board, "sealed_result", read)
     assert page(board, "seasons/winter.html").words == first.words
 
 
-def test_the_site_of_a_board_with_seasons_is_well_formed_and_its_links_work(
-    board, key, tmp_path
-) -> None:
+def test_the_site_of_a_board_with_seasons_is_well_formed_and_its_links_work(board, key, tmp_path):
     board.announce(OFFLINE)
     board.announce(ONLINE)
     entry(board, key)
