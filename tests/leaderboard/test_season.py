@@ -203,50 +203,26 @@ def test_the_plan_in_the_documentation_is_one() -> None:
     assert read_plan(online).published == ()
 
 
-def test_a_season_is_scored_ranked_and_replayed(store, key, season, published, later) -> None:
+def test_a_season_is_scored_ranked_and_replayed(
+    store, key, season, published, later, monkeypatch: pytest.MonkeyPatch
+) -> None:
     store.announce(season)
-    friend = SigningKey.generate()
-    enter(store, season, key, optima(season, published), method=method("Best"))
+    friend, best = SigningKey.generate(), optima(season, published)
+    first = enter(store, season, key, best, method=method("Best"))
     last = enter(store, season, key, halves(published), method=method("Best"))
     # Kept back, and logged by an organiser's own board when a later one had arrived.
     old = {"method": method("Best"), "created": moment(-2)}
     store.enter(signed_entry(store, season, key, [None, None], **old))
     enter(store, season, friend, halves(published), method=method("Fit", "family"))
-    family = enter(store, season, friend, optima(season, published), method=method("Fit"))
+    family = enter(store, season, friend, best, method=method("Fit"))
     failed = enter(store, season, friend, [None, None], method=method("Failed"))
+    middle = [0.25 + 0.5 * each for each in best]  # half way from ½ to the optimum
+    near = enter(store, season, friend, middle, method=method("Middle"))
     with pytest.raises(Rejection, match="season_not_closed"):
         score_entries(store, season.id)
     later()
     reveal(store, season)
-    assert [row.entrant.id for row in counting(store, season)] == [last, family, failed]
-    assert score_entries(store, season.id) == 3
-    assert score_entries(store, season.id) == 0
-    rankings = season_rankings(store, season, "wd_regret")
-    generic, fitted = rankings["generic"], rankings["family"]
-    assert [row.entry.id for row in generic] == [last, failed]
-    assert [row.entry.id for row in fitted] == [family]
-    assert generic[0].value.value == pytest.approx(1.0, abs=1e-6)
-    assert fitted[0].value.value == pytest.approx(0.0, abs=1e-5)
-    assert fitted[0].entry.oracle_like
-    report = verify_season(store, season.id)
-    assert (report.instances, report.rounded, report.entries, report.results) == (2, 0, 6, 3)
-    assert by_key(store, season) == {key.public: (1, 3), friend.public: (2, 3)}
-    [first, *_] = store.entrants(season.digest)
-    store.rank(failed_result(season, first.entrant.id))
-    name = rf"{first.entrant.id[7:]}\.json: is of an entry that does not"
-    with pytest.raises(TamperedError, match=name):
-        verify_season(store, season.id)
-
-
-def test_entries_share_the_optimum_of_an_instance(
-    store, key, season, published, later, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    store.announce(season)
-    for share in (0.25, 0.5, 0.75):
-        answers = [share * each for each in optima(season, published)]
-        enter(store, season, key, answers, method=method(f"Share {share}"))
-    later()
-    reveal(store, season)
+    assert [row.entrant.id for row in counting(store, season)] == [last, family, failed, near]
     passes = []
 
     def counted(policies: Any, *arguments: Any) -> Any:
@@ -254,20 +230,29 @@ def test_entries_share_the_optimum_of_an_instance(
         return evaluate_many(policies, *arguments)
 
     monkeypatch.setattr("leaderboard.scoring.sealed.evaluate_many", counted)
-    assert score_entries(store, season.id) == 3
-    assert verify_season(store, season.id).results == 3
+    assert score_entries(store, season.id) == 4
+    assert score_entries(store, season.id) == 0
+    rankings = season_rankings(store, season, "wd_regret")
+    generic, fitted = rankings["generic"], rankings["family"]
+    assert [row.entry.id for row in generic] == [near, last, failed]
+    assert [row.entry.id for row in fitted] == [family]
+    values = [row.value.value for row in generic]
+    assert values == pytest.approx([0.5, 1.0, 1.0], abs=1e-5)
+    assert fitted[0].value.value == pytest.approx(0.0, abs=1e-5)
+    assert fitted[0].entry.oracle_like
+    report = verify_season(store, season.id)
+    assert (report.instances, report.rounded, report.entries, report.results) == (2, 0, 7, 4)
     assert passes == 2 * [3, 3]  # scored and verified, on each of two instances
-    regrets = [
-        result.scores.wd_regret.value
-        for result in map(store.sealed_result, store.entrants(season.digest))
-        if result is not None
-    ]
-    assert regrets == sorted(regrets, reverse=True)
-    instance = next(instances(season, MASTER))
-    alone, _ = score_run(instance, 0.5 * optima(season, published)[0], None)
-    together = store.sealed_result(store.entrants(season.digest)[1])
+    assert by_key(store, season) == {key.public: (1, 3), friend.public: (3, 4)}
+    alone, _ = score_run(next(instances(season, MASTER)), middle[0], None)
+    row = store.entrant(near)
+    assert row is not None
+    together = store.sealed_result(row)
     assert together is not None
     assert together.runs[0].normalised_regret == alone.normalised_regret
+    store.rank(failed_result(season, first))
+    with pytest.raises(TamperedError, match=rf"{first[7:]}\.json: is of an entry that does not"):
+        verify_season(store, season.id)
 
 
 def test_a_replay_finds_scores_that_do_not_follow(store, key, season, published, later) -> None:
@@ -347,14 +332,13 @@ def test_another_machines_rounding_is_told_from_other_data(
 def test_the_class_with_the_fewest_runs_decides_on_a_rank(
     tmp_path: Path, key, later, needed: int, reason: str
 ) -> None:
-    sizes = {"one": 1, "three": 3}
     member = tiny_terms().to_dict()["classes"][0]
+    names = ["one", "three", "three", "three"]
     season = tiny_season(
-        classes=[{**member, "name": name, "instances": size} for name, size in sizes.items()],
+        classes=[{**member, "name": n, "instances": names.count(n)} for n in ("one", "three")],
         published=[
-            {"class_name": name, "instance": number, "data": NOTHING, "challenge": NOTHING}
-            for name, size in sizes.items()
-            for number in range(size)
+            {"class_name": name, "instance": i, "data": NOTHING, "challenge": NOTHING}
+            for i, name in zip((0, 0, 1, 2), names, strict=True)
         ],
     )
     with tiny_board(tmp_path / "board", runs_to_rank=needed) as store:
@@ -368,18 +352,25 @@ def test_the_class_with_the_fewest_runs_decides_on_a_rank(
 
 
 @pytest.mark.parametrize(("needed", "reason"), [(4, ""), (5, "too_few_runs")])
-def test_runs_of_all_tickets_count_towards_a_rank(
+def test_the_tickets_of_each_method_have_scores_and_a_rank_of_their_own(
     tmp_path: Path, key, needed: int, reason: str
 ) -> None:
     season = tiny_season("sealed-online")
     with tiny_board(tmp_path / "board", runs_to_rank=needed) as store:
         store.announce(season)
-        for nonce in (1, 2):
-            request = signed_request(store, season, key, nonce)
-            number = store.start_ticket(request)
-            store.end_ticket(season.digest, number, failed_result(season, request.id))
-        [row] = season_rankings(store, season, "wd_regret")["generic"]
-    assert (row.reason, row.entry.runs) == (reason, 4)
+        other = SigningKey.generate()
+        for number in range(4):
+            name, who = ("Good", key) if number < 2 else ("Bad", other)
+            request = signed_request(store, season, who, number, method=method(name))
+            store.start_ticket(request)
+            result = failed_result(season, request.id)
+            if name == "Good":
+                runs = [run.model_copy(update={"wd_regret": 0.5}) for run in result.runs]
+                result = sealed_result(season, request.id, runs, {}, 100, result.stepping)
+            store.end_ticket(season.digest, number + 1, result)
+        rows = season_rankings(store, season, "wd_regret")["generic"]
+    shown = [(row.entry.method, row.value.value, row.entry.runs, row.reason) for row in rows]
+    assert shown == [("Good", 0.5, 4, reason), ("Bad", 1.0, 4, reason)]
 
 
 def test_an_entry_after_the_close_counts_nowhere(store, key, later) -> None:
@@ -412,20 +403,3 @@ def test_a_replay_finds_entries_that_their_key_has_not_signed(
     score_entries(store, season.id)
     with pytest.raises(TamperedError, match="its signature does not match the entrant's key"):
         verify_season(store, season.id)
-
-
-def test_tickets_of_each_method_have_scores_of_their_own(store, key) -> None:
-    season = tiny_season("sealed-online")
-    store.announce(season)
-    other = SigningKey.generate()
-    for number in range(4):
-        name, who = ("Good", key) if number < 2 else ("Bad", other)
-        request = signed_request(store, season, who, number, method=method(name))
-        store.start_ticket(request)
-        result = failed_result(season, request.id)
-        if name == "Good":
-            runs = [run.model_copy(update={"wd_regret": 0.5}) for run in result.runs]
-            result = sealed_result(season, request.id, runs, {}, 100, result.stepping)
-        store.end_ticket(season.digest, number + 1, result)
-    rows = season_rankings(store, season, "wd_regret")["generic"]
-    assert [(row.entry.method, row.value.value) for row in rows] == [("Good", 0.5), ("Bad", 1.0)]
