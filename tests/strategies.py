@@ -53,13 +53,7 @@ def observations(draw: st.DrawFn) -> dict[str, Any]:
 def spec_fields(
     draw: st.DrawFn, team: bool | None = None, *, plain: bool = False
 ) -> dict[str, Any]:
-    """The fields of a valid spec as plain data.
-
-    Args:
-      draw: Hypothesis's.
-      team: whether it has a team; None for either.
-      plain: leave out safety and observation.
-    """
+    """The fields of a valid spec; `plain` leaves safety and observation out."""
     state_dim, action_dim = draw(st.integers(1, 6)), draw(st.integers(1, 5))
     fields = {
         "state_dim": state_dim,
