@@ -31,13 +31,6 @@ def _elsewhere(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
 
 
-@pytest.mark.parametrize("command", ["make", "list", "show", "validate"])
-def test_the_help_of_each_command_has_examples(command):
-    text = good(command, "--help").stdout
-    assert "Examples:" in text
-    assert text.count(f"sme dataset {command}") >= 3
-
-
 def test_make_list_show_and_validate():
     result = good("make", "Default", "--nu", "0.5", "-n", "300", "--seed", "7")
     assert "300 of 300 transitions" in result.stderr
@@ -74,21 +67,6 @@ def test_make_accepts_a_mix_a_field_a_name_and_a_folder():
     assert "no data sets" in good("list").stderr
 
 
-def test_a_policys_zip_is_recorded_by_its_digest(tmp_path):
-    from stable_baselines3 import PPO
-
-    import sme_registry
-    from sme_registry.io import sha256_of
-
-    env = sme_registry.make("Default", action_range="symmetric")
-    PPO("MlpPolicy", env, seed=0, n_steps=8, batch_size=8, device="cpu").save(tmp_path / "mine.zip")
-    good("make", "Default", "--mix", "policy=mine.zip:1", "-n", "60", "--name", "sme/ppo-v0")
-    (behaviour,) = open_dataset("sme/ppo-v0").recipe.behaviours
-    assert behaviour.policy == "mine"
-    assert behaviour.sha256 == sha256_of((tmp_path / "mine.zip").read_bytes())
-    assert "valid" in good("validate", "sme/ppo-v0").stdout
-
-
 def test_a_policys_onnx_acts_as_its_zip(tmp_path):
     for package in ("onnx", "onnxruntime"):
         pytest.importorskip(package)
@@ -99,7 +77,9 @@ def test_a_policys_onnx_acts_as_its_zip(tmp_path):
     from sme_registry.io import sha256_of
 
     env = sme_registry.make("Default", action_range="symmetric")
-    TD3("MlpPolicy", env, seed=0, buffer_size=1, device="cpu").save(tmp_path / "mine.zip")
+    narrow = {"net_arch": [8]}
+    model = TD3("MlpPolicy", env, seed=0, buffer_size=1, device="cpu", policy_kwargs=narrow)
+    model.save(tmp_path / "mine.zip")
     exported = CliRunner().invoke(leaderboard, ["export-sb3", "mine.zip", "-o", "mine.onnx"])
     assert exported.exit_code == 0, exported.output
     sets = {}
@@ -107,10 +87,11 @@ def test_a_policys_onnx_acts_as_its_zip(tmp_path):
         good("make", "Default", "--mix", f"policy=mine.{suffix}:1", "-n", "60",
              "--name", f"sme/{suffix}-v0")  # fmt: skip
         sets[suffix] = open_dataset(f"sme/{suffix}-v0")
-    assert "valid" in good("validate", "sme/onnx-v0").stdout
-    (behaviour,) = sets["onnx"].recipe.behaviours
-    assert behaviour.policy == "mine"
-    assert behaviour.sha256 == sha256_of((tmp_path / "mine.onnx").read_bytes())
+    for suffix, made in sets.items():
+        assert "valid" in good("validate", f"sme/{suffix}-v0").stdout
+        (behaviour,) = made.recipe.behaviours
+        assert behaviour.policy == "mine"
+        assert behaviour.sha256 == sha256_of((tmp_path / f"mine.{suffix}").read_bytes())
     # A later step doubles a difference in the last bit; the first few are the same to rounding.
     one, other = (made.transitions().actions[:5] for made in sets.values())
     np.testing.assert_allclose(one, other, atol=1e-5)
@@ -121,16 +102,13 @@ def test_a_policys_onnx_acts_as_its_zip(tmp_path):
     ("arguments", "message"),
     [
         (["--nu", "1.5"], "nu=1.5: must be a finite number in [0, 1] or null"),
-        (["--nu", "nan"], "nu=nan: must be"),
         (["--mix", "nu=0.5:0.7", "--mix", "random:0.2"], "0.7 + 0.2 = 0.9: must add up to 1"),
         (["--mix", "half:1"], "--mix 'half:1': must be nu=NU:WEIGHT"),
         (["--mix", "nu=x:1"], "must be nu=NU:WEIGHT"),
-        (["--mix", "random"], "must be nu=NU:WEIGHT"),
         (["--mix", "policy=no.zip:1"], "no.zip: cannot be read: No such file"),
         (["--mix", "policy=no.onnx:1"], "Give the path of a saved model (.zip or .onnx)"),
         (["--nu", "0.5", "--mix", "random:1"], "give only one of them"),
         (["--name", "a.b-v0"], "name='a.b-v0': must be [namespace/]name-v<number>"),
-        (["--coverage", "0.2"], "coverage=0.2: must be"),
         (["--coverage", "-0.99"], "coverage=-0.99: 50 transitions"),
         (["-n", "0"], "transitions=0: must be an integer in [1, "),
         (["--seed", "-1"], "seed=-1: must be an integer in [0, "),
@@ -160,20 +138,6 @@ def test_an_existing_data_set_is_kept_without_force():
     assert open_dataset("sme/Default-v1-nu50-seed0-v0").recipe.transitions == 60
 
 
-def test_validate_names_the_invalid_data_set_and_checks_the_others(tmp_path):
-    import h5py
-
-    for name in ("sme/good-v0", "sme/bad-v0"):
-        good("make", "Default", "-n", "50", "--name", name)
-    with h5py.File(tmp_path / "minari/sme/bad-v0/data/main_data.hdf5", "r+") as file:
-        file["episode_0/rewards"][0] = 1.0
-    result = commands.sme(
-        "dataset", "validate", "sme/bad-v0", "sme/good-v0", "sme/none-v0", "--json"
-    )
-    assert result.exit_code == 2
-    assert [checked["valid"] for checked in json.loads(result.stdout)] == [False, True, False]
-
-
 def test_a_copy_under_another_name_is_neither_listed_nor_valid(tmp_path):
     good("make", "Default", "-n", "50")
     own = "sme/Default-v1-nu50-seed0-v0"
@@ -191,15 +155,24 @@ def test_a_copy_under_another_name_is_neither_listed_nor_valid(tmp_path):
     good("validate", own, f"minari/{own}", f"backup/{own}")
 
 
-def test_list_reports_broken_data_sets(tmp_path):
-    good("make", "Default", "-n", "50", "--name", "sme/one-v0")
-    good("make", "Default", "-n", "50", "--name", "sme/two-v0")
-    (tmp_path / "minari/sme/two-v0/data/metadata.json").write_text("{")
+def test_broken_data_sets_are_named_and_the_others_are_listed_and_checked(tmp_path):
+    import h5py
+
+    for name in ("sme/good-v0", "sme/bad-v0"):
+        good("make", "Default", "-n", "50", "--name", name)
+    with h5py.File(tmp_path / "minari/sme/bad-v0/data/main_data.hdf5", "r+") as file:
+        file["episode_0/rewards"][0] = 1.0
+    result = commands.sme(
+        "dataset", "validate", "sme/bad-v0", "sme/good-v0", "sme/none-v0", "--json"
+    )
+    assert result.exit_code == 2
+    assert [checked["valid"] for checked in json.loads(result.stdout)] == [False, True, False]
+    (tmp_path / "minari/sme/bad-v0/data/metadata.json").write_text("{")
     result = good("list")
-    assert "sme/one-v0" in result.stdout
-    assert "two-v0" not in result.stdout
+    assert "sme/good-v0" in result.stdout
+    assert "bad-v0" not in result.stdout
     assert "invalid:" in result.stderr
-    assert "two-v0" in result.stderr
+    assert "bad-v0" in result.stderr
 
 
 @pytest.mark.parametrize("command", ["list", "show", "validate"])

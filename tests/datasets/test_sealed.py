@@ -197,9 +197,9 @@ def test_an_episode_that_is_a_link_is_not_followed(dataset: SealedDataset, tmp_p
 
 def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     (tmp_path / "data").mkdir()
-    path = tmp_path / "data" / "main_data.hdf5"
-    os.mkfifo(path)
-    writer = os.open(path, os.O_RDWR)  # so that a reader would fail, and not wait for ever
+    os.mkfifo(tmp_path / "data" / "main_data.hdf5")
+    # A writer, so that a reader would fail, and not wait for ever.
+    writer = os.open(tmp_path / "data" / "main_data.hdf5", os.O_RDWR)
     try:
         with pytest.raises(MalformedDocumentError, match="no such file"):
             SealedDataset.read(tmp_path)

@@ -33,7 +33,7 @@ def model_in_mid_run(algorithm: str, dimensions: Dimensions) -> Any:
             "MlpPolicy", env, seed=3, batch_size=BATCH, buffer_size=1000, device="cpu",
             policy_kwargs={"net_arch": list(NET_ARCH)},
         )  # fmt: skip
-        model.learn(280)
+        model.learn(140)
     # Actions near 1, which target smoothing moves beyond it and the squashing corrects most.
     for name, bias in model.policy.named_parameters():
         if name in ("actor.mu.bias", "actor.mu.4.bias", "actor_target.mu.4.bias"):
@@ -51,17 +51,12 @@ class Replayed(NamedTuple):
 
 
 def replay(kind: type[OffPolicyProgram], settings: Any) -> list[Replayed]:
-    """Let SB3 and us make the same updates, of one model for each of `DIMENSIONS`, in mid-run.
-
-    Args:
-      kind: of TD3 or SAC.
-      settings: its hyperparameters.
-    """
+    """Let SB3 and us make the same updates, of one model for each of `DIMENSIONS`, in mid-run."""
     full = DIMENSIONS[0]
     models = [model_in_mid_run(type(settings).__name__, own) for own in DIMENSIONS]
     padding = Padding(partial(kind.initial_weights, settings), full)
     learner = _stacked([_learner(kind, model, padding, own) for model, own in _zip(models)])
-    masks = jnp.stack([jnp.arange(full.action_dim) < own.action_dim for own in DIMENSIONS])
+    masks = np.stack([np.arange(full.action_dim) < own.action_dim for own in DIMENSIONS])
     update = jax.jit(jax.vmap(partial(kind.update, settings), (0, 0, 0, 0, None, None)))
     results = [Replayed(_weights(model), {}, {}, {}) for model in models]
     for count in range(1, max(COUNTS) + 1):
@@ -147,7 +142,7 @@ def _adam(optimiser: Any, names: list[str], padding: Padding, own: Dimensions) -
 
 
 def _stacked(lanes: list[Any]) -> Any:
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *lanes)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *lanes)
 
 
 def _zip(each: list[Any]) -> list[tuple[Any, Dimensions]]:

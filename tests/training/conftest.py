@@ -1,13 +1,22 @@
-"""A finished run, shared by the tests of training."""
+"""A finished run with figures, shared by the tests of training; runs of single tests draw none."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import pytest
 
 from sme_registry.training import TrainingResult
-from tests.training.runs import short
+from tests.jax.conftest import quickly_compiled  # noqa: F401
+from tests.training.runs import short, without_figures
 
 
 @pytest.fixture(scope="package")
 def run(tmp_path_factory: pytest.TempPathFactory) -> TrainingResult:
     return short(tmp_path_factory.mktemp("run"), checkpoint_every=100)
+
+
+@pytest.fixture(autouse=True)
+def _no_figures() -> Iterator[None]:
+    with without_figures():
+        yield

@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from sme_registry import SMESpec
 from sme_registry.training import TrainingResult, train
 
 TINY = SMESpec(state_dim=2, action_dim=2, horizon=20, seed=5)
-
-
 PROTOCOL = {"states_per_region": 50}
+NARROW = {"policy_kwargs": {"net_arch": [8]}}
+
+
+@contextmanager
+def without_figures() -> Iterator[None]:
+    """As without Matplotlib: figures take longer than training."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "matplotlib", None)
+        yield
 
 
 def short(folder: Path, **changes: Any) -> TrainingResult:
@@ -23,7 +34,7 @@ def short(folder: Path, **changes: Any) -> TrainingResult:
         "protocol": PROTOCOL,
         "progress": False,
     }
-    return train(TINY, folder=folder, **{**settings, **changes})
+    return train(changes.pop("task", TINY), folder=folder, **{**settings, **changes})
 
 
 def copy_files(source: Path, target: Path) -> None:

@@ -17,9 +17,9 @@ from sme_registry.errors import (
     OptionError,
     PolicyError,
 )
-from sme_registry.training import RunRecord
+from sme_registry.training import RunRecord, TrainingResult
 from sme_registry.training.episodes import read_episodes
-from tests.training.runs import TINY, copy_files, short
+from tests.training.runs import TINY, copy_files, short, without_figures
 
 pytest.importorskip("stable_baselines3")
 
@@ -53,34 +53,55 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_killed_run_resumes_from_its_checkpoint(killed: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "run"
+@pytest.fixture(scope="module")
+def resumed(killed: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainingResult:
+    """The killed run, 60 steps on."""
+    folder = tmp_path_factory.mktemp("resumed") / "run"
     copy_files(killed, folder)
-    before = RunRecord.read(folder)
-    assert before is not None
-    assert before.status == "running"
-    logged = read_episodes(folder / "episodes.csv")
-    steps = before.steps_done + 60
+    with without_figures():
+        return short(folder, seed=3, steps=steps_of(killed) + 60, resume=True)
 
+
+def steps_of(folder: Path) -> int:
+    record = RunRecord.read(folder)
+    assert record is not None
+    assert record.status == "running"
+    return record.steps_done
+
+
+def test_a_killed_run_resumes_from_its_checkpoint(killed: Path, resumed: TrainingResult) -> None:
     with pytest.raises(OptionError, match="--resume"):
-        short(folder, seed=3, steps=steps)
-    result = short(folder, seed=3, steps=steps, resume=True)
-
-    assert result.record.sessions == 2
-    assert result.record.steps_done == steps
-    kept = [episode for episode in logged if episode.step <= before.steps_done]
+        short(killed, seed=3, steps=1000)
+    before = steps_of(killed)
+    logged = read_episodes(killed / "episodes.csv")
+    assert resumed.record.sessions == 2
+    assert resumed.record.steps_done == before + 60
+    kept = [episode for episode in logged if episode.step <= before]
     assert kept
-    assert list(result.episodes[: len(kept)]) == kept
-    assert len(result.episodes) > len(kept)
-    numbers = [episode.episode for episode in result.episodes]
+    assert list(resumed.episodes[: len(kept)]) == kept
+    numbers = [episode.episode for episode in resumed.episodes]
     assert numbers == list(range(1, len(numbers) + 1))
-    assert result.episodes[-1].step > before.steps_done
-    assert result.episodes[-1].wall_seconds > kept[-1].wall_seconds
+    assert len(numbers) > len(kept)
+    assert resumed.episodes[-1].step > before
+    assert resumed.episodes[-1].wall_seconds > kept[-1].wall_seconds
     # Its starts are drawn from another stream than those of the first session.
-    with zipfile.ZipFile(folder / "checkpoint.zip") as archive:
+    with zipfile.ZipFile(resumed.folder / "checkpoint.zip") as archive:
         replay = np.load(io.BytesIO(archive.read("sme_replay_buffer.npz")))
-    starts = replay["observations"][[0, before.steps_done], 0, :2]
+    starts = replay["observations"][[0, before], 0, :2]
     assert not np.array_equal(starts[0], starts[1])
+
+
+def test_resuming_keeps_the_hyperparameters_and_repeats_to_the_bit(
+    killed: Path, resumed: TrainingResult, tmp_path: Path
+) -> None:
+    from stable_baselines3 import TD3
+
+    assert resumed.record.hyperparameters == {"gamma": 0.9}
+    assert TD3.load(resumed.model_path, device="cpu").gamma == 0.9
+    copy_files(killed, tmp_path / "again")
+    again = short(tmp_path / "again", seed=3, steps=resumed.record.steps, resume=True)
+    assert again.report.regions == resumed.report.regions
+    assert [e.regret for e in again.episodes] == [e.regret for e in resumed.episodes]
 
 
 def test_the_checkpoint_holds_the_model_its_optimisers_and_its_replay_buffer(
@@ -119,19 +140,6 @@ def test_a_run_that_was_killed_after_its_last_step_is_only_evaluated(
     before.updated(steps=20).continuing(before.updated(steps=20), tmp_path)
 
 
-def test_resuming_twice_from_one_checkpoint_gives_the_same_run(
-    killed: Path, tmp_path: Path
-) -> None:
-    reports = []
-    for name in ("one", "two"):
-        copy_files(killed, tmp_path / name)
-        record = RunRecord.read(killed)
-        assert record is not None
-        result = short(tmp_path / name, seed=3, steps=record.steps_done + 40, resume=True)
-        reports.append(result.report.regions)
-    assert reports[0] == reports[1]
-
-
 @pytest.mark.parametrize(
     ("change", "field"),
     [
@@ -149,19 +157,6 @@ def test_another_plan_cannot_be_resumed(killed: Path, change: dict[str, Any], fi
     with pytest.raises(OptionError, match=f"^{field}="):
         short(killed, **{"seed": 3, "steps": 100_000, "resume": True, **change})
     assert (killed / "run.json").read_bytes() == before
-
-
-def test_hyperparameters_are_kept_and_may_be_left_out(killed: Path, tmp_path: Path) -> None:
-    from stable_baselines3 import TD3
-
-    copy_files(killed, tmp_path / "run")
-    record = RunRecord.read(killed)
-    assert record is not None
-    assert record.hyperparameters == {"gamma": 0.9}
-    steps = record.steps_done + 20
-    result = short(tmp_path / "run", seed=3, steps=steps, resume=True)
-    assert result.record.hyperparameters == {"gamma": 0.9}
-    assert TD3.load(result.model_path, device="cpu").gamma == 0.9
 
 
 def test_a_broken_checkpoint_is_refused_with_a_remedy(killed: Path, tmp_path: Path) -> None:
