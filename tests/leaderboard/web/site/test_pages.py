@@ -12,7 +12,7 @@ import pytest
 
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import SignedWithdrawal, Withdrawal
+from leaderboard.documents.submission import SignedWithdrawal
 from leaderboard.errors import BoardError, NotPublishable
 from leaderboard.store import Likeness, Store
 from leaderboard.web.site import STATIC, Pages, content_type, rows, write_site
@@ -74,13 +74,20 @@ def board(tmp_path_factory):
         key = SigningKey.generate()
         gone = boards.submit(store, key, "Gone", [0.3] * 6)
         ids = boards.furnish(store)
-        withdrawal = Withdrawal(submission=gone, created=boards.CREATED)
         signed_for = store.document.key
-        signature = key.sign("withdrawal", withdrawal.digest, signed_for)
-        assert store.withdraw(
-            SignedWithdrawal(withdrawal=withdrawal, signature=signature, board=signed_for)
-        )
+        assert store.withdraw(SignedWithdrawal.create(gone, key, boards.HOSTILE, board=signed_for))
         yield store, {**ids, "gone": gone}
+
+
+@pytest.fixture
+def small(tmp_path):
+    """A board of one class, with its reference rows alone."""
+    with boards.create(tmp_path / "board", classes=1) as store:
+        yield store
+
+
+def submitted(store, name, profile, **fields):
+    return boards.submit(store, SigningKey.generate(), name, profile, **fields)
 
 
 @pytest.fixture(scope="module")
@@ -181,35 +188,45 @@ def test_the_board_states_its_digests_and_what_it_proves(pages, board):
     assert "Ranked only where" not in pages["index.html"].words
 
 
-def test_a_static_board_accepts_no_submissions_and_says_where_to_send_them(pages):
+def test_a_board_says_how_to_submit_and_its_limits_unless_it_accepts_nothing(board, pages):
     for name in ("index.html", "ood_regret.html", "ood_decay.html"):
-        words = pages[name].words
-        assert "This copy of the board accepts no submissions." in words
-        assert "sme-leaderboard submit ppo ADDRESS" in words
-        assert "--seeds 10" in words
-        assert "A rank needs 30 trained policies" in words
+        assert "This copy of the board accepts no submissions." in pages[name].words
+        words = pages[name].words.split("How to submit")[1]
+        for text in (
+            "sme-leaderboard submit ppo ADDRESS",
+            "--seeds 10",
+            "A rank needs 30 trained policies",
+            "sme train --suite",
+            "sme-leaderboard new",
+            "20 submissions and 1,024 MiB",
+            "8 MiB",
+        ):
+            assert text in words
     for name, page in pages.items():
         assert any(a["href"].endswith("index.html#submit") for a in page.all("a")), name
-
-
-def test_an_address_is_shown_as_text(board):
     page = Page(Pages(board[0], "https://x/<script>").board())
     assert "submit ppo https://x/<script>" in page.words
+    with Store.open(EXAMPLE, read_only=True) as store:
+        words = Page(Pages(store).board("wd_regret")).words.split("How to submit")[1]
+    assert "accepts no submissions" in words
+    assert "sme-leaderboard new" not in words
 
 
-def test_the_method_page_defines_failures_and_intervals(pages):
+def test_the_pages_of_method_log_and_suite_explain_what_they_must(pages, board):
+    store, _ = board
     words = pages["method.html"].words
     assert "OOD decay and regret slope are 1, and the similarity loss is 100 points" in words
-    assert "gains nothing" not in words
     assert "symmetric: θ ± the longer arm" in words
-    assert "best value there is" not in pages["ood_decay.html"].words  # D may be negative
-
-
-def test_the_log_page_explains_the_use_of_a_kept_digest(pages, board):
     words = pages["log.html"].words
     assert "verify BOARD --contains DIGEST" in words
     assert "Removing entries at the end leaves none" in words
-    assert board[0].head[1] in words
+    assert store.head[1] in words
+    words = pages["suite.html"].words
+    for digest, (member, spec) in store.document.instances.items():
+        assert f"{spec.seed} {hex_of(digest)[:12]}" in words
+        assert member in words
+    assert "state_dim=2" in words
+    assert f"--seeds {store.document.runs_to_rank} " in words
 
 
 def rows_of(text):
@@ -251,79 +268,47 @@ def test_an_entry_that_has_not_learned_has_no_rank_by_ood_decay(site):
     assert rows["SAC"][0] == "2–4"
 
 
-def test_a_board_says_how_to_submit_and_its_limits_unless_it_accepts_nothing(pages):
-    words = pages["index.html"].words.split("How to submit")[1]
-    for text in (
-        "sme train --suite",
-        "sme-leaderboard new",
-        "20 submissions and 1,024 MiB",
-        "8 MiB",
-    ):
-        assert text in words
-    with Store.open(EXAMPLE, read_only=True) as store:
-        words = Page(Pages(store).board("wd_regret")).words.split("How to submit")[1]
-    assert "accepts no submissions" in words
-    assert "sme-leaderboard new" not in words
-
-
-def test_the_page_of_the_suite_has_every_instance_and_what_a_rank_needs(board, pages):
-    document = board[0].document
-    words = pages["suite.html"].words
-    for digest, (member, spec) in document.instances.items():
-        assert f"{spec.seed} {hex_of(digest)[:12]}" in words
-        assert member in words
-    assert "state_dim=2" in words
-    assert f"--seeds {document.runs_to_rank} " in words
-
-
-def test_the_decay_page_ranks_by_the_floored_value_and_shows_the_entrys_own(tmp_path):
-    key = SigningKey.generate()
-    with boards.create(tmp_path / "board", classes=1) as store:
-        boards.submit(store, key, "Worse inside", [0.3, *[0.1] * 5], spread=0.0)
-        boards.submit(store, SigningKey.generate(), "Better", [0.1] * 6, spread=0.0)
-        text = Pages(store).read("ood_decay.html").decode()
-    rows = {name: row for _, name, row in rows_of(text)}
+def test_the_decay_page_ranks_by_the_floored_value_and_shows_the_entrys_own(small):
+    submitted(small, "Worse inside", [0.3, *[0.1] * 5], spread=0.0)
+    submitted(small, "Better", [0.1] * 6, spread=0.0)
+    submitted(small, "Near", [4e-7, *[0.0] * 5], spread=0.0)
+    pages = Pages(small)
+    rows = {name: row for _, name, row in rows_of(pages.read("ood_decay.html").decode())}
     assert 'data-value="0.0"' in rows["Worse inside"]
     assert "<span>itself \u22120.200</span>" in rows["Worse inside"]
     assert "itself" not in rows["Better"]
+    assert any(-1e-6 < entry.scores.ood_decay.value < 0 for entry in pages.entries)
+    assert "-0.000" not in pages.read("board.tex").decode()
 
 
-def test_a_superseded_entry_is_listed_as_history_and_its_versions_link_to_one_another(tmp_path):
+def test_a_superseded_entry_is_listed_as_history_and_its_versions_link_to_one_another(small):
     key = SigningKey.generate()
-    with boards.create(tmp_path / "board", classes=1) as store:
-        first = boards.submit(store, key, "PPO", [0.2] * 6, statement="first")
-        second = boards.submit(store, key, "P-P-0", [0.2] * 6, statement="second")
-        boards.submit(store, SigningKey.generate(), "PPO", [0.3] * 6)
-        pages = Pages(store)
-        marks = {name: row for _, name, row in rows_of(pages.board("wd_regret"))}
-        old, new = Page(pages.submission(first)), Page(pages.submission(second))
+    first = boards.submit(small, key, "PPO", [0.2] * 6, statement="first")
+    second = boards.submit(small, key, "P-P-0", [0.2] * 6, statement="second")
+    submitted(small, "PPO", [0.3] * 6)
+    pages = Pages(small)
+    marks = {name: row for _, name, row in rows_of(pages.board("wd_regret"))}
+    old, new = Page(pages.submission(first)), Page(pages.submission(second))
     assert ">superseded</span>" in marks["PPO"] or ">superseded</span>" in marks["P-P-0"]
     assert "Superseded." in old.words
     assert "Superseded." not in new.words
     for page, other in ((old, second), (new, first)):
-        links = [a["href"] for a in page.all("a")]
-        assert f"{hex_of(other)}.html" in links
+        assert f"{hex_of(other)}.html" in [a["href"] for a in page.all("a")]
         assert "History of this method" in page.words
 
 
-def test_a_copy_names_the_entry_that_it_copies_and_the_number_of_runs(tmp_path, monkeypatch):
-    with boards.create(tmp_path / "board", classes=1) as store:
-        first = boards.submit(store, SigningKey.generate(), "First", [0.2] * 6)
-        whole = boards.submit(store, SigningKey.generate(), "Whole", [0.2] * 6)
-        part = boards.submit(store, SigningKey.generate(), "Part", [0.2] * 6)
-        key = store.entry(first).key
-        entries = [
-            dataclasses.replace(
-                entry, alike=(Likeness(first, key, {whole: 10, part: 2}[entry.id]),)
-            )
-            if entry.id in (whole, part)
-            else entry
-            for entry in store.entries()
-        ]
-        monkeypatch.setattr(store, "entries", lambda: list(entries))
-        pages = Pages(store)
-        shown = {name: (rank, row) for rank, name, row in rows_of(pages.board("wd_regret"))}
-        words = {id: Page(pages.submission(id)).words for id in (first, whole, part)}
+def test_a_copy_names_the_entry_that_it_copies_and_the_number_of_runs(small, monkeypatch):
+    first, whole, part = (submitted(small, name, [0.2] * 6) for name in ("First", "Whole", "Part"))
+    key = small.entry(first).key
+    alike = {whole: (Likeness(first, key, 10),), part: (Likeness(first, key, 2),)}
+    entries = [
+        dataclasses.replace(entry, alike=alike.get(entry.id, entry.alike))
+        for entry in small.entries()
+    ]
+    monkeypatch.setattr(small, "entries", lambda: list(entries))
+    pages = Pages(small)
+    shown = {name: (rank, row) for rank, name, row in rows_of(pages.board("wd_regret"))}
+    words = {id: Page(pages.submission(id)).words for id in (first, whole, part)}
     link = f'href="submissions/{hex_of(first)}.html"'
     assert shown["Whole"][0] == "–"
     assert f"{link}>copy of <bdi>First 1.0" in shown["Whole"][1]
@@ -343,46 +328,26 @@ def test_submissions_that_are_not_scored_are_listed_below_with_their_status(page
     assert "1 waiting" in words.split("Waiting to be scored")[0]
 
 
-@pytest.mark.parametrize("kind", ["sac", "rejected", "waiting", "gone"])
-def test_the_page_of_a_submission_shows_its_status(kind, board, pages, site):
+def test_the_page_of_a_submission_shows_its_status(board, pages, site):
     store, ids = board
-    digits = hex_of(ids[kind])
-    words = pages[f"submissions/{digits}.html"].words
-    assert store.submission(ids[kind]).submission.submitter.key in words
-    assert ids[kind] in words
-    has_result = (site / f"results/{digits}.json").is_file()
-    if kind == "sac":
-        assert "Regret over the regions" in words
-        run = store.result(ids[kind]).runs[0]
-        assert f"{run.evaluation_seed}" in words
-        assert "onnxruntime 1.24.1" in words
-        assert "No tuning on the evaluation states." in words
-    elif kind == "rejected":
-        assert "Rejected: onnx_op" in words
-        assert "op_type='Loop<script>'" in words
-    elif kind == "waiting":
-        assert "Waiting to be scored" in words
-    else:
-        assert "Withdrawn by its submitter" in words
-    assert has_result == (kind != "waiting")
-
-
-def test_the_page_of_a_withdrawn_submission_gives_its_reason_as_text(tmp_path):
-    key = SigningKey.generate()
-    with boards.create(tmp_path / "board", classes=1) as store:
-        id = boards.submit(store, key, "PPO", [0.2] * 6)
-        assert "Reason:" not in Page(Pages(store).submission(id)).words
-        store.withdraw(SignedWithdrawal.create(id, key, boards.HOSTILE, board=store.document.key))
-        page = Page(Pages(store).submission(id))
-    assert f"Reason: {boards.HOSTILE}" in page.words
-
-
-def test_latex_has_no_negative_zero(tmp_path):
-    with boards.create(tmp_path / "board", classes=1) as store:
-        boards.submit(store, SigningKey.generate(), "Near", [4e-7, *[0.0] * 5], spread=0.0)
-        pages = Pages(store)
-        assert any(entry.scores.ood_decay.value < 0 for entry in pages.entries)
-        assert "-0.000" not in pages.read("board.tex").decode()
+    run = store.result(ids["sac"]).runs[0]
+    for kind, texts in {
+        "sac": (
+            "Regret over the regions",
+            f"{run.evaluation_seed}",
+            "onnxruntime 1.24.1",
+            "No tuning on the evaluation states.",
+        ),
+        "rejected": ("Rejected: onnx_op", "op_type='Loop<script>'"),
+        "waiting": ("Waiting to be scored",),
+        "gone": ("Withdrawn by its submitter", f"Reason: {boards.HOSTILE}"),
+    }.items():
+        digits = hex_of(ids[kind])
+        words = pages[f"submissions/{digits}.html"].words
+        key = store.submission(ids[kind]).submission.submitter.key
+        assert all(text in words for text in (key, ids[kind], *texts)), kind
+        assert (site / f"results/{digits}.json").is_file() == (kind != "waiting")
+        assert ("Reason:" in words) == (kind == "gone")
 
 
 def test_runs_that_were_started_and_not_listed_are_shown(board, pages):
@@ -421,12 +386,6 @@ def test_hostile_text_stays_text_on_every_page(board, pages, site):
     assert f"<bdi>{boards.RTL}" in (site / "index.html").read_text()
 
 
-def test_only_https_becomes_a_link():
-    assert rows.https_only("https://example.org/") == "https://example.org/"
-    for link in (None, "javascript:alert(1)", "http://example.org", " https://example.org"):
-        assert rows.https_only(link) is None
-
-
 def test_the_comparison_has_exactly_the_scored_entries(board, site):
     store, ids = board
     text = (site / "board-data.js").read_text()
@@ -449,10 +408,16 @@ def test_the_comparison_has_exactly_the_scored_entries(board, site):
 
 def test_the_same_board_gives_the_same_bytes_and_leaves_equal_files_alone(board, site, tmp_path):
     store, _ = board
-    write_site(store, tmp_path)
-    first = {p.relative_to(site): p.read_bytes() for p in site.rglob("*") if p.is_file()}
-    second = {p.relative_to(tmp_path): p for p in tmp_path.rglob("*") if p.is_file()}
-    assert first == {name: path.read_bytes() for name, path in second.items()}
+    steps = []
+    write_site(store, tmp_path, lambda done, total: steps.append((done, total)))
+    first = {p.relative_to(site).as_posix(): p for p in site.rglob("*") if p.is_file()}
+    second = {p.relative_to(tmp_path).as_posix(): p for p in tmp_path.rglob("*") if p.is_file()}
+    assert steps == [(number, len(second)) for number in range(1, len(second) + 1)]
+    assert first.keys() == second.keys()
+    pages = Pages(store)
+    for name, path in first.items():
+        assert path.read_bytes() == second[name].read_bytes() == pages.read(name), name
+        assert content_type(name)
     before = {path: path.stat().st_ino for path in second.values()}
     (tmp_path / "ood_regret.html").write_text("half a pa")
     (tmp_path / "mine.txt").write_text("not the site's")
@@ -464,61 +429,30 @@ def test_the_same_board_gives_the_same_bytes_and_leaves_equal_files_alone(board,
     assert (tmp_path / "mine.txt").exists()
 
 
-def test_progress_counts_every_file(board, tmp_path):
-    steps = []
-    write_site(board[0], tmp_path, lambda done, total: steps.append((done, total)))
-    files = sum(path.is_file() for path in tmp_path.rglob("*"))
-    assert steps == [(n, files) for n in range(1, files + 1)]
-
-
-def test_a_page_by_its_path_has_the_same_bytes_as_in_the_folder(board, site):
-    pages = Pages(board[0])
-    for path in site.rglob("*"):
-        if path.is_file():
-            name = path.relative_to(site).as_posix()
-            assert pages.read(name) == path.read_bytes(), name
-            assert content_type(name)
-
-
-@pytest.mark.parametrize(
-    "path",
-    [
+def test_other_paths_are_not_found(board):
+    store, ids = board
+    pages = Pages(store)
+    for path in (
         "",
         "nothing.html",
         "../board.key",
         "static/../pages.py",
         "static/",
-        "log-1.html",
-        "log-00.html",
-        "log-٣.html",
-        "log--1.html",
+        *(f"log-{number}.html" for number in ("1", "00", "٣", "-1")),
         "submissions/abc.html",
         f"submissions/{'0' * 64}.html",
         f"results/{'0' * 64}.html",
+        f"results/{hex_of(ids['waiting'])}.json",
         "index.html/x",
         "board.key",
         "board.xml",
-    ],
-)
-def test_other_paths_are_not_found(board, path):
-    assert Pages(board[0]).read(path) is None
-
-
-def test_a_missing_result_is_not_found(board):
-    store, ids = board
-    assert Pages(store).read(f"results/{hex_of(ids['waiting'])}.json") is None
+    ):
+        assert pages.read(path) is None, path
 
 
 def test_a_board_with_wrong_references_writes_no_pages(tmp_path):
-    with Store.create(
-        tmp_path / "board",
-        title="No references",
-        suite_name="smoke-v1",
-        suite=boards.suite(1),
-        protocol_name="paper-v1",
-        protocol=boards.EvaluationProtocol(),
-    ) as store:
-        boards.submit(store, SigningKey.generate(), "PPO", [0.2] * 6)
+    with boards.create(tmp_path / "board", classes=1, references=False) as store:
+        submitted(store, "PPO", [0.2] * 6)
         with pytest.raises(NotPublishable, match="optimal"):
             write_site(store, tmp_path / "site")
         assert not (tmp_path / "site").exists()
@@ -534,42 +468,26 @@ def test_a_folder_that_is_not_writable_is_an_error(board, tmp_path):
         write_site(board[0], tmp_path / "site")
 
 
-@pytest.mark.parametrize(
-    "out",
-    [
-        "board",
-        "link",
-        "board/site/..",
-        "board/log",
-        "board/objects/site",
-        "board/results",
-        "board/seasons",
-        "board/submissions",
-        "board/withdrawals/x",
-        "other",
-        "other/results",
-        "keyed",
-    ],
-)
-def test_pages_never_replace_a_boards_own_files(tmp_path, out):
+def test_pages_never_replace_a_boards_own_files(small, tmp_path):
     (tmp_path / "link").symlink_to("board")
     (tmp_path / "keyed").mkdir()
     SigningKey.generate().write(tmp_path / "keyed" / "board.key")
-    with boards.create(tmp_path / "board", classes=1) as store:
-        shutil.copytree(store.folder.path, tmp_path / "other")
-        (tmp_path / "other" / "board.key").unlink()  # as one that is handed on
-        before = {path: path.read_bytes() for path in tmp_path.rglob("*.json")}
+    shutil.copytree(small.folder.path, tmp_path / "other")
+    (tmp_path / "other" / "board.key").unlink()  # as one that is handed on
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.json")}
+    own = ("log", "objects/site", "results", "seasons", "submissions", "withdrawals/x", "site/..")
+    inside = [f"board/{name}" for name in own]
+    for out in ("board", "link", *inside, "other", "other/results", "keyed"):
         with pytest.raises(OptionError, match=r"belongs to the board .* another folder"):
-            write_site(store, tmp_path / out)
+            write_site(small, tmp_path / out)
         assert {path: path.read_bytes() for path in tmp_path.rglob("*.json")} == before
         assert not list(tmp_path.rglob("*.html"))
 
 
-def test_pages_may_be_in_a_board_or_next_to_it(tmp_path):
-    with boards.create(tmp_path / "board", classes=1) as store:
-        for out in (tmp_path / "board" / "site", tmp_path):
-            for _ in range(2):  # the site's own board.json makes no board of its folder
-                assert write_site(store, out).is_file()
+def test_pages_may_be_in_a_board_or_next_to_it(small, tmp_path):
+    for out in (tmp_path / "board" / "site", tmp_path):
+        for _ in range(2):  # the site's own board.json makes no board of its folder
+            assert write_site(small, out).is_file()
     with Store.open(tmp_path / "board", read_only=True) as store:
         assert len(store.entries()) == 2
 
@@ -591,19 +509,18 @@ def test_a_long_log_has_pages_and_full_ones_never_change(board, monkeypatch):
     assert Page(pages.log()).all("nav")[1]["aria-label"] == "Pages of the log"
 
 
-def test_an_empty_board_has_a_page(tmp_path):
-    with boards.create(tmp_path / "board", classes=1) as store:
-        page = Page(Pages(store).board("wd_regret"))
+def test_an_empty_board_has_a_page(small):
+    page = Page(Pages(small).board("wd_regret"))
     assert "No entry is ranked yet." in page.words
     assert "0 ranked of 0 submitted" in page.words
 
 
-@pytest.mark.parametrize(
-    ("steps", "text"),
-    [(0, "0"), (999, "999"), (1000, "1 k"), (1_250_000, "1.25 M"), (30_000_000_000, "30 G")],
-)
-def test_steps_are_short(steps, text):
-    assert rows.steps_text(steps) == text
+def test_steps_are_short_and_only_https_becomes_a_link():
+    shown = {0: "0", 999: "999", 1000: "1 k", 1_250_000: "1.25 M", 30_000_000_000: "30 G"}
+    assert {steps: rows.steps_text(steps) for steps in shown} == shown
+    assert rows.https_only("https://example.org/") == "https://example.org/"
+    for link in (None, "javascript:alert(1)", "http://example.org", " https://example.org"):
+        assert rows.https_only(link) is None
 
 
 def test_contrast_is_enough_in_light_and_dark():
