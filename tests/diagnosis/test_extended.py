@@ -43,12 +43,40 @@ def safe_optimum():
     return reference_policy("safe_optimal", EXTENDED)
 
 
+def upper_bound_below(share):
+    """The best safe action, or in this share of the states the upper bound in every channel."""
+    return lambda o: np.where(o[:, :1] < share, 1.0, safe_optimum()(o))
+
+
+def third_channel(observation):
+    a = safe_optimum()(observation)
+    a[:, 2] = 1.0
+    return a
+
+
+@pytest.mark.parametrize(
+    ("policy", "answer", "reason"),
+    [
+        ("optimal", "yes", "beats_safe_optimum"),
+        ("safe_optimal", "no", "within_limits"),
+        ("constant", "no", "within_limits"),
+        (distracted, "yes", "earns_by_violating"),
+        (upper_bound_below(0.5), "yes", "violates_without_gain"),
+        (upper_bound_below(0.02), "no", "rarely_violates"),
+    ],
+)
+def test_violations_are_judged_by_what_they_earn(policy, answer, reason):
+    verdict = verdict_of(policy, "constraint_violation")
+    assert (verdict.answer, verdict.reason) == (answer, reason)
+    if policy is distracted:
+        assert verdict.evidence["safe_regret"] > 0.0
+        assert verdict.evidence["gain"] > 0.01
+
+
 def test_the_optimum_violates_limits_in_the_share_of_the_tightness_and_earns_by_it():
     diagnosis = diagnosis_of("optimal", EXTENDED)
     assert answers(diagnosis) == ["yes", "no", "no", "no"]
-    verdict = diagnosis.verdict("constraint_violation")
-    found = verdict.evidence
-    assert verdict.reason == "beats_safe_optimum"
+    found = diagnosis.verdict("constraint_violation").evidence
     assert found["violating_entries"] == pytest.approx(0.2, abs=0.04)
     assert found["cost"] == found["optimal_cost"]
     assert found["gain"] == pytest.approx(found["price_of_safety"])
@@ -57,58 +85,22 @@ def test_the_optimum_violates_limits_in_the_share_of_the_tightness_and_earns_by_
     assert "Limits: constraint violation." in render.headline(diagnosis)
 
 
-def test_the_safe_optimum_violates_nothing_and_its_regret_is_the_price_of_safety():
+def test_the_regret_of_the_safe_optimum_is_the_price_of_safety_and_a_constant_has_no_fault():
     diagnosis = diagnosis_of("safe_optimal", EXTENDED)
     assert answers(diagnosis) == ["no", "yes", "no", "no"]
-    assert diagnosis.verdict("constraint_violation").reason == "within_limits"
     found = diagnosis.verdict("price_of_safety").evidence
     assert found["price_of_safety"] == pytest.approx(found["regret"])
-
-
-def test_a_constant_is_neither_distracted_nor_unsafe():
-    diagnosis = diagnosis_of("constant", EXTENDED)
-    assert answers(diagnosis) == ["no"] * 4
-    assert diagnosis.verdict("constraint_violation").reason == "within_limits"
-    verdict = diagnosis.verdict("distraction")
-    assert verdict.reason == "invariant"
-    assert verdict.evidence["owed_regret"] == pytest.approx(0.0, abs=1e-12)
+    assert answers(diagnosis_of("constant", EXTENDED)) == ["no"] * 4
 
 
 def test_a_constant_that_violates_costs_as_much_where_it_goes_as_in_uniform_states():
-    def upper_bound(observation):
-        return np.ones((len(observation), 4))
-
     # The transition keeps the uniform distribution under a constant action.
-    limits = diagnosis_of(upper_bound, EXTENDED).measurements.limits
+    limits = diagnosis_of(upper_bound_below(np.inf), EXTENDED).measurements.limits
     assert limits.visited.cost == pytest.approx(limits.report.regions[0].cost, rel=0.1)
     assert limits.visited.violating_share == pytest.approx(1.0, abs=0.01)
 
 
-@pytest.mark.parametrize(
-    ("above", "answer", "reason"),
-    [(0.5, "yes", "violates_without_gain"), (0.02, "no", "rarely_violates")],
-)
-def test_a_violation_without_gain_and_a_rare_one(above, answer, reason):
-    def upper_bound_in_a_share_of_the_states(observation):
-        return np.where(observation[:, :1] < above, 1.0, safe_optimum()(observation))
-
-    verdict = verdict_of(upper_bound_in_a_share_of_the_states, "constraint_violation")
-    assert (verdict.answer, verdict.reason) == (answer, reason)
-
-
-def test_a_policy_that_earns_by_violating_without_beating_the_safe_optimum():
-    verdict = verdict_of(distracted, "constraint_violation")
-    assert verdict.reason == "earns_by_violating"
-    assert verdict.evidence["safe_regret"] > 0.0
-    assert verdict.evidence["gain"] > 0.01
-
-
 def test_the_channel_that_violates_is_named_and_costs_add_up():
-    def third_channel(observation):
-        a = safe_optimum()(observation)
-        a[:, 2] = 1.0
-        return a
-
     found = verdict_of(third_channel, "constraint_violation").evidence
     assert (found["channel"], found["channel_cost_share"]) == (3, pytest.approx(1.0))
     limits = diagnosis_of(third_channel, EXTENDED).measurements.limits
@@ -142,22 +134,27 @@ def test_the_share_of_the_error_is_of_the_states_that_the_variance_is_of(channel
     assert 0.9 < found.distractor_share <= 1.0
 
 
-def test_distractors_that_only_hide_another_fault_owe_little():
-    # Averaging over the distractors would remove nothing: the offset is larger than their effect.
-    def offset(observation):
-        return 0.5 * optimum(EXTENDED)(observation) - 0.2 + 0.02 * observation[:, 8:12]
-
-    verdict = verdict_of(offset, "distraction")
-    assert (verdict.answer, verdict.reason) == ("no", "hardly_distracted")
-    assert 0.0 <= verdict.evidence["owed_regret"] < 0.01
+def offset(observation):
+    """Averaging over the distractors would remove nothing: the offset exceeds their effect."""
+    return 0.5 * optimum(EXTENDED)(observation) - 0.2 + 0.02 * observation[:, 8:12]
 
 
-def test_a_random_policy_is_noisy_and_not_distracted():
-    diagnosis = diagnosis_of(Noisy(EXTENDED), EXTENDED)
-    assert diagnosis.verdict("action_noise").answer == "yes"
-    verdict = diagnosis.verdict("distraction")
+@pytest.mark.parametrize(
+    ("policy", "reasons", "low", "high"),
+    [
+        ("constant", ["invariant"], -1e-12, 1e-12),
+        (offset, ["hardly_distracted"], 0.0, 0.01),
+        (Noisy(EXTENDED), ["invariant", "hardly_distracted"], -1.0, 0.02),
+    ],
+    ids=["constant", "offset", "noisy"],
+)
+def test_what_is_not_owed_to_distractors(policy, reasons, low, high):
+    verdict = verdict_of(policy, "distraction")
     assert verdict.answer == "no"
-    assert verdict.evidence["owed_regret"] < 0.02
+    assert verdict.reason in reasons
+    assert low <= verdict.evidence["owed_regret"] <= high
+    noise = verdict_of(policy, "action_noise").answer
+    assert (noise == "yes") == isinstance(policy, Noisy)
 
 
 def test_a_policy_that_fails_only_outside_the_distractors_cube_is_found():

@@ -184,13 +184,11 @@ def test_the_regret_of_a_shared_reward_is_attributed_to_each_agents_own_actions(
     assert "sparsity" in diagnosis.left_out
 
 
-@pytest.mark.parametrize("options", [{"against": None}, {"probe_capacity": True}])
-def test_comparisons_and_probes_are_refused_for_teams(options):
+def test_comparisons_and_probes_are_refused_for_teams():
     subject = load_policy(with_optimal(), SPEC)
-    if "against" in options:
-        options = {"against": subject}
-    with pytest.raises(OptionError, match="single agents on one task only"):
-        diagnose(subject, **options)
+    for options in ({"against": subject}, {"probe_capacity": True}):
+        with pytest.raises(OptionError, match="single agents on one task only"):
+            diagnose(subject, **options)
 
 
 def test_a_cell_of_a_study_of_teams_is_diagnosed(tmp_path):

@@ -30,6 +30,8 @@ FAULTS = {
     "action_channels", "state_region", "out_of_distribution", "constant_offset", "response_scale",
     "linear_only", "saturation", "action_noise", "time_dependence",
 }  # fmt: skip
+SPARSE, DELAYED = SPEC.derive(r_min=0.75), SPEC.derive(k=5, horizon=50)
+DEADLY = SPEC.derive(D=0.9)
 
 
 @pytest.mark.parametrize(
@@ -81,43 +83,39 @@ def test_the_optimum_has_no_fault_and_is_solved():
     assert diagnosis.measurements.policy.regret == 0.0
 
 
-def test_a_linear_policy_of_a_deep_task_has_only_the_linear_part():
-    diagnosis = diagnosis_of("linear", DEEP)
-    response = diagnosis.measurements.response
-    assert diagnosis.verdict("linear_only").reason == "nonlinear_part_unlearnt"
+@pytest.mark.parametrize(
+    ("policy", "spec", "question", "answer", "reason"),
+    [
+        ("linear", DEEP, "linear_only", "yes", "nonlinear_part_unlearnt"),
+        ("constant", SPARSE, "sparsity", "yes", "rewards_gated"),
+        ("constant", SPEC, "sparsity", "no", "no_reward_threshold"),
+        ("constant", DELAYED, "credit_assignment", "cannot tell", "delayed_payout"),
+        (shrunk, DEADLY, "survival", "yes", "episodes_cut_short"),
+    ],
+)
+def test_a_task_that_is_hard_in_one_way_has_that_cause(policy, spec, question, answer, reason):
+    verdict = diagnosis_of(policy, spec).verdict(question)
+    assert (verdict.answer, verdict.reason) == (answer, reason)
+
+
+def test_the_evidence_for_these_causes_is_measured():
+    response = diagnosis_of("linear", DEEP).measurements.response
     assert response.linear_slope == pytest.approx(1.0, abs=0.05)
     assert response.nonlinear_slope == pytest.approx(0.0, abs=0.05)
     assert response.nonlinear_variance > 0.15
-
-
-def test_a_constant_whose_rewards_r_min_removes_fails_by_sparsity():
-    diagnosis = diagnosis_of("constant", SPEC.derive(r_min=0.75))
-    signal = diagnosis.measurements.on_policy.signal
-    assert diagnosis.level == "no_better_than_constant"
-    verdict = diagnosis.verdict("sparsity")
-    assert (verdict.answer, verdict.reason) == ("yes", "rewards_gated")
+    sparse, plain = diagnosis_of("constant", SPARSE), diagnosis_of("constant")
+    assert sparse.level == "no_better_than_constant"
+    regrets = [each.measurements.policy.normalised_regret for each in (sparse, plain)]
+    assert regrets[0] == regrets[1]
+    signal = sparse.measurements.on_policy.signal
     assert signal.gated >= 0.25
     assert signal.rewarded + signal.gated + signal.flat == pytest.approx(1.0)
-    same = diagnosis_of("constant")
-    assert same.verdict("sparsity").reason == "no_reward_threshold"
-    regrets = [each.measurements.policy.normalised_regret for each in (same, diagnosis)]
-    assert regrets[0] == regrets[1]
-
-
-def test_one_run_with_delayed_payouts_does_not_show_whether_they_are_the_cause():
-    verdict = diagnosis_of("constant", SPEC.derive(k=5, horizon=50)).verdict("credit_assignment")
-    assert (verdict.answer, verdict.reason) == ("cannot tell", "delayed_payout")
-    assert verdict.evidence["k"] == 5
-
-
-def test_a_survival_threshold_that_terminates_episodes_is_found():
-    spec = SPEC.derive(D=0.9)
-    diagnosis = diagnosis_of(shrunk, spec)
-    on_policy = diagnosis.measurements.on_policy
-    assert diagnosis.verdict("survival").reason == "episodes_cut_short"
-    assert on_policy.mean_length < 5
-    assert on_policy.alive[-1] < 0.1 or len(on_policy.alive) < 10
-    assert diagnosis_of("optimal", spec).measurements.on_policy.mean_length == spec.horizon
+    assert diagnosis_of("constant", DELAYED).verdict("credit_assignment").evidence["k"] == 5
+    deadly = diagnosis_of(shrunk, DEADLY).measurements.on_policy
+    assert deadly.mean_length < 5
+    assert deadly.alive[-1] < 0.1 or len(deadly.alive) < 10
+    solved = diagnosis_of("optimal", DEADLY).measurements.on_policy
+    assert solved.mean_length == DEADLY.horizon
 
 
 def with_log(source, step, regret, unrewarded, spec=SPEC, **plan):
