@@ -153,7 +153,7 @@ def test_scoring_refuses_a_broken_bubblewrap_and_warns_of_a_missing_one(monkeypa
     assert result.exit_code == 0
     assert "bubblewrap is not installed" in " ".join(result.stderr.split())
     with Store.open("board", read_only=True) as store:
-        kinds = {store.result(entry.id).isolation for entry in store.entries()}  # type: ignore[union-attr]
+        kinds = {store.result(entry.id).isolation for entry in store.entries()}
     assert kinds == {"process"}
 
 
@@ -246,17 +246,10 @@ def test_invalid_usage_exits_with_2():
     good("keygen")
     assert "already exists" in fails(2, "keygen")
     assert "init" in fails(2, "rank", "nowhere")
-    assert "no such folder" in fails(
-        2, "new", "b", "--runs", "runs/*", "--method", "M", "--submitter", "S"
-    )
-    assert "knowledge" in fails(
-        2, "new", "b", "--runs", "runs.json", "--method", "M", "--submitter", "S",
-        "--knowledge", "much", "--suite", "tiny-v1.json",
-    )  # fmt: skip
-    assert "CLASS=N" in fails(
-        2, "new", "b", "--runs", "runs.json", "--method", "M", "--submitter", "S",
-        "--started", "many", "--suite", "tiny-v1.json",
-    )  # fmt: skip
+    new = ("new", "b", "--method", "M", "--submitter", "S", "--suite", "tiny-v1.json", "--runs")
+    assert "no such folder" in fails(2, *new, "runs/*")
+    assert "knowledge" in fails(2, *new, "runs.json", "--knowledge", "much")
+    assert "CLASS=N" in fails(2, *new, "runs.json", "--started", "many")
     make_board()
     assert "at most one" in fails(2, "rank", "board", "--json", "--csv")
     assert "new folder" in fails(2, "init", "board", "--suite", "tiny-v1.json")

@@ -9,9 +9,6 @@ import time
 from collections import Counter
 from pathlib import Path
 
-import pytest
-
-from leaderboard.documents.result import METRICS
 from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import run_scorers
 from leaderboard.store import Store, collect_garbage
@@ -111,29 +108,17 @@ def test_rows_of_many_entries_are_read_from_the_index_alone(tmp_path, key, monke
             first = put_submission(store, key).submission
             result = synthetic_result(store, first.digest)
             for number in range(entries):
-                method = first.method.model_copy(update={"name": f"Method {number}"})
                 if number > 0:
+                    method = first.method.model_copy(update={"name": f"Method {number}"})
                     other = first.model_copy(update={"method": method})
                     store.receive(other.signed(key, store.document.key))
                 claim = store.queue.claim("filler")
-                assert claim is not None
-                scores = {
-                    metric: getattr(result.scores, metric).model_copy(
-                        update={"value": 0.5 + 0.001 * number}
-                    )
-                    for metric in METRICS
-                }
-                update = {
-                    "submission": claim.id,
-                    "scores": result.scores.model_copy(update=scores),
-                }
+                update = {"submission": claim.id}
                 assert store.queue.finish(claim, result.model_copy(update=update))
         store.reindex()
         rows = store.entries()
-        assert [row.scores.wd_regret.value for row in rows] == pytest.approx(
-            [0.5 + 0.001 * number for number in range(entries)]
-        )
-        assert all(row.runs == runs for row in rows)
+        assert len(rows) == entries
+        assert all((row.runs, row.scores) == (runs, result.scores) for row in rows)
         for name in ("submissions", "results"):
             (store.folder.path / name).rename(tmp_path / name)
         assert store.entries() == rows

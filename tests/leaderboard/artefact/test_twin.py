@@ -8,10 +8,10 @@ from onnx import TensorProto
 
 from leaderboard.artefact import twin
 from leaderboard.artefact.gate import inspect, widths
-from leaderboard.artefact.reference import constant_onnx, optimal_onnx
+from leaderboard.artefact.reference import optimal_onnx
 from leaderboard.artefact.sandbox import MAX_ROUNDING, Sandbox
 from leaderboard.errors import Rejection
-from sme_registry import SMESpec, materialize
+from sme_registry import SMESpec
 from sme_registry.export import operators
 from tests.leaderboard.artefact.models import (
     ACTION,
@@ -85,24 +85,6 @@ def repeated(weights_of_copies):
     return np.zeros(len(columns), np.int64), columns
 
 
-def logistic_map(times, dtype=f32):
-    """A chaotic map, iterated: each step doubles an error."""
-    steps = []
-    for i in range(times):
-        steps += [node("Sub", f"one x{i}", f"s{i}"), node("Mul", f"x{i} s{i}", f"p{i}")]
-        steps += [node("Mul", f"p{i} r", f"x{i + 1}")]
-    type = TensorProto.FLOAT if dtype is f32 else TensorProto.DOUBLE
-    return policy(
-        node("MatMul", "o W", "y"),
-        node("Sigmoid", "y", "start"),
-        node("Cast", "start", "x0", to=type),
-        *steps,
-        node("Cast", f"x{times}", "a", to=TensorProto.FLOAT),
-        one=np.array(1.0, dtype),
-        r=np.array(3.99, dtype),
-    )
-
-
 def tail(operator, at, factor):
     """The tail of a function, where a kernel may round to 0."""
     return amplified(
@@ -145,7 +127,6 @@ def rare():
     )
 
 
-SUMS = {"W64": RNG.normal(size=(OBSERVATION, 64)).astype(f32), "ones": np.ones((64, ACTION), f32)}
 COPIES, CANCELLING = repeated([0.1] * 30 + [-0.1] * 30)
 
 SENSITIVE = {
@@ -158,10 +139,6 @@ SENSITIVE = {
         node("Sub", "v w", "d"), factor=1e8,
         WW=np.repeat(RNG.normal(size=(OBSERVATION, 1)).astype(f32), 2 * ACTION, axis=1),
     ),
-    "copies that cancel inside a product": amplified(
-        node("Gather", "o copies", "c", axis=1), node("MatMul", "c V", "d"),
-        copies=COPIES, V=CANCELLING.astype(f32), factor=1e7,
-    ),
     "copies that cancel in double precision": amplified(
         node("Gather", "o copies", "c", axis=1), node("Cast", "c", "x", to=TensorProto.DOUBLE),
         node("MatMul", "x V", "e"), node("Mul", "e large", "l"),
@@ -172,26 +149,12 @@ SENSITIVE = {
         node("MatMul", "K V", "e"), node("Mul", "y zero", "n"), node("Add", "n e", "d"),
         K=np.ones((1, len(CANCELLING)), f32), V=CANCELLING.astype(f32), zero=0.0, factor=1e7,
     ),
-    "a sum in two orders": amplified(
-        node("MatMul", "o W64", "h"), node("ReduceSum", "h last", "s"),
-        node("MatMul", "h ones", "t"), node("Sub", "s t", "d"),
-        last=np.int64([1]), factor=1e6, **SUMS,
-    ),
     "1 − erf": amplified(
         node("Abs", "y", "x"), node("Add", "x far", "z2"), node("Erf", "z2", "e"),
         node("Sub", "one e", "d"), far=3.8, one=1.0, factor=1e7,
     ),
     "the tail of a sigmoid": tail("Sigmoid", -17.0, 1e7),
-    "the tail of a GELU": tail("Gelu", -5.0, 1e6),
-    "a logarithm of a probability": amplified(
-        node("Mul", "y apart", "z2"), node("LogSoftmax", "z2", "d", axis=1),
-        apart=f32([20.0, -20.0]), factor=1e7,
-    ),
     "a hundredth of the states": rare(),
-    "the last bits of the observation": first_channel(
-        node("Mul", "x scale", "g"), node("Floor", "g", "h"), node("Sub", "g h", "z"),
-        scale=2.0**22,
-    ),
     "the last bits of the observation, by operators that do not round": first_channel(
         node("Mod", "x unit", "m", fmod=1), node("Mul", "m scale", "z"),
         unit=2.0**-20, scale=2.0**20,
@@ -202,14 +165,12 @@ SENSITIVE = {
         node("Mul", "q small", "z"),
         scale=2.0**24, prime=np.array(97), small=1 / 97,
     ),
-    "a chaotic map": logistic_map(60),
-    "a chaotic map in double precision": logistic_map(80, np.float64),
     "a cast to integers that overflows": amplified(
         node("Mul", "y huge", "h"), node("Cast", "h", "i", to=TensorProto.INT32),
         node("Cast", "i", "d", to=TensorProto.FLOAT), huge=1e12, factor=2.0**-31,
     ),
     **{f"the last bits of {name}": last_bits(name)
-       for name in ("Exp", "Sin", "Cos", "Erf", "Tanh", "Log", "Sqrt", "Softplus", "Elu", "Mish")},
+       for name in ("Exp", "Tanh", "Sqrt")},
 }  # fmt: skip
 
 
@@ -290,33 +251,11 @@ def table():
     )
 
 
-def deep(layers, gain, width=64):
-    """A random network; each layer amplifies by the gain where its tanh is not saturated."""
-    nodes, tensors, x, columns = [], {}, "o", OBSERVATION
-    for i in range(layers):
-        W = RNG.normal(size=(columns, width)) * gain / np.sqrt(columns)
-        tensors[f"W{i}"] = W.astype(f32)
-        nodes += [node("MatMul", f"{x} W{i}", f"y{i}"), node("Tanh", f"y{i}", f"x{i}")]
-        x, columns = f"x{i}", width
-    tensors["last"] = RNG.normal(size=(width, ACTION)).astype(f32)
-    return policy(*nodes, node("MatMul", f"{x} last", "y"), node("Sigmoid", "y", "a"), **tensors)
-
-
 INSENSITIVE = {
     "a network": (network(64), 1e-6),
-    "20 layers of gain 2": (deep(20, 2.0), 3e-5),
     "a tree": (tree(4), 0.0),
     "a tree of products": (tree_of_products(), 1e-6),
     "a table": (table(), 0.0),
-    "the best of 20 actions": (
-        policy(
-            node("MatMul", "o Q", "q"), node("ArgMax", "q", "i", axis=1, keepdims=0),
-            node("Gather", "actions i", "a", axis=0),
-            Q=RNG.normal(size=(OBSERVATION, 20)).astype(f32),
-            actions=RNG.random((20, ACTION)).astype(f32),
-        ),
-        1e-5,
-    ),
     "one of two actions": (
         amplified(node("Sign", "y", "d"), factor=0.5), 1e-6
     ),
@@ -330,44 +269,22 @@ def test_an_honest_policy_changes_far_less_than_the_limit(kind):
     assert most < MAX_ROUNDING / 3.0
 
 
-@pytest.mark.parametrize("team", [False, True])
-def test_the_reference_policies_change_far_less_than_the_limit(team):
-    agents = {"team": {"agents": [{"action_dim": 1}, {"action_dim": 1}]}} if team else {}
-    spec = SMESpec(state_dim=3, action_dim=2, complexity=20, **agents)
+def test_the_optimal_policy_of_a_team_changes_far_less_than_the_limit():
+    team = {"agents": [{"action_dim": 1}, {"action_dim": 1}]}
+    spec = SMESpec(state_dim=3, action_dim=2, complexity=20, team=team)
     assert rounding(optimal_onnx(spec), widths(spec)) <= 1e-6
-    assert rounding(constant_onnx(spec), widths(spec)) <= 1e-6
-
-
-def test_the_optimal_policy_in_single_precision_passes_at_the_highest_complexity():
-    spec = SMESpec(state_dim=2, action_dim=1, complexity=50)
-    nodes, tensors, x = [], [tensor("one", f32(1)), tensor("half", f32(0.5))], "states"
-    for i, (W, b) in enumerate(materialize(spec).policies[0]):
-        root2 = np.sqrt(2.0)
-        tensors += [tensor(f"W{i}", (W.T / root2).astype(f32))]
-        tensors += [tensor(f"b{i}", (b / root2).astype(f32))]
-        nodes += [node("Gemm", f"{x} W{i} b{i}", f"g{i}"), node("Erf", f"g{i}", f"e{i}")]
-        nodes += [node("Add", f"e{i} one", f"p{i}"), node("Mul", f"p{i} half", f"x{i}")]
-        x = f"x{i}"
-    tensors.append(tensor("channels", np.int64([0, 1])))
-    found = model(
-        [node("Gather", "o channels", "states", axis=1), *nodes, node("Identity", x, "a")],
-        tensors,
-        inputs=[value("o", "batch", 4)],
-        outputs=[value("a", "batch", 1)],
-    )
-    assert 1e-6 < rounding(found, (4, 1)) < MAX_ROUNDING / 2.0
 
 
 def test_errors_are_drawn_anew_in_each_run_and_reach_every_row():
     observations = np.random.default_rng(1).random((ROWS, OBSERVATION), f32)
-    with Sandbox(deep(2, 1.0).SerializeToString(), OBSERVATION, ACTION) as opened:
+    with Sandbox(network(64).SerializeToString(), OBSERVATION, ACTION) as opened:
         first, second = opened.rounding(observations), opened.rounding(observations)
         assert (opened(observations) == opened(observations)).all()
     assert (first != second).mean() > 0.7
     assert (first > 0.0).mean() > 0.7
 
 
-@pytest.mark.parametrize("opset", [13, 17, 21, 23])
+@pytest.mark.parametrize("opset", [13, 23])
 def test_every_opset_has_a_twin(opset):
     found = network(8)
     found.opset_import[0].version = opset

@@ -89,7 +89,6 @@ class KillableServer:
         self.start()
 
     def start(self) -> None:
-        """Start it, and wait until it listens."""
         root = str(Path(__file__).parents[3])
         self._process = subprocess.Popen(
             self._command, stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": root}, text=True
@@ -128,9 +127,9 @@ def step_through_kills(board: Board, tickets: int, requests: int, kills: int) ->
             thread.start()
         for kill in range(1, kills + 1):
             due = tickets * requests * kill // (kills + 1)
-            while sum(each.requests for each in entrants) < due:
-                if not any(thread.is_alive() for thread in threads):
-                    break
+            while sum(each.requests for each in entrants) < due and any(
+                thread.is_alive() for thread in threads
+            ):
                 time.sleep(0.002)
             server.kill()
             server.start()

@@ -114,53 +114,42 @@ def test_what_an_organiser_replaces_before_the_result_is_found(
             verify_season(played.store, season.id)
 
 
-def _lie(result: SealedResult, part: str) -> SealedResult:
-    """A result that differs from this one in one part."""
-    run, steps, value = result.runs[0], result.stepping[0], result.scores.wd_regret
-    runs: dict[str, Any] = {
-        "regret": {"normalised_regret": (0.5, *run.normalised_regret[1:])},
-        "metric": {"similarity_loss": 0.0},
-        "answers": {"artefact": "sha256:" + "a" * 64},
-    }
-    stepping: dict[str, Any] = {
-        "online regret": {"normalised_online_regret": 0.0},
-        "curve": {"learning_curve": (*steps.learning_curve[:-1], 0.0)},
-        "steps": {"steps": 1},
-        "signature": {"signed": "sha256:" + "a" * 64},
-    }
-    if part in runs:
-        return result.model_copy(
-            update={"runs": (run.model_copy(update=runs[part]), *result.runs[1:])}
-        )
-    if part in stepping:
-        first = steps.model_copy(update=stepping[part])
-        return result.model_copy(update={"stepping": (first, *result.stepping[1:])})
-    lower = value.model_copy(update={"value": 0.5})
-    return result.model_copy(
-        update={"scores": result.scores.model_copy(update={"wd_regret": lower})}
-    )
-
-
 @pytest.mark.parametrize(
-    ("part", "message"),
+    ("part", "changes", "message"),
     [
-        ("regret", r"runs\.0: scored again"),
-        ("metric", r"runs\.0: scored again"),
-        ("answers", r"runs\.0: scored again"),
-        ("online regret", r"stepping\.0: replayed from its journal"),
-        ("curve", r"stepping\.0: replayed from its journal"),
-        ("steps", r"stepping\.0: replayed from its journal"),
-        ("signature", r"stepping\.0: names another signature"),
-        ("scores", "its scores do not follow from its runs"),
+        ("runs", {"normalised_regret": (0.5,) * 6}, "scored again"),
+        ("runs", {"similarity_loss": 0.0}, "scored again"),
+        ("runs", {"artefact": "sha256:" + "a" * 64}, "scored again"),
+        ("stepping", {"normalised_online_regret": 0.0}, "replayed from its journal"),
+        ("stepping", {"learning_curve": (*(1.0,) * 15, 0.0)}, "replayed from its journal"),
+        ("stepping", {"steps": 1}, "replayed from its journal"),
+        ("stepping", {"signed": "sha256:" + "a" * 64}, "names another signature"),
+        ("scores", {}, "its scores do not follow from its runs"),
     ],
 )
 def test_a_result_that_does_not_follow_is_found(
-    revealed: Board, monkeypatch: pytest.MonkeyPatch, part: str, message: str
+    revealed: Board,
+    monkeypatch: pytest.MonkeyPatch,
+    part: str,
+    changes: dict[str, Any],
+    message: str,
 ) -> None:
     with Store.open(revealed.path, read_only=True) as store:
         stored = store.sealed_result
-        monkeypatch.setattr(store, "sealed_result", lambda row: _lie(stored(row), part))
-        with pytest.raises(TamperedError, match=message):
+
+        def lie(row: Any) -> SealedResult:
+            result = stored(row)
+            assert result is not None
+            if part == "scores":
+                value = result.scores.wd_regret.model_copy(update={"value": 0.4})
+                scores = result.scores.model_copy(update={"wd_regret": value})
+                return result.model_copy(update={"scores": scores})
+            first, *others = getattr(result, part)
+            return result.model_copy(update={part: (first.model_copy(update=changes), *others)})
+
+        monkeypatch.setattr(store, "sealed_result", lie)
+        where = "" if part == "scores" else rf"{part}\.0: "
+        with pytest.raises(TamperedError, match=where + message):
             verify_season(store, revealed.season.id)
 
 

@@ -387,66 +387,47 @@ class Ended:
         pass
 
 
-@pytest.fixture
-def two_over(played: Played, monkeypatch: pytest.MonkeyPatch) -> Played:
-    """Two tickets that were played, and whose time is over."""
+def test_tickets_that_could_not_be_scored_are_tried_again_after_a_pause_one_by_one(
+    played: Played, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first process dies; then the journal of ticket 1 cannot be read for a while."""
+    broken = played.folder / "0.journal"
     for number in (1, 2):
         if played.number < number:
             played.take_ticket(number)
         played.start()
         played.step(1)
-    set_clocks(monkeypatch, 0, passed=25)
-    return played
-
-
-def test_processes_that_die_are_started_again_after_a_pause_for_each_ticket_alone(
-    two_over: Played, monkeypatch: pytest.MonkeyPatch
-) -> None:
     started: list[list[int]] = []
+    codes: list[object] = []
 
     def start(attendant: Attendant) -> Ended:
+        board = played.board
         started.append(attendant._numbers)
-        return Ended(1)
-
-    monkeypatch.setattr(Attendant, "_start", start)
-    attendant = Attendant(two_over.tickets)
-    attendant.attend()
-    attendant.attend()
-    assert started == [[1, 2]]
-    set_clocks(monkeypatch, 0, passed=25 + 2 / 3600)
-    for _ in range(3):
-        attendant.attend()
-    assert started == [[1, 2], [1], [2]]
-    attendant.attend()
-    assert len(started) == 3
-
-
-def test_a_ticket_that_cannot_be_scored_holds_up_no_other_and_is_tried_again(
-    two_over: Played, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    codes = []
-
-    def start(attendant: Attendant) -> Ended:
-        board, season = two_over.board, two_over.board.season.digest
+        if len(started) == 1:
+            return Ended(1)
         with pytest.raises(SystemExit) as end:
-            _score(board.path, season, board.secret, attendant._numbers)
-        codes.append(int(end.value.code))
-        return Ended(codes[-1])
+            _score(board.path, board.season.digest, board.secret, attendant._numbers)
+        codes.append(bool(end.value.code))
+        return Ended(int(codes[-1]))
+
+    def attend(seconds: float) -> list[list[int]]:
+        set_clocks(monkeypatch, 0, passed=25 + seconds / 3600)
+        attendant.attend()
+        attendant.attend()
+        return started
 
     monkeypatch.setattr("leaderboard.sealed.attendant.signal.signal", lambda *_: None)
     monkeypatch.setattr(Attendant, "_start", start)
-    attendant, broken = Attendant(two_over.tickets), two_over.folder.parent / "1" / "0.journal"
-    whole = broken.read_bytes()
+    attendant, whole = Attendant(played.tickets), broken.read_bytes()
     broken.write_bytes(b"no journal")
-    attendant.attend()
-    assert two_over.tickets.over() == [1]
-    attendant.attend()
+    assert attend(seconds=0) == [[1, 2]]
+    assert attend(seconds=2) == [[1, 2], [1]]
+    assert attend(seconds=2) == [[1, 2], [1], [2]]
+    assert played.tickets.over() == [1]
     broken.write_bytes(whole)
-    set_clocks(monkeypatch, 0, passed=25 + 2 / 3600)
-    for _ in range(2):
-        attendant.attend()
-    assert two_over.tickets.over() == []
-    assert codes == [1, 0]
+    assert attend(seconds=60) == [[1, 2], [1], [2], [1]]
+    assert played.tickets.over() == []
+    assert codes == [True, False, False]
 
 
 @pytest.mark.parametrize("lanes", [1, LANES])
