@@ -149,7 +149,8 @@ def test_a_result_says_in_what_program_it_was_made_and_a_reference_s_does_not(wh
 
 
 def test_curve_and_regret_mean_what_they_mean_in_any_cell(whole: Path) -> None:
-    for result in agents(whole):
+    results = agents(whole)
+    for result in results:
         curve = result.curve
         assert curve.steps == (24, 48, 72, 96)
         assert curve.length == (20.0,) * 4
@@ -158,8 +159,8 @@ def test_curve_and_regret_mean_what_they_mean_in_any_cell(whole: Path) -> None:
         assert result.online_regret is not None
         assert 0.5 < result.online_regret < 1.0
         assert result.timing.total > 0
-    assert len({result.curve.episode_return for result in agents(whole)}) == 4
-    assert len({result.online_regret for result in agents(whole)}) == 4
+    assert len({result.curve.episode_return for result in results}) == 4
+    assert len({result.online_regret for result in results}) == 4
 
 
 def test_a_report_says_which_algorithms_run_in_jax(whole: Path) -> None:
@@ -202,8 +203,7 @@ def test_after_kill_9_a_program_goes_on_from_its_state_with_the_same_bits(
     assert status.count("done") == 4
     assert steps[0] == 64  # after the next rollout; from the beginning, it would be 32
     assert not state.exists()
-    uninterrupted = numbers(whole)
-    assert numbers(tmp_path) == {key: uninterrupted[key] for key in numbers(tmp_path)}
+    assert numbers(tmp_path).items() <= numbers(whole).items()
 
 
 def change_state(
@@ -259,8 +259,7 @@ def test_a_lane_whose_weights_are_not_finite_fails_and_the_others_go_on(
     (failure,) = Ledger(study).failures().values()
     assert failure.key == header["cells"][1]
     assert failure.error.startswith("PolicyError: its weights were not finite after step 64.")
-    uninterrupted = numbers(whole)
-    assert numbers(study) == {key: uninterrupted[key] for key in numbers(study)}
+    assert numbers(study).items() <= numbers(whole).items()
 
 
 def test_a_retry_goes_on_from_the_state_if_an_evaluation_at_the_end_failed(
@@ -319,16 +318,14 @@ def test_a_state_of_other_versions_is_not_used(whole: Path, study: Path, state: 
     assert numbers(study).items() <= numbers(whole).items()
 
 
-@pytest.mark.parametrize(
-    ("name", "array"),
-    [("records/regret", None), ("records/rows", np.zeros(3)), ("program/.key", np.zeros(3))],
-)
+@pytest.mark.parametrize("name", ["records/regret", "records/rows", "program/.key"])
 def test_a_state_with_other_arrays_counts_as_none_and_a_message_says_so(
-    name: str, array: Any, whole: Path, study: Path, state: Path
+    name: str, whole: Path, study: Path, state: Path
 ) -> None:
     def change(arrays: dict[str, Any]) -> None:
         assert arrays.pop(name) is not None
-        arrays |= {} if array is None else {name: array}
+        if name != "records/regret":
+            arrays[name] = np.zeros(3)
 
     change_state(state, change)
     printed, steps = io.StringIO(), list[int]()
@@ -361,10 +358,15 @@ def test_a_cell_by_itself_is_a_program_of_one_lane(tmp_path: Path) -> None:
 
 
 def test_a_cell_with_limits_and_distractors_has_their_costs_and_reports() -> None:
-    observation = {"distractors": 3, "dynamics": "driven", "mixing": "nonlinear"}
-    setting = {"state_dim": 2, "action_dim": 2, "horizon": 20, "safety": {"tightness": 0.3}}
-    setting["observation"] = observation
-    file = plan_file(classes=[{"name": "mixed", "setting": setting, "seeds": [1]}], seeds=1)
+    setting = {
+        "state_dim": 2,
+        "action_dim": 2,
+        "horizon": 20,
+        "safety": {"tightness": 0.3},
+        "observation": {"distractors": 3, "dynamics": "driven", "mixing": "nonlinear"},
+    }
+    classes = [{"name": "mixed", "setting": setting, "seeds": [1]}]
+    file = plan_file(classes=classes, seeds=1, steps=32, evaluations=0)
     result = run_cell(file.plan.cells[0].cell)
     assert result.online_cost is not None
     assert 0.0 < result.online_cost < 1.0

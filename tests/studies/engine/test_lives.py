@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +13,7 @@ from rich.console import Console
 
 from sme_registry import SMESpec, StreamSpec, materialize
 from sme_registry.errors import PolicyError, SMEError, SpecError
-from sme_registry.evaluation import evaluate_stream, expected_regret
+from sme_registry.evaluation import StreamReport, evaluate_stream, expected_regret
 from sme_registry.spec import Cell, StudyFile, StudyPlan
 from sme_registry.studies.engine import lanes
 from sme_registry.studies.engine.cell import run_cell
@@ -33,7 +29,6 @@ from sme_registry.training.snapshots import Snapshots
 
 pytest.importorskip("stable_baselines3")
 
-ROOT = Path(__file__).resolve().parents[3]
 TASK = SMESpec(state_dim=2, action_dim=2, horizon=8)
 OTHER = TASK.derive(seed=1)
 SMALL = {"n_steps": 16, "batch_size": 16, "n_epochs": 2, "policy_kwargs": {"net_arch": [4]}}
@@ -121,14 +116,22 @@ def lived(tmp_path_factory: pytest.TempPathFactory) -> tuple[CellResult, Path]:
     return run_cell(life(), model_path=model), model
 
 
+@pytest.fixture(scope="module")
+def report(lived: tuple[CellResult, Path]) -> StreamReport:
+    """The life's."""
+    report = lived[0].stream_report
+    assert report is not None
+    assert report.dynamic_regret is not None
+    return report
+
+
 def test_a_life_has_the_policies_that_ppo_has_at_the_end_of_each_visit(
-    lived: tuple[CellResult, Path],
+    lived: tuple[CellResult, Path], report: StreamReport
 ) -> None:
     from stable_baselines3 import PPO
 
     from sme_registry.sb3 import SMEVecEnv
 
-    result, _ = lived
     settings = SMALL | {"policy_kwargs": dict(SMALL["policy_kwargs"])}  # type: ignore[call-overload]
     env = SMEVecEnv(TWICE, 1, action_range="symmetric")
     model: Any = PPO("MlpPolicy", env, seed=3, device="cpu", **settings)
@@ -136,24 +139,19 @@ def test_a_life_has_the_policies_that_ppo_has_at_the_end_of_each_visit(
     for _ in range(4):
         model.learn(32, reset_num_timesteps=not rows)
         rows.append(matrix(evaluate_stream([model] * 4, TWICE, PROTOCOL))[0])
-    assert result.report is None
-    assert result.stream_report is not None
-    assert result.stream_report.policy == "PPO"
-    np.testing.assert_allclose(matrix(result.stream_report), rows, atol=1e-6)
-    assert len({*matrix(result.stream_report)[:, 0]}) == 4
+    assert lived[0].report is None
+    assert report.policy == "PPO"
+    np.testing.assert_allclose(matrix(report), rows, atol=1e-6)
+    assert len({*matrix(report)[:, 0]}) == 4
 
 
 def test_a_life_has_the_agent_that_stopped_learning_after_its_first_visit(
-    lived: tuple[CellResult, Path],
+    lived: tuple[CellResult, Path], report: StreamReport
 ) -> None:
-    result, model = lived
-    report = result.stream_report
-    assert report is not None
-    assert report.dynamic_regret is not None
-    frozen = report.reference_regret["frozen_agent"]
-    own = report.dynamic_regret
+    frozen, own = report.reference_regret["frozen_agent"], report.dynamic_regret
+    assert own is not None
     assert frozen.visits[0].online_regret == pytest.approx(own.visits[0].online_regret)
-    kept = Snapshots(model.with_suffix(""), TWICE).visits[0]
+    kept = Snapshots(lived[1].with_suffix(""), TWICE).visits[0]
     expected = expected_regret([0.0, kept, kept, kept], TWICE, action_range="symmetric")
     for visit in (1, 2, 3):
         found, wanted = frozen.visits[visit].online_regret, expected.visits[visit].online_regret
@@ -179,39 +177,36 @@ def test_a_life_s_document_is_read_again_and_holds_one_report(
 
 
 def test_the_dynamic_regret_of_a_life_is_that_of_its_training(
-    lived: tuple[CellResult, Path],
+    lived: tuple[CellResult, Path], report: StreamReport
 ) -> None:
-    result, _ = lived
-    assert result.stream_report is not None
-    regret = result.stream_report.dynamic_regret
+    result, regret = lived[0], report.dynamic_regret
     assert regret is not None
     assert [visit.steps for visit in regret.visits] == [32] * 4
     assert regret.online_regret == pytest.approx(result.online_regret)
     assert regret.lifetime == tuple(range(1, 129))
     fresh = [run_cell(cell) for cell in result.cell.fresh]
-    report = result.stream_report.with_fresh(
+    beside = report.with_fresh(
         [each.any_report for each in fresh], [each.online_regret or 0.0 for each in fresh]
     )
-    assert None not in report.region().agent.plasticity_ratio
-    assert report.dynamic_regret is not None
-    assert report.dynamic_regret.learning_transfer is not None
-    assert report.dynamic_regret.visits[0].learning_transfer == pytest.approx(0.0)  # the same agent
+    assert None not in beside.region().agent.plasticity_ratio
+    assert beside.dynamic_regret is not None
+    assert beside.dynamic_regret.learning_transfer is not None
+    assert beside.dynamic_regret.visits[0].learning_transfer == pytest.approx(0.0)  # the same agent
 
 
 def test_the_models_of_a_life_are_kept_before_training_and_after_each_visit(
-    lived: tuple[CellResult, Path],
+    lived: tuple[CellResult, Path], report: StreamReport
 ) -> None:
-    result, model = lived
+    model = lived[1]
     names = ["initial.zip", "visit-00.zip", "visit-01.zip", "visit-02.zip", "visit-03.zip"]
     files = sorted(model.with_suffix("").iterdir())
     assert [path.name for path in files] == names
     initial, *visits = map(str, files)
     again = evaluate_stream(visits, TWICE, PROTOCOL, initial=initial)
-    assert result.stream_report is not None
-    np.testing.assert_allclose(matrix(again), matrix(result.stream_report), atol=1e-6)
+    np.testing.assert_allclose(matrix(again), matrix(report), atol=1e-6)
     last = evaluate_stream([str(model)] * 4, TWICE, PROTOCOL)
     np.testing.assert_array_equal(matrix(last)[3], matrix(again)[3])
-    agent, own = again.region().agent, result.stream_report.region().agent
+    agent, own = again.region().agent, report.region().agent
     assert agent.forward_transfer == pytest.approx(own.forward_transfer, abs=1e-6)
 
 
@@ -279,16 +274,13 @@ def test_a_study_keeps_the_models_of_its_lives(studied: Path) -> None:
     ledger = Ledger(studied)
     for place in plan_file().plan.cells:
         key = place.cell.digest
-        kept = sorted(path.name for path in ledger.snapshots_path(key).glob("*"))
-        assert kept == (
-            [] if place.phase is not None else ["initial.zip", "visit-00.zip", "visit-01.zip"]
-        )
+        names = [] if place.phase is not None else ["initial.zip", "visit-00.zip", "visit-01.zip"]
+        assert sorted(path.name for path in ledger.snapshots_path(key).glob("*")) == names
         assert ledger.model_path(key).exists()
 
 
 def test_a_life_takes_longer_than_a_task_of_equal_steps() -> None:
-    one = life(stream_of(TASK, steps=128))
-    many = life(TWICE)
+    one, many = life(stream_of(TASK, steps=128)), life(TWICE)
     assert Estimator().seconds(many).low > Estimator().seconds(one).low
 
 
@@ -338,24 +330,6 @@ def test_lives_that_switch_at_the_same_steps_are_lanes_of_one_program() -> None:
     assert programs.program(others[3]).shape == (2, 2, 3, 8)
 
 
-# Kills itself at the end of the last visit, when the state before it has been written.
-KILLED = """
-import os, signal, sys
-from pathlib import Path
-from sme_registry.studies.engine import lanes
-from tests.studies.engine import test_lives
-
-def kill(run, visit, weights, original=lanes._Run._on_visit):
-    original(run, visit, weights)
-    if visit == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-
-lanes.SECONDS_BETWEEN_STATES = 0.0
-lanes._Run._on_visit = kill
-test_lives.ran(Path(sys.argv[1]), test_lives.jax_file(), device="cpu")
-"""
-
-
 def jax_file() -> StudyFile:
     """Two lives, on two draws of a stream."""
     stream = {"name": "switch", "stream": stream_of(TASK, OTHER).to_dict(), "draws": [0, 1]}
@@ -371,39 +345,45 @@ def numbers(study: Path) -> dict[str, Any]:
     return documents
 
 
-def test_after_kill_9_lives_in_jax_go_on_with_the_weights_of_their_visits(tmp_path: Path) -> None:
-    pytest.importorskip("jax")
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    ran(whole, jax_file(), device="cpu", keep_models=True)
-    process = subprocess.run(
-        [sys.executable, "-c", KILLED, str(killed)],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
-    assert process.returncode == -signal.SIGKILL, process.stderr
-    assert not Ledger(killed).results()
-    assert list((killed / "states").glob("*.npz"))
+@pytest.fixture
+def visits(monkeypatch: pytest.MonkeyPatch) -> tuple[list[int], list[type[BaseException]]]:
+    """The visits that lives in JAX ended; and what to raise at the end of visit 1, once."""
     ended: list[int] = []
+    raised: list[type[BaseException]] = []
     original = lanes._Run._on_visit
 
     def on_visit(run: Any, visit: int, weights: Any) -> None:
         ended.append(visit)
         original(run, visit, weights)
+        if visit == 1 and raised:
+            raise raised.pop()
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lanes._Run, "_on_visit", on_visit)
-        status = ran(killed, jax_file(), device="cpu")
+    monkeypatch.setattr(lanes, "SECONDS_BETWEEN_STATES", 0.0)
+    monkeypatch.setattr(lanes._Run, "_on_visit", on_visit)
+    return ended, raised
+
+
+def test_interrupted_lives_in_jax_go_on_with_the_weights_of_their_visits(
+    tmp_path: Path, visits: tuple[list[int], list[type[BaseException]]]
+) -> None:
+    pytest.importorskip("jax")
+    whole, interrupted = tmp_path / "whole", tmp_path / "interrupted"
+    ran(whole, jax_file(), device="cpu", keep_models=True)
+    ended, raised = visits
+    raised.append(KeyboardInterrupt)
+    with pytest.raises(KeyboardInterrupt):
+        ran(interrupted, jax_file(), device="cpu")
+    assert not Ledger(interrupted).results()
+    assert list((interrupted / "states").glob("*.npz"))
+    ended.clear()
+    assert ran(interrupted, jax_file(), device="cpu").count("done") == 6
     assert ended == [1]  # visit 0 had been saved
-    assert status.count("done") == 6
-    assert numbers(killed) == numbers(whole)
+    assert numbers(interrupted) == numbers(whole)
     lives = [result for result in Ledger(whole).results().values() if result.cell.stream]
     assert [len({*matrix(result.stream_report)[:, 0]}) for result in lives] == [2, 2]
     for result in lives:
-        files = sorted(Ledger(whole).snapshots_path(result.key).iterdir())
-        initial, *visits = map(str, files)
-        again = evaluate_stream(visits, result.cell.document, PROTOCOL, initial=initial)
+        initial, *files = map(str, sorted(Ledger(whole).snapshots_path(result.key).iterdir()))
+        again = evaluate_stream(files, result.cell.document, PROTOCOL, initial=initial)
         np.testing.assert_allclose(matrix(again), matrix(result.stream_report), atol=1e-6)
         regret = result.stream_report and result.stream_report.dynamic_regret
         assert regret is not None
@@ -412,48 +392,31 @@ def test_after_kill_9_lives_in_jax_go_on_with_the_weights_of_their_visits(tmp_pa
         assert result.curve.steps == (16, 32, 48, 64)
 
 
-class Interrupted(Exception):
-    """At the end of the last visit."""
-
-
-@pytest.mark.parametrize(
-    ("kept_before", "kept_after", "lived_after"),
-    [(False, False, [1]), (True, False, [1]), (False, True, [0, 1])],
-)
+@pytest.mark.parametrize("kept_before", [True, False])
 def test_the_state_of_lives_in_jax_has_the_weights_that_its_reports_or_models_need(
-    kept_before: bool, kept_after: bool, lived_after: list[int], tmp_path: Path
+    kept_before: bool, tmp_path: Path, visits: tuple[list[int], list[type[BaseException]]]
 ) -> None:
     pytest.importorskip("jax")
+    kept_after = not kept_before
     cells = [place.cell for place in jax_file().plan.cells if place.cell.stream]
     program = Lanes(2, state=tmp_path / "state.npz")
-    ended: list[int] = []
     notes: list[str] = []
-    original = lanes._Run._on_visit
-
-    def on_visit(run: Any, visit: int, weights: Any) -> None:
-        ended.append(visit)
-        original(run, visit, weights)
-        if visit == 1 and ended == [0, 1] and not notes:
-            raise Interrupted
+    ended, raised = visits
 
     def report(done: int, total: int, compilations: int = 0, note: str = "", /) -> None:
         notes.extend([note] if note else [])
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lanes, "SECONDS_BETWEEN_STATES", 0.0)
-        patch.setattr(lanes._Run, "_on_visit", on_visit)
-        with pytest.raises(Interrupted):
-            list(lanes.run_lanes(cells, program, report, kept_before))
-        prefix = "records/snapshot/1/"
-        names = {n.removeprefix(prefix) for n in read_state(tmp_path / "state.npz") if prefix in n}
-        assert {"action_net.bias", "mlp_extractor.policy_net.0.weight"} <= names
-        assert ("value_net.bias" in names) is kept_before
-        ended.clear()
-        (tmp_path / "state.npz").replace(tmp_path / "again.npz")
-        program = Lanes(2, state=tmp_path / "again.npz")
-        finished = list(lanes.run_lanes(cells, program, report, kept_after))
-    assert ended == lived_after
-    assert any("starts again" in note for note in notes) is (lived_after == [0, 1])
+    raised.append(KeyboardInterrupt)
+    with pytest.raises(KeyboardInterrupt):
+        list(lanes.run_lanes(cells, program, report, kept_before))
+    prefix = "records/snapshot/1/"
+    names = {n.removeprefix(prefix) for n in read_state(tmp_path / "state.npz") if prefix in n}
+    assert {"action_net.bias", "mlp_extractor.policy_net.0.weight"} <= names
+    assert ("value_net.bias" in names) is kept_before
+    ended.clear()
+    finished = list(lanes.run_lanes(cells, program, report, kept_after))
+    assert ended == ([0, 1] if kept_after else [1])  # a model needs more than was saved
+    assert any("starts again" in note for note in notes) is kept_after
     for each in finished:
         assert isinstance(each.ended, CellResult)
         assert len(each.snapshots) == (3 if kept_after else 0)

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from typer.testing import CliRunner
 
 from sme_registry import studies
-from sme_registry.cli import app
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.statistics import iqm
 from sme_registry.studies.report.classes import ALL
 from sme_registry.studies.report.compare import comparison_tables
+from tests.commands import good
 
 
 @pytest.fixture(scope="module")
@@ -74,15 +73,15 @@ def test_bad_names_are_refused(frames, finished: Path) -> None:
 def test_the_command_writes_tables_and_figures(finished: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     command = ["study", "compare", str(finished), "Alpha", "Beta", "--out", str(tmp_path), "--json"]
-    done = CliRunner().invoke(app, command)
-    assert done.exit_code == 0, done.output
-    assert json.loads(done.stdout) == json.loads((tmp_path / "differences.json").read_text())
+    assert json.loads(good(*command).stdout) == json.loads(
+        (tmp_path / "differences.json").read_text()
+    )
     assert {path.name for path in tmp_path.iterdir()} == {
         "differences.csv", "differences.json", "differences-wd-regret.tex",
         "differences-ood-regret.tex", "differences.png", "differences.pdf",
         "learning-curves-by-class.png", "learning-curves-by-class.pdf",
     }  # fmt: skip
-    text = CliRunner().invoke(app, command[:-3]).stdout
+    text = good(*command[:-3]).stdout
     assert "Alpha − Beta" in text
     assert "(n = 3)" in text
     few = "With fewer than 5 pairs on a class, an interval covers"

@@ -1,7 +1,8 @@
-"""Studies of tasks with limits or distractors: their metrics, and what the layers keep."""
+"""Studies of tasks with limits or distractors: their columns and metrics, and what layers keep."""
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import pandas as pd
@@ -9,7 +10,9 @@ import pytest
 
 from sme_registry.errors import UnknownNameError
 from sme_registry.evaluation.observation import LayerProbe
+from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.report import exports, frames
 from sme_registry.studies.report.analysis import Analysis, analyse
 from sme_registry.studies.report.compare import compare
@@ -17,55 +20,123 @@ from sme_registry.studies.report.frames import study_frames
 from sme_registry.studies.report.tables import METRICS, layers
 from tests.studies.cells import small_file
 
-SMALL = {"state_dim": 2, "action_dim": 2}
 FIELDS: dict[str, dict[str, Any]] = {
     "plain": {},
     "safe": {"safety": {"tightness": 0.4}},
     "driven": {"observation": {"distractors": 3, "dynamics": "driven"}},
+    "mixed": {"observation": {"mixing": "nonlinear"}},
 }
-OF_SAFETY = {"wd_cost", "wd_safe_regret"}  # references do not train, so they have no online cost
-OF_DISTRACTORS = {"distractor_regret", "wd_invariance"}
+Study = tuple[StudyFile, dict[str, CellResult]]
 
 
-def finished(*names: str, state_r2: tuple[float, ...] = ()) -> tuple[Any, dict[str, Any]]:
-    """A study of these classes under two references; runs with distractors have these probes."""
-    classes = [{"name": n, "setting": SMALL | FIELDS[n], "seeds": [1, 2]} for n in names]
+@pytest.fixture(scope="module")
+def study() -> Study:
+    """Two references on these classes; learners' costs, probes and invariance are made up."""
+    small = {"state_dim": 2, "action_dim": 2}
+    classes = [{"name": n, "setting": small | own, "seeds": [1, 2]} for n, own in FIELDS.items()]
     algorithms = ["linear_least_squares", "constant"]
     file = small_file(seeds=2, algorithms=algorithms, classes=classes)
-    results: dict[str, Any] = {}
-    for planned in file.plan.cells:
+    results: dict[str, CellResult] = {}
+    for number, planned in enumerate(file.plan.cells):
         result = run_cell(planned.cell)
-        assert result.report is not None
-        if result.report.observation is not None:
+        report = result.report
+        assert report is not None
+        changes: dict[str, Any] = {}
+        if planned.class_name == "safe" and planned.algorithm == "constant":
+            changes["online_cost"] = number / 100
+        if report.observation is not None and planned.class_name == "driven":
             probes = tuple(
                 LayerProbe(layer=i, units=5, state_r2=r2 + planned.run, distractor_r2=0.25)
-                for i, r2 in enumerate(state_r2)
+                for i, r2 in enumerate((-2.0, -1.0))
             )
-            seen = result.report.observation.model_copy(update={"probes": probes})
-            report = result.report.model_copy(update={"observation": seen})
-            result = result.model_copy(update={"report": report})
-        results[planned.cell.digest] = result
+            inside, *shells = report.observation.invariance
+            invariance = (inside.model_copy(update={"invariance": 0.25}), *shells)
+            seen = {"probes": probes, "invariance": invariance}
+            observation = report.observation.model_copy(update=seen)
+            changes["report"] = report.model_copy(update={"observation": observation})
+        results[planned.cell.digest] = result.model_copy(update=changes)
     return file, results
 
 
 @pytest.fixture(scope="module")
-def analysis() -> Analysis:
-    return analyse(*finished("plain", "safe", "driven", state_r2=(-2.0, -1.0)), draws=200)
+def analysis(study: Study) -> Analysis:
+    return analyse(*study, draws=200)
 
 
-def test_the_metrics_of_a_class_are_those_that_its_tasks_have(analysis: Analysis) -> None:
+def only(study: Study, name: str) -> Study:
+    """The study of this class alone; results of the others are ignored."""
+    file, results = study
+    fields = file.plan.to_dict()
+    fields["classes"] = [each for each in fields["classes"] if each["name"] == name]
+    return file.model_copy(update={"plan": StudyPlan.from_dict(fields)}), results
+
+
+def test_rows_have_the_numbers_of_their_reports(study: Study) -> None:
+    file, results = study
+    rows = study_frames(file.plan, results).results
+    documented = set(re.findall(r"\w+", str(frames.__doc__)))
+    assert not set(rows) - documented
+    runs = frames.runs(rows).set_index("key")
+    for key, of_run in rows.groupby("key"):
+        result, run = results[key], runs.loc[key]
+        safety, observation = result.report.safety, result.report.observation
+        if safety is not None:
+            for name in ("cost", "violating_share", "safe_regret", "price_of_safety"):
+                assert list(of_run[name]) == [getattr(each, name) for each in safety.regions]
+            inside = safety.regions[0]
+            assert (run.wd_cost, run.wd_safe_regret) == (inside.cost, inside.safe_regret)
+            assert inside.safe_regret != inside.cost
+            if result.online_cost is not None:
+                assert run.online_cost == result.online_cost
+        if observation is not None and run.class_name == "driven":
+            assert list(of_run.invariance) == [each.invariance for each in observation.invariance]
+            assert run.wd_invariance == 0.25
+            assert run.distractor_regret == result.report.distractor_regret
+    assert rows[rows.class_name == "safe"].cost.max() > 0
+    of_class = runs.drop_duplicates("class_name").set_index("class_name")
+    assert of_class.tightness.dropna().to_dict() == {"safe": 0.4}
+    assert of_class.distractors.dropna().to_dict() == {"driven": 3, "mixed": 0}
+    assert of_class.dynamics.dropna().to_dict() == {"driven": "driven"}
+    assert of_class.mixing.dropna().to_dict() == {"driven": "none", "mixed": "nonlinear"}
+    assert of_class.mixing_depth.dropna().to_dict() == {"mixed": 1}
+    assert of_class.distractor_regret.dropna().index.to_list() == ["driven"]
+    trained = runs[runs.online_cost.notna()]  # references do not train
+    assert set(zip(trained.class_name, trained.algorithm, strict=True)) == {("safe", "constant")}
+
+
+def test_plans_without_limits_and_observations_have_no_such_columns(study: Study) -> None:
+    columns = {}
+    for name in ("plain", "safe", "driven"):
+        file, results = only(study, name)
+        columns[name] = set(study_frames(file.plan, results).results)
+    assert columns["safe"] - columns["plain"] == {
+        "tightness", "online_cost", "wd_cost", "wd_safe_regret", "cost", "violating_share",
+        "safe_regret", "price_of_safety",
+    }  # fmt: skip
+    assert columns["driven"] - columns["plain"] == {
+        "distractors", "dynamics", "mixing", "mixing_depth", "distractor_regret", "invariance",
+        "wd_invariance",
+    }  # fmt: skip
+    assert columns["plain"] <= columns["safe"] & columns["driven"]
+
+
+def test_the_metrics_of_a_class_are_those_that_its_tasks_have(
+    study: Study, analysis: Analysis
+) -> None:
     of_regret = {"wd_regret", "ood_regret", "ood_decay"}
-    found = {
+    metrics = {
         name: set(rows.metric) - of_regret for name, rows in analysis.levels.groupby("class_name")
     }
-    assert found == {"plain": set(), "safe": OF_SAFETY, "driven": OF_DISTRACTORS}
+    assert metrics == {
+        "plain": set(),
+        "safe": {"wd_cost", "wd_safe_regret", "online_cost"},
+        "driven": {"distractor_regret", "wd_invariance"},
+        "mixed": set(),
+    }
     assert set(analysis.contrasts.metric) == of_regret  # the first class has no others
-
-
-def test_levels_are_the_iqm_of_the_reports(analysis: Analysis) -> None:
     costs = [
         result.report.safety.regions[0].cost
-        for result in analysis.cells.values()
+        for result in study[1].values()
         if result.report is not None
         and result.report.safety is not None
         and result.cell.uses == "reference:linear_least_squares"
@@ -77,48 +148,21 @@ def test_levels_are_the_iqm_of_the_reports(analysis: Analysis) -> None:
     assert row.iqm > 0
 
 
-def test_columns_of_a_run_are_those_of_the_cube_and_of_its_training() -> None:
-    file, results = finished("safe", "driven")
-    costs = {key: number / 100 for number, key in enumerate(results)}
-    for planned in file.plan.cells:
-        key = planned.cell.digest
-        if planned.cell.spec.safety is not None:
-            results[key] = results[key].model_copy(update={"online_cost": costs[key]})
-        else:  # references do not see distractors
-            report = results[key].report
-            inside, *shells = report.observation.invariance
-            invariance = (inside.model_copy(update={"invariance": 0.25}), *shells)
-            seen = report.observation.model_copy(update={"invariance": invariance})
-            report = report.model_copy(update={"observation": seen})
-            results[key] = results[key].model_copy(update={"report": report})
-    runs = frames.runs(study_frames(file.plan, results).results).set_index("key")
-    for planned in file.plan.cells:
-        key, report = planned.cell.digest, results[planned.cell.digest].report
-        assert report is not None
-        row = runs.loc[key]
-        if report.safety is not None:
-            inside = report.safety.regions[0]
-            assert (row.online_cost, row.wd_cost) == (costs[key], inside.cost)
-            assert row.wd_safe_regret == inside.safe_regret != inside.cost
-        else:
-            assert report.observation is not None
-            assert row.wd_invariance == report.observation.invariance[0].invariance
-            assert row.distractor_regret == report.distractor_regret
-
-
-def test_differences_and_comparisons_have_the_metrics_too() -> None:
-    file, results = finished("safe", "driven")
-    frames = study_frames(file.plan, results)
-    table = compare(frames, "constant", "linear_least_squares", ["wd_cost", "wd_invariance"])
+def test_comparisons_have_the_metrics_too(study: Study) -> None:
+    file, results = study
+    pair = "constant", "linear_least_squares"
+    table = compare(study_frames(file.plan, results), *pair, ["wd_cost", "wd_invariance"])
     rows = {(row.metric, row.class_name): row for row in table.itertuples()}
     assert set(rows) == {("wd_cost", "safe"), ("wd_invariance", "driven")}
     assert rows["wd_cost", "safe"].verdict != "worse"  # ½ is within most limits
-    plain, of_plain = finished("plain")
+    plain = study_frames(only(study, "plain")[0].plan, results)
     with pytest.raises(UnknownNameError, match="metric='wd_cost': must be one of wd_regret"):
-        compare(study_frames(plain.plan, of_plain), "constant", "linear_least_squares", ["wd_cost"])
+        compare(plain, *pair, ["wd_cost"])
 
 
-def test_tables_for_people_show_them_and_what_the_layers_keep(analysis: Analysis) -> None:
+def test_tables_for_people_show_them_and_what_the_layers_keep(
+    study: Study, analysis: Analysis
+) -> None:
     tables = {table.name: table.frame for table in exports.text_tables(analysis)}
     assert list(tables["levels-wd-cost"]["class"]) == ["safe"]
     assert tables["layers"].to_numpy().tolist() == [
@@ -126,6 +170,10 @@ def test_tables_for_people_show_them_and_what_the_layers_keep(analysis: Analysis
         ["driven", "1", "−0.50, 0.25", "−0.50, 0.25"],
     ]
     assert "layers" in exports.csv_tables(analysis)
+    plain = analyse(*only(study, "plain"), draws=200)
+    assert plain.metrics == METRICS
+    assert "layers" not in exports.csv_tables(plain)
+    assert "layers" not in {table.name for table in exports.text_tables(plain)}
 
 
 def test_what_layers_keep_is_the_iqm_over_runs() -> None:
@@ -133,10 +181,3 @@ def test_what_layers_keep_is_the_iqm_over_runs() -> None:
     kept = layers(probes.assign(class_name="driven", algorithm="PPO", layer=0, distractor_r2=0.25))
     assert kept.state_r2.tolist() == pytest.approx([0.3])
     assert kept.runs.tolist() == [4]
-
-
-def test_a_study_of_plain_tasks_has_none_of_them() -> None:
-    plain = analyse(*finished("plain"), draws=200)
-    assert plain.metrics == METRICS
-    assert "layers" not in exports.csv_tables(plain)
-    assert "layers" not in {table.name for table in exports.text_tables(plain)}

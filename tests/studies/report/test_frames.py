@@ -13,11 +13,8 @@ import pytest
 
 from sme_registry import studies
 from sme_registry.errors import OptionError
-from sme_registry.evaluation import EvaluationReport
-from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.report import frames
-from tests.studies.cells import small_file
 
 
 @pytest.fixture(scope="module")
@@ -70,95 +67,20 @@ def test_curves_have_one_row_per_evaluation(finished: Path, loaded: studies.Stud
 
 
 def test_final_return_is_in_percent_of_the_optimum(loaded: studies.StudyFrames) -> None:
-    runs = frames.runs(loaded.results)
     last = loaded.curves.groupby(frames.RUN).episode_return.apply(lambda x: x.iloc[-2:].mean())
-    expected = runs.set_index(frames.RUN).final_return
+    expected = frames.runs(loaded.results).set_index(frames.RUN).final_return
     assert np.allclose(last / 20 * 100, expected.reindex(last.index))
 
 
-def test_a_study_without_results_has_the_same_columns(
+def test_every_column_is_documented_and_is_there_without_results(
     finished: Path, loaded: studies.StudyFrames, tmp_path: Path
 ) -> None:
+    documented = set(re.findall(r"\w+", str(frames.__doc__)))
     (tmp_path / "plan.json").write_bytes((finished / "plan.json").read_bytes())
     for empty, full in zip(studies.load(tmp_path), loaded, strict=True):
+        assert not set(full) - documented
         assert len(empty) == 0
         pd.testing.assert_series_equal(empty.dtypes, full.dtypes)
-
-
-EXTENDED = {
-    "plain": {},
-    "safe": {"safety": {"tightness": 0.4}},
-    "driven": {"observation": {"distractors": 3, "dynamics": "driven"}},
-    "mixed": {"observation": {"mixing": "nonlinear"}},
-}
-
-
-def frames_of(
-    *names: str, **changed: float
-) -> tuple[studies.StudyFrames, dict[str, EvaluationReport]]:
-    """The frames of these classes under one reference, with fields of results changed; reports."""
-    small = {"state_dim": 2, "action_dim": 2}
-    classes = [{"name": n, "setting": small | EXTENDED[n], "seeds": [1]} for n in names]
-    plan = small_file(seeds=1, algorithms=["linear_least_squares"], classes=classes).plan
-    results = {
-        cell.cell.digest: run_cell(cell.cell).model_copy(update=changed) for cell in plan.cells
-    }
-    reports = {cell.class_name: results[cell.cell.digest].report for cell in plan.cells}
-    assert all(reports.values())
-    return frames.study_frames(plan, results), reports  # type: ignore[return-value]
-
-
-def test_tasks_with_limits_and_observations_have_columns_of_them() -> None:
-    (results, _), reports = frames_of(*EXTENDED)
-    of_class = {name: rows.reset_index() for name, rows in results.groupby("class_name")}
-    safety = reports["safe"].safety
-    assert safety is not None
-    for name in ("cost", "violating_share", "safe_regret", "price_of_safety"):
-        assert list(of_class["safe"][name]) == [getattr(each, name) for each in safety.regions]
-    assert of_class["safe"].cost.iloc[0] > 0
-    observation = reports["driven"].observation
-    assert observation is not None
-    assert list(of_class["driven"].invariance) == [e.invariance for e in observation.invariance]
-    assert of_class["driven"].distractor_regret[0] == reports["driven"].distractor_regret
-    run = frames.runs(results).set_index("class_name")
-    assert run.online_cost.isna().all()  # a reference does not train
-    assert set(frames_of("safe", online_cost=0.25)[0].results.online_cost) == {0.25}
-    assert run.tightness.dropna().to_dict() == {"safe": 0.4}
-    assert run.distractors.dropna().to_dict() == {"driven": 3, "mixed": 0}
-    assert run.dynamics.dropna().to_dict() == {"driven": "driven"}
-    assert run.mixing.dropna().to_dict() == {"driven": "none", "mixed": "nonlinear"}
-    assert run.mixing_depth.dropna().to_dict() == {"mixed": 1}
-    assert run.distractor_regret.dropna().index.to_list() == ["driven"]
-    inside = safety.regions[0]
-    assert run.wd_cost.dropna().to_dict() == {"safe": inside.cost}
-    assert run.wd_safe_regret.dropna().to_dict() == {"safe": inside.safe_regret}
-    first = observation.invariance[0].invariance
-    assert run.wd_invariance.dropna().to_dict() == {"driven": first}
-    documented = set(re.findall(r"\w+", str(frames.__doc__)))
-    assert not set(results) - documented
-
-
-def test_plans_without_limits_and_observations_have_no_such_columns() -> None:
-    plain, safe, driven = (set(frames_of(name)[0].results) for name in ("plain", "safe", "driven"))
-    limits = {
-        "tightness",
-        "online_cost",
-        "wd_cost",
-        "wd_safe_regret",
-        "cost",
-        "violating_share",
-        "safe_regret",
-        "price_of_safety",
-    }
-    assert safe - plain == limits
-    fields = {"distractors", "dynamics", "mixing", "mixing_depth"}
-    assert driven - plain == fields | {"distractor_regret", "invariance", "wd_invariance"}
-    assert plain <= safe & driven
-
-
-def test_the_documentation_names_every_column(loaded: studies.StudyFrames) -> None:
-    documented = set(re.findall(r"\w+", str(frames.__doc__)))
-    assert not {*loaded.results, *loaded.curves} - documented
 
 
 def test_a_folder_without_a_study_is_rejected(tmp_path: Path) -> None:
