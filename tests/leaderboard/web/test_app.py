@@ -21,7 +21,6 @@ from leaderboard import intake
 from leaderboard.artefact import isolation
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.result import Result
 from leaderboard.documents.submission import SignedSubmission, utc
 from leaderboard.errors import BoardError
 from leaderboard.public_view import PublicView
@@ -220,7 +219,7 @@ def test_a_waiting_entry_shows_the_faults_that_postponed_it(tmp_path):
         with serving(store.folder.path) as url:
             before = [HTTP.get(url + path).text for path in paths]  # the server keeps them
             claim = store.queue.claim("scorer")
-                    store.queue.fault(claim, "no space left <on> device")
+            store.queue.fault(claim, "no space left <on> device")
             after = [HTTP.get(url + path).text for path in paths]
             view = HTTP.get(f"{url}/api/submissions/{hex_of(id)}").json()
     assert not any("no space left" in text for text in before)
@@ -265,7 +264,14 @@ def test_the_pages_say_how_to_submit_at_the_configured_address(tmp_path):
 
 def test_serve_refuses_what_it_cannot_do(store):
     path = store.folder.path
-    urls = ("board.example", "ftp://x", "https://x/$(id)", 'https://x"', "https://x/a b", "https://")
+    urls = (
+        "board.example",
+        "ftp://x",
+        "https://x/$(id)",
+        'https://x"',
+        "https://x/a b",
+        "https://",
+    )
     for url in urls:
         with pytest.raises(OptionError, match="url="):
             serve(path, port=0, workers=0, url=url)
