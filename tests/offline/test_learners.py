@@ -132,21 +132,14 @@ def test_iql_prefers_the_rewarded_action() -> None:
     assert mean == pytest.approx(0.5 * np.tanh(1.5), abs=0.03)
 
 
-def test_every_row_is_used_once_before_any_repeats() -> None:
+def test_batches_have_matching_rows_of_all_columns_and_every_row_once_before_any_repeats() -> None:
     transitions = transitions_of(count=50)
     batches = iter(Batches(transitions, 20, torch.Generator().manual_seed(0)))
-    seen = np.concatenate([next(batches).observations.numpy() for _ in range(5)])
-    rows = {row.tobytes(): index for index, row in enumerate(transitions.observations)}
-    indices = [rows[row.tobytes()] for row in seen]
-    assert sorted(indices[:50]) == sorted(indices[50:]) == list(range(50))
-    assert indices[:50] != indices[50:]
-
-
-def test_a_batch_has_matching_rows_of_all_columns() -> None:
-    transitions = transitions_of(count=50)
-    batch = next(iter(Batches(transitions, 50, torch.Generator().manual_seed(0))))
+    batch = Batch(*map(torch.cat, zip(*(next(batches) for _ in range(5)), strict=True)))
     rows = {row.tobytes(): index for index, row in enumerate(transitions.observations)}
     at = [rows[row.numpy().tobytes()] for row in batch.observations]
+    assert sorted(at[:50]) == sorted(at[50:]) == list(range(50))
+    assert at[:50] != at[50:]
     np.testing.assert_allclose((batch.actions.numpy() + 1) / 2, transitions.actions[at], atol=6e-8)
     np.testing.assert_array_equal(batch.next_observations, transitions.next_observations[at])
     np.testing.assert_allclose(batch.rewards[:, 0], transitions.rewards[at], rtol=1e-6)

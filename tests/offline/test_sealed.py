@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -30,7 +28,7 @@ def dataset() -> SealedDataset:
 
 
 @pytest.mark.parametrize("algorithm", ["bc", "iql"])
-def test_the_policy_is_that_of_the_same_rows_with_their_task(dataset, algorithm) -> None:
+def test_the_policy_is_that_of_the_same_rows_with_their_task(dataset, algorithm):
     rows = collect(RECIPE, materialize(TINY))
     protocol = {"states_per_region": 50}
     known = train_offline(
@@ -44,7 +42,7 @@ def test_the_policy_is_that_of_the_same_rows_with_their_task(dataset, algorithm)
     assert hidden.about == about  # and no digest of a spec
 
 
-def test_the_progress_is_reported_of_all_steps_and_faults_are_named(dataset) -> None:
+def test_the_progress_is_reported_of_all_steps_and_faults_are_named(dataset):
     calls: list[tuple[int, int]] = []
     longer = {**SHORT, "steps": 60}
     train_sealed(dataset, algorithm="bc", progress=lambda *done: calls.append(done), **longer)
@@ -55,7 +53,7 @@ def test_the_progress_is_reported_of_all_steps_and_faults_are_named(dataset) -> 
         train_sealed(dataset, batch_size=201)
 
 
-def test_the_command_writes_a_policy(dataset, tmp_path: Path) -> None:
+def test_the_command_writes_a_policy(dataset, tmp_path):
     folder, target = dataset.write("sealed/autumn/deep-0-v0", tmp_path), tmp_path / "deep-0.npz"
     command = ["offline", "sealed", folder, "-o", target, "-n", "20", "--batch-size", "32"]
     good(*command, "--set", "hidden=[16]")
