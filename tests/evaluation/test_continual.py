@@ -141,13 +141,10 @@ def test_reference_agents_are_exact():
         assert M["frozen_optimum"][0, j] == pytest.approx(single.wd_regret, abs=1e-12)
 
 
-def test_a_life_is_named_after_its_policies_if_they_share_a_name():
+def test_lives_are_named_after_their_policies_and_may_be_frozen_or_start_anew():
     lives = [["constant"] * 3, ["constant", "constant", "random"]]
     reports = [evaluate_stream(life, THREE, PROTOCOL) for life in lives]
     assert [each.policy for each in reports] == ["constant", "3 policies"]
-
-
-def test_lives_of_agents_that_are_frozen_or_start_anew():
     assert frozen_after_first(TWICE, ["a", "b"]) == ["a"] * 4
     assert fresh_per_phase(TWICE, ["a", "b"]) == ["a", "b", "a", "b"]
 
@@ -311,13 +308,22 @@ def test_learning_transfer_is_the_forward_transfer_of_continual_world():
     assert log.fresh_online_regret == pytest.approx((0.6, 0.2))
 
 
-def test_learning_transfer_is_none_where_nothing_can_be_compared():
+def test_learning_transfer_needs_a_visit_that_is_over_and_regret_of_a_fresh_agent():
     # Visit 1 is not over, and visit 0 lacks the end of an episode only.
     log = dynamic_regret(TWICE, [45, 60], [0.5, 0.5], [45, 10]).with_fresh(TWICE, [0.5, 0.5])
     assert [visit.learning_transfer for visit in log.visits] == [0.0, None]
     assert log.learning_transfer is None
     optimal = dynamic_regret(TWICE, [50], [0.5], 50).with_fresh(TWICE, [0.0, 0.5])
     assert optimal.learning_transfer is optimal.visits[0].learning_transfer is None
+    # The last visit begins 6 steps late and ends in an unfinished episode of 6 steps.
+    late = dynamic_regret(TWICE, [56, 106, 156, 194], [0.5] * 4, [56, 50, 50, 38])
+    late = late.with_fresh(TWICE, [1.0, 1.0])
+    assert [visit.learning_transfer for visit in late.visits] == [0.5] * 4
+    # A visit of less than an episode of 10 steps.
+    short = stream_of(SPEC, SPEC.derive(seed=1), steps=8)
+    for steps, expected in ((3, None), (5, 0.5)):
+        log = dynamic_regret(short, [steps], [0.5], steps).with_fresh(short, [1.0, 1.0])
+        assert log.visits[0].learning_transfer == expected
 
 
 @pytest.mark.parametrize(
@@ -352,18 +358,6 @@ def test_fresh_agents_of_another_stream_are_refused(other, switch):
     other = StreamSpec.from_dict({**other.to_dict(), "switch": switch})
     with pytest.raises(OptionError, match=r"stream: is another one than that of this life, .* 150"):
         log.with_fresh(other, [0.5] * len(other.phases))
-
-
-def test_a_visit_is_over_where_the_log_ends_less_than_an_episode_before():
-    # The last visit begins 6 steps late and ends in an unfinished episode of 6 steps.
-    late = dynamic_regret(TWICE, [56, 106, 156, 194], [0.5] * 4, [56, 50, 50, 38])
-    late = late.with_fresh(TWICE, [1.0, 1.0])
-    assert [visit.learning_transfer for visit in late.visits] == [0.5] * 4
-    # A visit of less than an episode of 10 steps.
-    short = stream_of(SPEC, SPEC.derive(seed=1), steps=8)
-    for steps, expected in ((3, None), (5, 0.5)):
-        log = dynamic_regret(short, [steps], [0.5], steps).with_fresh(short, [1.0, 1.0])
-        assert log.visits[0].learning_transfer == expected
 
 
 @pytest.mark.parametrize(

@@ -143,23 +143,20 @@ def test_the_optimum_of_a_drifting_phase_is_that_of_its_last_task():
     assert frozen.dynamic_regret > 1.0
 
 
-def test_a_frozen_agent_has_its_own_first_visit():
+def test_a_frozen_agent_has_its_own_first_visit_and_needs_its_training():
     training = dynamic_regret(TWICE, [50, 100], [0.75, 0.1], 50)
     frozen = network(0)
     found = reference_regret(TWICE, frozen=frozen, training=training, episodes=50)["frozen_agent"]
     acting = expected_regret([frozen] * 4, TWICE, episodes=50)
     assert by_visit(found)[0] == 37.5 != by_visit(acting)[0]
     assert found.visits[1:] == acting.visits[1:]
-
-
-def test_a_frozen_agent_needs_its_training():
     with pytest.raises(OptionError, match="frozen, training: must be given together"):
         reference_regret(TWICE, frozen="linear")
-    late, whole = (dynamic_regret(TWICE, [end], [0.5], 10) for end in (60, 10))
+    late = dynamic_regret(TWICE, [60], [0.5], 10)
     with pytest.raises(OptionError, match="training: has no steps in visit 0"):
         reference_regret(TWICE, frozen="linear", training=late)
     with pytest.raises(UnknownNameError, match=r"frozen: .*'linear'"):
-        reference_regret(TWICE, frozen="linaer", training=whole)
+        reference_regret(TWICE, frozen="linaer", training=training)
 
 
 def test_a_report_has_the_regret_of_reference_agents(tmp_path):

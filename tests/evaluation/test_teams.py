@@ -142,7 +142,7 @@ def test_a_team_of_one_has_the_numbers_of_its_single_agent_task():
             assert scope.references == alone.references
 
 
-def test_reference_policies_by_name_act_for_teams_as_the_references_of_a_report():
+def test_references_act_for_teams_and_for_their_agents_by_name():
     for name, same, near in (
         ("optimal", "optimal", 1e-9),
         ("constant", "constant_half", 0.0),
@@ -153,13 +153,13 @@ def test_reference_policies_by_name_act_for_teams_as_the_references_of_a_report(
         for agent in evaluate(name, SPEC, SMALL).agents.values():
             region, expected = agent.regions[0], agent.references[same][0]
             assert region.normalised_regret == pytest.approx(expected.normalised_regret, abs=near)
-
-
-def test_agents_of_a_team_may_have_policies_by_name():
     mixed = {**dict.fromkeys(NAMES, "optimal"), NAMES[1]: "constant_half"}
     report = evaluate(mixed, SPEC, SMALL)
     regrets = [report.agents[name].regions[0].normalised_regret for name in NAMES]
     assert regrets == pytest.approx([0.0, 1.0, 0.0], abs=1e-9)
+
+
+def test_a_prepared_team_is_accepted_as_it_is_for_its_own_agents():
     prepared = as_policy("linear", SPEC)
     assert as_policy(prepared, SPEC) is prepared
     assert (prepared.name, evaluate(prepared, SPEC, SMALL).policy) == ("linear", "linear")
@@ -301,28 +301,22 @@ def test_a_shared_model_scores_as_its_file(sb3, tmp_path):
     assert (live.policy, saved.policy) == ("PPO", "team")
     assert live.action_range == saved.action_range == "symmetric"
     assert numbers(live) == numbers(saved)
+    with pytest.raises(PolicyError, match=r"shape \(6,\): must be \(9,\) for a policy that all 3"):
+        evaluate(model(sb3, 6, 6), SPEC, SMALL)
 
 
 def test_models_of_each_agents_own_are_taken_with_their_own_action_ranges(sb3):
-    policies = {
-        "left_0": model(sb3, 4, 1, low=-1.0),
-        "right_0": model(sb3, 5, 3),
-        "right_1": half(2),
-    }
+    left = model(sb3, 4, 1, low=-1.0)
+    policies = {"left_0": left, "right_0": model(sb3, 5, 3), "right_1": half(2)}
     result = evaluate(policies, SPEC, SMALL)
     assert result.action_range == "mixed"
 
     def predicted(observations):
-        action = policies["left_0"].predict(observations, deterministic=True)[0]
+        action = left.predict(observations, deterministic=True)[0]
         return (action.astype(np.float64) + 1.0) / 2.0
 
     again = evaluate({**policies, "left_0": predicted}, SPEC, SMALL)
     mine, theirs = result.agents["left_0"].regions, again.agents["left_0"].regions
     assert [r.mae for r in mine] == pytest.approx([r.mae for r in theirs], abs=1e-6)
-
-
-def test_a_model_of_other_widths_is_refused_by_whose_it_is(sb3):
     with pytest.raises(PolicyError, match=r"^right_0: .*shape \(4,\): must be \(5,\) for 3 obs"):
         evaluate({**SLANTED, "right_0": model(sb3, 4, 3)}, SPEC, SMALL)
-    with pytest.raises(PolicyError, match=r"shape \(6,\): must be \(9,\) for a policy that all 3"):
-        evaluate(model(sb3, 6, 6), SPEC, SMALL)
