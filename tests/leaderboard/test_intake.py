@@ -96,7 +96,7 @@ def after(**duration: float) -> datetime.datetime:
 # Submissions.
 
 
-def test_a_submission_is_kept_once_and_known_at_any_age(store: Store, key: SigningKey) -> None:
+def test_a_submission_is_kept_once_and_known_at_any_age(store, key):
     signed, artefacts = tiny_submission(store, key)
     assert code_of(lambda: receive(store, signed)) == "artefact_missing"
     put(store, key, artefacts)
@@ -109,7 +109,7 @@ def test_a_submission_is_kept_once_and_known_at_any_age(store: Store, key: Signi
     assert store.head.sequence == 1
 
 
-def test_an_artefact_that_another_key_uploaded_is_missing(store: Store, key: SigningKey) -> None:
+def test_an_artefact_that_another_key_uploaded_is_missing(store, key):
     """Its digest is public as soon as a submission names it, its bytes only later."""
     signed, artefacts = tiny_submission(store, key)
     put(store, key, artefacts)
@@ -132,9 +132,7 @@ def test_an_artefact_that_another_key_uploaded_is_missing(store: Store, key: Sig
     assert receive(store, copy) == copy.id
 
 
-def test_a_key_submits_its_artefact_again_without_another_upload(
-    store: Store, key: SigningKey
-) -> None:
+def test_a_key_submits_its_artefact_again_without_another_upload(store, key):
     signed = uploaded(store, key)
     receive(store, signed)
     again, artefacts = tiny_submission(store, key, statement="revised")
@@ -147,7 +145,7 @@ def test_a_key_submits_its_artefact_again_without_another_upload(
     assert not store.possesses(copier.public, digest)
 
 
-def test_a_name_belongs_to_the_first_key_that_uses_it(store: Store, key: SigningKey) -> None:
+def test_a_name_belongs_to_the_first_key_that_uses_it(store, key):
     put_submission(store, key, 1, submitter={"name": "A Lab", "key": key.public})
     assert store.holder_of_name("a lab") == key.public  # while it waits
     names = ["A Lab", "a lab", "A.Lab", "A-L-A-B", "A 1ab", "A Iab", "4 La8"]
@@ -159,7 +157,7 @@ def test_a_name_belongs_to_the_first_key_that_uses_it(store: Store, key: Signing
         assert receive(store, mine) == mine.id
 
 
-def test_policies_that_are_rejected_occupy_no_name(store: Store, key: SigningKey) -> None:
+def test_policies_that_are_rejected_occupy_no_name(store, key):
     put_submission(store, key, 1, submitter={"name": "A Lab", "key": key.public})
     claim = store.queue.claim("worker")
     assert claim is not None
@@ -175,9 +173,7 @@ def test_policies_that_are_rejected_occupy_no_name(store: Store, key: SigningKey
     assert store.holder_of_name("a lab") is None
 
 
-def test_two_keys_that_send_a_name_at_once_do_not_share_it(
-    store: Store, key: SigningKey, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_keys_that_send_a_name_at_once_do_not_share_it(store, key, monkeypatch):
     keys = (key, SigningKey.generate())
     one, two = (
         uploaded(store, each, n, submitter={"name": "A Lab", "key": each.public})
@@ -200,7 +196,7 @@ def envelope(signed: SignedSubmission) -> Envelope[SignedSubmission]:
     return Envelope.read(signed.to_bytes(), SignedSubmission)
 
 
-def test_refused_submissions_count_for_their_key(tmp_path: Path, key: SigningKey) -> None:
+def test_refused_submissions_count_for_their_key(tmp_path, key):
     with tiny_board(tmp_path / "b", limits={"submissions_per_day": 3}) as store:
         refusals = intake.Refusals()
         put_submission(store, key, 1)
@@ -218,9 +214,7 @@ def test_refused_submissions_count_for_their_key(tmp_path: Path, key: SigningKey
         assert not intake.receive(store, envelope(signed), refusals)
 
 
-def test_what_strangers_can_send_again_counts_for_nobody_and_a_refusal_for_good_once(
-    tmp_path: Path, key: SigningKey
-) -> None:
+def test_what_strangers_can_send_again_counts_for_nobody_and_a_refusal_for_good_once(tmp_path, key):
     """Submissions to other boards and withdrawn ones are public, with their signatures."""
     with tiny_board(tmp_path / "b", limits={"submissions_per_day": 3}) as store:
         refusals = intake.Refusals()
@@ -241,7 +235,7 @@ def test_what_strangers_can_send_again_counts_for_nobody_and_a_refusal_for_good_
         assert code_of(lambda: intake.receive(store, last, refusals)) == "quota"
 
 
-def test_no_more_refusals_are_kept_than_stated(store: Store, key: SigningKey) -> None:
+def test_no_more_refusals_are_kept_than_stated(store, key):
     refusals, now = intake.Refusals(kept=3), datetime.datetime.now(datetime.UTC)
     for number in range(5):
         signed, _ = tiny_submission(store, key, number)
@@ -253,9 +247,7 @@ def test_no_more_refusals_are_kept_than_stated(store: Store, key: SigningKey) ->
     assert code_of(lambda: refusals.repeat(last.id)) == "schema"
 
 
-def test_an_artefact_is_inspected_once_for_its_widths(
-    store: Store, key: SigningKey, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_artefact_is_inspected_once_for_its_widths(store, key, monkeypatch):
     seen: list[int] = []
     real = admission.inspect
     monkeypatch.setattr(admission, "inspect", lambda *each: (seen.append(1), real(*each)))
@@ -270,9 +262,7 @@ def test_an_artefact_is_inspected_once_for_its_widths(
     assert len(store.entries()) == 2
 
 
-def test_an_artefact_of_another_size_is_refused_and_a_failed_run_needs_none(
-    store: Store, key: SigningKey
-) -> None:
+def test_an_artefact_of_another_size_is_refused_and_a_failed_run_needs_none(store, key):
     plain = uploaded(store, key).submission.to_dict()
     (run,) = plain["runs"]
     other = {**run, "artefact": {**run["artefact"], "size": run["artefact"]["size"] - 1}}
@@ -284,7 +274,7 @@ def test_an_artefact_of_another_size_is_refused_and_a_failed_run_needs_none(
     assert receive(store, failed) == failed.id
 
 
-def test_the_daily_quota_frees_up_at_the_stated_time(tmp_path: Path, key: SigningKey) -> None:
+def test_the_daily_quota_frees_up_at_the_stated_time(tmp_path, key):
     with tiny_board(tmp_path / "b", limits={"submissions_per_day": 2}) as store:
         put_submission(store, key, 1)
         put_submission(store, key, 2)
@@ -297,9 +287,7 @@ def test_the_daily_quota_frees_up_at_the_stated_time(tmp_path: Path, key: Signin
         assert receive(store, signed, at=free + datetime.timedelta(seconds=2)) == signed.id
 
 
-def test_a_second_of_a_wrong_clock_uses_up_no_quota_for_good(
-    tmp_path: Path, key: SigningKey, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_of_a_wrong_clock_uses_up_no_quota_for_good(tmp_path, key, monkeypatch):
     limits = {"submissions_per_day": 1, "upload_bytes_per_day": 1000}
     with tiny_board(tmp_path / "b", limits=limits) as store:
         with monkeypatch.context() as patch:
@@ -315,9 +303,7 @@ def test_a_second_of_a_wrong_clock_uses_up_no_quota_for_good(
 
 
 @pytest.mark.parametrize("year", [1, 9999])
-def test_the_first_and_the_last_year_have_quotas(
-    tmp_path: Path, key: SigningKey, monkeypatch: pytest.MonkeyPatch, year: int
-) -> None:
+def test_the_first_and_the_last_year_have_quotas(tmp_path, key, monkeypatch, year):
     moment = datetime.datetime(year, 12 if year > 1 else 1, 31 if year > 1 else 1, 23, 59, 30)
     moment = moment.replace(tzinfo=datetime.UTC)
     for name in ("log", "store"):
@@ -334,9 +320,7 @@ def test_the_first_and_the_last_year_have_quotas(
         store.reindex()
 
 
-def test_a_full_queue_accepts_only_references_and_faults_make_room_in_it(
-    tmp_path: Path, key: SigningKey
-) -> None:
+def test_a_full_queue_accepts_only_references_and_faults_make_room_in_it(tmp_path, key):
     with tiny_board(tmp_path / "b", limits={"waiting_submissions": 1}) as store:
         put_submission(store, key, 1)
         signed = uploaded(store, key, 2)
@@ -349,7 +333,7 @@ def test_a_full_queue_accepts_only_references_and_faults_make_room_in_it(
         assert len(intake.submit_references(store)) == 2  # without them nothing is ever shown
 
 
-def test_a_submission_is_for_one_board(tmp_path: Path, store: Store, key: SigningKey) -> None:
+def test_a_submission_is_for_one_board(tmp_path, store, key):
     signed, artefacts = tiny_submission(store, key)
     with tiny_board(tmp_path / "other") as other:
         put(other, key, artefacts)
@@ -366,9 +350,7 @@ def test_a_submission_is_for_one_board(tmp_path: Path, store: Store, key: Signin
 # Bundles.
 
 
-def test_a_bundle_is_stored_with_its_artefacts(
-    tmp_path: Path, store: Store, key: SigningKey
-) -> None:
+def test_a_bundle_is_stored_with_its_artefacts(tmp_path, store, key):
     signed, artefacts = tiny_submission(store, key)
     folder = bundle(tmp_path / "bundle", signed, artefacts)
     for _ in range(2):
@@ -378,9 +360,7 @@ def test_a_bundle_is_stored_with_its_artefacts(
         assert store.objects.read(digest) == data
 
 
-def test_a_bundle_that_is_refused_leaves_nothing(
-    tmp_path: Path, store: Store, key: SigningKey
-) -> None:
+def test_a_bundle_that_is_refused_leaves_nothing(tmp_path, store, key):
     signed, artefacts = tiny_submission(store, key, created=ANY_TIME)
     folder = bundle(tmp_path / "old", signed, artefacts)
     assert code_of(lambda: intake.submit_bundle(store, folder)) == "stale_time"
@@ -390,9 +370,7 @@ def test_a_bundle_that_is_refused_leaves_nothing(
     assert (objects(store), store.entries()) == ([], [])
 
 
-def test_a_bundle_for_no_board_is_signed_for_the_board_it_is_sent_to(
-    tmp_path: Path, store: Store, key: SigningKey
-) -> None:
+def test_a_bundle_for_no_board_is_signed_for_the_board_it_is_sent_to(tmp_path, store, key):
     signed, artefacts = tiny_submission(store, key)
     folder = bundle(tmp_path / "bundle", signed.submission.signed(key), artefacts)
     assert code_of(lambda: intake.submit_bundle(store, folder)) == "wrong_board"
@@ -407,9 +385,7 @@ def test_a_bundle_for_no_board_is_signed_for_the_board_it_is_sent_to(
 # The board's own rows.
 
 
-def test_reference_rows_exist_once_however_often_submitted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_reference_rows_exist_once_however_often_submitted(tmp_path, monkeypatch):
     with tiny_board(tmp_path / "b", instances=2) as store:
         ids = intake.submit_references(store)
         assert intake.submit_references(store) == ids
@@ -429,8 +405,8 @@ def test_reference_rows_exist_once_however_often_submitted(
 
 
 def test_an_old_board_accepts_its_reference_rows_whatever_else_has_their_name(
-    store: Store, key: SigningKey, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    store, key, monkeypatch
+):
     entry = store.log(0, 1)[0].model_copy(update={"time": "2020-01-01T00:00:00Z"})
     monkeypatch.setattr(store, "log", lambda *_: [entry])
     method = {"name": "optimal", "version": "1", "family": "reference", "knowledge": "oracle"}
@@ -442,7 +418,7 @@ def test_an_old_board_accepts_its_reference_rows_whatever_else_has_their_name(
 # Withdrawals.
 
 
-def test_a_withdrawal_is_final(store: Store, key: SigningKey) -> None:
+def test_a_withdrawal_is_final(store, key):
     signed = put_submission(store, key)
     withdrawal = signed_withdrawal(store, signed.id, key, "a bug")
     assert store.withdraw(withdrawal)
@@ -453,9 +429,7 @@ def test_a_withdrawal_is_final(store: Store, key: SigningKey) -> None:
     assert code_of(lambda: receive(store, signed)) == "withdrawn"
 
 
-def test_only_the_submitter_withdraws_for_this_board_and_in_plain_text(
-    store: Store, key: SigningKey
-) -> None:
+def test_only_the_submitter_withdraws_for_this_board_and_in_plain_text(store, key):
     """A submission's id is the same on every board, so only the signature names the board."""
     signed = put_submission(store, key)
     refused = [
@@ -476,7 +450,7 @@ def test_only_the_submitter_withdraws_for_this_board_and_in_plain_text(
     store.withdraw(signed_withdrawal(store, signed.id, key, "ein Käfer <b>,\nzweite Zeile"))
 
 
-def test_a_withdrawal_is_read_back(key: SigningKey) -> None:
+def test_a_withdrawal_is_read_back(key):
     withdrawal = SignedWithdrawal.create("sha256:" + "0" * 64, key, "a bug")
     assert SignedWithdrawal.read(withdrawal.model_dump_json().encode()) == withdrawal
     assert code_of(lambda: SignedWithdrawal.read(b"{")) == "not_json"
@@ -487,7 +461,7 @@ def test_a_withdrawal_is_read_back(key: SigningKey) -> None:
 # Uploads.
 
 
-def test_an_upload_is_signed_for_one_object_and_one_board(key: SigningKey) -> None:
+def test_an_upload_is_signed_for_one_object_and_one_board(key):
     this, that = "sha256:" + "1" * 64, "sha256:" + "2" * 64
     board, other = "a" * 64, "b" * 64
     unbound = intake.upload_header(key, this)
@@ -510,7 +484,7 @@ def test_an_upload_is_signed_for_one_object_and_one_board(key: SigningKey) -> No
 
 
 @pytest.mark.parametrize("minutes", [-11, 11])
-def test_an_upload_is_signed_for_ten_minutes(key: SigningKey, minutes: int) -> None:
+def test_an_upload_is_signed_for_ten_minutes(key, minutes):
     digest = "sha256:" + "1" * 64
     header = intake.upload_header(key, digest)
     moment = datetime.datetime.now(datetime.UTC)
@@ -520,7 +494,7 @@ def test_an_upload_is_signed_for_ten_minutes(key: SigningKey, minutes: int) -> N
     assert code_of(lambda: intake.uploader(header, digest, at=past)) == "stale_time"
 
 
-def test_upload_quotas_count_stored_and_pending_bytes(tmp_path: Path, key: SigningKey) -> None:
+def test_upload_quotas_count_stored_and_pending_bytes(tmp_path, key):
     limits = {"upload_bytes_per_day": 1000, "total_bytes": 2000, "artefact_bytes": 900}
     with tiny_board(tmp_path / "b", limits=limits) as store:
         put(store, key, {sha256_of(bytes(500)): bytes(500)})
@@ -535,7 +509,7 @@ def test_upload_quotas_count_stored_and_pending_bytes(tmp_path: Path, key: Signi
         intake.check_upload(store, me, 900, at=tomorrow)
 
 
-def test_documents_count_like_artefacts(store: Store, key: SigningKey) -> None:
+def test_documents_count_like_artefacts(store, key):
     signed = put_submission(store, key)
     (artefact,) = {run.artefact.size for run in signed.submission.runs if run.artefact}
     used = artefact + len(signed.to_bytes())
@@ -550,7 +524,7 @@ def test_documents_count_like_artefacts(store: Store, key: SigningKey) -> None:
     assert store.total_bytes() == used
 
 
-def test_a_full_board_accepts_no_submission(tmp_path: Path, key: SigningKey) -> None:
+def test_a_full_board_accepts_no_submission(tmp_path, key):
     limits = {"total_bytes": 2000, "artefact_bytes": 2000}
     with tiny_board(tmp_path / "b", limits=limits) as store:
         signed, artefacts = tiny_submission(store, key, statement="x" * 1500)
@@ -587,7 +561,7 @@ def left(store: Store) -> set[bytes]:
     return {store.objects.read(digest)[:1] for digest, _ in store.objects.paths()}
 
 
-def test_old_uploads_without_a_submission_make_room(full: tuple[Store, Upload]) -> None:
+def test_old_uploads_without_a_submission_make_room(full):
     store, upload = full
     upload(A, b"1" * 300, 30)
     upload(B, b"2" * 300, 40)
@@ -603,7 +577,7 @@ def test_old_uploads_without_a_submission_make_room(full: tuple[Store, Upload]) 
     assert left(store) == set()
 
 
-def test_young_uploads_and_those_of_the_sender_stay(full: tuple[Store, Upload]) -> None:
+def test_young_uploads_and_those_of_the_sender_stay(full):
     store, upload = full
     upload(A, b"1" * 300, 9)
     upload(ME, b"2" * 300, 90)
@@ -617,9 +591,7 @@ def test_young_uploads_and_those_of_the_sender_stay(full: tuple[Store, Upload]) 
 
 
 @pytest.mark.parametrize("table", ["entry", "sealed"])
-def test_who_has_a_submission_or_has_entered_a_season_keeps_uploads_longer(
-    full: tuple[Store, Upload], key: SigningKey, table: str
-) -> None:
+def test_who_has_a_submission_or_has_entered_a_season_keeps_uploads_longer(full, key, table):
     store, upload = full
     if table == "entry":
         plain = tiny_submission(store, key)[0].submission.to_dict()
@@ -638,9 +610,7 @@ def test_who_has_a_submission_or_has_entered_a_season_keeps_uploads_longer(
     assert left(store) == {b"1"}
 
 
-def test_bytes_that_two_keys_uploaded_stay_until_both_lose_them(
-    full: tuple[Store, Upload],
-) -> None:
+def test_bytes_that_two_keys_uploaded_stay_until_both_lose_them(full):
     store, upload = full
     digest = upload(A, b"1" * 600, 90)
     upload(B, b"1" * 600, 9)

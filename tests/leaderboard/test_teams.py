@@ -90,9 +90,7 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "board"
 
 
-def test_a_board_of_teams_scores_a_shared_policy_and_each_agent(
-    board: Path, tmp_path: Path
-) -> None:
+def test_a_board_of_teams_scores_a_shared_policy_and_each_agent(board, tmp_path):
     with Store.open(board, read_only=True) as store:
         ranking.refuse_unpublishable(store.entries())  # the references of teams score 0 and 1
         id = next(row.id for row in store.entries() if not row.reference)
@@ -110,7 +108,7 @@ def test_a_board_of_teams_scores_a_shared_policy_and_each_agent(
     assert page.count("<bdi>driver_0</bdi>") == 1
 
 
-def test_an_altered_agent_is_found(board: Path, tmp_path: Path) -> None:
+def test_an_altered_agent_is_found(board, tmp_path):
     assert verify(board).results == 3
     copy = shutil.copytree(board, tmp_path / "board")
     results = sorted((copy / "results").iterdir())
@@ -120,9 +118,7 @@ def test_an_altered_agent_is_found(board: Path, tmp_path: Path) -> None:
         verify(copy)
 
 
-def test_agents_receive_what_they_observe_and_their_rows_are_checked_in_every_region(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_agents_receive_what_they_observe_and_their_rows_are_checked_in_every_region(monkeypatch):
     seen: list[sandbox.Observations] = []
     checked: list[tuple[float, ...]] = []
     call = sandbox.Sandbox.__call__
@@ -149,6 +145,6 @@ def test_agents_receive_what_they_observe_and_their_rows_are_checked_in_every_re
     assert checked == [(1.0, 0.0), (0.0, 1.0)] * 6
 
 
-def test_a_policy_of_other_widths_is_rejected(tmp_path: Path) -> None:
+def test_a_policy_of_other_widths_is_rejected(tmp_path):
     with pytest.raises(Rejection, match="onnx_interface"):
         bundle(tmp_path / "mine", linear_onnx(400, 4, 3))

@@ -17,7 +17,7 @@ MIXED = {"observation": {"mixing": "orthogonal"}}
 
 
 @pytest.mark.parametrize("setting", [LIMITED, MIXED], ids=["safety", "observation"])
-def test_boards_refuse_classes_with_safety_or_observation(setting: dict[str, object]) -> None:
+def test_boards_refuse_classes_with_safety_or_observation(setting):
     classes = [{"name": "Plain", "setting": {}, "seeds": [0]}]
     classes.append({"name": "Other", "setting": setting, "seeds": [0]})
     fields = {"title": "x", "suite_name": "x-v1", "protocol_name": "quick-v1", "protocol": {}}
@@ -28,9 +28,7 @@ def test_boards_refuse_classes_with_safety_or_observation(setting: dict[str, obj
 
 
 @pytest.mark.parametrize("name", ["safety", "representation"])
-def test_commands_refuse_the_suites_of_the_catalogue_that_boards_do_not_score(
-    name: str, tmp_path: object
-) -> None:
+def test_commands_refuse_the_suites_of_the_catalogue_that_boards_do_not_score(name, tmp_path):
     with pytest.raises(SpecError, match="safety or observation"):
         find_suite(name)
     result = CliRunner().invoke(app, ["init", f"{tmp_path}/board", "--suite", name])

@@ -60,7 +60,7 @@ def small_order_keys() -> list[str]:
     return keys
 
 
-def test_a_signature_is_for_one_document_purpose_and_board() -> None:
+def test_a_signature_is_for_one_document_purpose_and_board():
     key = SigningKey.generate()
     uses = list(
         itertools.product(("submission", "withdrawal", "upload", "log"), (BOARD, OTHER, None))
@@ -75,7 +75,7 @@ def test_a_signature_is_for_one_document_purpose_and_board() -> None:
     assert not verifies(SigningKey.generate().public, signature, "submission", DIGEST, BOARD)
 
 
-def test_keys_of_small_order_sign_nothing() -> None:
+def test_keys_of_small_order_sign_nothing():
     """With such a key, R = S·B and R + h·A agree for every document whose h is a multiple of 8."""
     zero = "0" * 64
     signatures = [encode(point) + zero for point in small_order_points()]
@@ -85,7 +85,7 @@ def test_keys_of_small_order_sign_nothing() -> None:
         assert not verifies(public, signature, "submission", digest, BOARD), case
 
 
-def test_a_key_with_a_part_of_small_order_signs_nothing() -> None:
+def test_a_key_with_a_part_of_small_order_signs_nothing():
     """A + T, with T of order 2: S·B = R + h·(A + T) wherever h is even, so a rule of its own."""
     from nacl.bindings import crypto_scalarmult_ed25519_base_noclamp as times_base
 
@@ -103,6 +103,6 @@ def test_a_key_with_a_part_of_small_order_signs_nothing() -> None:
                 assert verifies(public, signature.hex(), "submission", digest, BOARD) == expected
 
 
-def test_what_is_no_key_signs_nothing() -> None:
+def test_what_is_no_key_signs_nothing():
     for public in ("", "0" * 64, "f" * 64, "x" * 64, "0" * 63):
         assert not verifies(public, "0" * 128, "submission", DIGEST, BOARD)

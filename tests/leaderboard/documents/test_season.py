@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import itertools
 import stat
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any, get_args
 
 import pytest
@@ -55,7 +53,7 @@ def offline(**fields: Any) -> dict[str, Any]:
     return online(**{**own, **fields})
 
 
-def test_a_season_round_trips_and_is_committed_to_its_master_and_to_every_term() -> None:
+def test_a_season_round_trips_and_is_committed_to_its_master_and_to_every_term():
     for fields in (online(), offline()):
         season = Terms.from_dict(fields).commit(MASTER)
         assert Season.from_dict(season.to_dict()) == season
@@ -69,7 +67,7 @@ def test_a_season_round_trips_and_is_committed_to_its_master_and_to_every_term()
 
 
 @pytest.mark.parametrize("track", [online, offline])
-def test_the_commitment_is_the_documented_hash(track: Callable[..., dict[str, Any]]) -> None:
+def test_the_commitment_is_the_documented_hash(track):
     terms = Terms.from_dict(track(versions={"numpy": "2.0.0"}))
     message = b"sme-seal/1" + MASTER.raw + rfc8785.dumps(terms.to_dict())
     expected = "sha256:" + hashlib.sha256(message).hexdigest()
@@ -77,14 +75,14 @@ def test_the_commitment_is_the_documented_hash(track: Callable[..., dict[str, An
     assert set(terms.to_dict()) == set(Terms.model_fields)
 
 
-def test_a_reveal_has_32_bytes() -> None:
+def test_a_reveal_has_32_bytes():
     season = Terms.from_dict(online()).commit(MASTER)
     for master in ("", "0" * 63, "0" * 65, "G" * 64, "A" * 64):
         with pytest.raises(SpecError, match="64 hex digits"):
             Reveal.from_dict({"season": season.digest, "master": master})
 
 
-def test_every_purpose_and_place_has_a_secret_of_its_own() -> None:
+def test_every_purpose_and_place_has_a_secret_of_its_own():
     places = [
         Place(*parts)
         for parts in itertools.product(
@@ -96,7 +94,7 @@ def test_every_purpose_and_place_has_a_secret_of_its_own() -> None:
     assert MASTER.secret("task", places[0]) != Master(bytes(32)).secret("task", places[0])
 
 
-def test_a_seed_has_256_bits_and_makes_a_spec() -> None:
+def test_a_seed_has_256_bits_and_makes_a_spec():
     places = [Place("autumn", "deep", i) for i in range(64)]
     for purpose in ("task", "data"):  # a seed of hidden data could be tried out, too
         seeds = [MASTER.seed(place, purpose) for place in places]
@@ -107,13 +105,13 @@ def test_a_seed_has_256_bits_and_makes_a_spec() -> None:
     assert 0 <= MASTER.states_seed(places[0]) < 2**53
 
 
-def test_the_seed_of_published_states_has_no_bits_of_another_secret() -> None:
+def test_the_seed_of_published_states_has_no_bits_of_another_secret():
     place = Place("autumn", "deep", 0)
     first = {each: int.from_bytes(MASTER.secret(each, place)[:8]) >> 11 for each in PURPOSES}
     assert {each for each in PURPOSES if first[each] == MASTER.states_seed(place)} == {"states"}
 
 
-def test_a_master_is_written_for_its_owner_only_and_never_shown(tmp_path: Path) -> None:
+def test_a_master_is_written_for_its_owner_only_and_never_shown(tmp_path):
     path = MASTER.write(tmp_path / "new" / "season.master")
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert Master.read(path) == MASTER
@@ -124,7 +122,7 @@ def test_a_master_is_written_for_its_owner_only_and_never_shown(tmp_path: Path) 
     assert Master.read(path) == MASTER
 
 
-def test_a_file_without_a_master_is_named(tmp_path: Path) -> None:
+def test_a_file_without_a_master_is_named(tmp_path):
     path = tmp_path / "season.master"
     for content in ("", "00", "z" * 64, "0" * 66):
         path.write_text(content)
@@ -170,6 +168,6 @@ def online_class(**fields: Any) -> dict[str, Any]:
         (online(protocol={"seed": 1}), "seed=1: must be 0"),
     ],
 )
-def test_terms_that_do_not_fit_are_refused(fields: dict[str, Any], message: str) -> None:
+def test_terms_that_do_not_fit_are_refused(fields, message):
     with pytest.raises(SpecError, match=message):
         Terms.from_dict(fields)

@@ -66,7 +66,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_content_is_validated_after_its_signature_and_answered_shortly(name: str) -> None:
+def test_content_is_validated_after_its_signature_and_answered_shortly(name):
     data = text(HOSTILE[name], signed=False)
     assert len(data) <= MAX_BYTES
     refused = rejection(data)
@@ -105,13 +105,13 @@ def test_content_is_validated_after_its_signature_and_answered_shortly(name: str
         (b"[" * 60_000, "not_json"),
     ],
 )
-def test_what_is_no_signed_document_gets_a_short_answer(data: bytes, code: str) -> None:
+def test_what_is_no_signed_document_gets_a_short_answer(data, code):
     refused = rejection(data)
     assert refused.code == code
     assert len(refused.message.encode()) < 500
 
 
-def test_a_content_nested_as_deeply_as_the_parser_allows_is_refused() -> None:
+def test_a_content_nested_as_deeply_as_the_parser_allows_is_refused():
     depth = 1
     while True:  # the parser's limit differs between versions of Python
         data = text(PLAIN, signed=False).replace(
@@ -124,14 +124,14 @@ def test_a_content_nested_as_deeply_as_the_parser_allows_is_refused() -> None:
         depth *= 2
 
 
-def test_the_id_is_known_before_the_content_is_validated() -> None:
+def test_the_id_is_known_before_the_content_is_validated():
     envelope = Envelope.read(text(PLAIN), SignedSubmission)
     assert (envelope.key, envelope.board) == (KEY.public, BOARD)
     assert envelope.open().id == envelope.id
     assert envelope.open().to_bytes() == SignedSubmission.read(text(PLAIN)).to_bytes()
 
 
-def test_a_signature_covers_every_field() -> None:
+def test_a_signature_covers_every_field():
     """The board keeps the whole document, which its signature must still fit."""
     removals: list[Callable[[dict[str, Any]], Any]] = [
         lambda plain: plain.pop("statement"),

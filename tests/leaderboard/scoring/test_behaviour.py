@@ -99,7 +99,7 @@ COPIES = {
 
 
 @pytest.mark.parametrize("name", COPIES)
-def test_one_policy_in_other_bytes_is_one_run_and_has_a_like_sketch(name: str) -> None:
+def test_one_policy_in_other_bytes_is_one_run_and_has_a_like_sketch(name):
     copy = policy(COPIES[name])
     with pytest.raises(Rejection, match=r"of runs\.1 in the same states") as caught:
         observed(policy(network(1)), policy(ORIGINAL), copy)
@@ -109,7 +109,7 @@ def test_one_policy_in_other_bytes_is_one_run_and_has_a_like_sketch(name: str) -
     assert alike(one, other)
 
 
-def test_independent_trainings_are_runs_with_unlike_sketches() -> None:
+def test_independent_trainings_are_runs_with_unlike_sketches():
     policies = [policy(network(seed)) for seed in range(6)]
     sketches = observed(*policies)
     pairs = [(one, other) for i, one in enumerate(sketches) for other in sketches[:i]]
@@ -118,7 +118,7 @@ def test_independent_trainings_are_runs_with_unlike_sketches() -> None:
     assert not refused(*weak)
 
 
-def test_a_copy_that_differs_only_outside_the_cube_is_refused() -> None:
+def test_a_copy_that_differs_only_outside_the_cube_is_refused():
     def other_outside(o: Numbers) -> Numbers:
         outside = (np.abs(o[:, :2] - 0.5).max(axis=1) > 0.5)[:, None]
         return np.where(outside, policy(network(1))(o), policy(ORIGINAL)(o))
@@ -126,26 +126,26 @@ def test_a_copy_that_differs_only_outside_the_cube_is_refused() -> None:
     assert refused(policy(ORIGINAL), other_outside)
 
 
-def test_the_same_policy_on_another_instance_is_no_repetition() -> None:
+def test_the_same_policy_on_another_instance_is_no_repetition():
     behaviours = Behaviours(PROTOCOL, "one")
     for spec in (SPEC, plane(complexity=2)):
         behaviours.observe("runs.0", spec, policy(ORIGINAL))
 
 
-def test_near_optimal_copies_are_refused_and_near_optimal_networks_are_not() -> None:
+def test_near_optimal_copies_are_refused_and_near_optimal_networks_are_not():
     assert refused(OPTIMUM, lambda o: OPTIMUM(o) + FLOOR / 2)
     assert alike(*(observed(OPTIMUM, submission=name)[0] for name in ("one", "two")))
     wave = [lambda o, k=k: OPTIMUM(o) + 2e-3 * np.sin(9 * o[:, :2] + k) for k in range(3)]
     assert not refused(*wave)
 
 
-def test_runs_that_collapsed_to_one_constant_are_no_repetition() -> None:
+def test_runs_that_collapsed_to_one_constant_are_no_repetition():
     corner = [lambda o, k=k: np.full((len(o), 2), [1.0 + k, -3.0 - k]) for k in range(5)]
     almost = [lambda o, k=k: 0.3 + CONSTANT * np.sin(o[:, :2] + k) for k in range(3)]
     assert observed(*corner, *almost) == [""] * 8
 
 
-def test_a_saturated_policy_that_depends_on_the_state_is_compared() -> None:
+def test_a_saturated_policy_that_depends_on_the_state_is_compared():
     def bang(o: Numbers) -> Numbers:
         return (o[:, :2] > 0.4) * 1.0
 
@@ -155,7 +155,7 @@ def test_a_saturated_policy_that_depends_on_the_state_is_compared() -> None:
 # Sketches
 
 
-def test_no_policy_hides_behind_the_states_of_another_submission() -> None:
+def test_no_policy_hides_behind_the_states_of_another_submission():
     # The public parts of a sketch are its waves and mixtures. A policy that errs differently in
     # the states of one submission has no effect on the next.
     seen: list[Numbers] = []
@@ -175,7 +175,7 @@ def test_no_policy_hides_behind_the_states_of_another_submission() -> None:
     assert alike(one, other)
 
 
-def test_a_sketch_is_a_function_of_policy_protocol_instance_and_submission() -> None:
+def test_a_sketch_is_a_function_of_policy_protocol_instance_and_submission():
     one, again = (observed(policy(ORIGINAL))[0] for _ in range(2))
     elsewhere = Behaviours(PROTOCOL.model_copy(update={"seed": 1}), "one")
     other = elsewhere.observe("runs.0", SPEC, policy(ORIGINAL))
@@ -185,7 +185,7 @@ def test_a_sketch_is_a_function_of_policy_protocol_instance_and_submission() -> 
     assert sketch.differ(one, "", 1.0)
 
 
-def test_numbers_that_are_not_finite_are_like_nothing() -> None:
+def test_numbers_that_are_not_finite_are_like_nothing():
     (one,) = observed(policy(ORIGINAL))
     good = sketch.numbers(sketch.to_bytes(one))
     for value in (np.nan, np.inf, 0.0):
@@ -195,7 +195,7 @@ def test_numbers_that_are_not_finite_are_like_nothing() -> None:
     assert sketch.alike(good[0], good[:0]).tolist() == []
 
 
-def test_the_policies_of_teams_are_compared_and_sketched() -> None:
+def test_the_policies_of_teams_are_compared_and_sketched():
     agents = [{"name": f"agent_{i}", "action_dim": 1} for i in range(2)]
     spec = plane(team={"agents": agents})
 

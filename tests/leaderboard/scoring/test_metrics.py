@@ -23,7 +23,7 @@ LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 # One run
 
 
-def test_metrics_of_a_run_match_a_calculation_by_hand() -> None:
+def test_metrics_of_a_run_match_a_calculation_by_hand():
     actual = run_metrics(
         (0.1, 0.2, 0.3, 0.4, 0.5, 0.6), (0.95, 0.9, 0.85, 0.8, 0.75, 0.7), levels=LEVELS
     )
@@ -34,13 +34,13 @@ def test_metrics_of_a_run_match_a_calculation_by_hand() -> None:
     assert actual["similarity_loss"] == pytest.approx(100 * (0.95 - 0.8))
 
 
-def test_slope_is_that_of_the_least_squares_line() -> None:
+def test_slope_is_that_of_the_least_squares_line():
     regret = np.random.default_rng(1).random(6)
     slope = run_metrics(tuple(regret), tuple(1 - regret), LEVELS)["regret_slope"]
     assert slope == pytest.approx(np.polynomial.Polynomial.fit(LEVELS, regret, 1).convert().coef[1])
 
 
-def test_a_constant_policy_has_no_decay_and_a_run_without_a_policy_loses_all_points() -> None:
+def test_a_constant_policy_has_no_decay_and_a_run_without_a_policy_loses_all_points():
     for levels in (LEVELS, (0.0, 0.1, 0.3, 0.7)):
         constant = run_metrics((1.0,) * len(levels), (0.75,) * len(levels), levels)
         assert constant == {
@@ -62,13 +62,13 @@ def test_a_constant_policy_has_no_decay_and_a_run_without_a_policy_loses_all_poi
 # Over runs
 
 
-def test_iqm_is_scipys_trimmed_mean() -> None:
+def test_iqm_is_scipys_trimmed_mean():
     for runs in range(1, 30):
         values = np.random.default_rng(runs).normal(size=(runs, 3))
         np.testing.assert_allclose(iqm(values), trim_mean(values, 0.25, axis=0), rtol=1e-13)
 
 
-def test_failing_one_class_of_six_moves_theta_ten_times_as_far_as_the_pooled_iqm() -> None:
+def test_failing_one_class_of_six_moves_theta_ten_times_as_far_as_the_pooled_iqm():
     rng = np.random.default_rng(0)
     honest = {str(index): rng.normal(0.33, 0.03, size=(10, 1)) for index in range(6)}
     gave_up = {**honest, "0": np.ones((10, 1))}
@@ -84,7 +84,7 @@ def test_failing_one_class_of_six_moves_theta_ten_times_as_far_as_the_pooled_iqm
 
 
 @pytest.mark.parametrize("n", [3, 13, 24])
-def test_the_interval_is_the_one_that_sorting_every_sample_gives(n: int) -> None:
+def test_the_interval_is_the_one_that_sorting_every_sample_gives(n):
     runs = np.random.default_rng(2).lognormal(size=(n, 2))
     bits = statistics._stream("seed", "only")
     chosen = (bits.random_raw(300 * n) >> np.uint64(11)).astype(float) / 2**53 * n
@@ -97,27 +97,27 @@ def test_the_interval_is_the_one_that_sorting_every_sample_gives(n: int) -> None
     np.testing.assert_allclose(high, iqm(runs) + arm, rtol=1e-12)
 
 
-def test_all_metrics_are_of_the_same_resampled_runs() -> None:
+def test_all_metrics_are_of_the_same_resampled_runs():
     runs = np.random.default_rng(3).normal(size=(10, 1))
     low, high = bootstrap({"a": np.concatenate([runs, 2 * runs + 1], axis=1)}, 500, "a")
     assert low[1] == pytest.approx(2 * low[0] + 1)
     assert high[1] == pytest.approx(2 * high[0] + 1)
 
 
-def test_classes_are_resampled_apart() -> None:
+def test_classes_are_resampled_apart():
     runs = np.random.default_rng(4).normal(size=(10, 1))
     (low,), (high,) = bootstrap({"a": runs}, 4000, "a")
     (low_of_two,), (high_of_two,) = bootstrap({"a": runs, "b": runs}, 4000, "a")
     assert (high_of_two - low_of_two) / (high - low) == pytest.approx(2**-0.5, rel=0.1)
 
 
-def test_runs_that_agree_leave_no_interval_and_one_run_adds_none() -> None:
+def test_runs_that_agree_leave_no_interval_and_one_run_adds_none():
     low, high = bootstrap({"agree": np.ones((10, 2)), "one": np.full((1, 2), 0.5)}, 500, "a")
     np.testing.assert_array_equal(low, [0.75, 0.75])
     np.testing.assert_array_equal(high, [0.75, 0.75])
 
 
-def test_an_interval_contains_its_score() -> None:
+def test_an_interval_contains_its_score():
     rng = np.random.default_rng(0)
     for _ in range(20):
         classes = {name: rng.lognormal(size=(3, 4)) for name in ("one", "two")}
@@ -130,9 +130,7 @@ def test_an_interval_contains_its_score() -> None:
     ("name", "instances"),
     [("lognormal(1)", 1), ("two humps 80:20", 1), ("20 % failed", 2), ("normal", 10)],
 )
-def test_intervals_cover_the_truth_and_do_not_separate_equal_methods(
-    name: str, instances: int
-) -> None:
+def test_intervals_cover_the_truth_and_do_not_separate_equal_methods(name, instances):
     actual = simulate(DISTRIBUTIONS[name], repetitions=400, draws=500, instances=instances)
     # Three standard errors of what 400 methods, or 200 pairs of them, can show.
     slack = 3 * math.sqrt(0.93 * 0.07 / 400)
@@ -142,7 +140,7 @@ def test_intervals_cover_the_truth_and_do_not_separate_equal_methods(
     assert actual.separated <= 0.02 + 3 * math.sqrt(0.02 * 0.98 / 200)
 
 
-def test_the_bootstrap_of_many_runs_needs_little_memory() -> None:
+def test_the_bootstrap_of_many_runs_needs_little_memory():
     classes = {"one": np.random.default_rng(0).lognormal(size=(1000, 11))}
     tracemalloc.start()
     bootstrap(classes, 4000, "a")
@@ -154,7 +152,7 @@ def test_the_bootstrap_of_many_runs_needs_little_memory() -> None:
 # Ranks
 
 
-def test_ranks_match_counting_every_pair() -> None:
+def test_ranks_match_counting_every_pair():
     rng = np.random.default_rng(5)
     for _ in range(200):
         ends = np.sort(rng.integers(0, 12, size=(rng.integers(1, 15), 2)), axis=1)
@@ -166,7 +164,7 @@ def test_ranks_match_counting_every_pair() -> None:
         assert (actual[0] <= actual[1]).all()
 
 
-def test_intervals_that_touch_share_a_rank_and_no_entries_have_none() -> None:
+def test_intervals_that_touch_share_a_rank_and_no_entries_have_none():
     first, last = rank_ranges([0.1, 0.2, 0.5], [0.2, 0.3, 0.6])
     assert list(zip(first.tolist(), last.tolist(), strict=True)) == [(1, 2), (1, 2), (3, 3)]
     first, last = rank_ranges([], [])

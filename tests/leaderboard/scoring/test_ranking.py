@@ -94,7 +94,7 @@ def reasons(*entries: EntryRow) -> dict[int, str]:
     return {sequence: reason for sequence, _, _, reason in ranks("wd_regret", *entries)}
 
 
-def test_entries_are_ordered_with_the_ranks_that_their_intervals_allow() -> None:
+def test_entries_are_ordered_with_the_ranks_that_their_intervals_allow():
     entries = [
         entry(3, scores(0.50, 0.6)),
         entry(4, scores(0.20, 0.6)),
@@ -111,7 +111,7 @@ def test_entries_are_ordered_with_the_ranks_that_their_intervals_allow() -> None
     assert list(reasons(*equal)) == [4, 7, 9]  # in order of submission
 
 
-def test_each_metric_has_its_own_order() -> None:
+def test_each_metric_has_its_own_order():
     entries = [entry(3, scores(0.1, 0.9)), entry(4, scores(0.3, 0.5)), entry(5, scores(0.4, 0.45))]
     orders = {
         metric: [row[0] for row in ranks(metric, *entries)]
@@ -120,7 +120,7 @@ def test_each_metric_has_its_own_order() -> None:
     assert orders == {"wd_regret": [3, 4, 5], "ood_regret": [5, 4, 3], "ood_decay": [5, 4, 3]}
 
 
-def test_unranked_entries_have_a_reason_and_take_no_rank() -> None:
+def test_unranked_entries_have_a_reason_and_take_no_rank():
     few, ranked = entry(3, scores(0.1, 0.2), enough_runs=False), entry(4, scores(0.3, 0.4))
     unlisted = [
         entry(5, status="waiting"),
@@ -135,7 +135,7 @@ def test_unranked_entries_have_a_reason_and_take_no_rank() -> None:
     ]
 
 
-def test_entries_that_may_not_have_learned_have_no_rank_by_ood_decay() -> None:
+def test_entries_that_may_not_have_learned_have_no_rank_by_ood_decay():
     unsure, sure = entry(3, scores(0.46, 0.46)), entry(4, scores(0.45, 0.6))
     assert ranks("ood_decay", unsure, sure) == [(3, None, None, "not_learned"), (4, 1, 1, "")]
     assert [row[1] for row in ranks("wd_regret", unsure, sure)] == [1, 1]
@@ -148,7 +148,7 @@ def by_decay(*entries: EntryRow) -> list[tuple[int, int | None, int | None]]:
     return [row[:3] for row in ranks("ood_decay", *entries)]
 
 
-def test_a_policy_made_worse_inside_the_cube_stays_below_the_original() -> None:
+def test_a_policy_made_worse_inside_the_cube_stays_below_the_original():
     original = entry(3, scores(0.1, 0.3, 0.01))
     sabotaged = entry(4, scores(0.44, 0.3, 0.01))  # decay −0.14
     lucky = entry(4, scores(0.44, 0.299, 0.01))  # in the states of some regions
@@ -162,20 +162,20 @@ def test_a_policy_made_worse_inside_the_cube_stays_below_the_original() -> None:
     assert by_decay(steep, honest) == [(4, 1, 1), (3, 2, 2)]
 
 
-def test_a_decay_below_zero_is_worth_no_more_than_none() -> None:
+def test_a_decay_below_zero_is_worth_no_more_than_none():
     negative, flat = entry(3, scores(0.3, 0.2, 0.01)), entry(4, scores(0.15, 0.15, 0.01))
     optimal = entry(5, scores(0.0, 0.0, 0.0))
     assert by_decay(negative, flat, optimal) == [(5, 1, 3), (4, 1, 3), (3, 1, 3)]
 
 
-def test_an_entry_without_a_rank_holds_nobody_down() -> None:
+def test_an_entry_without_a_rank_holds_nobody_down():
     better = entry(3, scores(0.1, 0.3, 0.01), enough_runs=False)
     worse, other = entry(4, scores(0.4, 0.35, 0.01)), entry(5, scores(0.1, 0.2, 0.01))
     assert by_decay(better, worse) == [(4, 1, 1), (3, None, None)]
     assert by_decay(better, worse, other) == [(5, 1, 2), (4, 1, 2), (3, None, None)]
 
 
-def test_no_entry_stands_above_one_that_is_better_in_every_region() -> None:
+def test_no_entry_stands_above_one_that_is_better_in_every_region():
     rng = random.Random(1)
     entries = [entry(i, scores(rng.random() / 3, rng.random(), 0.01)) for i in range(3, 120)]
     rows = ranking(entries, "ood_decay")
@@ -190,7 +190,7 @@ def test_no_entry_stands_above_one_that_is_better_in_every_region() -> None:
 # One row of a key's method, and none for copies
 
 
-def test_the_latest_entry_of_a_key_with_the_same_method_and_version_is_ranked() -> None:
+def test_the_latest_entry_of_a_key_with_the_same_method_and_version_is_ranked():
     first = entry(3, scores(0.1, 0.2), method="PPO", version="1")
     again = entry(4, scores(0.2, 0.3), method="pp0", version="1")
     other_version = entry(5, scores(0.3, 0.3), method="PPO", version="2")
@@ -207,14 +207,14 @@ def test_the_latest_entry_of_a_key_with_the_same_method_and_version_is_ranked() 
         assert reasons(*versions) == {3: "", 5: ""}
 
 
-def test_twenty_versions_of_the_same_policies_are_one_row() -> None:
+def test_twenty_versions_of_the_same_policies_are_one_row():
     first = entry(3, scores(0.1, 0.2), policies=10)
     alike = (Likeness(first.id, first.key, 10),)
     others = [entry(i, scores(0.1, 0.2), policies=10, alike=alike) for i in range(4, 23)]
     assert reasons(first, *others) == {**dict.fromkeys(range(3, 22), "superseded"), 22: ""}
 
 
-def test_a_copy_of_another_key_has_no_rank_and_pushes_nobody_down() -> None:
+def test_a_copy_of_another_key_has_no_rank_and_pushes_nobody_down():
     original = entry(3, scores(0.2, 0.3), policies=10)
     own = entry(5, scores(0.4, 0.5), key="2" * 64, policies=10)
 
@@ -237,7 +237,7 @@ def test_a_copy_of_another_key_has_no_rank_and_pushes_nobody_down() -> None:
 # The reference rows
 
 
-def test_a_board_with_right_reference_rows_is_publishable() -> None:
+def test_a_board_with_right_reference_rows_is_publishable():
     refuse_unpublishable(REFERENCES)
     refuse_unpublishable([reference(1, "optimal", 9e-7), reference(2, "constant", 1 - 9e-7)])
     off = reference(3, "optimal", 0.1)
@@ -251,7 +251,7 @@ def test_a_board_with_right_reference_rows_is_publishable() -> None:
     refuse_unpublishable([REFERENCES[0], row])
 
 
-def test_without_both_reference_rows_nothing_is_published() -> None:
+def test_without_both_reference_rows_nothing_is_published():
     optimal, constant = REFERENCES
     for rows, match in [
         ([optimal, entry(3, scores(0.1, 0.2))], "'constant': missing: must be scored"),
@@ -267,7 +267,7 @@ def test_without_both_reference_rows_nothing_is_published() -> None:
 
 
 @pytest.mark.parametrize("name", ["wd_regret", "ood_regret", "ood_decay", "regret_slope", 0, 3, 5])
-def test_a_wrong_reference_row_blocks_publication_in_any_region_or_metric(name: str | int) -> None:
+def test_a_wrong_reference_row_blocks_publication_in_any_region_or_metric(name):
     for which, off in [(0, 2e-6), (0, -2e-6), (1, 2e-6), (1, -2e-6)]:
         rows = list(REFERENCES)
         values = rows[which].scores
@@ -302,7 +302,7 @@ def csv_of(rows: list[Any], metric: str = "wd_regret") -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(to_csv(rows, metric, BOARD, HEAD, DATE))))
 
 
-def test_no_cell_of_the_csv_is_a_formula() -> None:
+def test_no_cell_of_the_csv_is_a_formula():
     lines = csv_of(hostile_rows())
     assert len(lines) == 4
     for line in lines:
@@ -323,7 +323,7 @@ def test_no_cell_of_the_csv_is_a_formula() -> None:
         assert line["submitter"] == f"'{start[-1]}cmd"
 
 
-def test_the_csv_has_every_score_with_its_interval() -> None:
+def test_the_csv_has_every_score_with_its_interval():
     lines = csv_of(hostile_rows())
     assert [line["first"] for line in lines] == ["", "1", "2", ""]
     row = lines[1]
@@ -333,7 +333,7 @@ def test_the_csv_has_every_score_with_its_interval() -> None:
     assert float(row["normalised_regret_5_high"]) == pytest.approx(0.25)
 
 
-def test_an_export_has_what_an_entry_ranks_by_its_steps_per_run_and_what_it_copies() -> None:
+def test_an_export_has_what_an_entry_ranks_by_its_steps_per_run_and_what_it_copies():
     alike = (Likeness("sha256:" + "a" * 64, "f" * 64, 2),)
     copied = entry(3, scores(0.3, 0.1), runs=10, steps=1000, policies=10, alike=alike)
     rows = ranking([copied], "ood_decay")
@@ -345,7 +345,7 @@ def test_an_export_has_what_an_entry_ranks_by_its_steps_per_run_and_what_it_copi
     assert r"& 10 & 100 & " in to_latex(rows, "ood_decay", BOARD, HEAD, DATE)
 
 
-def test_names_are_escaped_in_latex_and_stay_on_their_line() -> None:
+def test_names_are_escaped_in_latex_and_stay_on_their_line():
     text = to_latex(hostile_rows(), "wd_regret", BOARD, HEAD, DATE)
     line = next(line for line in text.splitlines() if "passwd" in line)
     assert line == (
@@ -359,7 +359,7 @@ def test_names_are_escaped_in_latex_and_stay_on_their_line() -> None:
     assert r"a \textbackslash{}end\{tabular\} b" in "\n".join(lines)
 
 
-def test_the_json_has_the_whole_scores() -> None:
+def test_the_json_has_the_whole_scores():
     plain = json.loads(to_json(hostile_rows(), "wd_regret", BOARD, HEAD, DATE))
     assert plain["metric"] == "wd_regret"
     assert [row["not_ranked"] for row in plain["rows"]] == ["reference", "", "", "reference"]
@@ -368,7 +368,7 @@ def test_the_json_has_the_whole_scores() -> None:
 
 
 @pytest.mark.parametrize("write", [to_csv, to_latex, to_json])
-def test_every_export_names_its_suite_protocol_and_log(write: Any) -> None:
+def test_every_export_names_its_suite_protocol_and_log(write):
     text = write(hostile_rows(), "wd_regret", BOARD, HEAD, DATE).replace(r"\_", "_")
     suite, protocol = BOARD.suite.digest, BOARD.protocol.digest
     for fact in ("small_suite-v1", suite, "few-v1", protocol, HEAD[1], DATE):

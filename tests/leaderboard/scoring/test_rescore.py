@@ -44,9 +44,7 @@ def again(board: Path, result: Result) -> list[RescoreNote]:
         return rescore(store, result.submission)
 
 
-def test_the_draw_is_unpredictable_and_its_seed_repeats_it(
-    board: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_draw_is_unpredictable_and_its_seed_repeats_it(board, monkeypatch):
     monkeypatch.setattr("leaderboard.scoring.verify.rescore", lambda store, id: [])
     reports = [verify(board, rescore=1) for _ in range(3)]
     assert len({report.rescore_seed for report in reports}) == 3
@@ -60,7 +58,7 @@ def test_the_draw_is_unpredictable_and_its_seed_repeats_it(
     assert draw(names, "all", 1) == draw(names, 1000, 1) == names
 
 
-def test_a_small_forgery_of_an_ordinary_policy_is_found(board: Path) -> None:
+def test_a_small_forgery_of_an_ordinary_policy_is_found(board):
     with pytest.raises(TamperedError, match=r"differs by [\d.]+e-05: must be at most 1.\de-05"):
         again(board, moved(board, STEADY, 1e-4))
     assert verify(board).rescored == 0
@@ -70,7 +68,7 @@ def test_a_small_forgery_of_an_ordinary_policy_is_found(board: Path) -> None:
     assert tampered.value.where == f"results/{path.name}"
 
 
-def test_what_rounding_explains_is_a_note_and_more_is_tampering(board: Path) -> None:
+def test_what_rounding_explains_is_a_note_and_more_is_tampering(board):
     (note,) = again(board, moved(board, SENSITIVE, 1e-4))
     assert (note.submission, note.kind, note.where) == (
         *(ids(board)[SENSITIVE], "rounding", "runs.0"),
@@ -91,7 +89,7 @@ def rejected(result: Result, code: str, versions: dict[str, str] | None = None) 
     )
 
 
-def test_what_depends_on_versions_or_chance_is_noted_and_not_confirmed(board: Path) -> None:
+def test_what_depends_on_versions_or_chance_is_noted_and_not_confirmed(board):
     honest = result_on(board, STEADY)
     other = honest.model_copy(update={"versions": {**honest.versions, "onnxruntime": "1.0.0"}})
     (note,) = again(board, other)
@@ -109,13 +107,13 @@ def test_what_depends_on_versions_or_chance_is_noted_and_not_confirmed(board: Pa
     assert (answer.exit_code, "Not confirmed" in answer.stdout) == (1, True)
 
 
-def test_a_board_that_rejects_a_policy_without_a_fault_is_found(board: Path) -> None:
+def test_a_board_that_rejects_a_policy_without_a_fault_is_found(board):
     with pytest.raises(TamperedError, match="it is scored, not onnx_op"):
         again(board, rejected(result_on(board, STEADY), "onnx_op"))
     assert verify(board).results == 4
 
 
-def test_scores_of_a_policy_that_is_rejected_are_found(board: Path) -> None:
+def test_scores_of_a_policy_that_is_rejected_are_found(board):
     scored, refused = result_on(board, STEADY), result_on(board, REFUSED)
     with Store.open(board, read_only=True) as store:
         (run,) = store.submission(refused.submission).submission.runs
@@ -128,9 +126,7 @@ def test_scores_of_a_policy_that_is_rejected_are_found(board: Path) -> None:
 
 
 @pytest.mark.parametrize("code", ["run_failed", "onnx_refused"])
-def test_a_policy_that_fails_here_was_not_scored_by_the_same_versions(
-    board: Path, code: str
-) -> None:
+def test_a_policy_that_fails_here_was_not_scored_by_the_same_versions(board, code):
     scored = result_on(board, STEADY)
     here = rejected(scored, code)
     assert _other_verdict(scored, here, other_versions=True).here == code

@@ -131,7 +131,7 @@ def scored() -> Scored:
     return Scored(result, calls)
 
 
-def test_the_seed_is_the_first_53_bits_of_the_three_digests() -> None:
+def test_the_seed_is_the_first_53_bits_of_the_three_digests():
     bits = bin(int(hashlib.sha256(b"p\ns\na").hexdigest(), 16))[2:].zfill(256)
     assert evaluation_seed("p", "s", "a") == int(bits[:53], 2)
     assert len({evaluation_seed(*digests) for digests in ("psa", "qsa", "pta", "psb")}) == 4
@@ -143,7 +143,7 @@ def estimates(result: Result) -> list[Estimate]:
     return [*regrets, *result.scores.normalised_regret]
 
 
-def test_a_copy_of_the_optimal_policy_scores_zero_and_is_flagged() -> None:
+def test_a_copy_of_the_optimal_policy_scores_zero_and_is_flagged():
     # What an open board cannot tell: the specs are public, and so is π*. It shows performance,
     # never learning; all that the board can do is to ask for code.
     result = score(optimal_onnx, board=ONE)
@@ -151,7 +151,7 @@ def test_a_copy_of_the_optimal_policy_scores_zero_and_is_flagged() -> None:
     assert result.oracle_like
 
 
-def test_the_constant_policy_scores_one_and_has_no_decay_or_sketch() -> None:
+def test_the_constant_policy_scores_one_and_has_no_decay_or_sketch():
     result = score(constant_onnx, board=ONE)
     assert {estimate.value for estimate in estimates(result)} == {1.0}
     assert result.scores is not None
@@ -160,7 +160,7 @@ def test_the_constant_policy_scores_one_and_has_no_decay_or_sketch() -> None:
     assert result.runs[0].sketch == ""
 
 
-def test_a_run_has_the_numbers_that_anyone_can_recompute(scored: Scored) -> None:
+def test_a_run_has_the_numbers_that_anyone_can_recompute(scored):
     W = numpy_helper.to_array(models.linear().graph.initializer[0])
     for index in (0, 2):
         run, spec = scored.result.runs[index], SUITE.instances[index]
@@ -182,9 +182,7 @@ def test_a_run_has_the_numbers_that_anyone_can_recompute(scored: Scored) -> None
         assert run.sketch  # by which copies are found
 
 
-def test_a_result_is_the_same_each_time_whatever_else_is_loaded(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_result_is_the_same_each_time_whatever_else_is_loaded(monkeypatch):
     first = score(LINEAR, board=ONE)
     monkeypatch.setitem(sys.modules, "torch", types.ModuleType("torch"))
     again = score(LINEAR, board=ONE)
@@ -198,9 +196,7 @@ def test_a_result_is_the_same_each_time_whatever_else_is_loaded(
     assert first.versions["onnxruntime"] == metadata.version("onnxruntime")
 
 
-def test_a_result_records_the_isolation_and_the_effect_of_rounding_and_reads_back(
-    scored: Scored,
-) -> None:
+def test_a_result_records_the_isolation_and_the_effect_of_rounding_and_reads_back(scored):
     result = scored.result
     assert result.isolation == available_isolation()
     assert [run.rounding is None for run in result.runs] == [False, True, False]
@@ -212,7 +208,7 @@ def test_a_result_records_the_isolation_and_the_effect_of_rounding_and_reads_bac
     assert "isolation" not in Result.from_dict(plain).to_dict()
 
 
-def test_failed_and_unlisted_runs_score_one(scored: Scored) -> None:
+def test_failed_and_unlisted_runs_score_one(scored):
     result = scored.result
     shallow, deep = result.classes
     assert (shallow.runs, shallow.submitted) == (4, 1)
@@ -245,7 +241,7 @@ def hidden_units(order: list[int], factor: float = 1.0) -> bytes:
     return as_bytes(models.model(nodes, tensors))
 
 
-def test_one_policy_in_two_files_is_refused_and_both_runs_are_named() -> None:
+def test_one_policy_in_two_files_is_refused_and_both_runs_are_named():
     original, copy = hidden_units(list(range(8))), hidden_units(list(range(8))[::-1], 0.3)
     assert original != copy
     result = score(original, None, None, copy)
@@ -254,7 +250,7 @@ def test_one_policy_in_two_files_is_refused_and_both_runs_are_named() -> None:
     assert "runs.0 in the same states" in result.message
 
 
-def test_what_its_documents_show_rejects_a_submission_before_scoring() -> None:
+def test_what_its_documents_show_rejects_a_submission_before_scoring():
     opened: list[str] = []
     other = SMESpec(state_dim=2, action_dim=2, seed=77).digest
     for result, code, fact in [
@@ -302,7 +298,7 @@ DEPENDENT_OUTSIDE = models.squashed(
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_rejected_artefact_rejects_the_submission_and_is_named(policy: bytes, code: str) -> None:
+def test_a_rejected_artefact_rejects_the_submission_and_is_named(policy, code):
     result = score(None, policy, LINEAR)
     assert (result.status, result.code) == ("rejected", code)
     assert result.message.startswith(
@@ -345,7 +341,7 @@ def checks(regions: int, batches: list[int], agents: int = 1) -> Recorder:
     return recorder
 
 
-def test_a_random_batch_and_the_last_of_each_region_are_checked() -> None:
+def test_a_random_batch_and_the_last_of_each_region_are_checked():
     chosen = [
         (int(rows[0, 0]), int(rows[0, 2])) for rows in checks(40, [800, 800, 800, 100]).checked
     ]
@@ -358,7 +354,7 @@ def test_a_random_batch_and_the_last_of_each_region_are_checked() -> None:
     ]
 
 
-def test_rounding_is_measured_in_random_states_of_each_region() -> None:
+def test_rounding_is_measured_in_random_states_of_each_region():
     regions = checks(3, [800, 800, 800, 100]).rounded
     assert [sorted({*rows[:, 0].tolist()}) for rows in regions] == [[0], [1], [2]]
     numbers = [set(rows[:, 2].tolist()) for rows in regions]
@@ -367,7 +363,7 @@ def test_rounding_is_measured_in_random_states_of_each_region() -> None:
     assert all(max(each) >= 2400 for each in numbers)
 
 
-def test_every_agent_is_checked_in_the_same_states() -> None:
+def test_every_agent_is_checked_in_the_same_states():
     recorder = checks(2, [600, 600, 50], agents=2)
     for rows in recorder.rounded:
         first, second = (rows[rows[:, 1] == agent, 2] for agent in (0, 1))
@@ -377,7 +373,7 @@ def test_every_agent_is_checked_in_the_same_states() -> None:
     assert all([int(rows[0, 1]) for rows in pair] == [0, 1] for pair in pairs)
 
 
-def test_dependence_on_the_batch_in_the_last_one_alone_is_detected() -> None:
+def test_dependence_on_the_batch_in_the_last_one_alone_is_detected():
     # The rows of the last batch of 8,192 + 500 states: only they see each other.
     rows = models.tensor("rows", np.float32(500.0))
     policy = as_bytes(
@@ -405,7 +401,7 @@ def test_dependence_on_the_batch_in_the_last_one_alone_is_detected() -> None:
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
-def test_errors_of_the_scorer_do_not_reject_the_submission(error: type[BaseException]) -> None:
+def test_errors_of_the_scorer_do_not_reject_the_submission(error):
     def stop(done: int, total: int) -> None:
         raise error
 
@@ -422,7 +418,7 @@ def children() -> list[int]:
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="finds its children in /proc")
-def test_a_sandbox_ended_from_outside_does_not_reject_the_submission() -> None:
+def test_a_sandbox_ended_from_outside_does_not_reject_the_submission():
     before = set(children())
 
     def end_it(done: int, total: int) -> None:

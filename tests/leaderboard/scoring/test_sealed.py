@@ -28,7 +28,7 @@ def policy(observations: np.ndarray) -> np.ndarray:
     return 1.5 * observations[:, :1] - 0.2
 
 
-def test_answers_score_what_their_policy_scores() -> None:
+def test_answers_score_what_their_policy_scores():
     shown = challenge(FIRST.spec, FIRST.protocol)
     assert shown.shape == (FIRST.rows, 4) == (300, 4)
     assert shown.dtype == np.float32
@@ -41,7 +41,7 @@ def test_answers_score_what_their_policy_scores() -> None:
     assert "numpy" in versions
 
 
-def test_the_order_of_answers_matters_and_each_is_used_once() -> None:
+def test_the_order_of_answers_matters_and_each_is_used_once():
     shown = challenge(FIRST.spec, FIRST.protocol)
     right, _ = score_run(FIRST, policy(shown), None)
     wrong, _ = score_run(FIRST, policy(shown)[::-1], None)
@@ -50,7 +50,7 @@ def test_the_order_of_answers_matters_and_each_is_used_once() -> None:
         score_run(FIRST, np.zeros((301, 1), np.float32), None)
 
 
-def test_tasks_and_states_are_an_instances_own_and_a_tickets() -> None:
+def test_tasks_and_states_are_an_instances_own_and_a_tickets():
     others = instances(SEASON, MASTER, "2", "a" * 64)
     everyone = [FIRST, SECOND, *others, *instances(SEASON, MASTER, "1", "b" * 64)]
     assert len({each.spec.digest for each in everyone}) == 6
@@ -65,7 +65,7 @@ def test_tasks_and_states_are_an_instances_own_and_a_tickets() -> None:
     )
 
 
-def test_wrong_answers_are_refused() -> None:
+def test_wrong_answers_are_refused():
     tables = [
         (pack_table(np.zeros((299, 1))), "answer_shape"),
         (pack_table(np.zeros((300, 2))), "answer_shape"),
@@ -79,7 +79,7 @@ def test_wrong_answers_are_refused() -> None:
         assert error.value.code == code
 
 
-def test_a_result_averages_instances_and_an_unanswered_one_scores_1() -> None:
+def test_a_result_averages_instances_and_an_unanswered_one_scores_1():
     run, versions = score_run(FIRST, policy(challenge(FIRST.spec, FIRST.protocol)), None)
     failed, _ = score_run(SECOND, None, None)
     assert failed == failed_run(SEASON.protocol, "deep", None)
