@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import pickle
-import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -13,18 +12,23 @@ import numpy as np
 import pytest
 
 import sme_registry
-from sme_registry.errors import ActionError, EpisodeError, OptionError, SpecError, StateError
+from sme_registry.errors import (
+    ActionError,
+    EpisodeError,
+    MissingDependencyError,
+    OptionError,
+    SpecError,
+    StateError,
+)
 
 pytest.importorskip("stable_baselines3")
 
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import EvalCallback
-from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
-    SubprocVecEnv,
     VecCheckNan,
     VecFrameStack,
     VecMonitor,
@@ -221,38 +225,12 @@ def test_what_cannot_be_used_is_a_typed_error() -> None:
     env.step(np.zeros((2, 4)))
 
 
-def test_subprocess_workers_make_it_by_module_and_id() -> None:
-    kwargs: dict[str, Any] = {
-        "n_envs": 2, "seed": 5, "env_kwargs": {"action_range": "symmetric", "horizon": 6, "k": 4}
-    }  # fmt: skip
-    workers = make_vec_env(
-        "sme_registry:SME/Default-v1", vec_env_cls=SubprocVecEnv,
-        vec_env_kwargs={"start_method": "spawn"}, **kwargs,
-    )  # fmt: skip
-    ours = SMEVecEnv("Default", 2, horizon=6, k=4)
-    ours.seed(5)
-    np.testing.assert_array_equal(workers.reset(), ours.reset())
-    rng = np.random.default_rng(0)
-    for _ in range(14):
-        action = rng.uniform(-1, 1, (2, 4)).astype(np.float32)
-        observations, rewards, dones, _ = ours.step(action)
-        got = workers.step(action)
-        np.testing.assert_array_equal(got[0], observations)
-        np.testing.assert_array_equal(got[1].astype(np.float32), rewards)  # theirs are float64
-        np.testing.assert_array_equal(got[2], dones)
-    workers.close()
-
-
-def test_without_sb3_the_way_to_install_it_is_named() -> None:
-    code = (
-        "import sys; sys.modules['stable_baselines3'] = None\n"
-        "from sme_registry.errors import MissingDependencyError\n"
-        "try:\n    import sme_registry.sb3\n"
-        "except MissingDependencyError as error:\n    print(error)\n"
-    )
-    root = Path(sme_registry.__file__).resolve().parents[1]
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root)
-    assert "[train]" in done.stdout, done.stderr
+def test_without_sb3_the_way_to_install_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in sys.modules if name.startswith("sme_registry.sb3")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    with pytest.raises(MissingDependencyError, match=r"\[train\]"):
+        importlib.import_module("sme_registry.sb3")
 
 
 def test_frames_are_those_of_a_dummy_vec_env_of_singles() -> None:
@@ -260,8 +238,7 @@ def test_frames_are_those_of_a_dummy_vec_env_of_singles() -> None:
     ours = SMEVecEnv(HARD, 2, render_mode="rgb_array")
     few = SMEVecEnv(HARD, 2, render_mode="rgb_array", render_lanes=[1])
     theirs = dummy(HARD, 2, render_mode="rgb_array")
-    assert ours.render_mode == "rgb_array"
-    assert ours.metadata["render_fps"] == 10
+    assert (ours.render_mode, ours.metadata["render_fps"]) == ("rgb_array", 10)
     for env in (ours, few, theirs):
         env.seed(3)
         env.reset()

@@ -178,21 +178,6 @@ def test_a_batch_of_teams_is_the_loop_of_its_lanes_bit_for_bit(backend, spec, B,
             np.testing.assert_array_equal(got, expected, err_msg=name)
 
 
-@settings(max_examples=15)
-@given(spec=specs(plain=True), seed=st.integers(0, 100))
-@example(DEEP, 0)
-@example(WIDE, 0)
-@example(TEAM, 0)
-@example(SHARED, 0)
-def test_a_batch_of_the_numba_engine_is_that_of_numpys(spec, seed):
-    pytest.importorskip("numba")
-    task, random, B = materialize(spec), np.random.default_rng(seed), 70
-    s, t = random.random((B, spec.state_dim)), random.integers(0, spec.horizon, B)
-    r_cum, a = random.random((B, len(task.names))), near_optimal(task, s, random)
-    fast, plain = (step_batch(task, engine(task, b), s, t, r_cum, a) for b in BACKENDS)
-    assert_follows(task, a, fast, plain)
-
-
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("B", [0, 1, 300])
 def test_the_oracle_of_any_number_of_states_is_the_definitions(backend, B):
@@ -218,20 +203,6 @@ def test_an_action_that_is_not_finite_is_refused_and_nothing_moves(backend, dtyp
             assert lane.step(action) is None
             np.testing.assert_array_equal(lane.numbers, before)
         assert lane.step(np.full(spec.action_dim, 0.5, dtype)) is not None
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_batch_with_an_action_that_is_not_finite_is_refused(backend):
-    for spec, bad in itertools.product((SMESpec(), TEAM, SHARED), (np.nan, -np.inf)):
-        task = materialize(spec)
-        s, t = np.full((70, spec.state_dim), 0.3), np.zeros(70, np.int64)
-        r_cum, a = np.zeros((70, len(task.names))), np.full((70, spec.action_dim), 0.5)
-        a[69, spec.action_dim - 1] = bad
-        before = s.copy()
-        assert step_batch(task, engine(task, backend), s, t, r_cum, a) is None
-        np.testing.assert_array_equal(s, before)
-        np.testing.assert_array_equal(t, 0)
-        np.testing.assert_array_equal(r_cum, 0.0)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -90,16 +90,6 @@ def test_overrides_give_the_derived_digest_and_do_not_keep_the_name() -> None:
     assert again.spec.id == env.spec.id
 
 
-def test_a_native_batch_with_overrides_does_not_keep_the_name_either() -> None:
-    mode = gymnasium.vector.AutoresetMode.SAME_STEP
-    env = gymnasium.make_vec("SME/Default-v1", num_envs=2, horizon=5, autoreset_mode=mode)
-    assert env.spec.id == f"SME/{env.unwrapped.sme_spec.content_name}-v1"
-    again: Any = gymnasium.make_vec(EnvSpec.from_json(env.spec.to_json()))
-    assert again.num_envs == 2
-    assert again.metadata["autoreset_mode"] is mode
-    assert again.unwrapped.sme_spec == env.unwrapped.sme_spec
-
-
 def test_another_spec_given_to_a_named_id_does_not_take_its_name(tmp_path: Path) -> None:
     other = SMESpec(seed=9)
     path = sme_registry.save(other, tmp_path / "Mine.json")
@@ -234,7 +224,14 @@ def test_a_symmetric_name_is_not_that_of_a_task() -> None:
     assert env.action_space.low[0] == -1.0
 
 
-def test_an_env_spec_with_overrides_goes_by_the_derived_content() -> None:
+def test_batches_and_env_specs_with_overrides_do_not_keep_the_name_either() -> None:
+    mode = gymnasium.vector.AutoresetMode.SAME_STEP
+    env = gymnasium.make_vec("SME/Default-v1", num_envs=2, horizon=5, autoreset_mode=mode)
+    assert env.spec.id == f"SME/{env.unwrapped.sme_spec.content_name}-v1"
+    again: Any = gymnasium.make_vec(EnvSpec.from_json(env.spec.to_json()))
+    assert again.num_envs == 2
+    assert again.metadata["autoreset_mode"] is mode
+    assert again.unwrapped.sme_spec == env.unwrapped.sme_spec
     derived = sme_registry.load("Default").derive(complexity=10)
     made = sme_registry.env_spec(sme_registry.load("Default"), complexity=10, action_range="unit")
     assert made.id == f"SME/{derived.content_name}-v1"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import warnings
 from typing import Any
 
 import numpy as np
@@ -137,11 +136,3 @@ def test_a_faulty_team_is_seen(check: Any, faulty: type[SMETeamEnv], words: str)
     passes(check)
     with pytest.raises(ConformanceError, match=words):
         check(TASK, parallel=faulty)
-
-
-def test_pettingzoos_parallel_seed_test_passes_a_team_that_is_random_from_step_two_on() -> None:
-    # This is why the kit also checks whole episodes.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        from pettingzoo.test import parallel_seed_test
-    parallel_seed_test(lambda: RANDOM_FROM_STEP_TWO(TASK))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from typing import Any
 
-import numpy as np
 import pettingzoo
 import pytest
 from pettingzoo.utils.conversions import aec_to_parallel, parallel_to_aec
@@ -99,24 +98,3 @@ def test_the_conversion_back_from_turns_gives_the_environment_itself() -> None:
     env = sme_registry.make_parallel("Team2")
     assert aec_to_parallel(parallel_to_aec(env)) is env
     assert aec_to_parallel(sme_registry.make_aec("Team2")).sme_spec == env.sme_spec
-
-
-def test_cumulated_rewards_in_turns_are_the_returns_of_the_parallel_episode() -> None:
-    env, turns = sme_registry.make_parallel("DuoDeep"), sme_registry.make_aec("DuoDeep")
-    env.reset(seed=4)
-    turns.reset(seed=4)
-    rng = np.random.default_rng(0)
-    returns = dict.fromkeys(env.possible_agents, 0.0)
-    returns_in_turns = dict(returns)
-    while env.agents:
-        actions = {name: rng.random(env.action_space(name).shape) for name in env.agents}
-        for name in env.agents:
-            returns_in_turns[name] += turns.last()[1]
-            turns.step(actions[name])
-        for name, reward in env.step(actions)[1].items():
-            returns[name] += reward
-    for name in turns.agent_iter():
-        returns_in_turns[name] += turns.last()[1]
-        turns.step(None)
-    assert returns_in_turns == returns
-    assert min(returns.values()) > 0.0

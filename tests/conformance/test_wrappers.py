@@ -89,19 +89,6 @@ def test_recorded_statistics_of_a_batch_are_those_of_its_singles() -> None:
     assert infos["episode"]["l"].tolist() == [T, T]
 
 
-def test_a_time_limit_of_the_horizon_or_more_changes_nothing() -> None:
-    for limit in (T, 10 * T):
-        env = gymnasium.make("SME/Default-v1", horizon=T, k=5, max_episode_steps=limit)
-        env.reset(seed=0)
-        returned, steps, ended = 0.0, 0, False
-        while not ended:
-            action = env.unwrapped.task.optimal_action(env.unwrapped.state)
-            _, reward, terminated, truncated, _ = env.step(action.astype(np.float32))
-            returned, steps, ended = returned + float(reward), steps + 1, terminated or truncated
-        assert steps == T
-        assert returned == pytest.approx(T, abs=1e-3)
-
-
 @pytest.mark.parametrize("outside", [None, wrappers.Autoreset, wrappers.RecordEpisodeStatistics])
 def test_a_time_limit_below_the_horizon_is_refused_at_reset(outside: Any) -> None:
     made = gymnasium.make("SME/Default-v1", horizon=T, max_episode_steps=T - 1)

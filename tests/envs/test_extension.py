@@ -16,7 +16,6 @@ from sme_registry.envs import SMEEnv, SMEVectorEnv
 from sme_registry.envs.team import SMETeamEnv
 from sme_registry.errors import OptionError, SpecError, StateError
 from sme_registry.task.streams import counted
-from sme_registry.wrappers import RecordRegret
 from tests.strategies import specs
 
 SPECS = {
@@ -215,6 +214,10 @@ def test_distractors_that_cannot_be_used_are_refused_and_nothing_changes(make: A
         ({"distractors": None}, StateError, r"distractors of shape \(\)"),
         ({"distractor": [0.5] * 8}, OptionError, "Did you mean 'distractors'"),
     ):
+        plain = make(SPECS["mixed"])  # has no distractors, and so no option for them
+        assert plain.distractors.shape[-1] == 0
+        with pytest.raises(OptionError, match=r"'distractors'.*unknown option"):
+            plain.reset(options={"distractors": []})
         env = make(SPECS["noise"])
         env.reset(seed=0)
         twin = copy.deepcopy(env)
@@ -222,14 +225,6 @@ def test_distractors_that_cannot_be_used_are_refused_and_nothing_changes(make: A
             env.reset(seed=9, options=options)
         np.testing.assert_array_equal(env.distractors, twin.distractors)
         np.testing.assert_array_equal(env.reset()[0], twin.reset()[0])
-
-
-@pytest.mark.parametrize("name", ["safe", "mixed"])
-def test_a_task_without_distractors_has_no_option_for_them(name: str) -> None:
-    with pytest.raises(OptionError, match=r"'distractors'.*unknown option"):
-        SMEEnv(SPECS[name]).reset(options={"distractors": []})
-    assert SMEEnv(SPECS[name]).distractors.shape == (0,)
-    assert SMEVectorEnv(SPECS[name], 2).distractors.shape == (2, 0)
 
 
 def test_an_environment_without_a_seed_can_be_repeated(monkeypatch: Any) -> None:
@@ -257,21 +252,14 @@ def test_a_generator_of_the_users_serves() -> None:
         first = env.distractors
 
 
-def test_wrappers_and_frames_work_with_what_the_agent_sees(tmp_path: Any) -> None:
+def test_frames_show_tasks_with_distractors_and_limits() -> None:
     pytest.importorskip("pygame")
-    spec = SPECS["both"]
-    env = RecordRegret(SMEEnv(spec, render_mode="rgb_array"), tmp_path / "episodes.csv")
-    env.reset(seed=0)
-    for _ in range(20):
-        *_, info = env.step(np.full(17, 0.4, np.float32))
-    assert env.episodes[0].length == 20
-    assert info["episode"]["l"] == 20
-    assert env.render().shape[-1] == 3  # type: ignore[union-attr]
-    env.close()
-    frames = SMEVectorEnv(spec, 2, render_mode="rgb_array")
-    frames.reset(seed=0)
-    frames.step(np.full((2, 17), 0.4, np.float32))
-    assert len(frames.render() or ()) == 2
+    env = SMEEnv(SPECS["both"], render_mode="rgb_array")
+    frames = SMEVectorEnv(SPECS["both"], 2, render_mode="rgb_array")
+    for each in (env, frames):
+        each.reset(seed=0)
+        each.step(np.full(each.action_space.shape, 0.4, np.float32))
+    np.testing.assert_array_equal(env.render(), (frames.render() or ())[0])
 
 
 @pytest.mark.parametrize(("name", "field"), [("safe", "safety"), ("noise", "observation")])

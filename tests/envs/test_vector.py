@@ -30,23 +30,6 @@ def plane(mode: str = "NextStep", **fields: Any) -> SMEVectorEnv:
     return SMEVectorEnv("Plane1", 3, autoreset_mode=mode, **fields)
 
 
-def test_same_step_gives_the_last_observation_and_info_beside_the_next_first_ones() -> None:
-    env, single = plane("SameStep", horizon=2, k=5), SMEEnv("Plane1", horizon=2, k=5)
-    env.reset(seed=0)
-    single.reset(seed=1)
-    for _ in range(2):
-        observations, rewards, _, truncated, infos = env.step(HALF)
-        last, reward, _, _, info = single.step(HALF[1])
-    assert truncated.all()
-    assert rewards[1] == reward
-    np.testing.assert_array_equal(infos["final_obs"][1], last)
-    assert infos["final_info"]["regret"][1] == info["regret"]
-    assert infos["_final_obs"].all()
-    assert infos["_regret"].all()
-    assert np.isnan(infos["regret"]).all()
-    np.testing.assert_array_equal(observations[1], single.reset()[0])
-
-
 def test_next_step_ignores_the_actions_of_lanes_that_rest_but_not_their_form() -> None:
     env = plane(horizon=1)
     env.reset(seed=0)

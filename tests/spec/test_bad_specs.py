@@ -48,56 +48,10 @@ BAD = [
     ({7: 3}, ["7: field names must be strings."]),
     ({"team": "two"}, ["team: must be an object of named fields, got 'two'."]),
     ({"team": {}}, ["team.agents: missing: must be a list of 1 to 1024 entries. Add it."]),
-    ({"team": {"agents": []}}, ["team.agents=[]: must be a list of 1 to 1024 entries."]),
-    ({"team": {"agents": ["me"]}}, ["team.agents.0: must be an object of named fields, got 'me'."]),
     (
-        {"team": {"agents": [{"action_dim": 3}]}},
-        ["team.agents: their action channels add up to 3", "action_dim=4"],
+        {"team": {"agents": [ONE], "reward": "all"}},
+        ["reward='all': must be 'individual' or 'team'."],
     ),
-    (
-        {"team": {"agents": [{"action_dim": 2}, {"action_dim": "2"}]}},
-        ["team.agents.1.action_dim='2': must be an integer in [1, 1048576]."],
-    ),
-    (
-        {"team": {"agents": [ONE | {"observs": "all"}]}},
-        ["team.agents.0.observs='all': unknown field.", "Did you mean 'observes'?"],
-    ),
-    (
-        {"team": {"agents": [ONE | {"observes": [3, 1]}]}},
-        ["team.agents.0.observes=[3, 1]: channels must be in increasing order", "Write [1, 3]."],
-    ),
-    ({"team": {"agents": [ONE | {"observes": []}]}}, ["observes=[]: must be 'all' or"]),
-    ({"team": {"agents": [ONE | {"observes": [True]}]}}, ["observes=[True]: must be"]),
-    (
-        {"team": {"agents": [ONE | {"observes": np.arange(3)}]}},
-        ["team.agents.0.observes=array([0, 1, 2]): must be 'all' or a list"],
-    ),
-    (
-        {"team": {"agents": [ONE | {"observes": [8]}]}},
-        ["team.agents.agent_0.observes=[8]: must be in [0, state_dim=8).", "Remove channel 8"],
-    ),
-    (
-        {"team": {"agents": [ONE | {"name": "the pilot"}]}},
-        ["team.agents.0.name='the pilot': must be a word, '_' and a number, such as 'agent_0'"],
-    ),
-    (
-        {"team": {"agents": [{"action_dim": 2, "name": "agent_1"}, {"action_dim": 2}]}},
-        ["team.agents: the name 'agent_1' appears twice. Rename one of them."],
-    ),
-    (
-        {"team": {"agents": [ONE], "reward": "shared"}},
-        ["team.reward='shared': must be 'individual' or 'team'."],
-    ),
-    *[
-        (
-            {"safety": {"tightness": tightness}},
-            [f"safety.tightness={tightness}: must be a finite number in (0, 0.5]. Correct it."],
-        )
-        for tightness in (0, -0.1, 0.51, float("nan"), True, None)
-    ],
-    ({"safety": {}}, ["safety.tightness: missing: must be a finite number in (0, 0.5]. Add it."]),
-    ({"safety": 0.2}, ["safety: must be an object of named fields, got 0.2.", ": tightness."]),
-    ({"safety": {"tightness": 0.2, "tau": 0.2}}, ["safety.tau=0.2: unknown field.", "Rename or"]),
     ({"safety": {"tightness": 0.2}, "D": 0.25}, ["D=0.25: must be 0 with safety", "Leave D or"]),
     (
         {"safety": {"tightness": 0.2}, "team": {"agents": [ONE]}},
@@ -107,52 +61,75 @@ BAD = [
         {"observation": {"distractors": 2}, "team": {"agents": [ONE]}},
         ["observation={'distractors': 2,", "must be null in a task for a team (1 agent)"],
     ),
+]
+BAD_AGENTS = [
+    ([], "team.agents=[]: must be a list of 1 to 1024 entries."),
+    (["me"], "team.agents.0: must be an object of named fields, got 'me'."),
+    ([{"action_dim": 3}], "team.agents: their action channels add up to 3 … action_dim=4"),
+    (
+        [ONE, {"action_dim": "2"}],
+        "team.agents.1.action_dim='2': must be an integer in [1, 1048576].",
+    ),
+    (
+        [ONE | {"observs": "all"}],
+        "team.agents.0.observs='all': unknown field. Did you mean 'observes'?",
+    ),
+    ([ONE | {"observes": [3, 1]}], "observes=[3, 1]: channels must be in incr … Write [1, 3]."),
+    ([ONE | {"observes": []}], "team.agents.0.observes=[]: must be 'all' or"),
+    ([ONE | {"observes": [True]}], "observes=[True]: must be"),
+    ([ONE | {"observes": np.arange(3)}], "observes=array([0, 1, 2]): must be 'all' or a list"),
+    ([ONE | {"observes": [8]}], "agent_0.observes=[8]: must be in [0, state_dim=8). … channel 8"),
+    ([ONE | {"name": "the pilot"}], "name='the pilot': must be a word, '_' and a number, such as"),
+    (
+        [{"action_dim": 2, "name": "agent_1"}, {"action_dim": 2}],
+        "team.agents: the name 'agent_1' appears twice. Rename one of them.",
+    ),
+]
+RANGE = "must be a finite number in (0, 0.5]."
+BAD_SAFETY = [
     *[
-        (
-            {"observation": {"distractors": distractors}},
-            [f"observation.distractors={distractors}: must be an integer in [0, 1048576]."],
-        )
-        for distractors in (-1, 2**20 + 1, 8.0)
+        ({"tightness": tightness}, f"safety.tightness={tightness}: {RANGE} Correct it.")
+        for tightness in (0, -0.1, 0.51, float("nan"), True, None)
+    ],
+    ({}, f"safety.tightness: missing: {RANGE} Add it."),
+    (0.2, "safety: must be an object of named fields, got 0.2. Known fields: tightness."),
+    ({"tightness": 0.2, "tau": 0.2}, "safety.tau=0.2: unknown field."),
+]
+SEEN = "observation.distractors=0: with mixing='none' the agent would see the state as"
+BAD_OBSERVATION = [
+    *[
+        ({"distractors": number}, f"distractors={number}: must be an integer in [0, 1048576].")
+        for number in (-1, 2**20 + 1, 8.0)
     ],
     (
-        {"observation": {"distractors": 8, "dynamics": "random"}},
-        ["observation.dynamics='random': must be 'noise' or 'autonomous' or 'driven' or null."],
+        {"distractors": 8, "dynamics": "random"},
+        "observation.dynamics='random': must be 'noise' or 'autonomous' or 'driven' or null.",
     ),
-    (
-        {"observation": {"mixing": "linear"}},
-        ["observation.mixing='linear': must be 'none' or 'orthogonal' or 'nonlinear'."],
-    ),
+    ({"mixing": "linear"}, "mixing='linear': must be 'none' or 'orthogonal' or 'nonlinear'."),
     *[
         (
-            {"observation": {"mixing": "nonlinear", "mixing_depth": depth}},
-            [f"observation.mixing_depth={depth}: must be an integer in [1, 3] or null."],
+            {"mixing": "nonlinear", "mixing_depth": depth},
+            f"observation.mixing_depth={depth}: must be an integer in [1, 3] or null.",
         )
         for depth in (0, 4, True)
     ],
     *[
-        (
-            {"observation": {"mixing": mixing} | fields},
-            [f"observation.{name}: needs {needs}. Leave {name.partition('=')[0]} out, or"],
-        )
+        ({"mixing": mixing} | fields, f"observation.{needs}. Leave {name} out, or")
         for mixing in ("none", "orthogonal")
-        for fields, name, needs in (
-            ({"distractors": 2, "mixing_depth": 2}, "mixing_depth=2", "mixing='nonlinear'"),
-            ({"dynamics": "driven"}, "dynamics='driven'", "distractors > 0"),
+        for name, fields, needs in (
+            ("mixing_depth", {"distractors": 2, "mixing_depth": 2},
+             "mixing_depth=2: needs mixing='nonlinear'"),
+            ("dynamics", {"dynamics": "driven"}, "dynamics='driven': needs distractors > 0"),
         )
     ],
-    *[
-        (
-            {"observation": observation},
-            ["observation.distractors=0: with mixing='none' the agent would see the state as"],
-        )
-        for observation in ({}, {"mixing": "none"})
-    ],
-    ({"observation": "nonlinear"}, ["observation: must be an object", "got 'nonlinear'."]),
-    (
-        {"observation": {"distractor": 8}},
-        ["observation.distractor=8: unknown field.", "Did you mean 'distractors'?"],
-    ),
-]
+    ({}, SEEN),
+    ({"mixing": "none"}, SEEN),
+    ("nonlinear", "observation: must be an object of named fields, got 'nonlinear'."),
+    ({"distractor": 8}, "observation.distractor=8: unknown field. Did you mean 'distractors'?"),
+]  # fmt: skip
+BAD += [({"team": {"agents": agents}}, words.split(" … ")) for agents, words in BAD_AGENTS]
+BAD += [({"safety": safety}, [words]) for safety, words in BAD_SAFETY]
+BAD += [({"observation": observation}, [words]) for observation, words in BAD_OBSERVATION]
 
 
 def refusal(fields):

@@ -11,7 +11,7 @@ import pytest
 from pydantic import Field
 
 import sme_registry
-from sme_registry.spec import Integer, SMESpec, StrictModel, TeamSpec
+from sme_registry.spec import Integer, SMESpec, StrictModel
 from sme_registry.spec.descriptions import allowed, summary
 from sme_registry.spec.validation_errors import allowed_values
 
@@ -88,11 +88,3 @@ def test_ranges_follow_from_the_fields():
         "  second: of two.\n    True or false.\n\nExamples:\n  none\n"
     )
     assert Tuned(second=True).__doc__ == Tuned.__doc__
-
-
-def test_a_class_without_a_docstring_has_none_and_keeps_the_descriptions_of_its_base():
-    class Own(TeamSpec):
-        pass
-
-    assert Own.__doc__ is None
-    assert all(field.description for field in Own.model_fields.values())

@@ -198,9 +198,10 @@ class TestSuites:
             SuiteClass(name="deep", setting=SMESpec(seed=3), seeds=[1])
 
     def test_suites_are_equal_exactly_where_their_digests_are(self):
-        one = Suite(classes=[{"name": "a", "setting": {}, "seeds": [1, 2]}])
-        same = Suite(classes=[{"name": "a", "setting": {"D": -0.0}, "seeds": (1, 2)}])
-        other = Suite(classes=[{"name": "a", "setting": {}, "seeds": [2, 1]}])
+        one, same, other = (
+            Suite(classes=[{"name": "a", "setting": setting, "seeds": seeds}])
+            for setting, seeds in (({}, [1, 2]), ({"D": -0.0}, (1, 2)), ({}, [2, 1]))
+        )
         assert one == same
         assert one.digest == same.digest
         assert one != other

@@ -126,17 +126,6 @@ def test_lanes_that_merge_are_refused() -> None:
     assert found.value == pytest.approx(1 / 64)
 
 
-def test_states_in_float32_collapse_and_float64_do_not() -> None:
-    class Float32(Task):
-        def transition(self, s, a):  # type: ignore[no-untyped-def, override]
-            y = (s + self.b + a @ self.W).astype(np.float32)
-            return (np.float32(2) * np.abs(y - np.rint(y))).astype(np.float64)
-
-    assert check(certified("Default"), "distinct_states").value == 1.0
-    found = certify(recast(materialize(SMESpec()), Float32))
-    assert check(found, "distinct_states").outcome == "refused"
-
-
 def test_the_linear_policy_is_reported_and_near_optimal_only_for_one_layer() -> None:
     shallow = check(certified("Default"), "linear_policy_reward")
     deep = check(certified("Complexity10"), "linear_policy_reward")

@@ -13,7 +13,7 @@ from sme_registry.errors import ResourceLimitError
 from sme_registry.task import Layer, Task, materialize
 from sme_registry.task.certificate import Check
 from sme_registry.task.certify import certify
-from sme_registry.task.certify_observation import _jacobians, observation_checks
+from sme_registry.task.certify_observation import observation_checks
 
 MOVING = {"distractor_row_sums", "uniform_distractors", "distinct_distractors"}
 MIXED = {"mixing_orthogonal", "mixing_centred", "mixing_condition", "mixing_linear_r2"}
@@ -68,19 +68,6 @@ def test_deeper_mixings_are_worse_conditioned_and_less_linear() -> None:
     r2 = [each["mixing_linear_r2"].value for each in found]
     assert conditions == sorted(conditions)  # type: ignore[type-var]
     assert r2 == sorted(r2, reverse=True)  # type: ignore[type-var]
-
-
-@pytest.mark.parametrize("mixing", ["orthogonal", "nonlinear"])
-def test_the_jacobian_is_the_derivative_of_the_mixing(mixing: str) -> None:
-    depth = {"mixing_depth": 2} if mixing == "nonlinear" else {}
-    task = materialize(spec(distractors=2, mixing=mixing, **depth))
-    x, h = np.random.default_rng(0).random((5, 6)), 1e-6
-    steps = h * np.eye(6)
-    columns = [
-        (task.seen(x[:, :4] + e[:4], x[:, 4:] + e[4:]) - task.seen(x[:, :4], x[:, 4:])) / h
-        for e in steps
-    ]
-    np.testing.assert_allclose(_jacobians(task, x), np.stack(columns, axis=-1), atol=1e-4)
 
 
 def test_a_mixing_too_deep_for_float32_is_refused() -> None:

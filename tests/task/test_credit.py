@@ -93,15 +93,14 @@ def test_difference_rewards_are_those_of_brute_force(spec, seed):
                 assert np.abs(graded - spec.r_min).min() < 1e-9
 
 
-@pytest.mark.parametrize("credit", ["regret_shares", "difference_rewards"])
-def test_bad_states_and_actions_are_typed_errors(credit):
+def test_bad_states_and_actions_are_typed_errors():
     task, s, a = drawn(TRIO)
-    call = getattr(task, credit)
-    with pytest.raises(ActionError, match="must be \\[6\\] or \\[B, 6\\]"):
-        call(s, a[:, :4])
-    with pytest.raises(StateError, match="must be \\[8\\] or \\[B, 8\\]"):
-        call(s[:, :4], a)
-    with pytest.raises(ActionError, match="NaN"):
-        call(s, np.full_like(a, np.nan))
-    with pytest.raises(ActionError, match="one action for each"):
-        call(s, a[:7])
+    for call in (task.regret_shares, task.difference_rewards):
+        for states, actions, error, words in (
+            (s, a[:, :4], ActionError, r"must be \[6\] or \[B, 6\]"),
+            (s[:, :4], a, StateError, r"must be \[8\] or \[B, 8\]"),
+            (s, np.full_like(a, np.nan), ActionError, "NaN"),
+            (s, a[:7], ActionError, "one action for each"),
+        ):
+            with pytest.raises(error, match=words):
+                call(states, actions)

@@ -55,15 +55,15 @@ def test_environments_batches_and_files_that_cannot_fit_are_refused_too(tmp_path
 @pytest.mark.parametrize(
     "fields",
     [
-        {"state_dim": 100_000, "action_dim": 1},
+        {"state_dim": 50_000, "action_dim": 1},
         {"state_dim": 1, "action_dim": 10_000},
-        {"complexity": 50, "policy_init": "unit_variance"},
+        {"complexity": 20, "policy_init": "unit_variance"},
         {"complexity": 2, "state_dim": 4096, "action_dim": 4, "hidden_width": 1},
         {"action_dim": 40, "team": {"agents": [{"action_dim": 10}] * 4}, "complexity": 4},
-        {"complexity": 3, "hidden_width": 300, "safety": {"tightness": 0.2}},
-        {"action_dim": 300, "observation": {"distractors": 400, "dynamics": "driven"}},
-        {"observation": {"distractors": 200, "mixing": "orthogonal"}},
-        {"observation": {"distractors": 200, "mixing": "nonlinear", "mixing_depth": 3}},
+        {"complexity": 3, "hidden_width": 150, "safety": {"tightness": 0.2}},
+        {"action_dim": 150, "observation": {"distractors": 200, "dynamics": "driven"}},
+        {"observation": {"distractors": 120, "mixing": "orthogonal"}},
+        {"observation": {"distractors": 120, "mixing": "nonlinear", "mixing_depth": 3}},
     ],
 )
 def test_the_estimate_is_above_what_a_draw_takes_and_not_by_far(fields):

@@ -136,16 +136,6 @@ def test_the_end_of_one_is_the_end_of_all():
     assert one_step(shared, 0.2, 0.2, 0.2).terminated[0]
 
 
-def test_every_agent_has_an_account_of_its_own_that_is_paid_every_k_steps():
-    spec = TRIO.derive(k=4)
-    held = one_step(spec, 0.0, 0.05, 0.1, t=1, r_cum=(1.0, 0.5, 0.0))
-    np.testing.assert_array_equal(held.reward, 0.0)
-    np.testing.assert_allclose(held.accumulated_reward, [[2.0, 1.3, 0.6]], rtol=0, atol=1e-12)
-    paid = one_step(spec, 0.0, 0.05, 0.1, t=3, r_cum=(3.0, 0.5, 0.0))
-    np.testing.assert_allclose(paid.reward, [[4.0, 1.3, 0.6]], rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(paid.accumulated_reward, 0.0)
-
-
 def test_names_and_channels_are_in_the_order_of_the_spec():
     task = materialize(TRIO)
     assert task.names == ("agent_0", "agent_1", "agent_2")

@@ -15,19 +15,6 @@ def test_every_text_is_escaped() -> None:
     assert html.count("&lt;script&gt;") == 8
 
 
-def test_bold_text_indentation_line_breaks_and_sections_are_kept() -> None:
-    html = table_html(Table("", {"a": "text"}, [("  [bold]x<y[/] z\n[red]new[/]",)]))
-    assert "<caption><b>one</b><br>two</caption>" in table_html(Table("one\ntwo", {"a": "name"}))
-    assert "&nbsp;&nbsp;<b>x&lt;y</b> z<br>new" in html
-    table = Table("", {"a": "name", "b": "number"})
-    table.add_row("one", "1", style="bold")
-    table.add_section()
-    table.add_row("two", "2")
-    html = table_html(table)
-    assert html.count("<tbody>") == 2
-    assert '<tr class=bold><td class="name">one</td><td class="num">1</td></tr>' in html
-
-
 def test_a_long_table_says_how_many_rows_it_leaves_out() -> None:
     html = table_html(Table("", {"a": "name"}, [(f"row {i}",) for i in range(2_000)]))
     assert "row 59" in html

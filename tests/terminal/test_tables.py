@@ -51,18 +51,6 @@ def test_every_cell_is_whole_at_every_width(width: int | None) -> None:
     assert lines[-1].strip() == "A caption"
 
 
-def test_a_table_loses_its_lines_before_anything_wraps() -> None:
-    columns = {"name": "name", "a": "number", "tags": "text"}
-    table = Table("", columns, [("x" * 20, "1", "two tags that fit")])
-    assert any("┃" in line for line in printed(table, 80))
-    narrow = printed(table, 44)
-    assert not any("┃" in line for line in narrow)
-    assert len(narrow) == 2
-    assert len(printed(table, 39)) == 3  # the tags wrap
-    blocks = [line.rstrip() for line in printed(table, 24)]
-    assert blocks == ["x" * 20, "  a 1", "  tags two tags that fit"]
-
-
 def test_sections_and_missing_cells_are_kept() -> None:
     table = Table("", {"": "name", "a": "number"})
     table.add_row("heading", style="italic")
