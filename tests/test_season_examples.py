@@ -39,7 +39,7 @@ def data() -> SealedDataset:
 
 
 @pytest.mark.parametrize("policy_init", ["semi_orthogonal", "unit_variance"])
-def test_a_guess_with_the_weights_of_a_task_is_its_optimum(family: Any, policy_init: str) -> None:
+def test_a_guess_with_the_weights_of_a_task_is_its_optimum(family, policy_init):
     import torch
 
     task = materialize(SPEC.model_copy(update={"policy_init": policy_init}))
@@ -61,16 +61,14 @@ def sizes(W: np.ndarray, rows: bool) -> np.ndarray:
     return np.linalg.norm(W, axis=1) if rows else np.linalg.svd(W, compute_uv=False)
 
 
-def test_rewards_are_distances_to_the_optimum(family: Any, data: SealedDataset) -> None:
+def test_rewards_are_distances_to_the_optimum(family, data):
     rows = family.Rows.of(data.observations, data.actions, data.rewards)
     optimum = materialize(SPEC).optimal_action(data.observations[:, :-2].astype(float))
     distances = np.abs(data.actions - optimum).mean(axis=1)
     np.testing.assert_allclose(rows.distances, np.minimum(distances, 0.25), atol=1e-5)
 
 
-def test_the_family_is_fitted_to_a_data_set(
-    family: Any, data: SealedDataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_family_is_fitted_to_a_data_set(family, data, monkeypatch):
     import torch
 
     torch.manual_seed(0)

@@ -38,7 +38,7 @@ def dataset() -> SealedDataset:
     return SealedDataset.collect(RECIPE)
 
 
-def test_it_holds_what_the_agent_saw(dataset: SealedDataset) -> None:
+def test_it_holds_what_the_agent_saw(dataset):
     rows = collect(RECIPE, materialize(SPEC))
     for name in ("observations", "actions", "rewards", "next_observations", "terminations"):
         np.testing.assert_array_equal(getattr(dataset, name), getattr(rows, name))
@@ -48,7 +48,7 @@ def test_it_holds_what_the_agent_saw(dataset: SealedDataset) -> None:
     )
 
 
-def test_an_episode_that_ends_at_the_horizon_is_truncated_also_where_it_terminates() -> None:
+def test_an_episode_that_ends_at_the_horizon_is_truncated_also_where_it_terminates():
     spec = SPEC.model_copy(update={"horizon": 3, "D": 0.5})
     short = SealedDataset.collect(RECIPE.model_copy(update={"spec": spec}))
     ends = np.flatnonzero(short.terminations | short.truncations)[:-1]
@@ -57,9 +57,7 @@ def test_an_episode_that_ends_at_the_horizon_is_truncated_also_where_it_terminat
     assert (short.terminations & short.truncations)[ends].any()
 
 
-def test_it_is_read_back_bit_for_bit_by_us_and_by_minari(
-    dataset: SealedDataset, tmp_path: Path
-) -> None:
+def test_it_is_read_back_bit_for_bit_by_us_and_by_minari(dataset, tmp_path):
     path = dataset.write(ID, tmp_path)
     assert SealedDataset.read(path).digest == dataset.digest
     assert SealedDataset.collect(RECIPE).digest == dataset.digest
@@ -75,7 +73,7 @@ def test_it_is_read_back_bit_for_bit_by_us_and_by_minari(
     assert episodes[0].observations.shape == (len(episodes[0]) + 1, 4)
 
 
-def test_data_sets_agree_up_to_rounding(dataset: SealedDataset) -> None:
+def test_data_sets_agree_up_to_rounding(dataset):
     rounded = dataclasses.replace(dataset, rewards=dataset.rewards + 1e-14)
     assert dataset.agrees_with(rounded)
     assert rounded.digest != dataset.digest
@@ -89,7 +87,7 @@ def test_data_sets_agree_up_to_rounding(dataset: SealedDataset) -> None:
         assert not dataset.agrees_with(other)
 
 
-def test_nothing_in_the_files_tells_the_task(dataset: SealedDataset, tmp_path: Path) -> None:
+def test_nothing_in_the_files_tells_the_task(dataset, tmp_path):
     path = dataset.write(ID, tmp_path) / "data"
     metadata = json.loads((path / "metadata.json").read_text())
     assert set(metadata) == {
@@ -116,9 +114,7 @@ def test_nothing_in_the_files_tells_the_task(dataset: SealedDataset, tmp_path: P
     assert "ab" * 32 not in repr(dataset)
 
 
-def test_nothing_is_replaced_and_a_bad_id_or_file_is_named(
-    dataset: SealedDataset, tmp_path: Path
-) -> None:
+def test_nothing_is_replaced_and_a_bad_id_or_file_is_named(dataset, tmp_path):
     path = dataset.write(ID, tmp_path)
     with pytest.raises(NameTakenError, match="already exists"):
         dataset.write(ID, tmp_path)
@@ -169,9 +165,7 @@ def stranger(folder: Path) -> h5py.File:
         (_made(data=np.zeros((2, 4), "f4")), None),
     ],
 )
-def test_a_strangers_file_is_read_only_as_it_would_be_written(
-    tmp_path: Path, fault: Any, message: str | None
-) -> None:
+def test_a_strangers_file_is_read_only_as_it_would_be_written(tmp_path, fault, message):
     secret = tmp_path / "private.txt"
     secret.write_bytes(b"a private file of the entrant ...")
     with stranger(tmp_path) as file:
@@ -187,7 +181,7 @@ def test_a_strangers_file_is_read_only_as_it_would_be_written(
         SealedDataset.read(tmp_path)
 
 
-def test_an_episode_that_is_a_link_is_not_followed(dataset: SealedDataset, tmp_path: Path) -> None:
+def test_an_episode_that_is_a_link_is_not_followed(dataset, tmp_path):
     private = dataset.write(ID, tmp_path / "private") / "data" / "main_data.hdf5"
     with stranger(tmp_path) as file:
         file["episode_0"] = h5py.ExternalLink(str(private), "episode_0")
@@ -195,7 +189,7 @@ def test_an_episode_that_is_a_link_is_not_followed(dataset: SealedDataset, tmp_p
         SealedDataset.read(tmp_path)
 
 
-def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+def test_a_pipe_is_not_waited_for(tmp_path):
     (tmp_path / "data").mkdir()
     os.mkfifo(tmp_path / "data" / "main_data.hdf5")
     # A writer, so that a reader would fail, and not wait for ever.
@@ -207,7 +201,7 @@ def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
         os.close(writer)
 
 
-def test_episodes_that_share_their_bytes_do_not_multiply(tmp_path: Path) -> None:
+def test_episodes_that_share_their_bytes_do_not_multiply(tmp_path):
     with stranger(tmp_path) as file:
         group = file.create_group("episode_0")
         group["observations"] = np.zeros((20_001, 4), "f4")

@@ -120,9 +120,7 @@ def false_season(store: Store, terms: Terms) -> Season:
     return season
 
 
-def test_a_season_is_generated_from_its_plan_and_its_master(
-    season: Season, published: Path, tmp_path: Path
-) -> None:
+def test_a_season_is_generated_from_its_plan_and_its_master(season, published, tmp_path):
     assert season.is_committed_to(MASTER)
     assert check_published(season, published) == 2
     assert create_season(read_plan(plan()), MASTER, tmp_path / "again") == season
@@ -137,7 +135,7 @@ def test_a_season_is_generated_from_its_plan_and_its_master(
     assert create_season(online, MASTER, tmp_path / "online").published == ()
 
 
-def test_nothing_published_tells_a_secret(season: Season, published: Path) -> None:
+def test_nothing_published_tells_a_secret(season, published):
     secrets = {MASTER.raw.hex()}
     for instance in instances(season, MASTER):
         seeds = (instance.spec.seed, instance.protocol.seed, recipe(instance, MASTER).seed)
@@ -151,7 +149,7 @@ def test_nothing_published_tells_a_secret(season: Season, published: Path) -> No
         assert MASTER.raw not in content
 
 
-def test_an_altered_publication_is_named(season: Season, published: Path, tmp_path: Path) -> None:
+def test_an_altered_publication_is_named(season, published, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(published, copy)
     first, second = season.hidden
@@ -172,7 +170,7 @@ def test_an_altered_publication_is_named(season: Season, published: Path, tmp_pa
         check_published(Season.from_dict(fields), published)
 
 
-def test_answers_must_fit_a_board_and_somebody_must_be_able_to_have_a_rank() -> None:
+def test_answers_must_fit_a_board_and_somebody_must_be_able_to_have_a_rank():
     refuse_large_answers(tiny_terms(), 10_000)
     with pytest.raises(BoardError, match=r"classes\.deep: its answers have"):
         refuse_large_answers(tiny_terms(), 1000)
@@ -184,14 +182,14 @@ def test_answers_must_fit_a_board_and_somebody_must_be_able_to_have_a_rank() -> 
         refuse_unrankable(tiny_terms("sealed-online"), 5)
 
 
-def test_a_plan_with_a_fault_is_refused_and_leaves_no_folder(tmp_path: Path) -> None:
+def test_a_plan_with_a_fault_is_refused_and_leaves_no_folder(tmp_path):
     for fields in ({"classes": None}, {"classes": [{"name": "deep"}]}, {"track": "open"}):
         with pytest.raises(SMEError):
             create_season(read_plan({**plan(), **fields}), MASTER, tmp_path / "new")
     assert not any(tmp_path.iterdir())
 
 
-def test_the_plan_in_the_documentation_is_one() -> None:
+def test_the_plan_in_the_documentation_is_one():
     page = (Path(__file__).parents[2] / "docs" / "guides" / "seasons.md").read_text()
     [text] = re.findall(r"```json\n(.*?)```", page, re.S)
     terms = read_plan(json.loads(text))
@@ -203,9 +201,7 @@ def test_the_plan_in_the_documentation_is_one() -> None:
     assert read_plan(online).published == ()
 
 
-def test_a_season_is_scored_ranked_and_replayed(
-    store, key, season, published, later, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_season_is_scored_ranked_and_replayed(store, key, season, published, later, monkeypatch):
     store.announce(season)
     friend, best = SigningKey.generate(), optima(season, published)
     first = enter(store, season, key, best, method=method("Best"))
@@ -255,7 +251,7 @@ def test_a_season_is_scored_ranked_and_replayed(
         verify_season(store, season.id)
 
 
-def test_a_replay_finds_scores_that_do_not_follow(store, key, season, published, later) -> None:
+def test_a_replay_finds_scores_that_do_not_follow(store, key, season, published, later):
     """The organiser, who holds the board's key, publishes another score."""
     store.announce(season)
     enter(store, season, key, halves(published))
@@ -279,8 +275,8 @@ def test_a_replay_finds_scores_that_do_not_follow(store, key, season, published,
 
 @pytest.mark.parametrize("part", ["data", "challenge"])
 def test_a_replay_finds_what_was_published_and_does_not_follow(
-    store: Store, tmp_path: Path, season: Season, published: Path, later: Any, part: str
-) -> None:
+    store, tmp_path, season, published, later, part
+):
     fields, copy = season.terms.to_dict(), tmp_path / "copy"
     fields["published"][1][part] = fields["published"][0][part]
     shutil.copytree(published, copy)
@@ -296,9 +292,7 @@ def test_a_replay_finds_what_was_published_and_does_not_follow(
         verify_season(store, false.id, published=copy)
 
 
-def test_another_machines_rounding_is_told_from_other_data(
-    tmp_path: Path, season: Season, published: Path, later: Any
-) -> None:
+def test_another_machines_rounding_is_told_from_other_data(tmp_path, season, published, later):
     """As if the organiser's processor had rounded rewards otherwise than this one."""
     later()
     folder = tmp_path / "copy"
@@ -329,9 +323,7 @@ def test_another_machines_rounding_is_told_from_other_data(
 
 
 @pytest.mark.parametrize(("needed", "reason"), [(1, ""), (2, "too_few_runs")])
-def test_the_class_with_the_fewest_runs_decides_on_a_rank(
-    tmp_path: Path, key, later, needed: int, reason: str
-) -> None:
+def test_the_class_with_the_fewest_runs_decides_on_a_rank(tmp_path, key, later, needed, reason):
     member = tiny_terms().to_dict()["classes"][0]
     names = ["one", "three", "three", "three"]
     season = tiny_season(
@@ -353,8 +345,8 @@ def test_the_class_with_the_fewest_runs_decides_on_a_rank(
 
 @pytest.mark.parametrize(("needed", "reason"), [(4, ""), (5, "too_few_runs")])
 def test_the_tickets_of_each_method_have_scores_and_a_rank_of_their_own(
-    tmp_path: Path, key, needed: int, reason: str
-) -> None:
+    tmp_path, key, needed, reason
+):
     season = tiny_season("sealed-online")
     with tiny_board(tmp_path / "board", runs_to_rank=needed) as store:
         store.announce(season)
@@ -373,7 +365,7 @@ def test_the_tickets_of_each_method_have_scores_and_a_rank_of_their_own(
     assert shown == [("Good", 0.5, 4, reason), ("Bad", 1.0, 4, reason)]
 
 
-def test_an_entry_after_the_close_counts_nowhere(store, key, later) -> None:
+def test_an_entry_after_the_close_counts_nowhere(store, key, later):
     """As an organiser's own board may log it."""
     season = tiny_season()
     store.announce(season)
@@ -388,9 +380,7 @@ def test_an_entry_after_the_close_counts_nowhere(store, key, later) -> None:
 
 
 @pytest.mark.parametrize("fault", ["signature", "board"])
-def test_a_replay_finds_entries_that_their_key_has_not_signed(
-    store: Store, key: SigningKey, season: Season, later: Any, fault: str
-) -> None:
+def test_a_replay_finds_entries_that_their_key_has_not_signed(store, key, season, later, fault):
     store.announce(season)
     signed = signed_entry(store, season, key, [None, None])
     if fault == "board":

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import stat
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +49,7 @@ def facts(*arguments: str) -> Any:
     return json.loads(good("season", *arguments, "--json"))
 
 
-def test_a_season_is_played_from_the_command_line(later: Callable[[], None]) -> None:
+def test_a_season_is_played_from_the_command_line(later):
     printed = good("season", "new", "board", PLAN)
     secret = Path("board.autumn.master")
     assert stat.S_IMODE(secret.stat().st_mode) == 0o600
@@ -91,7 +90,7 @@ def test_a_season_is_played_from_the_command_line(later: Callable[[], None]) -> 
     assert "revealed" in good("season", "show", "board")
 
 
-def test_a_class_that_a_table_solves_is_warned_of() -> None:
+def test_a_class_that_a_table_solves_is_warned_of():
     fields = json.loads(Path(PLAN).read_text())
     for state_dim, warned in ((2, True), (8, False)):
         fields["id"] = f"s{state_dim}"
@@ -115,7 +114,7 @@ def entered(*arguments: str | Path) -> list[np.ndarray | None]:
         ]
 
 
-def test_files_policies_and_constants_are_entered_as_actions(season: Path) -> None:
+def test_files_policies_and_constants_are_entered_as_actions(season):
     names = ("deep-0", "deep-1")
     shown = [
         unpack_table((season / "challenges" / f"{name}.npy").read_bytes(), 4) for name in names
@@ -138,7 +137,7 @@ def test_files_policies_and_constants_are_entered_as_actions(season: Path) -> No
     assert "cannot be read" in fails(2, *enter, "missing-{name}.npy", *ENTER)
 
 
-def test_an_entry_is_sent_to_a_served_board(season: Path) -> None:
+def test_an_entry_is_sent_to_a_served_board(season):
     for name in ("deep-0", "deep-1"):
         Path(f"{name}.npy").write_bytes(pack_table(np.full((300, 1), 0.5, np.float32)))
     Path("bad-deep-0.npy").write_bytes(pack_table(np.full((299, 1), 0.5, np.float32)))
@@ -150,7 +149,7 @@ def test_an_entry_is_sent_to_a_served_board(season: Path) -> None:
         assert [row.entrant.id for row in store.entrants(read_season(season).digest)] == [id]
 
 
-def test_faults_of_a_plan_are_named(tmp_path: Path) -> None:
+def test_faults_of_a_plan_are_named(tmp_path):
     fields = json.loads(Path(PLAN).read_text())
     fields["classes"][0]["setting"]["complexity"] = 4
     Path("shallow.json").write_text(json.dumps(fields))

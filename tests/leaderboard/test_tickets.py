@@ -57,7 +57,7 @@ def policy(observations: np.ndarray) -> np.ndarray:
     return observations[:, :1]
 
 
-def test_a_ticket_is_started_stepped_and_answered(url: str, board: Board) -> None:
+def test_a_ticket_is_started_stepped_and_answered(url, board):
     shown = start(0, url, "--knowledge", "family")
     assert "keep it secret" in shown
     ticket = Ticket.read("ticket.json")
@@ -82,7 +82,7 @@ def test_a_ticket_is_started_stepped_and_answered(url: str, board: Board) -> Non
         assert [each.phase for each in hidden.status().instances] == ["answered", "answered"]
 
 
-def test_files_of_actions_answer_challenges_that_were_fetched(url: str, board: Board) -> None:
+def test_files_of_actions_answer_challenges_that_were_fetched(url, board):
     start(0, url)
     ticket = Ticket.read("ticket.json")
     with Instance(url, ticket, 0, 4) as hidden:
@@ -113,9 +113,7 @@ def test_files_of_actions_answer_challenges_that_were_fetched(url: str, board: B
     np.testing.assert_array_equal(np.load(folder / "0.npy", allow_pickle=False), states[:, :1])
 
 
-def test_an_interrupted_request_gets_the_same_ticket(
-    url: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_request_gets_the_same_ticket(url, monkeypatch):
     request = client.request_ticket
 
     def interrupted(*arguments: object) -> Ticket:
@@ -137,7 +135,7 @@ def test_an_interrupted_request_gets_the_same_ticket(
     assert not Path("third.json.request").exists()
 
 
-def test_refusals_have_stable_codes(url: str) -> None:
+def test_refusals_have_stable_codes(url):
     assert "season_unknown" in start(1, url, season="summer")
     assert not Path("ticket.json.request").exists()
     assert "season=" in start(2, url, season="../x")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -86,7 +85,7 @@ def steps(terminated: list[bool], truncated: list[bool]) -> Steps:
 
 
 @pytest.mark.parametrize("ends", [([True, False, True], [False, True, True]), ([False] * 3,) * 2])
-def test_steps_arrive_with_every_kind_of_end_in_one_size(ends: tuple[list[bool], list[bool]]):
+def test_steps_arrive_with_every_kind_of_end_in_one_size(ends):
     sent = steps(*ends)
     data = FORMAT.pack_steps(sent)
     assert len(data) == FORMAT.answer_bytes == 4 * LANES * (2 * (S + 2) + 2)
@@ -105,7 +104,7 @@ def test_ends_that_do_not_exist_are_refused():
 
 
 @pytest.mark.parametrize("rows", [0, 1, 1000, 123456])
-def test_a_table_is_the_file_that_numpy_reads_and_writes(rows: int):
+def test_a_table_is_the_file_that_numpy_reads_and_writes(rows):
     table = random(rows, A)
     assert np.array_equal(np.load(io.BytesIO(pack_table(table)), allow_pickle=False), table)
     assert len(pack_table(table)) <= table_bytes(rows, A)
@@ -139,7 +138,7 @@ def long_header() -> bytes:
         long_header(),
     ],
 )
-def test_nothing_but_a_table_of_float32_is_read(data: bytes):
+def test_nothing_but_a_table_of_float32_is_read(data):
     with pytest.raises(WireError, match=r"must be an \.npy file"):
         unpack_table(data, A)
 
@@ -153,7 +152,7 @@ def test_nothing_but_a_table_of_float32_is_read(data: bytes):
         (pack_table(random(4, A)) + b"\0", "bytes: must have"),
     ],
 )
-def test_a_table_of_another_size_is_refused(data: bytes, message: str):
+def test_a_table_of_another_size_is_refused(data, message):
     with pytest.raises(WireError, match=message):
         unpack_table(data, A, 4)
 
@@ -179,7 +178,7 @@ def test_a_ticket_counts_its_instances_class_by_class_and_hides_its_token():
     assert TICKET["token"] not in repr(ticket)
 
 
-def test_a_ticket_s_file_is_its_owner_s_alone_and_is_not_replaced(tmp_path: Path):
+def test_a_ticket_s_file_is_its_owner_s_alone_and_is_not_replaced(tmp_path):
     ticket, path = Ticket.from_dict(TICKET), tmp_path / "new" / "ticket.json"
     with pytest.raises(SpecError, match=r"ticket\.json"):
         Ticket.read(path)

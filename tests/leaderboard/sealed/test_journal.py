@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -32,7 +31,7 @@ def written(path: Path, count: int) -> None:
         journal.append(actions(number))
 
 
-def test_a_journal_gives_back_what_was_added(tmp_path: Path) -> None:
+def test_a_journal_gives_back_what_was_added(tmp_path):
     written(tmp_path / "0", 5)
     journal = Journal.open(tmp_path / "0")
     assert (journal.lanes, journal.action_dim) == (LANES, A)
@@ -40,7 +39,7 @@ def test_a_journal_gives_back_what_was_added(tmp_path: Path) -> None:
     assert contents(journal) == [actions(number) for number in range(1, 6)]
 
 
-def test_a_torn_record_is_cut_off_and_the_next_one_takes_its_place(tmp_path: Path) -> None:
+def test_a_torn_record_is_cut_off_and_the_next_one_takes_its_place(tmp_path):
     for extra in range(RECORD):
         path = tmp_path / str(extra)
         written(path, 3)
@@ -60,9 +59,7 @@ def lose_a_record(data: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("fault", [lose_a_page, lose_a_record])
-def test_a_journal_ends_before_a_record_that_is_not_whole_or_out_of_order(
-    tmp_path: Path, fault: Callable[[bytes], bytes]
-) -> None:
+def test_a_journal_ends_before_a_record_that_is_not_whole_or_out_of_order(tmp_path, fault):
     path = tmp_path / "0"
     written(path, 3)
     path.write_bytes(fault(path.read_bytes()))
@@ -73,7 +70,7 @@ def test_a_journal_ends_before_a_record_that_is_not_whole_or_out_of_order(
     assert path.stat().st_size == HEADER + 2 * RECORD
 
 
-def test_an_ended_journal_stays_ended_and_accepts_nothing(tmp_path: Path) -> None:
+def test_an_ended_journal_stays_ended_and_accepts_nothing(tmp_path):
     path = tmp_path / "0"
     written(path, 2)
     journal = Journal.open(path)
@@ -91,8 +88,8 @@ def test_an_ended_journal_stays_ended_and_accepts_nothing(tmp_path: Path) -> Non
 @pytest.mark.parametrize("written_before", [0, 1, RECORD - 1])
 @pytest.mark.parametrize("is_undone", [True, False])
 def test_a_full_disk_adds_nothing_and_the_journal_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written_before: int, is_undone: bool
-) -> None:
+    tmp_path, monkeypatch, written_before, is_undone
+):
     """Also where what was written could not be removed: the next record replaces it."""
     path = tmp_path / "0"
     journal = Journal.create(path, LANES, A)
@@ -122,9 +119,7 @@ def test_a_full_disk_adds_nothing_and_the_journal_goes_on(
     assert contents(journal) == contents(Journal.open(path)) == [actions(1), actions(3)]
 
 
-def test_what_was_added_is_flushed_to_the_disk_once_and_again_if_that_failed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_added_is_flushed_to_the_disk_once_and_again_if_that_failed(tmp_path, monkeypatch):
     folders: list[Path] = []
     flushed: list[int] = []  # sizes of the file
     failing = False
@@ -153,7 +148,7 @@ def test_what_was_added_is_flushed_to_the_disk_once_and_again_if_that_failed(
     assert flushed == [HEADER + 2 * RECORD, HEADER + 3 * RECORD]
 
 
-def test_another_file_is_no_journal_and_a_journal_is_never_replaced(tmp_path: Path) -> None:
+def test_another_file_is_no_journal_and_a_journal_is_never_replaced(tmp_path):
     path = tmp_path / "0"
     for content in (b"", b"x" * 20, b"x" * 100):
         path.write_bytes(content)

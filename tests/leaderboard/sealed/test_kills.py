@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from tests.leaderboard.sealed.killing import step_through_kills
 from tests.leaderboard.sealed.playing import LANES, online_board
 from tests.leaderboard.sealing import SETTING
 
 
-def test_entrants_go_on_when_their_server_is_killed(tmp_path: Path) -> None:
+def test_entrants_go_on_when_their_server_is_killed(tmp_path):
     member = {"name": "deep", "setting": SETTING, "instances": 1, "budget": 60 * LANES}
     board = online_board(tmp_path, classes=[member])
     step_through_kills(board, tickets=3, requests=60, kills=1)

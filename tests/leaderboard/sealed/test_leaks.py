@@ -91,9 +91,7 @@ def everything(url: str, board: Board, client: httpx.Client) -> Iterator[httpx.R
     yield client.get(url + sealed.ticket_path(board.season.id, 1), headers=token)
 
 
-def test_no_answer_file_or_log_holds_a_secret(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_no_answer_file_or_log_holds_a_secret(tmp_path, caplog):
     board = online_board(tmp_path)
     answered: list[bytes] = []
 
@@ -122,7 +120,7 @@ def test_no_answer_file_or_log_holds_a_secret(
     assert any(each in board.secret.read_bytes() for each in searched)  # the search can find
 
 
-def test_answers_to_steps_have_one_form(tmp_path: Path) -> None:
+def test_answers_to_steps_have_one_form(tmp_path):
     """The same head and size, whether episodes end or not, in any task."""
     board = online_board(tmp_path)
     size, heads = sealed.StepFormat(LANES, 2, 1).answer_bytes, set()
@@ -150,14 +148,14 @@ class Failing:
         raise SMEError("the seed is 0x5eed")
 
 
-def test_a_fault_is_logged_without_its_text(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_fault_is_logged_without_its_text(caplog):
     tickets: Any = Failing()
     Attendant(tickets).attend()
     assert "SMEError" in caplog.text
     assert "5eed" not in caplog.text
 
 
-def test_what_holds_a_secret_shows_none(tmp_path: Path) -> None:
+def test_what_holds_a_secret_shows_none(tmp_path):
     with playing(online_board(tmp_path)) as played:
         searched = secrets_of(played.board, played.store)
         ticket = played.tickets.ticket(played.number)

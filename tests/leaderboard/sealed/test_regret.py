@@ -39,9 +39,7 @@ def regrets(actions: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("taken", "budget"), [(250, 250), (130, 250), (5, 8)])
-def test_the_curve_has_the_regret_of_each_part_relative_to_the_constant(
-    tmp_path: Path, taken: int, budget: int
-) -> None:
+def test_the_curve_has_the_regret_of_each_part_relative_to_the_constant(tmp_path, taken, budget):
     """Steps that were not taken count like the constant's."""
     actions = np.random.default_rng(1).random((taken, 1, 2), dtype=np.float32)
     measured = measured_steps(START, journal(tmp_path, actions), budget)
@@ -60,9 +58,7 @@ def test_the_curve_has_the_regret_of_each_part_relative_to_the_constant(
     assert measured.steps == taken
 
 
-def test_the_constant_has_a_regret_of_one_with_any_lanes_and_without_a_start(
-    tmp_path: Path,
-) -> None:
+def test_the_constant_has_a_regret_of_one_with_any_lanes_and_without_a_start(tmp_path):
     half = np.full((6, 3, 2), 0.5, np.float32)
     measured = measured_steps(START, journal(tmp_path, half), 20)  # 18 of them can be taken
     np.testing.assert_allclose(measured.learning_curve, [1.0] * 6, rtol=1e-12)

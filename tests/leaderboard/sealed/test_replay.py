@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 
 from leaderboard.documents.board import SeasonFolder
-from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import SealedResult
 from leaderboard.documents.season import Reveal
 from leaderboard.errors import TamperedError
@@ -48,7 +46,7 @@ def revealed(tmp_path_factory: pytest.TempPathFactory) -> Board:
     return board
 
 
-def test_a_season_of_tickets_is_replayed_and_every_one_of_them_counts(revealed: Board) -> None:
+def test_a_season_of_tickets_is_replayed_and_every_one_of_them_counts(revealed):
     with Store.open(revealed.path, read_only=True) as store:
         report = verify_season(store, revealed.season.id)
         assert (report.entries, report.results) == (2, 2)
@@ -63,7 +61,7 @@ def test_a_season_of_tickets_is_replayed_and_every_one_of_them_counts(revealed: 
     assert row.value.interval is not None
 
 
-def test_altered_journals_and_answers_are_found(revealed: Board, tmp_path: Path) -> None:
+def test_altered_journals_and_answers_are_found(revealed, tmp_path):
     shutil.copytree(revealed.path, tmp_path / "board")
     with Store.open(tmp_path / "board", read_only=True) as store:
         folder = store.season_folder(revealed.season.digest).ticket(1)
@@ -97,9 +95,7 @@ def remove_signature(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("replace", [replace_answers, replace_journal, remove_signature])
-def test_what_an_organiser_replaces_before_the_result_is_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, replace: Callable[[Path], None]
-) -> None:
+def test_what_an_organiser_replaces_before_the_result_is_found(tmp_path, monkeypatch, replace):
     with playing(online_board(tmp_path)) as played:
         played.start()
         played.step(1, 0.5)
@@ -127,13 +123,7 @@ def test_what_an_organiser_replaces_before_the_result_is_found(
         ("scores", {}, "its scores do not follow from its runs"),
     ],
 )
-def test_a_result_that_does_not_follow_is_found(
-    revealed: Board,
-    monkeypatch: pytest.MonkeyPatch,
-    part: str,
-    changes: dict[str, Any],
-    message: str,
-) -> None:
+def test_a_result_that_does_not_follow_is_found(revealed, monkeypatch, part, changes, message):
     with Store.open(revealed.path, read_only=True) as store:
         stored = store.sealed_result
 
@@ -176,14 +166,8 @@ def reveal(board: Board, folder: SeasonFolder) -> tuple[Any, ...]:
     ],
 )
 def test_tickets_that_the_terms_forbid_are_found(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    key: SigningKey,
-    fields: dict[str, Any],
-    days: float,
-    number: int,
-    message: str,
-) -> None:
+    tmp_path, monkeypatch, key, fields, days, number, message
+):
     board = online_board(tmp_path, **fields)
     monkeypatch.setattr(Log, "_refuse_wrong_clock", lambda *_: None)
     with Store.open(board.path) as store:
@@ -197,9 +181,7 @@ def test_tickets_that_the_terms_forbid_are_found(
             verify_season(store, board.season.id)
 
 
-def test_a_ticket_that_ended_early_without_all_answers_is_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: SigningKey
-) -> None:
+def test_a_ticket_that_ended_early_without_all_answers_is_found(tmp_path, monkeypatch, key):
     board = online_board(tmp_path)
     with Store.open(board.path) as store:
         store.start_ticket(signed_request(store, board.season, key))
@@ -210,9 +192,7 @@ def test_a_ticket_that_ended_early_without_all_answers_is_found(
             verify_season(store, board.season.id)
 
 
-def test_a_reveal_before_the_close_is_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_reveal_before_the_close_is_found(tmp_path, monkeypatch):
     board = online_board(tmp_path)
     with Store.open(board.path) as store:
         folder = store.season_folder(board.season.digest)

@@ -12,7 +12,7 @@ SPEC = SMESpec(state_dim=3, action_dim=2, complexity=5, horizon=3, k=2, D=0.1, s
 SEED = 2**255 + 3
 
 
-def test_steps_and_regret_are_those_of_single_environments() -> None:
+def test_steps_and_regret_are_those_of_single_environments():
     lanes, unmeasured = Lanes(Start(SPEC, SEED), 3), Lanes(Start(SPEC, SEED), 3)
     singles = [SMEEnv(SPEC) for _ in range(3)]
     first = [env.reset(seed=SEED + lane)[0] for lane, env in enumerate(singles)]

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -92,9 +93,7 @@ FAULTS = ("full disk", "no memory")
 )
 @example(events=["step", "restart", "again", "full disk", "no memory", "again"], lanes=4)
 @example(events=[*["step"] * 17, "again", "restart", "again", "step"], lanes=4)
-def test_each_step_is_taken_once_whatever_happens(
-    many: Played, events: list[str], lanes: int
-) -> None:
+def test_each_step_is_taken_once_whatever_happens(many, events, lanes):
     many.take_ticket(many.number)
     here, form = Lanes(many.tickets.ticket(many.number).start(0), lanes), StepFormat(lanes, 2, 1)
     taken, last, most = 0, b"", 64 // lanes
@@ -142,9 +141,7 @@ def runs_out(*_: Any) -> None:
 
 
 @pytest.mark.parametrize(("budget", "most"), [(64, 64), (1000, 256)])
-def test_lanes_have_a_range_and_an_instance_keeps_them(
-    tmp_path: Path, budget: int, most: int
-) -> None:
+def test_lanes_have_a_range_and_an_instance_keeps_them(tmp_path, budget, most):
     member = {"name": "deep", "setting": SETTING, "instances": 1, "budget": budget}
     with playing(online_board(tmp_path, classes=[member])) as played:
         for lanes in (0, most + 1, 2**40):
@@ -156,7 +153,7 @@ def test_lanes_have_a_range_and_an_instance_keeps_them(
         played.start(most)
 
 
-def test_a_step_has_one_size_and_finite_actions_which_are_clipped(played: Played) -> None:
+def test_a_step_has_one_size_and_finite_actions_which_are_clipped(played):
     played.start()
     body = request(1)
     for other in (b"\1", body[:7], body[:8], body[:-1], body + b"\0"):
@@ -170,7 +167,7 @@ def test_a_step_has_one_size_and_finite_actions_which_are_clipped(played: Played
     assert played.status().used == LANES
 
 
-def test_phases_follow_each_other(played: Played) -> None:
+def test_phases_follow_each_other(played):
     refused("instance_phase", played.step, 1)
     refused("instance_phase", played.tickets.challenge, played.number, played.token, 0)
     refused("instance_phase", played.answer, HALF)
@@ -195,7 +192,7 @@ def test_phases_follow_each_other(played: Played) -> None:
     played.finish()
 
 
-def test_answers_have_one_form(played: Played) -> None:
+def test_answers_have_one_form(played):
     played.finish()
     wide = np.full((ROWS, 2), 0.5)
     for table in (HALF[1:], wide, b"", pickle.dumps(HALF), pack_table(HALF) + b"\0"):
@@ -204,7 +201,7 @@ def test_answers_have_one_form(played: Played) -> None:
     assert played.answer(HALF)
 
 
-def test_answers_need_a_signature_of_them_and_the_journal(played: Played) -> None:
+def test_answers_need_a_signature_of_them_and_the_journal(played):
     played.start()
     played.step(1)
     played.finish()
@@ -227,7 +224,7 @@ def test_answers_need_a_signature_of_them_and_the_journal(played: Played) -> Non
     assert instance.is_signed
 
 
-def test_requests_older_than_signed_answers_need_no_signature(played: Played) -> None:
+def test_requests_older_than_signed_answers_need_no_signature(played):
     old = played.board.request(played.key, 1, answers_key=None)
     assert "answers_key" not in old.to_dict()["ticket"]
     number = played.store.start_ticket(old)
@@ -239,7 +236,7 @@ def test_requests_older_than_signed_answers_need_no_signature(played: Played) ->
     assert "signed" not in result.to_dict()["stepping"][0]
 
 
-def test_a_token_opens_one_ticket(played: Played) -> None:
+def test_a_token_opens_one_ticket(played):
     number, token, tickets = played.number, played.token, played.tickets
     played.take_ticket(1)
     for ticket, password in ((played.number, token), (number, ""), (number, "é")):
@@ -259,7 +256,7 @@ def test_a_token_opens_one_ticket(played: Played) -> None:
     refused("instance_unknown", tickets.start, number, token, 2, 1)
 
 
-def test_a_deadline_ends_everything(played: Played, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_deadline_ends_everything(played, monkeypatch):
     played.start()
     played.step(1)
     assert played.tickets.over() == []
@@ -275,7 +272,7 @@ def test_a_deadline_ends_everything(played: Played, monkeypatch: pytest.MonkeyPa
     refused("ticket_ended", played.step, 3)
 
 
-def test_a_ticket_is_over_when_its_last_instance_is_answered(played: Played) -> None:
+def test_a_ticket_is_over_when_its_last_instance_is_answered(played):
     for instance, over in ((0, []), (1, [played.number])):
         played.finish(instance)
         played.answer(HALF, instance)
@@ -284,9 +281,7 @@ def test_a_ticket_is_over_when_its_last_instance_is_answered(played: Played) -> 
         assert phase == ("ended" if over else "running")
 
 
-def test_an_altered_request_holds_up_no_other_ticket(
-    played: Played, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_altered_request_holds_up_no_other_ticket(played, monkeypatch):
     second = played.board.request(played.key, 1)
     played.store.start_ticket(second)
     (played.folder / "ticket.json").write_bytes(second.to_bytes())
@@ -295,9 +290,7 @@ def test_an_altered_request_holds_up_no_other_ticket(
     assert played.tickets.over() == [2]
 
 
-def test_a_clock_set_forward_ends_tickets_after_a_minute(
-    played: Played, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_clock_set_forward_ends_tickets_after_a_minute(played, monkeypatch):
     def over(hours: float, seconds: float) -> list[int]:
         set_clocks(monkeypatch, hours, seconds / 3600.0)
         return played.tickets.over()
@@ -307,14 +300,14 @@ def test_a_clock_set_forward_ends_tickets_after_a_minute(
     assert over(25, 131.0) == [played.number]
 
 
-def test_the_clock_of_a_server_begins_no_earlier_than_the_log() -> None:
+def test_the_clock_of_a_server_begins_no_earlier_than_the_log():
     start = moment(2)
     clock, expected = Clock(start), datetime.datetime.fromisoformat(start).timestamp()
     assert clock.now >= expected
     assert clock.sure >= expected
 
 
-def test_a_closed_ticket_takes_nothing_from_requests_in_progress(played: Played) -> None:
+def test_a_closed_ticket_takes_nothing_from_requests_in_progress(played):
     played.start(instance=1)
     instance, other = played.tickets.ticket(played.number).instances
     played.finish()
@@ -326,9 +319,7 @@ def test_a_closed_ticket_takes_nothing_from_requests_in_progress(played: Played)
     refused("ticket_ended", other.finish)
 
 
-def test_steps_that_arrive_while_an_unplayed_ticket_is_closed_are_scored(
-    played: Played, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_steps_that_arrive_while_an_unplayed_ticket_is_closed_are_scored(played, monkeypatch):
     def late(ticket: RunningTicket) -> None:
         ticket.instance(0).start(LANES)
         ticket.instance(0).step(request(1))
@@ -340,9 +331,7 @@ def test_steps_that_arrive_while_an_unplayed_ticket_is_closed_are_scored(
     assert played.store.ticket(played.board.season.digest, played.number).result is None
 
 
-def test_tickets_that_nobody_played_score_one_without_a_process(
-    played: Played, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tickets_that_nobody_played_score_one_without_a_process(played, monkeypatch):
     played.take_ticket(1)
     played.start(lanes=48)
     store, season = played.store, played.board.season
@@ -356,9 +345,7 @@ def test_tickets_that_nobody_played_score_one_without_a_process(
     assert store.holder_of_name(f"Tester {played.key.public[:8]}") is None
 
 
-def test_a_ticket_takes_nothing_while_it_is_scored_and_what_it_took_is_flushed(
-    played: Played, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_ticket_takes_nothing_while_it_is_scored_and_what_it_took_is_flushed(played, monkeypatch):
     played.start()
     played.step(1)
     flushed: list[int] = []
@@ -368,10 +355,15 @@ def test_a_ticket_takes_nothing_while_it_is_scored_and_what_it_took_is_flushed(
     Attendant(played.tickets).attend()
     assert len(flushed) == 1
     set_clocks(monkeypatch, 0, passed=25)
-    monkeypatch.setattr(Attendant, "_start", lambda _: None)
-    Attendant(played.tickets).attend()
+    process = Mock()
+    monkeypatch.setattr(Attendant, "_start", lambda _: process)
+    attendant = Attendant(played.tickets)
+    attendant.attend()
     instance = played.tickets.ticket(played.number).instance(0)
     refused("ticket_ended", instance.step, request(2))
+    attendant.stop()
+    process.terminate.assert_called_once()
+    process.join.assert_called_once()
 
 
 class Ended:
@@ -388,8 +380,8 @@ class Ended:
 
 
 def test_tickets_that_could_not_be_scored_are_tried_again_after_a_pause_one_by_one(
-    played: Played, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    played, monkeypatch
+):
     """The first process dies; then the journal of ticket 1 cannot be read for a while."""
     broken = played.folder / "0.journal"
     for number in (1, 2):
@@ -418,8 +410,10 @@ def test_tickets_that_could_not_be_scored_are_tried_again_after_a_pause_one_by_o
 
     monkeypatch.setattr("leaderboard.sealed.attendant.signal.signal", lambda *_: None)
     monkeypatch.setattr(Attendant, "_start", start)
-    attendant, whole = Attendant(played.tickets), broken.read_bytes()
+    whole = broken.read_bytes()
     broken.write_bytes(b"no journal")
+    played.restart()
+    attendant = Attendant(played.tickets)
     assert attend(seconds=0) == [[1, 2]]
     assert attend(seconds=2) == [[1, 2], [1]]
     assert attend(seconds=2) == [[1, 2], [1], [2]]
@@ -431,7 +425,7 @@ def test_tickets_that_could_not_be_scored_are_tried_again_after_a_pause_one_by_o
 
 
 @pytest.mark.parametrize("lanes", [1, LANES])
-def test_journals_and_answers_count_on_the_board(tmp_path: Path, lanes: int) -> None:
+def test_journals_and_answers_count_on_the_board(tmp_path, lanes):
     member = {"name": "deep", "setting": SETTING, "instances": 1, "budget": 1024}
     with playing(online_board(tmp_path, classes=[member])) as played:
         season = played.board.season
@@ -455,7 +449,7 @@ def test_journals_and_answers_count_on_the_board(tmp_path: Path, lanes: int) -> 
         assert played_bytes(season, result) >= written()
 
 
-def test_no_ticket_starts_without_room_for_its_steps(tmp_path: Path) -> None:
+def test_no_ticket_starts_without_room_for_its_steps(tmp_path):
     member = {"name": "deep", "setting": SETTING, "instances": 2, "budget": 4096}
     room = played_bytes(tiny_season("sealed-online", classes=[member])) * 3 // 2
     board = online_board(tmp_path, limits={"total_bytes": room}, classes=[member])
@@ -471,9 +465,7 @@ def test_no_ticket_starts_without_room_for_its_steps(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("confirmed", [False, True])
-def test_answers_that_do_not_reach_the_disk_are_sent_again(
-    played: Played, monkeypatch: pytest.MonkeyPatch, confirmed: bool
-) -> None:
+def test_answers_that_do_not_reach_the_disk_are_sent_again(played, monkeypatch, confirmed):
     """They are not stored, or only the folder could not be synced: then they are confirmed."""
     played.finish()
     if confirmed:
@@ -491,8 +483,8 @@ def test_answers_that_do_not_reach_the_disk_are_sent_again(
 
 
 def test_instances_used_long_ago_leave_memory_and_large_networks_take_more_of_it(
-    played: Played, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    played, monkeypatch
+):
     def ready() -> list[bool]:
         instances = played.tickets.ticket(played.number).instances
         return [each.is_ready for each in instances]
@@ -514,7 +506,7 @@ def test_instances_used_long_ago_leave_memory_and_large_networks_take_more_of_it
     assert ready() == [False, False]
 
 
-def test_one_server_that_has_the_master_steps_a_season(played: Played, tmp_path: Path) -> None:
+def test_one_server_that_has_the_master_steps_a_season(played, tmp_path):
     with pytest.raises(BoardError, match="another server steps it"):
         Tickets(played.store, played.board.secret)
     other = Master.generate().write(tmp_path / "other.master")
@@ -526,7 +518,7 @@ def test_one_server_that_has_the_master_steps_a_season(played: Played, tmp_path:
             Tickets(store, played.board.secret)
 
 
-def test_what_was_not_answered_scores_one(played: Played) -> None:
+def test_what_was_not_answered_scores_one(played):
     played.start()
     played.step(1)
     played.finish()
