@@ -119,17 +119,13 @@ def test_starts_are_uniform_and_do_not_depend_on_padding() -> None:
     assert abs(np.corrcoef(starts.T) - np.eye(3)).max() < 5 / np.sqrt(4096)
 
 
-def test_an_episode_begins_at_any_state() -> None:
-    observation, state = env.start(jnp.full(8, 0.25), task_params(SMESpec()))
-    assert observation.tolist() == [0.25] * 8 + [0.0, 0.0]
-    assert (state.t, state.accumulated_reward) == (0, 0.0)
-
-
 def test_arrays_of_other_shapes_are_refused_before_a_step() -> None:
     params = task_params(SMESpec(state_dim=3, action_dim=2))
     lanes = task_params([SMESpec(state_dim=3, action_dim=2)] * 4)
     key = jax.random.key(0)
-    _, state = env.start(jnp.zeros(3), params)
+    observation, state = env.start(jnp.full(3, 0.25), params)
+    assert observation.tolist() == [0.25] * 3 + [0.0, 0.0]
+    assert (state.t, state.accumulated_reward) == (0, 0.0)
     for action in (jnp.zeros(3), jnp.zeros((5, 2)), 0.5):
         with pytest.raises(
             ActionError, match=r"^action of shape .*: must be of shape \(2,\)\. Use"

@@ -173,17 +173,24 @@ def test_a_task_without_both_carries_nothing_of_them() -> None:
 
 
 def test_an_episode_begins_with_any_distractors() -> None:
-    params = task_params(lanes({"distractors": M})[0])
-    s, d = jnp.full(3, 0.25), jnp.full(M, 0.75)
-    assert env.start(s, params, d)[0].tolist() == [0.25] * 3 + [0.75] * M + [0.0, 0.0]
+    spec = lanes({"distractors": M})[0]
+    params = task_params(spec)
+    s, d = np.full(3, 0.25), np.full(M, 0.75)
+    observation, state = jax.jit(env.start)(s, params, d)
+    assert observation.tolist() == [0.25] * 3 + [0.75] * M + [0.0, 0.0]
     for wrong in (None, jnp.zeros(3), pairs.from_float64(np.zeros(M))):
         with pytest.raises(StateError, match=r"^distractors .*: must be of shape \(4,\), float64"):
             env.start(s, params, wrong)  # type: ignore[arg-type]
-    _, state = env.start(s, params, d)
     with pytest.raises(StateError, match=r"^distractors left out: must be of shape \(4,\)"):
         env.step(jax.random.key(0), state._replace(distractors=None), jnp.zeros(2), params)
     with pytest.raises(StateError, match=r"^distractors of shape \(3,\): must be left out"):
         env.start(jnp.zeros(8), task_params(SMESpec()), s)
+
+    environment = Environment(spec)  # gymnax's
+    observation, state = environment.reset(jax.random.key(0))
+    assert observation.shape == environment.observation_space().shape == (3 + M + 2,)
+    info = environment.step(jax.random.key(1), state, jnp.ones(2))[-1]
+    assert 0.0 <= info["cost"] <= 1.0
 
 
 def test_tasks_of_other_forms_share_no_program() -> None:
@@ -194,11 +201,3 @@ def test_tasks_of_other_forms_share_no_program() -> None:
     params = task_params([specs[0], specs[0].derive(safety={"tightness": 0.1})])
     assert params.limits is not None
     assert params.limits.tightness.tolist() == [0.3, 0.1]
-
-
-def test_gymnaxs_environment_has_the_agents_observation() -> None:
-    environment = Environment(lanes({"distractors": M, **MIXINGS["orthogonal"]})[0])
-    observation, state = environment.reset(jax.random.key(0))
-    assert observation.shape == environment.observation_space().shape == (3 + M + 2,)
-    info = environment.step(jax.random.key(1), state, jnp.ones(2))[-1]
-    assert 0.0 <= info["cost"] <= 1.0

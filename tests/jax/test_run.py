@@ -80,13 +80,24 @@ def scripted_run(program: Scripted, due: list[int], **changes: Any) -> list[Any]
 
 
 def test_evaluations_precede_the_update_of_their_step_and_the_last_one_follows_all() -> None:
+    """The state may be saved after each piece and its evaluations."""
     program = Scripted(budget=10)
-    rows = scripted_run(program, [2, 3, 10], piece=4)
+    saved = program.events
+    due = [2, 3, 10]
+    rows = scripted_run(program, due, piece=4, after_piece=lambda: saved.append(program.steps))
     assert rows == [(0, 2, 1, [10, 10]), (1, 3, 2, [11, 11]), (2, 10, 10, [12, 12])]
     one = ("evaluate", (3, 2, 2))
-    assert program.events == [
-        ("steps", 2), one, ("steps", 1), one, ("steps", 4), ("steps", 3), "finish", one,
+    assert saved == [
+        ("steps", 2), one, 2, ("steps", 1), one, 3, ("steps", 4), 7, ("steps", 3), 10, "finish",
+        one,
     ]  # fmt: skip
+    restored = Scripted(budget=10)
+    restored.steps = 5
+    assert [row[:2] for row in scripted_run(restored, [2, 5, 7, 10])] == [(2, 7), (3, 10)]
+    without_steps = Scripted(budget=0)
+    rows = scripted_run(without_steps, [0, 0])
+    assert [row[:3] for row in rows] == [(0, 0, 0), (1, 0, 0)]
+    assert "finish" not in without_steps.events
 
 
 def test_evaluations_in_one_rollout_run_together_always_as_many() -> None:
@@ -99,28 +110,6 @@ def test_evaluations_in_one_rollout_run_together_always_as_many() -> None:
     assert {event for event in program.events if event[0] == "evaluate"} == {
         ("evaluate", (3, 4, 2))
     }
-
-
-def test_a_restored_run_goes_on_after_the_evaluations_that_are_done() -> None:
-    program = Scripted(budget=10)
-    program.steps = 5
-    assert [row[:2] for row in scripted_run(program, [2, 5, 7, 10])] == [(2, 7), (3, 10)]
-
-
-def test_a_run_without_steps_is_only_evaluated() -> None:
-    program = Scripted(budget=0)
-    assert [row[:3] for row in scripted_run(program, [0, 0])] == [(0, 0, 0), (1, 0, 0)]
-    assert "finish" not in program.events
-
-
-def test_the_state_may_be_saved_after_each_piece_and_its_evaluations() -> None:
-    program = Scripted(budget=10)
-    saved = program.events
-    scripted_run(program, [5, 10], piece=3, after_piece=lambda: saved.append(program.steps))
-    one = ("evaluate", (3, 2, 2))
-    assert saved == [
-        ("steps", 3), 3, ("steps", 2), one, 5, ("steps", 3), 8, ("steps", 2), 10, "finish", one,
-    ]  # fmt: skip
 
 
 def stream(seed: int) -> StreamSpec:

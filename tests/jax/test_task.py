@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -45,16 +47,6 @@ def test_lanes_are_padded_to_the_smallest_shape_that_covers_them() -> None:
     assert (first.b[3:] == 0).all()
 
 
-def test_a_list_of_one_task_has_an_axis_of_lanes() -> None:
-    assert task_params([SMESpec()]).W.shape == (1, 4, 8)
-    assert task_params(SMESpec()).W.shape == (4, 8)
-
-
-def test_names_digests_and_fields_are_tasks_too() -> None:
-    named = task_params(["SME/Default-v1", {"seed": 0}])
-    assert named.W.shape == (2, 4, 8)
-
-
 def test_dtypes_are_those_of_the_oracle_and_of_states() -> None:
     params = task_params(SMESpec(), dtype=jnp.float32)
     assert params.output.W.dtype == params.D.dtype == jnp.float32
@@ -67,42 +59,35 @@ def test_hidden_width_of_a_task_without_inner_layers_does_not_split_groups() -> 
     assert Shape.of(SMESpec(complexity=2, hidden_width=16)) == Shape(8, 4, 2, 16)
 
 
-def test_tasks_with_and_without_inner_layers_share_no_program() -> None:
-    with pytest.raises(OptionError, match=r"complexity=1 .* 2: must be 1 for all"):
-        task_params([SMESpec(), SMESpec(complexity=2)])
-
-
-def test_a_task_larger_than_the_shape_is_refused() -> None:
-    with pytest.raises(OptionError, match=r"shape.action_dim=3: must be at least 4"):
-        task_params(SMESpec(), shape=Shape(8, 3, 1, 0))
-
-
-def test_shapes_are_those_of_tasks() -> None:
+def test_a_list_of_names_or_fields_has_an_axis_of_lanes_and_any_shape_that_covers_it() -> None:
+    assert task_params(["SME/Default-v1", {"seed": 0}]).W.shape == (2, 4, 8)
+    assert task_params([SMESpec()]).W.shape == (1, 4, 8)
+    assert task_params(SMESpec()).W.shape == (4, 8)
     assert task_params(SMESpec(state_dim=3), shape=(5, 6, 1, 9)).output.W.shape == (6, 5)
-    for shape in ((2, 2), (8, 4, 1, "wide"), 3):
-        with pytest.raises(OptionError, match=r"^shape=.*: must be a Shape of state_dim, action"):
-            task_params(SMESpec(), shape=shape)  # type: ignore[arg-type]
 
 
-def test_no_task_is_refused() -> None:
-    with pytest.raises(OptionError, match=r"specs=\[\]: must have at least one"):
-        task_params([])
+TEAM = SMESpec.from_dict({"action_dim": 2, "team": {"agents": [{"action_dim": 1}] * 2}})
 
 
-def test_unknown_kinds_of_states_are_refused() -> None:
-    with pytest.raises(OptionError, match=r"states='int': must be 'float64' or 'pairs'"):
-        task_params(SMESpec(), states="int")
-
-
-def test_oracles_in_half_precision_are_refused() -> None:
-    with pytest.raises(OptionError, match=r"dtype=.*: must be float64 or float32"):
-        task_params(SMESpec(), dtype=jnp.bfloat16)
-
-
-def test_teams_are_refused_by_name() -> None:
-    team = SMESpec.from_dict({"action_dim": 2, "team": {"agents": [{"action_dim": 1}] * 2}})
-    with pytest.raises(SpecError, match=r"^team=.*must be absent, since tasks in JAX have no team"):
-        task_params(team)
+@pytest.mark.parametrize(
+    ("specs", "options", "message"),
+    [
+        ([SMESpec(), SMESpec(complexity=2)], {}, r"complexity=1 .* 2: must be 1 for all"),
+        (SMESpec(), {"shape": Shape(8, 3, 1, 0)}, r"shape.action_dim=3: must be at least 4"),
+        (SMESpec(), {"shape": (2, 2)}, r"^shape=.*: must be a Shape of state_dim, action"),
+        (SMESpec(), {"shape": (8, 4, 1, "wide")}, r"^shape=.*: must be a Shape of state_dim"),
+        (SMESpec(), {"shape": 3}, r"^shape=.*: must be a Shape of state_dim, action"),
+        ([], {}, r"specs=\[\]: must have at least one"),
+        (SMESpec(), {"states": "int"}, r"states='int': must be 'float64' or 'pairs'"),
+        (SMESpec(), {"dtype": jnp.bfloat16}, r"dtype=.*: must be float64 or float32"),
+        (TEAM, {}, r"^team=.*must be absent, since tasks in JAX have no team"),
+    ],
+)
+def test_what_is_no_task_in_jax_is_refused_by_name(
+    specs: Any, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(SpecError if specs is TEAM else OptionError, match=message):
+        task_params(specs, **options)
 
 
 class FutureSpec(SMESpec):
@@ -111,12 +96,9 @@ class FutureSpec(SMESpec):
     gravity: float = 0.0
 
 
-def test_fields_of_later_versions_are_refused_unless_they_have_their_default() -> None:
+def test_every_field_is_supported_or_refused_on_purpose_and_later_ones_have_their_default() -> None:
+    assert SMESpec.model_fields.keys() - SUPPORTED_FIELDS == {"team"}
+    assert SMESpec.model_fields.keys() >= SUPPORTED_FIELDS
     check_supported(FutureSpec())
     with pytest.raises(SpecError, match=r"^gravity=0.3: must be absent"):
         check_supported(FutureSpec(gravity=0.3))
-
-
-def test_every_field_is_supported_or_refused_on_purpose() -> None:
-    assert SMESpec.model_fields.keys() - SUPPORTED_FIELDS == {"team"}
-    assert SMESpec.model_fields.keys() >= SUPPORTED_FIELDS
