@@ -1,6 +1,8 @@
 """Reports of every kind of task: alike in any batches, and as files, tables, frames and charts."""
 
+import functools
 import io
+import operator
 import sys
 import tracemalloc
 from xml.etree import ElementTree
@@ -136,57 +138,38 @@ def test_a_report_whose_digest_is_of_something_else_is_refused(report, tmp_path,
         EvaluationReport.read(changed.write(tmp_path / "report.json"))
 
 
-OF_A_PLAIN_TASK = {"spec": SAFE.derive(safety=None).to_dict()}
-OF_A_PLAIN_TASK["spec_digest"] = SAFE.derive(safety=None).digest
-
-
 @pytest.mark.parametrize(
-    ("kind", "change", "message"),
+    ("kind", "missing", "message"),
     [
-        ("plain", lambda d: d.update(extra=1), "unknown field"),
-        ("plain", lambda d: d["regions"][0].pop("mae"), "mae: missing"),
-        (
-            "safe",
-            lambda d: d["safety"]["references"].pop("shrunk_optimal"),
-            "safety.references: is of",
-        ),
-        (
-            "safe",
-            lambda d: d["safety"]["references"].pop("linear_least_squares"),
-            "safety.references: is of",
-        ),
-        (
-            "safe",
-            lambda d: d["safety"]["regions"].pop(),
-            "safety.regions: is of WD, .*OOD 4: must be of WD, .*OOD 5",
-        ),
-        (
-            "safe",
-            lambda d: d["safety"]["references"]["optimal"].pop(),
-            "safety.references.optimal: is of WD, .*: must be of",
-        ),
-        ("safe", lambda d: d.pop("safety"), "safety: is missing"),
-        (
-            "safe",
-            lambda d: d.update(OF_A_PLAIN_TASK),
-            "safety: is present, but the task is one without safety",
-        ),
+        ("plain", ["regions", 0, "mae"], "mae: missing"),
+        ("safe", ["safety", "references", "shrunk_optimal"], "safety.references: is of"),
+        ("safe", ["safety", "references", "linear_least_squares"], "safety.references: is of"),
+        ("safe", ["safety", "references", "optimal", -1], "references.optimal: is of WD, .*: must"),
+        ("safe", ["safety", "regions", -1], "regions: is of WD, .*OOD 4: must be of WD, .*OOD 5"),
+        ("safe", ["safety"], "safety: is missing"),
+        ("distracted", ["observation", "invariance", -1], "observation.invariance: is of"),
         (
             "distracted",
-            lambda d: d["observation"]["invariance"].pop(),
-            "observation.invariance: is of",
-        ),
-        (
-            "distracted",
-            lambda d: d["observation"]["distractor_regions"].pop(),
+            ["observation", "distractor_regions", -1],
             "observation.distractor_regions: is of",
         ),
     ],
 )
-def test_a_stored_report_that_does_not_fit_its_task_is_refused(kind, change, message):
+def test_a_stored_report_that_lacks_something_is_refused(kind, missing, message):
     document = report_of(kind).to_dict()
-    change(document)
+    *path, last = missing
+    functools.reduce(operator.getitem, path, document).pop(last)
     with pytest.raises(SpecError, match=message):
+        EvaluationReport.from_dict(document)
+
+
+def test_a_stored_report_with_more_than_its_task_has_is_refused(report):
+    with pytest.raises(SpecError, match="unknown field"):
+        EvaluationReport.from_dict(report.to_dict() | {"extra": 1})
+    plain = SAFE.derive(safety=None)
+    document = report_of("safe").to_dict()
+    document |= {"spec": plain.to_dict(), "spec_digest": plain.digest}
+    with pytest.raises(SpecError, match="safety: is present, but the task is one without safety"):
         EvaluationReport.from_dict(document)
 
 
