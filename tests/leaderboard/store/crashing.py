@@ -23,11 +23,7 @@ def fork() -> int:
 
 
 def crashes_before(call: int, work: Callable[[], object]) -> bool:
-    """Do some work in a copy of this process, which is gone before its n-th call that matters.
-
-    Returns:
-      Whether there were so many calls; False means that the work was done.
-    """
+    """Whether a fork that does some work ends before its n-th call that matters."""
     child = fork()
     if child == 0:
         status = 1

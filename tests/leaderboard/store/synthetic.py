@@ -10,14 +10,7 @@ from leaderboard.store import Store
 
 
 def synthetic_result(store: Store, id: str, *, code: str = "", level: float = 0.5) -> Result:
-    """A result that fits a submission: rejected with `code`, or of regret `level` or so.
-
-    Args:
-      store: the board's.
-      id: the submission's.
-      code: empty for one that is scored.
-      level: of the regret within the distribution; a little more outside.
-    """
+    """A result that fits a submission: rejected with `code`, or of regret `level` or so."""
     document = store.document
     if code:
         return Result(

@@ -93,7 +93,6 @@ def test_a_write_is_complete_or_absent_and_can_be_repeated(tmp_path, key, work: 
         verify(board)
         work(board, key)
         assert state(board) == after, call
-        verify(board)
         with Store.open(board) as store:
             collect_garbage(store, temporary_older_than=0, objects_older_than=1e9)
         assert [path.name for path in board.rglob(".*")] == []
@@ -127,7 +126,7 @@ def test_a_full_disk_is_reported_and_leaves_no_partial_file(tmp_path, key):
             pytest.skip("no file system may be mounted here")
         messages = []
         with tiny_board(disk / "board") as store:
-            for number in range(28):
+            for number in range(0, 28, 2):
                 _, _, before = state(disk / "board")
                 fill(disk / "filler", free=4096 * number)
                 try:
@@ -141,7 +140,7 @@ def test_a_full_disk_is_reported_and_leaves_no_partial_file(tmp_path, key):
                 assert after - before in (0, 1)
                 assert [path.name for path in (disk / "board").rglob(".*")] == []
                 verify(disk / "board")
-        assert 0 < len(messages) < 28
+        assert 0 < len(messages) < 14
         assert all("No space left" in line or "is full" in line for line in messages), messages
         with Store.open(disk / "board") as store:
             put_submission(store, key, 999)

@@ -56,10 +56,12 @@ def test_garbage_is_temporary_files_and_unnamed_artefacts(store, litter):
     assert collect_garbage(store).files == 0
 
 
-def test_a_dry_run_counts_the_same_and_removes_nothing(store, litter):
-    before = sorted(path for path in store.folder.path.rglob("*"))
+def test_a_dry_run_counts_the_same_and_ages_are_arguments(store, litter):
+    before = sorted(store.folder.path.rglob("*"))
     counted = collect_garbage(store, dry_run=True)
-    assert sorted(path for path in store.folder.path.rglob("*")) == before
+    everything = collect_garbage(store, dry_run=True, temporary_older_than=0, objects_older_than=0)
+    assert (everything.temporary, everything.objects) == (4, 2)
+    assert sorted(store.folder.path.rglob("*")) == before
     assert counted == collect_garbage(store)
 
 
@@ -68,11 +70,6 @@ def test_uploading_an_object_again_resets_its_age(store, key, litter):
     assert put(store, key, b"old and not submitted") == old
     assert collect_garbage(store).objects == 0
     assert store.objects.has(old)
-
-
-def test_ages_are_arguments(store, litter):
-    garbage = collect_garbage(store, temporary_older_than=0, objects_older_than=0)
-    assert (garbage.temporary, garbage.objects) == (4, 2)
 
 
 def test_gc_keeps_an_upload_in_progress(store, key):

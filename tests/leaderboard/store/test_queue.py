@@ -37,16 +37,13 @@ def test_an_expired_claim_is_claimed_again_and_the_late_result_rejected(store, s
     assert [entry.event for entry in store.log()] == ["opened", "received", "result"]
 
 
-def test_a_worker_with_an_expired_claim_may_finish_if_no_other_has_claimed_since(store, submit):
+def test_a_worker_with_an_expired_claim_may_finish_if_nobody_has_claimed_since(store, submit):
     submit()
-    claim = store.queue.claim("slow", seconds=0)
-    assert store.queue.finish(claim, synthetic_result(store, claim.id))
-
-
-def test_the_same_worker_claiming_again_is_another_attempt(store, submit):
-    submit()
+    slow = store.queue.claim("worker", seconds=0)
+    assert store.queue.finish(slow, synthetic_result(store, slow.id))
+    submit(1)
     first = store.queue.claim("worker", seconds=0)
-    second = store.queue.claim("worker")
+    second = store.queue.claim("worker")  # another attempt, though of the same worker
     assert first.worker == second.worker
     assert not store.queue.finish(first, synthetic_result(store, first.id))
     assert store.queue.finish(second, synthetic_result(store, second.id))
@@ -75,25 +72,31 @@ def test_a_claim_does_not_survive_a_reboot(store, submit, monkeypatch):
     assert store.queue.claim("other").attempt == 2
 
 
-@pytest.mark.parametrize("days", [-400, 400])
-def test_setting_the_clock_changes_no_claim(store, submit, monkeypatch, days):
+def test_setting_the_clock_changes_no_claim(store, submit, monkeypatch):
     submit(0)
     submit(1)
-    claim = store.queue.claim("worker", seconds=60)
-    shifted = time.time() + days * 86400
-    monkeypatch.setattr(time, "time", lambda: shifted)
-    assert store.queue.claim("other").id != claim.id
-    assert store.queue.claim("third") is None
-    assert store.queue.heartbeat(claim)
+    claim, real = store.queue.claim("worker", seconds=60), time.time()
+    for days in (-400, 400):
+        monkeypatch.setattr(time, "time", lambda at=real + days * 86400: at)
+        other = store.queue.claim("other")
+        assert other.id != claim.id
+        assert store.queue.claim("third") is None
+        assert store.queue.heartbeat(claim)
+        store.queue.release(other)
     assert store.queue.finish(claim, synthetic_result(store, claim.id))
 
 
-def test_a_released_claim_is_no_fault(store, submit):
+def test_a_released_claim_is_no_fault_and_an_abandoned_one_is_lost(store, submit):
     submit()
-    for _ in range(7):
+    for _ in range(3):
         store.queue.release(store.queue.claim("worker"))
-    assert store.queue.claim("worker").attempt == 8
+    claim = store.queue.claim("dead")
+    assert claim.attempt == 4
     assert store.entries()[0].faults == 0
+    assert store.queue.abandon("dead")
+    assert not store.queue.abandon("dead")
+    assert not store.queue.heartbeat(claim)
+    assert not store.queue.finish(claim, synthetic_result(store, claim.id))
 
 
 @pytest.fixture
@@ -107,7 +110,7 @@ def clock(monkeypatch):
 def test_faults_postpone_a_submission_ever_longer_and_never_reject_it(store, submit, clock):
     faulty = submit(0)
     waits = []
-    for number in range(1, 1200):
+    for number in range(1, 13):
         claim = store.queue.claim("worker")
         assert claim.attempt == number
         store.queue.fault(claim, f"fault\nno. {number}")
@@ -116,8 +119,6 @@ def test_faults_postpone_a_submission_ever_longer_and_never_reject_it(store, sub
         waits.append(retry_seconds(number))
         assert (store.queue.claimable(), store.queue.claimed()) == (int(number == 1), 0)
         clock[0] += waits[-1]
-        if number == 30:
-            break
     assert waits[:5] == [0, 10, 20, 40, 80]
     assert waits[-1] == retry_seconds(10**6) == 3600
     claim = store.queue.claim("worker")
@@ -158,15 +159,6 @@ def test_a_slow_scorer_may_still_finish_after_its_claim_ended_in_a_fault(store, 
     clock[0] += 4.0
     assert store.queue.claimed() == 1
     assert store.queue.finish(slow, synthetic_result(store, slow.id))
-
-
-def test_an_abandoned_claim_cannot_be_finished_or_renewed(store, submit):
-    submit()
-    claim = store.queue.claim("dead")
-    assert store.queue.abandon("dead")
-    assert not store.queue.abandon("dead")
-    assert not store.queue.heartbeat(claim)
-    assert not store.queue.finish(claim, synthetic_result(store, claim.id))
 
 
 def test_reference_rows_are_first_and_wait_like_others_after_a_fault(store, submit, clock):
@@ -252,13 +244,15 @@ def test_nothing_is_claimed_without_the_boards_key(store, submit):
     submit()
     key = store.folder.key.read_text()
     store.folder.key.unlink()
-    with (
-        Store.open(store.folder.path) as other,
-        pytest.raises(BoardError, match=r"board\.key"),
-    ):
-        other.queue.claim("worker")
-    store.folder.key.write_text(key)
-    assert store.queue.claim("worker").attempt == 1
+    with Store.open(store.folder.path) as other:
+        with pytest.raises(BoardError, match=r"board\.key"):
+            other.queue.claim("worker")
+        store.folder.key.write_text(key)
+        claim = store.queue.claim("worker")
+        assert claim.attempt == 1
+        assert other.queue.claim("other") is None  # every store of the board sees a claim
+        assert other.queue.finish(claim, synthetic_result(other, claim.id))
+        assert store.entries()[0].status == "scored"
 
 
 def test_two_scorers_work_for_two_keys(store, submit):
@@ -309,12 +303,3 @@ def test_a_result_of_another_submission_or_protocol_is_refused(store, submit):
     )
     with pytest.raises(ValueError, match="result of"):
         store.queue.finish(claim, foreign)
-
-
-def test_claims_are_seen_by_every_store_of_the_board(store, submit):
-    submit()
-    with Store.open(store.folder.path) as other:
-        claim = store.queue.claim("worker")
-        assert other.queue.claim("other") is None
-        assert other.queue.finish(claim, synthetic_result(other, claim.id))
-        assert store.entries()[0].status == "scored"
