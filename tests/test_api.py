@@ -27,12 +27,10 @@ def test_the_public_names_are_sorted_and_hold_the_contract():
     assert set(sme_registry.__all__) >= CONTRACT
 
 
-@pytest.mark.parametrize("name", sme_registry.__all__)
-def test_a_public_name_can_be_imported_and_is_documented(name):
-    thing = getattr(sme_registry, name)
-    assert inspect.getdoc(thing), name
-    assert thing.__doc__, name  # its own, not its base's
-    assert name in dir(sme_registry)
+def test_a_public_name_can_be_imported_and_is_documented():
+    for name in sme_registry.__all__:
+        assert getattr(sme_registry, name).__doc__, name  # its own, not its base's
+        assert name in dir(sme_registry)
 
 
 def test_star_import_gives_the_public_names():
@@ -41,72 +39,7 @@ def test_star_import_gives_the_public_names():
     assert set(sme_registry.__all__) <= namespace.keys()
 
 
-SUBMODULES = [
-    "datasets", "diagnosis", "envs", "errors", "evaluation", "offline", "plots", "sb3", "sealed",
-    "spec", "statistics", "studies", "task", "teams", "testing", "training",
-]  # fmt: skip
-
-
-def test_submodules_are_attributes_after_one_import():
-    script = (
-        "import sys, sme_registry\n"
-        "assert 'sme_registry.datasets' not in sys.modules\n"
-        f"for name in {SUBMODULES}:\n"
-        "    assert name in dir(sme_registry), name\n"
-        "    assert getattr(sme_registry, name) is sys.modules[f'sme_registry.{name}'], name\n"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
-def test_a_type_checker_sees_every_name_that_is_loaded_on_first_use():
-    imported = ROOT_SOURCE[ROOT_SOURCE.index("if TYPE_CHECKING") : ROOT_SOURCE.index("__all__")]
-    for name in SUBMODULES:
-        assert f"from sme_registry import {name} as {name}\n" in imported
-    for name, module in sme_registry._LAZY.items():
-        assert re.search(rf"from {module} import .*\b{name}\b", imported), name
-
-
-@pytest.mark.parametrize("name", [name for name in SUBMODULES if name != "errors"])
-def test_a_public_module_lists_its_names_in_order(name):
-    module = importlib.import_module(f"sme_registry.{name}")
-    capitals_first = sorted(module.__all__, key=lambda text: (not text.isupper(), text))
-    assert module.__all__ == capitals_first
-    for public in module.__all__:
-        assert hasattr(module, public)
-
-
-def test_an_unknown_attribute_is_an_attribute_error():
-    with pytest.raises(AttributeError, match="no attribute 'maek'"):
-        sme_registry.maek  # noqa: B018
-
-
-MODULES = [
-    "envs.batch", "envs.team", "errors", "io", "registration", "spec", "spec.catalogue",
-    "spec.document", "spec.envelope",
-    "spec.protocol", "spec.resolve", "spec.sme_spec", "spec.suite", "task", "task.draw",
-    "task.fingerprint", "task.memory", "task.step", "task.loading", "task.streams", "task.task",
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("name", MODULES)
-def test_what_is_public_in_a_module_is_documented(name):
-    module = importlib.import_module(f"sme_registry.{name}")
-    assert module.__doc__
-    for public, thing in vars(module).items():
-        if public.startswith("_") or getattr(thing, "__module__", None) != module.__name__:
-            continue
-        if inspect.isfunction(thing) or inspect.isclass(thing):
-            assert thing.__doc__, f"{name}.{public}"
-        if inspect.isclass(thing):
-            for method, member in vars(thing).items():
-                if not method.startswith("_") and (
-                    inspect.isfunction(member) or isinstance(member, property)
-                ):
-                    assert member.__doc__, f"{name}.{public}.{method}"
-
-
-def test_every_error_is_ours_documented_and_drawn_in_the_tree():
+SUBdef test_every_error_is_ours_documented_and_drawn_in_the_tree():
     kinds = [
         kind
         for kind in vars(errors).values()
