@@ -39,7 +39,47 @@ def test_star_import_gives_the_public_names():
     assert set(sme_registry.__all__) <= namespace.keys()
 
 
-SUBdef test_every_error_is_ours_documented_and_drawn_in_the_tree():
+SUBMODULES = [
+    "datasets", "diagnosis", "envs", "errors", "evaluation", "offline", "plots", "sb3", "sealed",
+    "spec", "statistics", "studies", "task", "teams", "testing", "training",
+]  # fmt: skip
+
+
+def test_submodules_are_attributes_after_one_import():
+    script = (
+        "import sys, sme_registry\n"
+        "assert 'sme_registry.datasets' not in sys.modules\n"
+        f"for name in {SUBMODULES}:\n"
+        "    assert name in dir(sme_registry), name\n"
+        "    assert getattr(sme_registry, name) is sys.modules[f'sme_registry.{name}'], name\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_type_checker_sees_every_name_that_is_loaded_on_first_use():
+    imported = ROOT_SOURCE[ROOT_SOURCE.index("if TYPE_CHECKING") : ROOT_SOURCE.index("__all__")]
+    for name in SUBMODULES:
+        assert f"from sme_registry import {name} as {name}\n" in imported
+    for name, module in sme_registry._LAZY.items():
+        assert re.search(rf"from {module} import .*\b{name}\b", imported), name
+
+
+@pytest.mark.parametrize("name", [name for name in SUBMODULES if name != "errors"])
+def test_a_public_module_lists_its_names_in_order(name):
+    module = importlib.import_module(f"sme_registry.{name}")
+    capitals_first = sorted(module.__all__, key=lambda text: (not text.isupper(), text))
+    assert module.__all__ == capitals_first
+    for public in module.__all__:
+        assert hasattr(module, public)
+
+
+def test_an_unknown_attribute_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'maek'"):
+        sme_registry.maek  # noqa: B018
+
+
+def test_every_error_is_ours_documented_and_drawn_in_the_tree():
     kinds = [
         kind
         for kind in vars(errors).values()

@@ -43,18 +43,27 @@ EPISODES = [
 
 
 @pytest.mark.parametrize("ending", FORMATS)
-@pytest.mark.parametrize("kind", ["cost_curve", "decay_curve", "similarity_map", "training_curve"])
-def test_every_figure_is_written_in_every_format(tmp_path, report, ending, kind):
-    path = tmp_path / "new" / f"figure.{ending}"
-    figure = {
-        "cost_curve": lambda: plots.cost_curve(EPISODES, path),
-        "decay_curve": lambda: plots.decay_curve(report, path),
-        "similarity_map": lambda: plots.similarity_map(half, PLANE, path, resolution=20),
-        "training_curve": lambda: plots.training_curve(EPISODES, path),
-    }[kind]()
-    assert figure.axes
-    assert path.read_bytes().startswith(SIGNATURES[ending])
-    assert [file.name for file in path.parent.iterdir()] == [path.name]
+def test_the_same_figure_is_the_same_file_in_every_format(tmp_path, report, ending):
+    first, second = tmp_path / "new" / f"1.{ending}", tmp_path / f"2.{ending}"
+    for path in (first, second):
+        plots.decay_curve(report, path)
+    assert first.read_bytes() == second.read_bytes()
+    assert first.read_bytes().startswith(SIGNATURES[ending])
+    if ending == "png":  # in a notebook, too
+        assert plots.decay_curve(report)._repr_png_().startswith(SIGNATURES["png"])
+    assert list(first.parent.iterdir()) == [first]
+
+
+def test_every_figure_is_written(tmp_path):
+    for draw in (
+        lambda path: plots.cost_curve(EPISODES, path),
+        lambda path: plots.similarity_map(half, PLANE, path, resolution=20),
+        lambda path: plots.training_curve(EPISODES, path),
+    ):
+        path = tmp_path / "figure.png"
+        assert draw(path).axes
+        assert path.read_bytes().startswith(SIGNATURES["png"])
+        path.unlink()
 
 
 def test_56_lines_differ_in_colour_or_marker_and_ten_in_marker():
@@ -64,27 +73,11 @@ def test_56_lines_differ_in_colour_or_marker_and_ten_in_marker():
     assert len(set(markers)) == len(markers) >= 10
 
 
-@pytest.mark.parametrize("ending", FORMATS)
-def test_the_same_figure_is_the_same_file(tmp_path, report, ending):
-    first, second = tmp_path / f"1.{ending}", tmp_path / f"2.{ending}"
-    plots.decay_curve(report, first)
-    plots.decay_curve(report, second)
-    assert first.read_bytes() == second.read_bytes()
-
-
 @pytest.mark.parametrize("name", ["figure.jpg", "figure", "png"])
 def test_unknown_formats_are_rejected_before_anything_is_drawn(tmp_path, report, name):
     with pytest.raises(OptionError, match=r"must end in \.png, \.pdf, \.svg"):
         plots.decay_curve(report, tmp_path / name)
     assert not list(tmp_path.iterdir())
-
-
-def test_a_figure_that_fails_keeps_the_old_file(tmp_path):
-    path = tmp_path / "map.png"
-    path.write_bytes(b"old")
-    with pytest.raises(PolicyError):
-        plots.similarity_map(lambda o: np.zeros((len(o), 3)), PLANE, path, resolution=4)
-    assert path.read_bytes() == b"old"
 
 
 def test_without_matplotlib_the_message_names_the_extra(tmp_path, report, monkeypatch):
@@ -94,54 +87,56 @@ def test_without_matplotlib_the_message_names_the_extra(tmp_path, report, monkey
         plots.decay_curve(report, tmp_path / "figure.png")
 
 
-def test_drawing_does_not_change_matplotlibs_settings(tmp_path, report):
+def test_a_figure_that_fails_keeps_the_old_file_and_matplotlibs_settings(tmp_path, report):
     import matplotlib
 
     before = dict(matplotlib.rcParams)
-    plots.decay_curve(report, tmp_path / "figure.png")
-    with pytest.raises(PolicyError):
-        plots.similarity_map(lambda o: None, PLANE, tmp_path / "map.png", resolution=4)
+    path = tmp_path / "map.png"
+    path.write_bytes(b"old")
+    for policy in (lambda o: np.zeros((len(o), 3)), lambda o: None):
+        with pytest.raises(PolicyError):
+            plots.similarity_map(policy, PLANE, path, resolution=4)
+        assert path.read_bytes() == b"old"
+    plots.decay_curve(report)
     assert dict(matplotlib.rcParams) == before
 
 
-def test_decay_curve_shows_the_reports_numbers_and_every_reference(tmp_path, report, figures):
-    plots.decay_curve(report, tmp_path / "figure.png")
-    for axes, measure in zip(figures[0].axes, ("similarity", "normalised_regret"), strict=True):
+def test_decay_curve_shows_the_reports_numbers_and_every_reference(report):
+    figure = plots.decay_curve(report)
+    for axes, measure in zip(figure.axes, ("similarity", "normalised_regret"), strict=True):
         drawn = [tuple(line.get_ydata()) for line in axes.lines]
         for regions in (report.regions, *report.references.values()):
             assert tuple(getattr(region, measure) for region in regions) in drawn
         assert tuple(axes.lines[0].get_xdata()) == (0.0, 0.5, 1.0)
         assert "not comparable" in axes.get_xlabel()
+    # "$\\frac$" as a formula would be an error
+    assert figure.legends[0].get_texts()[0].get_text() == r"a \$\frac\$ name"
+    assert figure.get_suptitle() == f"SME/{report.spec.content_name}"
 
 
-def test_figures_name_their_task(tmp_path, report, figures):
-    plots.decay_curve(report, tmp_path / "decay.png")
-    plots.similarity_map(half, "Plane1", tmp_path / "map.png", resolution=4)
-    assert figures[0].get_suptitle() == f"SME/{report.spec.content_name}"
-    assert "half on SME/Plane1-v1, L = 1" in figures[1].get_suptitle()
+def test_figures_of_one_task_name_it(report):
+    figure = plots.similarity_map(half, "Plane1", resolution=4)
+    assert "half on SME/Plane1-v1, L = 1" in figure.get_suptitle()
     other = evaluate(half, PLANE.derive(seed=1), PROTOCOL)
-    plots.decay_curve([report, other], tmp_path / "two.png")
-    assert figures[2].get_suptitle() == ""
+    assert plots.decay_curve([report, other]).get_suptitle() == ""
+    other = evaluate(half, PLANE.derive(state_dim=3), PROTOCOL)
+    label = plots.decay_curve([report, other]).axes[0].get_xlabel()
+    assert "different S: these levels are not comparable" in label
 
 
-def test_policy_names_are_not_parsed_as_formulas(tmp_path, report, figures):
-    plots.decay_curve(report, tmp_path / "figure.png")  # "$\\frac$" would be an error
-    assert figures[0].legends[0].get_texts()[0].get_text() == r"a \$\frac\$ name"
-
-
-def test_decay_curve_draws_references_once_for_each_task(tmp_path, report, figures):
+def test_decay_curve_draws_references_once_for_each_task(report):
     again = report.model_copy(update={"policy": "again"})
     other = evaluate(half, PLANE.derive(seed=1), PROTOCOL)
+    counts = []
     for reports in ([report], [report, again], [report, again, other]):
-        plots.decay_curve(reports, tmp_path / "figure.png", measures=["similarity"])
-    lines = [sum(len(line.get_xdata()) > 0 for line in f.axes[0].lines) for f in figures]
-    assert lines == [1 + 5, 2 + 5, 3 + 5 + 5]
-    plots.decay_curve(report, tmp_path / "figure.png", references=False)
-    assert len(figures[-1].axes[0].lines) == 1
+        axes = plots.decay_curve(reports, measures=["similarity"]).axes[0]
+        counts.append(sum(len(line.get_xdata()) > 0 for line in axes.lines))
+    assert counts == [1 + 5, 2 + 5, 3 + 5 + 5]
+    assert len(plots.decay_curve(report, references=False).axes[0].lines) == 1
 
 
-@pytest.mark.parametrize("n", [1, 2, 6, 7])
-def test_decay_curve_of_a_team_has_a_line_for_each_agent(tmp_path, figures, n):
+@pytest.mark.parametrize("n", [1, 6, 7])
+def test_decay_curve_of_a_team_has_a_line_for_each_agent(n):
     agents = [{"action_dim": 1 + i % 2} for i in range(n)]
     width = sum(agent["action_dim"] for agent in agents)
     team = SMESpec(state_dim=2, action_dim=width, team={"agents": agents})
@@ -151,57 +146,30 @@ def test_decay_curve_of_a_team_has_a_line_for_each_agent(tmp_path, figures, n):
         return np.repeat(shares[:, None], min(n, 2), axis=1)
 
     report = evaluate(spread, team, PROTOCOL)
-    plots.decay_curve(report, tmp_path / "figure.png")
-    for axes, measure in zip(figures[0].axes, ("similarity", "normalised_regret"), strict=True):
+    figure = plots.decay_curve(report)
+    for axes, measure in zip(figure.axes, ("similarity", "normalised_regret"), strict=True):
         drawn = [tuple(line.get_ydata()) for line in axes.lines]
         for scope in (report, *report.agents.values()):
             assert tuple(getattr(region, measure) for region in scope.regions) in drawn
-    named = [text.get_text() for text in figures[0].legends[0].get_texts()]
+    named = [text.get_text() for text in figure.legends[0].get_texts()]
     expected = [f"agent_{i}" for i in range(n)] if n < 7 else ["each of 7 agents"]
     assert named[: 1 + len(expected)] == ["spread", *expected]
-
-    plots.decay_curve([report, report], tmp_path / "figure.png", references=False)
-    assert len(figures[1].axes[0].lines) == 2
+    assert len(plots.decay_curve([report, report], references=False).axes[0].lines) == 2
 
 
-def test_similarity_map_of_a_team_shows_its_joint_action(tmp_path, figures):
+def test_similarity_map_of_a_team_shows_its_joint_action():
     team = PLANE.derive(team={"agents": [{"action_dim": 1, "observes": [1]}, {"action_dim": 1}]})
     policies = {"agent_0": lambda o: o[:, :1], "agent_1": lambda o: o[:, :1]}
-    plots.similarity_map(policies, team, tmp_path / "map.png", resolution=8, epsilon=1.0)
-    drawn = figures[0].axes[0].images[0].get_array()
+    figure = plots.similarity_map(policies, team, resolution=8, epsilon=1.0)
+    drawn = figure.axes[0].images[0].get_array()
     side = -0.5 + (np.arange(8) + 0.5) / 4
     s = np.array([[x, y] for y in side for x in side])
     expected = materialize(team).similarity(s, s[:, ::-1]).reshape(8, 8)
     assert np.asarray(drawn) == pytest.approx(expected, abs=1e-6)
 
 
-def test_decay_curve_of_different_state_dims_warns_that_levels_differ(tmp_path, report, figures):
-    other = evaluate(half, PLANE.derive(state_dim=3), PROTOCOL)
-    plots.decay_curve([report, other], tmp_path / "figure.png")
-    assert "different S: these levels are not comparable" in figures[0].axes[0].get_xlabel()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (([],), "must be one or more evaluation reports"),
-        (({"A": []},), "must be one or more evaluation reports"),
-        ((3,), "reports=3: must be an EvaluationReport, the path of an evaluation.json"),
-        (([None],), "reports=None: must be"),
-        (({"A": [{}]},), "reports={}: must be"),
-        (("r", "m"), "measures="),
-    ],
-)
-def test_decay_curve_rejects_invalid_arguments(tmp_path, report, arguments, message):
-    reports = report if arguments[0] == "r" else arguments[0]
-    measures = ["mae"] if len(arguments) > 1 else ["similarity"]
-    with pytest.raises(OptionError, match=message):
-        plots.decay_curve(reports, tmp_path / "figure.png", measures=measures)
-
-
-def test_similarity_map_shows_r_over_the_plane_beyond_the_unit_square(tmp_path, figures):
-    plots.similarity_map(half, PLANE, tmp_path / "map.png", resolution=8)
-    axes = figures[0].axes[0]
+def test_similarity_map_shows_r_over_the_plane_beyond_the_unit_square():
+    axes = plots.similarity_map(half, PLANE, resolution=8).axes[0]
     (image,) = axes.images
     assert image.get_extent() == [-0.5, 1.5, -0.5, 1.5]
     side = (np.arange(8) + 0.5) / 4 - 0.5
@@ -212,7 +180,7 @@ def test_similarity_map_shows_r_over_the_plane_beyond_the_unit_square(tmp_path, 
     assert set(zip(*outline.get_data(), strict=True)) == {(0, 0), (1, 0), (1, 1), (0, 1)}
 
 
-def test_similarity_map_passes_the_time_to_the_policy(tmp_path):
+def test_similarity_map_passes_the_time_to_the_policy():
     seen = set()
 
     def watching(observations):
@@ -220,32 +188,16 @@ def test_similarity_map_passes_the_time_to_the_policy(tmp_path):
         seen.update(map(tuple, observations[:, 2:]))
         return half(observations)
 
-    plots.similarity_map(watching, PLANE, tmp_path / "map.png", resolution=4, time=0.25)
+    plots.similarity_map(watching, PLANE, resolution=4, time=0.25)
     assert seen == {(0.25, 0.0)}
 
 
-@pytest.mark.parametrize(
-    ("spec", "options", "message"),
-    [
-        ("Default-v1", {}, "state_dim=8: must be 2 for a map"),
-        (PLANE, {"epsilon": 0.0}, r"epsilon=0.0: must be in \(0, 100\]"),
-        (PLANE, {"epsilon": float("nan")}, r"epsilon=nan: must be in"),
-        (PLANE, {"resolution": 1}, r"resolution=1: must be an integer in \[2, 2,000\]"),
-        (PLANE, {"time": 1.5}, r"time=1.5: must be in \[0, 1\]"),
-    ],
-)
-def test_similarity_map_rejects_arguments_out_of_range(tmp_path, spec, options, message):
-    with pytest.raises(OptionError, match=message):
-        plots.similarity_map(half, spec, tmp_path / "map.png", **options)
-
-
-def test_training_curve_reads_a_csv_and_ignores_an_incomplete_row(tmp_path, figures):
+def test_training_curve_reads_a_csv_and_ignores_an_incomplete_row(tmp_path):
     path = tmp_path / "episodes.csv"
     rows = [f"{i},{row['step']},{row['regret']}" for i, row in enumerate(EPISODES)]
     path.write_text("\n".join(["episode,step,regret", *rows, "51,51"]))
-    plots.training_curve(path, tmp_path / "from-csv.png", window=5)
-    plots.training_curve(EPISODES, tmp_path / "from-rows.png", window=5)
-    cloud, expected = (f.axes[0].collections[0].get_offsets() for f in figures)
+    drawn = (plots.training_curve(rows, window=5) for rows in (path, EPISODES))
+    cloud, expected = (figure.axes[0].collections[0].get_offsets() for figure in drawn)
     assert len(cloud) == 50
     assert np.array_equal(cloud, expected)
 
@@ -342,36 +294,13 @@ def test_decay_curve_reads_files_and_folders_of_reports(tmp_path, report):
             plots.decay_curve(missing)
 
 
-def test_learning_curve_takes_a_method_with_one_run_alone(tmp_path):
-    (tmp_path / "episodes.csv").write_text("step,regret\n10,0.5\n20,0.25\n")
-    for run in (tmp_path, str(tmp_path), {"step": [10, 20], "regret": [0.5, 0.25]}):
-        line = plots.learning_curve({"TD3": run}).axes[0].lines[0]
+def test_learning_curve_reads_one_run_alone_and_the_files_and_folders_of_runs(tmp_path):
+    path = tmp_path / "episodes.csv"
+    path.write_text("step,regret\n10,0.5\n20,0.25\n")
+    alone = {"step": [10, 20], "regret": [0.5, 0.25]}
+    for runs in (tmp_path, str(tmp_path), alone, [tmp_path, path]):
+        line = plots.learning_curve({"TD3": runs}).axes[0].lines[0]
         assert (line.get_ydata()[0], line.get_ydata()[-1]) == (0.5, 0.25)
-
-
-def test_learning_curve_reads_the_folders_of_runs(tmp_path):
-    (tmp_path / "episodes.csv").write_text("step,regret\n10,0.5\n20,0.25\n")
-    line = plots.learning_curve({"TD3": [tmp_path, tmp_path / "episodes.csv"]}).axes[0].lines[0]
-    assert (line.get_ydata()[0], line.get_ydata()[-1]) == (0.5, 0.25)
-
-
-@pytest.mark.parametrize(
-    ("runs", "message"),
-    [
-        ({}, "one or more runs"),
-        ({"A": []}, "one or more runs"),
-        (3, "runs=3: must map each method's name to its runs"),
-        ("runs/a", "runs='runs/a': must map each method's name to its runs"),
-        ({"A": 3}, r"runs\['A'\]=3: must be one or more runs"),
-        ({"A": "no/such/run"}, "no/such/run: cannot be read"),
-        ({"regret": [1.0]}, "columns step and regret"),
-        ({"regret": [1.0, 2.0], "step": [1]}, "columns step and regret of equal length"),
-        ({"A": [EPISODES[:5], EPISODES[40:]]}, "share no steps"),
-    ],
-)
-def test_learning_curve_rejects_invalid_runs(runs, message):
-    with pytest.raises(OptionError, match=message):
-        plots.learning_curve(runs)
 
 
 def test_decay_curve_of_methods_is_the_iqm_over_their_runs(report):
@@ -386,12 +315,6 @@ def test_decay_curve_of_methods_is_the_iqm_over_their_runs(report):
     assert np.allclose(
         lines["linear (LSQ)"], np.mean([[r.similarity for r in one] for one in linear], axis=0)
     )
-
-
-def test_decay_curve_of_methods_rejects_runs_of_different_protocols(report):
-    other = evaluate(half, PLANE, {"states_per_region": 100, "epsilons": [0.3]})
-    with pytest.raises(OptionError, match="different regions"):
-        plots.decay_curve({"A": [report, other]})
 
 
 def test_references_that_coincide_are_one_line_with_both_names():
@@ -486,10 +409,6 @@ def test_colours_of_a_map_cover_its_similarities_and_the_scale_says_so():
     assert f"colours from {low:.2f} to {high:.2f}" in figure.axes[1].get_ylabel()
 
 
-def test_a_notebook_shows_a_figure(report):
-    assert plots.decay_curve(report)._repr_png_().startswith(SIGNATURES["png"])
-
-
 EXTENDED = SMESpec(
     state_dim=3, action_dim=2, safety={"tightness": 0.3}, observation={"distractors": 4}
 )
@@ -507,18 +426,16 @@ def extended():
 
 
 @pytest.mark.parametrize("name", EXTENSIONS)
-def test_figures_of_safety_and_observation_are_readable_and_written(tmp_path, extended, name):
+def test_figures_of_safety_and_observation_are_readable(extended, name):
     draw = getattr(plots, name)
     named = [extended.model_copy(update={"policy": name}) for name in LONG]
     for given in (extended, named, {name: [extended] * 3 for name in LONG[:3]}):
         assert_readable(draw(given))
-    draw(extended, tmp_path / "figure.svg")
-    assert (tmp_path / "figure.svg").read_bytes().startswith(SIGNATURES["svg"])
 
 
-def test_reward_against_cost_shows_the_policy_and_four_references(extended):
+def test_figures_of_safety_and_observation_show_the_numbers_of_the_report(extended):
     inside, outside = plots.reward_against_cost(extended).axes
-    safety = extended.safety
+    safety, observation = extended.safety, extended.observation
     for axes, regions in ((inside, slice(0, 1)), (outside, slice(1, None))):
         drawn = {tuple(np.ravel(line.get_xydata())) for line in axes.lines}
         shown = ("optimal", "safe_optimal", "shrunk_optimal", "constant_half")
@@ -527,37 +444,17 @@ def test_reward_against_cost_shows_the_policy_and_four_references(extended):
             expected = np.mean(of, axis=0)
             assert any(len(p) == 2 and np.allclose(p, expected, atol=1e-12) for p in drawn)
 
-
-def test_sensitivity_bars_have_the_heights_of_the_report(extended):
     (axes,) = plots.sensitivity_bars(extended).axes
-    observation = extended.observation
-    outside = np.mean([region.normalised_regret for region in observation.distractor_regions])
+    far = np.mean([region.normalised_regret for region in observation.distractor_regions])
     invariance = observation.invariance[0].invariance
-    heights = [bar.get_height() for bar in axes.patches]
-    assert heights == pytest.approx(
-        [extended.wd_regret, extended.ood_regret, outside, invariance], abs=1e-12
-    )
+    expected = [extended.wd_regret, extended.ood_regret, far, invariance]
+    assert [bar.get_height() for bar in axes.patches] == pytest.approx(expected, abs=1e-12)
 
-
-def test_layer_probes_show_r2_by_layer_of_state_and_distractors(extended):
     left, right = plots.layer_probes(extended).axes
-    probes = extended.observation.probes
+    probes = observation.probes
     assert list(left.lines[0].get_ydata()) == [probe.state_r2 for probe in probes]
     assert list(right.lines[0].get_ydata()) == [probe.distractor_r2 for probe in probes]
     assert [tick.get_text() for tick in left.get_xticklabels()] == ["observation", "1"]
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("reward_against_cost", "is of a task without limits"),
-        ("sensitivity_bars", "is of a task without distractors"),
-        ("layer_probes", "has no probes"),
-    ],
-)
-def test_figures_of_safety_and_observation_refuse_other_reports(report, name, message):
-    with pytest.raises(OptionError, match=message):
-        getattr(plots, name)(report)
 
 
 def test_runs_with_other_layers_are_not_one_method(extended):
@@ -578,15 +475,82 @@ def test_a_decay_curve_of_tasks_with_and_without_limits_shows_what_they_share(ex
     }
 
 
-def test_commands_write_the_figures_for_which_the_report_has_numbers(tmp_path, extended, report):
+def test_commands_write_the_figures_for_which_the_report_has_numbers(
+    tmp_path, extended, report, monkeypatch
+):
     from sme_registry.plots.files import write_evaluation
 
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *args, **options: None)
     names = {path.stem for path in write_evaluation(extended, tmp_path / "extended")}
     assert names == {"decay_curve", *EXTENSIONS}
     assert {path.stem for path in write_evaluation(report, tmp_path / "plain")} == {"decay_curve"}
 
 
-def test_a_map_of_a_task_with_observation_is_refused():
-    spec = PLANE.derive(observation={"distractors": 1})
-    with pytest.raises(OptionError, match="must be absent for a map"):
-        plots.similarity_map(half, spec)
+@pytest.mark.parametrize(
+    ("draw", "message"),
+    [
+        (lambda report: plots.decay_curve([]), "must be one or more evaluation reports"),
+        (lambda report: plots.decay_curve({"A": []}), "must be one or more evaluation reports"),
+        (
+            lambda report: plots.decay_curve(3),
+            "reports=3: must be an EvaluationReport, the path of an evaluation.json",
+        ),
+        (lambda report: plots.decay_curve([None]), "reports=None: must be"),
+        (lambda report: plots.decay_curve({"A": [{}]}), "reports={}: must be"),
+        (lambda report: plots.decay_curve(report, measures=["mae"]), "measures="),
+        (
+            lambda report: plots.decay_curve(
+                {"A": [report, evaluate(half, PLANE, PROTOCOL | {"epsilons": [0.3]})]}
+            ),
+            "different regions",
+        ),
+        (lambda report: plots.similarity_map(half, "Default-v1"), "state_dim=8: must be 2"),
+        (
+            lambda report: plots.similarity_map(half, PLANE.derive(observation={"distractors": 1})),
+            "must be absent for a map",
+        ),
+        (
+            lambda report: plots.similarity_map(half, PLANE, epsilon=0.0),
+            r"epsilon=0.0: must be in \(0, 100\]",
+        ),
+        (lambda report: plots.similarity_map(half, PLANE, epsilon=np.nan), "epsilon=nan: must be"),
+        (
+            lambda report: plots.similarity_map(half, PLANE, resolution=1),
+            r"resolution=1: must be an integer in \[2, 2,000\]",
+        ),
+        (
+            lambda report: plots.similarity_map(half, PLANE, time=1.5),
+            r"time=1.5: must be in \[0, 1\]",
+        ),
+        (lambda report: plots.learning_curve({}), "one or more runs"),
+        (lambda report: plots.learning_curve({"A": []}), "one or more runs"),
+        (lambda report: plots.learning_curve(3), "runs=3: must map each method's name to its runs"),
+        (
+            lambda report: plots.learning_curve("runs/a"),
+            "runs='runs/a': must map each method's name to its runs",
+        ),
+        (
+            lambda report: plots.learning_curve({"A": 3}),
+            r"runs\['A'\]=3: must be one or more runs",
+        ),
+        (
+            lambda report: plots.learning_curve({"A": "no/such/run"}),
+            "no/such/run: cannot be read",
+        ),
+        (lambda report: plots.learning_curve({"regret": [1.0]}), "columns step and regret"),
+        (
+            lambda report: plots.learning_curve({"regret": [1.0, 2.0], "step": [1]}),
+            "columns step and regret of equal length",
+        ),
+        (
+            lambda report: plots.learning_curve({"A": [EPISODES[:5], EPISODES[40:]]}),
+            "share no steps",
+        ),
+        (plots.reward_against_cost, "is of a task without limits"),
+        (plots.sensitivity_bars, "is of a task without distractors"),
+        (plots.layer_probes, "has no probes"),
+    ],
+)
+def test_bad_input_is_refused(report, draw, message):
+    with pytest.raises(OptionError, match=message):
+        draw(report)

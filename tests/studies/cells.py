@@ -104,12 +104,7 @@ def surroundings(
 
 def starts(folder: Path) -> Counter[str]:
     """How often each cell was begun, by key."""
-    path = folder / STARTED
-    return (
-        Counter(line.split()[0] for line in path.read_text().splitlines())
-        if path.exists()
-        else Counter()
-    )
+    return Counter(line[0] for line in _lines(folder))
 
 
 def pids(folder: Path) -> list[int]:
@@ -130,7 +125,7 @@ def alive(pid: int) -> bool:
         return False
 
 
-def wait_for(condition: Any, seconds: float = 60.0) -> None:
+def wait_for(condition: Any, seconds: float = 180.0) -> None:
     """Poll until it holds."""
     deadline = time.monotonic() + seconds
     while not condition():

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import CliRunner
 
 from leaderboard.cli import app as leaderboard
 from leaderboard.cli.options import find_suite
@@ -14,11 +14,11 @@ from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import BoardError
 from sme_registry import SMESpec, StreamSpec, load, save
-from sme_registry.cli import app
 from sme_registry.errors import SpecError
 from sme_registry.spec import StreamFile, StudyFile, StudyPlan, Suite, SuiteFile, catalogue
 from sme_registry.spec.study import Cell
 from sme_registry.studies.engine.checks import uneven_rollouts
+from tests import commands
 
 TASK = SMESpec(state_dim=2, action_dim=2, horizon=8)
 STREAM = StreamSpec(
@@ -33,22 +33,14 @@ def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save(STREAM, "mine.json")
 
 
-def sme(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, [*map(str, arguments)])
-
-
 def good(*arguments: str | Path) -> str:
-    result = sme(*arguments)
-    assert result.exit_code == 0, result.output
-    return result.stdout
+    return commands.good(*arguments).stdout
 
 
 def refused(*arguments: str | Path) -> str:
-    result = sme(*arguments)
-    assert result.exit_code == 2, result.output
-    assert result.stderr.startswith("error: ")
-    assert len(result.stderr.splitlines()) == 1
-    return result.stderr
+    message = commands.refused(*arguments)
+    assert len(message.splitlines()) == 1
+    return message
 
 
 def new_suite(*others: str) -> Suite:
@@ -75,7 +67,7 @@ def test_a_suite_has_a_class_for_a_stream_beside_tasks() -> None:
     assert suite.stream_instances == tuple(STREAM.draw(number) for number in range(3))
     assert [member.name for member in suite.classes] == ["Default"]
     assert suite.runs == {"Default": 3, "mine": 3}
-    wider = sme("suite", "new", "wider.json", "--suite", "lives.json", "-t", "Switch5")
+    wider = commands.good("suite", "new", "wider.json", "--suite", "lives.json", "-t", "Switch5")
     assert "3 classes, 7 instances" in wider.stderr
     assert [member.name for member in SuiteFile.read("wider.json").suite.streams] == [
         "mine",
@@ -179,17 +171,16 @@ def test_what_a_plan_of_streams_cannot_have_is_refused(
 
 
 def test_steps_are_those_of_single_tasks_beside_streams() -> None:
-    plan = new_plan(
-        "-t", "Default", "-t", "mine.json", "-a", "TD3", "-n", "77", "--seeds", "1"
-    ).plan
+    tasks = ("-t", "Default", "-t", "mine.json")
+    plan = new_plan(*tasks, "-a", "TD3", "-n", "77", "--seeds", "1").plan
     assert [place.cell.steps for place in plan.cells] == [77, 128, 40, 24]
 
 
 def test_rollouts_that_do_not_end_where_phases_do_are_named_with_a_better_length() -> None:
     chosen = ("-a", "PPO", "-a", "TD3", "-a", "short=PPO", "--set", "short.n_steps=8")
     chosen += ("--set", "short.batch_size=8")
-    result = sme("study", "new", "plan.json", "-t", "mine.json", "-t", "Switch5", *chosen)
-    assert result.exit_code == 0, result.output
+    tasks = ("-t", "mine.json", "-t", "Switch5")
+    result = commands.good("study", "new", "plan.json", *tasks, *chosen)
     plan = StudyFile.read("plan.json").plan
     (uneven,) = uneven_rollouts(plan)
     assert (uneven.algorithm, uneven.n_steps, uneven.better) == ("PPO", 2048, 8)
@@ -257,15 +248,12 @@ def test_a_plan_with_a_life_of_more_visits_than_are_evaluated_is_refused() -> No
         StudyPlan.from_dict(fields)
 
 
-def test_a_plan_of_streams_alone_has_no_steps_of_an_algorithm() -> None:
-    fields = new_plan("-t", "mine.json", "-a", "TD3").plan.to_dict()
+def test_steps_that_are_not_those_of_the_stream_are_refused() -> None:
+    plan = new_plan("-t", "mine.json", "-a", "TD3").plan
+    fields = plan.to_dict()
     fields["algorithms"][0]["steps"] = 100
     with pytest.raises(SpecError, match=r"algorithms.0.steps=100: .* steps of their streams"):
         StudyPlan.from_dict(fields)
-
-
-def test_a_cell_whose_steps_are_not_those_of_its_stream_is_refused() -> None:
-    fields = new_plan("-t", "mine.json", "-a", "TD3").plan.cells[0].cell.to_dict()
     with pytest.raises(SpecError, match="stream: its first phase and its steps must be the cell's"):
-        Cell.from_dict(fields | {"steps": 127})
+        Cell.from_dict(plan.cells[0].cell.to_dict() | {"steps": 127})
     assert "stream" not in new_plan("-t", "Default", "-a", "TD3").plan.cells[0].cell.to_dict()

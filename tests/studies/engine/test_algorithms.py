@@ -46,7 +46,7 @@ def made(uses: str, env: Any, **hyperparameters: Any) -> Any:
     return new_learner(uses, env, seed=1, steps=100, hyperparameters=hyperparameters)
 
 
-@pytest.mark.parametrize("name", ["PPO", "ppo", "Td3", "SAC", "A2C", "DDPG"])
+@pytest.mark.parametrize("name", ["PPO", "Td3", "ddpg"])
 def test_sb3s_algorithms_are_found_in_any_case(name: str) -> None:
     assert find_algorithm(name) is getattr(sb3, name.upper())
 
@@ -60,11 +60,7 @@ def test_a_class_of_sb3s_kind_is_used_as_it_is(env: Any) -> None:
     assert tqc.seed == 1
     assert tqc.replay_buffer.buffer_size == 101
     assert tqc.learn(10).num_timesteps >= 10
-
-
-def test_the_replay_buffer_keeps_the_size_that_was_asked_for(env: Any) -> None:
     assert made("TD3", env, buffer_size=50).replay_buffer.buffer_size == 50
-    assert made("TD3", env).replay_buffer.buffer_size == 101
 
 
 def test_a_function_of_a_module_in_this_folder_makes_the_learner(

@@ -85,16 +85,14 @@ def td3(tmp_path_factory: pytest.TempPathFactory) -> tuple[CellResult, Path]:
     return run_cell(cell(), model_path=path), path
 
 
-def test_the_same_cell_gives_the_same_result(td3: tuple[CellResult, Path]) -> None:
-    assert without_timing(run_cell(cell())) == without_timing(td3[0])
-    assert without_timing(run_cell(cell(seed=4))) != without_timing(td3[0])
-
-
-def test_a_result_survives_its_file(td3: tuple[CellResult, Path]) -> None:
+def test_the_same_cell_gives_the_same_result_which_survives_its_file(
+    td3: tuple[CellResult, Path],
+) -> None:
     result = td3[0]
+    assert without_timing(run_cell(cell())) == without_timing(result)
+    assert without_timing(run_cell(cell(seed=4))) != without_timing(result)
     assert CellResult.from_dict(result.to_dict()) == result
-    assert result.key == cell().digest
-    assert result.cell == cell()
+    assert (result.key, result.cell) == (cell().digest, cell())
     assert {"torch", "stable_baselines3", "sme_registry"} <= result.versions.keys()
 
 
@@ -146,15 +144,12 @@ def test_on_policy_training_ends_with_its_last_rollout() -> None:
     assert result.report.policy == "PPO"
 
 
-def test_more_evaluations_than_steps_are_all_made() -> None:
+def test_evaluations_are_made_with_fewer_steps_and_without_any() -> None:
     assert run_cell(cell(steps=2, evaluations=5)).curve.steps == (0, 1, 1, 2, 2)
-
-
-def test_without_steps_what_is_judged_is_untrained() -> None:
-    result = run_cell(cell(steps=0, evaluations=2))
-    assert result.curve.steps == (0, 0)
-    assert result.online_regret is None
-    assert result.timing.steps_per_second == 0.0
+    untrained = run_cell(cell(steps=0, evaluations=2))
+    assert untrained.curve.steps == (0, 0)
+    assert untrained.online_regret is None
+    assert untrained.timing.steps_per_second == 0.0
 
 
 def test_seconds_add_up(td3: tuple[CellResult, Path]) -> None:
@@ -199,9 +194,6 @@ def test_a_learner_of_another_make_is_evaluated_when_it_is_due() -> None:
     assert 0.0 < (result.online_regret or 0.0) < 1.0
     # A constant action: its return no longer changes once the best try is found.
     assert result.report.regions[0].similarity > 0.6
-
-
-def test_a_learner_that_stops_early_is_refused() -> None:
     with pytest.raises(PolicyError, match="returned after 65 steps"):
         run_cell(cell("tests.studies.engine.test_cell:idle"))
 

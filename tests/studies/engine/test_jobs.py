@@ -112,7 +112,7 @@ def test_cells_of_one_shape_and_kind_of_reward_share_a_program_and_others_do_not
 
 
 @pytest.mark.parametrize(
-    ("seeds", "most", "lanes"), [(3, 10, 6), (5, 10, 10), (6, 10, 6), (13, 10, 9), (3, 4, 3)]
+    ("seeds", "most", "lanes"), [(5, 10, 10), (6, 10, 6), (13, 10, 9), (3, 4, 3)]
 )
 def test_the_programs_of_a_group_have_equally_many_lanes_at_most_the_limit(
     seeds: int, most: int, lanes: int
@@ -123,18 +123,15 @@ def test_the_programs_of_a_group_have_equally_many_lanes_at_most_the_limit(
 
 
 def test_elsewhere_than_on_a_cpu_few_shapes_cover_the_ablations() -> None:
-    settings = [
-        *({"state_dim": S} for S in (2, 4, 8, 16, 32, 64)),
-        *({"action_dim": A} for A in (1, 2, 4, 8, 16)),
-        *({"complexity": L} for L in (2, 5, 10, 50)),
-    ]
+    sizes = {"state_dim": (2, 16, 64), "action_dim": (1, 16), "complexity": (2, 50)}
+    settings = [{name: size} for name, own in sizes.items() for size in own]
     classes = [{"name": str(i), "setting": s, "seeds": [1]} for i, s in enumerate(settings)]
     file = plan_file(seeds=1, classes=classes)
     everywhere, gpu = Programs(cells(file)), Programs(cells(file), platform="gpu")
     assert (everywhere.one_at_a_time, gpu.one_at_a_time) == (False, True)
     shapes = {gpu.program(cell).shape for cell in cells(file)}
     assert shapes == {(8, 4, 1, 0), (64, 4, 1, 0), (8, 16, 1, 0), (8, 4, 50, 64)}
-    assert len({everywhere.program(cell).shape for cell in cells(file)}) == 14
+    assert len({everywhere.program(cell).shape for cell in cells(file)}) == 7
 
 
 def test_a_run_claims_the_cells_of_one_program_at_a_time_and_references_alone(

@@ -60,6 +60,8 @@ def test_a_result_is_read_back_as_it_was_and_ends_the_failure_before_it(
 
 def test_a_lock_is_had_once_until_it_is_released(tmp_path: Path) -> None:
     ledger, another = Ledger(tmp_path), Ledger(tmp_path)
+    assert not ledger.is_running(CELL.digest)
+    assert list(tmp_path.iterdir()) == []  # asking makes no file
     lock = ledger.lock(CELL.digest)
     assert lock is not None
     assert another.lock(CELL.digest) is None
@@ -104,11 +106,6 @@ def test_a_reader_who_may_not_write_sees_that_a_cell_runs() -> None:
         shutil.rmtree(folder)
 
 
-def test_asking_whether_a_cell_runs_makes_no_file(tmp_path: Path) -> None:
-    assert not Ledger(tmp_path).is_running(CELL.digest)
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize("damage", ["half", "other", "not JSON", "edited"])
 def test_a_file_that_is_no_result_of_its_cell_counts_as_absent_and_is_set_aside(
     damage: str, tmp_path: Path, result: CellResult
@@ -139,21 +136,18 @@ def test_a_file_that_is_no_result_of_its_cell_counts_as_absent_and_is_set_aside(
     assert "runs again" in line
 
 
-def test_a_good_result_is_not_set_aside(tmp_path: Path, result: CellResult) -> None:
-    ledger = Ledger(tmp_path)
-    ledger.write(result)
-    ledger.set_aside(CELL.digest)
-    assert ledger.result(CELL.digest) == result
-
-
-def test_what_a_killed_write_leaves_is_never_read(tmp_path: Path, result: CellResult) -> None:
-    ledger = Ledger(tmp_path)
+def test_a_good_result_is_not_set_aside_and_a_killed_write_leaves_nothing_to_read(
+    tmp_path: Path, result: CellResult
+) -> None:
+    ledger, path = Ledger(tmp_path), result_path(tmp_path, CELL)
     ledger.write_plan(FILE)
-    path = result_path(tmp_path, CELL)
     path.parent.mkdir()
     (path.parent / f".{path.name}.x1y2z3").write_text("{")
     assert ledger.results() == {}
     assert ledger.plan_file() == FILE
+    ledger.write(result)
+    ledger.set_aside(CELL.digest)
+    assert ledger.result(CELL.digest) == result
 
 
 def test_a_folder_of_other_files_is_no_study(tmp_path: Path) -> None:

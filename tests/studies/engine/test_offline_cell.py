@@ -7,14 +7,15 @@ import pytest
 from sme_registry.datasets import DatasetRecipe
 from sme_registry.datasets.collect import collect
 from sme_registry.errors import OptionError, SpecError, UnknownNameError
-from sme_registry.spec import Cell, EvaluationProtocol, SMESpec, StudyFile, StudyPlan
+from sme_registry.spec import Cell, EvaluationProtocol, SMESpec
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.checks import check_task
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.runner import run_study
 from sme_registry.task import materialize
+from tests.studies.cells import small_file
 
-PROTOCOL = EvaluationProtocol(states_per_region=200)
+PROTOCOL = EvaluationProtocol(states_per_region=50)
 
 
 def cell(uses: str = "offline:bc", spec: SMESpec | None = None, **hyperparameters: object) -> Cell:
@@ -70,14 +71,6 @@ def test_cells_have_limits_and_distractors_and_repeat_to_the_bit(uses: str) -> N
     assert done.report.observation is not None
 
 
-def test_agents_in_jax_accept_limits_and_refuse_teams_before_they_begin() -> None:
-    spec = SMESpec(state_dim=2, action_dim=1)
-    check_task(cell("jax:PPO", spec=spec.derive(safety={"tightness": 0.2})))
-    team = spec.derive(team={"agents": [{"name": "agent_0", "action_dim": 1}]})
-    with pytest.raises(SpecError, match="uses='jax:PPO': cannot learn a task for 1 agents"):
-        cell("jax:PPO", spec=team)
-
-
 def test_more_noise_makes_worse_data_and_other_cells() -> None:
     noisy, clean = run_cell(cell(nu=1.0)), run_cell(cell(nu=0.0))
     assert noisy.key != clean.key
@@ -87,7 +80,12 @@ def test_more_noise_makes_worse_data_and_other_cells() -> None:
     assert noisy.offline.behaviour_similarity < 0.97
 
 
-def test_bad_offline_cells_are_refused_in_words() -> None:
+def test_bad_cells_are_refused_in_words() -> None:
+    spec = SMESpec(state_dim=2, action_dim=1)
+    check_task(cell("jax:PPO", spec=spec.derive(safety={"tightness": 0.2})))
+    team = spec.derive(team={"agents": [{"name": "agent_0", "action_dim": 1}]})
+    with pytest.raises(SpecError, match="uses='jax:PPO': cannot learn a task for 1 agents"):
+        cell("jax:PPO", spec=team)
     with pytest.raises(UnknownNameError, match="offline:iql"):
         run_cell(cell("offline:iq"))
     with pytest.raises(OptionError, match="nu"):
@@ -99,27 +97,10 @@ def test_bad_offline_cells_are_refused_in_words() -> None:
 
 
 def test_a_study_runs_offline_cells_as_it_runs_others(tmp_path) -> None:
-    setting = {"state_dim": 2, "action_dim": 1}
-    plan = StudyPlan.from_dict(
-        {
-            "classes": [{"name": "tiny", "setting": setting, "seeds": [1]}],
-            "algorithms": [
-                {
-                    "name": "BC (0.5)",
-                    "uses": "offline:bc",
-                    "hyperparameters": {"nu": 0.5, "transitions": 500},
-                }
-            ],
-            "seeds": 1,
-            "steps": 20,
-            "evaluations": 1,
-            "evaluation_episodes": 1,
-            "protocol": PROTOCOL.to_dict(),
-        }
-    )
-    file = StudyFile(name="tiny", version=1, digest=plan.digest, plan=plan)
+    learner = {"name": "BC (0.5)", "uses": "offline:bc", "action_range": "unit",
+               "hyperparameters": {"nu": 0.5, "transitions": 500}}  # fmt: skip
+    file = small_file(seeds=1, algorithms=[learner], steps=20, evaluations=1)
     run_study(file, tmp_path / "study", executor="in-process")
-    ledger = Ledger(tmp_path / "study")
-    result = ledger.result(plan.cells[0].cell.digest)
+    result = Ledger(tmp_path / "study").result(file.plan.cells[0].cell.digest)
     assert result is not None
     assert result.offline is not None
