@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 import datetime
-import functools
 from typing import Any
 
 import pytest
 
-from leaderboard.documents.entry import (
-    Entry,
-    SignedEntry,
-    SignedTicketRequest,
-    TicketRequest,
-)
+from leaderboard.documents.entry import Entry, SignedEntry, SignedTicketRequest, TicketRequest
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.master import Master
 from leaderboard.documents.result import SealedResult, Stepping
@@ -42,9 +36,7 @@ def move_clock(monkeypatch: pytest.MonkeyPatch, time: str = AFTERWARDS) -> None:
         monkeypatch.setattr(f"leaderboard.store.{module}.now", lambda: time)
 
 
-@functools.cache
-def _open_times() -> tuple[str, str]:
-    return moment(-1), moment(1)
+OPENS, CLOSES = moment(-1), moment(1)  # the same in every document of a run
 
 
 def tiny_terms(track: str = "sealed-offline", instances: int = 2, **fields: Any) -> Terms:
@@ -56,15 +48,14 @@ def tiny_terms(track: str = "sealed-offline", instances: int = 2, **fields: Any)
         {"class_name": "deep", "instance": i, "data": NOTHING, "challenge": NOTHING}
         for i in range(instances)
     ]
-    opens, closes = _open_times()
     return Terms.from_dict(
         {
             "id": track,
             "title": "Tiny",
             "track": track,
             "classes": [member],
-            "opens": opens,
-            "closes": closes,
+            "opens": OPENS,
+            "closes": CLOSES,
             "protocol_name": "quick-v1",
             "protocol": EvaluationProtocol(states_per_region=50).to_dict(),
             "ticket_hours": 24 if online else None,

@@ -274,9 +274,7 @@ def test_a_replay_finds_scores_that_do_not_follow(store, key, season, published,
 
 
 @pytest.mark.parametrize("part", ["data", "challenge"])
-def test_a_replay_finds_what_was_published_and_does_not_follow(
-    store, tmp_path, season, published, later, part
-):
+def test_a_replay_finds_a_false_publication(store, tmp_path, season, published, later, part):
     fields, copy = season.terms.to_dict(), tmp_path / "copy"
     fields["published"][1][part] = fields["published"][0][part]
     shutil.copytree(published, copy)
@@ -344,9 +342,7 @@ def test_the_class_with_the_fewest_runs_decides_on_a_rank(tmp_path, key, later, 
 
 
 @pytest.mark.parametrize(("needed", "reason"), [(4, ""), (5, "too_few_runs")])
-def test_the_tickets_of_each_method_have_scores_and_a_rank_of_their_own(
-    tmp_path, key, needed, reason
-):
+def test_the_tickets_of_each_method_have_their_own_scores_and_rank(tmp_path, key, needed, reason):
     season = tiny_season("sealed-online")
     with tiny_board(tmp_path / "board", runs_to_rank=needed) as store:
         store.announce(season)

@@ -90,15 +90,20 @@ def test_a_season_is_played_from_the_command_line(later):
     assert "revealed" in good("season", "show", "board")
 
 
-def test_a_class_that_a_table_solves_is_warned_of():
+def test_a_class_that_a_table_solves_is_warned_of_and_a_false_plan_is_refused(tmp_path):
     fields = json.loads(Path(PLAN).read_text())
+    setting = fields["classes"][0]["setting"]
     for state_dim, warned in ((2, True), (8, False)):
-        fields["id"] = f"s{state_dim}"
-        fields["classes"][0]["setting"]["state_dim"] = state_dim
+        fields["id"], setting["state_dim"] = f"s{state_dim}", state_dim
         Path(PLAN).write_text(json.dumps(fields))
         made = board_command("season", "new", "board", PLAN)
         assert made.exit_code == 0
         assert ("Warning: classes.deep: a table of the nearest states" in made.stderr) == warned
+    fields["id"], setting["complexity"] = "shallow", 4
+    Path(PLAN).write_text(json.dumps(fields))
+    assert "complexity=4: must be at least 5" in fails(2, "season", "new", "board", PLAN)
+    assert not list(tmp_path.glob("*.shallow.master"))
+    assert "season_unknown" in fails(1, "season", "show", "board", "winter")
 
 
 def entered(*arguments: str | Path) -> list[np.ndarray | None]:
@@ -147,12 +152,3 @@ def test_an_entry_is_sent_to_a_served_board(season):
         assert "answer_shape" in fails(1, *bad)
     with Store.open("board", read_only=True) as store:
         assert [row.entrant.id for row in store.entrants(read_season(season).digest)] == [id]
-
-
-def test_faults_of_a_plan_are_named(tmp_path):
-    fields = json.loads(Path(PLAN).read_text())
-    fields["classes"][0]["setting"]["complexity"] = 4
-    Path("shallow.json").write_text(json.dumps(fields))
-    assert "complexity=4: must be at least 5" in fails(2, "season", "new", "board", "shallow.json")
-    assert not list(tmp_path.glob("*.master"))
-    assert "season_unknown" in fails(1, "season", "show", "board", "winter")

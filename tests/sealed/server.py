@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from leaderboard.documents.keys import SigningKey
-from leaderboard.scoring.sealed import Instance, challenge, instances
+from leaderboard.scoring.sealed import Instance, instances
 from leaderboard.sealed.attendant import Attendant
 from leaderboard.store import Store
 from sme_registry.envs import SMEVectorEnv
@@ -57,11 +57,6 @@ class Server:
         """What is hidden of an instance."""
         number = str(self.ticket.ticket)
         return list(instances(self.board.season, MASTER, number, f"{NONCE:064x}"))[instance]
-
-    def challenge(self, instance: int) -> np.ndarray:
-        """The challenge states of an instance."""
-        hidden = self.hidden(instance)
-        return challenge(hidden.spec, hidden.protocol)
 
     def seed(self, instance: int) -> int:
         """The seed of an instance's first lane."""

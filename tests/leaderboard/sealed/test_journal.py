@@ -87,9 +87,7 @@ def test_an_ended_journal_stays_ended_and_accepts_nothing(tmp_path):
 
 @pytest.mark.parametrize("written_before", [0, 1, RECORD - 1])
 @pytest.mark.parametrize("is_undone", [True, False])
-def test_a_full_disk_adds_nothing_and_the_journal_goes_on(
-    tmp_path, monkeypatch, written_before, is_undone
-):
+def test_a_full_disk_adds_nothing(tmp_path, monkeypatch, written_before, is_undone):
     """Also where what was written could not be removed: the next record replaces it."""
     path = tmp_path / "0"
     journal = Journal.create(path, LANES, A)

@@ -165,9 +165,7 @@ def reveal(board: Board, folder: SeasonFolder) -> tuple[Any, ...]:
         ({"tickets": 1}, 0, 2, "exceeds the 1 tickets of the season"),
     ],
 )
-def test_tickets_that_the_terms_forbid_are_found(
-    tmp_path, monkeypatch, key, fields, days, number, message
-):
+def test_forbidden_tickets_are_found(tmp_path, monkeypatch, key, fields, days, number, message):
     board = online_board(tmp_path, **fields)
     monkeypatch.setattr(Log, "_refuse_wrong_clock", lambda *_: None)
     with Store.open(board.path) as store:

@@ -188,6 +188,7 @@ def test_phases_follow_each_other(played):
     played.restart()
     assert not played.answer(HALF)
     refused("instance_phase", played.start)
+    refused("instance_phase", played.step, 1)
     refused("instance_phase", played.step, 2)
     played.finish()
 
@@ -366,22 +367,12 @@ def test_a_ticket_takes_nothing_while_it_is_scored_and_what_it_took_is_flushed(p
     process.join.assert_called_once()
 
 
-class Ended:
+def ended(code: int) -> Any:
     """A process that has ended."""
-
-    def __init__(self, exitcode: int) -> None:
-        self.exitcode = exitcode
-
-    def is_alive(self) -> bool:
-        return False
-
-    def close(self) -> None:
-        pass
+    return Mock(exitcode=code, is_alive=lambda: False)
 
 
-def test_tickets_that_could_not_be_scored_are_tried_again_after_a_pause_one_by_one(
-    played, monkeypatch
-):
+def test_tickets_that_could_not_be_scored_are_tried_again_one_by_one(played, monkeypatch):
     """The first process dies; then the journal of ticket 1 cannot be read for a while."""
     broken = played.folder / "0.journal"
     for number in (1, 2):
@@ -390,17 +381,17 @@ def test_tickets_that_could_not_be_scored_are_tried_again_after_a_pause_one_by_o
         played.start()
         played.step(1)
     started: list[list[int]] = []
-    codes: list[object] = []
+    codes: list[bool] = []
 
-    def start(attendant: Attendant) -> Ended:
+    def start(attendant: Attendant) -> Any:
         board = played.board
         started.append(attendant._numbers)
         if len(started) == 1:
-            return Ended(1)
+            return ended(1)
         with pytest.raises(SystemExit) as end:
             _score(board.path, board.season.digest, board.secret, attendant._numbers)
         codes.append(bool(end.value.code))
-        return Ended(int(codes[-1]))
+        return ended(int(codes[-1]))
 
     def attend(seconds: float) -> list[list[int]]:
         set_clocks(monkeypatch, 0, passed=25 + seconds / 3600)
@@ -482,9 +473,7 @@ def test_answers_that_do_not_reach_the_disk_are_sent_again(played, monkeypatch, 
     assert played.tickets.ticket(played.number).instance(0).answered
 
 
-def test_instances_used_long_ago_leave_memory_and_large_networks_take_more_of_it(
-    played, monkeypatch
-):
+def test_instances_used_long_ago_leave_memory_and_large_ones_take_more(played, monkeypatch):
     def ready() -> list[bool]:
         instances = played.tickets.ticket(played.number).instances
         return [each.is_ready for each in instances]
