@@ -22,7 +22,9 @@ from leaderboard.intake import upload_header
 from leaderboard.store import Store
 from leaderboard.web import limits, serve
 from leaderboard.web.connections import ConnectionLimits, Connections
+from leaderboard.web.downloads import PIECE
 from leaderboard.web.errors import RequestError
+from leaderboard.web.guard import Guard
 from leaderboard.web.limits import Turns, counted_address
 from sme_registry.errors import OptionError
 from sme_registry.io import sha256_of
@@ -289,6 +291,25 @@ def test_many_large_uploads_at_once_take_little_memory(tmp_path, key):
         assert stored == [size] * uploads
         assert store.uploaded_bytes(key.public, "2000-01-01T00:00:00Z") == uploads * size
         assert len(store.objects.read(digests[0])) == size  # which verifies its digest
+
+
+def test_answers_are_sent_in_pieces():
+    content = bytes(range(256)) * 2**10
+    sent = []
+
+    async def app(scope, receive, send):
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await send({"type": "http.response.body", "body": content})
+
+    async def send(message):
+        sent.append(message)
+
+    scope = {"type": "http", "method": "GET", "path": "/", "headers": [], "raw_path": b"/"}
+    asyncio.run(Guard(app)(scope, None, send))
+    pieces = sent[1:]
+    assert b"".join(piece["body"] for piece in pieces) == content
+    assert max(len(piece["body"]) for piece in pieces) == PIECE
+    assert [piece.get("more_body", False) for piece in pieces] == [True] * 3 + [False]
 
 
 def test_a_client_reads_why_its_body_is_refused_while_it_still_sends(path):
