@@ -81,11 +81,7 @@ def tiny_submission(
 ) -> tuple[SignedSubmission, dict[str, bytes]]:
     """A signed submission, valid on a tiny board, and its artefacts by their digests.
 
-    Args:
-      store: the board's.
-      key: the submitter's.
-      number: another number is another policy.
-      fields: of the submission, instead of those here.
+    Another number is another policy.
     """
     data = linear_onnx(number)
     digest = sha256_of(data)

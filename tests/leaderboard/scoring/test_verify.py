@@ -278,7 +278,7 @@ def test_an_altered_artefact_is_named(board):
         ("UPDATE object SET size = 1", "object"),
         ("INSERT INTO object VALUES ('sha256:0', 1, '', '')", "inserted"),
         ("UPDATE head SET time = '2001-01-01T00:00:00Z'", "head"),
-        ("UPDATE head SET sequence = 3", "head"),
+        ("UPDATE head SET sequence = 4", "head"),
         ("INSERT INTO lease VALUES ('x', 'y', 1, 0, 0, '', '', 0.0, 0.0)", None),
     ],
 )
