@@ -19,6 +19,7 @@ import pytest
 
 import sme_registry
 from sme_registry.datasets import list_datasets, make_dataset, open_dataset, replay, storage
+from sme_registry.datasets.collect import collect
 from sme_registry.errors import (
     DigestMismatchError,
     MalformedDocumentError,
@@ -85,32 +86,25 @@ def edited(folder, change):
 
 
 class TestReading:
-    def test_transitions_are_read_bit_for_bit(self, root):
-        from sme_registry.datasets.collect import collect
-
-        dataset = open_dataset(NAME, root)
+    @pytest.mark.parametrize("kind", ["plain", "limited and distracted"])
+    def test_transitions_are_read_bit_for_bit(self, kind, root, tmp_path):
+        spec = {
+            "safety": {"tightness": 0.2},
+            "observation": {"distractors": 3, "mixing": "nonlinear", "mixing_depth": 1},
+        }
+        dataset = (
+            open_dataset(NAME, root)
+            if kind == "plain"
+            else make_dataset(spec, 0.5, transitions=150, folder=tmp_path)
+        )
         task = materialize(dataset.recipe.spec)
         read, generated = dataset.transitions(), collect(dataset.recipe, task)
         for name, array in generated.columns().items():
             np.testing.assert_array_equal(getattr(read, name), array, strict=True)
         assert read.digest == dataset.record.arrays_digest
         replay(read, dataset.recipe, task)
-
-    def test_costs_and_distractors_are_read_bit_for_bit_and_minari_has_them(self, tmp_path):
-        from sme_registry.datasets.collect import collect
-
-        spec = {
-            "safety": {"tightness": 0.2},
-            "observation": {"distractors": 3, "mixing": "nonlinear", "mixing_depth": 1},
-        }
-        dataset = make_dataset(spec, 0.5, transitions=150, folder=tmp_path)
-        task = materialize(dataset.recipe.spec)
-        read, generated = dataset.transitions(), collect(dataset.recipe, task)
-        assert {"costs", "limits", "distractors"} <= set(generated.columns())
-        for name, array in generated.columns().items():
-            np.testing.assert_array_equal(getattr(read, name), array, strict=True)
-        replay(read, dataset.recipe, task)
-
+        if kind == "plain":
+            return
         loaded = dataset.minari()
         assert loaded.observation_space.shape == (13,)
         episode = loaded[0]
@@ -119,6 +113,7 @@ class TestReading:
         np.testing.assert_array_equal(episode.infos["distractors"][1:], read.next_distractors[:100])
         np.testing.assert_array_equal(episode.truncations, read.timeouts[:100])
         env = loaded.recover_environment()
+        assert env.unwrapped.sme_spec == dataset.recipe.spec
         env.reset(options={name: episode.infos[name][0] for name in ("state", "distractors")})
         _, _, _, _, info = env.step(episode.actions[0])
         assert info["cost"] == read.costs[0]
@@ -280,11 +275,18 @@ class TestNames:
 
 
 class TestAnExistingSet:
-    def test_is_refused_and_left_as_it_is(self, copied):
+    def test_is_refused_and_left_as_it_is_without_force(self, copied):
         before = (copied / NAME / "data" / "main_data.hdf5").read_bytes()
         with pytest.raises(NameTakenError, match=r"already exists, with another .*--name"):
             make_dataset("Default", 0.1, transitions=10, name=NAME, folder=copied)
+        edited(copied, lambda data: data["sme"].update(recipe_digest="sha256:" + "0" * 64))
+        with pytest.raises(NameTakenError, match=r"already exists\. Give another --name"):
+            make_dataset("Default", transitions=10, name=NAME, folder=copied)  # cannot be opened
         assert (copied / NAME / "data" / "main_data.hdf5").read_bytes() == before
+        make_dataset("Default", 0.1, transitions=10, name=NAME, folder=copied, force=True)
+        assert open_dataset(NAME, copied).recipe.transitions == 10
+        folders = [child.name for child in (copied / "sme").iterdir() if child.is_dir()]
+        assert folders == ["tests-v0"]
 
     def test_of_a_function_is_compared_by_its_name(self, tmp_path):
         def act(observations):
@@ -293,18 +295,6 @@ class TestAnExistingSet:
         for words in ("", "with the same recipe \\(a policy without a file"):
             with pytest.raises(NameTakenError, match=words) if words else nullcontext():
                 make_dataset("Default", mix=[(act, 1.0)], transitions=10, folder=tmp_path)
-
-    def test_that_cannot_be_opened_is_refused_without_a_comparison(self, copied):
-        edited(copied, lambda data: data["sme"].update(recipe_digest="sha256:" + "0" * 64))
-        with pytest.raises(NameTakenError, match=r"already exists\. Give another --name"):
-            make_dataset("Default", transitions=10, name=NAME, folder=copied)
-
-    def test_is_replaced_with_force(self, copied):
-        make_dataset("Default", 0.1, transitions=10, name=NAME, folder=copied, force=True)
-        assert open_dataset(NAME, copied).recipe.transitions == 10
-        assert [child.name for child in (copied / "sme").iterdir() if child.is_dir()] == [
-            "tests-v0"
-        ]
 
     @pytest.mark.parametrize("foreign", ["empty", "minari's", "a file"])
     def test_of_another_package_is_never_replaced(self, foreign, tmp_path):
@@ -404,16 +394,23 @@ class TestAChangedSet:
         with pytest.raises(DigestMismatchError, match="total_steps=350: must be 250"):
             open_dataset(NAME, copied)
 
-    def test_with_a_changed_spec_is_rejected(self, copied):
+    def test_with_a_wrong_digest_or_a_changed_spec_is_rejected(self, copied):
+        path = copied / NAME / "data" / "metadata.json"
+        whole = path.read_text()
+        for field in ("spec_digest", "recipe_digest", "protocol_digest"):
+            path.write_text(whole)
+            edited(copied, lambda data, f=field: data["sme"].update({f: "sha256:" + "0" * 64}))
+            with pytest.raises(DigestMismatchError, match=field):
+                open_dataset(NAME, copied)
+        path.write_text(whole)
         edited(copied, lambda data: data["sme"]["recipe"]["spec"].update(complexity=10))
         with pytest.raises(DigestMismatchError, match="recipe_digest"):
             open_dataset(NAME, copied)
-
-    @pytest.mark.parametrize("field", ["spec_digest", "recipe_digest", "protocol_digest"])
-    def test_with_a_wrong_digest_is_rejected(self, field, copied):
-        edited(copied, lambda data: data["sme"].update({field: "sha256:" + "0" * 64}))
-        with pytest.raises(DigestMismatchError, match=field):
+        path.write_text(whole)
+        edited(copied, lambda data: data.pop("sme"))
+        with pytest.raises(MalformedDocumentError, match="Minari can open it"):
             open_dataset(NAME, copied)
+        assert list_datasets(copied) == ([], {})
 
     @pytest.mark.parametrize(("version", "age"), [(0, "an older"), (2, "a newer")])
     def test_of_another_schema_is_rejected_and_not_modified(self, version, age, copied):
@@ -426,42 +423,31 @@ class TestAChangedSet:
         assert list(broken) == [copied / NAME]
         assert sorted((path, path.stat().st_mtime_ns) for path in copied.rglob("*")) == before
 
-    @pytest.mark.parametrize(
-        "change",
-        [
+    def test_with_an_invalid_record_is_rejected(self, copied):
+        path = copied / NAME / "data" / "metadata.json"
+        whole = path.read_text()
+        for change in (
             lambda record: record.clear(),
             lambda record: record.pop("scores"),
             lambda record: record.update(unknown=1),
             lambda record: record.update(trajectories="4"),
             lambda record: record["recipe"]["behaviours"][0].update(nu=2.0),
-        ],
-    )
-    def test_with_an_invalid_record_is_rejected(self, change, copied):
-        edited(copied, lambda data: change(data["sme"]))
-        with pytest.raises(SMEError, match="sme"):
-            open_dataset(NAME, copied)
+        ):
+            path.write_text(whole)
+            edited(copied, lambda data, change=change: change(data["sme"]))
+            with pytest.raises(SMEError, match="sme"):
+                open_dataset(NAME, copied)
 
-    @pytest.mark.parametrize("content", [b"", b"\x89HDF\r\n\x1a\n", b"no HDF5 at all" * 100])
-    def test_with_data_that_is_not_hdf5_cannot_be_read(self, content, copied):
-        (copied / NAME / "data" / "main_data.hdf5").write_bytes(content)
-        with pytest.raises(MalformedDocumentError, match="cannot be read"):
-            open_dataset(NAME, copied).transitions()
-
-    def test_with_truncated_or_missing_data_cannot_be_read(self, copied):
+    def test_with_data_that_is_not_hdf5_or_not_whole_cannot_be_read(self, copied):
         path = copied / NAME / "data" / "main_data.hdf5"
+        whole = path.read_bytes()
         with h5py.File(path, "r+") as file:
             del file["episode_2/infos/regret"]
-        with pytest.raises(MalformedDocumentError, match="cannot be read"):
-            open_dataset(NAME, copied).transitions()
-        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-        with pytest.raises(MalformedDocumentError, match="cannot be read"):
-            open_dataset(NAME, copied).transitions()
-
-    def test_not_written_by_this_package_is_not_listed(self, copied):
-        edited(copied, lambda data: data.pop("sme"))
-        with pytest.raises(MalformedDocumentError, match="Minari can open it"):
-            open_dataset(NAME, copied)
-        assert list_datasets(copied) == ([], {})
+        contents = (b"", b"\x89HDF\r\n\x1a\n", b"no HDF5 at all" * 100, whole[: len(whole) // 2])
+        for content in (path.read_bytes(), *contents):
+            path.write_bytes(content)
+            with pytest.raises(MalformedDocumentError, match="cannot be read"):
+                open_dataset(NAME, copied).transitions()
 
 
 class TestAMisplacedSet:

@@ -69,42 +69,34 @@ class Agent:
 
 def made(name: str) -> tuple[Any, str]:
     torch.manual_seed(3)
-    gaussian, agent, squashed = Gaussian(), Agent(), Squashed()
-    return {
+    gaussian, agent, net = Gaussian(), Agent(), nn.Linear(5, 12)
+    policies: dict[str, tuple[Any, str]] = {
         "sequential": (nn.Sequential(nn.Linear(5, 8), nn.Tanh(), nn.Linear(8, 2)), "symmetric"),
-        "squashed": (squashed, "symmetric"),
         "residual": (Residual(), "unit"),
         "double": (Squashed().double(), "symmetric"),
         "batch norm": (nn.Sequential(nn.Linear(5, 8), nn.BatchNorm1d(8), nn.Linear(8, 2)), "unit"),
-        "lambda": (lambda x: gaussian(x).mean, "unit"),
         "method": (gaussian.act, "unit"),
-        "agent's method": (agent.act, "symmetric"),
         "lambda of an agent": (lambda x: agent.act(x)[:, :2], "symmetric"),
         "no parameters": (lambda x: x[:, :2], "unit"),
-        **{f"sizes {i}": (function, "unit") for i, function in enumerate(sizes(nn.Linear(5, 12)))},
-    }[name]
-
-
-def sizes(net: Any) -> list[Any]:
-    """Networks that PyTorch writes with shape arithmetic, although only the batch size varies."""
-    return [
-        lambda x: net(x).chunk(6, -1)[0],
-        lambda x: net(x).view(x.shape[0], -1)[:, :2],
-        lambda x: net(x).reshape(x.size(0), 3, -1).mean(1)[:, :2],
-        lambda x: net(x).view(x.shape[0], 2, -1)[:, 0, :1] + x.view(x.shape[0], -1)[:, :2],
-        lambda x: net(x).unflatten(1, (3, 4)).flatten(1)[:, :2],
-        lambda x: net(x)[:, : x.shape[-1] // 2],
-        lambda x: net(x)[:, :2] + torch.ones(x.shape[0], 2) * 0.1,
-        lambda x: torch.where(x > 0.5, x, torch.zeros_like(x))[:, :2],
-        lambda x: ((x - x.mean(1, keepdim=True)) / x.std(1, keepdim=True))[:, :2],
-        lambda x: x[:, :2] * torch.arange(x.shape[1])[1:3],
-    ]
+        # Networks that PyTorch writes with shape arithmetic, although only the batch size varies.
+        "chunk": (lambda x: net(x).chunk(6, -1)[0], "unit"),
+        "view": (lambda x: net(x).view(x.shape[0], -1)[:, :2], "unit"),
+        "reshape": (lambda x: net(x).reshape(x.size(0), 3, -1).mean(1)[:, :2], "unit"),
+        "unflatten": (lambda x: net(x).unflatten(1, (3, 4)).flatten(1)[:, :2], "unit"),
+        "ones": (lambda x: net(x)[:, :2] + torch.ones(x.shape[0], 2) * 0.1, "unit"),
+        "where": (lambda x: torch.where(x > 0.5, x, torch.zeros_like(x))[:, :2], "unit"),
+        "moments": (
+            lambda x: ((x - x.mean(1, keepdim=True)) / x.std(1, keepdim=True))[:, :2],
+            "unit",
+        ),
+        "arange": (lambda x: x[:, :2] * torch.arange(x.shape[1])[1:3], "unit"),
+    }
+    return policies[name]
 
 
 NAMES = (
-    "sequential", "squashed", "residual", "double", "batch norm", "lambda", "method",
-    "agent's method", "lambda of an agent", "no parameters",
-    *(f"sizes {i}" for i in range(10)),
+    "sequential", "residual", "double", "batch norm", "method", "lambda of an agent",
+    "no parameters", "chunk", "view", "reshape", "unflatten", "ones", "where", "moments", "arange",
 )  # fmt: skip
 
 

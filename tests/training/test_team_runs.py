@@ -105,8 +105,9 @@ def test_training_lowers_the_regret_of_each_agent(tmp_path: Path) -> None:
         {"state_dim": 1, "action_dim": 2, "horizon": 25, "seed": 2,
          "team": {"agents": [{"action_dim": 1}, {"action_dim": 1}]}}
     )  # fmt: skip
+    settings = {"policy_kwargs": {"net_arch": [64, 64]}, "learning_rate": 0.003}
     result = train(spec, algorithm="TD3", steps=225, folder=tmp_path / "run", protocol=PROTOCOL,
-                   progress=False)  # fmt: skip
+                   hyperparameters=settings, progress=False)  # fmt: skip
     assert result.record.num_envs == 1
     regrets = np.array([episode.agents_regret for episode in result.episodes])
     assert (regrets[-2:].mean(axis=0) < 0.7 * regrets[:2].mean(axis=0)).all()
