@@ -118,7 +118,7 @@ def step_through_kills(board: Board, tickets: int, requests: int, kills: int) ->
         entrants = [
             Entrant(board.ticket(url, SigningKey.generate(), number)) for number in range(tickets)
         ]
-        together = threading.Barrier(tickets, timeout=120)
+        together = threading.Barrier(tickets, timeout=600)
         threads = [
             threading.Thread(target=each.play, args=(url, requests, together), daemon=True)
             for each in entrants
