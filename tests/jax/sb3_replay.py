@@ -110,7 +110,6 @@ def _one_update(
 
 
 def _weights(model: Any) -> dict[str, np.ndarray]:
-    """All weights by the names of the policy's state_dict, and log α of SAC."""
     weights = {name: w.numpy().copy() for name, w in model.policy.state_dict().items()}
     if hasattr(model, "log_ent_coef"):
         weights["log_ent_coef"] = model.log_ent_coef.detach().numpy().copy()

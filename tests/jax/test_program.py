@@ -16,7 +16,7 @@ from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import available_memory
 from sme_registry.jax.networks import HostWeights, Weights, initial_linear, linear
-from sme_registry.jax.program import Program, StepLog, policy
+from sme_registry.jax.program import Program, StepLog
 from sme_registry.task import materialize
 
 BASE = SMESpec(state_dim=3, action_dim=2, horizon=30, seed=1)
@@ -139,16 +139,6 @@ def test_only_lanes_with_weights_that_are_not_finite_have_failed() -> None:
     actor = broken.state.weights["actor.weight"].at[2, 0, 0].set(jnp.nan)
     broken.state = broken.state._replace(weights={**broken.state.weights, "actor.weight": actor})
     assert broken.failed().tolist() == [False, False, True, False]
-
-
-def test_the_policy_of_a_lane_has_no_padding() -> None:
-    program = Linear((), SEPARABLE, (0, 1, 2), steps=1)
-    observations = np.linspace(0.0, 1.0, 8, dtype=np.float32).reshape(2, 4)
-    weights = program.weights(2)  # 2 state channels of 3, 3 action channels
-    actions = policy(Linear, (), weights, symmetric=True)(observations)
-    expected = observations @ weights["actor.weight"].T + weights["actor.bias"]
-    np.testing.assert_allclose(actions, expected, atol=1 / 64 + 1e-6)
-    assert actions.shape == (2, 3)
 
 
 def test_too_many_lanes_for_the_memory_are_refused_with_the_number_that_fits() -> None:

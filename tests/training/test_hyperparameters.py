@@ -51,7 +51,6 @@ def test_a_file_holds_an_object(tmp_path: Path) -> None:
     [
         ("PPO", {"n_stepz": 64}, r"hyperparameters\.n_stepz: PPO has .*Did you mean 'n_steps'"),
         ("td3", {"policy_kwargs": {"net_arhc": [8]}}, r"policy_kwargs\.net_arhc: .*'net_arch'"),
-        ("PPO", {"_init_setup_model": False}, "has no such hyperparameter"),
         ("PPO", {"tensorboard_log": "logs"}, "has no such hyperparameter"),
         ("sb3_contrib:TQC", {"top_quantiles": 1}, "top_quantiles_to_drop_per_net"),
     ],
