@@ -132,9 +132,6 @@ def test_other_algorithms_are_rejected(
 ) -> None:
     with pytest.raises(OptionError, match=message):
         independent(tmp_path / "run", **changes)
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_single_agent_has_no_independent_learners(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="single agent"):
         train(TINY, independent=True, folder=tmp_path / "run")
+    assert not (tmp_path / "run").exists()

@@ -41,14 +41,7 @@ def test_a_run_writes_all_files_into_its_folder(run: TrainingResult) -> None:
         assert "policy.pth" in archive.namelist()
 
 
-def test_tensorboard_has_the_mean_regret_of_the_episodes(run: TrainingResult) -> None:
-    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    events = accumulator.EventAccumulator(str(run.folder / "tensorboard")).Reload()
-    (first, *_) = events.Scalars("rollout/regret")  # SB3 writes after every fourth episode
-    assert first.value == pytest.approx(np.mean([e.regret for e in run.episodes[:4]]), abs=1e-6)
-
-
-def test_the_record_describes_the_run(run: TrainingResult) -> None:
+def test_the_record_and_the_report_describe_the_run(run: TrainingResult) -> None:
     record = RunRecord.read(run.folder)
     assert record == run.record
     assert record is not None
@@ -57,6 +50,15 @@ def test_the_record_describes_the_run(run: TrainingResult) -> None:
     assert record.spec_digest == TINY.digest
     assert {"torch", "stable_baselines3", "numpy", "python"} <= record.versions.keys()
     assert record.steps_per_second == pytest.approx(150 / record.wall_seconds, rel=0.01)
+    older = {**record.to_dict(), "hyperparameters": "stable-baselines3 defaults, but n_steps=8"}
+    assert RunRecord.from_dict(older, "run.json").hyperparameters == {"n_steps": 8}
+    report = EvaluationReport.read(run.folder / "evaluation.json")
+    assert report == run.report
+    assert evaluate(run.model_path, TINY, PROTOCOL, name="TD3").regions == report.regions
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    events = accumulator.EventAccumulator(str(run.folder / "tensorboard")).Reload()
+    (first, *_) = events.Scalars("rollout/regret")  # SB3 writes after every fourth episode
+    assert first.value == pytest.approx(np.mean([e.regret for e in run.episodes[:4]]), abs=1e-6)
 
 
 def test_logged_episodes_are_complete_and_their_regret_is_exact(run: TrainingResult) -> None:
@@ -72,13 +74,6 @@ def test_logged_episodes_are_complete_and_their_regret_is_exact(run: TrainingRes
     assert read_episodes(run.folder / "episodes.csv") == [
         Episode(*(pytest.approx(value) for value in episode)) for episode in run.episodes
     ]
-
-
-def test_the_final_model_is_the_one_evaluated(run: TrainingResult) -> None:
-    report = EvaluationReport.read(run.folder / "evaluation.json")
-    assert report == run.report
-    again = evaluate(run.model_path, TINY, PROTOCOL, name="TD3")
-    assert again.regions == report.regions
 
 
 def test_the_same_seed_trains_the_same_model_and_another_one_does_not(
@@ -102,9 +97,10 @@ def test_a_run_with_limits_and_distractors_is_repeated_and_reports_both(tmp_path
 
 
 def test_training_lowers_regret(tmp_path: Path) -> None:
-    # One second of TD3 on a task of one channel; the first 100 steps act at random.
+    # TD3 on a task of one channel; the first 100 steps act at random.
     spec = SMESpec(state_dim=1, action_dim=1, horizon=25, seed=1)
-    result = train(spec, steps=350, folder=tmp_path / "run", protocol=PROTOCOL, progress=False)
+    settings = {"policy_kwargs": {"net_arch": [64, 64]}, "learning_rate": 0.003}
+    result = train(spec, steps=350, folder=tmp_path, protocol=PROTOCOL, hyperparameters=settings)
     regrets = [episode.regret for episode in result.episodes]
     assert np.mean(regrets[-4:]) < 0.7 * np.mean(regrets[:4])
     reference = result.report.references["constant_half"][0]
@@ -216,11 +212,6 @@ def test_a_function_that_returns_a_model_of_sb3_is_trained(tmp_path: Path) -> No
     assert not (tmp_path / "other").exists()
 
 
-def test_records_of_older_versions_are_read(run: TrainingResult) -> None:
-    plain = {**run.record.to_dict(), "hyperparameters": "stable-baselines3 defaults, but n_steps=8"}
-    assert RunRecord.from_dict(plain, "run.json").hyperparameters == {"n_steps": 8}
-
-
 def test_a_finished_run_is_replaced_only_with_force(run: TrainingResult, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     copy_files(run.folder, folder)
@@ -233,7 +224,7 @@ def test_a_finished_run_is_replaced_only_with_force(run: TrainingResult, tmp_pat
 
 
 def test_a_folder_in_which_another_process_trains_is_refused(
-    run: TrainingResult, tmp_path: Path
+    run: TrainingResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "run"
     copy_files(run.folder, folder)
@@ -245,16 +236,12 @@ def test_a_folder_in_which_another_process_trains_is_refused(
                 short(folder, **change)
     assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == before
     assert short(folder, resume=True).record.sessions == 2
-
-
-def test_two_processes_that_begin_at_once_do_not_mix(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    # Two that begin at once do not mix.
     monkeypatch.setattr("sme_registry.training.run.is_locked", lambda path: False)
-    with file_lock(tmp_path / "run" / ".lock"):  # type: ignore[union-attr]
+    with file_lock(tmp_path / "new" / ".lock"):  # type: ignore[union-attr]
         with pytest.raises(OptionError, match="another process is training in this folder"):
-            short(tmp_path / "run")
-        assert [path.name for path in (tmp_path / "run").iterdir()] == [".lock"]
+            short(tmp_path / "new")
+        assert [path.name for path in (tmp_path / "new").iterdir()] == [".lock"]
 
 
 def test_a_folder_with_other_files_is_never_touched(tmp_path: Path) -> None:
