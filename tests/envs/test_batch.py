@@ -171,7 +171,7 @@ def test_the_state_that_is_handed_out_is_a_copy() -> None:
     for lanes, state_dim in ((1, 8), (5, 1), (1, 1), (5, 8)):
         batch = Batch(materialize(SMESpec(state_dim=state_dim)), lanes)
         batch.begin(np.arange(lanes), batch.observe())
-        before = batch.state
+        before = batch.state.copy()
         batch.state[:] = -7.0
         np.testing.assert_array_equal(batch.state, before)
 
