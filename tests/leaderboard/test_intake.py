@@ -237,14 +237,12 @@ def test_what_strangers_can_send_again_counts_for_nobody_and_a_refusal_for_good_
 
 def test_no_more_refusals_are_kept_than_stated(store, key):
     refusals, now = intake.Refusals(kept=3), datetime.datetime.now(datetime.UTC)
-    for number in range(5):
-        signed, _ = tiny_submission(store, key, number)
-        refusals.add(envelope(signed), Rejection("schema", f"number {number}."), now)
+    submissions = [tiny_submission(store, key, number)[0] for number in range(5)]
+    for signed in submissions:
+        refusals.add(envelope(signed), Rejection("schema", "a fault."), now)
     assert len(refusals.times(key.public, now)) == 3
-    first, _ = tiny_submission(store, key, 0)
-    refusals.repeat(first.id)
-    last, _ = tiny_submission(store, key, 4)
-    assert code_of(lambda: refusals.repeat(last.id)) == "schema"
+    refusals.repeat(submissions[0].id)
+    assert code_of(lambda: refusals.repeat(submissions[-1].id)) == "schema"
 
 
 def test_an_artefact_is_inspected_once_for_its_widths(store, key, monkeypatch):
