@@ -34,7 +34,7 @@ serve: $(INSTALLED)    ## serve a leaderboard on this machine: pages and submiss
 	$(VENV)/bin/sme-leaderboard serve $(BOARD)
 
 test: $(INSTALLED)     ## run the whole test suite, as CI does
-	$(PY) -m pytest -n auto
+	$(PY) -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 check: $(INSTALLED)    ## check style, formatting, types and import contracts
 	$(VENV)/bin/ruff check .

@@ -1,5 +1,6 @@
 """Shared by every test: the same examples, threads and signals on every run and machine."""
 
+import ctypes
 import gc
 import os
 import signal
@@ -23,11 +24,25 @@ os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # read when ONNX Runtime is
 os.environ.setdefault(
     "SME_JAX_CACHE", str(Path(tempfile.gettempdir()) / f"sme-jax-cache-{os.getuid()}")
 )
+# JAX keeps only what took a second to compile; here the workers share all of it.
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
+# The files that take longest, longest first: no worker is left with one at the end.
+LONG = (
+    "tests/leaderboard/web/test_browser.py",
+    "tests/jax/test_off_policy.py",
+)
 
 settings.register_profile(
     "deterministic", derandomize=True, deadline=None, database=None, max_examples=50
 )
 settings.load_profile("deterministic")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give the long files to workers first."""
+    rank = {name: place for place, name in enumerate(LONG)}
+    items.sort(key=lambda item: rank.get(item.nodeid.partition("::")[0], len(rank)))
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -37,6 +52,8 @@ def _forgets_compiled_programs() -> Iterator[None]:
     if jax := sys.modules.get("jax"):
         jax.clear_caches()
         gc.collect()
+        if sys.platform == "linux":
+            ctypes.CDLL(None).malloc_trim(0)  # glibc keeps a third of what was freed
 
 
 @pytest.fixture(scope="session")
