@@ -22,7 +22,9 @@ from leaderboard.web.serve import listen, server_config, url_of
 
 _SERVE = """
 import sys
+from leaderboard.web import connections
 from leaderboard.web.serve import serve
+connections._ENDING_SECONDS = 0.2  # far from uvicorn's own five, on a machine under load too
 serve(sys.argv[1], port=0, workers=int(sys.argv[2]), announce=lambda url: print(url, flush=True))
 """
 

@@ -240,11 +240,13 @@ def test_slow_readers_take_little_memory_and_do_not_disturb_the_end_of_the_serve
             assert each.recv(12, socket.MSG_WAITALL) == b"HTTP/1.1 200"
         assert httpx.get(url, timeout=PATIENCE).status_code == 200
         assert kibibytes(process.pid, "VmRSS") - before < len(readers) * 2**9
+        for each in readers[1:]:
+            each.close()
         body = connect(url, BODY + b" ")
         process.terminate()
         _, err = process.communicate(timeout=PATIENCE)
-        for each in (*readers, body):
-            each.close()
+        readers[0].close()
+        body.close()
     assert (process.returncode, err) == (0, "")
 
 
