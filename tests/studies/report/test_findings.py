@@ -12,8 +12,7 @@ from typing import Any, get_args
 
 import pytest
 
-from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.report.analysis import Analysis, analyse
+from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.findings import (
     AlgorithmFinding,
     Contrast,
@@ -22,34 +21,18 @@ from sme_registry.studies.report.findings import (
     Rival,
     findings,
 )
-from sme_registry.studies.report.offline_findings import (
-    Behaviour,
-    Depth,
-    Learner,
-    OfflineFindings,
-    Place,
-)
 from sme_registry.studies.report.tables import ENOUGH_RUNS, contrast_verdict
+from tests.studies.finished import analysed
 
 pytest.importorskip("matplotlib")
 
 from sme_registry.studies.report.page import page
 
+CHANGE = Contrast(
+    class_name="c", axis="k", setting="k = 25", base=0.1, level=0.9, change=0.8, low=0.7,
+    high=0.9, pairs=5, enough_pairs=True, verdict="worse",
+)  # fmt: skip
 SINGLE = {"low": math.nan, "high": math.nan, "pairs": 1}
-
-
-@pytest.fixture(scope="module")
-def analysis(finished: Path) -> Analysis:
-    return without(finished, lambda planned: False)
-
-
-def without(finished: Path, leave_out: Any) -> Analysis:
-    ledger = Ledger(finished)
-    file = ledger.plan_file()
-    assert file is not None
-    gone = {planned.cell.digest for planned in file.plan.cells if leave_out(planned)}
-    results = {key: result for key, result in ledger.results().items() if key not in gone}
-    return analyse(file, results, draws=300)
 
 
 def contrasted(analysis: Analysis, *changes: tuple[str, str, dict[str, Any]]) -> Analysis:
@@ -87,13 +70,11 @@ def test_findings_name_the_property_that_each_learner_was_built_to_fail_at(analy
 
 
 def test_larger_changes_that_are_open_are_listed_next_to_the_worst(analysis: Analysis):
-    alpha = of_alpha(
-        contrasted(
-            analysis,
-            ("complexity-10", "wd_regret", {"change": 1.06, **SINGLE}),
-            ("complexity-10", "ood_regret", {"change": 1.01, **SINGLE}),
-        )
+    changes = (
+        ("complexity-10", "wd_regret", {"change": 1.06, **SINGLE}),
+        ("complexity-10", "ood_regret", {"change": 1.01, **SINGLE}),
     )
+    alpha = of_alpha(contrasted(analysis, *changes))
     assert (alpha.verdict, worst_class(alpha)) == ("broken", "r_min-0_5")
     assert classes(alpha.larger) == ["complexity-10"]
     assert (alpha.larger[0].change, alpha.larger[0].low) == (1.06, None)
@@ -103,26 +84,20 @@ def test_larger_changes_that_are_open_are_listed_next_to_the_worst(analysis: Ana
     assert outside is not None
     assert worst_class(outside) == "r_min-0_5"
     assert [contrast.change for contrast in outside.larger] == [1.01]
+    # Nothing is certainly the worst next to a change without an interval, however small.
+    small = ("complexity-10", "wd_regret", {"change": 0.01, **SINGLE})
+    alpha = of_alpha(contrasted(analysis, small))
+    assert (alpha.certainty, classes(alpha.rivals)) == ("rivals", ["complexity-10"])
 
 
 def test_an_axis_with_one_change_for_the_worse_still_lists_an_open_one(analysis: Analysis):
-    alpha = of_alpha(
-        contrasted(
-            analysis,
-            ("k-25", "wd_regret", {"change": 0.05, "low": 0.02, "high": 0.08}),
-            ("complexity-10", "wd_regret", {"axis": "k", "change": 0.1, **SINGLE}),
-        )
+    changes = (
+        ("k-25", "wd_regret", {"change": 0.05, "low": 0.02, "high": 0.08}),
+        ("complexity-10", "wd_regret", {"axis": "k", "change": 0.1, **SINGLE}),
     )
+    alpha = of_alpha(contrasted(analysis, *changes))
     (contrast,) = (contrast for contrast in alpha.open if contrast.axis == "k")
     assert (contrast.class_name, contrast.change, contrast.pairs) == ("complexity-10", 0.1, 1)
-
-
-def test_nothing_is_certainly_the_worst_next_to_a_change_without_an_interval(analysis: Analysis):
-    alpha = of_alpha(
-        contrasted(analysis, ("complexity-10", "wd_regret", {"change": 0.01, **SINGLE}))
-    )
-    assert alpha.certainty == "rivals"
-    assert classes(alpha.rivals) == ["complexity-10"]
 
 
 @pytest.mark.parametrize(
@@ -151,14 +126,14 @@ def test_few_pairs_make_an_indication_and_a_caveat(analysis: Analysis):
 
 def test_a_slight_change_is_not_called_broken(finished: Path):
     """Without r_min, nothing that is left makes more than a slight difference to Alpha."""
-    cut = without(finished, lambda p: p.class_name in ("r_min-0_5",) and p.algorithm == "Alpha")
+    cut = analysed(finished, lambda p: (p.class_name, p.algorithm) == ("r_min-0_5", "Alpha"))
     alpha = of_alpha(cut)
     assert alpha.verdict in ("slightly_hurt", "none_shown") or alpha.certainty == "rivals"
     assert alpha.verdict != "broken"
 
 
 def test_single_runs_show_nothing(finished: Path):
-    cut = without(finished, lambda p: p.run > 0)
+    cut = analysed(finished, lambda p: p.run > 0)
     for finding in findings(cut).algorithms:
         assert finding.verdict == "none_shown"
         rows = cut.contrasts
@@ -166,10 +141,6 @@ def test_single_runs_show_nothing(finished: Path):
         assert finding.largest_single is not None
         assert finding.largest_single.change == rows.change.max()
         assert finding.highest_change is None
-
-
-def test_the_highest_end_of_an_interval_is_apart_from_single_pairs(finished: Path):
-    cut = without(finished, lambda p: p.run > 0)
     ends = {"change": 0.01, "low": -0.02, "high": 0.04, "pairs": 2}
     alpha = of_alpha(contrasted(cut, ("k-25", "wd_regret", ends)))
     assert (alpha.verdict, alpha.highest_change) == ("none_shown", 0.04)
@@ -178,7 +149,7 @@ def test_the_highest_end_of_an_interval_is_apart_from_single_pairs(finished: Pat
 
 
 def test_without_the_first_class_there_are_no_contrasts(finished: Path):
-    cut = without(finished, lambda p: p.class_name == "default")
+    cut = analysed(finished, lambda p: p.class_name == "default")
     assert {finding.verdict for finding in findings(cut).algorithms} == {"no_contrasts"}
 
 
@@ -210,8 +181,8 @@ def test_different_training_steps_are_reported(analysis: Analysis):
     assert findings(analysis).steps == {}
     runs = analysis.runs.copy()
     runs.loc[runs.algorithm == "Alpha", "steps"] = 4000
-    found = findings(dataclasses.replace(analysis, runs=runs))
-    assert found.steps == {"Alpha": 4000, "Beta": 40}
+    steps = findings(dataclasses.replace(analysis, runs=runs)).steps
+    assert steps == {"Alpha": 4000, "Beta": 40}
 
 
 def choices(model: Any, field: str) -> tuple[Any, ...]:
@@ -223,10 +194,7 @@ def choices(model: Any, field: str) -> tuple[Any, ...]:
 
 def every_algorithm_finding(analysis: Analysis) -> list[AlgorithmFinding]:
     """Every verdict with every certainty and position, and lists with and without entries."""
-    worst = Contrast(
-        class_name="c", axis="k", setting="k = 25", base=0.1, level=0.9, change=0.8, low=0.7,
-        high=0.9, pairs=5, enough_pairs=True, verdict="worse",
-    )  # fmt: skip
+    worst = CHANGE
     single = {"axis": "", "low": None, "high": None, "pairs": 1, "enough_pairs": False}
     few = {"axis": "several axes", "pairs": 3, "enough_pairs": False}
     listed = (worst, worst.model_copy(update=single), worst.model_copy(update=few))
@@ -253,48 +221,24 @@ def every_algorithm_finding(analysis: Analysis) -> list[AlgorithmFinding]:
     return found
 
 
-def every_offline_finding() -> list[OfflineFindings]:
-    """Every verdict on a learner and on its depth."""
-    place = Place(class_name="c", nu=0.5, difference=-0.1)
-    two = (place, place.model_copy(update={"nu": 1.0, "difference": 0.2}))
-    depths = [
-        None,
-        Depth(class_name="deep", verdict="no_runs", runs=0),
-        Depth(class_name="deep", verdict="holds", runs=1, places=(place,), lowest=place),
-        *(
-            Depth(class_name="deep", verdict="collapses", runs=2, places=two, lowest=place,
-                  few_runs=few, at_constant=at, below_data=below)
-            for few in (True, False)
-            for at, below in (((place,), ()), ((), (place,)), ((place,), two))
-        ),
-    ]  # fmt: skip
-    verdicts = ("above", "above_few", "below", "below_few", "open", "single_above")
-    learners = tuple(
-        Learner(name="BC", verdict=verdict, surpasses=bool(places), near=two, farthest=place,
-                places=places, depth=depth)
-        for verdict in choices(Learner, "verdict")
-        for places in ({}, dict.fromkeys(verdicts, two), {"above": (place,)})
-        for depth in depths
-    )  # fmt: skip
-    return [
-        OfflineFindings(
-            example="BC (0)", nu=0.0, learners=learners, fewest_runs=fewest, most_runs=most,
-            behaviour=Behaviour(places=two, farthest=place, far=far),
-        )
-        for far in ((), two)
-        for fewest, most in ((1, 1), (1, 5), (5, 5))
-    ]  # fmt: skip
-
-
-def text_of(page: str) -> str:
+def text_of(analysis: Analysis, found: Findings, *reasons: str) -> str:
     """What a reader sees of the page."""
-    body = re.sub("</?(code|strong)>", "", page[page.index("<main>") :])
+    text = page(analysis, found, [], reasons, [])
+    body = re.sub("</?(code|strong)>", "", text[text.index("<main>") :])
     return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", body)).split())
+
+
+def assert_worded(analysis: Analysis, found: Findings) -> str:
+    """The text of a page without values that are missing and without gaps between words."""
+    text = text_of(analysis, found, "No maps.")
+    assert "None" not in text
+    assert not re.search(r"\(\s|\s[,.;:)]|\.\.|,,", text)
+    assert not re.search(r"\d[a-z]{3}|[a-z½)](?=[0-9A-Z½])", text[: text.index("Tables")])
+    return text
 
 
 def test_every_verdict_has_words_on_the_page(analysis: Analysis):
     found = findings(analysis)
-    algorithms = tuple(every_algorithm_finding(analysis))
     rivals = tuple(
         Rival(algorithm="B", probability=0.6, low=low, high=low, verdict=verdict)
         for verdict in choices(Rival, "verdict")
@@ -302,54 +246,33 @@ def test_every_verdict_has_words_on_the_page(analysis: Analysis):
     )
     (best,) = found.best
     many = best.model_copy(update={"rivals": rivals, "nu": 0.5, "transitions": 50_000})
-    none = found.caveats.model_copy(update={"missing": 0, "fewest_pairs": None, "intervals": 0,
-                                            "other_policy_init": ()})  # fmt: skip
-    failed = found.caveats.model_copy(update={"failed": 1})
-    for offline, caveats in itertools.product(every_offline_finding(), (none, failed)):
-        everything = Findings(
-            **{**dict(found), "algorithms": algorithms, "best": (best, many), "caveats": caveats,
-               "steps": {"A": 40, "B": 4000}, "offline": offline}
-        )  # fmt: skip
-        text = text_of(page(analysis, everything, [], ["No maps."], []))
-        assert "None" not in text
-        assert not re.search(r"\(\s|\s[,.;:)]|\.\.|,,", text)
-        assert not re.search(r"\d[a-z]{3}|[a-z½)](?=[0-9A-Z½])", text[: text.index("Tables")])
-        algorithms = algorithms[:1]  # the others were rendered once
-    assert "No algorithm" in text_of(
-        page(analysis, found.model_copy(update={"algorithms": ()}), [], [], [])
-    )
+    none = {"missing": 0, "fewest_pairs": None, "intervals": 0, "other_policy_init": ()}
+    everything = {
+        "algorithms": tuple(every_algorithm_finding(analysis)),
+        "best": (best, many),
+        "steps": {"A": 40, "B": 4000},
+        "caveats": found.caveats.model_copy(update={"failed": 1}),
+    }
+    assert_worded(analysis, found.model_copy(update=everything))
+    nothing = {"algorithms": (), "caveats": found.caveats.model_copy(update=none)}
+    assert "No algorithm" in assert_worded(analysis, found.model_copy(update=nothing))
 
 
-def headline(finding: AlgorithmFinding, base: str = "hard") -> str:
-    from sme_registry.studies.report import page as module
-    from sme_registry.studies.report.classes import AXES, SEVERAL
-    from sme_registry.terminal.templates import environment
-
-    templates = environment(Path(module.__file__).parent / "templates", autoescape=True)
-    templates.globals |= {"axes": AXES, "several": SEVERAL}
-    templates.filters["by"] = list
-    words: Any = templates.get_template("findings.jinja").module
-    return " ".join(str(words.headline(finding, base)).split())
+def in_words(analysis: Analysis, **fields: Any) -> str:
+    """What the page says of one algorithm, A."""
+    finding = AlgorithmFinding(algorithm="A", **fields)
+    found = findings(analysis).model_copy(update={"algorithms": (finding,)})
+    return text_of(analysis, found)
 
 
-def test_little_learning_comes_before_any_change() -> None:
-    worst = Contrast(
-        class_name="c", axis="k", setting="k = 25", base=0.95, level=0.98, change=0.03, low=0.02,
-        high=0.04, pairs=5, enough_pairs=True, verdict="worse",
-    )  # fmt: skip
-    common = {"algorithm": "A", "verdict": "slightly_hurt", "base_wd_regret": 0.95, "worst": worst}
-    text = headline(AlgorithmFinding(**common, base_unlearnt=True))
-    assert text.startswith("A has learnt almost nothing")
-    assert "most" not in text.removeprefix("A has learnt almost nothing")
-    text = headline(AlgorithmFinding(**common))
-    assert text.startswith("A is hurt slightly, most by reward interval k: on c its WD regret")
-
-
-def test_classes_that_are_easier_than_the_first_are_called_easier() -> None:
-    better = Contrast(
-        class_name="c", axis="k", setting="k = 1", base=0.5, level=0.2, change=-0.3, low=-0.4,
-        high=-0.2, pairs=5, enough_pairs=True, verdict="better",
-    )  # fmt: skip
-    text = headline(AlgorithmFinding(algorithm="A", verdict="none_shown", better=(better,)))
-    assert text.startswith("Other classes are easier for A than the first one, hard:")
+def test_headlines_name_the_most_important_first(analysis: Analysis) -> None:
+    hurt = {"verdict": "slightly_hurt", "base_wd_regret": 0.95, "worst": CHANGE}
+    words = "A is hurt slightly, most by reward interval k: on c its WD regret"
+    assert words in in_words(analysis, **hurt)
+    text = in_words(analysis, **hurt, base_unlearnt=True)
+    assert "A has learnt almost nothing" in text
+    assert "A is hurt" not in text
+    better = CHANGE.model_copy(update={"change": -0.03, "verdict": "better"})
+    text = in_words(analysis, verdict="none_shown", better=(better,))
+    assert "Other classes are easier for A than the first one, default:" in text
     assert "No class was shown to make" not in text
