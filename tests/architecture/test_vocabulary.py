@@ -59,9 +59,10 @@ def unnamed(model: type[BaseModel]) -> list[str]:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("model", documents(), ids=lambda model: model.__qualname__)
-def test_every_number_in_a_document_has_the_name_of_its_quantity(model: type[StrictModel]) -> None:
-    assert unnamed(model) == []
+def test_every_number_in_a_document_has_the_name_of_its_quantity() -> None:
+    models = documents()
+    assert len(models) > 100
+    assert {model.__qualname__: names for model in models if (names := unnamed(model))} == {}
 
 
 def columns() -> set[str]:
