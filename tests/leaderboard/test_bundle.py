@@ -1,7 +1,5 @@
 """Bundles: reading untrusted folders, and building completely or not at all."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """The small board in `examples/board`: intact, ranked, and open to anyone."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from leaderboard.scoring.ranking import ranking, refuse_unpublishable
@@ -11,14 +9,14 @@ from leaderboard.store import Store
 BOARD = Path(__file__).resolve().parents[2] / "examples" / "board"
 
 
-def test_the_example_board_is_small_and_verifies_down_to_its_policies() -> None:
+def test_the_example_board_is_small_and_verifies_down_to_its_policies():
     report = verify(BOARD, rescore=1)
     assert (report.submissions, report.results, report.unlogged) == (4, 4, 0)
     assert not (BOARD / "board.key").exists()
     assert sum(path.stat().st_size for path in BOARD.rglob("*") if path.is_file()) < 300_000
 
 
-def test_two_methods_are_ranked_with_ten_runs() -> None:
+def test_two_methods_are_ranked_with_ten_runs():
     with Store.open(BOARD, read_only=True) as store:
         entries = store.entries()
         refuse_unpublishable(entries)

@@ -1,10 +1,5 @@
-from __future__ import annotations
-
 import datetime
-from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -22,7 +17,6 @@ from leaderboard.documents.submission import (
 from leaderboard.errors import Rejection
 from leaderboard.intake import admission, references
 from leaderboard.scoring.worker import run_scorer
-from leaderboard.store import Store
 from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import (
     linear_onnx,
@@ -31,18 +25,16 @@ from tests.leaderboard.conftest import (
     tiny_board,
     tiny_submission,
 )
-from tests.leaderboard.sealing import signed_entry, tiny_season
 
-Upload = Callable[[str, bytes, float], str]
 ANY_TIME = "2000-01-01T00:00:00Z"
 
 
-def put(store: Store, key: SigningKey, artefacts: dict[str, bytes]) -> None:
+def put(store, key, artefacts):
     for digest, data in artefacts.items():
         store.put_object(digest, [data], by=key.public)
 
 
-def bundle(folder: Path, signed: SignedSubmission, artefacts: dict[str, bytes]) -> Path:
+def bundle(folder, signed, artefacts):
     (folder / "artefacts").mkdir(parents=True)
     (folder / "submission.json").write_bytes(signed.to_bytes())
     for digest, data in artefacts.items():
@@ -50,36 +42,36 @@ def bundle(folder: Path, signed: SignedSubmission, artefacts: dict[str, bytes]) 
     return folder
 
 
-def objects(store: Store) -> list[Path]:
+def objects(store):
     return [path for path in store.folder.objects.rglob("*") if path.is_file()]
 
 
-def code_of(call: Callable[[], Any]) -> str:
+def code_of(call):
     with pytest.raises(Rejection) as caught:
         call()
     assert caught.value.message.endswith(".")
     return caught.value.code
 
 
-def receive(store: Store, signed: SignedSubmission, at: datetime.datetime | None = None) -> str:
+def receive(store, signed, at=None):
     """Admit a submission from its bytes, as a server does."""
     read = SignedSubmission.read(signed.to_bytes())
     intake.admit(store, read, at)
     return read.id
 
 
-def resigned(store: Store, key: SigningKey, plain: dict[str, Any]) -> SignedSubmission:
+def resigned(store, key, plain):
     return Submission.from_dict(plain).signed(key, store.document.key)
 
 
-def uploaded(store: Store, key: SigningKey, number: int = 0, **fields: Any) -> SignedSubmission:
+def uploaded(store, key, number=0, **fields):
     """A submission whose artefacts the key has uploaded."""
     signed, artefacts = tiny_submission(store, key, number, **fields)
     put(store, key, artefacts)
     return signed
 
 
-def with_artefact(store: Store, key: SigningKey, data: bytes) -> SignedSubmission:
+def with_artefact(store, key, data):
     """A submission of a file that is on the board, whatever it is."""
     digest = sha256_of(data)
     put(store, key, {digest: data})
@@ -89,7 +81,7 @@ def with_artefact(store: Store, key: SigningKey, data: bytes) -> SignedSubmissio
     return resigned(store, key, plain)
 
 
-def after(**duration: float) -> datetime.datetime:
+def after(**duration):
     return datetime.datetime.now(datetime.UTC) + datetime.timedelta(**duration)
 
 
@@ -181,7 +173,7 @@ def test_two_keys_that_send_a_name_at_once_do_not_share_it(store, key, monkeypat
     )
     real = admission._check_artefacts
 
-    def meanwhile(*arguments: Any) -> None:
+    def meanwhile(*arguments):
         real(*arguments)
         store.receive(one)
 
@@ -192,26 +184,8 @@ def test_two_keys_that_send_a_name_at_once_do_not_share_it(store, key, monkeypat
 # Refusals.
 
 
-def envelope(signed: SignedSubmission) -> Envelope[SignedSubmission]:
+def envelope(signed):
     return Envelope.read(signed.to_bytes(), SignedSubmission)
-
-
-def test_refused_submissions_count_for_their_key(tmp_path, key):
-    with tiny_board(tmp_path / "b", limits={"submissions_per_day": 3}) as store:
-        refusals = intake.Refusals()
-        put_submission(store, key, 1)
-        for number in (2, 3):
-            missing, _ = tiny_submission(store, key, number)
-            call = partial(intake.receive, store, envelope(missing), refusals)
-            assert code_of(call) == "artefact_missing"
-        signed = uploaded(store, key, 4)
-        assert code_of(lambda: intake.receive(store, envelope(signed), refusals)) == "quota"
-        tomorrow = after(days=1, seconds=2)
-        assert intake.receive(store, envelope(signed), refusals, tomorrow)
-        other = SigningKey.generate()
-        signed = uploaded(store, other, 5)
-        assert intake.receive(store, envelope(signed), refusals)
-        assert not intake.receive(store, envelope(signed), refusals)
 
 
 def test_what_strangers_can_send_again_counts_for_nobody_and_a_refusal_for_good_once(tmp_path, key):
@@ -235,18 +209,8 @@ def test_what_strangers_can_send_again_counts_for_nobody_and_a_refusal_for_good_
         assert code_of(lambda: intake.receive(store, last, refusals)) == "quota"
 
 
-def test_no_more_refusals_are_kept_than_stated(store, key):
-    refusals, now = intake.Refusals(kept=3), datetime.datetime.now(datetime.UTC)
-    submissions = [tiny_submission(store, key, number)[0] for number in range(5)]
-    for signed in submissions:
-        refusals.add(envelope(signed), Rejection("schema", "a fault."), now)
-    assert len(refusals.times(key.public, now)) == 3
-    refusals.repeat(submissions[0].id)
-    assert code_of(lambda: refusals.repeat(submissions[-1].id)) == "schema"
-
-
 def test_an_artefact_is_inspected_once_for_its_widths(store, key, monkeypatch):
-    seen: list[int] = []
+    seen = []
     real = admission.inspect
     monkeypatch.setattr(admission, "inspect", lambda *each: (seen.append(1), real(*each)))
     for statement in ("one", "two"):
@@ -298,24 +262,6 @@ def test_a_second_of_a_wrong_clock_uses_up_no_quota_for_good(tmp_path, key, monk
         assert receive(store, signed) == signed.id
         again, _ = tiny_submission(store, key, 1, statement="Too many.")
         assert code_of(lambda: receive(store, again)) == "quota"
-
-
-@pytest.mark.parametrize("year", [1, 9999])
-def test_the_first_and_the_last_year_have_quotas(tmp_path, key, monkeypatch, year):
-    moment = datetime.datetime(year, 12 if year > 1 else 1, 31 if year > 1 else 1, 23, 59, 30)
-    moment = moment.replace(tzinfo=datetime.UTC)
-    for name in ("log", "store"):
-        monkeypatch.setattr(f"leaderboard.store.{name}.now", lambda: utc(moment))
-    monkeypatch.setattr("tests.leaderboard.conftest.now", lambda: utc(moment))
-    with tiny_board(tmp_path / "b", limits={"submissions_per_day": 1}) as store:
-        intake.submit_references(store)
-        signed = uploaded(store, key, 1)
-        intake.check_upload(store, key.public, 1, at=moment)
-        assert receive(store, signed, at=moment) == signed.id
-        signed, _ = tiny_submission(store, key, 1, statement="Too many.")
-        assert code_of(lambda: receive(store, signed, at=moment)) == "quota"
-        assert store.log()[-1].time == utc(moment)
-        store.reindex()
 
 
 def test_a_full_queue_accepts_only_references_and_faults_make_room_in_it(tmp_path, key):
@@ -535,11 +481,11 @@ def test_a_full_board_accepts_no_submission(tmp_path, key):
 
 
 @pytest.fixture
-def full(tmp_path: Path) -> Iterator[tuple[Store, Upload]]:
+def full(tmp_path):
     """A board of 1,000 bytes, and how to fill it with old uploads."""
     with tiny_board(tmp_path / "full", limits={"total_bytes": 1000, "artefact_bytes": 900}) as made:
 
-        def upload(key: str, data: bytes, minutes: float) -> str:
+        def upload(key, data, minutes):
             digest = sha256_of(data)
             made.put_object(digest, [data], by=key)
             time = utc(datetime.datetime.now(datetime.UTC) - datetime.timedelta(minutes=minutes))
@@ -555,7 +501,7 @@ def full(tmp_path: Path) -> Iterator[tuple[Store, Upload]]:
 A, B, C, ME = ("a" * 64, "b" * 64, "c" * 64, "d" * 64)
 
 
-def left(store: Store) -> set[bytes]:
+def left(store):
     return {store.objects.read(digest)[:1] for digest, _ in store.objects.paths()}
 
 
@@ -573,50 +519,3 @@ def test_old_uploads_without_a_submission_make_room(full):
     upload(A, b"1" * 600, -60 * 24 * 365)  # dated in the future, by a clock that was wrong
     intake.check_upload(store, ME, 500)
     assert left(store) == set()
-
-
-def test_young_uploads_and_those_of_the_sender_stay(full):
-    store, upload = full
-    upload(A, b"1" * 300, 9)
-    upload(ME, b"2" * 300, 90)
-    upload(B, b"3" * 300, 90)
-    upload(B, b"4" * 50, 1)  # B still uploads
-    assert code_of(lambda: intake.check_upload(store, ME, 100)) == "quota"
-    assert left(store) == {b"1", b"2", b"3", b"4"}
-    upload(C, b"5" * 40, 90)
-    assert code_of(lambda: intake.check_upload(store, ME, 100)) == "quota"
-    assert b"5" in left(store)  # it would not have been enough
-
-
-@pytest.mark.parametrize("table", ["entry", "sealed"])
-def test_who_has_a_submission_or_has_entered_a_season_keeps_uploads_longer(full, key, table):
-    store, upload = full
-    if table == "entry":
-        plain = tiny_submission(store, key)[0].submission.to_dict()
-        plain["runs"][0]["artefact"] = None
-        store.receive(resigned(store, key, plain))
-    else:
-        season = tiny_season()
-        store.announce(season)
-        store.enter(signed_entry(store, season, key, [None, None]))
-    assert store.total_bytes() > 100  # documents count, too
-    with store.transaction() as index:
-        index.connection.execute(f"UPDATE {table} SET bytes = 100")
-    upload(key.public, b"1" * 400, 90)
-    upload(A, b"2" * 400, 20)
-    intake.check_upload(store, ME, 200)
-    assert left(store) == {b"1"}
-
-
-def test_bytes_that_two_keys_uploaded_stay_until_both_lose_them(full):
-    store, upload = full
-    digest = upload(A, b"1" * 600, 90)
-    upload(B, b"1" * 600, 9)
-    assert store.total_bytes() == 600
-    assert code_of(lambda: intake.check_upload(store, ME, 500)) == "quota"
-    assert store.possesses(A, digest)
-    with store.transaction() as index:
-        index.connection.execute("UPDATE upload SET time = '2020-01-01T00:00:00Z'")
-    intake.check_upload(store, ME, 500)
-    assert not store.possesses(A, digest)
-    assert not store.objects.has(digest)

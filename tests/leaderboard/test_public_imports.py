@@ -1,23 +1,20 @@
 """The leaderboard uses the registry as any other package would: by its public names."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import pkgutil
 from pathlib import Path
-from types import ModuleType
 
 import leaderboard
 
 INTERRUPTS = "sme_registry.terminal.interrupts"  # light, unlike the rest of the terminal package
 
 
-def submodules(module: ModuleType) -> set[str]:
+def submodules(module):
     return {each.name for each in pkgutil.iter_modules(getattr(module, "__path__", ()))}
 
 
-def private_imports(source: str) -> list[str]:
+def private_imports(source):
     """Imports from the registry that are not of a public name of a top-level module."""
     private = []
     for node in ast.walk(ast.parse(source)):
@@ -33,14 +30,14 @@ def private_imports(source: str) -> list[str]:
     return private
 
 
-def test_the_leaderboard_imports_only_public_names_of_the_registry() -> None:
+def test_the_leaderboard_imports_only_public_names_of_the_registry():
     files = sorted(Path(leaderboard.__file__).parent.rglob("*.py"))
     assert len(files) > 30
     imports = {str(path): private_imports(path.read_text()) for path in files}
     assert {path: names for path, names in imports.items() if names} == {}
 
 
-def test_a_private_import_would_be_found() -> None:
+def test_a_private_import_would_be_found():
     source = "from sme_registry.io.files import atomic_file\nfrom sme_registry.io import _x, choice"
     assert private_imports(source) == [
         "sme_registry.io.files.atomic_file",

@@ -1,25 +1,20 @@
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 from typer.testing import CliRunner
 
 from leaderboard.cli import app
 from leaderboard.documents.keys import SigningKey
 from leaderboard.public_view import PublicView, public_view
-from leaderboard.store import Store
 from sme_registry.errors import SpecError
 from tests.leaderboard.web.site import boards
 
 
-def view_of(store: Store, id: str) -> PublicView:
+def view_of(store, id):
     entry = store.entry(id)
     assert entry is not None
     return public_view(store, entry)
 
 
-def test_an_earlier_version_is_shown_with_the_reason_why_it_has_no_rank(tmp_path: Path) -> None:
+def test_an_earlier_version_is_shown_with_the_reason_why_it_has_no_rank(tmp_path):
     key = SigningKey.generate()
     with boards.create(tmp_path / "board", classes=1) as store:
         first = boards.submit(store, key, "PPO", [0.2] * 6, statement="first")
@@ -32,7 +27,7 @@ def test_an_earlier_version_is_shown_with_the_reason_why_it_has_no_rank(tmp_path
     assert "each of 1,000,000 steps, 10,000,000 in total" in printed
 
 
-def test_an_earlier_servers_answer_is_read_and_nonsense_refused(tmp_path: Path) -> None:
+def test_an_earlier_servers_answer_is_read_and_nonsense_refused(tmp_path):
     with boards.create(tmp_path / "board", classes=1) as store:
         view = view_of(store, boards.submit(store, SigningKey.generate(), "PPO", [0.2] * 6))
     plain = view.to_dict()

@@ -1,11 +1,7 @@
 """Boards of teams: one shared policy, from each agent's own observations; regret by agent."""
 
-from __future__ import annotations
-
 import json
 import shutil
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +20,7 @@ from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import run_scorer
 from leaderboard.store import Store
 from leaderboard.web.site import write_site
-from sme_registry import EvaluationProtocol, SMESpec
+from sme_registry import EvaluationProtocol
 from sme_registry.spec import Suite, SuiteFile
 from tests.leaderboard.conftest import linear_onnx
 
@@ -42,8 +38,8 @@ SUITE = Suite.from_dict(
     }
 )
 FILE = SuiteFile(name="mixed", version=1, digest=SUITE.digest, suite=SUITE)
-TEAM: SMESpec = SUITE.instances[0]
-FIELDS: dict[str, Any] = {
+TEAM = SUITE.instances[0]
+FIELDS = {
     "title": "Teams",
     "suite_name": "mixed-v1",
     "suite": SUITE,
@@ -57,7 +53,7 @@ KEY = SigningKey.generate()
 WIDTHS = (6, 2)  # s, t/T, r_cum/k and two one-hot entries; the widest agent's channels
 
 
-def bundle(folder: Path, team: bytes) -> Path:
+def bundle(folder, team):
     """A bundle with this policy on one team, a failed run on the other, and a single agent."""
     folder.mkdir()
     (folder / "team.onnx").write_bytes(team)
@@ -80,7 +76,7 @@ def bundle(folder: Path, team: bytes) -> Path:
 
 
 @pytest.fixture(scope="module")
-def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def board(tmp_path_factory):
     """A board whose references and shared policy are scored; nobody changes it."""
     folder = tmp_path_factory.mktemp("teams")
     with Store.create(folder / "board", **FIELDS) as store:
@@ -119,11 +115,11 @@ def test_an_altered_agent_is_found(board, tmp_path):
 
 
 def test_agents_receive_what_they_observe_and_their_rows_are_checked_in_every_region(monkeypatch):
-    seen: list[sandbox.Observations] = []
-    checked: list[tuple[float, ...]] = []
+    seen = []
+    checked = []
     call = sandbox.Sandbox.__call__
 
-    def recorded(self: sandbox.Sandbox, observations: sandbox.Observations) -> sandbox.Actions:
+    def recorded(self, observations):
         seen.append(observations.copy())
         return call(self, observations)
 

@@ -1,7 +1,5 @@
 """What a board's definition refuses."""
 
-from __future__ import annotations
-
 import pytest
 from typer.testing import CliRunner
 

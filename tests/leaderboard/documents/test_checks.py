@@ -1,7 +1,5 @@
 """What a board checks of a submission: each code, and the order of them."""
 
-from __future__ import annotations
-
 import datetime
 
 import pytest

@@ -1,7 +1,5 @@
 """Signatures: one key, one document, one purpose, one board."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 
@@ -11,10 +9,9 @@ DIGEST, BOARD, OTHER = "sha256:" + "1" * 64, "a" * 64, "b" * 64
 P = 2**255 - 19
 L = 2**252 + 27742317777372353535851937790883648493
 D = -121665 * pow(121666, -1, P) % P
-Point = tuple[int, int]
 
 
-def add(one: Point, other: Point) -> Point:
+def add(one, other):
     """The sum of two points of edwards25519 (RFC 8032, section 5.1.4, in affine coordinates)."""
     (x1, y1), (x2, y2) = one, other
     product = D * x1 * x2 * y1 * y2
@@ -23,7 +20,7 @@ def add(one: Point, other: Point) -> Point:
     return x % P, y % P
 
 
-def decode(key: bytes) -> Point:
+def decode(key):
     number = int.from_bytes(key, "little")
     y, sign = number % 2**255, number >> 255
     square = (y * y - 1) * pow(D * y * y + 1, -1, P) % P
@@ -33,12 +30,12 @@ def decode(key: bytes) -> Point:
     return (x if x % 2 == sign else P - x), y
 
 
-def encode(point: Point) -> str:
+def encode(point):
     x, y = point
     return (y | (x % 2) << 255).to_bytes(32, "little").hex()
 
 
-def small_order_points() -> list[Point]:
+def small_order_points():
     """The eight points whose order divides 8: multiples of a point of order 8."""
     generator = decode(
         bytes.fromhex("26e8958fc2b227b045c3f489f2ef98f0d5dfac05d3c63339b13802886d53fc05")
@@ -49,7 +46,7 @@ def small_order_points() -> list[Point]:
     return points
 
 
-def small_order_keys() -> list[str]:
+def small_order_keys():
     """Every encoding of them, those included that are not reduced modulo p."""
     keys = []
     for x, y in small_order_points():

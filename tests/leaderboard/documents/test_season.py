@@ -1,11 +1,9 @@
 """Seasons: terms that fit their track, a commitment to the secret, secrets that do not collide."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import stat
-from typing import Any, get_args
+from typing import get_args
 
 import pytest
 import rfc8785
@@ -22,7 +20,7 @@ SETTING = {"state_dim": 3, "action_dim": 2, "complexity": 5}
 TEAM = {"complexity": 5, "team": {"agents": [{"action_dim": 4}]}}
 
 
-def online(**fields: Any) -> dict[str, Any]:
+def online(**fields):
     return {
         "id": "autumn",
         "title": "Autumn",
@@ -39,7 +37,7 @@ def online(**fields: Any) -> dict[str, Any]:
     }
 
 
-def offline(**fields: Any) -> dict[str, Any]:
+def offline(**fields):
     digests = {"data": "sha256:" + "1" * 64, "challenge": "sha256:" + "2" * 64}
     data = {"nu": 0.5, "transitions": 100}
     own = {
@@ -132,7 +130,7 @@ def test_a_file_without_a_master_is_named(tmp_path):
         Master.read(tmp_path / "missing")
 
 
-def online_class(**fields: Any) -> dict[str, Any]:
+def online_class(**fields):
     """A season online whose class has other fields."""
     return online(classes=[{**online()["classes"][0], **fields}])
 

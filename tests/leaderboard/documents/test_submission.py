@@ -1,12 +1,8 @@
 """Reading a signed submission: nothing is validated, or answered at length, without a signature."""
 
-from __future__ import annotations
-
 import copy
 import hashlib
 import json
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 import rfc8785
@@ -17,7 +13,7 @@ from leaderboard.errors import Rejection
 
 KEY, BOARD = SigningKey.generate(), "a" * 64
 DIGEST = "sha256:" + "0" * 64
-PLAIN: dict[str, Any] = {
+PLAIN = {
     "schema_version": 1,
     "track": "open",
     "suite": {"name": "x-v1", "digest": DIGEST},
@@ -32,7 +28,7 @@ PLAIN: dict[str, Any] = {
 }
 
 
-def text(plain: dict[str, Any], *, signed: bool = True, **envelope: Any) -> bytes:
+def text(plain, *, signed=True, **envelope):
     """A document with this content, whatever it is; without a right signature if not `signed`."""
     signature = "0" * 128
     if signed:
@@ -42,11 +38,11 @@ def text(plain: dict[str, Any], *, signed: bool = True, **envelope: Any) -> byte
     return json.dumps(document, separators=(",", ":")).encode()
 
 
-def changed(**fields: Any) -> dict[str, Any]:
+def changed(**fields):
     return {**copy.deepcopy(PLAIN), **fields}
 
 
-def rejection(data: bytes) -> Rejection:
+def rejection(data):
     with pytest.raises(Rejection) as caught:
         SignedSubmission.read(data)
     return caught.value
@@ -133,7 +129,7 @@ def test_the_id_is_known_before_the_content_is_validated():
 
 def test_a_signature_covers_every_field():
     """The board keeps the whole document, which its signature must still fit."""
-    removals: list[Callable[[dict[str, Any]], Any]] = [
+    removals = [
         lambda plain: plain.pop("statement"),
         lambda plain: plain.pop("schema_version"),
         lambda plain: plain["training"].pop("library"),

@@ -1,19 +1,15 @@
 """One scored board for the tests of `verify`, and how its owner could forge it."""
 
-from __future__ import annotations
-
 import json
 import shutil
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from leaderboard.documents.board import Folder
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.result import Result, RunScore
+from leaderboard.documents.result import Result
 from leaderboard.documents.submission import SignedSubmission
 from leaderboard.scoring.aggregation import never_listed, result_of
 from leaderboard.scoring.worker import run_scorer
@@ -34,7 +30,7 @@ STEADY, FAILED, SENSITIVE, REFUSED, WAITING = range(5)
 withdrawn, and receives the last. `FAILED` has a run that failed and one that it does not list."""
 
 
-def sensitive_onnx() -> bytes:
+def sensitive_onnx():
     """A policy that adds and subtracts a number so large that the actions lose their last bits."""
     model = models.model(
         [
@@ -52,7 +48,7 @@ def sensitive_onnx() -> bytes:
     return bytes(model.SerializeToString(deterministic=True))
 
 
-def make_board(folder: Path) -> None:
+def make_board(folder):
     path, key = folder / "board", SigningKey.generate()
     with tiny_board(path) as store:
         put_policy(store, key, linear_onnx(0), 0)
@@ -69,23 +65,23 @@ def make_board(folder: Path) -> None:
 
 
 @pytest.fixture
-def board(once: Callable[..., Path], tmp_path: Path) -> Path:
+def board(once, tmp_path):
     """A copy of the scored board."""
     whole = once("leaderboard-scored", make_board)
     return Path(shutil.copytree(whole / "board", tmp_path / "board"))
 
 
-def ids(board: Path) -> list[str]:
+def ids(board):
     with Store.open(board, read_only=True) as store:
         return [row.id for row in store.entries()]
 
 
-def result_on(board: Path, number: int) -> Result:
+def result_on(board, number):
     path = Folder(board).result(ids(board)[number])
     return Result.from_dict(json.loads(path.read_text()))
 
 
-def with_runs(board: Path, result: Result, runs: Sequence[RunScore], **fields: Any) -> Result:
+def with_runs(board, result, runs, **fields):
     """A result whose scores follow from these runs."""
     folder = Folder(board)
     signed = json.loads(folder.submission(result.submission).read_text())
@@ -98,7 +94,7 @@ def with_runs(board: Path, result: Result, runs: Sequence[RunScore], **fields: A
     )
 
 
-def forge(board: Path, result: Result) -> Path:
+def forge(board, result):
     """Replace a result and sign the log again, as the board's owner can; the result's file."""
     path = Folder(board).result(result.submission)
     path.write_text(to_json(result.to_dict()))
@@ -106,13 +102,13 @@ def forge(board: Path, result: Result) -> Path:
     return path
 
 
-def resign(board: Path, key: SigningKey, start: int = 1) -> None:
+def resign(board, key, start=1):
     """Write the log again from an entry on, chain and signatures right, documents as they are."""
     folder = Folder(board)
     previous = LogEntry.from_dict(json.loads(folder.log_entry(start - 1).read_text()))
     for path in sorted(folder.log.glob("*.json"))[start:]:
         entry = LogEntry.from_dict(json.loads(path.read_text()))
-        document: dict[str, Any] = {}
+        document = {}
         if entry.event == "result":
             result = Result.from_dict(json.loads(folder.result(entry.subject).read_text()))
             document = {"document": digest_of(result)}

@@ -1,9 +1,5 @@
 """From runs to a method's scores: what an instance, a class and the method weigh."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -43,11 +39,8 @@ TWO, THREE = SPECS[:2], SPECS[2:]
 ID = "sha256:" + "0" * 64
 LEVELS = (0.0, *BOARD.protocol.epsilons)
 
-Regrets = dict[str, list[float | None]]
-"""WD regret of each run on each instance, None for a failed run."""
 
-
-def run(spec: str, regret: float | Sequence[float] | None) -> RunScore:
+def run(spec, regret):
     if regret is None:
         return failed_run(BOARD.protocol, CLASS_OF[spec], spec)
     if isinstance(regret, float):
@@ -64,13 +57,13 @@ def run(spec: str, regret: float | Sequence[float] | None) -> RunScore:
     )
 
 
-def scored(regrets: Regrets, unlisted: dict[str, int] | None = None) -> Result:
-    """The result of these runs, and of so many unlisted ones of each class."""
+def scored(regrets, unlisted=None):
+    """The result of runs of this WD regret, None if failed, and of unlisted ones of each class."""
     runs = [run(spec, regret) for spec, values in regrets.items() for regret in values]
     return result_of(BOARD, ID, runs, {}, unlisted=never_listed(BOARD, started(runs, unlisted)))
 
 
-def started(runs: Sequence[RunScore], unlisted: dict[str, int] | None) -> Submission:
+def started(runs, unlisted):
     artefact = {"sha256": "sha256:" + "a" * 64, "size": 1}
     return Submission.from_dict(
         {
@@ -95,12 +88,12 @@ def started(runs: Sequence[RunScore], unlisted: dict[str, int] | None) -> Submis
     )
 
 
-def theta(result: Result, metric: str = "wd_regret") -> float:
+def theta(result, metric="wd_regret"):
     assert result.scores is not None
     return float(getattr(result.scores, metric).value)
 
 
-EVEN: Regrets = {**dict.fromkeys(TWO, [0.2] * 5), **dict.fromkeys(THREE, [0.2] * 4)}
+EVEN = {**dict.fromkeys(TWO, [0.2] * 5), **dict.fromkeys(THREE, [0.2] * 4)}
 
 # What a method scores
 
@@ -116,22 +109,6 @@ def test_a_class_is_the_mean_over_its_instances_and_the_method_the_mean_over_cla
         assert region.value == pytest.approx(
             np.mean([each.normalised_regret[index] for each in result.classes])
         )
-
-
-def test_what_is_given_up_costs_its_whole_share():
-    even = scored(EVEN)
-    outside = 0.2 + 0.1 * np.mean(LEVELS[1:])
-    attacks: list[tuple[Regrets, float, float]] = [
-        ({**EVEN, TWO[0]: [0.2] * 9, TWO[1]: [None]}, 1 / 4, 1.0),
-        ({**EVEN, THREE[0]: [None] * 4}, 1 / 6, 1.0),
-        ({**EVEN, **dict.fromkeys(THREE, [None] * 4)}, 1 / 2, 1.0),
-        ({**EVEN, TWO[0]: [0.2] * 100, TWO[1]: [1.0] * 5}, 1 / 4, 0.8 + outside),  # poor runs
-    ]
-    for regrets, share, worst_outside in attacks:
-        result = scored(regrets)
-        assert theta(result) - theta(even) == pytest.approx(share * 0.8)
-        lost = theta(result, "ood_regret") - theta(even, "ood_regret")
-        assert lost == pytest.approx(share * (worst_outside - outside))
 
 
 @pytest.mark.parametrize("on_one", [0, 1])
@@ -188,7 +165,7 @@ REGRET = st.floats(0.0, 1.0)
 RUNS = st.fixed_dictionaries({spec: st.lists(REGRET, min_size=1, max_size=9) for spec in SPECS})
 
 
-def flat(regrets: dict[str, list[float]]) -> list[RunScore]:
+def flat(regrets):
     return [run(spec, [each] * 6) for spec, values in regrets.items() for each in values]
 
 
@@ -227,13 +204,11 @@ def test_leaving_runs_out_never_improves_a_method_with_as_many_runs_on_each_inst
 # Intervals
 
 
-def ends(result: Result, metric: str = "wd_regret") -> tuple[float, float] | None:
-    assert result.scores is not None
-    interval: tuple[float, float] | None = getattr(result.scores, metric).interval
-    return interval
+def ends(result, metric="wd_regret"):
+    return getattr(result.scores, metric).interval
 
 
-def drawn(seed: int, counts: Sequence[int]) -> list[RunScore]:
+def drawn(seed, counts):
     rng = np.random.default_rng(seed)
     return [
         run(spec, rng.random(6).tolist())
@@ -253,20 +228,6 @@ def test_the_protocol_seeds_an_interval_and_neither_id_nor_order_of_runs_changes
     protocol = EvaluationProtocol(states_per_region=61)
     other = BOARD.model_copy(update={"protocol": protocol})
     assert ends(result) != ends(result_of(other, ID, runs, {}))
-
-
-def test_a_small_change_of_a_run_changes_an_interval_little():
-    runs = drawn(1, [5, 5, 4, 4, 4])
-    widths = []
-    for number in range(10):
-        rng = np.random.default_rng(number)
-        nudged = [
-            run(each.spec, [N + 1e-6 * rng.random() for N in each.normalised_regret])
-            for each in runs
-        ]
-        low, high = ends(result_of(BOARD, ID, nudged, {}), "ood_decay")
-        widths.append(high - low)
-    assert max(widths) - min(widths) < 1e-5
 
 
 def test_single_runs_of_several_instances_have_a_wide_interval_and_lone_ones_none():

@@ -1,13 +1,10 @@
 """Rankings: who has a rank, which one, and the files in which others read it."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json
 import random
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -36,8 +33,8 @@ HEAD = (7, "sha256:" + "ab" * 32)
 DATE = "2026-11-21T09:30:00Z"
 
 
-def scores(wd: float, ood: float, arm: float = 0.05) -> Scores:
-    def around(value: float) -> Estimate:
+def scores(wd, ood, arm=0.05):
+    def around(value):
         return Estimate(value=value, low=value - arm, high=value + arm)
 
     return Scores(
@@ -50,7 +47,7 @@ def scores(wd: float, ood: float, arm: float = 0.05) -> Scores:
     )
 
 
-def entry(sequence: int, values: Scores | None = None, **fields: Any) -> EntryRow:
+def entry(sequence, values=None, **fields):
     return replace(
         EntryRow(
             id=f"sha256:{sequence:064x}",
@@ -76,7 +73,7 @@ def entry(sequence: int, values: Scores | None = None, **fields: Any) -> EntryRo
     )
 
 
-def reference(sequence: int, name: str, regret: float, **fields: Any) -> EntryRow:
+def reference(sequence, name, regret, **fields):
     values = scores(regret, regret, arm=0.0)
     return entry(sequence, values, method=name, reference=True, enough_runs=False, **fields)
 
@@ -84,13 +81,13 @@ def reference(sequence: int, name: str, regret: float, **fields: Any) -> EntryRo
 REFERENCES = [reference(1, "optimal", 0.0), reference(2, "constant", 1.0)]
 
 
-def ranks(metric: str, *entries: EntryRow) -> list[tuple[int, int | None, int | None, str]]:
+def ranks(metric, *entries):
     """Each row's entry, first and last rank, and why it has none."""
     rows = ranking(list(entries), metric)
     return [(row.entry.sequence, row.first, row.last, row.reason) for row in rows]
 
 
-def reasons(*entries: EntryRow) -> dict[int, str]:
+def reasons(*entries):
     return {sequence: reason for sequence, _, _, reason in ranks("wd_regret", *entries)}
 
 
@@ -144,7 +141,7 @@ def test_entries_that_may_not_have_learned_have_no_rank_by_ood_decay():
 # By decay, sabotage inside the cube wins nothing
 
 
-def by_decay(*entries: EntryRow) -> list[tuple[int, int | None, int | None]]:
+def by_decay(*entries):
     return [row[:3] for row in ranks("ood_decay", *entries)]
 
 
@@ -207,18 +204,11 @@ def test_the_latest_entry_of_a_key_with_the_same_method_and_version_is_ranked():
         assert reasons(*versions) == {3: "", 5: ""}
 
 
-def test_twenty_versions_of_the_same_policies_are_one_row():
-    first = entry(3, scores(0.1, 0.2), policies=10)
-    alike = (Likeness(first.id, first.key, 10),)
-    others = [entry(i, scores(0.1, 0.2), policies=10, alike=alike) for i in range(4, 23)]
-    assert reasons(first, *others) == {**dict.fromkeys(range(3, 22), "superseded"), 22: ""}
-
-
 def test_a_copy_of_another_key_has_no_rank_and_pushes_nobody_down():
     original = entry(3, scores(0.2, 0.3), policies=10)
     own = entry(5, scores(0.4, 0.5), key="2" * 64, policies=10)
 
-    def thief(*copied: tuple[EntryRow, int]) -> EntryRow:
+    def thief(*copied):
         alike = tuple(Likeness(each.id, each.key, runs) for each, runs in copied)
         return entry(6, scores(0.1, 0.2), key="1" * 64, policies=10, alike=alike)
 
@@ -283,7 +273,7 @@ def test_a_wrong_reference_row_blocks_publication_in_any_region_or_metric(name):
             refuse_unpublishable(rows)
 
 
-def moved(estimate: Estimate, off: float) -> Estimate:
+def moved(estimate, off):
     return estimate.model_copy(update={"value": estimate.value + off})
 
 
@@ -292,13 +282,13 @@ def moved(estimate: Estimate, off: float) -> Estimate:
 HOSTILE = '=HYPERLINK("http://x","y")'
 
 
-def hostile_rows() -> list[Any]:
+def hostile_rows():
     evil = entry(3, scores(0.3, 0.2), method=HOSTILE, submitter="a;=1+1\r\n=2", version="-1")
     tex = entry(4, scores(0.6, 0.7), method=r"\input{/etc/passwd} 50% & $x_1^2$ #~", version="+1")
     return ranking([*REFERENCES, evil, tex], "wd_regret")
 
 
-def csv_of(rows: list[Any], metric: str = "wd_regret") -> list[dict[str, str]]:
+def csv_of(rows, metric="wd_regret"):
     return list(csv.DictReader(io.StringIO(to_csv(rows, metric, BOARD, HEAD, DATE))))
 
 

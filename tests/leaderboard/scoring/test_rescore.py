@@ -1,9 +1,5 @@
 """Rescoring: what is drawn, what is tampering, and what is only a note."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 from typer.testing import CliRunner
 
@@ -27,7 +23,7 @@ from tests.leaderboard.scoring.conftest import (
 )
 
 
-def moved(board: Path, number: int, by: float) -> Result:
+def moved(board, number, by):
     """A result with every regret moved, and the scores that follow from it."""
     result = result_on(board, number)
     (run,) = result.runs
@@ -37,7 +33,7 @@ def moved(board: Path, number: int, by: float) -> Result:
     return with_runs(board, result, [run])
 
 
-def again(board: Path, result: Result) -> list[RescoreNote]:
+def again(board, result):
     """The notes on a result that the board's owner has forged."""
     forge(board, result)
     with Store.open(board, read_only=True) as store:
@@ -77,7 +73,7 @@ def test_what_rounding_explains_is_a_note_and_more_is_tampering(board):
         again(board, moved(board, SENSITIVE, 1e-2))
 
 
-def rejected(result: Result, code: str, versions: dict[str, str] | None = None) -> Result:
+def rejected(result, code, versions=None):
     return Result(
         submission=result.submission,
         suite=result.suite,

@@ -1,13 +1,11 @@
 """A table of the nearest states solves few channels, and not many."""
 
-from __future__ import annotations
-
 from leaderboard.scoring import tables
 from leaderboard.scoring.tables import EASY, table_regret
 from sme_registry.spec import Setting
 
 
-def setting(state_dim: int) -> Setting:
+def setting(state_dim):
     return Setting(state_dim=state_dim, action_dim=1, complexity=5, hidden_width=16)
 
 

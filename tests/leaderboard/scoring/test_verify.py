@@ -1,13 +1,8 @@
 """`verify` names the first altered row, whatever was altered."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import sqlite3
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -34,29 +29,29 @@ LAST = 10
 ROWS = 19
 
 
-def where(board: Path, path: Path) -> str:
+def where(board, path):
     return path.relative_to(board).as_posix()
 
 
-def first_altered(board: Path, **arguments: Any) -> str:
+def first_altered(board, **arguments):
     with pytest.raises(TamperedError) as tampered:
         verify(board, **arguments)
     assert tampered.value.where in str(tampered.value)
     return tampered.value.where
 
 
-def changed(path: Path, change: Callable[[Any], Any]) -> bytes:
+def changed(path, change):
     """A document after a change, in the board's form."""
     plain = json.loads(path.read_text())
     change(plain)
     return to_json(plain).encode()
 
 
-def alter(path: Path, change: Callable[[Any], Any]) -> None:
+def alter(path, change):
     path.write_bytes(changed(path, change))
 
 
-def assert_named(board: Path, path: Path, *versions: bytes | None) -> None:
+def assert_named(board, path, *versions):
     """`verify` names this file while it has any of these bytes, or is missing for None."""
     data = path.read_bytes()
     for version in versions:
@@ -69,7 +64,7 @@ def assert_named(board: Path, path: Path, *versions: bytes | None) -> None:
         path.write_bytes(data)
 
 
-def assert_swap_named(board: Path, one: Path, other: Path) -> None:
+def assert_swap_named(board, one, other):
     first, second = one.read_bytes(), other.read_bytes()
     one.write_bytes(second)
     other.write_bytes(first)
@@ -349,7 +344,7 @@ def test_a_forged_and_signed_result_is_detected(board):
     assert verify(board).results == 4
 
 
-def test_a_result_of_an_earlier_version_that_gives_single_runs_an_interval_is_accepted() -> None:
+def test_a_result_of_an_earlier_version_that_gives_single_runs_an_interval_is_accepted():
     single = {"value": 0.5, "low": None, "high": None}
     assert close(single, {"value": 0.5, "low": 0.5, "high": 0.5}, 1e-12)
     assert not close(single, {"value": 0.5, "low": 0.4, "high": 0.6}, 1e-12)

@@ -1,7 +1,5 @@
 """Scorers: one in this process, several in their own, and what may stop them."""
 
-from __future__ import annotations
-
 import itertools
 import logging
 import multiprocessing
@@ -41,7 +39,7 @@ def quick(monkeypatch):
 
 
 @pytest.fixture
-def board(store, submit) -> Path:
+def board(store, submit):
     """A board of three policies."""
     for number in range(3):
         submit(number)
@@ -216,7 +214,7 @@ def test_a_scorer_stops_on_request(store, submit, quick):
 def test_several_processes_score_everything_once(store, board):
     seen, pids = [], []
 
-    def report(done: int, total: int) -> None:
+    def report(done, total):
         seen.append((done, total))
         if done == 2:  # the last is done after the last look at the queue, and counts
             wait_until(lambda: store.queue.done() == 3)
@@ -247,31 +245,6 @@ def test_processes_that_keep_dying_end_the_command(store, board, monkeypatch):
         run_scorers(board, 1, started=lambda pid: os.kill(pid, signal.SIGKILL))
     assert store.queue.waiting() == 3
     assert [row.faults for row in store.entries()] == [0, 0, 0]
-
-
-def test_a_served_board_replaces_dying_processes_with_growing_pauses(store, board, monkeypatch):
-    """Every process dies before it claims anything, twice as often as ends a command."""
-    at, started, pauses = [0.0], [], []
-    monkeypatch.setattr(scorer, "_FUTILE_DEATHS", 2)
-    monkeypatch.setattr(scorer, "_LONGEST_PAUSE", 4.0)
-
-    class Clock:
-        @staticmethod
-        def monotonic():
-            at[0] += 0.5
-            return at[0]
-
-    def kill(pid):
-        os.kill(pid, signal.SIGKILL)
-        started.append(at[0])
-
-    with monkeypatch.context() as patch:
-        patch.setattr(scorer, "time", Clock)
-        run_scorers(board, 1, until_empty=False, started=kill, stop=lambda: len(started) == 7)
-    pauses = [later - earlier for earlier, later in itertools.pairwise(started)]
-    assert pauses[0] < 1.0
-    assert all(pause >= least for pause, least in zip(pauses[1:], [1, 2, 4, 4, 4], strict=True))
-    assert store.queue.waiting() == 3
 
 
 def test_a_served_board_scores_on_after_any_error(tmp_path, monkeypatch, caplog):
