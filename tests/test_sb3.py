@@ -1,6 +1,4 @@
-"""`SMEVecEnv`: the numbers of SB3's own DummyVecEnv, under SB3's algorithms and wrappers."""
-
-from __future__ import annotations
+"""`SMEVecEnv` and `RegretCallback`: SB3's own numbers, under its algorithms and wrappers."""
 
 import importlib
 import pickle
@@ -12,6 +10,7 @@ import numpy as np
 import pytest
 
 import sme_registry
+from sme_registry import SMESpec
 from sme_registry.errors import (
     ActionError,
     EpisodeError,
@@ -26,6 +25,7 @@ pytest.importorskip("stable_baselines3")
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
@@ -35,7 +35,7 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
-from sme_registry.sb3 import SMETeamVecEnv, SMEVecEnv
+from sme_registry.sb3 import RegretCallback, SMETeamVecEnv, SMEVecEnv
 from sme_registry.testing.comparing import expect_same
 
 # Ends early and late, pays late, and its lanes drift apart.
@@ -47,13 +47,13 @@ DRIVEN = sme_registry.SMESpec(
 )
 
 
-def assert_same(got: Any, expected: Any) -> None:
+def assert_same(got, expected):
     """Equal in every bit and type."""
     expect_same("ours", got, expected)
     expect_same("theirs", expected, got)
 
 
-def dummy(spec: Any = HARD, lanes: int = 3, **kwargs: Any) -> DummyVecEnv:
+def dummy(spec=HARD, lanes=3, **kwargs):
     kwargs = {"action_range": "symmetric", **kwargs}
     return DummyVecEnv([lambda: sme_registry.make(spec, **kwargs)] * lanes)
 
@@ -63,7 +63,7 @@ def dummy(spec: Any = HARD, lanes: int = 3, **kwargs: Any) -> DummyVecEnv:
     [(HARD, "unit"), (BOTH, "symmetric"), ("HardSafeMixed", "symmetric"), (DRIVEN, "symmetric")],
     ids=["hard", "both-flags", "HardSafeMixed", "driven"],
 )
-def test_every_number_is_that_of_a_dummy_vec_env_of_singles(spec: Any, action_range: Any) -> None:
+def test_every_number_is_that_of_a_dummy_vec_env_of_singles(spec, action_range):
     ours = SMEVecEnv(spec, 3, action_range=action_range)
     theirs = dummy(spec, action_range=action_range)
     assert ours.observation_space == theirs.observation_space
@@ -98,7 +98,7 @@ def test_every_number_is_that_of_a_dummy_vec_env_of_singles(spec: Any, action_ra
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_sb3s_algorithms_learn_on_it(algorithm: Any, kwargs: dict[str, Any]) -> None:
+def test_sb3s_algorithms_learn_on_it(algorithm, kwargs):
     env = VecMonitor(SMEVecEnv("Default", 4, horizon=10, k=5))
     model = algorithm("MlpPolicy", env, seed=0, device="cpu", policy_kwargs={"net_arch": [16]},
                       **kwargs)  # fmt: skip
@@ -111,7 +111,7 @@ def test_sb3s_algorithms_learn_on_it(algorithm: Any, kwargs: dict[str, Any]) -> 
     assert np.isfinite(evaluated.last_mean_reward)
 
 
-def test_sb3s_wrappers_and_its_evaluation_work_on_it() -> None:
+def test_sb3s_wrappers_and_its_evaluation_work_on_it():
     env: Any = VecNormalize(VecFrameStack(VecCheckNan(VecMonitor(SMEVecEnv(HARD, 3))), 2))
     env.seed(0)
     env.reset()
@@ -125,7 +125,7 @@ def test_sb3s_wrappers_and_its_evaluation_work_on_it() -> None:
     assert episodes > 0
 
     class Optimum:
-        def predict(self, observation: Any, **_: Any) -> tuple[Any, None]:
+        def predict(self, observation, **_):
             state = observation[:, :-2].astype(np.float64)
             return 2.0 * task.optimal_action(state) - 1.0, None
 
@@ -135,7 +135,7 @@ def test_sb3s_wrappers_and_its_evaluation_work_on_it() -> None:
     assert (mean, spread) == pytest.approx((20.0, 0.0), abs=1e-3)
 
 
-def test_attributes_and_methods_of_the_lanes_are_reached() -> None:
+def test_attributes_and_methods_of_the_lanes_are_reached():
     env = SMEVecEnv("Default", 3, complexity=2)
     env.seed(1)
     observations = env.reset()
@@ -164,7 +164,7 @@ def test_attributes_and_methods_of_the_lanes_are_reached() -> None:
     env.close()
 
 
-def test_options_begin_lanes_where_they_say() -> None:
+def test_options_begin_lanes_where_they_say():
     ours, theirs = SMEVecEnv("Plane1", 3), dummy("Plane1")
     for options in ({"state": [0.25, 0.5]}, [{}, {"state": [0.5, 1.0]}, {}], None):
         for env in (ours, theirs):
@@ -180,7 +180,7 @@ def test_options_begin_lanes_where_they_say() -> None:
         ours.reset()
 
 
-def test_infos_are_fresh_and_writing_into_what_is_returned_moves_nothing() -> None:
+def test_infos_are_fresh_and_writing_into_what_is_returned_moves_nothing():
     env, untouched = SMEVecEnv(HARD, 3), SMEVecEnv(HARD, 3)
     rng = np.random.default_rng(0)
     for e in (env, untouched):
@@ -203,7 +203,7 @@ def test_infos_are_fresh_and_writing_into_what_is_returned_moves_nothing() -> No
     assert_same(env.get_attr("state"), untouched.get_attr("state"))
 
 
-def test_what_cannot_be_used_is_a_typed_error() -> None:
+def test_what_cannot_be_used_is_a_typed_error():
     with pytest.raises(OptionError, match="num_envs=0"):
         SMEVecEnv("Default", 0)
     with pytest.raises(OptionError, match="action_range"):
@@ -225,7 +225,7 @@ def test_what_cannot_be_used_is_a_typed_error() -> None:
     env.step(np.zeros((2, 4)))
 
 
-def test_without_sb3_the_way_to_install_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_sb3_the_way_to_install_it_is_named(monkeypatch):
     for name in [name for name in sys.modules if name.startswith("sme_registry.sb3")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
@@ -233,7 +233,7 @@ def test_without_sb3_the_way_to_install_it_is_named(monkeypatch: pytest.MonkeyPa
         importlib.import_module("sme_registry.sb3")
 
 
-def test_frames_are_those_of_a_dummy_vec_env_of_singles() -> None:
+def test_frames_are_those_of_a_dummy_vec_env_of_singles():
     pytest.importorskip("pygame")
     ours = SMEVecEnv(HARD, 2, render_mode="rgb_array")
     few = SMEVecEnv(HARD, 2, render_mode="rgb_array", render_lanes=[1])
@@ -253,7 +253,7 @@ def test_frames_are_those_of_a_dummy_vec_env_of_singles() -> None:
     np.testing.assert_array_equal(ours.render(), theirs.render())
 
 
-def test_a_vec_env_is_shown_with_its_task_and_its_lanes() -> None:
+def test_a_vec_env_is_shown_with_its_task_and_its_lanes():
     assert repr(SMEVecEnv("Default", 2)) == "SMEVecEnv(SME/Default-v1, num_envs=2)"
     name = SMEVecEnv("Default", 2, k=3).get_attr("sme_spec")[0].content_name
     assert repr(SMEVecEnv("Default", 2, k=3)) == f"SMEVecEnv(SME/{name}, num_envs=2)"
@@ -261,7 +261,7 @@ def test_a_vec_env_is_shown_with_its_task_and_its_lanes() -> None:
 
 
 @pytest.mark.parametrize("switch", ["episode", "step"])
-def test_lives_of_a_stream_are_those_of_a_dummy_vec_env(switch: str) -> None:
+def test_lives_of_a_stream_are_those_of_a_dummy_vec_env(switch):
     fields = {"horizon": 12, "D": 0.3, "complexity": 2}
     phases = [{"spec": fields | {"k": k, "seed": k}, "steps": 40} for k in (5, 2)]
     stream = sme_registry.StreamSpec(phases=phases, cycles=2, switch=switch, observes_phase=True)
@@ -292,3 +292,70 @@ def test_lives_of_a_stream_are_those_of_a_dummy_vec_env(switch: str) -> None:
     assert [info["phase"] for info in ours.reset_infos] == [0, 0, 0]
     assert ours.env_method("reset", indices=1, seed=0)[0][1]["lifetime"] == 0
     assert ours.get_attr("spec", 0)[0].id == f"SME/{stream.content_name}-v1"
+
+
+SPEC = SMESpec(state_dim=2, action_dim=2, horizon=8, seed=5)
+
+
+def make_env():
+    return sme_registry.make(SPEC, action_range="symmetric")
+
+
+def vec_env(kind):
+    if kind == "batch":
+        return SMEVecEnv(SPEC, 2)
+    return DummyVecEnv([lambda: Monitor(make_env())] * 2)
+
+
+def ppo(env):
+    return PPO("MlpPolicy", env, n_steps=16, batch_size=16, n_epochs=1, seed=1, device="cpu")
+
+
+@pytest.mark.parametrize("kind", ["batch", "dummy"])
+def test_the_mean_regret_of_each_episode_is_logged(kind, tmp_path):
+    env = vec_env(kind)
+    model = ppo(env)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    callback = RegretCallback()
+    model.learn(32, callback=callback)
+    model.logger.close()
+    env.close()
+    assert [episode.step for episode in callback.episodes] == [16, 16, 32, 32]
+    for episode in callback.episodes:
+        # With k = 1 and r_min = 0 the return is the horizon less the sum of regrets.
+        assert episode.episode_return == pytest.approx(8 * (1 - episode.regret), abs=1e-5)
+        assert episode.length == 8
+        assert not episode.terminated
+    header, first, *_ = (tmp_path / "progress.csv").read_text().splitlines()
+    logged = dict(zip(header.split(","), first.split(","), strict=True))
+    expected = np.mean([episode.regret for episode in callback.episodes])
+    assert float(logged["rollout/regret"]) == pytest.approx(expected)
+    assert "rollout/similarity" in logged
+
+
+def test_a_second_learn_continues_the_episodes_or_begins_new_ones():
+    model = ppo(vec_env("batch"))
+    model.n_steps = model.rollout_buffer.buffer_size = 4
+    callback = RegretCallback()
+    model.learn(8, callback=callback)
+    assert callback.episodes == []
+    model.learn(8, callback=callback, reset_num_timesteps=False)
+    assert [(e.step, e.length) for e in callback.episodes] == [(16, 8), (16, 8)]
+    model.learn(8, callback=callback)
+    model.learn(8, callback=callback)
+    assert len(callback.episodes) == 2
+
+
+def test_a_teams_agents_have_their_own_regret():
+    callback = RegretCallback()
+    model = ppo(SMETeamVecEnv("Team2", 2, horizon=8))
+    model.learn(64, callback=callback)
+    assert [episode.step for episode in callback.episodes] == [16, 16, 32, 32]
+    for episode in callback.episodes:
+        assert episode.regret == pytest.approx(np.mean(episode.agents_regret))
+        assert len(episode.agents_regret) == 2
+
+
+def test_other_environments_are_rejected():
+    with pytest.raises(OptionError, match="no 'regret'"):
+        ppo(gymnasium.make("Pendulum-v1")).learn(16, callback=RegretCallback())

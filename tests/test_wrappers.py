@@ -1,8 +1,5 @@
 """Recorded regret is that of `info`, in every kind of loop, and the file is that of `sme train`."""
 
-from __future__ import annotations
-
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -29,11 +26,11 @@ SPEC = SMESpec(state_dim=3, action_dim=1, D=0.1, r_min=0.1, horizon=3)
 STEPS = 60
 
 
-def actions(lanes: int = 1) -> Any:
+def actions(lanes=1):
     return np.random.default_rng(4).random((STEPS, lanes, 1), dtype=np.float32)
 
 
-def by_hand(env: Any, taken: Any, seed: int = 0) -> list[tuple[float, ...]]:
+def by_hand(env, taken, seed=0):
     """Return, length, mean regret, mean similarity and end of each episode."""
     env.reset(seed=seed)
     episodes: list[tuple[float, ...]] = []
@@ -51,14 +48,14 @@ def by_hand(env: Any, taken: Any, seed: int = 0) -> list[tuple[float, ...]]:
     return episodes
 
 
-def as_rows(env: Any) -> list[tuple[float, ...]]:
+def as_rows(env):
     return [
         (each.episode_return, each.length, each.regret, each.similarity, each.terminated)
         for each in env.episodes
     ]
 
 
-def test_each_episode_has_its_mean_regret(tmp_path: Path) -> None:
+def test_each_episode_has_its_mean_regret(tmp_path):
     path = tmp_path / "runs" / "episodes.csv"
     env = RecordRegret(sme_registry.make(SPEC), path)
     assert np.isnan(env.online_regret)
@@ -88,7 +85,7 @@ def test_each_episode_has_its_mean_regret(tmp_path: Path) -> None:
     ("kind", "mode"),
     [("native", "NextStep"), ("native", "SameStep"), ("sync", "NextStep"), ("sync", "Disabled")],
 )
-def test_a_vector_records_the_same_episodes_in_every_mode(kind: str, mode: str) -> None:
+def test_a_vector_records_the_same_episodes_in_every_mode(kind, mode):
     lanes, mode_ = 3, AutoresetMode(mode)
     taken = actions(lanes)
     if kind == "native":
@@ -122,7 +119,7 @@ def test_a_vector_records_the_same_episodes_in_every_mode(kind: str, mode: str) 
     np.testing.assert_allclose(sorted(as_rows(recorded)), sorted(expected), atol=1e-9)
 
 
-def test_it_stands_beside_gymnasiums_statistics() -> None:
+def test_it_stands_beside_gymnasiums_statistics():
     env = RecordRegret(RecordEpisodeStatistics(sme_registry.make(SPEC)))
     env.reset(seed=0)
     info: dict[str, Any] = {}
@@ -137,9 +134,7 @@ def test_it_stands_beside_gymnasiums_statistics() -> None:
     assert {"r", "regret"} <= set(info["episode"])
 
 
-def test_a_file_that_exists_is_kept_unless_forced_and_other_environments_refused(
-    tmp_path: Path,
-) -> None:
+def test_a_file_that_exists_is_kept_unless_forced_and_other_environments_refused(tmp_path):
     path = tmp_path / "episodes.csv"
     path.write_text("mine")
     with pytest.raises(OptionError, match=r"already exists.*force=True"):
@@ -156,11 +151,11 @@ def test_a_file_that_exists_is_kept_unless_forced_and_other_environments_refused
 LIMITED = SMESpec(state_dim=3, action_dim=2, horizon=4, safety={"tightness": 0.3})
 
 
-def high_actions(lanes: int, steps: int = 11) -> Any:
+def high_actions(lanes, steps=11):
     return np.random.default_rng(2).uniform(0.5, 1.0, (steps, lanes, 2)).astype(np.float32)
 
 
-def singles(taken: Any) -> Any:
+def singles(taken):
     """Cost and safe regret of each step, `[steps, lanes, 2]`, of single environments."""
     rows = []
     for lane in range(taken.shape[1]):
@@ -175,7 +170,7 @@ def singles(taken: Any) -> Any:
     return np.array(rows).swapaxes(0, 1)
 
 
-def test_a_step_with_cost_has_the_six_values_of_safety_gymnasium() -> None:
+def test_a_step_with_cost_has_the_six_values_of_safety_gymnasium():
     env = StepWithCost(sme_registry.make(LIMITED))
     env.reset(seed=0)
     taken = high_actions(1)[:4]
@@ -192,7 +187,7 @@ def test_a_step_with_cost_has_the_six_values_of_safety_gymnasium() -> None:
 
 
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep", "Disabled"])
-def test_a_vector_with_costs_has_those_of_its_singles(mode: str) -> None:
+def test_a_vector_with_costs_has_those_of_its_singles(mode):
     lanes = 3
     taken = high_actions(lanes)
     expected = singles(taken)[:, :, 0]
@@ -217,7 +212,7 @@ def test_a_vector_with_costs_has_those_of_its_singles(mode: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["single", "SameStep", "NextStep"])
-def test_recorded_episodes_have_their_cost(kind: str, tmp_path: Path) -> None:
+def test_recorded_episodes_have_their_cost(kind, tmp_path):
     path, lanes = tmp_path / "episodes.csv", 1 if kind == "single" else 2
     taken = high_actions(lanes, 4)
     infos = {}
@@ -247,8 +242,8 @@ def test_recorded_episodes_have_their_cost(kind: str, tmp_path: Path) -> None:
     [(0.005, 1, 0.0, 0.0), (0.005, 1, 2e-6, 1.0), (0.2, 200, 0.0, 0.0)],
 )
 def test_steps_above_a_limit_by_more_than_rounding_are_violations(
-    tightness: float, channels: int, above: float, share: float
-) -> None:
+    tightness, channels, above, share
+):
     spec = SMESpec(
         action_dim=channels,
         horizon=20,
@@ -277,7 +272,7 @@ def test_steps_above_a_limit_by_more_than_rounding_are_violations(
         assert episode.safety.violating_share == share
 
 
-def test_a_task_without_limits_has_no_costs() -> None:
+def test_a_task_without_limits_has_no_costs():
     vector = SyncVectorEnv([lambda: sme_registry.make(LIMITED)])
     for wrapper, env, words in (
         (StepWithCost, sme_registry.make(SPEC), "needs a task with limits"),

@@ -1,9 +1,5 @@
 """Streams keep every promise of the conformance kit; ids and EnvSpecs name them."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import gymnasium
 import pytest
 from gymnasium.envs.registration import EnvSpec
@@ -34,21 +30,19 @@ SHORT = StreamSpec.from_dict(
 )
 
 
-def short(**fields: Any) -> StreamSpec:
+def short(**fields):
     return StreamSpec.from_dict({**SHORT.to_dict(), **fields})
 
 
 @pytest.mark.parametrize(
     ("switch", "backend"), [("episode", "auto"), ("step", "auto"), ("step", "numpy")]
 )
-def test_streams_pass_the_conformance_kit(
-    switch: str, backend: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_streams_pass_the_conformance_kit(switch, backend, monkeypatch):
     monkeypatch.setenv("SME_BACKEND", backend)
     testing.check_stream(short(switch=switch, observes_phase=switch == "step"))
 
 
-def test_streams_of_the_catalogue_have_their_ids() -> None:
+def test_streams_of_the_catalogue_have_their_ids():
     for name in NAMES:
         stream = sme_registry.load(name, StreamSpec)
         ids = [name, f"Stream{name}", catalogue.symmetric_name(name), f"{stream.content_name}-v1"]
@@ -65,7 +59,7 @@ def test_streams_of_the_catalogue_have_their_ids() -> None:
     testing.check_env_spec("Switch5-v1")
 
 
-def test_names_make_single_environments_and_native_batches() -> None:
+def test_names_make_single_environments_and_native_batches():
     for name in ("Switch5", "SME/Switch5-v1", "sme_registry:SME/StreamSwitch5-v1"):
         env, batch = sme_registry.make(name), sme_registry.make_vec(name, 2)
         assert isinstance(env.unwrapped, SMEStreamEnv)
@@ -77,7 +71,7 @@ def test_names_make_single_environments_and_native_batches() -> None:
     assert repr(env.unwrapped) == "SMEStreamEnv(SME/Switch5-v1)"
 
 
-def test_a_stream_of_ones_own_goes_by_content_or_by_a_registered_name() -> None:
+def test_a_stream_of_ones_own_goes_by_content_or_by_a_registered_name():
     env = sme_registry.make(SHORT, action_range="symmetric")
     assert env.spec.id == f"SME/{SHORT.content_name}-v1"
     assert sme_registry.env_spec(SHORT).kwargs == {"stream": SHORT.to_dict()}
@@ -99,7 +93,7 @@ def test_a_stream_of_ones_own_goes_by_content_or_by_a_registered_name() -> None:
 
 
 @pytest.mark.parametrize("name", ["Switch5", "SME/StreamSwitch5-v1", SHORT, SHORT.to_dict()])
-def test_a_stream_where_one_task_is_needed_is_a_typed_error(name: Any) -> None:
+def test_a_stream_where_one_task_is_needed_is_a_typed_error(name):
     with pytest.raises(StreamError, match=r"is a stream.*phases\[0\]\.spec"):
         sme_registry.evaluate("optimal", name)
     with pytest.raises(StreamError):
@@ -109,14 +103,14 @@ def test_a_stream_where_one_task_is_needed_is_a_typed_error(name: Any) -> None:
 class _Forgets(SMEStreamEnv):
     """Restarts the life at each reset."""
 
-    def _live(self, lifetime: int | None) -> dict[str, Any]:
+    def _live(self, lifetime):
         return super()._live(0)
 
 
 class _Lags(SMEStreamEnv):
     """Tells the phase of the observation, rather than that of the action."""
 
-    def step(self, action: Any) -> Any:
+    def step(self, action):
         *returned, info = super().step(action)
         return *returned, {**info, "phase": self._phase}
 
@@ -124,7 +118,7 @@ class _Lags(SMEStreamEnv):
 class _Swaps(SMEStreamVectorEnv):
     """Switches one lane too late."""
 
-    def reset(self, **arguments: Any) -> Any:
+    def reset(self, **arguments):
         returned = super().reset(**arguments)
         self._batch._next_switch[1] += int(self._batch._next_switch[1] < SHORT.steps)
         return returned
@@ -138,6 +132,6 @@ class _Swaps(SMEStreamVectorEnv):
         ("step", {"vector": _Swaps}, "SameStep|NextStep"),
     ],
 )
-def test_the_kit_detects_faults_of_streams(switch: str, faulty: Any, words: str) -> None:
+def test_the_kit_detects_faults_of_streams(switch, faulty, words):
     with pytest.raises(ConformanceError, match=words):
         testing.check_stream(short(switch=switch, observes_phase=True), **faulty)

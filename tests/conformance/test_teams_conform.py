@@ -1,9 +1,6 @@
 """Every team of the catalogue keeps every promise: PettingZoo's and ours, by name, by content."""
 
-from __future__ import annotations
-
 import warnings
-from typing import Any
 
 import pettingzoo
 import pytest
@@ -29,7 +26,7 @@ UNEQUAL = {
 
 
 @pytest.mark.parametrize("name", ["Team2", "TeamBlindShared4", "DuoDeep", "HardFragile"])
-def test_a_team_of_each_kind_passes_the_conformance_kit(name: str) -> None:
+def test_a_team_of_each_kind_passes_the_conformance_kit(name):
     testing.check_team(name)
 
 
@@ -43,22 +40,22 @@ def test_a_team_of_each_kind_passes_the_conformance_kit(name: str) -> None:
     ],
     ids=["short", "fragile", "shared", "lone"],
 )
-def test_teams_at_the_edges_pass_the_conformance_kit(fields: dict[str, Any]) -> None:
+def test_teams_at_the_edges_pass_the_conformance_kit(fields):
     testing.check_team(fields)
 
 
-def test_a_team_in_turns_by_make_aec_passes_pettingzoos_tests() -> None:
+def test_a_team_in_turns_by_make_aec_passes_pettingzoos_tests():
     api_test(sme_registry.make_aec("Team4-v1", horizon=20), num_cycles=100)
     seed_test(lambda: sme_registry.make_aec("Team4-v1", horizon=20))
 
 
-def test_a_team_passes_pettingzoos_render_test(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_team_passes_pettingzoos_render_test(monkeypatch):
     pytest.importorskip("pygame")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     render_test(lambda render_mode: sme_registry.make_aec("Team2", render_mode=render_mode))
 
 
-def test_teams_are_in_pettingzoos_registry_by_name_and_by_content() -> None:
+def test_teams_are_in_pettingzoos_registry_by_name_and_by_content():
     assert {"Team2-v1", "Team4-v1", "Team8-v1", "TeamBlind4-v1", "TeamShared4-v1"} <= set(TEAMS)
     for name in TEAMS:
         spec = sme_registry.load(name)
@@ -68,7 +65,7 @@ def test_teams_are_in_pettingzoos_registry_by_name_and_by_content() -> None:
             assert pettingzoo.make("parallel", env_id, seed=5).sme_spec == spec.derive(seed=5)
 
 
-def test_single_agents_stay_out_of_pettingzoos_registry_and_teams_out_of_gymnasiums() -> None:
+def test_single_agents_stay_out_of_pettingzoos_registry_and_teams_out_of_gymnasiums():
     import gymnasium
 
     ours = {env_id for env_id in pettingzoo.parallel_registry if env_id.startswith("SME/")}
@@ -77,7 +74,7 @@ def test_single_agents_stay_out_of_pettingzoos_registry_and_teams_out_of_gymnasi
     assert not ours & gymnasium.registry.keys()
 
 
-def test_a_spec_of_your_own_with_a_team_is_made_by_its_name() -> None:
+def test_a_spec_of_your_own_with_a_team_is_made_by_its_name():
     spec = SMESpec(team=UNEQUAL, seed=301)
     assert sme_registry.register(spec, "ApiTrio") == "SME/ApiTrio-v1"
     assert pettingzoo.make("parallel", "SME/ApiTrio-v1").sme_spec == spec
@@ -86,7 +83,7 @@ def test_a_spec_of_your_own_with_a_team_is_made_by_its_name() -> None:
         sme_registry.register(SMESpec(seed=302), "ApiTrio")
 
 
-def test_a_team_is_made_from_an_id_a_path_a_digest_a_spec_and_its_fields(tmp_path: Any) -> None:
+def test_a_team_is_made_from_an_id_a_path_a_digest_a_spec_and_its_fields(tmp_path):
     spec = sme_registry.load("DuoDeep")
     path = sme_registry.save(spec, tmp_path / "duo.json")
     for given in ("SME/DuoDeep-v1", "DuoDeep", path, str(path), spec.digest, spec, spec.to_dict()):
@@ -94,7 +91,7 @@ def test_a_team_is_made_from_an_id_a_path_a_digest_a_spec_and_its_fields(tmp_pat
         assert sme_registry.make_aec(given).unwrapped.sme_spec == spec
 
 
-def test_the_conversion_back_from_turns_gives_the_environment_itself() -> None:
+def test_the_conversion_back_from_turns_gives_the_environment_itself():
     env = sme_registry.make_parallel("Team2")
     assert aec_to_parallel(parallel_to_aec(env)) is env
     assert aec_to_parallel(sme_registry.make_aec("Team2")).sme_spec == env.sme_spec

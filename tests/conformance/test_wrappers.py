@@ -1,7 +1,5 @@
 """The wrappers that people put around environments work on these, and none changes the task."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium
@@ -45,7 +43,7 @@ AROUND_BATCHES = {
 
 
 @pytest.mark.parametrize("name", AROUND_SINGLES)
-def test_an_episode_runs_whole_within_a_common_wrapper(name: str) -> None:
+def test_an_episode_runs_whole_within_a_common_wrapper(name):
     env = AROUND_SINGLES[name](sme_registry.make("Default", horizon=T, k=3))
     observation, _ = env.reset(seed=0)
     assert env.observation_space.contains(observation)
@@ -60,7 +58,7 @@ def test_an_episode_runs_whole_within_a_common_wrapper(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", AROUND_BATCHES)
-def test_a_batch_runs_on_over_episodes_within_a_common_wrapper(name: str) -> None:
+def test_a_batch_runs_on_over_episodes_within_a_common_wrapper(name):
     env = AROUND_BATCHES[name](sme_registry.make_vec("Default", 3, horizon=T, k=3))
     observation, _ = env.reset(seed=0)
     env.action_space.seed(0)
@@ -72,7 +70,7 @@ def test_a_batch_runs_on_over_episodes_within_a_common_wrapper(name: str) -> Non
     assert ends == 6
 
 
-def test_recorded_statistics_of_a_batch_are_those_of_its_singles() -> None:
+def test_recorded_statistics_of_a_batch_are_those_of_its_singles():
     batch = vector_wrappers.RecordEpisodeStatistics(
         sme_registry.make_vec("Default", 2, horizon=T, autoreset_mode="SameStep")
     )
@@ -90,7 +88,7 @@ def test_recorded_statistics_of_a_batch_are_those_of_its_singles() -> None:
 
 
 @pytest.mark.parametrize("outside", [None, wrappers.Autoreset, wrappers.RecordEpisodeStatistics])
-def test_a_time_limit_below_the_horizon_is_refused_at_reset(outside: Any) -> None:
+def test_a_time_limit_below_the_horizon_is_refused_at_reset(outside):
     made = gymnasium.make("SME/Default-v1", horizon=T, max_episode_steps=T - 1)
     by_hand = wrappers.TimeLimit(sme_registry.make("Default", horizon=T), T - 1)
     bare = wrappers.TimeLimit(sme_registry.envs.SMEEnv("Default", horizon=T), T - 1)
@@ -100,7 +98,7 @@ def test_a_time_limit_below_the_horizon_is_refused_at_reset(outside: Any) -> Non
             wrapped.reset(seed=0)
 
 
-def test_a_batch_takes_a_time_limit_of_the_horizon_and_refuses_one_below() -> None:
+def test_a_batch_takes_a_time_limit_of_the_horizon_and_refuses_one_below():
     for mode in ("sync", "vector_entry_point"):
         with pytest.raises(WrapperError, match=f"max_episode_steps={T - 1}"):
             gymnasium.make_vec(
@@ -113,7 +111,7 @@ def test_a_batch_takes_a_time_limit_of_the_horizon_and_refuses_one_below() -> No
     assert truncated.all()
 
 
-def test_frames_are_collected_and_can_be_observed() -> None:
+def test_frames_are_collected_and_can_be_observed():
     pytest.importorskip("pygame")
     collected = wrappers.RenderCollection(
         sme_registry.make("Default", horizon=T, render_mode="rgb_array")

@@ -1,7 +1,5 @@
 """A batch of teams is the loop of its single teams, bit for bit, over whole episodes."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 import weakref
@@ -32,7 +30,7 @@ SPECS = {
 }
 
 
-def mixed(task: Any, s: Any, rng: Any) -> Any:
+def mixed(task, s, rng):
     """Actions between the optimum and noise, some a little outside the range."""
     share = rng.uniform(0.0, 0.6, (len(s), 1))
     best = task.optimal_action(s)
@@ -40,7 +38,7 @@ def mixed(task: Any, s: Any, rng: Any) -> Any:
 
 
 @pytest.fixture(params=["numba", "numpy"])
-def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+def backend(request, monkeypatch):
     if request.param == "numba":
         pytest.importorskip("numba")
     monkeypatch.setenv("SME_BACKEND", request.param)
@@ -49,9 +47,7 @@ def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize("lanes", [1, 131])
 @pytest.mark.parametrize("name", SPECS)
-def test_a_batch_is_the_loop_of_its_teams_over_whole_episodes(
-    name: str, lanes: int, backend: str
-) -> None:
+def test_a_batch_is_the_loop_of_its_teams_over_whole_episodes(name, lanes, backend):
     task, rng = materialize(SPECS[name]), np.random.default_rng(lanes)
     batch, teams = Batch(task, lanes), [SMETeamEnv(SPECS[name]) for _ in range(min(lanes, 20))]
     # Of large batches some lanes are looked at: the first, the last, and those about a block's end.
@@ -93,7 +89,7 @@ def test_a_batch_is_the_loop_of_its_teams_over_whole_episodes(
     assert episodes >= 2 * len(watched)
 
 
-def test_a_refused_step_moves_nothing_and_copies_go_on_as_the_original(backend: str) -> None:
+def test_a_refused_step_moves_nothing_and_copies_go_on_as_the_original(backend):
     task = materialize(SPECS["individual"])
     batch = Batch(task, 70)
     batch.begin(np.arange(70), batch.observe())
@@ -113,7 +109,7 @@ def test_a_refused_step_moves_nothing_and_copies_go_on_as_the_original(backend: 
             np.testing.assert_array_equal(one, other)
 
 
-def torch_tensor(array: Any) -> Any:
+def torch_tensor(array):
     return pytest.importorskip("torch").from_numpy(array)
 
 
@@ -129,7 +125,7 @@ HOLDERS: dict[str, Callable[[Any], Any]] = {
 
 
 @pytest.mark.parametrize("holder", HOLDERS)
-def test_no_step_writes_to_a_result_that_is_held(holder: str) -> None:
+def test_no_step_writes_to_a_result_that_is_held(holder):
     for field in BatchStep._fields:
         spec = SPECS["fragile"].derive(horizon=2)
         if field == "limits":  # which teams have not
@@ -149,7 +145,7 @@ def test_no_step_writes_to_a_result_that_is_held(holder: str) -> None:
         assert len(set(kept)) > 1
 
 
-def test_a_result_that_nobody_holds_is_written_again_whatever_was_done_to_it() -> None:
+def test_a_result_that_nobody_holds_is_written_again_whatever_was_done_to_it():
     batch = Batch(materialize(SPECS["individual"]), 3)
     batch.begin(np.arange(3), batch.observe())
     action = np.full((3, 4), 0.4)
@@ -167,7 +163,7 @@ def test_a_result_that_nobody_holds_is_written_again_whatever_was_done_to_it() -
     assert sum(array() is not None for array in arrays) == 3  # few are kept of many
 
 
-def test_the_state_that_is_handed_out_is_a_copy() -> None:
+def test_the_state_that_is_handed_out_is_a_copy():
     for lanes, state_dim in ((1, 8), (5, 1), (1, 1), (5, 8)):
         batch = Batch(materialize(SMESpec(state_dim=state_dim)), lanes)
         batch.begin(np.arange(lanes), batch.observe())
@@ -176,7 +172,7 @@ def test_the_state_that_is_handed_out_is_a_copy() -> None:
         np.testing.assert_array_equal(batch.state, before)
 
 
-def test_actions_laid_out_otherwise_are_read_as_they_mean(backend: str) -> None:
+def test_actions_laid_out_otherwise_are_read_as_they_mean(backend):
     batches = [Batch(materialize(SPECS["one"]), 3) for _ in range(3)]
     for batch in batches:
         batch.begin(np.arange(3), batch.observe(), np.full((3, 8), 0.3))

@@ -1,6 +1,4 @@
-"""Frames: headless, of one size, of what has happened, and lazily drawn."""
-
-from __future__ import annotations
+"""Frames: headless, of one size, of what has happened, lazily drawn; of batches, as of singles."""
 
 import copy
 import os
@@ -11,27 +9,28 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import sme_registry
-from sme_registry.envs import SMEEnv, rendering
+from sme_registry.envs import SMEEnv, SMEVectorEnv, rendering
 from sme_registry.errors import EpisodeError, MissingDependencyError, OptionError
 
 pygame = pytest.importorskip("pygame")
 ROOT = Path(sme_registry.__file__).resolve().parents[1]
 
 
-def begun(name: Any = "Default", **kwargs: Any) -> SMEEnv:
+def begun(name="Default", **kwargs):
     env = SMEEnv(name, render_mode="rgb_array", **kwargs)
     env.reset(seed=0)
     return env
 
 
-def colours(frame: Any) -> set[tuple[int, ...]]:
+def colours(frame):
     packed = np.unique(frame.astype(np.int64) @ [65536, 256, 1])
     return {(colour >> 16, colour >> 8 & 255, colour & 255) for colour in packed.tolist()}
 
 
-def run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
+def run(code, **variables):
     """Run code in a process with no display; `variables` are added to its environment."""
     display = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
     kept = {name: value for name, value in os.environ.items() if name not in display}
@@ -55,7 +54,7 @@ def run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
     ],
     ids=str,
 )
-def test_every_frame_is_a_picture_of_one_size(fields: dict[str, int], action_range: Any) -> None:
+def test_every_frame_is_a_picture_of_one_size(fields, action_range):
     env = begun(fields, action_range=action_range)
     for step in range(2):
         frame = env.render()
@@ -68,7 +67,7 @@ def test_every_frame_is_a_picture_of_one_size(fields: dict[str, int], action_ran
             env.step(env.action_space.low + 0.25)
 
 
-def test_frames_are_fresh_and_show_each_step_of_the_episode() -> None:
+def test_frames_are_fresh_and_show_each_step_of_the_episode():
     env = begun()
     frames = [env.render()]
     for _ in range(3):
@@ -84,7 +83,7 @@ def test_frames_are_fresh_and_show_each_step_of_the_episode() -> None:
     np.testing.assert_array_equal(env.render(), frames[0])
 
 
-def test_an_optimal_action_is_drawn_on_its_mark_without_any_regret_between() -> None:
+def test_an_optimal_action_is_drawn_on_its_mark_without_any_regret_between():
     for action_range in ("unit", "symmetric"):
         env = begun("Plane1", action_range=action_range, horizon=10)
         optimal = copy.deepcopy(env).step(np.zeros(2))[4]["optimal_action"]
@@ -96,7 +95,7 @@ def test_an_optimal_action_is_drawn_on_its_mark_without_any_regret_between() -> 
         assert rendering._REGRET in colours(env.render()[90:260, rendering.WIDTH // 2 :])
 
 
-def test_the_numbers_shown_are_those_of_the_episode() -> None:
+def test_the_numbers_shown_are_those_of_the_episode():
     env = begun("Default", k=4, horizon=10)
     earned, paid = 0.0, []
     for _ in range(10):
@@ -109,9 +108,7 @@ def test_the_numbers_shown_are_those_of_the_episode() -> None:
     assert renderer._regrets[-1] == pytest.approx(10 - earned)
 
 
-def test_what_is_recorded_is_drawn_later_whatever_is_written_into_what_step_returned(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_is_recorded_is_drawn_later_whatever_is_written_into_what_step_returned(monkeypatch):
     drawn = []
     draw = rendering.Renderer._draw
     monkeypatch.setattr(
@@ -128,7 +125,7 @@ def test_what_is_recorded_is_drawn_later_whatever_is_written_into_what_step_retu
     assert len(drawn) == 2
 
 
-def test_frames_need_no_display_print_nothing_and_leave_the_process_alone() -> None:
+def test_frames_need_no_display_print_nothing_and_leave_the_process_alone():
     done = run(
         "import os, sme_registry\n"
         "from sme_registry.errors import OptionError\n"
@@ -150,7 +147,7 @@ def test_frames_need_no_display_print_nothing_and_leave_the_process_alone() -> N
     assert "Use render_mode='rgb_array'" in done.stdout
 
 
-def test_human_mode_shows_a_window_at_each_step() -> None:
+def test_human_mode_shows_a_window_at_each_step():
     done = run(
         "import numpy as np, pygame, sme_registry\n"
         "env = sme_registry.make('Plane1', render_mode='human', horizon=3)\n"
@@ -171,7 +168,7 @@ def test_human_mode_shows_a_window_at_each_step() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_what_cannot_be_rendered_is_a_typed_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_rendered_is_a_typed_error(monkeypatch):
     with pytest.raises(EpisodeError, match="reset"):
         SMEEnv("Default", render_mode="rgb_array").render()
     with pytest.raises(OptionError, match="render_mode='ansi'"):
@@ -180,3 +177,57 @@ def test_what_cannot_be_rendered_is_a_typed_error(monkeypatch: pytest.MonkeyPatc
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(MissingDependencyError, match=r"\[render\]"):
         SMEEnv("Default", render_mode="rgb_array").reset()
+
+
+# Lanes drift apart, and payouts are late.
+TASK = sme_registry.SMESpec(horizon=6, k=4, D=0.1, seed=4)
+
+
+def drawn(lanes=3, **kwargs):
+    return SMEVectorEnv(TASK, lanes, render_mode="rgb_array", **kwargs)
+
+
+@pytest.mark.parametrize(
+    ("mode", "action_range"),
+    [("NextStep", "symmetric"), ("SameStep", "unit"), ("Disabled", "unit")],
+)
+def test_frames_are_those_of_single_environments(mode, action_range):
+    batch = drawn(2, autoreset_mode=mode, action_range=action_range)
+    make = lambda: SMEEnv(TASK, render_mode="rgb_array", action_range=action_range)  # noqa: E731
+    singles: Any = SyncVectorEnv([make] * 2, autoreset_mode=AutoresetMode(mode))
+    for env in (batch, singles):
+        env.reset(seed=1)
+        env.action_space.seed(0)
+    np.testing.assert_array_equal(batch.render(), singles.render())
+    for _ in range(8):
+        action = batch.action_space.sample()
+        _, _, terminated, truncated, _ = batch.step(action)
+        singles.step(action)
+        ended = terminated | truncated
+        if mode == "Disabled" and ended.any():
+            for env in (batch, singles):
+                env.reset(options={"reset_mask": ended.copy()})
+        np.testing.assert_array_equal(batch.render(), singles.render())
+
+
+def test_lanes_that_are_not_chosen_share_one_white_frame():
+    few, each = drawn(4, render_lanes=[2]), drawn(4)
+    for env in (few, each):
+        env.reset(seed=0)
+        env.step(np.full((4, 4), 0.3, np.float32))
+    frames = few.render()
+    assert frames is not None
+    assert len(frames) == 4
+    assert frames[0] is frames[3]
+    assert (frames[0] == 255).all()
+    assert frames[0].shape == frames[2].shape
+    np.testing.assert_array_equal(frames[2], each.render()[2])  # type: ignore[index]
+
+
+def test_frames_need_a_mode_a_reset_and_lanes_that_exist():
+    assert SMEVectorEnv(TASK, 2).render() is None
+    with pytest.raises(EpisodeError, match="render"):
+        drawn().render()
+    for lanes in ([3], [-1], [0.5], 1, "0", []):
+        with pytest.raises(OptionError, match="render_lanes"):
+            drawn(render_lanes=lanes)

@@ -1,29 +1,29 @@
-"""`SMEEnv`: what is paid when, how episodes end, and what is refused."""
-
-from __future__ import annotations
+"""`SMEEnv`: what is paid when, how episodes end, and what is refused; cards in notebooks."""
 
 import copy
 import pickle
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
 import sme_registry
+from sme_registry import SMESpec
 from sme_registry.envs import SMEEnv
 from sme_registry.errors import ActionError, EpisodeError, OptionError, StateError
 
 START = np.array([0.3, 0.6, 0.9])
 
 
-def env_of(**fields: Any) -> SMEEnv:
+def env_of(**fields):
     """A small task, begun at a fixed state."""
     env = SMEEnv({"state_dim": 3, "action_dim": 2, **fields})
     env.reset(seed=0, options={"state": START})
     return env
 
 
-def earn(env: SMEEnv, step_reward: float) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+def earn(env, step_reward):
     """Step with an action that earns `step_reward`: each channel (1 − r)/4 off, or 0.3 for 0."""
     optimal = env.task.optimal_action(env.state)
     off = (1.0 - step_reward) / 4.0 if step_reward > 0 else 0.3
@@ -33,7 +33,7 @@ def earn(env: SMEEnv, step_reward: float) -> tuple[Any, float, bool, bool, dict[
     return observation, float(reward), *ends, info
 
 
-def test_rewards_are_paid_every_k_steps_and_at_the_end() -> None:
+def test_rewards_are_paid_every_k_steps_and_at_the_end():
     env = env_of(k=3, horizon=7)
     steps = [earn(env, 1.0) for _ in range(7)]
     assert [reward for _, reward, *_ in steps] == pytest.approx([0, 0, 3, 0, 0, 3, 1])
@@ -48,7 +48,7 @@ def test_rewards_are_paid_every_k_steps_and_at_the_end() -> None:
     assert [earn(env, r)[1] for r in (1.0, 0.5, 0.25, 1.0)] == pytest.approx([0, 0, 0, 2.75])
 
 
-def test_step_rewards_at_or_below_r_min_pay_nothing() -> None:
+def test_step_rewards_at_or_below_r_min_pay_nothing():
     for asked, paid in ((1.0, 1.0), (0.51, 0.51), (0.49, 0.0), (0.0, 0.0)):
         _, reward, _, _, info = earn(env_of(r_min=0.5), asked)
         assert reward == pytest.approx(paid)
@@ -56,7 +56,7 @@ def test_step_rewards_at_or_below_r_min_pay_nothing() -> None:
         assert info["similarity"] == pytest.approx(1 - (1 - asked) / 4 if asked else 0.7)
 
 
-def exactly_half(**fields: Any) -> tuple[Any, ...]:
+def exactly_half(**fields):
     """A step whose reward, before any threshold, is ½ in every bit."""
     env = SMEEnv({"state_dim": 1, "action_dim": 1, **fields})
     for start in np.linspace(0, 1, 200):
@@ -68,14 +68,14 @@ def exactly_half(**fields: Any) -> tuple[Any, ...]:
     raise AssertionError("no state gives a reward of exactly one half")
 
 
-def test_a_step_reward_of_exactly_r_min_pays_nothing_and_of_exactly_D_survives() -> None:
+def test_a_step_reward_of_exactly_r_min_pays_nothing_and_of_exactly_D_survives():
     assert exactly_half(r_min=0.5)[1] == 0.0
     assert exactly_half(r_min=float(np.nextafter(0.5, 0)))[1] == 0.5
     assert not exactly_half(D=0.5)[2]
     assert exactly_half(D=float(np.nextafter(0.5, 1)))[2]
 
 
-def test_termination_pays_nothing_extra_and_leaves_what_is_lost_in_info() -> None:
+def test_termination_pays_nothing_extra_and_leaves_what_is_lost_in_info():
     env = env_of(k=5, D=0.5, horizon=20)
     for _ in range(2):
         assert earn(env, 1.0)[2:4] == (False, False)
@@ -85,7 +85,7 @@ def test_termination_pays_nothing_extra_and_leaves_what_is_lost_in_info() -> Non
     assert observation[-1] == pytest.approx(2.25 / 5)
 
 
-def test_termination_on_the_step_of_a_payout_is_paid_as_any_other() -> None:
+def test_termination_on_the_step_of_a_payout_is_paid_as_any_other():
     env = env_of(k=2, D=0.5, horizon=20)
     earn(env, 1.0)
     _, reward, terminated, truncated, info = earn(env, 0.25)
@@ -94,7 +94,7 @@ def test_termination_on_the_step_of_a_payout_is_paid_as_any_other() -> None:
     assert info["accumulated_reward"] == 0.0
 
 
-def test_both_flags_are_set_on_one_step_and_truncation_pays() -> None:
+def test_both_flags_are_set_on_one_step_and_truncation_pays():
     env = env_of(k=5, D=0.5, horizon=3)
     earn(env, 1.0)
     earn(env, 1.0)
@@ -105,13 +105,13 @@ def test_both_flags_are_set_on_one_step_and_truncation_pays() -> None:
     assert observation[-2] == 1.0
 
 
-def test_survival_is_tested_on_the_gated_step_reward_not_on_the_payout() -> None:
+def test_survival_is_tested_on_the_gated_step_reward_not_on_the_payout():
     assert not earn(env_of(D=0.1), 0.4)[2]
     assert earn(env_of(D=0.1, r_min=0.6), 0.4)[2]
     assert not earn(env_of(D=0.5, k=10), 1.0)[2]
 
 
-def test_the_symmetric_range_is_the_same_task_rescaled_and_both_are_clipped() -> None:
+def test_the_symmetric_range_is_the_same_task_rescaled_and_both_are_clipped():
     unit, symmetric = SMEEnv("Default"), SMEEnv("Default", action_range="symmetric")
     unit.reset(seed=0)
     symmetric.reset(seed=0)
@@ -127,7 +127,7 @@ def test_the_symmetric_range_is_the_same_task_rescaled_and_both_are_clipped() ->
     np.testing.assert_array_equal(beyond.state, within.state)
 
 
-def test_an_action_is_the_same_in_whatever_form_it_comes() -> None:
+def test_an_action_is_the_same_in_whatever_form_it_comes():
     action = np.array([0.125, 0.75, 0.5, 0.25], np.float32)
     plain, other = SMEEnv("Default"), SMEEnv("Default")
     plain.reset(seed=0)
@@ -147,7 +147,7 @@ def test_an_action_is_the_same_in_whatever_form_it_comes() -> None:
 
 
 @pytest.mark.parametrize("action_range", ["unit", "symmetric"])
-def test_an_unusable_action_is_refused_and_nothing_moves(action_range: Any) -> None:
+def test_an_unusable_action_is_refused_and_nothing_moves(action_range):
     env, untouched = (SMEEnv("Plane1", action_range=action_range) for _ in range(2))
     for e in (env, untouched):
         e.reset(seed=0)
@@ -172,7 +172,7 @@ def test_an_unusable_action_is_refused_and_nothing_moves(action_range: Any) -> N
     np.testing.assert_array_equal(env.step(good)[0], untouched.step(good)[0])
 
 
-def test_a_step_before_reset_or_after_the_end_is_refused() -> None:
+def test_a_step_before_reset_or_after_the_end_is_refused():
     env = SMEEnv("Plane1", horizon=2)
     actions: Any = np.zeros(2, np.float32), np.zeros(2), [0, 0]
     for message in ("has not begun", "has ended"):
@@ -184,7 +184,7 @@ def test_a_step_before_reset_or_after_the_end_is_refused() -> None:
             env.step(np.zeros(2, np.float32))
 
 
-def test_a_given_state_begins_the_episode_and_takes_nothing_from_the_generator() -> None:
+def test_a_given_state_begins_the_episode_and_takes_nothing_from_the_generator():
     first, second = SMEEnv("Plane1"), SMEEnv("Plane1")
     for state in ([0.25, 0.75], (0, 1), np.array([1.0, 0.0], np.float32)):
         observation, _ = first.reset(seed=0, options={"state": state})
@@ -195,7 +195,7 @@ def test_a_given_state_begins_the_episode_and_takes_nothing_from_the_generator()
     np.testing.assert_array_equal(first.reset(options={})[0], second.reset(options=None)[0])
 
 
-def test_a_state_that_cannot_begin_an_episode_is_refused() -> None:
+def test_a_state_that_cannot_begin_an_episode_is_refused():
     env = SMEEnv("Plane1")
     env.reset(seed=0)
     env.step(np.zeros(2, np.float32))
@@ -216,7 +216,7 @@ def test_a_state_that_cannot_begin_an_episode_is_refused() -> None:
     np.testing.assert_array_equal(env.reset()[0], twin.reset()[0])  # nor has it been seeded
 
 
-def test_rendering_without_a_mode_warns_and_gives_nothing() -> None:
+def test_rendering_without_a_mode_warns_and_gives_nothing():
     env = SMEEnv("Plane1")
     env.reset()
     with pytest.warns(UserWarning, match="render_mode"):
@@ -224,9 +224,7 @@ def test_rendering_without_a_mode_warns_and_gives_nothing() -> None:
 
 
 @pytest.mark.parametrize("name", ["Complexity10", "HardSafeMixed", "Distract32Driven"])
-def test_an_episode_pickled_under_one_back_end_goes_on_under_the_other(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_episode_pickled_under_one_back_end_goes_on_under_the_other(name, monkeypatch):
     pytest.importorskip("numba")
     for here, there in (("numba", "numpy"), ("numpy", "numba")):
         for make in (SMEEnv, lambda name, **kw: sme_registry.make_vec(name, 3, **kw)):
@@ -245,9 +243,30 @@ def test_an_episode_pickled_under_one_back_end_goes_on_under_the_other(
                     np.testing.assert_allclose(got[4][key], expected[4][key], atol=3e-12)
 
 
-def test_seeds_are_integers_of_at_least_0() -> None:
+def test_seeds_are_integers_of_at_least_0():
     first, second = SMEEnv("Plane1"), SMEEnv("Plane1")
     np.testing.assert_array_equal(first.reset(seed=7)[0], second.reset(seed=np.int64(7))[0])  # type: ignore[arg-type]
     for seed in ("abc", 1.5, True, -1, [1], np.array([1])):
         with pytest.raises(OptionError, match=r"seed=.*integer of at least 0"):
             first.reset(seed=seed)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("make", "texts"),
+    [
+        (
+            lambda: gymnasium.make("SME/Default-v1").unwrapped,
+            ["SME/Default-v1", "[10] float32 in [0, 1]: state, t/T, r_cum/k", "not begun"],
+        ),
+        (lambda: SMEEnv(SMESpec(k=17).named("<script>")), ["Not the default: k=17"]),
+        (lambda: sme_registry.make_vec("Default", num_envs=7).unwrapped, ["num_envs=7"]),
+        (lambda: sme_registry.make_parallel("TeamBlind4"), ["agent_3", "0–1, 6–7"]),
+        (lambda: sme_registry.make("Switch5").unwrapped, ["5 visits", "seed=4"]),
+    ],
+)
+def test_a_card_in_a_notebook_shows_spaces_and_task(make, texts):
+    html = make()._repr_html_()
+    for text in texts:
+        assert text in html
+    assert "<script" not in html
+    assert len(html.encode()) < 20_000

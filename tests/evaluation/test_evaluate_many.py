@@ -98,5 +98,3 @@ def test_progress_counts_shared_states_once():
     assert {total for _, total in calls} == {1800}
 
 
-def test_nothing_to_evaluate_gives_nothing():
-    assert evaluate_many([], PROTOCOL) == []

@@ -1,4 +1,4 @@
-"""Checks of arguments, and the versions that documents record."""
+"""Checks of arguments and addresses, and the versions that documents record."""
 
 import math
 import platform
@@ -9,7 +9,7 @@ import pytest
 
 import sme_registry
 from sme_registry.errors import OptionError, PolicyError
-from sme_registry.io import choice, integer_in, number_in, versions
+from sme_registry.io import choice, integer_in, number_in, printable, server_address, versions
 
 
 def test_an_integer_or_a_number_in_its_range_comes_back_as_pythons():
@@ -58,3 +58,44 @@ def test_versions_are_of_what_is_installed():
         "numpy": np.__version__,
         **({"scipy": versions(["scipy"])["scipy"]} if "scipy" in sys.modules else {}),
     }
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "",
+        "board",
+        "http://127.0.0.1:99999",
+        "http://user:word@127.0.0.1",
+        "http://127.0.0.1/a board",
+        "http://127.0.0.1/\n",
+        "https://board.example/?next=1",
+        "http://localhost.example",
+    ],
+)
+def test_an_invalid_url_is_rejected(url):
+    with pytest.raises(OptionError, match="url="):
+        server_address(url)
+
+
+@pytest.mark.parametrize(
+    ("url", "host", "port", "path", "local"),
+    [
+        ("http://127.0.0.1:8000/", "127.0.0.1", 8000, "", True),
+        ("http://[::1]:8000", "::1", 8000, "", True),
+        ("http://localhost:8000/board/", "localhost", 8000, "/board", True),
+        ("https://board.example/", "board.example", None, "", False),
+    ],
+)
+def test_plain_http_is_for_this_machine(url, host, port, path, local):
+    address = server_address(url)
+    assert (address.host, address.port, address.path) == (host, port, path)
+    assert address.url == url.rstrip("/")
+    assert address.is_local == local
+    far = server_address("http://board.example:8000", insecure=True)
+    assert (far.is_https, far.is_local) == (False, False)
+
+
+def test_a_server_s_text_has_no_control_characters():
+    assert printable("a\x1b[2J\nb") == "a [2J b"
+    assert len(printable("a" * 10_000)) == 2000

@@ -25,25 +25,15 @@ ONE = {"action_dim": 4}
 BAD = [
     # fields, what the message must contain
     ({"k": np.True_}, ["k=np.True_: must be an integer in"]),
-    ({"k": 10**4000}, ["k=1000", "…: must be an integer in"]),
     ({"k": DEEP}, ["k=[[[", "must be an integer"]),
     ({"D": np.float32("nan")}, ["D=nan: must be a finite number"]),
     ({"policy_init": "unit"}, ["policy_init='unit': must be 'semi_orthogonal' or 'unit_variance'"]),
     ({"schema_version": 2}, ["schema_version=2: must be 1. Correct it, or leave it out"]),
-    ({"schema_version": True}, ["schema_version=True: must be 1."]),
-    ({"schema_version": 1.0}, ["schema_version=1.0: must be 1."]),
     ({"seed": -1}, ["seed=-1: must be an integer in [0, 9007199254740992)"]),
-    ({"seed": 2**53}, ["seed=9007199254740992: must be", "'0x…' of 1 to 64 hex digits"]),
-    ({"seed": 1.0}, ["seed=1.0: must be an integer"]),
-    ({"seed": True}, ["seed=True: must be an integer"]),
     ({"seed": "7"}, ["seed='7': must be", "0x"]),
-    ({"seed": "0x"}, ["seed='0x': must be"]),
     ({"seed": "0xg"}, ["seed='0xg': must be"]),
-    ({"seed": "0x1\n"}, ["seed='0x1\\n': must be"]),
     ({"seed": "0x" + "1" * 65}, ["seed='0x1111", "64 hex digits"]),
-    ({"seed": np.add}, ["seed=<ufunc 'add'>: must be"]),
     ({"hiden_width": 3}, ["hiden_width=3: unknown field.", "Did you mean 'hidden_width'?"]),
-    ({"K": 3}, ["K=3: unknown field.", "Did you mean 'k'?"]),
     ({"zzz": 3}, ["zzz=3: unknown field.", "Known fields: schema_version, state_dim"]),
     ({7: 3}, ["7: field names must be strings."]),
     ({"team": "two"}, ["team: must be an object of named fields, got 'two'."]),
@@ -64,20 +54,13 @@ BAD = [
 ]
 BAD_AGENTS = [
     ([], "team.agents=[]: must be a list of 1 to 1024 entries."),
-    (["me"], "team.agents.0: must be an object of named fields, got 'me'."),
     ([{"action_dim": 3}], "team.agents: their action channels add up to 3 … action_dim=4"),
     (
         [ONE, {"action_dim": "2"}],
         "team.agents.1.action_dim='2': must be an integer in [1, 1048576].",
     ),
-    (
-        [ONE | {"observs": "all"}],
-        "team.agents.0.observs='all': unknown field. Did you mean 'observes'?",
-    ),
     ([ONE | {"observes": [3, 1]}], "observes=[3, 1]: channels must be in incr … Write [1, 3]."),
     ([ONE | {"observes": []}], "team.agents.0.observes=[]: must be 'all' or"),
-    ([ONE | {"observes": [True]}], "observes=[True]: must be"),
-    ([ONE | {"observes": np.arange(3)}], "observes=array([0, 1, 2]): must be 'all' or a list"),
     ([ONE | {"observes": [8]}], "agent_0.observes=[8]: must be in [0, state_dim=8). … channel 8"),
     ([ONE | {"name": "the pilot"}], "name='the pilot': must be a word, '_' and a number, such as"),
     (
@@ -89,10 +72,9 @@ RANGE = "must be a finite number in (0, 0.5]."
 BAD_SAFETY = [
     *[
         ({"tightness": tightness}, f"safety.tightness={tightness}: {RANGE} Correct it.")
-        for tightness in (0, -0.1, 0.51, float("nan"), True, None)
+        for tightness in (0, 0.51, float("nan"), True)
     ],
     ({}, f"safety.tightness: missing: {RANGE} Add it."),
-    (0.2, "safety: must be an object of named fields, got 0.2. Known fields: tightness."),
     ({"tightness": 0.2, "tau": 0.2}, "safety.tau=0.2: unknown field."),
 ]
 SEEN = "observation.distractors=0: with mixing='none' the agent would see the state as"
@@ -106,26 +88,19 @@ BAD_OBSERVATION = [
         "observation.dynamics='random': must be 'noise' or 'autonomous' or 'driven' or null.",
     ),
     ({"mixing": "linear"}, "mixing='linear': must be 'none' or 'orthogonal' or 'nonlinear'."),
-    *[
-        (
-            {"mixing": "nonlinear", "mixing_depth": depth},
-            f"observation.mixing_depth={depth}: must be an integer in [1, 3] or null.",
-        )
-        for depth in (0, 4, True)
-    ],
-    *[
-        ({"mixing": mixing} | fields, f"observation.{needs}. Leave {name} out, or")
-        for mixing in ("none", "orthogonal")
-        for name, fields, needs in (
-            ("mixing_depth", {"distractors": 2, "mixing_depth": 2},
-             "mixing_depth=2: needs mixing='nonlinear'"),
-            ("dynamics", {"dynamics": "driven"}, "dynamics='driven': needs distractors > 0"),
-        )
-    ],
+    (
+        {"mixing": "nonlinear", "mixing_depth": 4},
+        "observation.mixing_depth=4: must be an integer in [1, 3] or null.",
+    ),
+    (
+        {"mixing": "orthogonal", "distractors": 2, "mixing_depth": 2},
+        "mixing_depth=2: needs mixing='nonlinear'. Leave mixing_depth out, or",
+    ),
+    (
+        {"mixing": "orthogonal", "dynamics": "driven"},
+        "dynamics='driven': needs distractors > 0. Leave dynamics out, or",
+    ),
     ({}, SEEN),
-    ({"mixing": "none"}, SEEN),
-    ("nonlinear", "observation: must be an object of named fields, got 'nonlinear'."),
-    ({"distractor": 8}, "observation.distractor=8: unknown field. Did you mean 'distractors'?"),
 ]  # fmt: skip
 BAD += [({"team": {"agents": agents}}, words.split(" … ")) for agents, words in BAD_AGENTS]
 BAD += [({"safety": safety}, [words]) for safety, words in BAD_SAFETY]
@@ -163,12 +138,6 @@ def test_a_threshold_is_a_finite_number_below_one(field):
         assert f"{field}={value!r}: must be a finite number in [0, 1)." in refusal({field: value})
 
 
-@pytest.mark.parametrize("document", [[], "x", 3, None, True])
-def test_what_is_no_mapping_is_no_spec(document):
-    with pytest.raises(SpecError, match="must be an object of named fields"):
-        SMESpec.from_dict(document)
-
-
 def test_all_errors_are_listed_at_once_by_the_constructor_too():
     fields = {"k": 0, "r_min": 2, "seeed": 1, "team": {"agents": [{"action_dim": 0}]}}
     with pytest.raises(SpecError) as of_dict:
@@ -182,12 +151,10 @@ def test_all_errors_are_listed_at_once_by_the_constructor_too():
     assert starts == ["k=0", "r_min=2", "team.agents.0.action_dim=0", "seeed=1"]
 
 
-def test_the_source_of_a_document_begins_its_error():
-    with pytest.raises(SpecError, match=r"^here\.json: k=0: must be"):
-        SMESpec.from_dict({"k": 0}, "here.json")
-
-
-def test_deriving_refuses_as_parsing_does():
+def test_deriving_refuses_as_parsing_does_and_a_source_begins_its_error():
+    for document in ([], None):
+        with pytest.raises(SpecError, match=r"^here\.json: must be an object of named fields"):
+            SMESpec.from_dict(document, "here.json")
     with pytest.raises(SpecError, match=r"complexiti=3: unknown field\. Did you mean 'complexity'"):
         SMESpec().derive(complexiti=3)
     with pytest.raises(SpecError, match="D=1: must be a finite number in"):
@@ -205,25 +172,12 @@ def test_deriving_refuses_as_parsing_does():
         ),
         (
             Suite,
-            {"classes": [{"name": "a", "setting": {}, "seeds": [1, -1]}]},
-            "classes.0.seeds.1=-1: must be an integer in [0, 9007199254740992)",
-        ),
-        (
-            Suite,
             {"classes": [{"name": "a", "setting": {}, "seeds": [i]} for i in (1, 2)]},
             "classes: the name 'a' appears twice.",
         ),
-        (
-            Suite,
-            {"classes": [{"name": "a", "setting": {"k": 0}, "seeds": [1]}]},
-            "classes.0.setting.k=0: must be an integer in",
-        ),
         (EvaluationProtocol, {"epsilons": [0.0]}, "epsilons=[0.0]: must increase, from above 0."),
         (EvaluationProtocol, {"states_per_region": 1}, "states_per_region=1: must be an integer"),
-        (EvaluationProtocol, {"sampling": "grid"}, "sampling='grid': must be 'volume_uniform'."),
         (EnvFile, SMESpec().to_dict(), "digest: missing: must be the digest of the spec."),
-        (EnvFile, {"name": "a"}, "spec: missing: must be an object: schema_version, "),
-        (EnvFile, {"digest": "", "spec": {"k": 0}}, "spec.k=0: must be an integer in"),
         (
             EnvFile,
             {"digest": "", "spec": {"team": {"agents": [{"action_dim": 1}]}}},

@@ -1,11 +1,12 @@
-"""What tables and figures call a task, and that a name is never part of its identity."""
+"""What tables and figures call a task, and what consoles and notebooks show of documents."""
 
 import pickle
 
 import pytest
 
+import sme_registry
 from sme_registry import EvaluationReport, SMESpec, evaluate, load, register, save
-from sme_registry.spec import catalogue
+from sme_registry.spec import ProtocolFile, StudyFile, SuiteFile, catalogue
 
 OTHER = SMESpec(state_dim=2, action_dim=2, k=2, seed=5)
 QUICK = {"states_per_region": 20, "epsilons": [0.5]}
@@ -55,3 +56,27 @@ def test_a_report_keeps_the_name_in_its_file(tmp_path, named):
     assert report.title == again.title == "k2"
     assert " on k2 (S=2" in str(again)
     assert "task" not in evaluate("constant_half", OTHER, QUICK).to_dict()
+
+
+def test_no_document_fills_a_screen():
+    for kind, name in ((SuiteFile, "core"), (StudyFile, "smoke"), (ProtocolFile, "paper")):
+        assert len(repr(catalogue.find(kind, name))) < 400
+    assert "agents=<tuple of 4>" in repr(sme_registry.load("Team4"))
+    spec = SMESpec(complexity=5)
+    assert eval(repr(spec)) == spec
+    assert "k=5, r_min=0.123456789" in SMESpec(r_min=0.123456789, k=5)._repr_html_()
+
+
+def test_a_notebook_shows_a_tasks_fields_name_and_digest():
+    spec = SMESpec(complexity=5, k=3).named("<Mine>")
+    html = spec._repr_html_()
+    for text in ("complexity", "<b>5</b><br>default 1", spec.digest, "&lt;Mine&gt;"):
+        assert text in html
+    assert "<Mine>" not in html
+    assert "Not the default: k=3, complexity=5" in html
+    assert ">L</b>" in html  # its symbol
+    assert "layers of the optimal policy" in html  # its meaning
+    assert html.count("<br>default ") == 2
+    assert "safety" not in html  # not set
+    stream = sme_registry.load("Switch5")._repr_html_()
+    assert stream.count(">seed=") == 4

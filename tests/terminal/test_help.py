@@ -1,10 +1,7 @@
 """Help texts show what their source says, and the shell completes names."""
 
-from __future__ import annotations
-
 import inspect
 import re
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -18,7 +15,7 @@ from sme_registry.cli import app as sme
 APPS = {"sme": sme, "sme-leaderboard": leaderboard}
 
 
-def commands(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+def commands(command, path=()):
     yield path, command
     for name, child in getattr(command, "commands", {}).items():
         yield from commands(child, (*path, name))
@@ -31,7 +28,7 @@ COMMANDS = [
 ]
 
 
-def words(text: str) -> str:
+def words(text):
     return f" {' '.join(re.sub('[│╭╮╰╯─]', ' ', text).split())} "
 
 
@@ -48,7 +45,7 @@ def test_help_shows_its_source_unchanged(program: str, path: tuple[str, ...], co
             assert f" {word} " in shown  # a longer word would be cut: use a shorter one
 
 
-def test_examples_are_lines_without_empty_ones_between_and_a_suggestion_has_one_mark() -> None:
+def test_examples_are_lines_without_empty_ones_between_and_a_suggestion_has_one_mark():
     lines = CliRunner().invoke(sme, ["list", "--help"], env={"COLUMNS": "80"}).stdout.splitlines()
     start = lines.index(next(line for line in lines if line.strip() == "Examples:"))
     examples = [line.strip() for line in lines[start + 1 : start + 5]]
@@ -71,7 +68,7 @@ def test_examples_are_lines_without_empty_ones_between_and_a_suggestion_has_one_
         ("sme-leaderboard", "sme-leaderboard new b --suite smo", {"smoke"}),
     ],
 )
-def test_the_shell_completes_names(program: str, line: str, expected: set[str]) -> None:
+def test_the_shell_completes_names(program, line, expected):
     settings = {
         f"_{program.replace('-', '_').upper()}_COMPLETE": "complete_bash",
         "COMP_WORDS": line,

@@ -1,8 +1,7 @@
-"""What a long job shows while it runs, and how durations are written."""
-
-from __future__ import annotations
+"""What a long job shows while it runs, how durations are written, and interrupts."""
 
 import io
+import signal
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -10,9 +9,10 @@ import pytest
 from rich.console import Console
 
 from sme_registry.terminal import Progress, duration, duration_range, err
+from sme_registry.terminal.interrupts import defer_interrupts
 
 
-def test_without_a_terminal_it_prints_lines_and_in_one_it_draws_a_bar() -> None:
+def test_without_a_terminal_it_prints_lines_and_in_one_it_draws_a_bar():
     text, bar, silent = io.StringIO(), io.StringIO(), io.StringIO()
     with Progress("training", 10, console=Console(file=text, width=200)) as progress:
         progress.update(4, "note")
@@ -32,7 +32,7 @@ def test_without_a_terminal_it_prints_lines_and_in_one_it_draws_a_bar() -> None:
     assert silent.getvalue() == ""
 
 
-def test_durations_are_in_words() -> None:
+def test_durations_are_in_words():
     for seconds, words in (
         (0.4, "0 s"), (59, "59 s"), (61, "1 min 1 s"), (7500, "2 h 5 min"), (302_400, "3.5 days"),
     ):  # fmt: skip
@@ -42,16 +42,14 @@ def test_durations_are_in_words() -> None:
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+def clock(monkeypatch):
     """Time as a test sets it."""
     clock = SimpleNamespace(now=0.0)
     monkeypatch.setattr("sme_registry.terminal.progress.time.monotonic", lambda: clock.now)
     return clock
 
 
-def test_what_precedes_the_first_steps_is_shown_at_once_and_slows_no_estimate(
-    clock: SimpleNamespace,
-) -> None:
+def test_what_precedes_the_first_steps_is_shown_at_once_and_slows_no_estimate(clock):
     text = io.StringIO()
     with Progress("training", 100, console=Console(file=text, width=200)) as progress:
         progress.prepare("compiling …")
@@ -72,7 +70,7 @@ def test_what_precedes_the_first_steps_is_shown_at_once_and_slows_no_estimate(
     ]
 
 
-def test_a_slow_rate_names_one_of_the_unit(clock: SimpleNamespace) -> None:
+def test_a_slow_rate_names_one_of_the_unit(clock):
     for unit, one in (("steps", "step"), ("entries", "entry")):
         text = io.StringIO()
         with Progress("scoring", 10, console=Console(file=text, width=200), unit=unit) as progress:
@@ -83,9 +81,7 @@ def test_a_slow_rate_names_one_of_the_unit(clock: SimpleNamespace) -> None:
 
 
 @pytest.mark.parametrize(("hours", "most"), [(0.05, 7), (1, 20), (24 * 30, 30)])
-def test_a_log_stays_short_however_long_the_job_takes(
-    clock: SimpleNamespace, hours: float, most: int
-) -> None:
+def test_a_log_stays_short_however_long_the_job_takes(clock, hours, most):
     text, seconds = io.StringIO(), int(hours * 3600)
     with Progress("training", seconds, console=Console(file=text, width=200)) as progress:
         for second in range(0, seconds + 1, max(1, seconds // 10_000)):
@@ -99,7 +95,7 @@ def test_a_log_stays_short_however_long_the_job_takes(
     assert max(steps) <= max(120, 0.11 * seconds)  # no long silence
 
 
-def test_a_job_that_stands_still_prints_ever_less(clock: SimpleNamespace) -> None:
+def test_a_job_that_stands_still_prints_ever_less(clock):
     text = io.StringIO()
     with Progress("study", 9, console=Console(file=text, width=200)) as progress:
         for second in range(0, 100_000, 10):
@@ -108,7 +104,7 @@ def test_a_job_that_stands_still_prints_ever_less(clock: SimpleNamespace) -> Non
     assert len(text.getvalue().splitlines()) <= 15
 
 
-def test_running_parts_are_named_in_a_line(clock: SimpleNamespace) -> None:
+def test_running_parts_are_named_in_a_line(clock):
     text = io.StringIO()
     console = Console(file=text, width=200)
     with Progress("study", 9, unit="cells", console=console, seconds_left=lambda: 61.0) as progress:
@@ -125,9 +121,7 @@ def test_running_parts_are_named_in_a_line(clock: SimpleNamespace) -> None:
     assert "cell 4" not in text.getvalue().splitlines()[-1]
 
 
-def test_in_a_pipe_colours_can_be_forced_but_not_bars(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_in_a_pipe_colours_can_be_forced_but_not_bars(monkeypatch, capsys):
     """Jupyter forces colours in the shell cells of a notebook."""
     monkeypatch.setenv("FORCE_COLOR", "1")
     console = err()
@@ -137,3 +131,17 @@ def test_in_a_pipe_colours_can_be_forced_but_not_bars(
     first, second = capsys.readouterr().err.splitlines()
     assert first.startswith("\x1b[31mlong\x1b[0m long")
     assert second.startswith("training: 10 of 10 steps")
+
+
+def test_an_interrupt_waits_until_the_block_ends():
+    written, before = [], signal.getsignal(signal.SIGINT)
+
+    def save():
+        with defer_interrupts():
+            signal.raise_signal(signal.SIGINT)
+            written.append("checkpoint and record")
+
+    with pytest.raises(KeyboardInterrupt):
+        save()
+    assert written == ["checkpoint and record"]
+    assert signal.getsignal(signal.SIGINT) is before

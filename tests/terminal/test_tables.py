@@ -1,17 +1,21 @@
-"""Tables at any width: nothing is cut, broken or dropped."""
-
-from __future__ import annotations
+"""Tables at any width: nothing is cut, broken or dropped; tables and charts in notebooks."""
 
 import contextlib
 import io
 import re
+from itertools import pairwise
+from xml.etree import ElementTree
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from rich.console import Console
 from typer.testing import CliRunner
 
 from sme_registry.cli import app
-from sme_registry.terminal import Table, out
+from sme_registry.terminal import Scale, Table, out
+from sme_registry.terminal.html import card, folded, pairs_html, table_html
+from sme_registry.terminal.svg import Line, line_chart
 
 WIDTHS = (60, 80, 200)
 COLUMNS = {"id": "name", "n": "number", "of all": "number", "about it": "text"}
@@ -22,7 +26,7 @@ ROWS = [
 ]
 
 
-def printed(table: Table, width: int | None) -> list[str]:
+def printed(table, width):
     """The lines on a terminal of this width, or in a pipe."""
     text = io.StringIO()
     with contextlib.redirect_stdout(text):
@@ -33,12 +37,12 @@ def printed(table: Table, width: int | None) -> list[str]:
     return text.getvalue().splitlines()
 
 
-def words(lines: list[str]) -> str:
+def words(lines):
     return f" {' '.join(re.sub('[│┃]', ' ', ' '.join(lines)).split())} "
 
 
 @pytest.mark.parametrize("width", [40, *WIDTHS, None])
-def test_every_cell_is_whole_at_every_width(width: int | None) -> None:
+def test_every_cell_is_whole_at_every_width(width):
     lines = printed(Table("A title", COLUMNS, ROWS, caption="A caption"), width)
     shown = words(lines)
     assert "…" not in shown
@@ -51,7 +55,7 @@ def test_every_cell_is_whole_at_every_width(width: int | None) -> None:
     assert lines[-1].strip() == "A caption"
 
 
-def test_sections_and_missing_cells_are_kept() -> None:
+def test_sections_and_missing_cells_are_kept():
     table = Table("", {"": "name", "a": "number"})
     table.add_row("heading", style="italic")
     table.add_section()
@@ -72,10 +76,7 @@ def test_sections_and_missing_cells_are_kept() -> None:
 @pytest.mark.parametrize(
     "command",
     [
-        "list",
         "show core",
-        "show Team4",
-        "certify Default",
         "study plan smoke",
         "evaluate linear Default --protocol quick-v1",
     ],
@@ -92,3 +93,69 @@ def test_commands_cut_nothing(command: str) -> None:
         assert narrow.count("…") == full.count("…")
         for number in re.findall(r"(?<![\w.])\d[\d,.]*\d(?![\w.])", full):
             assert number in narrow
+
+
+BAD = "<script>alert(1)</script>"
+
+
+def test_every_text_is_escaped():
+    table = Table(BAD, {BAD: "name"}, [(BAD,)], caption=BAD)
+    html = card(table_html(table), pairs_html(BAD, {BAD: BAD}), folded(BAD, pairs_html("", {})))
+    assert "<script" not in html
+    assert html.count("&lt;script&gt;") == 8
+
+
+def test_a_long_table_says_how_many_rows_it_leaves_out():
+    html = table_html(Table("", {"a": "name"}, [(f"row {i}",) for i in range(2_000)]))
+    assert "row 59" in html
+    assert "row 60" not in html
+    assert "1,940 more" in html
+
+
+finite = st.floats(-1e6, 1e6)
+
+
+@given(st.lists(finite, max_size=5))
+def test_a_scale_covers_every_value_with_round_ends(values):
+    scale = Scale.covering(*values)
+    assert scale.low < scale.high
+    assert 2 <= len(scale.ticks) <= 8
+    for value in values:
+        margin = 1e-6 * (scale.high - scale.low)
+        assert scale.low - margin <= value <= scale.high + margin
+        assert 0.0 <= scale.part(value) <= 1.0
+
+
+def texts(svg):
+    """The texts of a chart, and how far down each is."""
+    return {
+        each.text or "": float(each.attrib["y"])
+        for each in ElementTree.fromstring(svg).iter("text")
+    }
+
+
+@given(st.lists(st.floats(0.0, 1.0), min_size=2, max_size=8))
+def test_labels_at_the_end_are_a_line_of_text_apart_and_on_the_chart(ends):
+    lines = [Line(f"line {index}", [0.5, end]) for index, end in enumerate(ends)]
+    heights = sorted(
+        y for text, y in texts(line_chart("t", ["a", "b"], lines)).items() if "line" in text
+    )
+    assert len(heights) == len(ends)
+    assert all(below - above >= 14.9 for above, below in pairwise(heights))
+    assert 0 < heights[0] <= heights[-1] < 240
+
+
+def test_a_line_is_where_its_values_are():
+    root = ElementTree.fromstring(line_chart("t", ["a", "b"], [Line("x", [0.0, 1.0])]))
+    (drawn,) = root.iter("polyline")
+    (_, low), (_, high) = (map(float, point.split(",")) for point in drawn.attrib["points"].split())
+    ticks = texts(line_chart("t", ["a", "b"], [Line("x", [0.0, 1.0])]))
+    assert (low, high) == pytest.approx((ticks["0"] - 4, ticks["1"] - 4))
+
+
+def test_labels_and_titles_are_escaped_and_read_out():
+    svg = line_chart("<b>", ["<i>"], [Line('"&<script>', [0.25])])
+    assert "<script>" not in svg
+    root = ElementTree.fromstring(svg)
+    assert root.attrib["aria-label"] == '<b>. "&<script>: 0.25'
+    assert {'"&<script>', "<i>"} <= texts(svg).keys()

@@ -1,6 +1,8 @@
-"""`gymnasium.make_vec` in every mode, and batches against singles over many episodes."""
+"""Single agents' environments and batches keep every promise: each kind, edges, every mode.
 
-from __future__ import annotations
+That every entry of the catalogue is drawn and stepped as published is in `tests/spec`, kinds of
+safety and observation are in `tests/envs/test_extension.py`, teams in `test_teams_conform.py`.
+"""
 
 import copy
 from typing import Any
@@ -8,16 +10,66 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
+import sme_registry
 from sme_registry import SMESpec, testing
 from sme_registry.envs import SMEVectorEnv
+from sme_registry.spec import catalogue
+from sme_registry.spec.envelope import EnvFile
+
+NAMES = [file.versioned_name for file in catalogue.entries(EnvFile) if file.spec.team is None]
+KINDS = ["Default", "StateDim64", "ActionDim16", "Plane10", "HardFragile", "HardSafeMixed"]
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_an_entry_of_each_kind_passes_the_conformance_kit(name):
+    testing.check_sme(f"SME/{name}-v1")
+
+
+@pytest.mark.parametrize("name", ["Default", "HardSafeMixed"])
+def test_ids_pass_the_checkers_of_gymnasium_and_sb3(name):
+    # With the id, and so the EnvSpec: check_env then also makes and tries each render mode.
+    check_env(gymnasium.make(f"SME/{name}-v1").unwrapped, skip_render_check=name != "Default")
+    sb3_checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    env = gymnasium.make(f"SME/{name}-v1", action_range="symmetric")
+    sb3_checker.check_env(env.unwrapped, warn=True)
+
+
+def test_every_catalogue_entry_has_an_id_by_name_and_one_by_content():
+    assert "Default-v1" in NAMES
+    for name in NAMES:
+        spec = sme_registry.load(name)
+        for env_id in (f"SME/{name}", f"SME/{spec.content_name}-v1"):
+            env = gymnasium.make(env_id)
+            assert env.spec.id == env_id
+            assert env.unwrapped.sme_spec == spec
+            sent = gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json())
+            assert gymnasium.make(sent).unwrapped.sme_spec.digest == spec.digest
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"horizon": 1, "state_dim": 1, "action_dim": 1},
+        {"k": 7, "D": 0.75, "r_min": 0.9, "horizon": 20, "complexity": 3},
+        {"k": 50, "horizon": 12},
+        {"state_dim": 3, "action_dim": 9, "hidden_width": 5, "complexity": 4, "horizon": 15},
+        {"seed": "0xabcdef0123456789", "policy_init": "unit_variance", "complexity": 2,
+         "horizon": 10},
+    ],
+    ids=lambda fields: ",".join(fields),
+)  # fmt: skip
+def test_specs_at_the_edges_pass_the_conformance_kit(fields):
+    testing.check_sme(fields)
+
 
 # Ends early and late, pays late, and its lanes drift apart.
 HARD = {"horizon": 12, "k": 5, "r_min": 0.3, "D": 0.35, "complexity": 2, "seed": 4}
 
 
-def rollout(env: Any, steps: int = 30) -> list[np.ndarray]:
+def rollout(env, steps=30):
     """Observations, rewards and ends under fixed actions."""
     rng = np.random.default_rng(1)
     seen = [env.reset(seed=3)[0]]
@@ -28,7 +80,7 @@ def rollout(env: Any, steps: int = 30) -> list[np.ndarray]:
     return seen
 
 
-def test_make_vec_gives_the_same_numbers_in_every_mode(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_make_vec_gives_the_same_numbers_in_every_mode(monkeypatch):
     monkeypatch.setenv("PYTHONWARNINGS", "error")  # in the worker processes, too
     kwargs: dict[str, Any] = {"num_envs": 2, "horizon": 12, "k": 5}
     native = gymnasium.make_vec("SME/Default-v1", **kwargs)
@@ -44,12 +96,12 @@ def test_make_vec_gives_the_same_numbers_in_every_mode(monkeypatch: pytest.Monke
             np.testing.assert_array_equal(got, wanted)
 
 
-def test_a_batch_of_a_hard_task_equals_its_singles_in_all_autoreset_modes() -> None:
+def test_a_batch_of_a_hard_task_equals_its_singles_in_all_autoreset_modes():
     for seed in range(2):
         testing.check_vector(HARD, seed=seed)
 
 
-def test_a_lane_does_not_depend_on_how_many_others_there_are() -> None:
+def test_a_lane_does_not_depend_on_how_many_others_there_are():
     seen = []
     for lanes in (1, 7, 64, 200):
         env = SMEVectorEnv("Complexity10", lanes)
@@ -62,7 +114,7 @@ def test_a_lane_does_not_depend_on_how_many_others_there_are() -> None:
 
 
 @pytest.mark.parametrize("mode", [mode.value for mode in AutoresetMode])
-def test_returned_arrays_are_fresh_and_writing_into_them_moves_nothing(mode: str) -> None:
+def test_returned_arrays_are_fresh_and_writing_into_them_moves_nothing(mode):
     env = SMEVectorEnv(SMESpec.from_dict({**HARD, "D": 0.0}), 3, autoreset_mode=mode)
     clean = copy.deepcopy(env)
     rng = np.random.default_rng(2)
@@ -82,7 +134,7 @@ def test_returned_arrays_are_fresh_and_writing_into_them_moves_nothing(mode: str
             given[:] = 0.9
 
 
-def spoil(returned: Any) -> None:
+def spoil(returned):
     """Write into every array that a call has returned."""
     if isinstance(returned, np.ndarray):
         if returned.dtype == object:
