@@ -1,12 +1,10 @@
 """Small ONNX models, good and bad, made with the `onnx` package."""
 
-from __future__ import annotations
-
 import itertools
 import random
 
 import numpy as np
-from onnx import ModelProto, TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper, numpy_helper
 
 FLOAT = TensorProto.FLOAT
 OBSERVATION, ACTION = 4, 2
@@ -37,7 +35,7 @@ def model(
     outputs=None,
     opsets=(("", 17),),
     ir_version=8,
-) -> ModelProto:
+):
     """A model from `o` [batch, 4] to `a` [batch, 2], by default."""
     graph = helper.make_graph(
         nodes,
@@ -50,17 +48,27 @@ def model(
     return helper.make_model(graph, opset_imports=imports, ir_version=ir_version)
 
 
-def linear(**changes) -> ModelProto:
+def linear(**changes):
     """a = o W: the smallest policy that is one."""
     return model([node("MatMul", "o W", "a")], [weights()], **changes)
 
 
-def squashed(nodes, tensors=(), **changes) -> ModelProto:
+def external(location):
+    """The linear policy, with its weights in another file."""
+    found = linear()
+    W = found.graph.initializer[0]
+    W.ClearField("raw_data")
+    W.data_location = TensorProto.EXTERNAL
+    W.external_data.add(key="location", value=location)
+    return found
+
+
+def squashed(nodes, tensors=(), **changes):
     """The linear policy as `y`, then some nodes from it to `a`."""
     return model([node("MatMul", "o W", "y"), *nodes], [weights(), *tensors], **changes)
 
 
-def network(hidden=8, seed=0) -> ModelProto:
+def network(hidden=8, seed=0):
     """Two layers, clipped: with the bytes of an exported actor, but few of them."""
     return model(
         [
@@ -80,7 +88,7 @@ def network(hidden=8, seed=0) -> ModelProto:
     )
 
 
-def looping(times=2**62) -> ModelProto:
+def looping(times=2**62):
     """A loop whose condition stays true."""
     body = helper.make_graph(
         [node("Identity", "c", "c_out"), node("Sin", "x", "x_out")],
@@ -98,7 +106,7 @@ def looping(times=2**62) -> ModelProto:
     )
 
 
-def memory_bomb() -> ModelProto:
+def memory_bomb():
     """Some 200 bytes that ask for 4 GiB."""
     shape = tensor("shape", np.array([2**30], np.int64))
     return model(
@@ -112,7 +120,7 @@ def memory_bomb() -> ModelProto:
     )
 
 
-def doubling(times, axis=1) -> ModelProto:
+def doubling(times, axis=1):
     """An array that doubles again and again, by operators that the gate allows."""
     grown = ["y", *(f"y{i}" for i in range(times))]
     return squashed(
@@ -127,7 +135,7 @@ def doubling(times, axis=1) -> ModelProto:
     )
 
 
-def mutant(seed) -> bytes:
+def mutant(seed):
     """A network's file with a few of its bytes changed, lost, added, or copied from elsewhere."""
     chance = random.Random(seed)
     data = bytearray(network(hidden=4).SerializeToString())

@@ -1,7 +1,5 @@
 """Exported SB3 models act as the models do, and what cannot is refused and leaves no file."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

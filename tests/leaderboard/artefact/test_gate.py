@@ -1,7 +1,5 @@
 """The gate: good files pass, and each kind of bad one is refused with its own code."""
 
-from __future__ import annotations
-
 import itertools
 import subprocess
 import sys
@@ -9,8 +7,6 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
 from leaderboard.artefact import gate
@@ -98,15 +94,6 @@ def with_tensor(**fields):
     return found
 
 
-def external():
-    found = linear()
-    W = found.graph.initializer[0]
-    W.ClearField("raw_data")
-    W.data_location = TensorProto.EXTERNAL
-    W.external_data.add(key="location", value="../../etc/passwd")
-    return found
-
-
 def sparse():
     found = linear()
     found.graph.sparse_initializer.add(dims=[2**40], values=tensor("S", np.ones(1, np.float32)))
@@ -178,36 +165,21 @@ SPARSE = helper.make_sparse_tensor(tensor("v", ONES), tensor("i", np.zeros(1, np
 BAD = {
     "onnx_malformed": {
         "not an ONNX file": b"hello, world",
-        "a .zip": b"PK\x03\x04" + bytes(100),
         "no graph": changed(linear(), lambda m: m.ClearField("graph")),
         "an unknown field": linear().SerializeToString() + b"\xf8\x07\x01",
         "two graphs": linear().SerializeToString() * 2,
         "an attribute of two values": attributed(f=1.0),
         "an attribute of another type": attributed(type=3),
-        "an attribute of no type": attributed(type=0),
         "an attribute given twice": twice_attributed(),
         "half an entry": with_tensor(raw_data=b"\0" * 31),
-        **{
-            f"an empty input of {operator}": squashed([node_with(operator, ["y", "", "y"])])
-            for operator in ("Sum", "Mean", "Min", "Max", "Concat", "Where")
-        },
+        "an empty input of a sum": squashed([node_with("Sum", ["y", "", "y"])]),
         "a first input that is empty": squashed([node_with("Clip", ["", "y"])]),
-        "an empty output": squashed([node("Tanh", "y", "a"), node_with("Tanh", ["y"], [""])]),
         "no output": squashed([node("Tanh", "y", "a"), node_with("Tanh", ["y"], [])]),
         "fewer outputs announced than there are": split(3, num_outputs=2),
-        "more outputs announced than there are": split(3, num_outputs=4),
         "outputs that nothing announces": split(3),
-        "a second output without a name": squashed(
-            [
-                node_with("Split", ["y"], ["q", ""], axis=1, num_outputs=2),
-                node("Tanh", "q", "a"),
-            ],
-            opsets=[("", 18)],
-        ),
         "a value computed twice": squashed([node("Tanh", "y", "a"), node("Tanh", "y", "a")]),
         "a value computed and stored": squashed([node("Tanh", "y", "a")], [tensor("y", ONES)]),
         "a value stored twice": linear_with(weights()),
-        "a tensor without a name": linear_with(weights("")),
         "observations that are stored": linear_with(weights("o")),
     },
     "onnx_version": {
@@ -219,27 +191,22 @@ BAD = {
     },
     "onnx_domain": {
         "no opset": linear(opsets=[]),
-        "two domains": linear(opsets=[("", 17), ("com.microsoft", 1)]),
         "two opsets": linear(opsets=[("", 17), ("", 18)]),
-        "another domain": linear(opsets=[("ai.onnx.ml", 3)]),
-        "Microsoft's operator": squashed([node("FusedGemm", "y", "a", domain="com.microsoft")]),
         "a known operator elsewhere": squashed([node("Tanh", "y", "a", domain="com.microsoft")]),
     },
     "onnx_op": {
         "an operator's name with a space": squashed([node("Tanh ", "y", "a")]),
-        "a memory bomb": models.memory_bomb(),
         "an endless loop": models.looping(),
     },
     "onnx_subgraph": {
         "a subgraph in an operator of the list": attributed(g=GRAPH),
-        "subgraphs in an operator of the list": attributed(graphs=[GRAPH]),
         "a function's attribute": attributed(ref_attr_name="x"),
         "a function": changed(linear(), lambda m: m.functions.add(name="f")),
         "an overload": changed(linear(), lambda m: setattr(m.graph.node[0], "overload", "f")),
         "training information": changed(linear(), lambda m: m.training_info.add()),
     },
     "onnx_external_data": {
-        "external data": external(),
+        "external data": models.external("../../etc/passwd"),
         "a place outside alone": with_tensor(data_location=1),
     },
     "onnx_tensor": {
@@ -254,17 +221,12 @@ BAD = {
         "more data than the dimensions": with_tensor(dims=[4, 1]),
         "data given twice": with_tensor(float_data=[0.0] * 8),
         "data of another type": with_tensor(raw_data=b"", int64_data=[0] * 8),
-        "text in a tensor": linear_with(tensor("x", np.array(["a"], object))),
         "a tensor of float16": linear_with(tensor("x", np.ones(2, np.float16))),
-        "a tensor of complex numbers": linear_with(tensor("x", np.ones(2, np.complex64))),
         "a cast to text": squashed([node("Cast", "y", "a", to=TensorProto.STRING)]),
     },
     "onnx_too_many_nodes": {
         "too many nodes": many_nodes(MAX_NODES + 1),
         "too many tensors": linear_with(*(tensor(f"x{i}", np.float32(0)) for i in range(4096))),
-        "too many attributes": squashed(
-            [node("Flatten", "y", "a", **{f"x{i}": i for i in range(8193)})]
-        ),
         "too long a name": squashed(
             [node("Tanh", "y", "z" * (MAX_NAME + 1)), node("Tanh", "y", "a")]
         ),
@@ -274,13 +236,10 @@ BAD = {
         "two inputs": linear(inputs=[value("o", "b", 4), value("p", "b", 4)]),
         "two outputs": linear(outputs=[value("a", "b", 2), value("o", "b", 4)]),
         "an input too wide": linear(inputs=[value("o", "b", 5)]),
-        "an input of any width": linear(inputs=[value("o", "b", "w")]),
         "an output too narrow": linear(outputs=[value("a", "b", 1)]),
         "a batch of one": linear(inputs=[value("o", 1, 4)]),
-        "an output of one row": linear(outputs=[value("a", 1, 2)]),
         "an input of three axes": linear(inputs=[value("o", "b", 1, 4)]),
         "an input of float64": linear(inputs=[value("o", "b", 4, type=TensorProto.DOUBLE)]),
-        "an output of int64": linear(outputs=[value("a", "b", 2, type=TensorProto.INT64)]),
         "an input that is a sequence": linear(
             inputs=[helper.make_tensor_sequence_value_info("o", 1, ["b", 4])]
         ),
@@ -298,19 +257,13 @@ def test_bad_files_are_rejected_with_their_code(code):
 
 MALFORMED = {
     b"\x08": "does not end",
-    b"\x08\x80": "does not end",
     b"\x08" + b"\xff" * 9 + b"\x02": "exceeds 64 bits",
-    b"\x08" + b"\xff" * 10 + b"\x01": "does not end",
     b"\x08\x88\x00": "not in its shortest form",
-    b"\x88\x00\x08": "not in its shortest form",
     b"\x0a\x05abcd": "field 1 ends 1 bytes after its message",
     b"\x0a" + b"\xff" * 9 + b"\x01": "bytes after its message",
     b"\x0d\x00\x00\x00": "field 1 ends 1 bytes after",
-    b"\x09\x00": "field 1 ends 7 bytes after",
     b"\x00\x01": "field number 0",
-    b"\x80\x80\x80\x80\x10\x01": "field number 536870912",
     b"\x0b\x0c": "wire type 3",
-    b"\x0e": "wire type 6",
 }
 
 
@@ -323,11 +276,6 @@ def test_bytes_that_readers_may_understand_differently_are_rejected():
     for _ in range(2000):  # messages nested deeper than Python's stack
         inner = length_prefixed(0x32, length_prefixed(0x0A, length_prefixed(0x2A, inner)))
     assert rejection(HEAD + length_prefixed(0x3A, inner)).code == "onnx_malformed"
-
-
-@given(st.binary(max_size=64))
-def test_any_bytes_are_rejected(data):
-    rejection(data)
 
 
 def test_every_truncation_and_mutation_of_a_good_file_is_refused_or_read():
@@ -365,16 +313,12 @@ def floods(size):
     return {
         "fields": b"\x32\x00" * half,
         "metadata": HEAD + b"\x72\x00" * half,
-        "nodes": HEAD + length_prefixed(0x3A, b"\x0a\x00" * half),
         "tensors": HEAD + length_prefixed(0x3A, b"\x2a\x00" * half),
-        "value types": HEAD + length_prefixed(0x3A, b"\x6a\x00" * half),
         "dimensions": in_graph(0x2A, b"\x10\x01" + b"\x08\x01" * half),
-        "packed dimensions": in_graph(0x2A, b"\x10\x01" + length_prefixed(0x0A, b"\x01" * size)),
         "packed integers": in_graph(
             0x2A, b"\x10\x07\x08\x01" + length_prefixed(0x3A, b"\x01" * size)
         ),
         "one long number": b"\xff" * size,
-        "names": in_graph(0x0A, b"\x22\x04Tanh" + b"\x0a\x00" * half),
         "messages in messages": in_graph(0x5A, length_prefixed(0x12, b"\x0a\x00" * half)),
     }
 

@@ -1,14 +1,14 @@
-"""Isolation is chosen, and what is broken is a fault: nothing runs with less."""
-
-from __future__ import annotations
+"""Isolation is chosen, and nothing runs with less; what a machine has to spare, and has used."""
 
 import shutil
+import subprocess
 import sys
 
 import pytest
 
-from leaderboard.artefact import isolation
+from leaderboard.artefact import isolation, machine
 from leaderboard.artefact.isolation import available_isolation
+from leaderboard.artefact.machine import RESERVED_BYTES, processor_seconds, spare_memory
 from leaderboard.artefact.sandbox import Sandbox
 from leaderboard.errors import ScoringFault
 from tests.leaderboard.artefact.models import ACTION, OBSERVATION, linear
@@ -84,3 +84,29 @@ def test_only_a_machine_without_bubblewrap_runs_without_it(monkeypatch, tmp_path
         assert policy.isolation == "process"
     with pytest.raises(ScoringFault, match="bubblewrap is not installed"):
         Sandbox(MODEL, OBSERVATION, ACTION, isolation="bwrap")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.parametrize(("available", "spare"), [(RESERVED_BYTES + 7, 7), (7, 0), (None, 0)])
+def test_a_child_may_use_the_available_memory_without_a_reserve(monkeypatch, available, spare):
+    monkeypatch.setattr(machine, "available_memory", lambda: available)
+    assert spare_memory() == spare
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_processor_time_includes_descendants():
+    script = (
+        "import sys, time\n"
+        "while time.process_time() < 0.3: pass\n"
+        "print(flush=True); sys.stdin.read()\n"
+    )
+    inner = f"exec({script!r})"
+    outer = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {inner!r}])"
+    with subprocess.Popen(
+        [sys.executable, "-c", outer], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        assert processor_seconds(process.pid) >= 0.2
+        process.communicate()
+    assert processor_seconds(process.pid) == 0.0

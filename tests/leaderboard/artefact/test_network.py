@@ -1,7 +1,5 @@
 """A submitted file reaches a page as numbers: equal to what onnxruntime computes, or not at all."""
 
-from __future__ import annotations
-
 import numpy as np
 import onnxruntime
 import pytest

@@ -1,7 +1,5 @@
 """The reference policies: 0 and 1 by construction, as files that any board would take."""
 
-from __future__ import annotations
-
 import numpy as np
 import onnx
 import pytest

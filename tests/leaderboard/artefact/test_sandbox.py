@@ -1,8 +1,5 @@
 """The sandbox: what a model may do, and that nothing it does hurts the process that asks it."""
 
-from __future__ import annotations
-
-import concurrent.futures
 import contextlib
 import itertools
 import os
@@ -20,7 +17,7 @@ from leaderboard.artefact import isolation as isolations
 from leaderboard.artefact import sandbox
 from leaderboard.artefact.gate import inspect
 from leaderboard.artefact.sandbox import ROWS, Sandbox, SandboxLimits
-from leaderboard.errors import CODES, BoardError, Rejection, ScoringFault
+from leaderboard.errors import BoardError, Rejection, ScoringFault
 from sme_registry.errors import MissingDependencyError, StateError
 from tests.leaderboard.artefact import models
 from tests.leaderboard.artefact.models import (
@@ -110,17 +107,11 @@ def test_batches_of_every_size_are_answered_in_order_and_others_refused():
         assert policy(observations(2)).shape == (2, ACTION)
 
 
-UNLOADABLE = {
-    "an undefined name": model([node("MatMul", "o Q", "a")], [weights()]),
-    "a cycle": squashed([node("Add", "y q", "z"), node("Tanh", "z", "q"), node("Tanh", "q", "a")]),
-    "shapes that do not fit": model([node("MatMul", "o W", "a")], [weights(rows=5)]),
-    "an attribute that does not exist": squashed([node("Tanh", "y", "a", alpha=1.0)]),
-}
-
-
-@pytest.mark.parametrize("kind", UNLOADABLE)
-def test_what_onnxruntime_cannot_load_is_refused(kind):
-    assert code_of(UNLOADABLE[kind]) == "onnx_refused"
+def test_what_onnxruntime_cannot_load_is_refused():
+    undefined = model([node("MatMul", "o Q", "a")], [weights()])
+    unfitting = model([node("MatMul", "o W", "a")], [weights(rows=5)])
+    for found in (undefined, unfitting):
+        assert code_of(found) == "onnx_refused"
 
 
 FAILING = {
@@ -150,7 +141,7 @@ def test_a_failing_run_has_its_code(kind, unconfined):
     found, expected = FAILING[kind]
     inspect(found.SerializeToString(), OBSERVATION, ACTION)  # the gate cannot see it
     limits = SandboxLimits(memory_bytes=2**28)
-    assert code_of(found, limits) in ((expected,) if isinstance(expected, str) else expected)
+    assert code_of(found, limits) == expected
 
 
 def test_another_order_of_summation_passes_the_check_of_rows():
@@ -159,47 +150,39 @@ def test_another_order_of_summation_passes_the_check_of_rows():
         policy.check_rows(observations(1000))
 
 
+POSITIONS = [tensor("end", np.int64([2**31]))]
+POSITIONS += [
+    tensor(name, np.int64([at])) for at, name in enumerate(["last", "zero", "one", "two"], -1)
+]
+
+
 def test_a_row_that_reads_another_is_detected_in_reverse_order():
     # Row 1 has the action of row 0, in any batch that has one; it is not among those asked alone.
-    found = squashed(
-        [
-            node("Slice", "y zero one", "first"),
-            node("Slice", "y zero last", "but_last"),
-            node("Slice", "but_last zero one", "copied"),
-            node("Slice", "y two end", "rest"),
-            node("Concat", "first copied rest", "a", axis=0),
-        ],
-        [
-            tensor("zero", np.int64([0])),
-            tensor("one", np.int64([1])),
-            tensor("two", np.int64([2])),
-            tensor("last", np.int64([-1])),
-            tensor("end", np.int64([2**31])),
-        ],
-    )
-    assert code_of(found, rows=100) == "run_batch_dependent"
+    nodes = [
+        node("Slice", "y zero one", "first"),
+        node("Slice", "y zero last", "but_last"),
+        node("Slice", "but_last zero one", "copied"),
+        node("Slice", "y two end", "rest"),
+        node("Concat", "first copied rest", "a", axis=0),
+    ]
+    assert code_of(squashed(nodes, POSITIONS), rows=100) == "run_batch_dependent"
 
 
 def test_an_action_that_depends_on_both_neighbours_is_rejected():
     # In reverse order both neighbours are the same; in random order they are not.
-    found = squashed(
-        [
-            node("Slice", "y one end", "after"),
-            node("Slice", "y zero last", "before"),
-            node("Slice", "y zero one", "first"),
-            node("Slice", "y last end", "final"),
-            node("Concat", "after first", "next", axis=0),
-            node("Concat", "final before", "previous", axis=0),
-            node("Sum", "y next previous", "a"),
-        ],
-        [
-            tensor("zero", np.int64([0])),
-            tensor("one", np.int64([1])),
-            tensor("last", np.int64([-1])),
-            tensor("end", np.int64([2**31])),
-        ],
-    )
-    with opened(found) as policy, pytest.raises(Rejection, match="run_batch_dependent"):
+    nodes = [
+        node("Slice", "y one end", "after"),
+        node("Slice", "y zero last", "before"),
+        node("Slice", "y zero one", "first"),
+        node("Slice", "y last end", "final"),
+        node("Concat", "after first", "next", axis=0),
+        node("Concat", "final before", "previous", axis=0),
+        node("Sum", "y next previous", "a"),
+    ]
+    with (
+        opened(squashed(nodes, POSITIONS)) as policy,
+        pytest.raises(Rejection, match="run_batch_dependent"),
+    ):
         policy.check_rows(observations(100), rows=[])
 
 
@@ -249,13 +232,8 @@ def test_a_small_file_that_takes_gigabytes_is_stopped_without_the_gate(isolation
     assert code_of(bomb) == "run_memory"
 
 
-@pytest.fixture
-def short_of_memory(monkeypatch):
-    """A machine with 300 MiB to spare."""
+def test_a_machine_short_of_memory_judges_only_what_its_memory_allows(unconfined, monkeypatch):
     monkeypatch.setattr(sandbox, "spare_memory", lambda: 300 * 2**20)
-
-
-def test_a_machine_short_of_memory_judges_only_what_its_memory_allows(unconfined, short_of_memory):
     for found in (models.doubling(40), models.doubling(24)):
         with pytest.raises(ScoringFault, match="the machine had 300 MiB to spare"):
             run(found, LIMITS, 8)
@@ -312,12 +290,7 @@ def test_an_answer_that_takes_too_long_is_rejected(ungated, monkeypatch):
 def test_external_data_cannot_be_read_without_the_gate(isolation, ungated, tmp_path):
     secret = tmp_path / "secret"
     secret.write_bytes(np.ones((OBSERVATION, ACTION), np.float32).tobytes())
-    found = linear()
-    W = found.graph.initializer[0]
-    W.ClearField("raw_data")
-    W.data_location = W.EXTERNAL
-    W.external_data.add(key="location", value=os.path.relpath(secret, "/"))
-    assert code_of(found) == "onnx_refused"
+    assert code_of(models.external(os.path.relpath(secret, "/"))) == "onnx_refused"
 
 
 def test_other_formats_and_invalid_bytes_are_refused_without_the_gate(ungated, tmp_path):
@@ -417,12 +390,10 @@ STARTED = (
 LOADED = STARTED + "say(0, 0); "
 LIES = {
     "answers with another length": ("say(0, 2**32 - 1); time.sleep(60)", "run_failed"),
-    "answers with a status that there is not": ("say(77, 0); time.sleep(60)", "run_failed"),
     "tells a story without end": (
         "say(2, 2**31)\nwhile True: os.write(1, bytes(2**16))", "run_failed"
     ),
     "answers half and ends": ("say(0, 64); os.write(1, b'xx')", "run_failed"),
-    "ends": ("", "run_failed"),
     "answers without end": ("\nwhile True: os.write(1, bytes(2**16))", "run_failed"),
     "closes its pipes and hangs": ("os.close(0); os.close(1); time.sleep(60)", "run_failed"),
     "crashes": ("os.kill(os.getpid(), signal.SIGSEGV)", "run_failed"),
@@ -514,27 +485,6 @@ def test_a_missing_onnxruntime_is_an_error_with_the_install_command(monkeypatch,
             opened(linear())
     finally:
         isolations._library_folders.cache_clear()
-
-
-def outcome(data):
-    try:
-        with opened(data) as policy:
-            policy.check_rows(observations(4))
-    except Rejection as rejection:
-        return rejection.code
-    return "ran"
-
-
-def test_mutated_files_that_pass_the_gate_run_or_are_rejected():
-    passed = []
-    for seed in range(200):
-        with contextlib.suppress(Rejection):
-            inspect(models.mutant(seed), OBSERVATION, ACTION)
-            passed.append(models.mutant(seed))
-    with concurrent.futures.ThreadPoolExecutor(2) as threads:
-        outcomes = list(threads.map(outcome, passed[:20]))
-    assert set(outcomes) <= {"ran", *CODES}
-    assert "ran" in outcomes
 
 
 def test_other_systems_raise_an_error_that_names_linux(monkeypatch):
