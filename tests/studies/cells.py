@@ -1,28 +1,21 @@
 """Plans of small cells, and work for them that waits, fails or dies as a test wants it."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from sme_registry.spec import Cell, StudyFile, StudyPlan
+from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.result import CellResult
 
 PROTOCOL = {"states_per_region": 2, "epsilons": [1.0]}
 STARTED, GATE = "started", "gate"
 
 
-def small_file(
-    seeds: int = 2, algorithms: Sequence[str | dict[str, Any]] = ("constant",), **fields: Any
-) -> StudyFile:
+def small_file(seeds=2, algorithms=("constant",), **fields):
     """References, or other algorithms, on one small class, `seeds` runs each: milliseconds each."""
     plan = StudyPlan.from_dict(
         {
@@ -44,7 +37,7 @@ def small_file(
     return StudyFile(name="small", description="For tests.", digest=plan.digest, plan=plan)
 
 
-def noted(folder: Path, cell: Cell, progress: Any = None, model_path: Any = None) -> CellResult:
+def noted(folder, cell, progress=None, model_path=None):
     """The real thing, with a note in `folder` that it was begun, and by whom."""
     handle = os.open(folder / STARTED, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
     os.write(handle, f"{cell.digest} {os.getpid()} {cell.seed}\n".encode())
@@ -52,23 +45,21 @@ def noted(folder: Path, cell: Cell, progress: Any = None, model_path: Any = None
     return run_cell(cell, progress, model_path)
 
 
-def gated(
-    folder: Path, cell: Cell, progress: Any = None, model_path: Any = None, *, open_for: int = 0
-) -> CellResult:
+def gated(folder, cell, progress=None, model_path=None, *, open_for=0):
     """Runs of a number from `open_for` on wait until the gate is there."""
     result = noted(folder, cell, progress, model_path)
     wait_for(lambda: cell.seed < open_for or (folder / GATE).exists())
     return result
 
 
-def raising(cell: Cell, progress: Any = None, model_path: Any = None) -> CellResult:
+def raising(cell, progress=None, model_path=None):
     """Run 1 raises."""
     if cell.seed == 1:
         raise ValueError("this one is broken")
     return run_cell(cell, progress, model_path)
 
 
-def dying(cell: Cell, progress: Any = None, model_path: Any = None) -> CellResult:
+def dying(cell, progress=None, model_path=None):
     """Run 1 is killed, as the kernel does where memory runs out."""
     if cell.seed == 1:
         print("last words", flush=True)
@@ -76,13 +67,13 @@ def dying(cell: Cell, progress: Any = None, model_path: Any = None) -> CellResul
     return run_cell(cell, progress, model_path)
 
 
-def littering(cell: Cell, progress: Any = None, model_path: Any = None) -> CellResult:
+def littering(cell, progress=None, model_path=None):
     """Removes the folder for temporary files that cells share, as a cleaner of /tmp would."""
     shutil.rmtree(tempfile.gettempdir())
     return run_cell(cell)
 
 
-def modelled(cell: Cell, progress: Any = None, model_path: Path | None = None) -> CellResult:
+def modelled(cell, progress=None, model_path=None):
     """Leaves a model, and says how far it is."""
     if progress is not None:
         progress(10, 10)
@@ -91,9 +82,7 @@ def modelled(cell: Cell, progress: Any = None, model_path: Path | None = None) -
     return run_cell(cell)
 
 
-def surroundings(
-    folder: Path, cell: Cell, progress: Any = None, model_path: Any = None
-) -> CellResult:
+def surroundings(folder, cell, progress=None, model_path=None):
     """Writes down the threads that this process may use."""
     import numba
 
@@ -102,22 +91,22 @@ def surroundings(
     return run_cell(cell)
 
 
-def starts(folder: Path) -> Counter[str]:
+def starts(folder):
     """How often each cell was begun, by key."""
     return Counter(line[0] for line in _lines(folder))
 
 
-def pids(folder: Path) -> list[int]:
+def pids(folder):
     """The processes that began cells."""
     return [int(line[1]) for line in _lines(folder)]
 
 
-def _lines(folder: Path) -> list[list[str]]:
+def _lines(folder):
     path = folder / STARTED
     return [line.split() for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def alive(pid: int) -> bool:
+def alive(pid):
     """Whether a process runs; one that has ended and waits for its parent does not."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] not in "ZX"
@@ -125,7 +114,7 @@ def alive(pid: int) -> bool:
         return False
 
 
-def wait_for(condition: Any, seconds: float = 180.0) -> None:
+def wait_for(condition, seconds=180.0):
     """Poll until it holds."""
     deadline = time.monotonic() + seconds
     while not condition():

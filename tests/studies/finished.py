@@ -1,23 +1,20 @@
 """Studies that have been run: folders with real results of learners that learn in milliseconds."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellFailure
-from sme_registry.studies.report.analysis import Analysis, analyse
+from sme_registry.studies.report.analysis import analyse
 from sme_registry.studies.report.frames import plan_file
 
 LEARNERS = {
     "Alpha": {"half_life": 10.0, "r_min": 0.7, "k": 0.02},
     "Beta": {"half_life": 6.0, "k": 0.25, "complexity": 0.1},
 }
-CLASSES: dict[str, dict[str, Any]] = {
+CLASSES = {
     "default": {},
     "k-25": {"k": 25},
     "r_min-0_5": {"r_min": 0.5},
@@ -27,11 +24,7 @@ CLASSES: dict[str, dict[str, Any]] = {
 Choice = Callable[[Any], bool]  # of the plan's cells
 
 
-def study_file(
-    classes: dict[str, dict[str, Any]] = CLASSES,
-    learners: dict[str, dict[str, float]] = LEARNERS,
-    **fields: Any,
-) -> StudyFile:
+def study_file(classes=CLASSES, learners=LEARNERS, **fields):
     """Learners and a reference on small classes, with five seeds each."""
     algorithms = [
         {"name": name, "uses": "tests.studies.learners:blend", "hyperparameters": own}
@@ -62,7 +55,7 @@ def study_file(
     return StudyFile(name="finished", description="For tests.", digest=plan.digest, plan=plan)
 
 
-def finish(folder: Path) -> None:
+def finish(folder):
     """Run `study_file`; of Beta on k-25 two runs are missing, of which one failed."""
     file, ledger = study_file(), Ledger(folder)
     ledger.write_plan(file)
@@ -75,7 +68,7 @@ def finish(folder: Path) -> None:
             ledger.write(CellFailure(key=cell.digest, cell=cell, **error))
 
 
-def analysed(folder: Path, leave_out: Choice = lambda planned: False, draws: int = 300) -> Analysis:
+def analysed(folder, leave_out=lambda planned: False, draws=300):
     """The tables of a folder's runs, except for those left out."""
     ledger = Ledger(folder)
     file = plan_file(ledger)

@@ -3,10 +3,6 @@
 They make the results of studies in milliseconds: real cells, real curves, real evaluations.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 
 from sme_registry import materialize
@@ -19,7 +15,7 @@ class Blend:
     Outside the cube it knows the nearest state inside only.
     """
 
-    def __init__(self, env: Any, seed: int, half_life: float, costs: dict[str, float]) -> None:
+    def __init__(self, env, seed, half_life, costs):
         self._env, self._task = env, materialize(env.sme_spec)
         rng = np.random.default_rng(seed)
         spec = env.sme_spec
@@ -30,20 +26,20 @@ class Blend:
         self._wrong = rng.random(spec.action_dim)
         self._steps = 0
 
-    def learn(self, total_timesteps: int) -> None:
+    def learn(self, total_timesteps):
         observation = self._env.reset()
         for _ in range(total_timesteps):
             self._steps += 1
             action, _ = self.predict(observation, deterministic=False)
             observation = self._env.step(action.astype(np.float32))[0]
 
-    def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, None]:
+    def predict(self, observation, *, deterministic):
         s = observation[:, : self._task.spec.state_dim].astype(np.float64)
         e = self._floor + (1.0 - self._floor) * 2.0 ** (-self._steps / self._half_life)
         a = (1.0 - e) * self._task.optimal_action(s.clip(0.0, 1.0)) + e * self._wrong
         return 2.0 * a - 1.0, None
 
 
-def blend(env: Any, *, seed: int, half_life: float, **costs: float) -> Blend:
+def blend(env, *, seed, half_life, **costs):
     """What a plan's `uses` names."""
     return Blend(env, seed, half_life, costs)

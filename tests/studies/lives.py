@@ -8,12 +8,6 @@ its normalised regret on that phase is 1 − w.
     Stubborn    learns the first phase, and never anything again
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 
 from sme_registry import materialize
@@ -24,7 +18,7 @@ from sme_registry.evaluation import (
     reference_regret,
 )
 from sme_registry.evaluation.continual.retention import final_specs
-from sme_registry.spec import Cell, SMESpec, StreamSpec, StudyFile, StudyPlan
+from sme_registry.spec import StreamSpec, StudyFile, StudyPlan
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing
 
@@ -33,7 +27,7 @@ TASK = {"state_dim": 2, "action_dim": 2, "complexity": 2, "horizon": 10, "hidden
 TIMING = Timing(total=2.0, training=1.0, environment=0.5, evaluation=0.5, steps_per_second=100.0)
 
 
-def stream(*specs: dict[str, Any], cycles: int = 1) -> dict[str, Any]:
+def stream(*specs, cycles=1):
     return {"phases": [{"spec": TASK | spec, "steps": 100} for spec in specs], "cycles": cycles}
 
 
@@ -44,7 +38,7 @@ STREAMS = {
 }
 
 
-def stream_study(seeds: int = 5, **fields: Any) -> StudyFile:
+def stream_study(seeds=5, **fields):
     """The plan; each stream has two draws."""
     plan = StudyPlan.from_dict(
         {
@@ -63,7 +57,7 @@ def stream_study(seeds: int = 5, **fields: Any) -> StudyFile:
     return StudyFile(name="lived", description="For tests.", digest=plan.digest, plan=plan)
 
 
-def live(file: StudyFile, folder: Path, leave_out: Any = lambda planned: False) -> Ledger:
+def live(file, folder, leave_out=lambda planned: False):
     """Write a plan and the results of the cells of its streams, except for those left out."""
     ledger = Ledger(folder)
     ledger.write_plan(file)
@@ -72,7 +66,7 @@ def live(file: StudyFile, folder: Path, leave_out: Any = lambda planned: False) 
     return ledger
 
 
-def lived(cell: Cell, key: str) -> CellResult:
+def lived(cell, key):
     """The result of a life, or of a fresh agent."""
     alone = cell.stream is None or len(cell.stream.phases) == 1
     document = cell.document
@@ -103,7 +97,7 @@ def lived(cell: Cell, key: str) -> CellResult:
     return CellResult(stream_report=life, **common)
 
 
-def _share(cell: Cell, visit: int, *, alone: bool) -> float:
+def _share(cell, visit, *, alone):
     """w at the end of a visit; a little different in each run."""
     noise = 0.04 * np.random.default_rng([cell.seed, visit]).random()
     if alone or cell.hyperparameters.get("agent") != "Tired":
@@ -111,16 +105,14 @@ def _share(cell: Cell, visit: int, *, alone: bool) -> float:
     return float(0.8 / (1.0 + visit) - noise)
 
 
-def _plays(
-    cell: Cell, specs: tuple[SMESpec, ...], shares: list[float]
-) -> list[tuple[SMESpec, float]]:
+def _plays(cell, specs, shares):
     """The task whose optimum is played at the end of each visit, and its share."""
     if cell.hyperparameters.get("agent") == "Stubborn":
         return [(specs[0], shares[0])] * len(shares)
     return [(specs[v % len(specs)], share) for v, share in enumerate(shares)]
 
 
-def _policy(spec: SMESpec, share: float) -> Callable[[Any], Any]:
+def _policy(spec, share):
     task = materialize(spec)
     return lambda observations: (
         0.5

@@ -1,11 +1,7 @@
 """Cells that are lives in streams: the policies of their visits, their regret, their files."""
 
-from __future__ import annotations
-
 import io
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,15 +9,14 @@ from rich.console import Console
 
 from sme_registry import SMESpec, StreamSpec, materialize
 from sme_registry.errors import PolicyError, SMEError, SpecError
-from sme_registry.evaluation import StreamReport, evaluate_stream, expected_regret
+from sme_registry.evaluation import evaluate_stream, expected_regret
 from sme_registry.spec import Cell, StudyFile, StudyPlan
 from sme_registry.studies.engine import lanes
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.checks import check_task
 from sme_registry.studies.engine.estimate import Estimator
-from sme_registry.studies.engine.jobs import Lanes, Programs
+from sme_registry.studies.engine.jobs import Programs
 from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.engine.program_state import read_state
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.engine.runner import run_study
 from sme_registry.studies.engine.status import label, study_status
@@ -35,15 +30,15 @@ SMALL = {"n_steps": 16, "batch_size": 16, "n_epochs": 2, "policy_kwargs": {"net_
 PROTOCOL = {"states_per_region": 50, "epsilons": [1.0]}
 
 
-def stream_of(*specs: SMESpec, steps: int = 32, **fields: Any) -> StreamSpec:
+def stream_of(*specs, steps=32, **fields):
     return StreamSpec(phases=[{"spec": spec, "steps": steps} for spec in specs], **fields)
 
 
 TWICE = stream_of(TASK, OTHER, cycles=2)
 
 
-def life(stream: StreamSpec = TWICE, uses: str = "PPO", **changes: Any) -> Cell:
-    fields: dict[str, Any] = {
+def life(stream=TWICE, uses="PPO", **changes):
+    fields = {
         "spec": stream.phases[0].spec,
         "stream": stream,
         "uses": uses,
@@ -58,7 +53,7 @@ def life(stream: StreamSpec = TWICE, uses: str = "PPO", **changes: Any) -> Cell:
     return Cell(**{**fields, **changes})
 
 
-def plan_file(uses: str = "PPO", **fields: Any) -> StudyFile:
+def plan_file(uses="PPO", **fields):
     """Two streams that share phase 0, two runs each."""
     plan = StudyPlan.from_dict(
         {
@@ -81,60 +76,57 @@ def plan_file(uses: str = "PPO", **fields: Any) -> StudyFile:
     return StudyFile(name="lives", digest=plan.digest, plan=plan)
 
 
-def matrix(report: Any, region: str = "WD") -> Any:
+def matrix(report, region="WD"):
     return np.array(report.region(region).agent.normalised_regret)
 
 
 class Knowing:
     """A learner that acts optimally in one phase, or in the one that it observes."""
 
-    def __init__(self, env: Any, copies: bool) -> None:
+    def __init__(self, env, copies):
         stream = env.get_attr("stream")[0]
         self._env, self._tasks = env, [materialize(phase.spec) for phase in stream.phases]
         self._lock = None if copies else (each for each in ())
 
-    def learn(self, total_timesteps: int) -> None:
+    def learn(self, total_timesteps):
         observation = self._env.reset()
         for _ in range(total_timesteps):
             action, _ = self.predict(observation, deterministic=True)
             observation = self._env.step(action.astype(np.float32))[0]
 
-    def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, None]:
+    def predict(self, observation, *, deterministic):
         s, shown = observation[:, :2].astype(np.float64), observation[:, 4:]
         phase = int(shown[0].argmax()) if shown.size else 0
         return 2.0 * self._tasks[phase].optimal_action(s) - 1.0, None
 
 
-def knowing(env: Any, *, seed: int, copies: bool = True) -> Knowing:
+def knowing(env, *, seed, copies=True):
     return Knowing(env, copies)
 
 
 @pytest.fixture(scope="module")
-def lived(tmp_path_factory: pytest.TempPathFactory) -> tuple[CellResult, Path]:
+def lived(tmp_path_factory):
     """The result of a life, and where its models are."""
     model = tmp_path_factory.mktemp("life") / "model.zip"
     return run_cell(life(), model_path=model), model
 
 
 @pytest.fixture(scope="module")
-def report(lived: tuple[CellResult, Path]) -> StreamReport:
+def report(lived):
     """The life's."""
     report = lived[0].stream_report
-    assert report is not None
     assert report.dynamic_regret is not None
     return report
 
 
-def test_a_life_has_the_policies_that_ppo_has_at_the_end_of_each_visit(
-    lived: tuple[CellResult, Path], report: StreamReport
-) -> None:
+def test_a_life_has_the_policies_that_ppo_has_at_the_end_of_each_visit(lived, report):
     from stable_baselines3 import PPO
 
     from sme_registry.sb3 import SMEVecEnv
 
     settings = SMALL | {"policy_kwargs": dict(SMALL["policy_kwargs"])}  # type: ignore[call-overload]
     env = SMEVecEnv(TWICE, 1, action_range="symmetric")
-    model: Any = PPO("MlpPolicy", env, seed=3, device="cpu", **settings)
+    model = PPO("MlpPolicy", env, seed=3, device="cpu", **settings)
     rows = []
     for _ in range(4):
         model.learn(32, reset_num_timesteps=not rows)
@@ -145,11 +137,8 @@ def test_a_life_has_the_policies_that_ppo_has_at_the_end_of_each_visit(
     assert len({*matrix(report)[:, 0]}) == 4
 
 
-def test_a_life_has_the_agent_that_stopped_learning_after_its_first_visit(
-    lived: tuple[CellResult, Path], report: StreamReport
-) -> None:
+def test_a_life_has_the_agent_that_stopped_learning_after_its_first_visit(lived, report):
     frozen, own = report.reference_regret["frozen_agent"], report.dynamic_regret
-    assert own is not None
     assert frozen.visits[0].online_regret == pytest.approx(own.visits[0].online_regret)
     kept = Snapshots(lived[1].with_suffix(""), TWICE).visits[0]
     expected = expected_regret([0.0, kept, kept, kept], TWICE, action_range="symmetric")
@@ -158,9 +147,7 @@ def test_a_life_has_the_agent_that_stopped_learning_after_its_first_visit(
         assert found == pytest.approx(wanted, abs=1e-6)
 
 
-def test_a_life_s_document_is_read_again_and_holds_one_report(
-    lived: tuple[CellResult, Path],
-) -> None:
+def test_a_life_s_document_is_read_again_and_holds_one_report(lived):
     result, _ = lived
     document = json.loads(json.dumps(result.to_dict()))
     assert "report" not in document
@@ -176,11 +163,8 @@ def test_a_life_s_document_is_read_again_and_holds_one_report(
             CellResult.from_dict(wrong)
 
 
-def test_the_dynamic_regret_of_a_life_is_that_of_its_training(
-    lived: tuple[CellResult, Path], report: StreamReport
-) -> None:
+def test_the_dynamic_regret_of_a_life_is_that_of_its_training(lived, report):
     result, regret = lived[0], report.dynamic_regret
-    assert regret is not None
     assert [visit.steps for visit in regret.visits] == [32] * 4
     assert regret.online_regret == pytest.approx(result.online_regret)
     assert regret.lifetime == tuple(range(1, 129))
@@ -189,14 +173,11 @@ def test_the_dynamic_regret_of_a_life_is_that_of_its_training(
         [each.any_report for each in fresh], [each.online_regret or 0.0 for each in fresh]
     )
     assert None not in beside.region().agent.plasticity_ratio
-    assert beside.dynamic_regret is not None
     assert beside.dynamic_regret.learning_transfer is not None
     assert beside.dynamic_regret.visits[0].learning_transfer == pytest.approx(0.0)  # the same agent
 
 
-def test_the_models_of_a_life_are_kept_before_training_and_after_each_visit(
-    lived: tuple[CellResult, Path], report: StreamReport
-) -> None:
+def test_the_models_of_a_life_are_kept_before_training_and_after_each_visit(lived, report):
     model = lived[1]
     names = ["initial.zip", "visit-00.zip", "visit-01.zip", "visit-02.zip", "visit-03.zip"]
     files = sorted(model.with_suffix("").iterdir())
@@ -210,14 +191,14 @@ def test_the_models_of_a_life_are_kept_before_training_and_after_each_visit(
     assert agent.forward_transfer == pytest.approx(own.forward_transfer, abs=1e-6)
 
 
-def test_evaluations_during_a_life_are_on_the_task_in_force() -> None:
+def test_evaluations_during_a_life_are_on_the_task_in_force():
     name = f"{__name__}:knowing"
     regret = np.array(run_cell(life(uses=name)).curve.regret).reshape(4, 2)
     assert (regret[[0, 2]] < 1e-5).all()
     assert (regret[[1, 3]] > 0.1).all()
 
 
-def test_a_learner_that_observes_the_phase_is_shown_the_one_in_force() -> None:
+def test_a_learner_that_observes_the_phase_is_shown_the_one_in_force():
     stream = stream_of(TASK, OTHER, cycles=2, observes_phase=True)
     result = run_cell(life(stream, f"{__name__}:knowing"))
     assert max(result.curve.regret) < 1e-5
@@ -225,37 +206,35 @@ def test_a_learner_that_observes_the_phase_is_shown_the_one_in_force() -> None:
     assert np.abs(matrix(result.stream_report)).max() < 1e-6
 
 
-def test_a_life_of_a_learner_that_cannot_be_copied_is_refused_before_it_begins() -> None:
+def test_a_life_of_a_learner_that_cannot_be_copied_is_refused_before_it_begins():
     with pytest.raises(PolicyError, match=r"cannot be copied at the end of a visit: TypeError"):
         run_cell(life(uses=f"{__name__}:knowing", hyperparameters={"copies": False}))
 
 
-def test_a_phase_that_goes_on_to_the_end_of_an_episode_gets_its_regret() -> None:
+def test_a_phase_that_goes_on_to_the_end_of_an_episode_gets_its_regret():
     stream = stream_of(TASK, OTHER, steps=30, cycles=2)  # 30 is no multiple of the horizon
     result = run_cell(life(stream, f"{__name__}:knowing"))
-    assert result.stream_report is not None
     regret = result.stream_report.dynamic_regret
-    assert regret is not None
     assert [visit.steps for visit in regret.visits] == [32, 32, 32, 24]
     first, second, *_ = (visit.dynamic_regret for visit in regret.visits)
     assert first < 1e-4 < second
 
 
 @pytest.fixture(scope="module")
-def studied(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def studied(tmp_path_factory):
     """A study of lives that has been run, with its models."""
     study = tmp_path_factory.mktemp("study")
     ran(study, plan_file(), keep_models=True)
     return study
 
 
-def ran(study: Path, file: StudyFile, **options: Any) -> Any:
+def ran(study, file, **options):
     console = Console(file=io.StringIO(), width=200)
     options = {"executor": "in-process", "console": console, **options}
     return run_study(file, study, **options)
 
 
-def test_fresh_agents_that_two_streams_share_run_once_and_count_once(studied: Path) -> None:
+def test_fresh_agents_that_two_streams_share_run_once_and_count_once(studied):
     file = plan_file()
     status = study_status(studied, only=())
     places = file.plan.cells
@@ -270,7 +249,7 @@ def test_fresh_agents_that_two_streams_share_run_once_and_count_once(studied: Pa
     assert names[:2] == ["agent on switch, run 1", "agent on phase 0 of switch alone, run 1"]
 
 
-def test_a_study_keeps_the_models_of_its_lives(studied: Path) -> None:
+def test_a_study_keeps_the_models_of_its_lives(studied):
     ledger = Ledger(studied)
     for place in plan_file().plan.cells:
         key = place.cell.digest
@@ -279,7 +258,7 @@ def test_a_study_keeps_the_models_of_its_lives(studied: Path) -> None:
         assert ledger.model_path(key).exists()
 
 
-def test_a_life_takes_longer_than_a_task_of_equal_steps() -> None:
+def test_a_life_takes_longer_than_a_task_of_equal_steps():
     one, many = life(stream_of(TASK, steps=128)), life(TWICE)
     assert Estimator().seconds(many).low > Estimator().seconds(one).low
 
@@ -292,8 +271,8 @@ def test_a_life_takes_longer_than_a_task_of_equal_steps() -> None:
     ],
 )
 def test_a_stream_that_agents_in_jax_cannot_live_in_is_refused_before_anything_runs(
-    stream: StreamSpec, message: str, tmp_path: Path
-) -> None:
+    stream, message, tmp_path
+):
     pytest.importorskip("jax")
     with pytest.raises(SMEError, match=message):
         check_task(life(stream, "jax:PPO"))
@@ -304,7 +283,7 @@ def test_a_stream_that_agents_in_jax_cannot_live_in_is_refused_before_anything_r
     assert not (tmp_path / "study").exists()
 
 
-def test_lives_that_switch_at_the_same_steps_are_lanes_of_one_program() -> None:
+def test_lives_that_switch_at_the_same_steps_are_lanes_of_one_program():
     pytest.importorskip("jax")
     deep = TASK.derive(complexity=3, hidden_width=8)
     base = life(stream_of(TASK, OTHER), "jax:PPO")
@@ -330,13 +309,13 @@ def test_lives_that_switch_at_the_same_steps_are_lanes_of_one_program() -> None:
     assert programs.program(others[3]).shape == (2, 2, 3, 8)
 
 
-def jax_file() -> StudyFile:
+def jax_file():
     """Two lives, on two draws of a stream."""
     stream = {"name": "switch", "stream": stream_of(TASK, OTHER).to_dict(), "draws": [0, 1]}
     return plan_file("jax:PPO", streams=[stream])
 
 
-def numbers(study: Path) -> dict[str, Any]:
+def numbers(study):
     """All results but their times, and the versions of what else this process has loaded."""
     documents = {key: result.to_dict() for key, result in Ledger(study).results().items()}
     for document in documents.values():
@@ -346,13 +325,13 @@ def numbers(study: Path) -> dict[str, Any]:
 
 
 @pytest.fixture
-def visits(monkeypatch: pytest.MonkeyPatch) -> tuple[list[int], list[type[BaseException]]]:
+def visits(monkeypatch):
     """The visits that lives in JAX ended; and what to raise at the end of visit 1, once."""
-    ended: list[int] = []
-    raised: list[type[BaseException]] = []
+    ended = []
+    raised = []
     original = lanes._Run._on_visit
 
-    def on_visit(run: Any, visit: int, weights: Any) -> None:
+    def on_visit(run, visit, weights):
         ended.append(visit)
         original(run, visit, weights)
         if visit == 1 and raised:
@@ -363,9 +342,7 @@ def visits(monkeypatch: pytest.MonkeyPatch) -> tuple[list[int], list[type[BaseEx
     return ended, raised
 
 
-def test_interrupted_lives_in_jax_go_on_with_the_weights_of_their_visits(
-    tmp_path: Path, visits: tuple[list[int], list[type[BaseException]]]
-) -> None:
+def test_interrupted_lives_in_jax_go_on_with_the_weights_of_their_visits(tmp_path, visits):
     pytest.importorskip("jax")
     whole, interrupted = tmp_path / "whole", tmp_path / "interrupted"
     ran(whole, jax_file(), device="cpu", keep_models=True)
@@ -386,38 +363,21 @@ def test_interrupted_lives_in_jax_go_on_with_the_weights_of_their_visits(
         again = evaluate_stream(files, result.cell.document, PROTOCOL, initial=initial)
         np.testing.assert_allclose(matrix(again), matrix(result.stream_report), atol=1e-6)
         regret = result.stream_report and result.stream_report.dynamic_regret
-        assert regret is not None
         assert [visit.steps for visit in regret.visits] == [32, 32]
         assert regret.online_regret == pytest.approx(result.online_regret)
         assert result.curve.steps == (16, 32, 48, 64)
 
 
-@pytest.mark.parametrize("kept_before", [True, False])
-def test_the_state_of_lives_in_jax_has_the_weights_that_its_reports_or_models_need(
-    kept_before: bool, tmp_path: Path, visits: tuple[list[int], list[type[BaseException]]]
-) -> None:
+def test_models_that_are_asked_for_after_an_interruption_make_lives_in_jax_start_again(
+    tmp_path, visits
+):
     pytest.importorskip("jax")
-    kept_after = not kept_before
-    cells = [place.cell for place in jax_file().plan.cells if place.cell.stream]
-    program = Lanes(2, state=tmp_path / "state.npz")
-    notes: list[str] = []
     ended, raised = visits
-
-    def report(done: int, total: int, compilations: int = 0, note: str = "", /) -> None:
-        notes.extend([note] if note else [])
-
     raised.append(KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):
-        list(lanes.run_lanes(cells, program, report, kept_before))
-    prefix = "records/snapshot/1/"
-    names = {n.removeprefix(prefix) for n in read_state(tmp_path / "state.npz") if prefix in n}
-    assert {"action_net.bias", "mlp_extractor.policy_net.0.weight"} <= names
-    assert ("value_net.bias" in names) is kept_before
+        ran(tmp_path, jax_file(), device="cpu")
     ended.clear()
-    finished = list(lanes.run_lanes(cells, program, report, kept_after))
-    assert ended == ([0, 1] if kept_after else [1])  # a model needs more than was saved
-    assert any("starts again" in note for note in notes) is kept_after
-    for each in finished:
-        assert isinstance(each.ended, CellResult)
-        assert len(each.snapshots) == (3 if kept_after else 0)
-        assert len({*matrix(each.ended.stream_report)[:, 0]}) == 2
+    assert ran(tmp_path, jax_file(), device="cpu", keep_models=True).count("done") == 6
+    assert ended == [0, 1]  # a model needs more than was saved
+    folders = [Ledger(tmp_path).snapshots_path(key) for key in Ledger(tmp_path).results()]
+    assert sorted(len(list(folder.glob("*"))) for folder in folders) == [0] * 4 + [3] * 2

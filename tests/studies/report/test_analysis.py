@@ -1,10 +1,6 @@
 """The tables of a study: the numbers of its finished runs; missing runs are part of none."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,10 +10,9 @@ from sme_registry import statistics
 from sme_registry.spec import StudyPlan
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.report import tables
-from sme_registry.studies.report.analysis import Analysis, analyse
+from sme_registry.studies.report.analysis import analyse
 from sme_registry.studies.report.classes import ALL, SEVERAL, class_infos
 from sme_registry.studies.report.frames import window
-from sme_registry.studies.report.tables import METRICS
 from tests.studies.finished import analysed
 
 TABLES = (
@@ -26,11 +21,11 @@ TABLES = (
 
 
 @pytest.fixture(scope="module")
-def study(finished: Path, analysis: Analysis) -> tuple[Any, dict[str, Any], Analysis]:
+def study(finished, analysis):
     return analysis.file, Ledger(finished).results(), analysis
 
 
-def regrets(study: Any, class_name: str, algorithm: str) -> dict[int, float]:
+def regrets(study, class_name, algorithm):
     file, results, _ = study
     return {
         cell.run: results[cell.cell.digest].report.regions[0].normalised_regret
@@ -40,7 +35,7 @@ def regrets(study: Any, class_name: str, algorithm: str) -> dict[int, float]:
     }
 
 
-def row_of(table: pd.DataFrame, class_name: str, algorithm: str, metric: str) -> Any:
+def row_of(table, class_name, algorithm, metric):
     """The only row of a place; None where there is none."""
     wanted = class_name, algorithm, metric
     rows = [r for r in table.itertuples() if (r.class_name, r.algorithm, r.metric) == wanted]
@@ -48,7 +43,7 @@ def row_of(table: pd.DataFrame, class_name: str, algorithm: str, metric: str) ->
     return rows[0] if rows else None
 
 
-def contrast(analysis: Analysis, class_name: str, algorithm: str, metric: str) -> Any:
+def contrast(analysis, class_name, algorithm, metric):
     return row_of(analysis.contrasts, class_name, algorithm, metric)
 
 
@@ -76,13 +71,13 @@ def test_a_class_has_the_axis_in_which_it_differs_from_the_first(study):
     ]
 
 
-def infos_of(*settings: dict[str, Any]) -> list[tuple[str, str]]:
+def infos_of(*settings):
     classes = [{"name": f"c{i}", "setting": each, "seeds": [0]} for i, each in enumerate(settings)]
     plan = StudyPlan.from_dict({"classes": classes, "algorithms": [{"name": "A", "uses": "PPO"}]})
     return [(info.axis, info.label) for info in class_infos(plan).values()]
 
 
-def test_limits_and_observations_are_axes() -> None:
+def test_limits_and_observations_are_axes():
     safe = {"safety": {"tightness": 0.2}}
     assert infos_of({}, safe, safe | {"complexity": 10}) == [
         ("", ""),
@@ -137,7 +132,7 @@ def test_a_reference_has_no_online_regret(study):
     assert row_of(analysis.levels, "default", "Alpha", "online_regret") is not None
 
 
-def test_one_run_has_no_interval(finished: Path) -> None:
+def test_one_run_has_no_interval(finished):
     alone = analysed(finished, lambda planned: planned.run > 0, draws=50)
     for table in (alone.contrasts, alone.levels, alone.aggregates, alone.improvements):
         assert len(table) > 0
@@ -145,7 +140,7 @@ def test_one_run_has_no_interval(finished: Path) -> None:
     assert set(alone.contrasts.verdict) == {"open"}
 
 
-def test_only_classes_with_runs_of_every_algorithm_are_compared(finished: Path) -> None:
+def test_only_classes_with_runs_of_every_algorithm_are_compared(finished):
     cut = analysed(finished, lambda p: (p.class_name, p.algorithm) == ("plane", "Beta"), draws=50)
     assert (cut.groups[0].name, cut.groups[0].left_out) == (ALL, ("plane",))
     assert set(cut.aggregates[cut.aggregates.group == ALL].classes) == {4}
@@ -168,11 +163,11 @@ def test_curves_are_the_median_over_runs_then_smoothed(study):
 
 
 @pytest.mark.parametrize(("evaluations", "width"), [(1, 1), (40, 4), (100, 10), (400, 10)])
-def test_the_window_is_at_most_ten_evaluations(evaluations: int, width: int):
+def test_the_window_is_at_most_ten_evaluations(evaluations, width):
     assert window(evaluations) == width
 
 
-def test_the_same_results_give_the_same_tables(study, finished: Path):
+def test_the_same_results_give_the_same_tables(study, finished):
     file, results, analysis = study
     errors = {key: failure.error for key, failure in Ledger(finished).failures().items()}
     again = analyse(file, dict(reversed(results.items())), errors)
@@ -181,7 +176,7 @@ def test_the_same_results_give_the_same_tables(study, finished: Path):
 
 
 def test_without_results_the_tables_are_empty_and_without_the_first_class_the_contrasts(
-    study, finished: Path
+    study, finished
 ):
     cut = analysed(finished, lambda planned: planned.class_name == "default", draws=50)
     assert cut.contrasts.empty
@@ -197,13 +192,3 @@ def test_the_documentation_names_every_column_of_the_tables(study):
     documented = set(re.findall(r"\w+", str(tables.__doc__)))
     for name in (*TABLES, "counts", "missing"):
         assert not {*getattr(study[2], name)} - documented
-
-
-def test_every_metric_says_which_way_is_worse():
-    assert {metric.key: metric.worse for metric in METRICS} == {
-        "wd_regret": 1,
-        "ood_regret": 1,
-        "ood_decay": 1,
-        "final_return": -1,
-        "online_regret": 1,
-    }
