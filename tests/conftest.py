@@ -29,8 +29,11 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 # The files that take longest, longest first: no worker is left with one at the end.
 LONG = (
-    "tests/leaderboard/web/test_browser.py",
-    "tests/jax/test_off_policy.py",
+    "tests/test_documentation.py",
+    "tests/docs/test_site.py",
+    "tests/test_cli.py",
+    "tests/studies/engine/test_runner.py",
+    "tests/leaderboard/test_cli.py",
 )
 
 settings.register_profile(
