@@ -1,7 +1,5 @@
 """`Transitions` and its conversion for d3rlpy: all rows are aligned."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib.util
 import json

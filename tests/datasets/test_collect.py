@@ -1,7 +1,5 @@
 """Collecting: exact sizes, bits that do not depend on the batch, and transitions of the task."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

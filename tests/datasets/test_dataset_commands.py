@@ -1,7 +1,5 @@
 """The command `sme dataset`."""
 
-from __future__ import annotations
-
 import json
 import shutil
 

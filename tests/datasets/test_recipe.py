@@ -1,7 +1,5 @@
 """The recipe of a data set: its digest, its validation and its differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Exact returns compared with the environment, from any state, time and pending reward."""
 
-from __future__ import annotations
-
 import runpy
 from pathlib import Path
 from typing import Any
@@ -14,21 +12,20 @@ from sme_registry.datasets import DatasetRecipe
 from sme_registry.datasets.collect import collect
 from sme_registry.datasets.recipe import parse_behaviour
 from sme_registry.datasets.returns import exact_return, positions
-from sme_registry.errors import OptionError, PolicyError, SMEError, SpecError, StateError
-from sme_registry.task.draw import Array
+from sme_registry.errors import OptionError, PolicyError, SpecError, StateError
 
 SPEC = SMESpec(state_dim=3, action_dim=2, horizon=30, seed=4)
 STATES = np.random.default_rng(0).random((5, 3))
 
 
-def policy(observations: Any) -> Array:
+def policy(observations):
     """Near the optimum, row by row, so that no batch changes a bit; it reads the clock, too."""
     task = materialize(SPEC)
     optimal = task.optimal_action(observations[:, None, :3].astype(np.float64).reshape(-1, 3))
     return 0.8 * optimal + 0.1 * observations[:, 3:4] + 0.05 * observations[:, 4:5]
 
 
-def by_environment(spec: SMESpec, state: Array, gamma: float, skip: int = 0) -> tuple[float, float]:
+def by_environment(spec, state, gamma, skip=0):
     """An episode of the single environment: what it pays after its first `skip` steps."""
     env = make(spec)
     observation, _ = env.reset(options={"state": state})
@@ -50,7 +47,7 @@ VARIANTS = [
 
 
 @pytest.mark.parametrize("changes", VARIANTS, ids=str)
-def test_from_the_start_the_return_is_that_of_the_environment(changes: dict[str, Any]) -> None:
+def test_from_the_start_the_return_is_that_of_the_environment(changes):
     spec = SPEC.derive(**changes)
     found = exact_return(policy, spec, states=STATES, gamma=0.9)
     for row, state in enumerate(STATES):
@@ -61,7 +58,7 @@ def test_from_the_start_the_return_is_that_of_the_environment(changes: dict[str,
 
 
 @pytest.mark.parametrize("changes", VARIANTS[:-1], ids=str)
-def test_from_the_middle_of_an_episode_the_return_is_the_rest(changes: dict[str, Any]) -> None:
+def test_from_the_middle_of_an_episode_the_return_is_the_rest(changes):
     spec, state = SPEC.derive(**changes), STATES[0]
     env = make(spec)
     observation, _ = env.reset(options={"state": state})
@@ -69,7 +66,7 @@ def test_from_the_middle_of_an_episode_the_return_is_the_rest(changes: dict[str,
         observation, _, terminated, _, info = env.step(policy(observation[None])[0])
         if terminated:
             break
-        here = env.unwrapped.state  # type: ignore[attr-defined]
+        here = env.unwrapped.state
         owed = float(info["accumulated_reward"])
         found = exact_return(policy, spec, states=here[None], t=step, r_cum=owed, gamma=0.9)
         plain, discounted = by_environment(spec, state, 0.9, skip=step)
@@ -78,7 +75,7 @@ def test_from_the_middle_of_an_episode_the_return_is_the_rest(changes: dict[str,
     assert step > 1
 
 
-def test_rollouts_from_rows_of_a_data_set_repeat_its_rewards() -> None:
+def test_rollouts_from_rows_of_a_data_set_repeat_its_rewards():
     spec = SPEC.derive(k=4)
     recipe = DatasetRecipe(spec=spec, behaviours=(parse_behaviour(0.6),), transitions=90, seed=1)
     transitions = collect(recipe, materialize(spec))
@@ -103,7 +100,7 @@ def test_rollouts_from_rows_of_a_data_set_repeat_its_rewards() -> None:
     )
 
 
-def test_positions_are_found_behind_what_the_agent_sees() -> None:
+def test_positions_are_found_behind_what_the_agent_sees():
     observed = {"distractors": 3, "mixing": "orthogonal"}
     spec = SPEC.derive(k=7, observation=observed)
     recipe = DatasetRecipe(spec=spec, behaviours=(parse_behaviour(0.4),), transitions=90)
@@ -116,11 +113,11 @@ def test_positions_are_found_behind_what_the_agent_sees() -> None:
     assert found["r_cum"].max() > 1.0
 
 
-def test_the_optimum_earns_one_in_every_remaining_step() -> None:
+def test_the_optimum_earns_one_in_every_remaining_step():
     spec = SPEC.derive(k=5, D=0.9)
     task = materialize(spec)
 
-    def optimal(observations: Any) -> Array:
+    def optimal(observations):
         # What a policy is shown is rounded to float32, of which D = 0.9 takes no notice.
         return task.optimal_action(observations[:, :3])
 
@@ -130,7 +127,7 @@ def test_the_optimum_earns_one_in_every_remaining_step() -> None:
     np.testing.assert_allclose(found.similarity, 1.0, atol=1e-6)
 
 
-def test_many_states_at_different_times_keep_their_order() -> None:
+def test_many_states_at_different_times_keep_their_order():
     spec = SPEC.derive(state_dim=2, action_dim=1, horizon=4)
     states = np.random.default_rng(1).random((5000, 2))
     t = np.arange(5000) % 4
@@ -142,7 +139,7 @@ def test_many_states_at_different_times_keep_their_order() -> None:
 
 
 @pytest.mark.parametrize("source", ["policy", "distractors"])
-def test_the_interval_of_random_actions_contains_their_mean(source: str) -> None:
+def test_the_interval_of_random_actions_contains_their_mean(source):
     """Of one step, whose return is known by quadrature, with uniform actions.
 
     The policy draws them, or they are a distractor, which is drawn anew in each rollout.
@@ -193,13 +190,13 @@ def test_the_interval_of_random_actions_contains_their_mean(source: str) -> None
         ({"policy": lambda o: o}, PolicyError, "policy"),
     ],
 )
-def test_bad_input_is_refused(changes: dict[str, Any], error: type[SMEError], message: str) -> None:
+def test_bad_input_is_refused(changes, error, message):
     arguments = {"policy": policy, "spec": SPEC, "states": STATES, **changes}
     with pytest.raises(error, match=message):
         exact_return(arguments.pop("policy"), arguments.pop("spec"), **arguments)
 
 
-def test_fitted_q_and_exact_returns_rank_policies_equally() -> None:
+def test_fitted_q_and_exact_returns_rank_policies_equally():
     example = runpy.run_path(str(Path(__file__).resolve().parents[2] / "examples" / "ope.py"))
     values = example["compare"](SMESpec(), nu=1.0, seed=0, rows=4000)
     estimates, truths = ({name: row[i] for name, row in values.items()} for i in (0, 1))

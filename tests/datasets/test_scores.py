@@ -1,7 +1,5 @@
 """Reference scores: exact on the data set's states, and by rollouts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Data sets on disk: Minari reads them, writes are atomic, and changes are detected."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,10 +1,6 @@
 """Exported policies act as they did before, pass a board's checks, and what cannot is refused."""
 
-from __future__ import annotations
-
 import sys
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,11 +17,11 @@ SPEC = SMESpec(state_dim=3, action_dim=2)
 PROTOCOL = {"states_per_region": 100}
 
 
-def arrays(*shape: int, scale: float = 1.0) -> Any:
+def arrays(*shape, scale=1.0):
     return np.random.default_rng(sum(shape)).normal(scale=scale, size=shape).astype(np.float32)
 
 
-def same(policy: Any, path: Path, action_range: str = "unit", act: Any = None) -> None:
+def same(policy, path, action_range="unit", act=None):
     """The file scores as the policy does, and a board accepts it."""
     exported = evaluate(path, SPEC, PROTOCOL)
     own = evaluate(policy if act is None else act, SPEC, PROTOCOL, action_range=action_range)
@@ -46,9 +42,7 @@ LAYERS = [(arrays(5, 16), arrays(16), "tanh"), (arrays(16, 2), arrays(2), "ident
         ("tanh", "unit"),
     ],
 )
-def test_arrays_are_exported_without_pytorch(
-    hidden: str, action_range: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_arrays_are_exported_without_pytorch(hidden, action_range, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     policy = Perceptron([(*LAYERS[0][:2], hidden), LAYERS[1]])
     path = export_onnx(policy, SPEC, tmp_path / "a" / "policy.onnx", action_range=action_range)
@@ -57,7 +51,7 @@ def test_arrays_are_exported_without_pytorch(
     assert {prop.key: prop.value for prop in model.metadata_props} == {"action_range": "unit"}
 
 
-def test_a_policy_that_sees_distractors_is_exported(tmp_path: Path) -> None:
+def test_a_policy_that_sees_distractors_is_exported(tmp_path):
     observed = {"distractors": 4, "mixing": "orthogonal"}
     spec = SPEC.derive(safety={"tightness": 0.2}, observation=observed)
     policy = Perceptron([(arrays(9, 2), np.zeros(2), "identity")])
@@ -68,7 +62,7 @@ def test_a_policy_that_sees_distractors_is_exported(tmp_path: Path) -> None:
     refused(policy, tmp_path, r"have shape \(9,\): must be \(5,\)", SPEC)
 
 
-def test_an_offline_policy_is_exported(tmp_path: Path) -> None:
+def test_an_offline_policy_is_exported(tmp_path):
     layers = [(arrays(16, 5), arrays(16)), (arrays(2, 16), arrays(2))]
     policy = OfflinePolicy(layers)
     same(policy, export_onnx(policy, SPEC, tmp_path / "policy.onnx"))
@@ -88,19 +82,19 @@ def test_an_offline_policy_is_exported(tmp_path: Path) -> None:
         ([(np.ones((5, 2)), np.zeros(2))], r"must be \(W, b, activation\)"),
     ],
 )
-def test_arrays_that_are_no_network_are_refused(layers: Any, message: str) -> None:
+def test_arrays_that_are_no_network_are_refused(layers, message):
     with pytest.raises(PolicyError, match=message):
         Perceptron(layers)
 
 
-def refused(policy: Any, tmp_path: Path, message: str, spec: Any = SPEC, **options: Any) -> None:
+def refused(policy, tmp_path, message, spec=SPEC, **options):
     target = tmp_path / "out" / "policy.onnx"
     with pytest.raises(PolicyError, match=message):
         export_onnx(policy, spec, target, **options)
     assert not target.parent.exists()
 
 
-def test_other_names_and_places_are_refused(tmp_path: Path) -> None:
+def test_other_names_and_places_are_refused(tmp_path):
     with pytest.raises(OptionError, match=r"must end in \.onnx"):
         export_onnx(Perceptron(LAYERS), SPEC, tmp_path / "policy.pt")
     (tmp_path / "file").write_text("")
@@ -111,13 +105,13 @@ def test_other_names_and_places_are_refused(tmp_path: Path) -> None:
     refused(3, tmp_path, r"must be a torch\.nn\.Module")
 
 
-def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr("sme_registry.io.packages.is_installed", lambda name: name != "onnx")
     with pytest.raises(MissingDependencyError, match=r"onnx is not installed.*\[onnx\]"):
         export_onnx(Perceptron(LAYERS), SPEC, tmp_path / "policy.onnx")
 
 
-def test_the_recorded_range_of_a_file_is_used(tmp_path: Path) -> None:
+def test_the_recorded_range_of_a_file_is_used(tmp_path):
     path = export_onnx(Perceptron(LAYERS), SPEC, tmp_path / "policy.onnx")
     model = onnx.load(path)
     onnx.helper.set_model_props(model, {"action_range": "symmetric"})
@@ -126,7 +120,7 @@ def test_the_recorded_range_of_a_file_is_used(tmp_path: Path) -> None:
     assert evaluate(path, SPEC, PROTOCOL, action_range="unit").action_range == "unit"
 
 
-def test_the_policy_that_a_team_shares_is_exported(tmp_path: Path) -> None:
+def test_the_policy_that_a_team_shares_is_exported(tmp_path):
     team = SMESpec(action_dim=2, team={"agents": [{"action_dim": 1}, {"action_dim": 1}]})
     policy = Perceptron([(arrays(12, 1), np.full(1, 0.5), "sigmoid")])
     path = export_onnx(policy, team, tmp_path / "policy.onnx")

@@ -1,10 +1,5 @@
 """PyTorch networks as people write them, exported."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -19,18 +14,18 @@ nn = torch.nn
 class Squashed(nn.Module):
     """An actor as of TD3, with actions in [−1, 1]."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.fc1, self.fc2 = nn.Linear(5, 16), nn.Linear(16, 2)
 
-    def forward(self, x: Any) -> Any:
+    def forward(self, x):
         return torch.tanh(self.fc2(nn.functional.relu(self.fc1(x))))
 
 
 class Residual(nn.Module):
     """Blocks with layer normalisation, GELU, dropout and skip connections."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.first, self.last = nn.Linear(5, 16), nn.Linear(16, 2)
         self.blocks = nn.ModuleList(
@@ -38,7 +33,7 @@ class Residual(nn.Module):
             for _ in range(3)
         )
 
-    def forward(self, x: Any) -> Any:
+    def forward(self, x):
         x = self.first(x)
         for block in self.blocks:
             x = x + block(x)
@@ -48,29 +43,29 @@ class Residual(nn.Module):
 class Gaussian(nn.Module):
     """An actor as of PPO: a distribution around its mean."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.mean, self.log_sd = nn.Linear(5, 2), nn.Parameter(torch.zeros(2))
 
-    def forward(self, x: Any) -> Any:
+    def forward(self, x):
         return torch.distributions.Normal(self.mean(x), self.log_sd.exp())
 
-    def act(self, x: Any) -> Any:
+    def act(self, x):
         return self(x).mean
 
 
 class Agent:
-    def __init__(self) -> None:
+    def __init__(self):
         self.actor = Squashed()
 
-    def act(self, x: Any) -> Any:
+    def act(self, x):
         return self.actor(x)
 
 
-def made(name: str) -> tuple[Any, str]:
+def made(name):
     torch.manual_seed(3)
     gaussian, agent, net = Gaussian(), Agent(), nn.Linear(5, 12)
-    policies: dict[str, tuple[Any, str]] = {
+    policies = {
         "sequential": (nn.Sequential(nn.Linear(5, 8), nn.Tanh(), nn.Linear(8, 2)), "symmetric"),
         "residual": (Residual(), "unit"),
         "double": (Squashed().double(), "symmetric"),
@@ -101,15 +96,15 @@ NAMES = (
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_network_acts_as_before(name: str, tmp_path: Path) -> None:
+def test_a_network_acts_as_before(name, tmp_path):
     policy, action_range = made(name)
     modes = [part.training for part in policy.modules()] if isinstance(policy, nn.Module) else []
-    path = export_onnx(policy, SPEC, tmp_path / "policy.onnx", action_range=action_range)  # type: ignore[arg-type]
+    path = export_onnx(policy, SPEC, tmp_path / "policy.onnx", action_range=action_range)
     if modes:
         assert [part.training for part in policy.modules()] == modes
         policy.eval()
 
-    def act(observations: Any) -> Any:
+    def act(observations):
         with torch.no_grad():
             x = torch.from_numpy(observations)
             return policy(x.double() if name == "double" else x).numpy()
@@ -131,16 +126,16 @@ def test_a_network_acts_as_before(name: str, tmp_path: Path) -> None:
         (lambda x: torch.linalg.svd(x[:, :2])[0][:, :2], r"fails|cannot export|returns"),
     ],
 )
-def test_what_cannot_be_exported_is_refused(policy: Any, message: str, tmp_path: Path) -> None:
+def test_what_cannot_be_exported_is_refused(policy, message, tmp_path):
     refused(policy, tmp_path, message)
 
 
 class Recurrent(nn.Module):
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.gru = nn.GRU(5, 2, batch_first=True)
 
-    def forward(self, x: Any) -> Any:
+    def forward(self, x):
         return self.gru(x[:, None])[0][:, 0]
 
 
@@ -152,9 +147,7 @@ class Recurrent(nn.Module):
         (lambda x: x.repeat(1, 2)[:, 4:6], "Tile"),
     ],
 )
-def test_a_file_that_no_board_accepts_is_written_with_a_warning(
-    policy: Any, operator: str, tmp_path: Path
-) -> None:
+def test_a_file_that_no_board_accepts_is_written_with_a_warning(policy, operator, tmp_path):
     message = (
         rf"policy\.onnx: has the operators .*{operator}.*boards do not accept.*`split\(n, -1\)`"
     )
@@ -167,5 +160,5 @@ def test_a_file_that_no_board_accepts_is_written_with_a_warning(
     np.testing.assert_allclose(actions, expected, atol=1e-6)
 
 
-def test_a_length_that_tracing_fixes_is_named(tmp_path: Path) -> None:
+def test_a_length_that_tracing_fixes_is_named(tmp_path):
     refused(lambda x: x[:, :4].view(len(x), 2, 2)[:, 0], tmp_path, r"`x\.shape\[0\]` or -1")

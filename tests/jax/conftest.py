@@ -1,14 +1,10 @@
 """Fixtures of the tests in JAX."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-
 import pytest
 
 
 @pytest.fixture(scope="module")
-def quickly_compiled() -> Iterator[None]:
+def quickly_compiled():
     """In half the time: for programs that are not compared with another library's last bits."""
     jax = pytest.importorskip("jax")
     jax.config.update("jax_disable_most_optimizations", True)

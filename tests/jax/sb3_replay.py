@@ -1,9 +1,7 @@
 """TD3 and SAC of Stable-Baselines3 in mid-run, and their batches and noise for a replay."""
 
-from __future__ import annotations
-
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +9,6 @@ import numpy as np
 import torch
 
 from sme_registry.jax.networks import Adam
-from sme_registry.jax.off_policy import OffPolicyProgram
 from sme_registry.jax.padding import Dimensions, Padding
 from sme_registry.jax.replay import Transitions
 from sme_registry.sb3 import SMEVecEnv
@@ -24,7 +21,7 @@ COUNTS = (1, 10)
 DIMENSIONS = (Dimensions(8, 16), Dimensions(3, 4))
 
 
-def model_in_mid_run(algorithm: str, dimensions: Dimensions) -> Any:
+def model_in_mid_run(algorithm, dimensions):
     """A model after some updates; its episodes have terminated and been truncated."""
     spec = {"state_dim": dimensions.state_dim, "action_dim": dimensions.action_dim, "seed": 5}
     env = SMEVecEnv({**spec, "horizon": 20, "D": 0.1 if dimensions.action_dim < 9 else 0.0}, 1)
@@ -50,7 +47,7 @@ class Replayed(NamedTuple):
     padded: dict[int, dict[str, np.ndarray]]  # ours, with their padding
 
 
-def replay(kind: type[OffPolicyProgram], settings: Any) -> list[Replayed]:
+def replay(kind, settings):
     """Let SB3 and us make the same updates, of one model for each of `DIMENSIONS`, in mid-run."""
     full = DIMENSIONS[0]
     models = [model_in_mid_run(type(settings).__name__, own) for own in DIMENSIONS]
@@ -71,15 +68,13 @@ def replay(kind: type[OffPolicyProgram], settings: Any) -> list[Replayed]:
     return results
 
 
-def greatest_difference(weights: dict[str, np.ndarray], others: dict[str, np.ndarray]) -> float:
+def greatest_difference(weights, others):
     """Over all weights of the same names."""
     assert weights.keys() == others.keys()
     return max(float(np.abs(weight - others[name]).max()) for name, weight in weights.items())
 
 
-def _one_update(
-    model: Any, own: Dimensions, full: Dimensions, seed: int
-) -> tuple[Transitions, np.ndarray]:
+def _one_update(model, own, full, seed):
     """Let SB3 make one update; the batch and the noise that it drew, padded.
 
     NumPy's generator draws the batch and Torch's the noise. Noise of padded channels is 1.
@@ -92,7 +87,7 @@ def _one_update(
     _seed(seed)
     model.train(1, BATCH)
 
-    def observations(x: torch.Tensor) -> np.ndarray:
+    def observations(x):
         wider = np.zeros((BATCH, full.observation_dim), np.float32)
         wider[:, : own.state_dim], wider[:, full.state_dim :] = x[:, :-2], x[:, -2:]
         return wider
@@ -109,14 +104,14 @@ def _one_update(
     return batch, noise
 
 
-def _weights(model: Any) -> dict[str, np.ndarray]:
+def _weights(model):
     weights = {name: w.numpy().copy() for name, w in model.policy.state_dict().items()}
     if hasattr(model, "log_ent_coef"):
         weights["log_ent_coef"] = model.log_ent_coef.detach().numpy().copy()
     return weights
 
 
-def _learner(kind: type[OffPolicyProgram], model: Any, padding: Padding, own: Dimensions) -> Any:
+def _learner(kind, model, padding, own):
     """The model's weights and Adam states, padded."""
     optimisers = [
         (getattr(model, each).optimizer, [f"{each}.{n}" for n, _ in network.named_parameters()])
@@ -130,7 +125,7 @@ def _learner(kind: type[OffPolicyProgram], model: Any, padding: Padding, own: Di
     return type(learner)(weights, *adams)
 
 
-def _adam(optimiser: Any, names: list[str], padding: Padding, own: Dimensions) -> Adam:
+def _adam(optimiser, names, padding, own):
     """The state of a Torch optimiser whose parameters have these names, in their order."""
     state = list(optimiser.state_dict()["state"].values())
     mean, square = (
@@ -140,14 +135,14 @@ def _adam(optimiser: Any, names: list[str], padding: Padding, own: Dimensions) -
     return Adam(mean, square, np.int32(state[0]["step"].item()))
 
 
-def _stacked(lanes: list[Any]) -> Any:
+def _stacked(lanes):
     return jax.tree.map(lambda *leaves: np.stack(leaves), *lanes)
 
 
-def _zip(each: list[Any]) -> list[tuple[Any, Dimensions]]:
+def _zip(each):
     return list(zip(each, DIMENSIONS, strict=True))
 
 
-def _seed(seed: int) -> None:
+def _seed(seed):
     np.random.seed(seed)  # noqa: NPY002  (SB3 uses the global generator)
     torch.manual_seed(seed)

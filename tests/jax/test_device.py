@@ -1,9 +1,5 @@
 """The process's JAX."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 pytest.importorskip("jax")
@@ -13,9 +9,7 @@ import jax
 from sme_registry.jax.device import CACHE_VARIABLE, compilations, prepare
 
 
-def test_a_compile_cache_that_cannot_be_written_is_announced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_compile_cache_that_cannot_be_written_is_announced(tmp_path, monkeypatch, capsys):
     before = jax.config.jax_compilation_cache_dir
     (tmp_path / "file").write_text("")
     try:
@@ -33,7 +27,7 @@ def test_a_compile_cache_that_cannot_be_written_is_announced(
         jax.config.update("jax_compilation_cache_dir", before)
 
 
-def test_what_is_compiled_is_counted_and_what_runs_again_is_not() -> None:
+def test_what_is_compiled_is_counted_and_what_runs_again_is_not():
     add = jax.jit(lambda x: x + 0.125)
     counts = [compilations()]
     for x in (1.0, 2.0, 3):

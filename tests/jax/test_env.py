@@ -1,9 +1,5 @@
 """Reset and step, against the NumPy definition, lane by lane."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,10 +28,10 @@ DEEP = [
 
 
 @jax.jit
-def rollout(params: Any, keys: Any, actions: Any) -> Any:
+def rollout(params, keys, actions):
     """All steps of lanes with their own tasks: `[STEPS, lanes, …]`."""
 
-    def advance(state: Any, inputs: Any) -> Any:
+    def advance(state, inputs):
         keys, actions = inputs
         observation, after, *others = jax.vmap(env.step)(keys, state, actions, params)
         return after, (state, observation, after, *others)
@@ -44,14 +40,14 @@ def rollout(params: Any, keys: Any, actions: Any) -> Any:
     return observation, jax.lax.scan(advance, state, (keys[1:], actions))[1]
 
 
-def near_optimal(specs: list[SMESpec], A: int) -> Any:
+def near_optimal(specs, A):
     """Actions near ½, of which some earn and some end episodes."""
     rng = np.random.default_rng(0)
     return (0.5 + 0.2 * rng.standard_normal((STEPS, len(specs), A))).astype(np.float32)
 
 
 @pytest.mark.parametrize("specs", [SHALLOW, DEEP], ids=["shallow", "deep"])
-def test_lanes_of_tasks_step_as_in_numpy(specs: list[SMESpec]) -> None:
+def test_lanes_of_tasks_step_as_in_numpy(specs):
     keys = jax.random.split(jax.random.key(0), (STEPS + 1, len(specs)))
     a = near_optimal(specs, 4)
     run = jax.tree.map(np.asarray, rollout(task_params(specs), keys, a))
@@ -91,7 +87,7 @@ def test_lanes_of_tasks_step_as_in_numpy(specs: list[SMESpec]) -> None:
     assert (ends > 0).all()
 
 
-def test_a_step_without_a_batch_equals_its_lane() -> None:
+def test_a_step_without_a_batch_equals_its_lane():
     """Starts are drawn in a batch only if an episode ended in it."""
     params = task_params(SMESpec(horizon=2))
     keys = jax.random.split(jax.random.key(0), 3)
@@ -106,7 +102,7 @@ def test_a_step_without_a_batch_equals_its_lane() -> None:
             np.testing.assert_allclose(one, many[lane], rtol=0, atol=1e-15)
 
 
-def test_starts_are_uniform_and_do_not_depend_on_padding() -> None:
+def test_starts_are_uniform_and_do_not_depend_on_padding():
     spec = SMESpec(state_dim=3)
     keys = jax.random.split(jax.random.key(0), 4096)
     draw = jax.jit(jax.vmap(env.reset, (0, None)))
@@ -119,7 +115,7 @@ def test_starts_are_uniform_and_do_not_depend_on_padding() -> None:
     assert abs(np.corrcoef(starts.T) - np.eye(3)).max() < 5 / np.sqrt(4096)
 
 
-def test_arrays_of_other_shapes_are_refused_before_a_step() -> None:
+def test_arrays_of_other_shapes_are_refused_before_a_step():
     params = task_params(SMESpec(state_dim=3, action_dim=2))
     lanes = task_params([SMESpec(state_dim=3, action_dim=2)] * 4)
     key = jax.random.key(0)
@@ -130,7 +126,7 @@ def test_arrays_of_other_shapes_are_refused_before_a_step() -> None:
         with pytest.raises(
             ActionError, match=r"^action of shape .*: must be of shape \(2,\)\. Use"
         ):
-            env.step(key, state, action, params)  # type: ignore[arg-type]
+            env.step(key, state, action, params)
     wide = state._replace(s=jnp.zeros(4))
     with pytest.raises(StateError, match=r"^state of shape \(4,\): must be of shape \(3,\)"):
         jax.jit(env.step)(key, wide, jnp.zeros(2), params)
@@ -142,7 +138,7 @@ def test_arrays_of_other_shapes_are_refused_before_a_step() -> None:
 
 
 @pytest.mark.parametrize("states", ["float64", "pairs"])
-def test_observations_of_lanes_of_one_task_have_the_bits_of_numpys(states: str) -> None:
+def test_observations_of_lanes_of_one_task_have_the_bits_of_numpys(states):
     """XLA would turn the division by their common horizon into a product, an ulp off."""
     spec = SMESpec(k=2)
     t = np.arange(spec.horizon + 1)
@@ -157,7 +153,7 @@ def test_observations_of_lanes_of_one_task_have_the_bits_of_numpys(states: str) 
 
 
 @pytest.mark.parametrize("symmetric", [True, False])
-def test_actions_are_rescaled_with_the_bits_of_the_environments(symmetric: bool) -> None:
+def test_actions_are_rescaled_with_the_bits_of_the_environments(symmetric):
     u = np.random.default_rng(0).uniform(-1.5, 1.5, (50, 4)).astype(np.float32)
     u[0] = 1e-30, -1e-9, 1.0, -1.0
     expected = arguments.to_unit(u, u.shape, symmetric)

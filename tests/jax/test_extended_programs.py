@@ -1,9 +1,5 @@
 """Programs of PPO, TD3 and SAC on tasks with limits, distractors and mixed observations."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,31 +9,31 @@ from sme_registry import SMESpec, materialize
 from sme_registry.errors import UnknownNameError
 from sme_registry.evaluation.rollouts import start_states
 from sme_registry.jax import observing, replay
-from sme_registry.jax.program import Program, StepLog, _key_of
+from sme_registry.jax.program import _key_of
 from sme_registry.jax.run import hidden_of, new_program, policy_of
 from sme_registry.jax.task import Shape, task_params
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 STEPS, S, A, M, T = 48, 3, 2, 4, 7
-SMALL: dict[str, Any] = {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}}
-SETTINGS: dict[str, dict[str, Any]] = {
+SMALL = {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}}
+SETTINGS = {
     "PPO": {**SMALL, "n_steps": 16, "n_epochs": 2},
     "TD3": {**SMALL, "learning_starts": 6},
     "SAC": {**SMALL, "learning_starts": 6},
 }
-MIXED: dict[str, dict[str, Any]] = {  # of the algorithms that are trained
+MIXED = {  # of the algorithms that are trained
     "PPO": {"distractors": M, "dynamics": "autonomous", "mixing": "nonlinear"},
     "TD3": {"distractors": M, "dynamics": "driven", "mixing": "nonlinear"},
 }
 
 
-def spec(observation: dict[str, Any], **fields: Any) -> SMESpec:
+def spec(observation, **fields):
     base = {"state_dim": S, "action_dim": A, "horizon": T, "safety": {"tightness": 0.3}}
     return SMESpec.from_dict({**base, "observation": observation, **fields})
 
 
-def new(algorithm: str, observation: dict[str, Any], **options: Any) -> Program:
+def new(algorithm, observation, **options):
     """Two lanes, of which the second is padded."""
     specs = [spec(observation), spec(observation, seed=1, state_dim=S - 1)]
     settings = SETTINGS[algorithm]
@@ -47,14 +43,14 @@ def new(algorithm: str, observation: dict[str, Any], **options: Any) -> Program:
 
 
 @pytest.fixture(scope="module", params=MIXED)
-def trained(request: pytest.FixtureRequest) -> tuple[str, Program, StepLog]:
+def trained(request):
     program = new(request.param, MIXED[request.param])
     log = program.advance(STEPS)
     program.finish()
     return request.param, program, log
 
 
-def seen_and_chosen(program: Program) -> tuple[Any, Any]:
+def seen_and_chosen(program):
     """Observations `[steps, lanes, O]` and actions `[steps, lanes, A]` of the last steps."""
     arrays = program.save()
     if ".steps.observation" in arrays:
@@ -63,13 +59,11 @@ def seen_and_chosen(program: Program) -> tuple[Any, Any]:
     width = S + M + 2
     stored = replay.Transitions(
         *np.split(arrays[".buffer"], [width, width + A], axis=-1), *[None] * 2
-    )  # type: ignore[arg-type]
+    )
     return stored.observation, stored.action
 
 
-def test_costs_in_the_log_are_those_of_the_states_behind_the_observations(
-    trained: tuple[str, Program, StepLog],
-) -> None:
+def test_costs_in_the_log_are_those_of_the_states_behind_the_observations(trained):
     _, program, log = trained
     assert log.cost is not None
     assert log.safe_regret is not None
@@ -89,9 +83,7 @@ def test_costs_in_the_log_are_those_of_the_states_behind_the_observations(
     assert log.cost.max() > 0.01
 
 
-def test_a_program_goes_on_from_saved_state_bit_for_bit(
-    trained: tuple[str, Program, StepLog],
-) -> None:
+def test_a_program_goes_on_from_saved_state_bit_for_bit(trained):
     algorithm, whole, log = trained
     first, again = (new(algorithm, MIXED[algorithm]) for _ in range(2))
     first.advance(STEPS // 2)
@@ -105,9 +97,7 @@ def test_a_program_goes_on_from_saved_state_bit_for_bit(
 
 
 @pytest.mark.parametrize("algorithm", SETTINGS)
-def test_weights_and_hidden_layers_have_the_widths_of_the_agents_observation(
-    algorithm: str,
-) -> None:
+def test_weights_and_hidden_layers_have_the_widths_of_the_agents_observation(algorithm):
     program, uses, settings = new(algorithm, MIXED["PPO"]), f"jax:{algorithm}", SETTINGS[algorithm]
     for lane, task in enumerate(program.specs):
         weights = program.weights(lane)
@@ -124,7 +114,7 @@ def test_weights_and_hidden_layers_have_the_widths_of_the_agents_observation(
 
 
 @pytest.mark.parametrize(("dynamics", "k"), [("noise", 1), ("driven", 2)])
-def test_evaluations_are_episodes_of_numpys_task(dynamics: str, k: int) -> None:
+def test_evaluations_are_episodes_of_numpys_task(dynamics, k):
     """From the distractors and with the random numbers that follow from their initial states."""
     observation = {"distractors": M, "dynamics": dynamics, "mixing": "orthogonal"}
     task = spec(observation, k=k)
@@ -139,7 +129,7 @@ def test_evaluations_are_episodes_of_numpys_task(dynamics: str, k: int) -> None:
     for episode, s in enumerate(states):
         params, numpy_task = task_params(task), materialize(task)
         key = _key_of(jnp.asarray(s))
-        d: Any = np.asarray(observing.first_distractors(key, params))
+        d = np.asarray(observing.first_distractors(key, params))
         similarity, regret, accumulated = 0.0, 0.0, 0.0
         for t in range(T):
             seen = [*numpy_task.seen(s, d), t / T, accumulated / k]
@@ -147,14 +137,14 @@ def test_evaluations_are_episodes_of_numpys_task(dynamics: str, k: int) -> None:
             similarity += numpy_task.similarity(s, a)
             regret += numpy_task.regret(s, a)
             accumulated = 0.0 if (t + 1) % k == 0 else accumulated + numpy_task.step_reward(s, a)
-            u: Any = observing.drawn(jax.random.fold_in(key, t), params)
+            u = observing.drawn(jax.random.fold_in(key, t), params)
             d = numpy_task.distractor_step(d, a) if dynamics == "driven" else np.asarray(u)
             s = numpy_task.transition(s, a)
         assert evaluation.similarity[0, episode] == pytest.approx(similarity, abs=1e-3)
         assert evaluation.regret[0, episode] == pytest.approx(regret, abs=1e-3)
 
 
-def test_padding_changes_no_random_number() -> None:
+def test_padding_changes_no_random_number():
     """Of starts, of exploration, of distractors."""
     own, padded = (new("PPO", MIXED["PPO"], shape=x) for x in (None, Shape(S + 2, A + 1, 1, 0)))
     for program in (own, padded):
@@ -170,6 +160,6 @@ def test_padding_changes_no_random_number() -> None:
     assert np.unique(ours[:, 0, S : S + M]).size == 5 * M
 
 
-def test_algorithms_for_limits_are_not_in_jax() -> None:
+def test_algorithms_for_limits_are_not_in_jax():
     with pytest.raises(UnknownNameError, match=r"'jax:PPOLagrangian': must be one of jax:PPO, "):
         new_program("jax:PPOLagrangian", [spec(MIXED["PPO"])], [0], steps=1)

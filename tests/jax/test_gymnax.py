@@ -1,7 +1,5 @@
 """A task behind gymnax's methods, called as gymnax's wrappers call them."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import jax
@@ -23,17 +21,17 @@ class LogState(NamedTuple):
 class LogWrapper:
     """What gymnax's wrapper of the same name does: float32 sums in the carry of a scan."""
 
-    def __init__(self, env: Any) -> None:
+    def __init__(self, env):
         self._env = env
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name):
         return getattr(self._env, name)
 
-    def reset(self, key: Any, params: Any = None) -> Any:
+    def reset(self, key, params=None):
         observation, state = self._env.reset(key, params)
         return observation, LogState(state, jnp.zeros((), jnp.float32))
 
-    def step(self, key: Any, state: LogState, action: Any, params: Any = None) -> Any:
+    def step(self, key, state, action, params=None):
         observation, inner, reward, terminated, truncated, info = self._env.step(
             key, state.inner, action, params
         )
@@ -43,11 +41,11 @@ class LogWrapper:
         return observation, state, reward, terminated, truncated, info
 
 
-def test_a_wrapped_environment_runs_in_a_compiled_scan() -> None:
+def test_a_wrapped_environment_runs_in_a_compiled_scan():
     env = LogWrapper(Environment("SME/Default-v1", horizon=5, k=2))
     space = env.action_space(env.default_params)
 
-    def advance(carry: Any, key: jax.Array) -> Any:
+    def advance(carry, key):
         observation, state = carry
         observation, state, reward, _, truncated, info = env.step(key, state, space.sample(key))
         assert observation.shape == env.observation_space(env.default_params).shape
@@ -56,7 +54,7 @@ def test_a_wrapped_environment_runs_in_a_compiled_scan() -> None:
 
     @jax.jit
     @jax.vmap
-    def run(key: jax.Array) -> Any:
+    def run(key):
         return jax.lax.scan(advance, env.reset(key), jax.random.split(key, 12))[1]
 
     reward, truncated, total, discount = run(jax.random.split(jax.random.key(0), 3))
@@ -66,7 +64,7 @@ def test_a_wrapped_environment_runs_in_a_compiled_scan() -> None:
     assert (discount == 1.0).all()
 
 
-def test_steps_are_those_of_the_functions_with_rescaled_actions() -> None:
+def test_steps_are_those_of_the_functions_with_rescaled_actions():
     key, action = jax.random.key(1), jnp.array([0.5, -1.0, 3.0, 0.0], jnp.float32)
     env, params = Environment(), task_params("SME/Default-v1")
     observation, state = env.reset(key)
@@ -82,7 +80,7 @@ def test_steps_are_those_of_the_functions_with_rescaled_actions() -> None:
     assert abs(info["regret"] - expected[4]["regret"]) < 1e-15
 
 
-def test_names_and_spaces_are_those_of_the_task() -> None:
+def test_names_and_spaces_are_those_of_the_task():
     env = Environment("SME/Default-v1", action_dim=2)
     assert env.num_actions == 2
     assert env.default_params.max_steps_in_episode == 100
@@ -98,7 +96,7 @@ def test_names_and_spaces_are_those_of_the_task() -> None:
     assert Environment(action_range="unit").action_space().low == 0.0
 
 
-def test_a_step_without_a_new_episode_keeps_the_last_state() -> None:
+def test_a_step_without_a_new_episode_keeps_the_last_state():
     env = Environment("SME/Default-v1", horizon=1, D=0.9)
     key, action = jax.random.key(0), jnp.zeros(4)
     after, state, _, terminated, info = jax.jit(env.step_env)(key, env.reset(key)[1], action)
@@ -107,8 +105,8 @@ def test_a_step_without_a_new_episode_keeps_the_last_state() -> None:
     assert (info["discount"], after[-2]) == (0.0, 1.0)
 
 
-def test_unknown_ranges_and_teams_are_refused() -> None:
+def test_unknown_ranges_and_teams_are_refused():
     with pytest.raises(OptionError, match="action_range='wide': must be"):
-        Environment(action_range="wide")  # type: ignore[arg-type]
+        Environment(action_range="wide")
     with pytest.raises(SpecError, match=r"^team="):
         Environment("Team4")

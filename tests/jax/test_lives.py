@@ -1,9 +1,7 @@
 """Agents live through streams: each step is under the task in force, and nothing else changes."""
 
-from __future__ import annotations
-
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -37,9 +35,9 @@ DRIFT = {"rotation": 1.0, "increments": 2}
 BUDGET = 64
 
 
-def stream_of(*phases: tuple[SMESpec, int], drift: Any = None, **fields: Any) -> StreamSpec:
+def stream_of(*phases, drift=None, **fields):
     """A stream; the drift is of its last phase."""
-    listed: list[dict[str, Any]] = [{"spec": spec, "steps": steps} for spec, steps in phases]
+    listed = [{"spec": spec, "steps": steps} for spec, steps in phases]
     if drift:
         listed[-1]["drift"] = drift
     return StreamSpec(phases=listed, **fields)
@@ -59,13 +57,13 @@ CURRICULUM = stream_of(
     observes_phase=True,
 )
 
-ALGORITHMS: dict[str, tuple[Any, Any]] = {
+ALGORITHMS = {
     "TD3": (TD3Program, TD3(learning_starts=6, batch_size=8, net_arch=(8,))),
     "PPO": (PPOProgram, PPO(n_steps=32, batch_size=16, n_epochs=2, net_arch=(8,))),
 }
 
 
-def program(algorithm: str, *lanes: Any, budget: int = BUDGET) -> Any:
+def program(algorithm, *lanes, budget=BUDGET):
     kind, settings = ALGORITHMS[algorithm]
     return kind(settings, lanes, range(len(lanes)), steps=budget)
 
@@ -80,7 +78,7 @@ class Life(NamedTuple):
     log: StepLog
 
 
-def lived(algorithm: str, *lanes: Any) -> Life:
+def lived(algorithm, *lanes):
     """A whole life."""
     agents = program(algorithm, *lanes)
     if algorithm == "TD3":
@@ -105,9 +103,7 @@ def lived(algorithm: str, *lanes: Any) -> Life:
     [("TD3", SUDDEN), ("PPO", SUDDEN), ("PPO", CURRICULUM)],
     ids=["TD3-sudden", "PPO-sudden", "PPO-curriculum"],
 )
-def test_every_step_of_a_life_is_that_of_numpy_under_the_task_in_force(
-    algorithm: str, stream: StreamSpec
-) -> None:
+def test_every_step_of_a_life_is_that_of_numpy_under_the_task_in_force(algorithm, stream):
     """From its observation on; also what is observed at a switch, and where an episode ends."""
     life = lived(algorithm, stream, stream)
     tasks, at_once = materialize_stream(stream), stream.switch == "step"
@@ -149,7 +145,7 @@ def test_every_step_of_a_life_is_that_of_numpy_under_the_task_in_force(
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_a_life_is_that_of_its_task_to_the_bit_until_a_task_differs(algorithm: str) -> None:
+def test_a_life_is_that_of_its_task_to_the_bit_until_a_task_differs(algorithm):
     """A field without effect makes another task, and no difference."""
     twin = BASE.derive(hidden_width=32)
     stream = stream_of((BASE, 9), (twin, 13), cycles=2, switch="step")
@@ -169,7 +165,7 @@ def test_a_life_is_that_of_its_task_to_the_bit_until_a_task_differs(algorithm: s
     assert (log.similarity[9:] != plain[0].similarity[9:]).all()
 
 
-def test_ppo_bootstraps_from_what_is_observed_after_a_switch() -> None:
+def test_ppo_bootstraps_from_what_is_observed_after_a_switch():
     """At the end of a rollout, r_cum/k of the next task; all else in the rollout is the same."""
     base = BASE.derive(D=0.0, k=50, horizon=100)
     after, weights = (base, base.derive(k=100)), []
@@ -187,7 +183,7 @@ def test_ppo_bootstraps_from_what_is_observed_after_a_switch() -> None:
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("saved_at", [32, 40])
-def test_a_restored_life_goes_on_with_the_same_bits(algorithm: str, saved_at: int) -> None:
+def test_a_restored_life_goes_on_with_the_same_bits(algorithm, saved_at):
     """Also where it was saved at a switch."""
     one, other = program(algorithm, SUDDEN, SUDDEN), program(algorithm, SUDDEN, SUDDEN)
     one.advance(saved_at)
@@ -199,7 +195,7 @@ def test_a_restored_life_goes_on_with_the_same_bits(algorithm: str, saved_at: in
     np.testing.assert_equal(one.save(), other.save())
 
 
-def test_tasks_of_one_layer_and_of_several_are_padded_apart() -> None:
+def test_tasks_of_one_layer_and_of_several_are_padded_apart():
     lives = Lives([CURRICULUM, CURRICULUM], Shape(5, 4, 6, 8), jax.devices()[0])
     shallow, *deep = (lives.at(lifetime) for lifetime in (0, 14, 28))
     assert lives.at(13) is shallow
@@ -214,11 +210,11 @@ def test_tasks_of_one_layer_and_of_several_are_padded_apart() -> None:
 
 
 @cache
-def cached_lives(*lanes: Any) -> Lives:
+def cached_lives(*lanes):
     return Lives(lanes, None, jax.devices()[0])
 
 
-def test_visits_end_where_their_phases_do() -> None:
+def test_visits_end_where_their_phases_do():
     ends = [13, 25, 32, 45, 57, 64]
     lives = cached_lives(SUDDEN)
     assert [*lives.visit_ends(0)] == [*enumerate(ends)]
@@ -226,7 +222,7 @@ def test_visits_end_where_their_phases_do() -> None:
     assert [*lives.visit_ends(64)] == [*cached_lives(BASE).visit_ends(0)] == []
 
 
-def test_lanes_may_be_on_other_tasks_but_switch_together() -> None:
+def test_lanes_may_be_on_other_tasks_but_switch_together():
     other = stream_of((OTHERS[0], 9), (BASE, 13), switch="step")
     same = stream_of((BASE, 9), (OTHERS[1], 13), switch="step")
     assert cached_lives(other, same).at(12).k.tolist() == [5, 3]
@@ -241,7 +237,7 @@ def test_lanes_may_be_on_other_tasks_but_switch_together() -> None:
             cached_lives(same, lane)
 
 
-def test_a_phase_that_would_be_left_within_an_episode_is_refused_by_its_index() -> None:
+def test_a_phase_that_would_be_left_within_an_episode_is_refused_by_its_index():
     steady = BASE.derive(D=0.0)
     for phases, message in (
         ([(steady, 13), (BASE, 13)], r"^phases\.1\.spec: D=0\.02: must be 0, since agents in JAX"),

@@ -1,9 +1,6 @@
 """Distractors, what agents see of them, and costs, against the NumPy definition step by step."""
 
-from __future__ import annotations
-
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,14 +14,14 @@ from sme_registry.jax.gymnax import Environment
 from sme_registry.jax.task import Form, task_params
 
 STEPS, M = 9, 4
-MIXINGS: dict[str, dict[str, Any]] = {
+MIXINGS = {
     "none": {},
     "orthogonal": {"mixing": "orthogonal"},
     "nonlinear": {"mixing": "nonlinear", "mixing_depth": 2},
 }
 
 
-def lanes(observation: dict[str, Any]) -> list[SMESpec]:
+def lanes(observation):
     """Two tasks of unequal sizes; the second is padded."""
     base = {"horizon": 4, "k": 2, "safety": {"tightness": 0.3}, "observation": observation}
     sizes = {"state_dim": 3, "action_dim": 2}, {"state_dim": 2, "action_dim": 1}
@@ -32,10 +29,10 @@ def lanes(observation: dict[str, Any]) -> list[SMESpec]:
 
 
 @jax.jit
-def rollout(params: Any, keys: Any, actions: Any) -> Any:
+def rollout(params, keys, actions):
     """All steps of all lanes: states before, the random numbers, and what `step` returns."""
 
-    def advance(state: Any, inputs: Any) -> Any:
+    def advance(state, inputs):
         keys, actions = inputs
         numbers = jax.vmap(observing.drawn)(keys, params)
         observation, after, *others = jax.vmap(env.step)(keys, state, actions, params)
@@ -45,12 +42,12 @@ def rollout(params: Any, keys: Any, actions: Any) -> Any:
     return jax.lax.scan(advance, state, (keys[1:], actions))[1]
 
 
-def inputs(specs: list[SMESpec]) -> tuple[Any, Any]:
+def inputs(specs):
     actions = np.random.default_rng(0).uniform(-0.2, 1.2, (STEPS, len(specs), 2))
     return jax.random.split(jax.random.key(0), (STEPS + 1, len(specs))), actions.astype(np.float32)
 
 
-def float64(s: Any) -> Any:
+def float64(s):
     return pairs.to_float64(s) if isinstance(s, pairs.Pair) else np.asarray(s)
 
 
@@ -64,7 +61,7 @@ def float64(s: Any) -> Any:
         (None, "nonlinear"),
     ],
 )
-def test_lanes_step_as_in_numpy(dynamics: str | None, mixing: str) -> None:
+def test_lanes_step_as_in_numpy(dynamics, mixing):
     m = 0 if dynamics is None else M
     specs = lanes({"distractors": m, "dynamics": dynamics, **MIXINGS[mixing]})
     params = task_params(specs)
@@ -79,7 +76,7 @@ def test_lanes_step_as_in_numpy(dynamics: str | None, mixing: str) -> None:
         assert (same[6][name] == run[6][name]).all()
 
 
-def test_lanes_step_as_in_numpy_without_float64() -> None:
+def test_lanes_step_as_in_numpy_without_float64():
     specs = lanes({"distractors": M, "dynamics": "autonomous", **MIXINGS["nonlinear"]})
     params = task_params(specs, dtype=jnp.float32, states="pairs")
     program = rollout.lower(params, *inputs(specs)).compile()
@@ -87,7 +84,7 @@ def test_lanes_step_as_in_numpy_without_float64() -> None:
     check_steps(specs, program(params, *inputs(specs)), 1e-5)
 
 
-def check_steps(specs: list[SMESpec], run: Any, tolerance: float) -> None:
+def check_steps(specs, run, tolerance):
     _, a = inputs(specs)
     before, numbers, observed, after, _, done, info = jax.tree.map(np.asarray, run)
     assert done.sum() == 2 * len(specs)
@@ -126,7 +123,7 @@ def check_steps(specs: list[SMESpec], run: Any, tolerance: float) -> None:
     ("complexity", "dtype", "tolerance"),
     [(1, jnp.float64, 1e-12), (3, jnp.float32, 1e-5)],
 )
-def test_limits_and_costs_equal_numpys(complexity: int, dtype: Any, tolerance: float) -> None:
+def test_limits_and_costs_equal_numpys(complexity, dtype, tolerance):
     spec = SMESpec.from_dict(
         {"complexity": complexity, "hidden_width": 5, "safety": {"tightness": 0.2}, "r_min": 0.1}
     )
@@ -148,13 +145,13 @@ def test_limits_and_costs_equal_numpys(complexity: int, dtype: Any, tolerance: f
         oracle.cost(task_params(SMESpec()), a, a)
 
 
-def test_distractors_of_starts_and_noise_are_uniform_and_new() -> None:
+def test_distractors_of_starts_and_noise_are_uniform_and_new():
     spec = SMESpec.from_dict({"observation": {"distractors": 2}})
     keys, params = jax.random.split(jax.random.key(0), 4096), task_params(spec)
 
     @jax.jit
     @partial(jax.vmap, in_axes=(0, None))
-    def draw(key: Any, params: Any) -> Any:
+    def draw(key, params):
         own = observing.first_distractors(key, params), observing.drawn(key, params)
         return env.reset(key, params)[1].s, *own
 
@@ -164,7 +161,7 @@ def test_distractors_of_starts_and_noise_are_uniform_and_new() -> None:
     assert abs(np.corrcoef(columns.T) - np.eye(12)).max() < 5 / np.sqrt(4096)
 
 
-def test_a_task_without_both_carries_nothing_of_them() -> None:
+def test_a_task_without_both_carries_nothing_of_them():
     params = task_params(SMESpec())
     state = jax.eval_shape(env.reset, jax.random.key(0), params)[1]
     assert len(jax.tree.leaves(state)) == 3
@@ -172,7 +169,7 @@ def test_a_task_without_both_carries_nothing_of_them() -> None:
     assert observing.drawn(jax.random.key(0), params) is None
 
 
-def test_an_episode_begins_with_any_distractors() -> None:
+def test_an_episode_begins_with_any_distractors():
     spec = lanes({"distractors": M})[0]
     params = task_params(spec)
     s, d = np.full(3, 0.25), np.full(M, 0.75)
@@ -180,7 +177,7 @@ def test_an_episode_begins_with_any_distractors() -> None:
     assert observation.tolist() == [0.25] * 3 + [0.75] * M + [0.0, 0.0]
     for wrong in (None, jnp.zeros(3), pairs.from_float64(np.zeros(M))):
         with pytest.raises(StateError, match=r"^distractors .*: must be of shape \(4,\), float64"):
-            env.start(s, params, wrong)  # type: ignore[arg-type]
+            env.start(s, params, wrong)
     with pytest.raises(StateError, match=r"^distractors left out: must be of shape \(4,\)"):
         env.step(jax.random.key(0), state._replace(distractors=None), jnp.zeros(2), params)
     with pytest.raises(StateError, match=r"^distractors of shape \(3,\): must be left out"):
@@ -193,7 +190,7 @@ def test_an_episode_begins_with_any_distractors() -> None:
     assert 0.0 <= info["cost"] <= 1.0
 
 
-def test_tasks_of_other_forms_share_no_program() -> None:
+def test_tasks_of_other_forms_share_no_program():
     specs = lanes({"distractors": M})
     for other in (specs[0].derive(safety=None), lanes({"distractors": M + 1})[0], SMESpec()):
         with pytest.raises(OptionError, match=r"^specs\[1\]: must have safety and observation"):

@@ -1,9 +1,6 @@
 """Programs of TD3 and SAC: the order of steps, updates and evaluations, replay, resuming, NaN."""
 
-from __future__ import annotations
-
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +9,6 @@ import pytest
 
 from sme_registry.errors import OptionError
 from sme_registry.jax import replay
-from sme_registry.jax.off_policy import OffPolicyProgram
 from sme_registry.jax.program import StepLog
 from sme_registry.jax.run import settings_of
 from sme_registry.jax.sac import SAC, SACProgram
@@ -23,9 +19,9 @@ from sme_registry.training.hyperparameters import nested_hyperparameters
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 STARTS, BUDGET = 6, 30
-TINY: dict[str, Any] = {"learning_starts": STARTS, "batch_size": 8, "net_arch": (8,)}
+TINY = {"learning_starts": STARTS, "batch_size": 8, "net_arch": (8,)}
 # As many updates as steps before them; targets move at the first and every second one.
-RARE: dict[str, Any] = {
+RARE = {
     "train_freq": 3,
     "gradient_steps": -1,
     "target_update_interval": 2,
@@ -36,13 +32,13 @@ SPECS = [SMESpec(seed=i, state_dim=3, action_dim=2, horizon=7, D=0.2 * i) for i 
 
 
 @pytest.fixture(params=KINDS, ids=["TD3", "SAC"])
-def new(request: pytest.FixtureRequest) -> Any:
+def new(request):
     """Makes a program of two lanes; all of an algorithm share their compiled code."""
     kind, settings = request.param
     return partial(kind, settings, SPECS, [3, 4], steps=BUDGET)
 
 
-def test_pieces_of_any_length_give_the_same_bits(new: Any) -> None:
+def test_pieces_of_any_length_give_the_same_bits(new):
     whole, pieces = new(), new()
     log = whole.advance(BUDGET)
     parts = [pieces.advance(limit) for limit in (1, STARTS + 1, STARTS + 2, BUDGET)]
@@ -54,7 +50,7 @@ def test_pieces_of_any_length_give_the_same_bits(new: Any) -> None:
     assert_equal(whole.save(), pieces.save())
 
 
-def test_updates_begin_after_the_learning_starts_and_the_last_one_waits(new: Any) -> None:
+def test_updates_begin_after_the_learning_starts_and_the_last_one_waits(new):
     program = new()
     initial = program.weights(0)
     program.advance(STARTS)
@@ -69,7 +65,7 @@ def test_updates_begin_after_the_learning_starts_and_the_last_one_waits(new: Any
     assert_equal(program.save(), finished)
 
 
-def test_a_finished_program_can_go_on(new: Any) -> None:
+def test_a_finished_program_can_go_on(new):
     whole, continued = new(), new()
     whole.advance(BUDGET)
     continued.advance(STARTS + 5)
@@ -80,7 +76,7 @@ def test_a_finished_program_can_go_on(new: Any) -> None:
     assert np.array_equal(continued.save()[".buffer"], whole.save()[".buffer"])
 
 
-def test_td3_moves_its_policy_at_every_second_update() -> None:
+def test_td3_moves_its_policy_at_every_second_update():
     kind, settings = KINDS[0]
     program = kind(settings, SPECS, [3, 4], steps=BUDGET)
     program.advance(STARTS + 1)
@@ -95,7 +91,7 @@ def test_td3_moves_its_policy_at_every_second_update() -> None:
     assert changed == [critic, set(initial), critic, set(initial)]
 
 
-def test_updates_of_one_step_count_from_its_first() -> None:
+def test_updates_of_one_step_count_from_its_first():
     kind, settings = KINDS[1]
     program = kind(settings, SPECS, [3, 4], steps=BUDGET)
     program.advance(STARTS + 3)
@@ -105,7 +101,7 @@ def test_updates_of_one_step_count_from_its_first() -> None:
     assert np.array_equal(weights[CRITIC.replace("critic", "critic_target")], weights[CRITIC])
 
 
-def test_td3_acts_at_random_until_the_learning_starts() -> None:
+def test_td3_acts_at_random_until_the_learning_starts():
     kind, settings = KINDS[0]
     program = kind(settings, SPECS, [3, 4], steps=BUDGET)
     program.advance(STARTS + 1)
@@ -117,7 +113,7 @@ def test_td3_acts_at_random_until_the_learning_starts() -> None:
     assert 0.2 < np.abs(stored.action[:STARTS]).mean() < 0.8
 
 
-def test_an_episode_that_was_truncated_is_not_done(new: Any) -> None:
+def test_an_episode_that_was_truncated_is_not_done(new):
     program = new()
     log = program.advance(BUDGET)
     stored = rows(program)
@@ -132,7 +128,7 @@ def test_an_episode_that_was_truncated_is_not_done(new: Any) -> None:
     assert (time[log.truncated] == 1.0).all()
 
 
-def test_a_restored_program_goes_on_with_the_same_bits(new: Any) -> None:
+def test_a_restored_program_goes_on_with_the_same_bits(new):
     program = new()
     program.advance(STARTS + 5)
     saved = program.save()
@@ -146,7 +142,7 @@ def test_a_restored_program_goes_on_with_the_same_bits(new: Any) -> None:
     assert_equal(resumed.save(), program.save())
 
 
-def test_a_lane_that_fails_leaves_the_others_alone(new: Any) -> None:
+def test_a_lane_that_fails_leaves_the_others_alone(new):
     program, failing = new(), new()
     weights = failing.state.weights
     first = next(iter(weights))
@@ -175,7 +171,7 @@ def test_a_lane_that_fails_leaves_the_others_alone(new: Any) -> None:
         ("jax:SAC", "policy_kwargs.net_arch", []),
     ],
 )
-def test_hyperparameters_out_of_range_are_refused_by_name(uses: str, name: str, value: Any) -> None:
+def test_hyperparameters_out_of_range_are_refused_by_name(uses, name, value):
     with pytest.raises(OptionError, match=rf"^hyperparameters\.{name}="):
         settings_of(uses, nested_hyperparameters({name: value}))
 
@@ -183,7 +179,7 @@ def test_hyperparameters_out_of_range_are_refused_by_name(uses: str, name: str, 
 CRITIC = "critic.qf0.0.weight"
 
 
-def rows(program: OffPolicyProgram) -> replay.Transitions:
+def rows(program):
     """The buffer, `[steps, lanes, ...]`."""
     stored = program.state.buffer[: program.steps]
     lanes = jnp.arange(program.steps)[None].repeat(stored.shape[1], axis=0)
@@ -191,7 +187,7 @@ def rows(program: OffPolicyProgram) -> replay.Transitions:
     return jax.tree.map(lambda array: np.asarray(array).swapaxes(0, 1), read)
 
 
-def assert_equal(arrays: dict[str, Any], others: dict[str, Any]) -> None:
+def assert_equal(arrays, others):
     assert arrays.keys() == others.keys()
     for name, array in arrays.items():
         assert np.array_equal(array, others[name]), name

@@ -1,9 +1,5 @@
 """The optimal action and rewards are NumPy's, to rounding."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,16 +27,14 @@ SHAPES = [
 ]
 
 
-def judge(params: Any, s: Any, a: Any) -> Any:
+def judge(params, s, a):
     optimal = oracle.optimal_action(params, s)
     similarity = oracle.similarity(params, a, optimal)
     return optimal, similarity, oracle.step_reward(params, similarity)
 
 
 @pytest.mark.parametrize(("spec", "padded", "dtype", "tolerance"), SHAPES)
-def test_actions_similarities_and_rewards_equal_numpys(
-    spec: SMESpec, padded: Any, dtype: Any, tolerance: float
-) -> None:
+def test_actions_similarities_and_rewards_equal_numpys(spec, padded, dtype, tolerance):
     task = materialize(spec)
     rng = np.random.default_rng(0)
     s = rng.uniform(-0.5, 1.5, (256, spec.state_dim))
@@ -61,12 +55,12 @@ def test_actions_similarities_and_rewards_equal_numpys(
     np.testing.assert_allclose(reward, task.step_reward(s, a), rtol=0, atol=tolerance)
 
 
-def test_rewards_at_the_threshold_are_not_paid() -> None:
+def test_rewards_at_the_threshold_are_not_paid():
     params = task_params(SMESpec(r_min=0.5))
     rewards = jax.jit(oracle.step_reward)(params, np.array([0.5, 0.875, 0.9, 1.0]))
     np.testing.assert_allclose(rewards, [0.0, 0.0, 0.6, 1.0], atol=1e-15)
 
 
-def test_the_normal_cdf_is_exact_to_rounding() -> None:
+def test_the_normal_cdf_is_exact_to_rounding():
     x = np.linspace(-12, 12, 10_001)
     np.testing.assert_allclose(jax.jit(oracle.normal_cdf)(x), ndtr(x), rtol=0, atol=1e-15)

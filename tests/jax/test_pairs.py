@@ -1,10 +1,5 @@
 """Arithmetic in pairs of uint32 has the bits of float64."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
 import jax
 import numpy as np
 import pytest
@@ -16,7 +11,7 @@ ULP = 2.0**-52
 RNG = np.random.default_rng(0)
 
 
-def numbers(lowest: int, highest: int, *edges: float) -> Any:
+def numbers(lowest, highest, *edges):
     """Float64 from 2^lowest to 2^highest: zeros, bits with frequent ties and long carries."""
     bits = RNG.integers(0, 2**52, COUNT, dtype=np.uint64)
     few = bits & RNG.integers(0, 2**52, COUNT, dtype=np.uint64)
@@ -30,11 +25,11 @@ def numbers(lowest: int, highest: int, *edges: float) -> Any:
     return x
 
 
-def product(W: Any, a: Any) -> Any:
+def product(W, a):
     return W.astype(np.float64) * 2.0**-29 * a.astype(np.float64)
 
 
-def fractions() -> Any:
+def fractions():
     """Float32 in [0, 1], down to 2^-124."""
     a = RNG.random(COUNT, np.float32) * np.float32(2.0) ** RNG.integers(-100, 1, COUNT)
     a[::7], a[::11], a[::13] = 0.0, 1.0, 1 - 2**-24
@@ -44,7 +39,7 @@ def fractions() -> Any:
 W = RNG.integers(0, 2**29 + 1, COUNT, dtype=np.uint32)
 W[:3] = 0, 1, 2**29
 HALVES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, np.nextafter(0.5, 0), np.nextafter(1, 0), 2.0**20 + 0.5)
-OPERATIONS: dict[str, tuple[Callable[..., Any], Callable[..., Any], list[Any]]] = {
+OPERATIONS = {
     "sums": (pairs.add, np.add, [numbers(-4, 5), numbers(-4, 5)]),
     "sums of unequal numbers": (pairs.add, np.add, [numbers(-80, 21), numbers(-80, 21)]),
     "sums halfway between two numbers": (
@@ -66,14 +61,14 @@ OPERATIONS: dict[str, tuple[Callable[..., Any], Callable[..., Any], list[Any]]] 
 
 
 @pytest.mark.parametrize(("operation", "in_numpy", "inputs"), OPERATIONS.values(), ids=OPERATIONS)
-def test_operations_have_the_bits_of_float64(operation: Any, in_numpy: Any, inputs: Any) -> None:
+def test_operations_have_the_bits_of_float64(operation, in_numpy, inputs):
     given = [pairs.from_float64(x) if x.dtype == np.float64 else x for x in inputs]
     computed, expected = pairs.to_float64(jax.jit(operation)(*given)), in_numpy(*inputs)
     different = computed.view(np.uint64) != expected.view(np.uint64)
     assert not different.any(), (computed[different][:5], expected[different][:5])
 
 
-def test_conversions_lose_nothing_and_float32_is_the_nearest() -> None:
+def test_conversions_lose_nothing_and_float32_is_the_nearest():
     x = np.array([0.0, 5e-324, 2.0**-53, 1 / 3, 0.5, 1.0, 2.0**20 + 0.1])
     assert (pairs.to_float64(pairs.from_float64(x)) == x).all()
     x = numbers(-60, 2, 1 + 2**-24, 1 + 3 * 2**-24, 2 - 2**-30, 1 - 2**-25)

@@ -1,9 +1,7 @@
 """PPO against Stable-Baselines3 from its weights and Adam's state in mid-run, and its program."""
 
-from __future__ import annotations
-
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -53,7 +51,7 @@ class Recording(NamedTuple):
 class RecordingEnv(MonitoredVecEnv):
     """An environment that keeps the answers to its steps."""
 
-    def step_wait(self) -> Any:
+    def step_wait(self):
         answer = observation, rewards, dones, (info,) = super().step_wait()
         last = info.get("terminal_observation", observation[0])
         truncated = bool(dones[0] and last[-2] == 1.0)
@@ -65,17 +63,17 @@ class RecordingEnv(MonitoredVecEnv):
 class RecordingBuffer(RolloutBuffer):
     """A rollout that keeps which steps are in each minibatch."""
 
-    def _get_samples(self, batch_inds: Any, env: Any = None) -> Any:
+    def _get_samples(self, batch_inds, env=None):
         self.batches.append(batch_inds)
         return super()._get_samples(batch_inds, env)
 
 
 @pytest.fixture(scope="module")
-def recordings() -> list[Recording]:
+def recordings():
     return [recorded(spec) for spec in (SPEC, WIDE)]
 
 
-def recorded(spec: SMESpec) -> Recording:
+def recorded(spec):
     env = RecordingEnv(spec, action_range="symmetric")
     names = ("n_steps", "n_epochs", "clip_range_vf", "ent_coef")
     chosen = {name: getattr(SETTINGS, name) for name in names}
@@ -104,11 +102,11 @@ def recorded(spec: SMESpec) -> Recording:
     return Recording(spec, own, learner, steps, model._last_obs[0], rollout, batches, weights)
 
 
-def weights_of(model: Any) -> Weights:
+def weights_of(model):
     return {name: w.detach().numpy().copy() for name, w in model.policy.named_parameters()}
 
 
-def learner_of(model: Any) -> ppo.Learner:
+def learner_of(model):
     weights, moments = weights_of(model), model.policy.optimizer.state_dict()["state"]
     mean, square = (
         {name: moments[i][key].numpy().copy() for i, name in enumerate(weights)}
@@ -117,7 +115,7 @@ def learner_of(model: Any) -> ppo.Learner:
     return ppo.Learner(weights, Adam(mean, square, np.int32(moments[0]["step"])))
 
 
-def padded(recording: Recording, padding: Padding) -> tuple[ppo.Learner, ppo.Rollout]:
+def padded(recording, padding):
     """The learner and the rollout of one of several lanes."""
     own = recording.own
     weights, (mean, square, updates) = recording.learner
@@ -131,12 +129,12 @@ def padded(recording: Recording, padding: Padding) -> tuple[ppo.Learner, ppo.Rol
     return learner, recording.rollout._replace(observation=observation, action=action)
 
 
-def largest_difference(one: Weights, other: Weights) -> float:
+def largest_difference(one, other):
     assert one.keys() == other.keys()
     return max(np.abs(one[name] - other[name]).max() for name in one)
 
 
-def test_initial_weights_have_the_names_and_shapes_of_sb3(recordings: list[Recording]) -> None:
+def test_initial_weights_have_the_names_and_shapes_of_sb3(recordings):
     recording = recordings[1]
     rng = np.random.default_rng(0)
     weights = ppo.PPOProgram.initial_weights(SETTINGS, rng, 13, 16)
@@ -150,9 +148,7 @@ def test_initial_weights_have_the_names_and_shapes_of_sb3(recordings: list[Recor
 
 
 @pytest.mark.parametrize(("task", "ends"), [(0, [0, 1, 2, 3]), (1, [0, 2])])
-def test_advantages_equal_those_of_sb3(
-    recordings: list[Recording], task: int, ends: list[int]
-) -> None:
+def test_advantages_equal_those_of_sb3(recordings, task, ends):
     recording = recordings[task]
     found = 2 * recording.steps.truncated + recording.steps.terminated
     assert np.unique(found).tolist() == ends
@@ -166,9 +162,7 @@ def test_advantages_equal_those_of_sb3(
         np.testing.assert_allclose(getattr(ours, name), theirs, rtol=0, atol=tolerance)
 
 
-def test_weights_equal_those_of_sb3_after_1_and_80_updates_also_padded(
-    recordings: list[Recording],
-) -> None:
+def test_weights_equal_those_of_sb3_after_1_and_80_updates_also_padded(recordings):
     padding = Padding(functools.partial(ppo.PPOProgram.initial_weights, SETTINGS), FULL)
     lanes = [padded(recording, padding) for recording in recordings]
     learner, rollout = jax.tree.map(lambda *leaves: np.stack(leaves), *lanes)
@@ -196,9 +190,7 @@ def test_weights_equal_those_of_sb3_after_1_and_80_updates_also_padded(
         (SMESpec(complexity=2, hidden_width=4, horizon=7), True, "unit"),
     ],
 )
-def test_collected_steps_are_those_of_the_environment(
-    spec: SMESpec, separable: bool, action_range: str
-) -> None:
+def test_collected_steps_are_those_of_the_environment(spec, separable, action_range):
     n, rng = 32, np.random.default_rng(1)
     params = task_params(spec)
     weights = ppo.PPOProgram.initial_weights(SETTINGS, rng, 10, 4)
@@ -236,7 +228,7 @@ def test_collected_steps_are_those_of_the_environment(
     np.testing.assert_array_equal(ppo.observe(episode, params), observation)
 
 
-def test_permutations_are_random_orders() -> None:
+def test_permutations_are_random_orders():
     permutations = jax.jit(ppo.permutations, static_argnums=(1, 2))
     orders = np.asarray(permutations(jax.random.PRNGKey(0), 500, 12))
     assert (np.sort(orders) == np.arange(12)).all()
@@ -261,7 +253,7 @@ def test_permutations_are_random_orders() -> None:
         ({"target_kl": 0.1}, r"hyperparameters.target_kl: jax:PPO has no such hyperparameter"),
     ],
 )
-def test_hyperparameters_are_checked(values: dict[str, Any], message: str) -> None:
+def test_hyperparameters_are_checked(values, message):
     with pytest.raises(OptionError, match=message):
         settings_of("jax:PPO", values)
 
@@ -269,13 +261,13 @@ def test_hyperparameters_are_checked(values: dict[str, Any], message: str) -> No
 SMALL = ppo.PPO(n_steps=32, batch_size=16, n_epochs=2, net_arch=(8, 8))
 
 
-def program() -> ppo.PPOProgram:
+def program():
     """Two lanes of tasks of unequal sizes and reward settings."""
     specs = [SMESpec(k=10, r_min=0.5, seed=1), SMESpec(state_dim=5, action_dim=2, horizon=9)]
     return ppo.PPOProgram(SMALL, specs, [4, 5], steps=96)
 
 
-def test_a_program_collects_whole_rollouts_and_learns_between_them() -> None:
+def test_a_program_collects_whole_rollouts_and_learns_between_them():
     lanes = program()
     before, keys = lanes.weights(0), [lanes.state.key]
     log = lanes.advance(20)
@@ -302,7 +294,7 @@ def test_a_program_collects_whole_rollouts_and_learns_between_them() -> None:
     assert not lanes.failed().any()
 
 
-def test_a_program_goes_on_from_saved_state_bit_for_bit() -> None:
+def test_a_program_goes_on_from_saved_state_bit_for_bit():
     lanes = program()
     lanes.advance(64)
     again = program()
@@ -315,7 +307,7 @@ def test_a_program_goes_on_from_saved_state_bit_for_bit() -> None:
     assert largest_difference(lanes.weights(1), again.weights(1)) == 0.0
 
 
-def test_a_failed_lane_leaves_the_others_alone() -> None:
+def test_a_failed_lane_leaves_the_others_alone():
     lanes, broken = program(), program()
     weights = dict(broken.state.weights)
     weights["action_net.bias"] = weights["action_net.bias"].at[0].set(np.nan)

@@ -1,7 +1,5 @@
 """What all programs have: evaluation, padding, saving, lanes that failed."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +13,8 @@ from sme_registry import SMESpec
 from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import available_memory
-from sme_registry.jax.networks import HostWeights, Weights, initial_linear, linear
-from sme_registry.jax.program import Program, StepLog
+from sme_registry.jax.networks import Weights, initial_linear, linear
+from sme_registry.jax.program import Program
 from sme_registry.task import materialize
 
 BASE = SMESpec(state_dim=3, action_dim=2, horizon=30, seed=1)
@@ -37,9 +35,7 @@ class Linear(Program):
     buffer = "buffer"
 
     @staticmethod
-    def initial_weights(
-        settings: Any, rng: np.random.Generator, observation_dim: int, action_dim: int
-    ) -> HostWeights:
+    def initial_weights(settings, rng, observation_dim, action_dim):
         both = observation_dim + action_dim
         return {
             **initial_linear(rng, "actor", observation_dim, action_dim),
@@ -47,22 +43,22 @@ class Linear(Program):
             "log_std": np.full(action_dim, 0.5, np.float32),
         }
 
-    def initial_state(self, weights: Weights, keys: Any) -> LinearState:
+    def initial_state(self, weights, keys):
         return LinearState(weights, jnp.zeros((), jnp.int32), jnp.zeros((self.budget, self.lanes)))
 
     @staticmethod
-    def act(settings: Any, weights: Weights, observations: Any, symmetric: bool) -> Any:
+    def act(settings, weights, observations, symmetric):
         # Rounded, so that another order of its sums does not start another trajectory.
         return jnp.round(32 * linear(weights, "actor", observations)) / 32
 
-    def advance(self, limit: int) -> StepLog:
+    def advance(self, limit):
         raise NotImplementedError
 
-    def finish(self) -> None:
+    def finish(self):
         raise NotImplementedError
 
 
-def program(specs: tuple[SMESpec, ...], first_seed: int = 0, **changes: Any) -> Linear:
+def program(specs, first_seed=0, **changes):
     seeds = range(first_seed, first_seed + len(specs))
     return Linear((), specs, seeds, **{"steps": 4, "lanes": 4, **changes})
 
@@ -71,7 +67,7 @@ CASES = {"coupled": (COUPLED, "symmetric"), "separable": (SEPARABLE, "unit")}
 
 
 @pytest.mark.parametrize(("specs", "action_range"), CASES.values(), ids=CASES.keys())
-def test_evaluations_are_those_of_numpy(specs: tuple[SMESpec, ...], action_range: str) -> None:
+def test_evaluations_are_those_of_numpy(specs, action_range):
     """Also in lanes that are padded, and beside copies that fill the program up."""
     linear_program = program(specs, action_range=action_range)
     states = np.zeros((4, 5, 3))
@@ -84,7 +80,7 @@ def test_evaluations_are_those_of_numpy(specs: tuple[SMESpec, ...], action_range
         assert weights["actor.weight"].shape == (spec.action_dim, spec.state_dim + 2)
         assert weights["critic.weight"].shape == (1, spec.state_dim + 2 + spec.action_dim)
 
-        def policy(observations: Any, weights: Any = weights) -> Any:
+        def policy(observations, weights=weights):
             actions = observations @ weights["actor.weight"].T + weights["actor.bias"]
             actions = np.round(32 * actions) / 32
             return (actions + 1) / 2 if action_range == "symmetric" else actions
@@ -97,7 +93,7 @@ def test_evaluations_are_those_of_numpy(specs: tuple[SMESpec, ...], action_range
         assert evaluation.episode_return[lane] == pytest.approx(expected.episode_return, abs=1e-11)
 
 
-def test_weights_depend_on_their_seed_and_not_on_the_padding() -> None:
+def test_weights_depend_on_their_seed_and_not_on_the_padding():
     together, alone = program(COUPLED), Linear((), COUPLED[2:], [2], steps=4)
     for name, weight in alone.weights(0).items():
         assert np.array_equal(together.weights(2)[name], weight)
@@ -107,7 +103,7 @@ def test_weights_depend_on_their_seed_and_not_on_the_padding() -> None:
     assert (padded[[0, 1, 3, 4, 5, 6, 7]] != 0).all()
 
 
-def test_state_is_restored_whole_also_for_more_steps() -> None:
+def test_state_is_restored_whole_also_for_more_steps():
     one, other = program(BASE_LANES), program(BASE_LANES, first_seed=7, steps=6)
     one.steps = 3
     one.state = one.state._replace(count=jnp.int32(7), buffer=jnp.ones((4, 4)))
@@ -119,7 +115,7 @@ def test_state_is_restored_whole_also_for_more_steps() -> None:
         assert np.array_equal(other.state.weights[name], weight)
 
 
-def test_the_state_of_another_program_is_refused() -> None:
+def test_the_state_of_another_program_is_refused():
     two = program(BASE_LANES)
     with pytest.raises(OptionError, match=r"actor.*float32 of shape \(3, .*must be .*\(4, "):
         two.restore(program(BASE_LANES, lanes=3).save())
@@ -133,7 +129,7 @@ def test_the_state_of_another_program_is_refused() -> None:
     np.testing.assert_equal(two.save(), program(BASE_LANES).save())
 
 
-def test_only_lanes_with_weights_that_are_not_finite_have_failed() -> None:
+def test_only_lanes_with_weights_that_are_not_finite_have_failed():
     broken = program(BASE_LANES)
     assert not broken.failed().any()
     actor = broken.state.weights["actor.weight"].at[2, 0, 0].set(jnp.nan)
@@ -141,7 +137,7 @@ def test_only_lanes_with_weights_that_are_not_finite_have_failed() -> None:
     assert broken.failed().tolist() == [False, False, True, False]
 
 
-def test_too_many_lanes_for_the_memory_are_refused_with_the_number_that_fits() -> None:
+def test_too_many_lanes_for_the_memory_are_refused_with_the_number_that_fits():
     memory = available_memory()
     assert memory is not None
     steps = memory // 20  # of 8 bytes: 2.5 lanes would fit

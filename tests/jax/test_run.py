@@ -1,7 +1,5 @@
 """The order of steps, evaluations and updates of a run; names and hyperparameters."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,45 +23,45 @@ class Nothing(NamedTuple):
 class Scripted(Program):
     """Takes no steps but counts them, and records the order of its calls."""
 
-    def __init__(self, budget: int, rollout: int = 1, lanes: Any = SPECS) -> None:
+    def __init__(self, budget, rollout=1, lanes=SPECS):
         super().__init__((), lanes, (0, 1), steps=budget, lanes=3)
         self.rollout, self.events, self.updates = rollout, list[Any](), 0
         self.lifetimes = list[Any]()
 
     @staticmethod
-    def initial_weights(settings: Any, rng: Any, observation_dim: int, action_dim: int) -> Any:
+    def initial_weights(settings, rng, observation_dim, action_dim):
         return {"bias": np.zeros(1, np.float32)}
 
-    def initial_state(self, weights: Any, keys: Any) -> Nothing:
+    def initial_state(self, weights, keys):
         return Nothing(weights)
 
     @staticmethod
-    def act(settings: Any, weights: Any, observations: Any, symmetric: bool) -> Any:
+    def act(settings, weights, observations, symmetric):
         raise NotImplementedError
 
-    def advance(self, limit: int) -> StepLog:
+    def advance(self, limit):
         before = self.steps
         while self.steps < limit:
             self.updates = self.steps // self.rollout  # the one that was left pending
             self.steps += self.rollout
         return StepLog(*[np.zeros((self.steps - before, self.lanes))] * 5)
 
-    def finish(self) -> None:
+    def finish(self):
         self.updates = self.steps // self.rollout
         self.events.append("finish")
 
-    def evaluate(self, states: Any, lifetime: int | None = None) -> Evaluation:
+    def evaluate(self, states, lifetime=None):
         """The sum of each initial state as the return."""
         self.events.append(("evaluate", states.shape))
         self.lifetimes.append(lifetime)
         return Evaluation(*[states.sum(axis=-1)] * 4)
 
 
-def scripted_run(program: Scripted, due: list[int], **changes: Any) -> list[Any]:
+def scripted_run(program, due, **changes):
     """Rows of an evaluation's index, its step, updates before it, and the return of lane 1."""
-    rows: list[Any] = []
+    rows = []
 
-    def on_evaluation(k: int, step: int, evaluation: Evaluation) -> None:
+    def on_evaluation(k, step, evaluation):
         assert evaluation.length.shape == (3, 2)
         assert (evaluation.episode_return[2] == evaluation.episode_return[0]).all()  # a copy
         rows.append((k, step, program.updates, evaluation.episode_return[1].tolist()))
@@ -79,7 +77,7 @@ def scripted_run(program: Scripted, due: list[int], **changes: Any) -> list[Any]
     return rows
 
 
-def test_evaluations_precede_the_update_of_their_step_and_the_last_one_follows_all() -> None:
+def test_evaluations_precede_the_update_of_their_step_and_the_last_one_follows_all():
     """The state may be saved after each piece and its evaluations."""
     program = Scripted(budget=10)
     saved = program.events
@@ -100,7 +98,7 @@ def test_evaluations_precede_the_update_of_their_step_and_the_last_one_follows_a
     assert "finish" not in without_steps.events
 
 
-def test_evaluations_in_one_rollout_run_together_always_as_many() -> None:
+def test_evaluations_in_one_rollout_run_together_always_as_many():
     program = Scripted(budget=20, rollout=8)
     rows = scripted_run(program, [0, 1, 8, 9, 16, 20])
     assert [row[:3] for row in rows] == [
@@ -112,12 +110,12 @@ def test_evaluations_in_one_rollout_run_together_always_as_many() -> None:
     }
 
 
-def stream(seed: int) -> StreamSpec:
+def stream(seed):
     tasks = [SMESpec(state_dim=2 - seed, horizon=1, seed=i, k=1 + i) for i in (seed, 2)]
     return StreamSpec(phases=[{"spec": spec, "steps": 5} for spec in tasks], cycles=2)
 
 
-def test_evaluations_are_of_the_task_on_which_their_step_was_taken() -> None:
+def test_evaluations_are_of_the_task_on_which_their_step_was_taken():
     program = Scripted(budget=20, rollout=8, lanes=[stream(0), stream(1)])
     rows = scripted_run(program, [0, 1, 5, 6, 7, 20])
     assert [row[1] for row in rows] == [0, 1, 5, 6, 7, 24]
@@ -129,14 +127,12 @@ def test_evaluations_are_of_the_task_on_which_their_step_was_taken() -> None:
     ("rollout", "updates"),
     [(1, [5, 10, 15, 20]), (2, [2, 5, 7, 10]), (5, [1, 2, 3, 4]), (8, [0, 1, 1, 3])],
 )
-def test_a_visit_ends_after_the_update_of_the_last_rollout_in_it(
-    rollout: int, updates: list[int]
-) -> None:
+def test_a_visit_ends_after_the_update_of_the_last_rollout_in_it(rollout, updates):
     program = Scripted(budget=20, rollout=rollout, lanes=[stream(0), stream(1)])
-    ended: list[Any] = []
+    ended = []
     due = [5, 20]
 
-    def on_visit(visit: int, weights: list[dict[str, Any]]) -> None:
+    def on_visit(visit, weights):
         assert [each["bias"].shape for each in weights] == [(1,), (1,)]
         ended.append((visit, program.updates))
 
@@ -148,7 +144,7 @@ def test_a_visit_ends_after_the_update_of_the_last_rollout_in_it(
     assert len(ended) == 4
 
 
-def test_a_restored_run_goes_on_after_the_visits_that_have_ended() -> None:
+def test_a_restored_run_goes_on_after_the_visits_that_have_ended():
     program, ended = Scripted(budget=20, lanes=[stream(0), stream(1)]), list[int]()
     program.steps = 10
     scripted_run(program, [], on_visit=lambda visit, _: ended.append(visit))
@@ -168,19 +164,19 @@ def test_a_restored_run_goes_on_after_the_visits_that_have_ended() -> None:
         ({"steps": -1}, "steps=-1: must be"),
     ],
 )
-def test_a_program_of_invalid_lanes_is_refused(change: dict[str, Any], message: str) -> None:
+def test_a_program_of_invalid_lanes_is_refused(change, message):
     arguments = {"specs": SPECS, "seeds": (0, 1), "steps": 10, **change}
     with pytest.raises(OptionError, match=message):
         new_program("jax:PPO", **arguments)
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_the_actor_of_each_algorithm_is_all_that_acts(name: str) -> None:
+def test_the_actor_of_each_algorithm_is_all_that_acts(name):
     _, program = ALGORITHMS[name]
     settings = settings_of(f"jax:{name}", {"policy_kwargs": {"net_arch": [3]}})
     weights = program.initial_weights(settings, np.random.default_rng(0), 4, 2)
     actor = {each: weights[each] for each in weights if each.startswith(program.actor)}
     observations = np.linspace(0.0, 1.0, 8, dtype=np.float32).reshape(2, 4)
-    expected, actions = (program.act(settings, w, observations, True) for w in (weights, actor))  # type: ignore[arg-type]
+    expected, actions = (program.act(settings, w, observations, True) for w in (weights, actor))
     np.testing.assert_array_equal(actions, expected)
     assert not [each for each in actor if "critic" in each or "value" in each or "target" in each]

@@ -1,9 +1,5 @@
 """Drawn tasks as pytrees: lanes, padding, and specs that are refused."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +10,7 @@ from sme_registry.errors import OptionError, SpecError
 from sme_registry.jax.task import SUPPORTED_FIELDS, Shape, check_supported, task_params
 
 
-def test_one_task_has_the_numbers_of_its_draw() -> None:
+def test_one_task_has_the_numbers_of_its_draw():
     task = materialize(SMESpec(complexity=4, hidden_width=5, k=3, r_min=0.25, D=0.5, horizon=7))
     params = task_params(task.spec)
     assert (params.k, params.r_min, params.D, params.horizon) == (3, 0.25, 0.5, 7)
@@ -29,7 +25,7 @@ def test_one_task_has_the_numbers_of_its_draw() -> None:
         assert (np.asarray(computed[1]) == drawn[1]).all()
 
 
-def test_lanes_are_padded_to_the_smallest_shape_that_covers_them() -> None:
+def test_lanes_are_padded_to_the_smallest_shape_that_covers_them():
     specs = [
         SMESpec(state_dim=3, action_dim=5, complexity=2, hidden_width=4),
         SMESpec(state_dim=6, action_dim=2, complexity=4, hidden_width=3),
@@ -47,19 +43,19 @@ def test_lanes_are_padded_to_the_smallest_shape_that_covers_them() -> None:
     assert (first.b[3:] == 0).all()
 
 
-def test_dtypes_are_those_of_the_oracle_and_of_states() -> None:
+def test_dtypes_are_those_of_the_oracle_and_of_states():
     params = task_params(SMESpec(), dtype=jnp.float32)
     assert params.output.W.dtype == params.D.dtype == jnp.float32
     assert params.W.dtype == jnp.float64
     assert task_params(SMESpec(), states="pairs").W.dtype == jnp.uint32
 
 
-def test_hidden_width_of_a_task_without_inner_layers_does_not_split_groups() -> None:
+def test_hidden_width_of_a_task_without_inner_layers_does_not_split_groups():
     assert Shape.of(SMESpec(hidden_width=16)) == Shape.of(SMESpec(hidden_width=64))
     assert Shape.of(SMESpec(complexity=2, hidden_width=16)) == Shape(8, 4, 2, 16)
 
 
-def test_a_list_of_names_or_fields_has_an_axis_of_lanes_and_any_shape_that_covers_it() -> None:
+def test_a_list_of_names_or_fields_has_an_axis_of_lanes_and_any_shape_that_covers_it():
     assert task_params(["SME/Default-v1", {"seed": 0}]).W.shape == (2, 4, 8)
     assert task_params([SMESpec()]).W.shape == (1, 4, 8)
     assert task_params(SMESpec()).W.shape == (4, 8)
@@ -83,9 +79,7 @@ TEAM = SMESpec.from_dict({"action_dim": 2, "team": {"agents": [{"action_dim": 1}
         (TEAM, {}, r"^team=.*must be absent, since tasks in JAX have no team"),
     ],
 )
-def test_what_is_no_task_in_jax_is_refused_by_name(
-    specs: Any, options: dict[str, Any], message: str
-) -> None:
+def test_what_is_no_task_in_jax_is_refused_by_name(specs, options, message):
     with pytest.raises(SpecError if specs is TEAM else OptionError, match=message):
         task_params(specs, **options)
 
@@ -96,7 +90,7 @@ class FutureSpec(SMESpec):
     gravity: float = 0.0
 
 
-def test_every_field_is_supported_or_refused_on_purpose_and_later_ones_have_their_default() -> None:
+def test_every_field_is_supported_or_refused_on_purpose_and_later_ones_have_their_default():
     assert SMESpec.model_fields.keys() - SUPPORTED_FIELDS == {"team"}
     assert SMESpec.model_fields.keys() >= SUPPORTED_FIELDS
     check_supported(FutureSpec())

@@ -1,9 +1,5 @@
 """States have the bits of NumPy's over whole episodes, in float64 and in pairs, padded or not."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +14,7 @@ from sme_registry.task import step
 LANES, STEPS = 16, 99
 
 
-def actions(rng: np.random.Generator, A: int) -> Any:
+def actions(rng, A):
     """Float32 actions `[STEPS, LANES, A]`: uniform, out of range, tiny, and on the boundary."""
     shape = (STEPS, LANES, A)
     uniform = rng.random(shape, np.float32)
@@ -26,7 +22,7 @@ def actions(rng: np.random.Generator, A: int) -> Any:
     return np.choose(rng.integers(0, len(kinds), shape), kinds).astype(np.float32)
 
 
-def numpy_states(spec: SMESpec, start: Any, a: Any) -> Any:
+def numpy_states(spec, start, a):
     task, s = materialize(spec), start
     zeros, states = np.zeros((LANES, 1)), []
     for t in range(STEPS):
@@ -40,9 +36,7 @@ def numpy_states(spec: SMESpec, start: Any, a: Any) -> Any:
     ("S", "A", "padded_S", "padded_A"),
     [(1, 1, 1, 1), (3, 16, 5, 18), (2, 40, 2, 40)],
 )
-def test_states_equal_numpys_over_whole_episodes(
-    S: int, A: int, padded_S: int, padded_A: int, states: str
-) -> None:
+def test_states_equal_numpys_over_whole_episodes(S, A, padded_S, padded_A, states):
     spec = SMESpec(state_dim=S, action_dim=A, seed=S)
     rng = np.random.default_rng(A)
     start, a = rng.random((LANES, S)), actions(rng, A)
@@ -52,8 +46,8 @@ def test_states_equal_numpys_over_whole_episodes(
     padded_a = np.pad(a, ((0, 0), (0, 0), (0, padded_A - A)), constant_values=0.3)
 
     @jax.jit
-    def rollout(s: Any, a: Any) -> Any:
-        def advance(s: Any, a: Any) -> Any:
+    def rollout(s, a):
+        def advance(s, a):
             s = jax.vmap(next_state, (None, 0, 0))(params, s, a)
             return s, s
 
@@ -67,7 +61,7 @@ def test_states_equal_numpys_over_whole_episodes(
     assert (computed[..., S:] == 0.0).all()
 
 
-def test_many_states_move_alike_in_pairs() -> None:
+def test_many_states_move_alike_in_pairs():
     spec = SMESpec(state_dim=4, action_dim=3)
     rng = np.random.default_rng(0)
     s, a = rng.random((2**18, 4)), rng.random((2**18, 3), np.float32)
@@ -77,7 +71,7 @@ def test_many_states_move_alike_in_pairs() -> None:
     assert (pairs.to_float64(computed) == materialize(spec).transition(s, a)).all()
 
 
-def test_float64_actions_are_rounded_as_in_numpy() -> None:
+def test_float64_actions_are_rounded_as_in_numpy():
     spec = SMESpec()
     rng = np.random.default_rng(0)
     s, a = rng.random((64, 8)), rng.random((64, 4))

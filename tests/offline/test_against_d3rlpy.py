@@ -7,10 +7,7 @@ d3rlpy brings the retired `gym`, so it has an environment of its own, beside the
     ../d3rlpy/bin/python -m pytest tests/offline/test_against_d3rlpy.py
 """
 
-from __future__ import annotations
-
 import warnings
-from typing import Any
 
 import numpy as np
 import pytest
@@ -32,14 +29,14 @@ SEEN, ACTED, ROWS = 10, 4, 256
 
 
 @pytest.fixture
-def batch() -> Batch:
+def batch():
     torch.manual_seed(1)
     u = torch.rand(ROWS, ACTED) * 2 - 1
     continues = (torch.rand(ROWS, 1) < 0.9).float()
     return Batch(torch.rand(ROWS, SEEN), u, torch.rand(ROWS, SEEN), torch.rand(ROWS, 1), continues)
 
 
-def as_theirs(batch: Batch) -> Any:
+def as_theirs(batch):
     from d3rlpy.torch_utility import TorchMiniBatch
 
     return TorchMiniBatch(
@@ -55,13 +52,13 @@ def as_theirs(batch: Batch) -> Any:
     )
 
 
-def theirs(config: Any) -> Any:
+def theirs(config):
     algorithm = config.create(device="cpu:0")
     algorithm.create_impl((SEEN,), ACTED)
     return algorithm.impl
 
 
-def give(ours: torch.nn.Module, to: torch.nn.Module) -> None:
+def give(ours, to):
     """Their network gets our weights; both hold them in the same order of layers."""
     own, other = list(ours.parameters()), shaped(to)
     assert [p.shape for p in own] == [p.shape for p in other]
@@ -70,19 +67,19 @@ def give(ours: torch.nn.Module, to: torch.nn.Module) -> None:
             target.copy_(source)
 
 
-def shaped(network: torch.nn.Module) -> list[torch.nn.Parameter]:
+def shaped(network):
     """Their layers' weights and biases, encoder first, without log σ."""
     named = dict(network.named_parameters())
     encoder = [p for name, p in named.items() if name.startswith("_encoder")]
     return encoder + [p for name, p in named.items() if name.startswith(("_fc", "_mu"))]
 
 
-def close(ours: torch.nn.Module, to: torch.nn.Module) -> None:
+def close(ours, to):
     for mine, other in zip(ours.parameters(), shaped(to), strict=True):
         torch.testing.assert_close(mine, other, rtol=1e-5, atol=1e-7)
 
 
-def test_a_step_of_bc_is_the_same(batch: Batch) -> None:
+def test_a_step_of_bc_is_the_same(batch):
     ours = BC(SEEN, ACTED, BCHyperparameters())
     impl = theirs(d3rlpy.algos.BCConfig(batch_size=ROWS))
     give(ours.actor, impl.policy)
@@ -92,9 +89,7 @@ def test_a_step_of_bc_is_the_same(batch: Batch) -> None:
     close(ours.actor, impl.policy)
 
 
-def test_the_losses_of_iql_are_the_same_and_so_are_critics_and_value_after_a_step(
-    batch: Batch,
-) -> None:
+def test_the_losses_of_iql_are_the_same_and_so_are_critics_and_value_after_a_step(batch):
     ours = IQL(SEEN, ACTED, IQLHyperparameters())
     impl = theirs(d3rlpy.algos.IQLConfig())
     modules = impl.modules
@@ -128,7 +123,7 @@ def test_the_losses_of_iql_are_the_same_and_so_are_critics_and_value_after_a_ste
         close(mine, other)
 
 
-def test_the_policy_acts_the_same(batch: Batch) -> None:
+def test_the_policy_acts_the_same(batch):
     from sme_registry.offline import OfflinePolicy
     from sme_registry.offline.networks import weights
 

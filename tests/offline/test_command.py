@@ -1,9 +1,6 @@
 """The command `sme offline train`."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import pytest
 
@@ -17,7 +14,7 @@ SHORT = ["--steps", "5", "--batch-size", "16", "--evaluations", "1", "--set", "h
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("sets")
     make_dataset(
         TINY, 0.5, transitions=60, protocol={"states_per_region": 20}, name="tiny-v0", folder=place
@@ -26,9 +23,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("algorithm", ["bc", "iql"])
-def test_train_and_evaluate_from_the_command_line(
-    folder: Path, tmp_path: Path, algorithm: str
-) -> None:
+def test_train_and_evaluate_from_the_command_line(folder, tmp_path, algorithm):
     out, task = tmp_path / "run", tmp_path / "tiny.json"
     named = ("offline", "train", "tiny-v0", "-a", algorithm, "--datasets", folder)
     assert "improvement" in good(*named, "--out", out, *SHORT).stdout
@@ -39,7 +34,7 @@ def test_train_and_evaluate_from_the_command_line(
     assert json.loads(shown.stdout)["policy"] == "policy"
 
 
-def test_json_is_the_record_and_the_report(folder: Path, tmp_path: Path) -> None:
+def test_json_is_the_record_and_the_report(folder, tmp_path):
     shown = good(
         "offline", "train", folder / "tiny-v0", "-a", "bc", "--json", "--out", tmp_path / "run",
         *SHORT,
@@ -60,9 +55,7 @@ def test_json_is_the_record_and_the_report(folder: Path, tmp_path: Path) -> None
         (["tiny-v0", "--protocol", "nothing"], "nothing"),
     ],
 )
-def test_invalid_input_is_refused_and_writes_nothing(
-    folder: Path, tmp_path: Path, arguments: list[str], message: str
-) -> None:
+def test_invalid_input_is_refused_and_writes_nothing(folder, tmp_path, arguments, message):
     out = tmp_path / "run"
     assert message in refused("offline", "train", *arguments, "--datasets", folder, "--out", out)
     assert not out.exists()

@@ -1,7 +1,5 @@
 """The losses of BC and IQL against their equations, written out in NumPy row by row."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -20,7 +18,7 @@ SEEN, A, B = 4, 2, 32
 
 
 @pytest.fixture
-def batch() -> Batch:
+def batch():
     torch.manual_seed(1)
     u = torch.rand(B, A) * 2 - 1
     u[0], u[1] = 1.0, -1.0  # actions at the faces of the cube, where a tanh density ends
@@ -28,19 +26,19 @@ def batch() -> Batch:
     return Batch(torch.rand(B, SEEN), u, torch.rand(B, SEEN), torch.rand(B, 1), continues)
 
 
-def asked(network: torch.nn.Module, *inputs: torch.Tensor) -> np.ndarray:
+def asked(network, *inputs):
     with torch.no_grad():
         return network(torch.cat(inputs, dim=1)).double().numpy()
 
 
-def test_the_loss_of_bc_is_the_mean_squared_error(batch: Batch) -> None:
+def test_the_loss_of_bc_is_the_mean_squared_error(batch):
     learner = BC(SEEN, A, BCHyperparameters(hidden=(8,)))
     u = np.tanh(asked(learner.actor, batch.observations))
     expected = ((u - batch.actions.numpy()) ** 2).mean()
     assert float(learner.losses(batch)["actor"].detach()) == pytest.approx(expected, rel=1e-6)
 
 
-def test_the_losses_of_iql_are_its_equations(batch: Batch) -> None:
+def test_the_losses_of_iql_are_its_equations(batch):
     learner = IQL(SEEN, A, IQLHyperparameters(hidden=(8,), expectile=0.8, inverse_temperature=2.0))
     with torch.no_grad():  # targets unlike the critics, as after many steps; advantages of a size
         for network in (*learner.targets, learner.value):
@@ -63,7 +61,7 @@ def test_the_losses_of_iql_are_its_equations(batch: Batch) -> None:
     assert found == pytest.approx({"value": value, "critic": critic, "actor": actor}, rel=1e-5)
 
 
-def test_the_weight_of_an_advantage_is_limited(batch: Batch) -> None:
+def test_the_weight_of_an_advantage_is_limited(batch):
     free = IQL(SEEN, A, IQLHyperparameters(hidden=(8,), inverse_temperature=1000.0, max_weight=1e6))
     cut = IQL(SEEN, A, IQLHyperparameters(hidden=(8,), inverse_temperature=1000.0, max_weight=2.0))
     for learner in (free, cut):
@@ -78,7 +76,7 @@ def test_the_weight_of_an_advantage_is_limited(batch: Batch) -> None:
     assert losses == pytest.approx([1e6 * losses[2], 2.0 * losses[2], losses[2]], rel=1e-5)
 
 
-def test_each_loss_trains_only_its_own_networks(batch: Batch) -> None:
+def test_each_loss_trains_only_its_own_networks(batch):
     learner = IQL(SEEN, A, IQLHyperparameters(hidden=(8,)))
     parts = {
         "actor": [*learner.actor.parameters(), learner.spread],
@@ -93,7 +91,7 @@ def test_each_loss_trains_only_its_own_networks(batch: Batch) -> None:
         assert reached == {id(parameter) for parameter in own}
 
 
-def test_targets_follow_the_critics_by_their_rate(batch: Batch) -> None:
+def test_targets_follow_the_critics_by_their_rate(batch):
     learner = IQL(SEEN, A, IQLHyperparameters(hidden=(8,), target_rate=0.25))
     before = [parameter.clone() for parameter in learner.targets.parameters()]
     learner.step(batch)
@@ -103,7 +101,7 @@ def test_targets_follow_the_critics_by_their_rate(batch: Batch) -> None:
         assert not now.requires_grad
 
 
-def test_bc_learns_a_function_that_it_can_represent() -> None:
+def test_bc_learns_a_function_that_it_can_represent():
     torch.manual_seed(0)
     truth = mlp(SEEN, (4,), A)
     learner = BC(SEEN, A, BCHyperparameters(hidden=(32,), learning_rate=0.01))
@@ -117,7 +115,7 @@ def test_bc_learns_a_function_that_it_can_represent() -> None:
     assert last < 0.02 * first
 
 
-def test_iql_prefers_the_rewarded_action() -> None:
+def test_iql_prefers_the_rewarded_action():
     # One step, no future: of two actions in every state, +½ pays 1 and −½ nothing.
     torch.manual_seed(0)
     learner = IQL(SEEN, 1, IQLHyperparameters(hidden=(32,), learning_rate=0.01))
@@ -132,7 +130,7 @@ def test_iql_prefers_the_rewarded_action() -> None:
     assert mean == pytest.approx(0.5 * np.tanh(1.5), abs=0.03)
 
 
-def test_batches_have_matching_rows_of_all_columns_and_every_row_once_before_any_repeats() -> None:
+def test_batches_have_matching_rows_of_all_columns_and_every_row_once_before_any_repeats():
     transitions = transitions_of(count=50)
     batches = iter(Batches(transitions, 20, torch.Generator().manual_seed(0)))
     batch = Batch(*map(torch.cat, zip(*(next(batches) for _ in range(5)), strict=True)))

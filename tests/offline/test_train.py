@@ -1,10 +1,6 @@
 """Training on a data set: short real runs, their records, and invalid arguments."""
 
-from __future__ import annotations
-
 import sys
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,23 +13,22 @@ from sme_registry.errors import (
     MissingDependencyError,
     OptionError,
     PolicyError,
-    SMEError,
     SpecError,
     UnknownNameError,
 )
-from sme_registry.offline import OfflinePolicy, OfflineRecord, OfflineResult, train_offline
+from sme_registry.offline import OfflinePolicy, OfflineRecord, train_offline
 from tests.offline.sets import TINY, transitions_of
 
 PROTOCOL = {"states_per_region": 50}
 
 
 @pytest.fixture(scope="module")
-def transitions() -> Transitions:
+def transitions():
     return transitions_of()
 
 
-def short(data: Any, **changes: Any) -> OfflineResult:
-    settings: dict[str, Any] = {
+def short(data, **changes):
+    settings = {
         "algorithm": "bc",
         "steps": 40,
         "batch_size": 32,
@@ -46,14 +41,12 @@ def short(data: Any, **changes: Any) -> OfflineResult:
     return train_offline(data, **{**settings, **changes})
 
 
-def parts(result: OfflineResult) -> list[np.ndarray]:
+def parts(result):
     return [array for layer in result.policy.layers for array in layer]
 
 
 @pytest.mark.parametrize("algorithm", ["bc", "IQL"])
-def test_the_same_seed_gives_the_same_policy_and_scores(
-    transitions: Transitions, algorithm: str
-) -> None:
+def test_the_same_seed_gives_the_same_policy_and_scores(transitions, algorithm):
     one, two = (short(transitions, algorithm=algorithm) for _ in range(2))
     for first, second in zip(parts(one), parts(two), strict=True):
         np.testing.assert_array_equal(first, second)
@@ -63,7 +56,7 @@ def test_the_same_seed_gives_the_same_policy_and_scores(
     assert not np.array_equal(parts(one)[0], parts(other)[0])
 
 
-def test_learners_see_what_the_agent_saw_and_the_report_has_its_cost() -> None:
+def test_learners_see_what_the_agent_saw_and_the_report_has_its_cost():
     observed = {"distractors": 3, "mixing": "orthogonal"}
     spec = TINY.derive(safety={"tightness": 0.2}, observation=observed)
     data = transitions_of(spec)
@@ -79,14 +72,12 @@ def test_learners_see_what_the_agent_saw_and_the_report_has_its_cost() -> None:
         short(transitions_of(), spec=spec)
 
 
-def test_training_leaves_torch_as_it_was_and_progress_ends_at_the_last_step(
-    transitions: Transitions,
-) -> None:
+def test_training_leaves_torch_as_it_was_and_progress_ends_at_the_last_step(transitions):
     torch.set_num_threads(2)
     torch.manual_seed(5)
     expected = torch.rand(3)
     torch.manual_seed(5)
-    reports: list[tuple[int, int, str]] = []
+    reports = []
     short(transitions, progress=lambda *arguments: reports.append(arguments))
     assert torch.equal(torch.rand(3), expected)
     assert torch.get_num_threads() == 2
@@ -94,9 +85,7 @@ def test_training_leaves_torch_as_it_was_and_progress_ends_at_the_last_step(
     assert reports[-1][2].startswith("r̃ 0.")
 
 
-def test_evaluations_are_evenly_spaced_and_the_last_is_of_the_policy_returned(
-    transitions: Transitions,
-) -> None:
+def test_evaluations_are_evenly_spaced_and_the_last_is_of_the_policy_returned(transitions):
     result = short(transitions, steps=10, evaluations=3)
     assert [score.step for score in result.record.evaluations] == [3, 7, 10]
     last = result.record.evaluations[-1]
@@ -106,7 +95,7 @@ def test_evaluations_are_evenly_spaced_and_the_last_is_of_the_policy_returned(
     assert last.episode_return == pytest.approx(rewards.sum() / 3)
 
 
-def by_hand(result: OfflineResult, evaluation: int) -> tuple[np.ndarray, np.ndarray]:
+def by_hand(result, evaluation):
     """Every step's r̃ and R of three episodes, from the task's own equations."""
     from sme_registry.task import streams
 
@@ -123,7 +112,7 @@ def by_hand(result: OfflineResult, evaluation: int) -> tuple[np.ndarray, np.ndar
     return np.array(similarities), np.array(rewards)
 
 
-def test_bc_imitates_the_optimum() -> None:
+def test_bc_imitates_the_optimum():
     optimal = transitions_of(nu=0.0, count=2000)
     result = short(
         optimal, steps=400, batch_size=128, hyperparameters={"hidden": [64], "learning_rate": 0.01}
@@ -133,7 +122,7 @@ def test_bc_imitates_the_optimum() -> None:
     assert result.report.regions[0].similarity > 0.95
 
 
-def test_iql_surpasses_random_behaviour() -> None:
+def test_iql_surpasses_random_behaviour():
     noisy = transitions_of(nu="random", count=2000)
     result = short(
         noisy,
@@ -145,9 +134,7 @@ def test_iql_surpasses_random_behaviour() -> None:
     assert result.record.improvement > 0.1
 
 
-def test_a_folder_holds_what_was_returned_and_is_replaced_only_with_force(
-    transitions: Transitions, tmp_path: Path
-) -> None:
+def test_a_folder_holds_what_was_returned_and_is_replaced_only_with_force(transitions, tmp_path):
     folder = tmp_path / "run"
     result = short(transitions, folder=folder)
     assert OfflineRecord.read(folder / "offline.json") == result.record
@@ -174,7 +161,7 @@ def test_a_folder_holds_what_was_returned_and_is_replaced_only_with_force(
         short(transitions, folder=folder, force=True)
 
 
-def test_a_set_on_disk_provides_its_task_and_protocol(tmp_path: Path) -> None:
+def test_a_set_on_disk_provides_its_task_and_protocol(tmp_path):
     pytest.importorskip("minari")
     dataset = make_dataset(
         TINY, 0.5, transitions=100, protocol=PROTOCOL, name="sme/tiny-v0", folder=tmp_path
@@ -209,23 +196,19 @@ def test_a_set_on_disk_provides_its_task_and_protocol(tmp_path: Path) -> None:
         ({"protocol": "papr-v1"}, UnknownNameError, "paper-v1"),
     ],
 )
-def test_bad_input_is_refused(
-    transitions: Transitions, changes: dict[str, Any], error: type[SMEError], message: str
-) -> None:
+def test_bad_input_is_refused(transitions, changes, error, message):
     with pytest.raises(error, match=message):
         short(transitions, **changes)
 
 
-def test_other_data_is_refused() -> None:
+def test_other_data_is_refused():
     with pytest.raises(OptionError, match="must be a data set"):
         short([1, 2, 3])
     with pytest.raises(UnknownNameError, match="is neither the id of a data set"):
         short("sme/nothing-v0", spec=None)
 
 
-def test_numbers_that_are_not_finite_are_refused_and_a_training_that_diverges_says_so(
-    transitions: Transitions,
-) -> None:
+def test_numbers_that_are_not_finite_are_refused_and_a_training_that_diverges_says_so(transitions):
     columns = transitions.columns()
     rewards = columns["rewards"]
     columns["rewards"] = np.where(np.arange(600) == 7, np.nan, rewards)
@@ -236,9 +219,7 @@ def test_numbers_that_are_not_finite_are_refused_and_a_training_that_diverges_sa
         short(Transitions(**columns), algorithm="iql")
 
 
-def test_without_torch_it_says_what_to_install(
-    transitions: Transitions, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_torch_it_says_what_to_install(transitions, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(MissingDependencyError, match=r"\[offline\]"):
         short(transitions)

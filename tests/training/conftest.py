@@ -1,22 +1,17 @@
 """A finished run with figures, shared by the tests of training; runs of single tests draw none."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-
 import pytest
 
-from sme_registry.training import TrainingResult
 from tests.jax.conftest import quickly_compiled  # noqa: F401
 from tests.training.runs import short, without_figures
 
 
 @pytest.fixture(scope="package")
-def run(tmp_path_factory: pytest.TempPathFactory) -> TrainingResult:
+def run(tmp_path_factory):
     return short(tmp_path_factory.mktemp("run"), checkpoint_every=100)
 
 
 @pytest.fixture(autouse=True)
-def _no_figures() -> Iterator[None]:
+def _no_figures():
     with without_figures():
         yield

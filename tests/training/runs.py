@@ -1,18 +1,13 @@
 """Short training runs for these tests."""
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from sme_registry import SMESpec
-from sme_registry.training import TrainingResult, train
+from sme_registry.training import train
 
 TINY = SMESpec(state_dim=2, action_dim=2, horizon=20, seed=5)
 PROTOCOL = {"states_per_region": 50}
@@ -20,15 +15,15 @@ NARROW = {"policy_kwargs": {"net_arch": [8]}}
 
 
 @contextmanager
-def without_figures() -> Iterator[None]:
+def without_figures():
     """As without Matplotlib: figures take longer than training."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, "matplotlib", None)
         yield
 
 
-def short(folder: Path, **changes: Any) -> TrainingResult:
-    settings: dict[str, Any] = {
+def short(folder, **changes):
+    settings = {
         "algorithm": "TD3",
         "steps": 150,
         "protocol": PROTOCOL,
@@ -37,30 +32,30 @@ def short(folder: Path, **changes: Any) -> TrainingResult:
     return train(changes.pop("task", TINY), folder=folder, **{**settings, **changes})
 
 
-def copy_files(source: Path, target: Path) -> None:
+def copy_files(source, target):
     target.mkdir()
     for path in source.iterdir():
         if path.is_file():
             (target / path.name).write_bytes(path.read_bytes())
 
 
-def narrow(env: Any, *, seed: int, width: int = 8) -> Any:
+def narrow(env, *, seed, width=8):
     """An algorithm given as a function."""
     from stable_baselines3 import PPO
 
-    settings: dict[str, Any] = {"n_steps": 32, "batch_size": 32, "n_epochs": 1}
+    settings = {"n_steps": 32, "batch_size": 32, "n_epochs": 1}
     return PPO("MlpPolicy", env, seed=seed, policy_kwargs={"net_arch": [width]}, **settings)
 
 
 class Still:
     """A learner that is no model of Stable-Baselines3."""
 
-    def __init__(self, env: Any, *, seed: int) -> None:
+    def __init__(self, env, *, seed):
         self.shape = env.action_space.shape
 
-    def learn(self, total_timesteps: int) -> None:
+    def learn(self, total_timesteps):
         """Learn nothing."""
 
-    def predict(self, observation: Any, *, deterministic: bool) -> Any:
+    def predict(self, observation, *, deterministic):
         """The centre."""
         return np.zeros((len(observation), *self.shape))

@@ -1,9 +1,5 @@
 """The log of finished episodes."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from sme_registry.errors import (
@@ -12,11 +8,11 @@ from sme_registry.errors import (
 from sme_registry.training.episodes import COLUMNS, Episode, EpisodeLog, read_episodes
 
 
-def episode(number: int) -> Episode:
+def episode(number):
     return Episode(number, 20 * number, 1.5, 20, 0.25, 0.9, 0, 0.5)
 
 
-def test_a_row_cut_short_and_rows_after_the_checkpoint_are_dropped(tmp_path: Path) -> None:
+def test_a_row_cut_short_and_rows_after_the_checkpoint_are_dropped(tmp_path):
     path = tmp_path / "episodes.csv"
     log = EpisodeLog(path)
     assert path.read_text() == ",".join(COLUMNS) + "\n"

@@ -1,10 +1,5 @@
 """Hyperparameters: their names, their values, and those that several lanes need."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import pytest
 
 from sme_registry.errors import OptionError, UnknownNameError
@@ -18,7 +13,7 @@ from sme_registry.training.hyperparameters import (
 pytest.importorskip("stable_baselines3")
 
 
-def test_dotted_names_are_nested() -> None:
+def test_dotted_names_are_nested():
     flat = {"gamma": 0.9, "policy_kwargs.net_arch": [64, 64], "policy_kwargs.n_critics": 1}
     assert nested_hyperparameters(flat) == {
         "gamma": 0.9,
@@ -32,12 +27,12 @@ def test_dotted_names_are_nested() -> None:
 @pytest.mark.parametrize(
     "flat", [{"a": 1, "a.b": 2}, {"a.b": 2, "a": 1}, {"a.": 1}, {".a": 1}, {"a": 1, "a.b.c": 2}]
 )
-def test_names_that_cannot_be_nested_are_rejected(flat: dict[str, Any]) -> None:
+def test_names_that_cannot_be_nested_are_rejected(flat):
     with pytest.raises(OptionError, match="one name for each value"):
         nested_hyperparameters(flat)
 
 
-def test_a_file_holds_an_object(tmp_path: Path) -> None:
+def test_a_file_holds_an_object(tmp_path):
     path = tmp_path / "settings.json"
     path.write_text('{"policy_kwargs.net_arch": [8], "gamma": 0.5}')
     assert read_hyperparameters(path) == {"policy_kwargs": {"net_arch": [8]}, "gamma": 0.5}
@@ -55,14 +50,12 @@ def test_a_file_holds_an_object(tmp_path: Path) -> None:
         ("sb3_contrib:TQC", {"top_quantiles": 1}, "top_quantiles_to_drop_per_net"),
     ],
 )
-def test_unknown_names_are_rejected_with_a_similar_one(
-    uses: str, values: dict[str, Any], message: str
-) -> None:
+def test_unknown_names_are_rejected_with_a_similar_one(uses, values, message):
     with pytest.raises(OptionError, match=message):
         check_hyperparameters(uses, values)
 
 
-def test_a_hyperparameter_that_only_stable_baselines3_has_is_taken_for_no_field_of_a_task() -> None:
+def test_a_hyperparameter_that_only_stable_baselines3_has_is_taken_for_no_field_of_a_task():
     pytest.importorskip("jax")
     others = ["action_dim", "complexity"]
     with pytest.raises(
@@ -74,14 +67,14 @@ def test_a_hyperparameter_that_only_stable_baselines3_has_is_taken_for_no_field_
         check_hyperparameters("jax:TD3", {"complexty": 2}, others=others)
 
 
-def test_known_names_are_accepted_whatever_their_values() -> None:
+def test_known_names_are_accepted_whatever_their_values():
     check_hyperparameters("PPO", {"n_steps": "many", "policy_kwargs": {"net_arch": [8]}})
     check_hyperparameters("sb3_contrib:RecurrentPPO", {"policy_kwargs": {"lstm_hidden_size": 8}})
     with pytest.raises(UnknownNameError):
         check_hyperparameters("TD4", {"gamma": 0.9})
 
 
-def test_json_values_become_those_of_a_constructor() -> None:
+def test_json_values_become_those_of_a_constructor():
     from torch import nn
 
     values = {"train_freq": [1, "episode"], "policy_kwargs": {"activation_fn": "torch.nn:ELU"}}

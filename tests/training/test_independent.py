@@ -1,27 +1,22 @@
 """Independent learners of a team: the same updates as SB3's, one model for each agent, resuming."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
 from sme_registry import EvaluationReport, SMESpec, evaluate
 from sme_registry.errors import OptionError
-from sme_registry.training import TrainingResult, train
+from sme_registry.training import train
 from sme_registry.training.episodes import read_episodes
 from tests.training.runs import PROTOCOL, TINY, copy_files
 from tests.training.test_team_runs import TEAM
 
 pytest.importorskip("stable_baselines3")
 
-SETTINGS: dict[str, Any] = {"n_steps": 32, "batch_size": 32, "n_epochs": 2}
+SETTINGS = {"n_steps": 32, "batch_size": 32, "n_epochs": 2}
 
 
-def independent(folder: Path, **changes: Any) -> TrainingResult:
-    settings: dict[str, Any] = {
+def independent(folder, **changes):
+    settings = {
         "independent": True,
         "steps": 128,
         "num_envs": 2,
@@ -33,11 +28,11 @@ def independent(folder: Path, **changes: Any) -> TrainingResult:
 
 
 @pytest.fixture(scope="module")
-def team_run(tmp_path_factory: pytest.TempPathFactory) -> TrainingResult:
+def team_run(tmp_path_factory):
     return independent(tmp_path_factory.mktemp("independent") / "run")
 
 
-def test_a_team_of_one_learns_exactly_what_sb3s_ppo_learns(team_run: TrainingResult) -> None:
+def test_a_team_of_one_learns_exactly_what_sb3s_ppo_learns(team_run):
     """The same weights after three rollouts with episodes cut off at the horizon.
 
     Up to float32 rounding: PyTorch's sums depend on how its tensors are aligned in memory.
@@ -66,7 +61,7 @@ def test_a_team_of_one_learns_exactly_what_sb3s_ppo_learns(team_run: TrainingRes
         np.testing.assert_allclose(learnt, weights.numpy(), rtol=1e-4, atol=1e-6, err_msg=name)
 
 
-def test_each_agent_has_a_model_of_what_it_observes_and_owns(team_run: TrainingResult) -> None:
+def test_each_agent_has_a_model_of_what_it_observes_and_owns(team_run):
     from stable_baselines3 import PPO
 
     folder = team_run.model_path
@@ -82,9 +77,7 @@ def test_each_agent_has_a_model_of_what_it_observes_and_owns(team_run: TrainingR
     assert team_run.record.hyperparameters == SETTINGS
 
 
-def test_the_log_has_each_agents_regret_and_the_folder_is_evaluated(
-    team_run: TrainingResult,
-) -> None:
+def test_the_log_has_each_agents_regret_and_the_folder_is_evaluated(team_run):
     episodes = read_episodes(team_run.folder / "episodes.csv")
     assert [episode.step for episode in episodes] == [40, 40, 80, 80, 120, 120]
     for episode in episodes:
@@ -95,7 +88,7 @@ def test_the_log_has_each_agents_regret_and_the_folder_is_evaluated(
     assert (again.regions, again.agents) == (report.regions, report.agents)
 
 
-def test_independent_runs_resume(team_run: TrainingResult, tmp_path: Path) -> None:
+def test_independent_runs_resume(team_run, tmp_path):
     folder = tmp_path / "run"
     copy_files(team_run.folder, folder)
     team_run.record.updated(status="running").write(folder)
@@ -107,7 +100,7 @@ def test_independent_runs_resume(team_run: TrainingResult, tmp_path: Path) -> No
     assert len(result.episodes) > 6
 
 
-def test_independent_training_lowers_the_regret_of_each_agent(tmp_path: Path) -> None:
+def test_independent_training_lowers_the_regret_of_each_agent(tmp_path):
     spec = SMESpec.from_dict(
         {"state_dim": 1, "action_dim": 2, "horizon": 16, "seed": 2,
          "team": {"agents": [{"action_dim": 1}, {"action_dim": 1}]}}
@@ -127,9 +120,7 @@ def test_independent_training_lowers_the_regret_of_each_agent(tmp_path: Path) ->
         ({"hyperparameters": {"use_sde": True}}, "without use_sde"),
     ],
 )
-def test_other_algorithms_are_rejected(
-    changes: dict[str, Any], message: str, tmp_path: Path
-) -> None:
+def test_other_algorithms_are_rejected(changes, message, tmp_path):
     with pytest.raises(OptionError, match=message):
         independent(tmp_path / "run", **changes)
     with pytest.raises(OptionError, match="single agent"):

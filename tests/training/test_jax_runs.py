@@ -1,13 +1,9 @@
 """Runs of agents in JAX: the same folder, exact resumption, and models of Stable-Baselines3."""
 
-from __future__ import annotations
-
 import io
 import shutil
 import signal
 import sys
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +25,7 @@ from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.export import export_onnx
 from sme_registry.io import read_arrays, write_arrays
 from sme_registry.jax.run import new_program
-from sme_registry.training import RunRecord, TrainingResult, checkpoint, jax_learn, train
+from sme_registry.training import RunRecord, checkpoint, jax_learn, train
 from sme_registry.training.episodes import read_episodes
 from sme_registry.training.sb3_models import new_sb3_model, set_weights
 from tests.training.runs import NARROW, PROTOCOL, TINY
@@ -39,8 +35,8 @@ pytestmark = pytest.mark.usefixtures("quickly_compiled")
 PPO = {"n_steps": 32, "batch_size": 32, "n_epochs": 2, **NARROW}
 
 
-def jax_run(folder: Path, document: Any = TINY, **changes: Any) -> TrainingResult:
-    settings: dict[str, Any] = {
+def jax_run(folder, document=TINY, **changes):
+    settings = {
         "algorithm": "PPO",
         "agents": "jax",
         "steps": 120,
@@ -53,18 +49,18 @@ def jax_run(folder: Path, document: Any = TINY, **changes: Any) -> TrainingResul
 
 
 @pytest.fixture(scope="module")
-def shown() -> io.StringIO:
+def shown():
     """What `run` printed."""
     return io.StringIO()
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory, shown: io.StringIO) -> TrainingResult:
+def run(tmp_path_factory, shown):
     console = Console(file=shown, width=100)
     return jax_run(tmp_path_factory.mktemp("jax"), progress=True, console=console)
 
 
-def test_a_run_writes_the_same_files(run: TrainingResult, shown: io.StringIO) -> None:
+def test_a_run_writes_the_same_files(run, shown):
     assert "\ntraining PPO: compiling …\n" in shown.getvalue()
     assert "\ntraining PPO: 128 of 128 steps" in shown.getvalue()
     names = {path.name for path in run.folder.iterdir()}
@@ -90,7 +86,7 @@ def test_a_run_writes_the_same_files(run: TrainingResult, shown: io.StringIO) ->
         assert 0 < episode.similarity < 1
 
 
-def test_the_model_is_one_of_stable_baselines3(run: TrainingResult, tmp_path: Path) -> None:
+def test_the_model_is_one_of_stable_baselines3(run, tmp_path):
     model = load_sb3(run.model_path)
     assert (type(model).__name__, model.num_timesteps, model.n_steps) == ("PPO", 128, 32)
     assert evaluate(run.model_path, TINY, PROTOCOL, name="PPO").regions == run.report.regions
@@ -110,10 +106,10 @@ def test_the_model_is_one_of_stable_baselines3(run: TrainingResult, tmp_path: Pa
 @pytest.mark.parametrize(
     ("name", "action_range"), [("PPO", "symmetric"), ("TD3", "unit"), ("SAC", "symmetric")]
 )
-def test_the_model_predicts_the_same_actions(name: str, action_range: Any, tmp_path: Path) -> None:
+def test_the_model_predicts_the_same_actions(name, action_range, tmp_path):
     # A buffer that fits in no memory: neither here nor where the model is loaded it is allocated.
     settings = NARROW if name == "PPO" else {**NARROW, "buffer_size": 10**15}
-    run: Any = {"hyperparameters": settings, "action_range": action_range, "steps": 64}
+    run = {"hyperparameters": settings, "action_range": action_range, "steps": 64}
     program = new_program(f"jax:{name}", [TINY], [3], **run)
     model = new_sb3_model(f"jax:{name}", TINY, seed=3, **run)
     set_weights(model, program.weights(0), 64)
@@ -130,22 +126,22 @@ def test_the_model_predicts_the_same_actions(name: str, action_range: Any, tmp_p
     assert all(np.array_equal(own[name].numpy(), w) for name, w in weights.items() if name in own)
 
 
-def test_the_model_of_a_stream_has_the_inputs_of_its_phases() -> None:
+def test_the_model_of_a_stream_has_the_inputs_of_its_phases():
     phases = [{"spec": TINY, "steps": 20}, {"spec": TINY.derive(seed=1), "steps": 20}]
     stream = StreamSpec(phases=phases, observes_phase=True)
-    run: Any = {"hyperparameters": NARROW, "steps": 40}
+    run = {"hyperparameters": NARROW, "steps": 40}
     program = new_program("jax:SAC", [stream], [0], **run)
     model = new_sb3_model("jax:SAC", stream, seed=0, action_range="symmetric", **run)
     set_weights(model, program.weights(0), 0)
     assert model.observation_space.shape == (4 + 2,)
 
 
-def interrupted(folder: Path, monkeypatch: pytest.MonkeyPatch, **changes: Any) -> None:
+def interrupted(folder, monkeypatch, **changes):
     """A run that Ctrl-C ends while it writes its first checkpoint."""
     with monkeypatch.context() as patch:
         save = jax_learn.write_arrays
 
-        def save_and_interrupt(*arguments: Any) -> None:
+        def save_and_interrupt(*arguments):
             save(*arguments)
             signal.raise_signal(signal.SIGINT)  # delivered when the record is written, too
 
@@ -154,12 +150,12 @@ def interrupted(folder: Path, monkeypatch: pytest.MonkeyPatch, **changes: Any) -
             jax_run(folder, **changes)
 
 
-def without_times(result: TrainingResult) -> list[Any]:
+def without_times(result):
     rows = read_episodes(result.folder / "episodes.csv")
     return [episode._replace(wall_seconds=0.0) for episode in rows]
 
 
-def same_bits(one: TrainingResult, other: TrainingResult) -> None:
+def same_bits(one, other):
     assert without_times(one) == without_times(other)
     assert one.report.regions == other.report.regions
     with np.load(one.folder / checkpoint.FILE) as a, np.load(other.folder / checkpoint.FILE) as b:
@@ -169,9 +165,7 @@ def same_bits(one: TrainingResult, other: TrainingResult) -> None:
     assert all((weights[name] == others[name]).all() for name in weights)
 
 
-def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit(
-    run: TrainingResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit(run, tmp_path, monkeypatch):
     folder = tmp_path / "run"
     interrupted(folder, monkeypatch)
     assert not (folder / "model.zip").exists()
@@ -190,14 +184,14 @@ def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit(
 
 
 def test_a_damaged_checkpoint_is_refused_and_one_with_weights_that_are_not_finite_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     folder = tmp_path / "run"
     interrupted(folder, monkeypatch)
     path = folder / checkpoint.FILE
     whole = read_arrays(path)
 
-    def refused() -> None:
+    def refused():
         with pytest.raises(PolicyError, match=r"cannot be loaded: .*--force"):
             jax_run(folder, resume=True)
 
@@ -238,16 +232,14 @@ def test_a_damaged_checkpoint_is_refused_and_one_with_weights_that_are_not_finit
         ({"agents": "sb3", "algorithm": "jax:PPO"}, "agents='sb3': must be left out for 'jax:PPO'"),
     ],
 )
-def test_invalid_arguments_raise_typed_errors_and_create_no_folder(
-    change: dict[str, Any], message: str, tmp_path: Path
-) -> None:
+def test_invalid_arguments_raise_typed_errors_and_create_no_folder(change, message, tmp_path):
     settings = {"hyperparameters": {}, **change}
     with pytest.raises(SMEError, match=message):
         jax_run(tmp_path / "run", **settings)
     assert not (tmp_path / "run").exists()
 
 
-def test_a_team_is_refused_by_name(tmp_path: Path) -> None:
+def test_a_team_is_refused_by_name(tmp_path):
     team = SMESpec(action_dim=2, team={"agents": [{"action_dim": 1}, {"action_dim": 1}]})
     for algorithm in (None, "jax:PPO"):
         with pytest.raises(SMEError, match=r"team=.*JAX have no team.*leave out --agents jax"):
@@ -255,9 +247,7 @@ def test_a_team_is_refused_by_name(tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
-def test_without_jax_it_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_jax_it_says_what_to_install(tmp_path, monkeypatch):
     for name in [name for name in sys.modules if name.startswith("sme_registry.jax")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "jax", None)
@@ -266,9 +256,7 @@ def test_without_jax_it_says_what_to_install(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_life_has_the_snapshots_of_sb3_and_its_resumption_the_same_bits(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_life_has_the_snapshots_of_sb3_and_its_resumption_the_same_bits(tmp_path, monkeypatch):
     phases = [{"spec": TINY, "steps": 40}, {"spec": TINY.derive(seed=6), "steps": 40}]
     stream = StreamSpec(phases=phases)
     whole = jax_run(tmp_path / "whole", stream, steps=None)
@@ -301,13 +289,13 @@ MIXED = TINY.derive(
 
 
 @pytest.fixture(scope="module")
-def mixed_run(tmp_path_factory: pytest.TempPathFactory) -> TrainingResult:
+def mixed_run(tmp_path_factory):
     return jax_run(tmp_path_factory.mktemp("mixed"), MIXED)
 
 
 def test_a_run_on_a_task_with_limits_and_distractors_has_its_costs_and_resumes_bit_for_bit(
-    mixed_run: TrainingResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    mixed_run, tmp_path, monkeypatch
+):
     run = mixed_run
     assert "cost_curve.png" in {path.name for path in run.figures}
     assert run.report.safety is not None

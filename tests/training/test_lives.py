@@ -1,10 +1,6 @@
 """Runs on streams: snapshots, what is reported, resuming in mid-life, and what is refused."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +8,7 @@ import pytest
 from sme_registry import SMESpec, StreamSpec
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.evaluation import StreamReport, evaluate_stream, load_sb3
-from sme_registry.training import RunRecord, TrainingResult, learn, train
+from sme_registry.training import RunRecord, learn, train
 from sme_registry.training.episodes import read_episodes
 from tests.training.runs import PROTOCOL, TINY
 
@@ -24,8 +20,8 @@ STREAM = StreamSpec(phases=[{"spec": TINY, "steps": 60}, {"spec": BARREN, "steps
 PPO = {"n_steps": 32, "batch_size": 32, "n_epochs": 2, "policy_kwargs": {"net_arch": [8]}}
 
 
-def life(folder: Path, stream: Any = STREAM, **changes: Any) -> TrainingResult:
-    settings: dict[str, Any] = {
+def life(folder, stream=STREAM, **changes):
+    settings = {
         "algorithm": "PPO",
         "hyperparameters": PPO,
         "protocol": PROTOCOL,
@@ -35,25 +31,25 @@ def life(folder: Path, stream: Any = STREAM, **changes: Any) -> TrainingResult:
     return train(stream, folder=folder, **{**settings, **changes})
 
 
-def weights(path: Path) -> dict[str, Any]:
+def weights(path):
     return {k: v.numpy() for k, v in load_sb3(path).policy.state_dict().items()}
 
 
-def same_weights(one: Path, other: Path) -> bool:
+def same_weights(one, other):
     a, b = weights(one), weights(other)
     return all(np.array_equal(a[name], b[name]) for name in a)
 
 
-def visit_files(folder: Path) -> list[Path]:
+def visit_files(folder):
     return [folder / "snapshots" / f"visit-0{visit}.zip" for visit in range(4)]
 
 
 @pytest.fixture(scope="module")
-def lived(tmp_path_factory: pytest.TempPathFactory) -> TrainingResult:
+def lived(tmp_path_factory):
     return life(tmp_path_factory.mktemp("life") / "run")
 
 
-def test_a_life_writes_its_report_and_a_model_for_each_visit(lived: TrainingResult) -> None:
+def test_a_life_writes_its_report_and_a_model_for_each_visit(lived):
     names = {path.name for path in lived.folder.iterdir()}
     assert names >= {"run.json", "episodes.csv", "model.zip", "stream.json", "snapshots"}
     assert "evaluation.json" not in names
@@ -70,7 +66,7 @@ def test_a_life_writes_its_report_and_a_model_for_each_visit(lived: TrainingResu
     assert json.loads((lived.folder / "run.json").read_text())["stream"] == STREAM.to_dict()
 
 
-def test_a_snapshot_has_learned_from_the_rollouts_that_were_over(lived: TrainingResult) -> None:
+def test_a_snapshot_has_learned_from_the_rollouts_that_were_over(lived):
     # Rollouts of 32 steps, two epochs each: one is over at 60, three at 100, five at 160. The last
     # visit ends with the training, which finishes its last rollout.
     updates = [load_sb3(path)._n_updates for path in visit_files(lived.folder)]
@@ -80,7 +76,7 @@ def test_a_snapshot_has_learned_from_the_rollouts_that_were_over(lived: Training
     assert (load_sb3(initial)._n_updates, load_sb3(initial).num_timesteps) == (0, 0)
 
 
-def test_a_snapshot_of_td3_has_learned_from_every_step_of_the_visit(tmp_path: Path) -> None:
+def test_a_snapshot_of_td3_has_learned_from_every_step_of_the_visit(tmp_path):
     settings = {"learning_starts": 10, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}}
     td3 = life(tmp_path / "run", algorithm="TD3", hyperparameters=settings)
     updates = [load_sb3(path)._n_updates for path in visit_files(td3.folder)]
@@ -88,9 +84,7 @@ def test_a_snapshot_of_td3_has_learned_from_every_step_of_the_visit(tmp_path: Pa
     assert same_weights(visit_files(td3.folder)[-1], td3.model_path)
 
 
-def test_the_report_of_a_life_is_about_its_snapshots_and_its_episodes(
-    lived: TrainingResult,
-) -> None:
+def test_the_report_of_a_life_is_about_its_snapshots_and_its_episodes(lived):
     report = StreamReport.read(lived.folder / "stream.json")
     assert report == lived.report
     snapshots = lived.folder / "snapshots"
@@ -107,13 +101,11 @@ def test_the_report_of_a_life_is_about_its_snapshots_and_its_episodes(
     assert report.reference_regret.keys() >= {"frozen_optimum", "frozen_agent", "constant_half"}
 
 
-def killed(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, at_step: int, stream: StreamSpec = STREAM
-) -> None:
+def killed(folder, monkeypatch, at_step, stream=STREAM):
     """A life that ends right after the checkpoint of a step."""
     save = learn._save_checkpoint
 
-    def save_and_end(model: Any, log: Any) -> None:
+    def save_and_end(model, log):
         save(model, log)
         if model.num_timesteps >= at_step:
             raise KeyboardInterrupt
@@ -124,9 +116,7 @@ def killed(
             life(folder, stream)
 
 
-def test_a_resumed_life_goes_on_at_the_step_of_its_checkpoint(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_resumed_life_goes_on_at_the_step_of_its_checkpoint(tmp_path, monkeypatch):
     folder = tmp_path / "run"
     killed(folder, monkeypatch, at_step=96)
     first, second, *_ = visit_files(folder)
@@ -146,9 +136,7 @@ def test_a_resumed_life_goes_on_at_the_step_of_its_checkpoint(
     assert barren == [80, 116, 196, 216]
 
 
-def test_a_life_that_was_killed_after_its_last_step_ends_its_last_visit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_life_that_was_killed_after_its_last_step_ends_its_last_visit(tmp_path, monkeypatch):
     folder = tmp_path / "run"
     killed(folder, monkeypatch, at_step=224)
     assert not visit_files(folder)[-1].exists()
@@ -156,9 +144,7 @@ def test_a_life_that_was_killed_after_its_last_step_ends_its_last_visit(
     assert same_weights(visit_files(folder)[-1], resumed.model_path)
 
 
-def test_a_life_whose_first_visit_is_in_no_finished_episode_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_life_whose_first_visit_is_in_no_finished_episode_is_reported(tmp_path, monkeypatch):
     task = TINY.derive(horizon=50)
     phases = [{"spec": task, "steps": 10}, {"spec": task.derive(seed=6), "steps": 90}]
     stream = StreamSpec(phases=phases, switch="step")
@@ -171,9 +157,7 @@ def test_a_life_whose_first_visit_is_in_no_finished_episode_is_reported(
     assert "frozen_agent" not in resumed.report.reference_regret
 
 
-def test_force_removes_the_snapshots_of_the_run_before(
-    lived: TrainingResult, tmp_path: Path
-) -> None:
+def test_force_removes_the_snapshots_of_the_run_before(lived, tmp_path):
     folder = tmp_path / "run"
     (folder / "snapshots").mkdir(parents=True)
     (folder / "snapshots" / "visit-09.zip").write_bytes(b"of another stream")
@@ -194,9 +178,7 @@ def test_force_removes_the_snapshots_of_the_run_before(
         (TINY, "has 'sha256:[0-9a-f]{64}'. Resume"),
     ],
 )
-def test_a_life_is_not_resumed_on_another_stream(
-    other: Any, where: str, lived: TrainingResult, tmp_path: Path
-) -> None:
+def test_a_life_is_not_resumed_on_another_stream(other, where, lived, tmp_path):
     lived.record.updated(status="running").write(tmp_path)
     with pytest.raises(OptionError, match=rf"^stream_digest='.*': the run in .*{where}"):
         life(tmp_path, other, resume=True, steps=None if other is not TINY else 300)
@@ -227,9 +209,7 @@ def test_a_life_is_not_resumed_on_another_stream(
         ),
     ],
 )  # fmt: skip
-def test_what_a_life_cannot_have_is_refused_and_creates_no_folder(
-    change: dict[str, Any], message: str, tmp_path: Path
-) -> None:
+def test_what_a_life_cannot_have_is_refused_and_creates_no_folder(change, message, tmp_path):
     if "agents" in change:
         pytest.importorskip("jax")
     with pytest.raises(SMEError, match=message):
@@ -237,7 +217,7 @@ def test_what_a_life_cannot_have_is_refused_and_creates_no_folder(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_task_has_a_report_of_its_own_kind(tmp_path: Path) -> None:
+def test_a_task_has_a_report_of_its_own_kind(tmp_path):
     spec = SMESpec(state_dim=1, action_dim=1, horizon=10)
     result = life(tmp_path / "run", spec, steps=32)
     assert not isinstance(result.report, StreamReport)

@@ -1,9 +1,5 @@
 """The monitored environment: the numbers of `SMEVecEnv`, and their sums."""
 
-from __future__ import annotations
-
-from typing import Any, Literal
-
 import numpy as np
 import pytest
 
@@ -24,20 +20,18 @@ STREAM = StreamSpec(
 @pytest.mark.parametrize(
     ("document", "action_range"), [(SPEC, "unit"), (STREAM, "symmetric")], ids=["task", "stream"]
 )
-def test_steps_equal_those_of_a_batch_of_one(
-    document: SMESpec | StreamSpec, action_range: Literal["unit", "symmetric"]
-) -> None:
+def test_steps_equal_those_of_a_batch_of_one(document, action_range):
     from sme_registry.sb3 import SMEVecEnv
     from sme_registry.training.monitored_env import MonitoredVecEnv
 
-    batch: Any = SMEVecEnv(document, 1, action_range=action_range)
-    monitored: Any = MonitoredVecEnv(document, action_range=action_range)
+    batch = SMEVecEnv(document, 1, action_range=action_range)
+    monitored = MonitoredVecEnv(document, action_range=action_range)
     assert monitored.action_space == batch.action_space
     assert monitored.observation_space == batch.observation_space
     for env in (batch, monitored):
         env.seed(7)
     np.testing.assert_array_equal(monitored.reset(), batch.reset())
-    calls: list[int] = []
+    calls = []
     monitored.after_step = calls.append
     centre = (
         monitored.action_space.low[0] + 1.0

@@ -1,8 +1,6 @@
 """A model's policy in NumPy, and the model itself where its network is of another kind."""
 
-from __future__ import annotations
-
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -20,13 +18,7 @@ OBSERVATIONS = np.random.default_rng(0).random((200, 5), dtype=np.float32)
 Range = Literal["unit", "symmetric"]
 
 
-def new_model(
-    algorithm: Any,
-    action_range: Range = "symmetric",
-    noise: float = 0.2,
-    document: Any = SPEC,
-    **kwargs: Any,
-) -> Any:
+def new_model(algorithm, action_range="symmetric", noise=0.2, document=SPEC, **kwargs):
     """An untrained model, its weights moved so far that some of its actions are clipped."""
     from sme_registry.sb3 import SMEVecEnv
 
@@ -41,13 +33,13 @@ def new_model(
     return model
 
 
-def predicted(model: Any) -> Any:
+def predicted(model):
     """The actions of SB3's `predict`, in the unit range."""
     actions = model.predict(OBSERVATIONS, deterministic=True)[0].astype(np.float64)
     return (actions + 1.0) / 2.0 if model.action_space.low[0] < 0 else actions
 
 
-def algorithm_class(name: str) -> Any:
+def algorithm_class(name):
     """The class, of SB3 or else of sb3-contrib."""
     return getattr(sb3, name, None) or getattr(pytest.importorskip("sb3_contrib"), name)
 
@@ -59,7 +51,7 @@ def algorithm_class(name: str) -> Any:
         ("DDPG", "unit"), ("SAC", "symmetric"), ("TQC", "unit"),
     ],
 )  # fmt: skip
-def test_the_copied_network_acts_as_the_model_did(algorithm: str, action_range: Range) -> None:
+def test_the_copied_network_acts_as_the_model_did(algorithm, action_range):
     """Its hidden layers, too; later training does not change the copy."""
     model = new_model(algorithm_class(algorithm), action_range)
     own, copied = as_policy(model, SPEC), numpy_policy(model, SPEC)
@@ -88,7 +80,7 @@ def test_the_copied_network_acts_as_the_model_did(algorithm: str, action_range: 
 
 
 @pytest.mark.parametrize("observes_phase", [False, True])
-def test_a_policy_of_a_stream_observes_what_the_stream_shows(observes_phase: bool) -> None:
+def test_a_policy_of_a_stream_observes_what_the_stream_shows(observes_phase):
     phases = [{"spec": SPEC, "steps": 20}, {"spec": SPEC.derive(seed=1), "steps": 20}]
     stream = StreamSpec(phases=phases, observes_phase=observes_phase)
     model = new_model(sb3.PPO, document=stream)
@@ -107,7 +99,7 @@ def test_a_policy_of_a_stream_observes_what_the_stream_shows(observes_phase: boo
         ("TD3", {"noise": 0.0}),  # which does more than its layers say
     ],
 )
-def test_a_network_of_another_kind_is_called_directly(algorithm: str, settings: Any) -> None:
+def test_a_network_of_another_kind_is_called_directly(algorithm, settings):
     model = new_model(getattr(sb3, algorithm), **settings)
     if algorithm == "TD3":
         plain = model.policy.actor.forward
@@ -119,7 +111,7 @@ def test_a_network_of_another_kind_is_called_directly(algorithm: str, settings: 
     np.testing.assert_array_equal(function(OBSERVATIONS), OBSERVATIONS[:, :2].astype(np.float64))
 
 
-def test_a_team_is_rejected() -> None:
+def test_a_team_is_rejected():
     team = SPEC.derive(team={"agents": [{"action_dim": 1}, {"action_dim": 1}]})
     with pytest.raises(SpecError, match=r"^team: must be null"):
         numpy_policy(lambda observations: observations[:, :1], team)

@@ -1,14 +1,10 @@
 """Resuming a killed run from its checkpoint."""
 
-from __future__ import annotations
-
 import io
 import subprocess
 import sys
 import time
 import zipfile
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +13,7 @@ from sme_registry.errors import (
     OptionError,
     PolicyError,
 )
-from sme_registry.training import RunRecord, TrainingResult
+from sme_registry.training import RunRecord
 from sme_registry.training.episodes import read_episodes
 from tests.training.runs import TINY, copy_files, short, without_figures
 
@@ -34,7 +30,7 @@ train(spec, steps=100_000, seed=3, folder=sys.argv[1], checkpoint_every=50,
 
 
 @pytest.fixture(scope="module")
-def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def killed(tmp_path_factory):
     """The folder of a run whose process was killed some way beyond its third checkpoint."""
     folder = tmp_path_factory.mktemp("killed") / "run"
     process = subprocess.Popen([sys.executable, "-c", _SCRIPT, str(folder)])
@@ -54,7 +50,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def resumed(killed: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainingResult:
+def resumed(killed, tmp_path_factory):
     """The killed run, 60 steps on."""
     folder = tmp_path_factory.mktemp("resumed") / "run"
     copy_files(killed, folder)
@@ -62,14 +58,14 @@ def resumed(killed: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainingR
         return short(folder, seed=3, steps=steps_of(killed) + 60, resume=True)
 
 
-def steps_of(folder: Path) -> int:
+def steps_of(folder):
     record = RunRecord.read(folder)
     assert record is not None
     assert record.status == "running"
     return record.steps_done
 
 
-def test_a_killed_run_resumes_from_its_checkpoint(killed: Path, resumed: TrainingResult) -> None:
+def test_a_killed_run_resumes_from_its_checkpoint(killed, resumed):
     with pytest.raises(OptionError, match="--resume"):
         short(killed, seed=3, steps=1000)
     before = steps_of(killed)
@@ -91,9 +87,7 @@ def test_a_killed_run_resumes_from_its_checkpoint(killed: Path, resumed: Trainin
     assert not np.array_equal(starts[0], starts[1])
 
 
-def test_resuming_keeps_the_hyperparameters_and_repeats_to_the_bit(
-    killed: Path, resumed: TrainingResult, tmp_path: Path
-) -> None:
+def test_resuming_keeps_the_hyperparameters_and_repeats_to_the_bit(killed, resumed, tmp_path):
     from stable_baselines3 import TD3
 
     assert resumed.record.hyperparameters == {"gamma": 0.9}
@@ -104,9 +98,7 @@ def test_resuming_keeps_the_hyperparameters_and_repeats_to_the_bit(
     assert [e.regret for e in again.episodes] == [e.regret for e in resumed.episodes]
 
 
-def test_the_checkpoint_holds_the_model_its_optimisers_and_its_replay_buffer(
-    killed: Path,
-) -> None:
+def test_the_checkpoint_holds_the_model_its_optimisers_and_its_replay_buffer(killed):
     from stable_baselines3 import TD3
 
     from sme_registry.sb3 import SMEVecEnv
@@ -127,9 +119,7 @@ def test_the_checkpoint_holds_the_model_its_optimisers_and_its_replay_buffer(
     assert TD3.load(path, device="cpu").num_timesteps == steps
 
 
-def test_a_run_that_was_killed_after_its_last_step_is_only_evaluated(
-    killed: Path, tmp_path: Path
-) -> None:
+def test_a_run_that_was_killed_after_its_last_step_is_only_evaluated(killed, tmp_path):
     copy_files(killed, tmp_path / "run")
     before = RunRecord.read(killed)
     assert before is not None
@@ -152,14 +142,14 @@ def test_a_run_that_was_killed_after_its_last_step_is_only_evaluated(
         ({"hyperparameters": {"tau": 0.5}}, r"hyperparameters\.tau"),
     ],
 )
-def test_another_plan_cannot_be_resumed(killed: Path, change: dict[str, Any], field: str) -> None:
+def test_another_plan_cannot_be_resumed(killed, change, field):
     before = (killed / "run.json").read_bytes()
     with pytest.raises(OptionError, match=f"^{field}="):
         short(killed, **{"seed": 3, "steps": 100_000, "resume": True, **change})
     assert (killed / "run.json").read_bytes() == before
 
 
-def test_a_broken_checkpoint_is_refused_with_a_remedy(killed: Path, tmp_path: Path) -> None:
+def test_a_broken_checkpoint_is_refused_with_a_remedy(killed, tmp_path):
     folder = tmp_path / "run"
     copy_files(killed, folder)
     (folder / "checkpoint.zip").write_bytes(b"PK\x03\x04 no checkpoint")
@@ -167,7 +157,7 @@ def test_a_broken_checkpoint_is_refused_with_a_remedy(killed: Path, tmp_path: Pa
         short(folder, seed=3, resume=True)
 
 
-def test_a_run_killed_before_its_first_checkpoint_starts_again(tmp_path: Path) -> None:
+def test_a_run_killed_before_its_first_checkpoint_starts_again(tmp_path):
     folder = tmp_path / "run"
     finished = short(folder, steps=40)
     finished.record.updated(status="running", steps_done=0).write(folder)

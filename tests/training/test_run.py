@@ -1,15 +1,11 @@
 """Short real runs: their files, their numbers, and invalid arguments."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json
 import subprocess
 import sys
 import zipfile
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,14 +19,14 @@ from sme_registry.errors import (
     SMEError,
 )
 from sme_registry.io import file_lock
-from sme_registry.training import RunRecord, TrainingResult, train
+from sme_registry.training import RunRecord, train
 from sme_registry.training.episodes import Episode, read_episodes
 from tests.training.runs import NARROW, PROTOCOL, TINY, copy_files, short
 
 pytest.importorskip("stable_baselines3")
 
 
-def test_a_run_writes_all_files_into_its_folder(run: TrainingResult) -> None:
+def test_a_run_writes_all_files_into_its_folder(run):
     names = {path.name for path in run.folder.iterdir()}
     assert names >= {"run.json", "episodes.csv", "checkpoint.zip", "model.zip", "evaluation.json"}
     assert [name for name in names if name.startswith(".")] == [".lock"]
@@ -41,7 +37,7 @@ def test_a_run_writes_all_files_into_its_folder(run: TrainingResult) -> None:
         assert "policy.pth" in archive.namelist()
 
 
-def test_the_record_and_the_report_describe_the_run(run: TrainingResult) -> None:
+def test_the_record_and_the_report_describe_the_run(run):
     record = RunRecord.read(run.folder)
     assert record == run.record
     assert record is not None
@@ -61,7 +57,7 @@ def test_the_record_and_the_report_describe_the_run(run: TrainingResult) -> None
     assert first.value == pytest.approx(np.mean([e.regret for e in run.episodes[:4]]), abs=1e-6)
 
 
-def test_logged_episodes_are_complete_and_their_regret_is_exact(run: TrainingResult) -> None:
+def test_logged_episodes_are_complete_and_their_regret_is_exact(run):
     rows = list(csv.DictReader(io.StringIO((run.folder / "episodes.csv").read_text())))
     assert [int(row["episode"]) for row in rows] == [1, 2, 3, 4, 5, 6, 7]
     assert [int(row["step"]) for row in rows] == [20, 40, 60, 80, 100, 120, 140]
@@ -76,19 +72,17 @@ def test_logged_episodes_are_complete_and_their_regret_is_exact(run: TrainingRes
     ]
 
 
-def test_the_same_seed_trains_the_same_model_and_another_one_does_not(
-    run: TrainingResult, tmp_path: Path
-) -> None:
+def test_the_same_seed_trains_the_same_model_and_another_one_does_not(run, tmp_path):
     same, other = short(tmp_path / "same"), short(tmp_path / "other", seed=1)
     assert [e.regret for e in same.episodes] == [e.regret for e in run.episodes]
     assert same.report.regions == run.report.regions
     assert [e.regret for e in other.episodes] != [e.regret for e in run.episodes]
 
 
-def test_a_run_with_limits_and_distractors_is_repeated_and_reports_both(tmp_path: Path) -> None:
+def test_a_run_with_limits_and_distractors_is_repeated_and_reports_both(tmp_path):
     observed = {"distractors": 3, "dynamics": "autonomous", "mixing": "orthogonal"}
     spec = TINY.derive(safety={"tightness": 0.2}, observation=observed)
-    changes: dict[str, Any] = {"hyperparameters": NARROW, "steps": 110, "protocol": PROTOCOL}
+    changes = {"hyperparameters": NARROW, "steps": 110, "protocol": PROTOCOL}
     one, two = (train(spec, folder=tmp_path / name, **changes) for name in ("one", "two"))
     assert [e.regret for e in one.episodes] == [e.regret for e in two.episodes]
     assert one.report.to_dict() == two.report.to_dict()
@@ -96,7 +90,7 @@ def test_a_run_with_limits_and_distractors_is_repeated_and_reports_both(tmp_path
     assert one.report.observation is not None
 
 
-def test_training_lowers_regret(tmp_path: Path) -> None:
+def test_training_lowers_regret(tmp_path):
     # TD3 on a task of one channel; the first 100 steps act at random.
     spec = SMESpec(state_dim=1, action_dim=1, horizon=25, seed=1)
     settings = {"policy_kwargs": {"net_arch": [64, 64]}, "learning_rate": 0.003}
@@ -107,7 +101,7 @@ def test_training_lowers_regret(tmp_path: Path) -> None:
     assert result.report.regions[0].similarity > reference.similarity
 
 
-def test_an_episode_that_ends_by_D_is_logged_as_terminated(tmp_path: Path) -> None:
+def test_an_episode_that_ends_by_D_is_logged_as_terminated(tmp_path):
     import torch
 
     before = torch.get_num_threads()
@@ -125,9 +119,7 @@ def test_an_episode_that_ends_by_D_is_logged_as_terminated(tmp_path: Path) -> No
     assert not list((tmp_path / "run").glob("*.png"))
 
 
-def test_on_policy_algorithms_announce_that_they_finish_their_rollout_over_all_lanes(
-    tmp_path: Path,
-) -> None:
+def test_on_policy_algorithms_announce_that_they_finish_their_rollout_over_all_lanes(tmp_path):
     shown = io.StringIO()
     result = short(
         tmp_path / "run", algorithm="a2c", steps=31, num_envs=3, progress=True,
@@ -140,7 +132,7 @@ def test_on_policy_algorithms_announce_that_they_finish_their_rollout_over_all_l
 
 
 @pytest.mark.parametrize("algorithm", ["PPO", "TD3"])
-def test_weights_that_are_not_finite_end_the_run(algorithm: str, tmp_path: Path) -> None:
+def test_weights_that_are_not_finite_end_the_run(algorithm, tmp_path):
     own = {"n_steps": 32, "batch_size": 32} if algorithm == "PPO" else {"learning_starts": 10}
     settings = {"learning_rate": 1e30, "policy_kwargs": {"net_arch": [8]}, **own}
     with pytest.raises(PolicyError, match=r"the weights are not finite any longer at step \d+\. "):
@@ -153,14 +145,14 @@ def test_weights_that_are_not_finite_end_the_run(algorithm: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize("algorithm", ["SAC", "DDPG"])  # PPO below
-def test_every_algorithm_trains(algorithm: str, tmp_path: Path) -> None:
+def test_every_algorithm_trains(algorithm, tmp_path):
     result = short(tmp_path, algorithm=algorithm, steps=120, num_envs=2, hyperparameters=NARROW)
     assert result.report.policy == algorithm
     assert result.record.steps_done >= 120
     assert result.report.regions[0].similarity > 0.4
 
 
-def test_several_environments_leave_an_algorithm_what_it_is(tmp_path: Path) -> None:
+def test_several_environments_leave_an_algorithm_what_it_is(tmp_path):
     """PPO's rollout is divided; TD3 still updates once for each step."""
     result = short(tmp_path / "ppo", algorithm="PPO", steps=2048, num_envs=8)
     assert result.report.policy == "PPO"
@@ -180,7 +172,7 @@ SETTINGS = {
 }
 
 
-def test_hyperparameters_reach_the_model_and_the_record(tmp_path: Path) -> None:
+def test_hyperparameters_reach_the_model_and_the_record(tmp_path):
     import sb3_contrib
 
     result = short(
@@ -199,7 +191,7 @@ def test_hyperparameters_reach_the_model_and_the_record(tmp_path: Path) -> None:
     assert model.policy.net_arch == [16]
 
 
-def test_a_function_that_returns_a_model_of_sb3_is_trained(tmp_path: Path) -> None:
+def test_a_function_that_returns_a_model_of_sb3_is_trained(tmp_path):
     result = short(
         tmp_path / "run",
         algorithm="tests.training.runs:narrow",
@@ -212,7 +204,7 @@ def test_a_function_that_returns_a_model_of_sb3_is_trained(tmp_path: Path) -> No
     assert not (tmp_path / "other").exists()
 
 
-def test_a_finished_run_is_replaced_only_with_force(run: TrainingResult, tmp_path: Path) -> None:
+def test_a_finished_run_is_replaced_only_with_force(run, tmp_path):
     folder = tmp_path / "run"
     copy_files(run.folder, folder)
     for resume in (False, True):
@@ -223,14 +215,12 @@ def test_a_finished_run_is_replaced_only_with_force(run: TrainingResult, tmp_pat
     assert len(replaced.episodes) == 1
 
 
-def test_a_folder_in_which_another_process_trains_is_refused(
-    run: TrainingResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_in_which_another_process_trains_is_refused(run, tmp_path, monkeypatch):
     folder = tmp_path / "run"
     copy_files(run.folder, folder)
     run.record.updated(status="running").write(folder)
     before = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
-    with file_lock(folder / ".lock"):  # type: ignore[union-attr]
+    with file_lock(folder / ".lock"):
         for change in ({"resume": True}, {"force": True}, {}):
             with pytest.raises(OptionError, match="another process is training in this folder"):
                 short(folder, **change)
@@ -238,13 +228,13 @@ def test_a_folder_in_which_another_process_trains_is_refused(
     assert short(folder, resume=True).record.sessions == 2
     # Two that begin at once do not mix.
     monkeypatch.setattr("sme_registry.training.run.is_locked", lambda path: False)
-    with file_lock(tmp_path / "new" / ".lock"):  # type: ignore[union-attr]
+    with file_lock(tmp_path / "new" / ".lock"):
         with pytest.raises(OptionError, match="another process is training in this folder"):
             short(tmp_path / "new")
         assert [path.name for path in (tmp_path / "new").iterdir()] == [".lock"]
 
 
-def test_a_folder_with_other_files_is_never_touched(tmp_path: Path) -> None:
+def test_a_folder_with_other_files_is_never_touched(tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
     for force in (False, True):
         with pytest.raises(OptionError, match=r"thesis\.tex"):
@@ -275,23 +265,19 @@ def test_a_folder_with_other_files_is_never_touched(tmp_path: Path) -> None:
         ({"protocol": {"states": 4}}, "states=4"),
     ],
 )
-def test_invalid_arguments_raise_typed_errors_and_create_no_folder(
-    change: dict[str, Any], message: str, tmp_path: Path
-) -> None:
+def test_invalid_arguments_raise_typed_errors_and_create_no_folder(change, message, tmp_path):
     with pytest.raises(SMEError, match=message):
         short(tmp_path / "run", **change)
     assert not (tmp_path / "run").exists()
 
 
-def test_missing_stable_baselines_names_the_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_stable_baselines_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     with pytest.raises(MissingDependencyError, match=r"\[train\]"):
         short(tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
-def test_importing_the_package_of_training_imports_no_torch() -> None:
+def test_importing_the_package_of_training_imports_no_torch():
     code = "import sys, sme_registry.training; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,17 +1,14 @@
 """Training a team: its settings, its log and its evaluation."""
 
-from __future__ import annotations
-
 import csv
 import io
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sme_registry import EvaluationReport, SMESpec, evaluate
-from sme_registry.training import RunRecord, TrainingResult, train
+from sme_registry.training import RunRecord, train
 from sme_registry.training.episodes import COLUMNS, read_episodes
 from tests.training.runs import PROTOCOL, copy_files
 
@@ -26,12 +23,12 @@ TEAM = SMESpec.from_dict(
 
 
 @pytest.fixture(scope="module")
-def team_run(tmp_path_factory: pytest.TempPathFactory) -> TrainingResult:
+def team_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("team") / "run"
     return train(TEAM, steps=1000, folder=folder, protocol=PROTOCOL, progress=False)
 
 
-def test_a_team_is_trained_by_ppo_and_the_record_has_its_settings(team_run: TrainingResult) -> None:
+def test_a_team_is_trained_by_ppo_and_the_record_has_its_settings(team_run):
     record = RunRecord.read(team_run.folder)
     assert record == team_run.record
     assert record is not None
@@ -48,7 +45,7 @@ def test_a_team_is_trained_by_ppo_and_the_record_has_its_settings(team_run: Trai
     assert model.num_timesteps == 2 * 1024
 
 
-def test_each_agent_of_a_team_has_a_column_of_its_exact_regret(team_run: TrainingResult) -> None:
+def test_each_agent_of_a_team_has_a_column_of_its_exact_regret(team_run):
     path = team_run.folder / "episodes.csv"
     rows = list(csv.DictReader(io.StringIO(path.read_text())))
     assert tuple(rows[0]) == (*COLUMNS, "regret/agent_0", "regret/agent_1")
@@ -69,7 +66,7 @@ def test_each_agent_of_a_team_has_a_column_of_its_exact_regret(team_run: Trainin
     ]
 
 
-def test_the_logged_regret_is_that_in_the_infos(tmp_path: Path) -> None:
+def test_the_logged_regret_is_that_in_the_infos(tmp_path):
     """The first episode, taken from the replay buffer and played again."""
     from sme_registry.sb3 import SMETeamVecEnv
 
@@ -89,7 +86,7 @@ def test_the_logged_regret_is_that_in_the_infos(tmp_path: Path) -> None:
     assert episode.agents_regret == pytest.approx(np.mean(regrets, axis=0))
 
 
-def test_a_team_is_evaluated_by_the_policy_its_agents_share(team_run: TrainingResult) -> None:
+def test_a_team_is_evaluated_by_the_policy_its_agents_share(team_run):
     report = EvaluationReport.read(team_run.folder / "evaluation.json")
     assert report == team_run.report
     assert list(report.agents) == ["agent_0", "agent_1"]
@@ -100,7 +97,7 @@ def test_a_team_is_evaluated_by_the_policy_its_agents_share(team_run: TrainingRe
     }  # fmt: skip
 
 
-def test_training_lowers_the_regret_of_each_agent(tmp_path: Path) -> None:
+def test_training_lowers_the_regret_of_each_agent(tmp_path):
     spec = SMESpec.from_dict(
         {"state_dim": 1, "action_dim": 2, "horizon": 25, "seed": 2,
          "team": {"agents": [{"action_dim": 1}, {"action_dim": 1}]}}
@@ -113,7 +110,7 @@ def test_training_lowers_the_regret_of_each_agent(tmp_path: Path) -> None:
     assert (regrets[-2:].mean(axis=0) < 0.7 * regrets[:2].mean(axis=0)).all()
 
 
-def test_a_teams_run_resumes_with_its_columns(team_run: TrainingResult, tmp_path: Path) -> None:
+def test_a_teams_run_resumes_with_its_columns(team_run, tmp_path):
     folder = tmp_path / "run"
     copy_files(team_run.folder, folder)
     team_run.record.updated(status="running").write(folder)

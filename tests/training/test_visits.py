@@ -1,7 +1,5 @@
 """When a policy is the one at the end of a visit."""
 
-from __future__ import annotations
-
 import pytest
 
 from sme_registry import SMESpec, StreamSpec
@@ -24,11 +22,9 @@ STREAM = StreamSpec(
         (0, 14, [(0, 6), (1, 11)]),
     ],
 )
-def test_visits_end_at_the_next_step_and_the_last_one_with_the_training(
-    first: int, steps: int, called: list[tuple[int, int | str]]
-) -> None:
-    ended: list[tuple[int, int | str]] = []
-    now: int | str = first
+def test_visits_end_at_the_next_step_and_the_last_one_with_the_training(first, steps, called):
+    ended = []
+    now = first
     visits = VisitEnds(STREAM, lambda visit: ended.append((visit, now)), first)
     for now in range(first + 1, steps + 1):
         visits.after_step(int(now))
