@@ -14,7 +14,7 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, MAX_BYTES, Submission, Training
 from leaderboard.errors import Rejection
 from sme_registry import SMESpec, save
-from sme_registry.errors import OptionError, PolicyError, SMEError, SpecError
+from sme_registry.errors import OptionError, SMEError, SpecError
 from sme_registry.spec import StudyFile, StudyPlan, Suite, SuiteFile
 from sme_registry.studies import CellResult, run_study
 from sme_registry.studies.engine.result import CellFailure
@@ -159,19 +159,9 @@ def replaced_by_link(path, target):
     path.symlink_to(target)
 
 
-def replaced_by_folder(path, target):
-    path.unlink()
-    path.mkdir()
-
-
 def replaced_by_pipe(path, target):
     path.unlink()
     os.mkfifo(path)
-
-
-def replaced_by_nowhere(path, target):
-    path.unlink()
-    path.symlink_to(target / "absent")
 
 
 @pytest.mark.parametrize("has_dir_fd", [True, False])
@@ -179,7 +169,7 @@ def test_only_regular_files_are_read(tmp_path, whole, monkeypatch, has_dir_fd):
     if not has_dir_fd:  # the calls that Windows lacks
         monkeypatch.setattr(os, "supports_dir_fd", set())
     match = "must be a regular file inside the bundle"
-    for replace in (replaced_by_link, replaced_by_folder, replaced_by_pipe, replaced_by_nowhere):
+    for replace in (replaced_by_link, replaced_by_pipe):
         home = tmp_path / replace.__name__
         bundle = Bundle.read(shutil.copytree(whole.folder, home / "bundle"))
         assert bundle.signed == whole.signed
@@ -193,18 +183,6 @@ def test_only_regular_files_are_read(tmp_path, whole, monkeypatch, has_dir_fd):
 
 
 # --- making ------------------------------------------------------------------------------------
-
-
-def test_progress_counts_the_runs_and_more_may_have_been_started(tmp_path, table):
-    seen = []
-    bundle = made(
-        tmp_path / "bundle",
-        table,
-        runs_started={"B": 7},
-        progress=lambda *counts: seen.append(counts),
-    )
-    assert seen == [(1, 3), (2, 3), (3, 3)]
-    assert bundle.signed.submission.runs_started == {"A": 2, "B": 7}
 
 
 def test_specs_of_a_table_may_be_ids_digests_or_paths(tmp_path, table):
@@ -303,18 +281,6 @@ def nothing_is_left(tmp_path, error, match, *runs, **kwargs):
     assert not home.exists() or list(home.iterdir()) == []
 
 
-def test_runs_on_other_specs_are_named(tmp_path, table):
-    rows = [{**row(A0, None, seed), "spec": "SME/Default-v1"} for seed in range(7)]
-    name = SMESpec().content_name
-    nothing_is_left(
-        tmp_path,
-        Rejection,
-        rf"unknown_spec: .*runs.json, run 0 \({name}\).* and 2 more: .* 3 instances "
-        r"of two-v1 \(`sme show two`\)",
-        rewritten(table, rows),
-    )
-
-
 @pytest.mark.parametrize(
     ("rows", "error", "match"),
     [
@@ -325,16 +291,14 @@ def test_runs_on_other_specs_are_named(tmp_path, table):
             "duplicate_run: .*same spec and policy",
         ),
         ([row(A0, "a0.onnx")], Rejection, "missing_run: runs: none on"),
-        ([], SpecError, "runs"),
+        ([row(SMESpec(), None)], Rejection, r"unknown_spec: .*run 0 .*two-v1 \(`sme show two`\)"),
         ({"spec": 1}, SpecError, "must be a list of runs"),
         ([{"spec": A0.digest, "policy": None, "steps": 1}], SpecError, "run 0: seed: missing"),
         ([{**row(A0, None), "step": 1}], SpecError, "step=1: unknown field. Did you mean 'steps'"),
         ([row(A0, None, seed=-1)], SpecError, "seed=-1"),
         ([{**row(A0, None), "spec": "SME/Defalt-v1"}], SpecError, "run 0: .*Did you mean"),
-        ([{**row(A0, None), "spec": "absent.json"}], SpecError, "run 0: .*absent.json"),
         ([row(A0, "a0.pt")], SpecError, "policy='a0.pt': must be the path of an .onnx"),
         ([row(A0, "absent.onnx"), row(A1, None), row(B0, None)], OptionError, "cannot be read"),
-        ([row(A0, "absent.zip"), row(A1, None), row(B0, None)], PolicyError, "does not exist"),
         (
             [row(A0, None), row(A1, None), row(B0, "a0.onnx")],
             Rejection,
@@ -346,15 +310,12 @@ def test_a_table_that_is_wrong_is_refused(tmp_path, table, rows, error, match):
     nothing_is_left(tmp_path, error, match, rewritten(table, rows))
 
 
-def test_a_policy_above_the_limit_is_refused(tmp_path, table):
+def test_a_policy_above_the_limit_and_a_path_that_is_no_run_are_refused(tmp_path, table):
     with (table.parent / "a1.onnx").open("r+b") as stream:
         stream.truncate(2**40)
     nothing_is_left(tmp_path, Rejection, "too_large: .*runs.json, run 1", table)
-
-
-def test_a_path_that_is_no_run_is_refused(tmp_path):
     (tmp_path / "empty").mkdir()
-    for path in ("absent", "absent.json", "empty"):
+    for path in ("absent.json", "empty"):
         nothing_is_left(tmp_path, OptionError, f"runs='.*{path}': must be", tmp_path / path)
 
 
@@ -362,10 +323,7 @@ def test_a_path_that_is_no_run_is_refused(tmp_path):
     ("fields", "error", "match"),
     [
         ({"method": "<b>"}, Rejection, "unsafe_name: method.name"),
-        ({"submitter": ""}, SpecError, "submitter.name=''"),
         ({"code": "http://plain.org"}, SpecError, "code='http://plain.org': must be an https:"),
-        ({"code": 3}, SpecError, "code=3: must be an https:// link"),
-        ({"code": "https://a b"}, SpecError, "code='https://a b': must be an https:// link"),
         ({"code": "https://" + "a" * 293}, SpecError, "code='https://a+…: must be .* at most 300"),
         ({"runs_started": {"C": 1}}, Rejection, "missing_run: runs_started.C"),
         ({"runs_started": {"A": 1}}, Rejection, "missing_run: runs_started.A=1"),
@@ -417,11 +375,18 @@ def test_what_is_no_bundle_is_never_replaced(tmp_path, table, bundle):
         made(file / "bundle", table)
 
 
-def test_the_constant_policy_may_stand_for_two_instances_of_one_width(tmp_path, table):
+def test_one_policy_may_stand_for_two_instances_and_more_runs_may_have_started(tmp_path, table):
     (table.parent / "half.onnx").write_bytes(constant_onnx(A0))
     rows = [row(A0, "half.onnx"), row(A1, "half.onnx"), row(B0, None)]
-    bundle = made(tmp_path / "bundle", rewritten(table, rows))
+    seen = []
+    bundle = made(
+        *(tmp_path / "bundle", rewritten(table, rows)),
+        runs_started={"B": 7},
+        progress=lambda *counts: seen.append(counts),
+    )
     assert len(list((bundle.folder / "artefacts").iterdir())) == 1
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+    assert bundle.signed.submission.runs_started == {"A": 2, "B": 7}
 
 
 @pytest.fixture(scope="module")

@@ -140,8 +140,7 @@ def test_a_key_submits_its_artefact_again_without_another_upload(store, key):
 def test_a_name_belongs_to_the_first_key_that_uses_it(store, key):
     put_submission(store, key, 1, submitter={"name": "A Lab", "key": key.public})
     assert store.holder_of_name("a lab") == key.public  # while it waits
-    names = ["A Lab", "a lab", "A.Lab", "A-L-A-B", "A 1ab", "A Iab", "4 La8"]
-    for number, name in enumerate(names, 2):
+    for number, name in enumerate(["A Lab", "a lab"], 2):
         other = SigningKey.generate()
         imitation = uploaded(store, other, 2, submitter={"name": name, "key": other.public})
         assert code_of(lambda signed=imitation: receive(store, signed)) == "name_taken"
@@ -152,7 +151,6 @@ def test_a_name_belongs_to_the_first_key_that_uses_it(store, key):
 def test_policies_that_are_rejected_occupy_no_name(store, key):
     put_submission(store, key, 1, submitter={"name": "A Lab", "key": key.public})
     claim = store.queue.claim("worker")
-    assert claim is not None
     board = store.document
     rejected = Result(
         submission=claim.id,
@@ -209,27 +207,14 @@ def test_what_strangers_can_send_again_counts_for_nobody_and_a_refusal_for_good_
         assert code_of(lambda: intake.receive(store, last, refusals)) == "quota"
 
 
-def test_an_artefact_is_inspected_once_for_its_widths(store, key, monkeypatch):
-    seen = []
-    real = admission.inspect
-    monkeypatch.setattr(admission, "inspect", lambda *each: (seen.append(1), real(*each)))
-    for statement in ("one", "two"):
-        signed = uploaded(store, key, 987, statement=statement)
-        assert receive(store, signed) == signed.id
-    for widths in ({"observation_dim": 5}, {"action_dim": 2}):
-        broken = with_artefact(store, key, linear_onnx(986, **widths))
-        for _ in range(2):
-            assert code_of(partial(receive, store, broken)) == "onnx_interface"
-    assert len(seen) == 3
-    assert len(store.entries()) == 2
-
-
-def test_an_artefact_of_another_size_is_refused_and_a_failed_run_needs_none(store, key):
+def test_an_artefact_of_another_size_or_width_is_refused_and_a_failed_run_needs_none(store, key):
     plain = uploaded(store, key).submission.to_dict()
     (run,) = plain["runs"]
     other = {**run, "artefact": {**run["artefact"], "size": run["artefact"]["size"] - 1}}
     small = resigned(store, key, {**plain, "runs": [other]})
     assert code_of(lambda: receive(store, small)) == "artefact_digest"
+    wide = with_artefact(store, key, linear_onnx(986, observation_dim=5))
+    assert code_of(lambda: receive(store, wide)) == "onnx_interface"
     assert store.entries() == []
     runs = [run, {**run, "seed": 9, "artefact": None}]
     failed = resigned(store, key, {**plain, "runs": runs, "runs_started": {"Tiny": 2}})
@@ -270,7 +255,6 @@ def test_a_full_queue_accepts_only_references_and_faults_make_room_in_it(tmp_pat
         signed = uploaded(store, key, 2)
         assert code_of(lambda: receive(store, signed)) == "quota"
         claim = store.queue.claim("worker")
-        assert claim is not None
         store.queue.fault(claim, "no memory")
         assert receive(store, signed) == signed.id
         assert (store.queue.waiting(), store.queue.queued()) == (2, 1)
@@ -368,7 +352,6 @@ def test_a_withdrawal_is_final(store, key):
     assert store.withdraw(withdrawal)
     assert not store.withdraw(withdrawal)
     entry = store.entry(signed.id)
-    assert entry is not None
     assert entry.status == "withdrawn"
     assert code_of(lambda: receive(store, signed)) == "withdrawn"
 
@@ -392,14 +375,6 @@ def test_only_the_submitter_withdraws_for_this_board_and_in_plain_text(store, ke
         assert code_of(partial(store.withdraw, withdrawal)) == code
     assert store.withdrawal(signed.id) is None
     store.withdraw(signed_withdrawal(store, signed.id, key, "ein Käfer <b>,\nzweite Zeile"))
-
-
-def test_a_withdrawal_is_read_back(key):
-    withdrawal = SignedWithdrawal.create("sha256:" + "0" * 64, key, "a bug")
-    assert SignedWithdrawal.read(withdrawal.model_dump_json().encode()) == withdrawal
-    assert code_of(lambda: SignedWithdrawal.read(b"{")) == "not_json"
-    assert code_of(lambda: SignedWithdrawal.read(b"[]")) == "schema"
-    assert code_of(lambda: SignedWithdrawal.read(b" " * 10**6)) == "too_large"
 
 
 # Uploads.
@@ -468,54 +443,42 @@ def test_documents_count_like_artefacts(store, key):
     assert store.total_bytes() == used
 
 
+# Room on a full board.
+
+
 def test_a_full_board_accepts_no_submission(tmp_path, key):
     limits = {"total_bytes": 2000, "artefact_bytes": 2000}
     with tiny_board(tmp_path / "b", limits=limits) as store:
-        signed, artefacts = tiny_submission(store, key, statement="x" * 1500)
-        put(store, key, artefacts)
+        signed = uploaded(store, key, statement="x" * 1500)
         assert code_of(lambda: receive(store, signed)) == "quota"
         assert store.entries() == []
 
 
-# Room on a full board.
+def test_old_uploads_without_a_submission_make_room(tmp_path):
+    limits = {"total_bytes": 1000, "artefact_bytes": 900}
+    with tiny_board(tmp_path / "full", limits=limits) as store:
+        for number in (b"1", b"2", b"3"):
+            put(store, SigningKey.generate(), {sha256_of(number * 300): number * 300})
 
-
-@pytest.fixture
-def full(tmp_path):
-    """A board of 1,000 bytes, and how to fill it with old uploads."""
-    with tiny_board(tmp_path / "full", limits={"total_bytes": 1000, "artefact_bytes": 900}) as made:
-
-        def upload(key, data, minutes):
-            digest = sha256_of(data)
-            made.put_object(digest, [data], by=key)
-            time = utc(datetime.datetime.now(datetime.UTC) - datetime.timedelta(minutes=minutes))
-            with made.transaction() as index:
+        def date(number, minutes):
+            time = utc(after(minutes=-minutes))
+            digest = sha256_of(number * 300)
+            with store.transaction() as index:
                 index.connection.execute(
-                    "UPDATE upload SET time = ? WHERE digest = ? AND key = ?", (time, digest, key)
+                    "UPDATE upload SET time = ? WHERE digest = ?", (time, digest)
                 )
-            return digest
 
-        yield made, upload
+        def left():
+            return {store.objects.read(digest)[:1] for digest, _ in store.objects.paths()}
 
-
-A, B, C, ME = ("a" * 64, "b" * 64, "c" * 64, "d" * 64)
-
-
-def left(store):
-    return {store.objects.read(digest)[:1] for digest, _ in store.objects.paths()}
-
-
-def test_old_uploads_without_a_submission_make_room(full):
-    store, upload = full
-    upload(A, b"1" * 300, 30)
-    upload(B, b"2" * 300, 40)
-    upload(C, b"3" * 300, 20)
-    intake.check_upload(store, ME, 100)
-    assert left(store) == {b"1", b"2", b"3"}  # it fits without
-    intake.check_upload(store, ME, 150)
-    assert left(store) == {b"1", b"3"}
-    intake.check_upload(store, ME, 900)
-    assert (left(store), store.total_bytes()) == (set(), 0)
-    upload(A, b"1" * 600, -60 * 24 * 365)  # dated in the future, by a clock that was wrong
-    intake.check_upload(store, ME, 500)
-    assert left(store) == set()
+        other = SigningKey.generate().public
+        assert code_of(lambda: intake.check_upload(store, other, 150)) == "quota"  # they are young
+        date(b"1", 30)
+        date(b"2", 40)
+        intake.check_upload(store, other, 100)
+        assert left() == {b"1", b"2", b"3"}  # it fits without
+        intake.check_upload(store, other, 150)
+        assert left() == {b"1", b"3"}
+        date(b"3", -60 * 24 * 365)  # in the future, by a clock that was wrong
+        intake.check_upload(store, other, 900)
+        assert (left(), store.total_bytes()) == (set(), 0)

@@ -93,7 +93,6 @@ def test_a_board_of_teams_scores_a_shared_policy_and_each_agent(board, tmp_path)
         assert rescore(store, id) == []
         result = store.result(id)
         write_site(store, tmp_path / "site")
-    assert result is not None
     team, failed, alone = result.runs
     assert [agent.name for agent in team.agents] == ["scout_0", "driver_0"]
     # ρ of the team is the mean over channels, so its N lies between those of its agents.

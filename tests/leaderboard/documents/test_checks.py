@@ -3,22 +3,23 @@
 import datetime
 
 import pytest
+from typer.testing import CliRunner
 
+from leaderboard.cli.app import app
+from leaderboard.cli.options import find_suite
 from leaderboard.documents.board import BoardDocument, Limits
 from leaderboard.documents.checks import (
     check_names,
-    check_runs,
     check_submission,
     most_runs,
     refuse_unsubmittable,
 )
 from leaderboard.documents.submission import MAX_BYTES, SignedSubmission, Submission
 from leaderboard.errors import BoardError, Rejection
-from leaderboard.intake import submit_references
 from leaderboard.store import Store
 from sme_registry import EvaluationProtocol
+from sme_registry.errors import SpecError
 from sme_registry.spec import Suite, SuiteFile, catalogue
-from tests.leaderboard.conftest import tiny_board
 
 SETTING = {"state_dim": 2, "action_dim": 1}
 SUITE = Suite.from_dict(
@@ -50,7 +51,7 @@ def run(spec, seed=0, artefact=None):
     return {"spec": spec, "seed": seed, "steps": 10, "artefact": artefact}
 
 
-RUNS = [run(A0, 0, policy(1)), run(A1, 0, policy(2)), run(B0, 0, policy(3))]
+RUNS = [run(A0, 0, policy(1)), run(A1, 0, policy(2)), run(B0, 0, policy(3, size=1000))]
 
 
 def submission(**changes):
@@ -84,23 +85,13 @@ def accepted(**changes):
 NAMES = ("method__name", "method__version", "method__family", "submitter__name")
 UNSAFE_NAMES = [
     "<script>alert(1)</script>",
-    "=1+1",
-    "@SUM(A1)",
-    "-2+3",
     "+1",
     " PPO",
-    "PPO ",
-    "P  O",
-    "PPO\n",
     "P\tO",
-    "PPO\x00",
     "PPO\u202eOPP",
     "P\u200bPO",
     "РРО",  # Cyrillic
-    "a&b",
     "a\\b",
-    "a/b",
-    "{{7*7}}",
 ]
 
 
@@ -135,20 +126,6 @@ def test_what_the_boards_own_rows_are_called_is_the_boards_alone(field, names):
             check_names(submission(**{field: name}))
         accepted(**{field: name, "submitter__key": BOARD.key})
         accepted(**{field: f"{name} 2"})
-
-
-def test_a_reference_row_signed_by_another_key_is_refused(tmp_path):
-    with tiny_board(tmp_path / "board") as store:
-        for id in submit_references(store):
-            own = store.submission(id).submission
-            check_submission(store.document, own, datetime.datetime.now(datetime.UTC))
-            for field in ("submitter.name", "method.family"):
-                plain = own.to_dict()
-                plain["submitter"]["key"] = "cd" * 32
-                if field == "method.family":
-                    plain["submitter"]["name"] = "A Lab"
-                with pytest.raises(Rejection, match=f"^unsafe_name: {field}"):
-                    check_names(Submission.from_dict(plain), store.document.key)
 
 
 TEXTS = ("training__library", "training__hyperparameters", "training__hardware", "statement")
@@ -190,16 +167,6 @@ def test_a_time_far_from_the_boards_is_refused():
         refused(code, match, created=created)
 
 
-def test_a_run_on_another_spec_is_refused():
-    unknown = "sha256:" + "1" * 64
-    refused(
-        "unknown_spec",
-        f"runs.3.spec={unknown}: must be the digest of one of the suite's 3 instances "
-        r"\(`sme show two-v1`\)",
-        runs=[*RUNS, run(unknown)],
-    )
-
-
 def test_a_run_or_a_policy_that_is_listed_twice_on_one_spec_is_refused():
     for twice, match in [
         (run(A1, 0, policy(9)), "runs.3: seed=0: runs.1 has the same"),
@@ -208,10 +175,6 @@ def test_a_run_or_a_policy_that_is_listed_twice_on_one_spec_is_refused():
         refused("duplicate_run", match, runs=[*RUNS, twice])
     runs = [run(A0, 0, policy(1)), run(A1, 0, policy(1)), run(B0, 0), run(B0, 1)]
     accepted(runs=runs, runs_started={"A": 2, "B": 2})
-
-
-def test_an_instance_without_a_run_is_refused():
-    refused("missing_run", f"none on {A1} of class A", runs=[RUNS[0], RUNS[2]])
 
 
 def test_runs_started_count_all_runs_and_are_at_most_a_thousand():
@@ -231,20 +194,9 @@ def test_runs_started_count_all_runs_and_are_at_most_a_thousand():
     accepted(runs_started={"A": 900, "B": 100})
 
 
-def test_runs_without_any_policy_are_refused_by_new_rules_only():
+def test_runs_without_any_policy_are_refused():
     runs = [run(A0), run(A1), run(B0)]
     refused("missing_run", "none has a policy", runs=runs)
-    many = submission(runs=runs, runs_started={"A": 9_000, "B": 1_000})
-    check_runs(BOARD.suite, many, rules=1)
-
-
-def test_an_artefact_above_the_boards_limit_is_refused():
-    accepted(runs=[*RUNS[:2], run(B0, 0, policy(3, size=1000))])
-    refused(
-        "too_large",
-        "runs.2.artefact.size=1,001: must be at most 1,000 bytes",
-        runs=[*RUNS[:2], run(B0, 0, policy(3, size=1001))],
-    )
 
 
 def board_of(instances, **fields):
@@ -290,23 +242,50 @@ def test_a_board_whose_suite_exceeds_a_submission_is_refused(tmp_path):
 
 
 FAULTS = [
-    ("unsafe_name", {"method__name": "<b>"}),
-    ("unknown_suite", {"suite": {"name": "x", "digest": "sha256:" + "0" * 64}}),
-    ("stale_time", {"created": "2020-01-01T00:00:00Z"}),
-    ("unknown_spec", [run("sha256:" + "1" * 64)]),
-    ("duplicate_run", [run(A0, 5), run(A0, 5)]),
-    ("missing_run", {"runs_started": {"A": 100}}),
-    ("too_large", [run(A0, 6, policy(8, size=1001))]),
+    ("unsafe_name", {"method__name": "<b>"}, "method.name"),
+    ("unknown_suite", {"suite": {"name": "x", "digest": "sha256:" + "0" * 64}}, "suite=x"),
+    ("stale_time", {"created": "2020-01-01T00:00:00Z"}, "14 days"),
+    ("unknown_spec", [run("sha256:" + "1" * 64)], r"runs.3.spec=.*3 instances \(`sme show two"),
+    ("duplicate_run", [run(A0, 5), run(A0, 5)], "seed=5"),
+    ("missing_run", {"runs_started": {"A": 100}}, "runs_started.B=None"),
+    ("too_large", [run(A0, 6, policy(8, size=1001))], "size=1,001"),
 ]
 
 
 @pytest.mark.parametrize("first", range(len(FAULTS)))
 def test_the_first_of_several_faults_is_reported(first):
     changes, runs = {}, list(RUNS)
-    for _, fault in FAULTS[first:]:
+    for _, fault, _ in FAULTS[first:]:
         if isinstance(fault, dict):
             changes.update(fault)
         else:
             runs += fault
     changes.setdefault("runs_started", {"A": 100, "B": 1})
-    refused(FAULTS[first][0], ".", runs=runs, **changes)
+    code, _, match = FAULTS[first]
+    refused(code, match, runs=runs, **changes)
+
+
+# Suites that no board scores
+
+LIMITED = {"safety": {"tightness": 0.2}}
+MIXED = {"observation": {"mixing": "orthogonal"}}
+
+
+@pytest.mark.parametrize("setting", [LIMITED, MIXED], ids=["safety", "observation"])
+def test_boards_refuse_classes_with_safety_or_observation(setting):
+    classes = [{"name": "Plain", "setting": {}, "seeds": [0]}]
+    classes.append({"name": "Other", "setting": setting, "seeds": [0]})
+    fields = {"title": "x", "suite_name": "x-v1", "protocol_name": "quick-v1", "protocol": {}}
+    fields["key"] = "ab" * 32
+    BoardDocument.from_dict({**fields, "suite": Suite.from_dict({"classes": classes[:1]})})
+    with pytest.raises(SpecError, match=r"suite: has classes .* \(Other\), and a leaderboard"):
+        BoardDocument.from_dict({**fields, "suite": Suite.from_dict({"classes": classes})})
+
+
+@pytest.mark.parametrize("name", ["safety", "representation"])
+def test_commands_refuse_the_suites_of_the_catalogue_that_boards_do_not_score(name, tmp_path):
+    with pytest.raises(SpecError, match="safety or observation"):
+        find_suite(name)
+    result = CliRunner().invoke(app, ["init", f"{tmp_path}/board", "--suite", name])
+    assert result.exit_code == 2, result.output
+    assert "Choose a suite without them" in " ".join(result.stderr.split())

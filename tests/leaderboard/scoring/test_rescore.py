@@ -8,7 +8,7 @@ from leaderboard.documents.board import Folder
 from leaderboard.documents.result import Result
 from leaderboard.errors import TamperedError
 from leaderboard.scoring.metrics import levels_of, run_metrics
-from leaderboard.scoring.rescore import RescoreNote, _other_verdict, draw, rescore
+from leaderboard.scoring.rescore import RescoreNote, draw, rescore
 from leaderboard.scoring.score import evaluation_seed
 from leaderboard.scoring.verify import verify
 from leaderboard.store import Store
@@ -119,12 +119,3 @@ def test_scores_of_a_policy_that_is_rejected_are_found(board):
     forged = scored.model_copy(update={"submission": refused.submission})
     with pytest.raises(TamperedError, match="it is onnx_interface, not scored"):
         again(board, with_runs(board, forged, [copy]))
-
-
-@pytest.mark.parametrize("code", ["run_failed", "onnx_refused"])
-def test_a_policy_that_fails_here_was_not_scored_by_the_same_versions(board, code):
-    scored = result_on(board, STEADY)
-    here = rejected(scored, code)
-    assert _other_verdict(scored, here, other_versions=True).here == code
-    with pytest.raises(TamperedError, match=f"it is {code}, not scored"):
-        _other_verdict(scored, here, other_versions=False)

@@ -13,8 +13,10 @@ from leaderboard.scoring.sealed import (
     score_run,
     sealed_result,
 )
+from leaderboard.scoring.tables import EASY, table_regret
 from sme_registry import evaluate
 from sme_registry.sealed import pack_table
+from sme_registry.spec import Setting
 from tests.leaderboard.sealing import MASTER, tiny_season
 
 SEASON = tiny_season("sealed-online")
@@ -86,3 +88,20 @@ def test_a_result_averages_instances_and_an_unanswered_one_scores_1():
     low, high = result.scores.wd_regret.ends
     assert low < result.scores.wd_regret.value < high
     assert [member.runs for member in result.classes] == [2]
+
+
+# A table of the nearest states
+
+
+def setting(state_dim):
+    return Setting(state_dim=state_dim, action_dim=1, complexity=5, hidden_width=16)
+
+
+def test_few_state_channels_are_filled_by_a_table_and_many_are_not():
+    one, eight = table_regret(setting(1), 1000), table_regret(setting(8), 1000)
+    assert one < 0.01 < EASY < 0.2 < eight < 0.6
+
+
+def test_more_rows_make_a_better_table_and_one_row_is_enough():
+    one, hundred, thousands = (table_regret(setting(2), rows) for rows in (1, 100, 3000))
+    assert thousands < hundred < one < 2

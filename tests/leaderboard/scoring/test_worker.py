@@ -302,20 +302,6 @@ def assert_ended(pids):
             os.kill(pid, 0)
 
 
-def test_an_interrupt_stops_processes_that_are_still_starting(store, board, capfd):
-    pids = []
-
-    def interrupt(done, total):
-        if len(pids) == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run_scorers(board, 2, started=pids.append, progress=interrupt)
-    assert_ended(pids)
-    assert "Traceback" not in capfd.readouterr().err
-    assert store.queue.claimable() == store.queue.waiting() == 3
-
-
 SCRIPT = """
 import sys
 from leaderboard.scoring.worker import run_scorers
