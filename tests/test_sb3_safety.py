@@ -1,10 +1,7 @@
 """PPO with a multiplier and PPO with projected actions, on tasks with limits."""
 
-from __future__ import annotations
-
 import io
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,30 +31,30 @@ PROTOCOL = {"states_per_region": 50}
 ALGORITHMS = ["PPOLagrangian", "PPOProjection"]
 
 
-def lanes(count: int = 1, spec: SMESpec = SPEC, action_range: Any = "symmetric") -> SMEVecEnv:
+def lanes(count=1, spec=SPEC, action_range="symmetric"):
     return SMEVecEnv(spec, count, action_range=action_range)
 
 
-def observations(count: int = 500) -> Any:
+def observations(count=500):
     return np.random.default_rng(0).random((count, SPEC.observation_dim), dtype=np.float32)
 
 
-def same_weights(one: Any, other: Any) -> bool:
+def same_weights(one, other):
     pairs = zip(one.state_dict().values(), other.state_dict().values(), strict=True)
     return all(torch.equal(a, b) for a, b in pairs)
 
 
-def noting(costs: list[float]) -> Any:
+def noting(costs):
     """A callback that collects the cost of each step."""
 
-    def note(local: Any, _: Any) -> bool:
+    def note(local, _):
         costs.extend(info["cost"] for info in local["infos"])
         return True
 
     return note
 
 
-def reloaded(model: Any, env: Any = None) -> Any:
+def reloaded(model, env=None):
     archive = io.BytesIO()
     model.save(archive)
     archive.seek(0)
@@ -65,7 +62,7 @@ def reloaded(model: Any, env: Any = None) -> Any:
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_without_a_multiplier_it_is_ppo_bit_for_bit(count: int) -> None:
+def test_without_a_multiplier_it_is_ppo_bit_for_bit(count):
     plain = PPO("MlpPolicy", lanes(count), **SMALL).learn(200)
     fixed = PPOLagrangian("MlpPolicy", lanes(count), multiplier_learning_rate=0.0, **SMALL)
     assert same_weights(plain.policy, fixed.learn(200).policy)
@@ -76,7 +73,7 @@ def test_without_a_multiplier_it_is_ppo_bit_for_bit(count: int) -> None:
     assert weighted.multiplier == 1.0
 
 
-def test_the_multiplier_follows_the_mean_cost_of_the_rollout_down_to_0() -> None:
+def test_the_multiplier_follows_the_mean_cost_of_the_rollout_down_to_0():
     costs: list[float] = []
     settings = SMALL | {"cost_limit": 0.02, "multiplier_learning_rate": 3.0}
     model = PPOLagrangian("MlpPolicy", lanes(2), **settings)
@@ -94,7 +91,7 @@ def test_the_multiplier_follows_the_mean_cost_of_the_rollout_down_to_0() -> None
     assert model.multiplier == 0.0
 
 
-def test_a_multiplier_lowers_the_cost_and_the_critic_of_costs_learns() -> None:
+def test_a_multiplier_lowers_the_cost_and_the_critic_of_costs_learns():
     model = PPOLagrangian(
         "MlpPolicy",
         lanes(),
@@ -118,7 +115,7 @@ def test_a_multiplier_lowers_the_cost_and_the_critic_of_costs_learns() -> None:
     assert torch.equal(untrained["action_net.weight"], learned["action_net.weight"])
 
 
-def test_a_saved_model_keeps_its_multiplier_and_critic_but_not_its_last_rollout() -> None:
+def test_a_saved_model_keeps_its_multiplier_and_critic_but_not_its_last_rollout():
     model = PPOLagrangian("MlpPolicy", lanes(), cost_limit=0.0, **SMALL).learn(200)
     assert {"_costs", "_cut"} <= set(vars(model))
     again = reloaded(model, lanes())
@@ -131,7 +128,7 @@ def test_a_saved_model_keeps_its_multiplier_and_critic_but_not_its_last_rollout(
 
 
 @pytest.mark.parametrize("action_range", ["unit", "symmetric"])
-def test_projected_actions_never_cost_anything(action_range: Any) -> None:
+def test_projected_actions_never_cost_anything(action_range):
     env = lanes(2, action_range=action_range)
     costs: list[float] = []
 
@@ -154,7 +151,7 @@ def test_projected_actions_never_cost_anything(action_range: Any) -> None:
     assert np.array_equal(policy.act(seen), actions)
 
 
-def test_projected_actions_need_observations_that_show_the_state() -> None:
+def test_projected_actions_need_observations_that_show_the_state():
     for wrapper in (VecNormalize, lambda venv: VecFrameStack(venv, 2)):
         with pytest.raises(OptionError, match=r"must be those of the environment itself, Box\(0\."):
             PPOProjection("MlpPolicy", wrapper(lanes()))
@@ -168,7 +165,7 @@ def test_projected_actions_need_observations_that_show_the_state() -> None:
         PPOProjection("MlpPolicy", env, **SMALL).learn(64)
 
 
-def test_a_projection_goes_on_in_its_own_task_only_and_is_not_exported(tmp_path: Path) -> None:
+def test_a_projection_goes_on_in_its_own_task_only_and_is_not_exported(tmp_path):
     model = PPOProjection("MlpPolicy", lanes(), **SMALL)
     model.set_env(lanes())
     tighter = SPEC.derive(safety={"tightness": 0.4})
@@ -180,7 +177,7 @@ def test_a_projection_goes_on_in_its_own_task_only_and_is_not_exported(tmp_path:
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_a_task_without_limits_is_refused(algorithm: str, tmp_path: Path) -> None:
+def test_a_task_without_limits_is_refused(algorithm, tmp_path):
     plain = SPEC.derive(safety=None)
     with pytest.raises(OptionError, match=f"^{algorithm}: needs a task with limits"):
         {"PPOLagrangian": PPOLagrangian, "PPOProjection": PPOProjection}[algorithm](
@@ -194,7 +191,7 @@ def test_a_task_without_limits_is_refused(algorithm: str, tmp_path: Path) -> Non
         check_task(cell(algorithm, spec=plain))
 
 
-def test_hyperparameters_are_known_by_name_and_in_their_range() -> None:
+def test_hyperparameters_are_known_by_name_and_in_their_range():
     for name, value, allowed in (
         ("cost_limit", 1.5, r"in \[0, 1\]"),
         ("cost_limit", "0.1", r"in \[0, 1\]"),
@@ -210,7 +207,7 @@ def test_hyperparameters_are_known_by_name_and_in_their_range() -> None:
         check_hyperparameters("PPOProjection", {"policy_kwargs": {"limits": 1}})
 
 
-def cell(uses: str, spec: SMESpec = SPEC) -> Cell:
+def cell(uses, spec=SPEC):
     return Cell(
         spec=spec,
         uses=uses,
@@ -224,7 +221,7 @@ def cell(uses: str, spec: SMESpec = SPEC) -> Cell:
     )
 
 
-def test_studies_train_both_and_record_the_online_cost() -> None:
+def test_studies_train_both_and_record_the_online_cost():
     costs = {}
     for uses in ALGORITHMS:
         result = run_cell(cell(uses))
@@ -236,7 +233,7 @@ def test_studies_train_both_and_record_the_online_cost() -> None:
     assert "online_cost" not in plain.to_dict()
 
 
-def test_an_action_at_a_tight_limit_is_no_violation_but_for_rounding() -> None:
+def test_an_action_at_a_tight_limit_is_no_violation_but_for_rounding():
     spec = SPEC.derive(action_dim=1, safety={"tightness": 0.005})
     venv, counted = lanes(1, spec, "unit"), []
     sums = EpisodeSums(1, spec=lambda: spec)
@@ -252,7 +249,7 @@ def test_an_action_at_a_tight_limit_is_no_violation_but_for_rounding() -> None:
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_a_run_logs_and_draws_the_cost_of_its_episodes(algorithm: str, tmp_path: Path) -> None:
+def test_a_run_logs_and_draws_the_cost_of_its_episodes(algorithm, tmp_path):
     pytest.importorskip("matplotlib")
     result = train(
         SPEC,
@@ -274,16 +271,14 @@ def test_a_run_logs_and_draws_the_cost_of_its_episodes(algorithm: str, tmp_path:
     assert evaluate(str(result.model_path), SPEC, PROTOCOL).wd_regret == result.report.wd_regret
 
 
-def test_a_stopped_run_resumes_with_its_multiplier(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stopped_run_resumes_with_its_multiplier(tmp_path, monkeypatch):
     settings: dict[str, Any] = {
         "algorithm": "PPOLagrangian", "folder": tmp_path / "run", "checkpoint_every": 64,
         "protocol": PROTOCOL, "progress": False,
     }  # fmt: skip
     rounds, train_once = [], PPOLagrangian.train
 
-    def stop(model: Any) -> None:
+    def stop(model):
         rounds.append(model)
         if len(rounds) == 4:
             raise KeyboardInterrupt

@@ -1,9 +1,6 @@
 """`SMETeamVecEnv`: a policy shared by the agents of a team, on the numbers of `SMETeamEnv`."""
 
-from __future__ import annotations
-
 import pickle
-from typing import Any
 
 import numpy as np
 import pytest
@@ -35,7 +32,7 @@ SHARED = UNEQUAL.derive(team={**UNEQUAL.to_dict()["team"], "reward": "team"}, D=
 BOTH = UNEQUAL.derive(horizon=2, D=0.5)
 
 
-def shown(env: Any, agent: int, own: np.ndarray) -> np.ndarray:
+def shown(env, agent, own):
     """The shared observation of an agent, put together from its own one."""
     task = env.task
     S, n = task.spec.state_dim, len(task.names)
@@ -52,7 +49,7 @@ def shown(env: Any, agent: int, own: np.ndarray) -> np.ndarray:
     [(UNEQUAL, "symmetric"), (SHARED, "unit"), (BOTH, "symmetric"), ("Default", "unit")],
     ids=["unequal", "shared", "both-flags", "team-of-one"],
 )
-def test_every_number_is_that_of_teams_stepped_in_a_loop(spec: Any, action_range: Any) -> None:
+def test_every_number_is_that_of_teams_stepped_in_a_loop(spec, action_range):
     teams = 3
     ours = SMETeamVecEnv(spec, teams, action_range=action_range)
     theirs = [sme_registry.make_parallel(spec, action_range=action_range) for _ in range(teams)]
@@ -107,7 +104,7 @@ def test_every_number_is_that_of_teams_stepped_in_a_loop(spec: Any, action_range
         assert ends == {(True, False), (False, True), (True, True)}
 
 
-def test_entries_beyond_an_agents_own_channels_move_nothing() -> None:
+def test_entries_beyond_an_agents_own_channels_move_nothing():
     one, other = SMETeamVecEnv(UNEQUAL, 2, D=0), SMETeamVecEnv(UNEQUAL, 2, D=0)
     for env in (one, other):
         env.seed(0)
@@ -121,7 +118,7 @@ def test_entries_beyond_an_agents_own_channels_move_nothing() -> None:
     assert not np.array_equal(one.step(actions)[0], other.step(changed)[0])
 
 
-def test_sb3_learns_one_policy_for_all() -> None:
+def test_sb3_learns_one_policy_for_all():
     env = VecNormalize(VecMonitor(SMETeamVecEnv("Team4", 2, horizon=10, k=5)))
     model = PPO("MlpPolicy", env, seed=0, device="cpu", n_steps=32, batch_size=64, n_epochs=1)
     model.learn(256)
@@ -129,7 +126,7 @@ def test_sb3_learns_one_policy_for_all() -> None:
     assert [episode["l"] for episode in model.ep_info_buffer] == [10] * 24  # of each agent
 
 
-def test_options_begin_teams_where_they_say_and_are_used_once() -> None:
+def test_options_begin_teams_where_they_say_and_are_used_once():
     env = SMETeamVecEnv(UNEQUAL, 2)
     start = [0.25, 0.5, 0.75, 0.0, 1.0]
     env.set_options({"state": start})
@@ -145,7 +142,7 @@ def test_options_begin_teams_where_they_say_and_are_used_once() -> None:
     assert list(env.get_attr("state", 3)[0]) != start
 
 
-def test_what_is_returned_can_be_written_into_and_a_copy_goes_on_as_the_original() -> None:
+def test_what_is_returned_can_be_written_into_and_a_copy_goes_on_as_the_original():
     env, untouched = SMETeamVecEnv(UNEQUAL, 2), SMETeamVecEnv(UNEQUAL, 2)
     rng = np.random.default_rng(0)
     for e in (env, untouched):
@@ -168,7 +165,7 @@ def test_what_is_returned_can_be_written_into_and_a_copy_goes_on_as_the_original
     np.testing.assert_array_equal(env.get_attr("state"), untouched.get_attr("state"))
 
 
-def test_what_cannot_be_used_is_a_typed_error() -> None:
+def test_what_cannot_be_used_is_a_typed_error():
     with pytest.raises(OptionError, match="num_envs=0"):
         SMETeamVecEnv("Team2", 0)
     with pytest.raises(SpecError, match="action_dim"):

@@ -1,9 +1,6 @@
 """Environments of tasks with `safety` and `observation`: what agents see and what limits them."""
 
-from __future__ import annotations
-
 import copy
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -48,14 +45,14 @@ SPECS = {
 
 
 @pytest.fixture(params=["numba", "numpy"])
-def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+def backend(request, monkeypatch):
     if request.param == "numba":
         pytest.importorskip("numba")
     monkeypatch.setenv("SME_BACKEND", request.param)
     return str(request.param)
 
 
-def actions_of(env: Any, rng: np.random.Generator) -> Any:
+def actions_of(env, rng):
     """Actions between the optimum and noise."""
     best = env.task.optimal_action(env.state)
     share = rng.uniform(0.0, 0.5, (*best.shape[:-1], 1))
@@ -63,13 +60,13 @@ def actions_of(env: Any, rng: np.random.Generator) -> Any:
 
 
 @pytest.mark.parametrize("name", SPECS)
-def test_the_conformance_kit_passes(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_conformance_kit_passes(name, monkeypatch):
     monkeypatch.setenv("SME_BACKEND", "numpy" if name in ("safe", "driven") else "auto")
     testing.check_sme(SPECS[name])
 
 
 @pytest.mark.parametrize("name", SPECS)
-def test_a_batch_of_any_size_is_its_singles(name: str, backend: str) -> None:
+def test_a_batch_of_any_size_is_its_singles(name, backend):
     lanes = 131
     batch = SMEVectorEnv(SPECS[name], lanes)
     checked = [0, lanes // 2, lanes - 1]
@@ -94,9 +91,7 @@ def test_a_batch_of_any_size_is_its_singles(name: str, backend: str) -> None:
 
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(spec=specs(team=False), seed=st.integers(0, 99))
-def test_a_step_of_any_spec_is_the_definitions_single_and_in_a_batch(
-    spec: SMESpec, seed: int, backend: str
-) -> None:
+def test_a_step_of_any_spec_is_the_definitions_single_and_in_a_batch(spec, seed, backend):
     env, batch = SMEEnv(spec), SMEVectorEnv(spec, 3)
     task, rng = env.task, np.random.default_rng(seed)
     env.reset(seed=seed)
@@ -131,7 +126,7 @@ def test_a_step_of_any_spec_is_the_definitions_single_and_in_a_batch(
             break
 
 
-def test_observation_leaves_states_rewards_and_the_optimum_as_they_are() -> None:
+def test_observation_leaves_states_rewards_and_the_optimum_as_they_are():
     extended = SMEEnv(SPECS["both"].derive(safety=None))
     plain = SMEEnv(SPECS["both"].derive(safety=None, observation=None))
     rng = np.random.default_rng(0)
@@ -146,7 +141,7 @@ def test_observation_leaves_states_rewards_and_the_optimum_as_they_are() -> None
             np.testing.assert_equal(got[4], expected[4])
 
 
-def test_noise_and_first_distractors_follow_the_streams_definition(backend: str) -> None:
+def test_noise_and_first_distractors_follow_the_streams_definition(backend):
     env, m = SMEEnv(SPECS["noise"]), 8
     env.reset(seed=7)
     word = np.random.SeedSequence(7, spawn_key=(1,)).generate_state(1, np.uint64)
@@ -160,7 +155,7 @@ def test_noise_and_first_distractors_follow_the_streams_definition(backend: str)
 
 
 @pytest.mark.parametrize("action_range", ["unit", "symmetric"])
-def test_the_safe_action_costs_nothing_and_has_no_safe_regret(action_range: Any) -> None:
+def test_the_safe_action_costs_nothing_and_has_no_safe_regret(action_range):
     env, A = SMEEnv(SPECS["safe"], action_range=action_range), 4
     env.reset(seed=0)
     violated = 0
@@ -181,7 +176,7 @@ def test_the_safe_action_costs_nothing_and_has_no_safe_regret(action_range: Any)
 
 
 @pytest.mark.parametrize("name", ["noise", "driven"])
-def test_a_reset_begins_at_the_state_and_the_distractors_that_are_given(name: str) -> None:
+def test_a_reset_begins_at_the_state_and_the_distractors_that_are_given(name):
     spec = SPECS[name]
     s, d = np.full(spec.state_dim, 0.25), np.full(spec.distractors, 0.75)
     env, untouched = SMEEnv(spec), SMEEnv(spec)
@@ -205,7 +200,7 @@ def test_a_reset_begins_at_the_state_and_the_distractors_that_are_given(name: st
 
 
 @pytest.mark.parametrize("make", [SMEEnv, lambda spec: SMEVectorEnv(spec, 3)])
-def test_distractors_that_cannot_be_used_are_refused_and_nothing_changes(make: Any) -> None:
+def test_distractors_that_cannot_be_used_are_refused_and_nothing_changes(make):
     for options, error, words in (
         ({"distractors": [0.5] * 7}, StateError, r"distractors of shape \(7,\).*\(8,\)"),
         ({"distractors": [1.5] * 8}, StateError, r"distractors: entry .*1\.5.* lies outside"),
@@ -227,7 +222,7 @@ def test_distractors_that_cannot_be_used_are_refused_and_nothing_changes(make: A
         np.testing.assert_array_equal(env.reset()[0], twin.reset()[0])
 
 
-def test_an_environment_without_a_seed_can_be_repeated(monkeypatch: Any) -> None:
+def test_an_environment_without_a_seed_can_be_repeated(monkeypatch):
     env, twin = SMEEnv(SPECS["noise"]), SMEEnv(SPECS["noise"])
     first, _ = env.reset()
     np.testing.assert_array_equal(twin.reset(seed=env.np_random_seed)[0], first)
@@ -238,7 +233,7 @@ def test_an_environment_without_a_seed_can_be_repeated(monkeypatch: Any) -> None
     assert (env.reset(seed=2)[0] != twin.reset(seed=3)[0]).any()
 
 
-def test_a_generator_of_the_users_serves() -> None:
+def test_a_generator_of_the_users_serves():
     env, twin = SMEEnv(SPECS["noise"]), SMEEnv(SPECS["noise"])
     env.reset(seed=1)
     for each in (env, twin):
@@ -252,7 +247,7 @@ def test_a_generator_of_the_users_serves() -> None:
         first = env.distractors
 
 
-def test_frames_show_tasks_with_distractors_and_limits() -> None:
+def test_frames_show_tasks_with_distractors_and_limits():
     pytest.importorskip("pygame")
     env = SMEEnv(SPECS["both"], render_mode="rgb_array")
     frames = SMEVectorEnv(SPECS["both"], 2, render_mode="rgb_array")
@@ -263,7 +258,7 @@ def test_frames_show_tasks_with_distractors_and_limits() -> None:
 
 
 @pytest.mark.parametrize(("name", "field"), [("safe", "safety"), ("noise", "observation")])
-def test_streams_and_environments_of_teams_refuse_them(name: str, field: str) -> None:
+def test_streams_and_environments_of_teams_refuse_them(name, field):
     with pytest.raises(SpecError, match=rf"phases.0.spec: has {field}.*Remove its {field}"):
         StreamSpec.from_dict({"phases": [{"spec": SPECS[name].to_dict(), "steps": 10}]})
     with pytest.raises(SpecError, match=rf"{field}: not supported for teams"):

@@ -1,7 +1,5 @@
 """Streams: lives across phases, single and batched, what infos say, what is refused."""
 
-from __future__ import annotations
-
 import copy
 import functools
 from typing import Any
@@ -28,7 +26,7 @@ MODES = [mode.value for mode in AutoresetMode]
 HALF = np.full(2, 0.5, np.float32)
 
 
-def stream(switch: str = "episode", D: float = 0.35, **fields: Any) -> StreamSpec:
+def stream(switch="episode", D=0.35, **fields):
     """Two rounds of three phases: k falls and rises, and the second phase drifts."""
     specs = [SPEC | {"D": D, "k": k, "seed": seed} for seed, k in enumerate((7, 2, 5))]
     drift = {"rotation": 2.0, "increments": 3}
@@ -40,7 +38,7 @@ def stream(switch: str = "episode", D: float = 0.35, **fields: Any) -> StreamSpe
     return StreamSpec.from_dict({"phases": phases, "cycles": 2, "switch": switch, **fields})
 
 
-def phases_seen(env: Any, steps: int, action: Any = HALF) -> list[tuple[int, int]]:
+def phases_seen(env, steps, action=HALF):
     """(lifetime, phase) of every step; episodes follow each other."""
     seen = []
     for _ in range(steps):
@@ -51,7 +49,7 @@ def phases_seen(env: Any, steps: int, action: Any = HALF) -> list[tuple[int, int
     return seen
 
 
-def both_reset(batch: Any, singles: Any, mask: Any, seed: Any = None) -> list[Any]:
+def both_reset(batch, singles, mask, seed=None):
     """What resets of some lanes return; Gymnasium removes the mask from the options."""
     envs = batch, singles
     return [env.reset(seed=seed, options={"reset_mask": mask.copy()}) for env in envs]
@@ -59,7 +57,7 @@ def both_reset(batch: Any, singles: Any, mask: Any, seed: Any = None) -> list[An
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("switch", ["episode", "step"])
-def test_a_batch_of_lives_equals_its_singles_in_every_bit(switch: str, mode: str) -> None:
+def test_a_batch_of_lives_equals_its_singles_in_every_bit(switch, mode):
     spec = stream(switch, observes_phase=switch == "step")
     batch: Any = SMEStreamVectorEnv(spec, 5, autoreset_mode=mode)
     makers = [functools.partial(SMEStreamEnv, spec)] * 5
@@ -87,7 +85,7 @@ def test_a_batch_of_lives_equals_its_singles_in_every_bit(switch: str, mode: str
     assert apart > 10  # lanes that were in different pieces at once
 
 
-def test_a_phase_is_left_at_the_next_reset() -> None:
+def test_a_phase_is_left_at_the_next_reset():
     env = SMEStreamEnv(stream(D=0.0))
     env.reset(seed=0)
     # Episodes of 12 steps: 37 is passed in the fourth, and so on; after 182 the last phase goes on.
@@ -96,7 +94,7 @@ def test_a_phase_is_left_at_the_next_reset() -> None:
     assert phases_seen(env, 240) == list(zip(range(1, 241), phases, strict=True))
 
 
-def test_a_phase_is_left_at_once_however_far_away_the_switch_is() -> None:
+def test_a_phase_is_left_at_once_however_far_away_the_switch_is():
     phases = [{"spec": SPEC, "steps": 700}, {"spec": SPEC | {"seed": 1}, "steps": 100}]
     for spec in (stream("step", D=0.0), StreamSpec(phases=phases, switch="step")):
         env, steps = SMEStreamEnv(spec), spec.steps + 20
@@ -105,7 +103,7 @@ def test_a_phase_is_left_at_once_however_far_away_the_switch_is() -> None:
         assert phases_seen(env, steps) == expected
 
 
-def test_state_and_what_is_to_be_paid_carry_over_a_switch_within_an_episode() -> None:
+def test_state_and_what_is_to_be_paid_carry_over_a_switch_within_an_episode():
     specs = SPEC | {"k": 12}, SPEC | {"k": 2, "seed": 1}
     phases = [{"spec": spec, "steps": 9} for spec in specs]
     env = SMEStreamEnv(StreamSpec(phases=phases, switch="step", observes_phase=True))
@@ -127,7 +125,7 @@ def test_state_and_what_is_to_be_paid_carry_over_a_switch_within_an_episode() ->
     assert observation[5] == 0.0
 
 
-def test_a_reset_continues_the_life_and_a_seed_begins_a_new_one() -> None:
+def test_a_reset_continues_the_life_and_a_seed_begins_a_new_one():
     env, batch = SMEStreamEnv(stream()), SMEStreamVectorEnv(stream(), 2)
     assert env.reset(seed=0)[1]["lifetime"] == 0
     phases_seen(env, 50, env.task.optimal_action(env.state))
@@ -145,7 +143,7 @@ def test_a_reset_continues_the_life_and_a_seed_begins_a_new_one() -> None:
 
 
 @pytest.mark.parametrize("switch", ["episode", "step"])
-def test_a_life_may_begin_after_some_steps(switch: str) -> None:
+def test_a_life_may_begin_after_some_steps(switch):
     spec = stream(switch, D=0.0)
     env, batch = SMEStreamEnv(spec), SMEStreamVectorEnv(spec, 2, autoreset_mode="SameStep")
     for lifetime, phase in ((36, 0), (61, 2), (400, 2)):
@@ -163,7 +161,7 @@ def test_a_life_may_begin_after_some_steps(switch: str) -> None:
             observations, *_, infos = batch.step(np.stack([HALF, HALF]))
 
 
-def test_another_lifetime_or_that_of_a_task_is_refused_and_nothing_changes() -> None:
+def test_another_lifetime_or_that_of_a_task_is_refused_and_nothing_changes():
     env, batch = SMEStreamEnv(stream()), SMEStreamVectorEnv(stream(), 2)
     for each in env, batch:
         each.reset(seed=0)
@@ -183,7 +181,7 @@ def test_another_lifetime_or_that_of_a_task_is_refused_and_nothing_changes() -> 
             task.reset(options={"lifetime": 1})
 
 
-def test_a_refused_action_and_an_autoreset_are_no_steps_of_the_life() -> None:
+def test_a_refused_action_and_an_autoreset_are_no_steps_of_the_life():
     env = SMEStreamEnv(stream("step", D=0.0))
     env.reset(seed=0)
     for lifetime in range(1, 41):  # beyond the switch at 37
@@ -203,7 +201,7 @@ def test_a_refused_action_and_an_autoreset_are_no_steps_of_the_life() -> None:
     assert lifetimes == [*range(1, 13), 12, 13]
 
 
-def test_lanes_in_different_pieces_refuse_an_action_together() -> None:
+def test_lanes_in_different_pieces_refuse_an_action_together():
     batch = SMEStreamVectorEnv(stream("step"), 4, autoreset_mode="SameStep")
     batch.reset(seed=0)
     rng = np.random.default_rng(0)
@@ -223,7 +221,7 @@ def test_lanes_in_different_pieces_refuse_an_action_together() -> None:
         _ = twin.task
 
 
-def test_a_stream_of_one_phase_has_the_numbers_of_its_task() -> None:
+def test_a_stream_of_one_phase_has_the_numbers_of_its_task():
     spec = SPEC | {"k": 5, "D": 0.2}
     one = StreamSpec(phases=[{"spec": spec, "steps": 10}])
     pairs = [(SMEEnv(spec), SMEStreamEnv(one)), (SMEVectorEnv(spec, 3), SMEStreamVectorEnv(one, 3))]
@@ -241,7 +239,7 @@ def test_a_stream_of_one_phase_has_the_numbers_of_its_task() -> None:
 
 
 @pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
-def test_fields_of_specs_are_refused_with_the_way_to_another_stream(make: Any) -> None:
+def test_fields_of_specs_are_refused_with_the_way_to_another_stream(make):
     with pytest.raises(UnexpectedKeywordError, match=r"'complexity' for a stream.*spec\.derive"):
         make("SME/Switch5-v1", complexity=10)
     with pytest.raises(UnexpectedKeywordError, match=r"'cycles' for a stream.*StreamSpec\(\*\*"):
@@ -250,12 +248,12 @@ def test_fields_of_specs_are_refused_with_the_way_to_another_stream(make: Any) -
         make("SME/Switch5-v1", action_rnge="unit")
 
 
-def test_a_batch_that_does_not_fit_in_memory_is_refused() -> None:
+def test_a_batch_that_does_not_fit_in_memory_is_refused():
     with pytest.raises(ResourceLimitError, match="fewer lanes"):
         SMEStreamVectorEnv(stream(), 2**40)
 
 
-def test_frames_show_the_task_in_force() -> None:
+def test_frames_show_the_task_in_force():
     pytest.importorskip("pygame")
     phases = [{"spec": SPEC | {"k": k}, "steps": 3} for k in (2, 3)]
     spec = StreamSpec(phases=phases, switch="step")

@@ -96,5 +96,3 @@ def test_progress_counts_shared_states_once():
     )
     assert [done for done, _ in calls] == [300 * part for part in range(1, 7)]
     assert {total for _, total in calls} == {1800}
-
-

@@ -188,11 +188,9 @@ def test_a_report_has_the_regret_of_reference_agents(tmp_path):
     [
         (["constant"], {}, OptionError, "life=1 of them: must be 4"),
         ([0.5, 1.5, 0.5, 0.5], {}, OptionError, r"life\[1\]=1.5: must be"),
-        ([0.5, 0.5, True, 0.5], {}, OptionError, r"life\[2\]=True: must be"),
         ([0.5, "linaer", 0.5, 0.5], {}, UnknownNameError, r"life\[1\]: .*'linear'"),
         ([0.5, lambda o: o, 0.5, 0.5], {}, PolicyError, "policy 'policy'"),
         (["constant"] * 4, {"episodes": 0}, OptionError, "episodes=0"),
-        (["constant"] * 4, {"seed": -1}, OptionError, "seed=-1"),
     ],
 )
 def test_bad_input_is_refused(life, fields, error, message):

@@ -39,13 +39,10 @@ def evaluated(policy, **kw):
     [
         (lambda o: np.zeros((len(o), 3)), r"shape \(200, 3\): must be of shape \(200, 2\)"),
         (lambda o: np.zeros(len(o)), r"shape \(200,\): must be of shape \(200, 2\)"),
-        (lambda o: np.zeros((2, len(o))), r"must be of shape \(200, 2\)"),
         (lambda o: 0.5, r"must be of shape \(200, 2\)"),
         (lambda o: None, "must be numbers"),
-        (lambda o: np.full((len(o), 2), "a"), "must be numbers"),
         (lambda o: [[0.0], [0.0, 1.0]], "must be an array of shape"),
         (lambda o: np.full((len(o), 2), np.nan), "NaN or infinite"),
-        (lambda o: np.full((len(o), 2), np.inf), "NaN or infinite"),
         (lambda o: 1 / 0, "ZeroDivisionError: division by zero"),
         *[(each, NO_POLICY) for each in (None, 3, [0.5, 0.5], {"a": 1})],
     ],
@@ -156,8 +153,6 @@ OF_CONTRIB = '{"policy_class": {"__module__": "sb3_contrib.tqc.policies"}}'
     [
         ("absent.zip", None, "does not exist"),
         ("text.zip", b"hello", NO_MODEL),
-        ("policy", b"\x08\x07", NO_MODEL),
-        ("list.zip", archive("[]"), NO_MODEL),
         ("cut.zip", archive("{not json"), NO_MODEL),
         (
             "unsaid.zip",
@@ -166,9 +161,7 @@ OF_CONTRIB = '{"policy_class": {"__module__": "sb3_contrib.tqc.policies"}}'
         ),
         ("tqc.zip", archive(OF_CONTRIB), "cannot be loaded as a model of sb3_contrib:TQC"),
         ("absent.onnx", None, r"does not exist. Give the path of an \.onnx"),
-        ("empty.onnx", b"", NO_NETWORK),
         ("text.onnx", b"hello", NO_NETWORK),
-        ("bytes.onnx", b"\x08\x07", NO_NETWORK),
     ],
     ids=lambda value: value if isinstance(value, str) and "." in value[-5:] else "",
 )
