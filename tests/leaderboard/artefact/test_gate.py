@@ -100,13 +100,6 @@ def sparse():
     return found
 
 
-def twice_attributed():
-    found = squashed([node("Flatten", "y", "a", axis=1)])
-    flatten = found.graph.node[1]
-    flatten.attribute.append(flatten.attribute[0])
-    return found
-
-
 def test_networks_of_every_opset_and_form_are_accepted():
     for opset in (13, 17, 23):
         accepted(linear(opsets=[("", opset)]))
@@ -160,7 +153,6 @@ def test_operators_that_are_random_looping_growing_or_textual_are_refused():
 
 GRAPH = helper.make_graph([], "empty", [], [])
 ONES = np.ones(1, np.float32)
-SPARSE = helper.make_sparse_tensor(tensor("v", ONES), tensor("i", np.zeros(1, np.int64)), [4])
 
 BAD = {
     "onnx_malformed": {
@@ -170,7 +162,6 @@ BAD = {
         "two graphs": linear().SerializeToString() * 2,
         "an attribute of two values": attributed(f=1.0),
         "an attribute of another type": attributed(type=3),
-        "an attribute given twice": twice_attributed(),
         "half an entry": with_tensor(raw_data=b"\0" * 31),
         "an empty input of a sum": squashed([node_with("Sum", ["y", "", "y"])]),
         "a first input that is empty": squashed([node_with("Clip", ["", "y"])]),
@@ -211,7 +202,6 @@ BAD = {
     },
     "onnx_tensor": {
         "a sparse initialiser": sparse(),
-        "a sparse attribute": attributed(sparse_tensor=SPARSE),
         "a type as an attribute": attributed(tp=helper.make_tensor_type_proto(1, [2])),
         "huge dimensions": with_tensor(dims=[2**40, 2**40]),
         "dimensions whose product overflows": with_tensor(raw_data=b"", dims=[2**32, 2**32, 0]),

@@ -1,18 +1,24 @@
-"""The reference policies: 0 and 1 by construction, as files that any board would take."""
+"""Reference policies, as files that any board would take; submitted files, as numbers on a page."""
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 
 from leaderboard.artefact.gate import inspect, widths
+from leaderboard.artefact.network import network_of
 from leaderboard.artefact.reference import constant_onnx, optimal_onnx
+from leaderboard.web.site.explorers import can_show, explorer
 from sme_registry import SMESpec, evaluate, materialize
+from sme_registry.export.export import onnx_bytes
+from tests.explorer.networks import offline, perceptron
+from tests.explorer.test_programs import module
+from tests.leaderboard.artefact.models import doubling, looping, memory_bomb
 
 SPECS = {
     "default": SMESpec(),
     "more actions than states": SMESpec(state_dim=2, action_dim=5, policy_init="unit_variance"),
     "one channel, one unit": SMESpec(state_dim=1, action_dim=1, complexity=3, hidden_width=1),
-    "narrow and deep": SMESpec(state_dim=2, action_dim=16, complexity=20, hidden_width=8),
     "complexity 50": SMESpec(complexity=50, seed=3, policy_init="unit_variance"),
 }
 any_spec = pytest.mark.parametrize("spec", SPECS.values(), ids=SPECS)
@@ -20,8 +26,6 @@ any_spec = pytest.mark.parametrize("spec", SPECS.values(), ids=SPECS)
 
 def asked(data):
     """An ONNX file as a function of observations, on one thread."""
-    import onnxruntime
-
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
@@ -43,28 +47,17 @@ def test_the_optimum_is_the_nearest_float32_action_and_has_no_regret_in_any_regi
     assert max(region.normalised_regret for region in report.regions) <= 3e-7
 
 
-def test_the_optimum_depends_on_the_state_alone():
+def test_the_optimum_depends_on_the_state_alone_and_stays_in_the_unit_cube():
     spec = SPECS["default"]
     act, seen = asked(optimal_onnx(spec)), observations(spec)
     other = seen.copy()
     other[:, -2:] += 7.0
     assert (act(seen) == act(other)).all()
-
-
-def test_the_optimum_stays_in_the_unit_cube_however_far_the_state():
-    spec = SPECS["default"]
     for scale in (100.0, 1e30):
-        acted = asked(optimal_onnx(spec))(observations(spec, scale=scale))
+        acted = act(observations(spec, scale=scale))
         assert np.isfinite(acted).all()
         assert 0.0 <= acted.min() < 1e-9  # it does saturate there
         assert acted.max() == 1.0
-
-
-def test_a_row_alone_is_acted_on_as_in_a_batch():
-    spec = SPECS["complexity 50"]
-    act, seen = asked(optimal_onnx(spec)), observations(spec)
-    alone = np.concatenate([act(row[None]) for row in seen])
-    assert np.abs(alone - act(seen)).max() <= 2**-24
 
 
 @any_spec
@@ -112,3 +105,52 @@ def test_a_teams_reference_is_one_file_for_all_agents(made, regret, tmp_path):
         for region in each.regions:
             assert region.normalised_regret == pytest.approx(regret, abs=1e-6)
     assert list(report.agents) == ["scout_0", "driver_0", "driver_1"]
+
+
+SPEC = SMESpec(state_dim=3, action_dim=2)
+HOSTILE = "</script><img src=x onerror=alert(1)>"
+WIDTHS = 5, 2
+
+
+@pytest.mark.parametrize("kind", ["tanh", "silu", "elu", "offline", "module", "normalised"])
+def test_its_actions_are_those_of_the_runtime(kind):
+    if kind in ("module", "normalised"):
+        policy = module(SPEC, kind)
+    else:
+        policy = offline(SPEC) if kind == "offline" else perceptron(SPEC, kind)
+    data = onnx_bytes(policy, SPEC)
+    x = 2.0 * np.random.default_rng(0).random((64, 5), dtype=np.float32) - 0.5
+    np.testing.assert_allclose(network_of(data, *WIDTHS)(x), asked(data)(x), atol=1e-5)
+
+
+def test_the_constant_is_known_and_the_table_of_the_optimum_is_not():
+    x = np.zeros((2, 5))
+    assert network_of(constant_onnx(SPEC), *WIDTHS)(x).tolist() == [[0.5, 0.5], [0.5, 0.5]]
+    assert network_of(optimal_onnx(SPEC), *WIDTHS) is None
+
+
+def test_hostile_files_are_no_networks():
+    good = onnx_bytes(perceptron(SPEC), SPEC)
+    assert network_of(good, *WIDTHS) is not None
+    assert network_of(good, 6, 2) is None
+    assert network_of(b"", *WIDTHS) is None
+    for cut in range(0, len(good), 97):
+        network_of(good[:cut], *WIDTHS)
+        changed = bytearray(good)
+        changed[cut] ^= 0x5A
+        network_of(bytes(changed), *WIDTHS)
+    for bad in (looping(), memory_bomb(), doubling(40)):
+        assert network_of(bad.SerializeToString(), *WIDTHS) is None
+
+
+def test_a_page_says_what_it_cannot_compute_and_escapes_names():
+    page = explorer(HOSTILE, onnx_bytes(perceptron(SPEC), SPEC), SPEC)
+    assert HOSTILE not in page
+    assert page.count("<img") == 0
+    assert '<script src="../static/explorer.js"></script>' in page
+    assert '"of":"observation"' in page
+    unknown = explorer(HOSTILE, optimal_onnx(SPEC), SPEC)
+    assert "cannot compute the network" in unknown
+    assert '"of":"observation"' not in unknown
+    assert can_show(SPEC)
+    assert not can_show(SMESpec(state_dim=600))

@@ -105,6 +105,9 @@ def test_batches_of_every_size_are_answered_in_order_and_others_refused():
             with pytest.raises(StateError, match=r"must be \[B, 4\]"):
                 policy(np.zeros(shape, np.float32))
         assert policy(observations(2)).shape == (2, ACTION)
+    policy.close()
+    with pytest.raises(BoardError, match="closed"):
+        policy(observations(3))
 
 
 def test_what_onnxruntime_cannot_load_is_refused():
@@ -186,22 +189,9 @@ def test_an_action_that_depends_on_both_neighbours_is_rejected():
         policy.check_rows(observations(100), rows=[])
 
 
-@pytest.fixture
-def asked(monkeypatch):
-    """The batches of all calls."""
-    batches = []
-    call = Sandbox.__call__
-
-    def recorded(self, seen):
-        batches.append(seen)
-        return call(self, seen)
-
-    monkeypatch.setattr(Sandbox, "__call__", recorded)
-    return batches
-
-
-def test_the_rows_to_check_may_be_given_and_are_drawn_at_random_otherwise(asked):
-    seen = observations(1000)
+def test_the_rows_to_check_may_be_given_and_are_drawn_at_random_otherwise(monkeypatch):
+    asked, call, seen = [], Sandbox.__call__, observations(1000)
+    monkeypatch.setattr(Sandbox, "__call__", lambda self, o: asked.append(o) or call(self, o))
     with opened(linear()) as policy:
         policy.check_rows(seen, rows=[50, 3, 99])
         np.testing.assert_array_equal(np.concatenate(asked[-3:]), seen[[50, 3, 99]])
@@ -221,12 +211,10 @@ def test_the_process_reports_its_runtime_before_it_reads_the_model(unconfined, m
         assert policy.runtime == "1.0"
 
 
-def test_random_actions_are_rejected(ungated):
-    found = squashed([node("RandomUniformLike", "y", "a")])
-    assert code_of(found) == "run_batch_dependent"
-
-
-def test_a_small_file_that_takes_gigabytes_is_stopped_without_the_gate(isolation, ungated):
+def test_random_actions_and_a_small_file_of_gigabytes_are_rejected_without_the_gate(
+    isolation, ungated
+):
+    assert code_of(squashed([node("RandomUniformLike", "y", "a")])) == "run_batch_dependent"
     bomb = models.memory_bomb()
     assert len(bomb.SerializeToString()) < 250
     assert code_of(bomb) == "run_memory"
@@ -438,14 +426,6 @@ def test_a_child_killed_from_outside_does_not_reject_the_model(isolation):
         os.killpg(policy._process.pid, signal.SIGKILL)
         with pytest.raises(BoardError, match="not caused by the model"):
             policy(observations(3))
-
-
-def test_a_closed_sandbox_raises_and_closes_twice():
-    policy = opened(linear())
-    policy.close()
-    policy.close()
-    with pytest.raises(BoardError, match="closed"):
-        policy(observations(3))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="PR_SET_PDEATHSIG")

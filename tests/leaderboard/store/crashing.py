@@ -1,28 +1,23 @@
 """Kill a process, or fill a disk, at a chosen point."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 CALLS = ("fsync", "link", "replace", "rename", "unlink", "fchmod")
 _CRASHED = 77
 
 
-def fork() -> int:
+def fork():
     """`os.fork`. JAX, if an earlier test has loaded it, warns of its threads; no child uses it."""
     with warnings.catch_warnings(action="ignore"):
         return os.fork()
 
 
-def crashes_before(call: int, work: Callable[[], object]) -> bool:
+def crashes_before(call, work):
     """Whether a fork that does some work ends before its n-th call that matters."""
     child = fork()
     if child == 0:
@@ -41,11 +36,11 @@ def crashes_before(call: int, work: Callable[[], object]) -> bool:
     return code == _CRASHED
 
 
-def _exit_before(call: int) -> None:
+def _exit_before(call):
     left = call
 
-    def counted(real: Callable[..., Any]) -> Callable[..., Any]:
-        def before(*arguments: Any, **named: Any) -> Any:
+    def counted(real):
+        def before(*arguments, **named):
             nonlocal left
             if left == 0:
                 os._exit(_CRASHED)
@@ -59,7 +54,7 @@ def _exit_before(call: int) -> None:
 
 
 @contextlib.contextmanager
-def small_disk(path: Path, size: str = "1m") -> Iterator[Path | None]:
+def small_disk(path, size="1m"):
     """A file system of its own, in memory; None where none may be mounted."""
     path.mkdir()
     mount = shutil.which("mount")
@@ -73,7 +68,7 @@ def small_disk(path: Path, size: str = "1m") -> Iterator[Path | None]:
             subprocess.run(["umount", "-l", path], check=True)
 
 
-def fill(path: Path, free: int) -> None:
+def fill(path, free):
     """Fill a disk but for so many bytes."""
     with open(path, "wb", buffering=0) as stream:
         for size in (4096, 1):
@@ -83,10 +78,10 @@ def fill(path: Path, free: int) -> None:
         stream.truncate(max(0, stream.tell() - free))
 
 
-def make_read_only(path: Path) -> None:
+def make_read_only(path):
     """Remount a `small_disk` read-only, also for root."""
     subprocess.run(["mount", "-o", "remount,ro", path], check=True)
 
 
-def _succeeds(*command: str | Path) -> bool:
+def _succeeds(*command):
     return subprocess.run(command, capture_output=True, check=False).returncode == 0

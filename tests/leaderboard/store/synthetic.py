@@ -1,15 +1,12 @@
 """Synthetic results, for tests of storage that need no scoring."""
 
-from __future__ import annotations
-
 from leaderboard.documents.result import Result, RunScore
 from leaderboard.scoring.aggregation import result_of
 from leaderboard.scoring.metrics import run_metrics
 from leaderboard.scoring.score import evaluation_seed
-from leaderboard.store import Store
 
 
-def synthetic_result(store: Store, id: str, *, code: str = "", level: float = 0.5) -> Result:
+def synthetic_result(store, id, *, code="", level=0.5):
     """A result that fits a submission: rejected with `code`, or of regret `level` or so."""
     document = store.document
     if code:

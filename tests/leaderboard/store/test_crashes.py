@@ -1,14 +1,9 @@
 """A process killed before any system call leaves a state from which the next one continues."""
 
-from __future__ import annotations
-
 import shutil
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
-from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import BoardError
 from leaderboard.scoring.verify import verify
 from leaderboard.store import Store, collect_garbage
@@ -23,41 +18,39 @@ from tests.leaderboard.conftest import (
 from tests.leaderboard.store.crashing import crashes_before, fill, small_disk
 from tests.leaderboard.store.synthetic import synthetic_result
 
-Work = Callable[[Path, SigningKey], object]
 
-
-def put(board: Path, key: SigningKey) -> object:
+def put(board, key):
     data = linear_onnx(1)
     with Store.open(board) as store:
         digest = sha256_of(data)
         return store.put_object(digest, [data], by=key.public)
 
 
-def receive(board: Path, key: SigningKey) -> object:
+def receive(board, key):
     with Store.open(board) as store:
         signed, artefacts = tiny_submission(store, key, 0, created="2026-01-01T00:00:00Z")
         assert set(artefacts) == {run.artefact.sha256 for run in signed.submission.runs}
         return store.receive(signed)
 
 
-def finish(board: Path, key: SigningKey) -> object:
+def finish(board, key):
     with Store.open(board) as store:
         while (claim := store.queue.claim("worker", seconds=0)) is not None:
             store.queue.finish(claim, synthetic_result(store, claim.id))
         return True
 
 
-def withdraw(board: Path, key: SigningKey) -> object:
+def withdraw(board, key):
     with Store.open(board) as store:
         return store.withdraw(signed_withdrawal(store, store.entries()[0].id, key))
 
 
-def reindex(board: Path, key: SigningKey) -> object:
+def reindex(board, key):
     with Store.open(board) as store:
         return store.reindex()
 
 
-def prepared(path: Path, key: SigningKey, work: Work) -> None:
+def prepared(path, key, work):
     with tiny_board(path) as store:
         if work is receive:
             _, artefacts = tiny_submission(store, key, 0)
@@ -67,7 +60,7 @@ def prepared(path: Path, key: SigningKey, work: Work) -> None:
             put_submission(store, key, 0)
 
 
-def state(board: Path) -> tuple[object, ...]:
+def state(board):
     """What a reader of the board is shown."""
     with Store.open(board) as store:
         objects = tuple(path.name for path in store.folder.objects.glob("*/[!.]*"))
@@ -76,7 +69,7 @@ def state(board: Path) -> tuple[object, ...]:
 
 
 @pytest.mark.parametrize("work", [put, receive, finish, withdraw, reindex])
-def test_a_write_is_complete_or_absent_and_can_be_repeated(tmp_path, key, work: Work):
+def test_a_write_is_complete_or_absent_and_can_be_repeated(tmp_path, key, work):
     prepared(tmp_path / "start", key, work)
     before = state(tmp_path / "start")
     shutil.copytree(tmp_path / "start", tmp_path / "end")

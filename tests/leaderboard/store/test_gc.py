@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import os
 import time
 
@@ -16,13 +14,13 @@ from tests.leaderboard.conftest import tiny_submission
 HOUR, DAY = 3600.0, 86400.0
 
 
-def put(store, key, data: bytes) -> str:
+def put(store, key, data):
     digest = sha256_of(data)
     store.put_object(digest, [data], by=key.public)
     return digest
 
 
-def age(path, seconds: float) -> None:
+def age(path, seconds):
     then = time.time() - seconds
     os.utime(path, (then, then))
 

@@ -1,7 +1,5 @@
 """Copies of boards that a stranger has prepared: readers neither hang nor believe the index."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -9,7 +7,6 @@ import shutil
 import signal
 import socket
 import sqlite3
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -19,7 +16,7 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.reading import is_regular, open_regular, read_regular
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.verify import verify
-from leaderboard.store import EntryRow, Store
+from leaderboard.store import Store
 from sme_registry.errors import SMEError
 from tests.leaderboard.conftest import put_submission, tiny_board
 from tests.leaderboard.store.synthetic import synthetic_result
@@ -28,8 +25,8 @@ SECONDS = 60  # far more than reading takes; a reader that hangs fails its test
 
 
 @pytest.fixture(autouse=True)
-def alarm() -> Iterator[None]:
-    def ring(*_: object) -> None:
+def alarm():
+    def ring(*_):
         raise AssertionError(f"still reading after {SECONDS} s")
 
     previous = signal.signal(signal.SIGALRM, ring)
@@ -40,7 +37,7 @@ def alarm() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(tmp_path_factory):
     """Two scored submissions, and one that waits."""
     path, key = tmp_path_factory.mktemp("hostile") / "board", SigningKey.generate()
     with tiny_board(path) as store:
@@ -54,7 +51,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def board(whole: Path, tmp_path: Path) -> Path:
+def board(whole, tmp_path):
     """A copy without the private key, as a stranger publishes it."""
     copy = shutil.copytree(whole, tmp_path / "board")
     (copy / "board.key").unlink()
@@ -62,35 +59,35 @@ def board(whole: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def rows(whole: Path) -> list[EntryRow]:
+def rows(whole):
     return rows_of(whole)
 
 
-def rows_of(board: Path, *, read_only: bool = True) -> list[EntryRow]:
+def rows_of(board, *, read_only=True):
     with Store.open(board, read_only=read_only) as store:
         return store.entries()
 
 
-def pipe(path: Path) -> None:
+def pipe(path):
     os.mkfifo(path)
 
 
-def endless_link(path: Path) -> None:
+def endless_link(path):
     path.symlink_to("/dev/zero")
 
 
-def link_to_a_copy(path: Path) -> None:
+def link_to_a_copy(path):
     elsewhere = path.with_name("elsewhere")
     elsewhere.write_bytes(b"{}")
     path.symlink_to(elsewhere)
 
 
-def terabyte(path: Path) -> None:
+def terabyte(path):
     with open(path, "wb") as stream:
         stream.truncate(2**40)
 
 
-def deaf_socket(path: Path) -> None:
+def deaf_socket(path):
     home = Path.cwd()
     os.chdir(path.parent)  # the address of a socket has at most 107 characters
     try:
@@ -101,15 +98,14 @@ def deaf_socket(path: Path) -> None:
 
 
 HARMS = (pipe, endless_link, link_to_a_copy, terabyte, deaf_socket, Path.mkdir)
-harmed = pytest.mark.parametrize("harm", HARMS, ids=lambda harm: harm.__name__)
 
 
-def replace(path: Path, harm: Callable[[Path], object]) -> None:
+def replace(path, harm):
     path.unlink(missing_ok=True)
     harm(path)
 
 
-@harmed
+@pytest.mark.parametrize("harm", HARMS)
 def test_only_regular_files_of_limited_size_are_read(tmp_path, harm):
     (tmp_path / "plain").write_bytes(b"abc")
     assert read_regular(tmp_path / "plain", 3) == b"abc"
@@ -195,10 +191,9 @@ i AS sequence, 'x' AS digest, 'x' AS time FROM n
     [
         f"DROP TABLE head; CREATE VIEW head AS {ENDLESS};",
         "CREATE TRIGGER t AFTER INSERT ON entry BEGIN DELETE FROM entry; END;",
-        "CREATE VIRTUAL TABLE more USING fts5(a);",
         "UPDATE entry SET submitter = 'Somebody', scores = replace(scores, '0.', '0.0')",
     ],
-    ids=["endless view", "trigger", "virtual table", "lie"],
+    ids=["endless view", "trigger", "lie"],
 )
 def test_a_changed_index_has_no_effect_and_is_repaired(whole, tmp_path, rows, change):
     board = shutil.copytree(whole, tmp_path / "board")
@@ -218,32 +213,12 @@ def test_a_changed_index_has_no_effect_and_is_repaired(whole, tmp_path, rows, ch
         assert store.entries() == rows
 
 
-def test_a_database_whose_pages_form_a_circle_is_refused(whole, tmp_path, rows):
-    """Every page of the index is the root of the largest table: without checks, read for ever."""
-    board = shutil.copytree(whole, tmp_path / "board")
-    path = board / "index.sqlite"
-    data = bytearray(path.read_bytes())
-    size = int.from_bytes(data[16:18], "big")
-    page = bytearray(size)  # an interior page of a table, whose children are itself
-    page[0], page[3:5], page[5:7] = 5, (1).to_bytes(2, "big"), (size - 8).to_bytes(2, "big")
-    for number in range(2, len(data) // size + 1):
-        page[8:12] = number.to_bytes(4, "big")
-        page[12:14] = (size - 8).to_bytes(2, "big")
-        page[size - 8 : size - 4] = number.to_bytes(4, "big")
-        data[(number - 1) * size : number * size] = page
-    path.write_bytes(data)
-    with pytest.raises(TamperedError):
-        verify(board)
-    assert rows_of(board, read_only=False) == rows
-
-
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
         ({"draws": 10**7}, "draws"),
         ({"seeds": list(range(1001))}, "1,001 instances"),
         ({"title": "x" * 2**21}, "bytes"),
-        ({"runs_to_rank": 10**9}, "runs_to_rank"),
     ],
     ids=lambda each: "" if isinstance(each, str) else next(iter(each)),
 )

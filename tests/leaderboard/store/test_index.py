@@ -1,19 +1,12 @@
-from __future__ import annotations
-
 import contextlib
-import datetime
 import os
 import shutil
 import sqlite3
-import time
 import traceback
-from functools import partial
-from pathlib import Path
 
 import pytest
 
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import SignedSubmission, utc
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.scoring.aggregation import result_of
 from leaderboard.store import Index, Store, collect_garbage
@@ -21,13 +14,12 @@ from tests.leaderboard.conftest import (
     put_submission,
     signed_withdrawal,
     tiny_board,
-    tiny_submission,
 )
 from tests.leaderboard.store.crashing import fork, make_read_only, small_disk
 from tests.leaderboard.store.synthetic import synthetic_result
 
 
-def fill(store: Store, key: SigningKey, *, waiting: bool = False) -> None:
+def fill(store, key, *, waiting=False):
     """Submissions of every status; a waiting one only where asked for."""
     signed = [put_submission(store, key, number) for number in range(4)]
     for number in range(3):
@@ -41,15 +33,7 @@ def fill(store: Store, key: SigningKey, *, waiting: bool = False) -> None:
         store.withdraw(signed_withdrawal(store, signed[3].id, key))
 
 
-def put_artefacts(store: Store, key: SigningKey, number: int) -> SignedSubmission:
-    """A submission whose artefacts are on the board, and which has not been received."""
-    signed, artefacts = tiny_submission(store, key, number)
-    for digest, data in artefacts.items():
-        store.put_object(digest, [data], by=key.public)
-    return signed
-
-
-def compacted(path: Path) -> bytes:
+def compacted(path):
     """The bytes of a database without its history."""
     copy = path.with_name("compacted")
     with contextlib.closing(sqlite3.connect(path)) as connection:
@@ -59,12 +43,12 @@ def compacted(path: Path) -> bytes:
     return data
 
 
-def dump(path: Path) -> list[str]:
+def dump(path):
     with contextlib.closing(sqlite3.connect(path)) as connection:
         return list(connection.iterdump())
 
 
-def derived(store: Store) -> list[object]:
+def derived(store):
     with store.transaction() as index:
         return list(index.derived_rows())
 
@@ -121,7 +105,7 @@ def test_rows_signed_by_the_boards_key_are_reference_rows(store, key):
 
 
 def test_only_the_submissions_own_key_withdraws_it_and_only_once(store, key, submit):
-    signed = submit()
+    signed, unknown = submit(), "sha256:" + "0" * 64
     with pytest.raises(Rejection) as refused:
         store.withdraw(signed_withdrawal(store, signed.id, SigningKey.generate()))
     assert refused.value.code == "bad_signature"
@@ -129,10 +113,6 @@ def test_only_the_submissions_own_key_withdraws_it_and_only_once(store, key, sub
     assert not store.withdraw(signed_withdrawal(store, signed.id, key))
     assert store.entry(signed.id).status == "withdrawn"
     assert store.queue.waiting() == 0
-
-
-def test_an_unknown_id_is_reported(store, key):
-    unknown = "sha256:" + "0" * 64
     with pytest.raises(Rejection, match="unknown_submission"):
         store.submission(unknown)
     with pytest.raises(Rejection, match="unknown_submission"):
@@ -141,18 +121,8 @@ def test_an_unknown_id_is_reported(store, key):
     assert store.entry(unknown) is None
 
 
-def test_submissions_are_counted_by_key_and_time(store, key, submit):
-    submit(1)
-    submit(2)
-    put_submission(store, SigningKey.generate(), 3)
-    now = datetime.datetime.now(datetime.UTC)
-    day = datetime.timedelta(days=1)
-    assert len(store.submission_times(key.public, utc(now - day))) == 2
-    assert store.submission_times(key.public, utc(now + day)) == []
-
-
 @pytest.fixture(scope="module")
-def filled(tmp_path_factory) -> Path:
+def filled(tmp_path_factory):
     """A board with submissions of every status, to be copied."""
     path = tmp_path_factory.mktemp("filled") / "board"
     with tiny_board(path) as store:
@@ -160,7 +130,7 @@ def filled(tmp_path_factory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("harm", ["missing", "empty", "noise", "torn", "schema", "another board"])
+@pytest.mark.parametrize("harm", ["missing", "torn", "schema", "another board"])
 def test_an_unusable_index_is_rebuilt_on_opening(tmp_path, filled, key, harm):
     shutil.copytree(filled, tmp_path / "board")
     with Store.open(tmp_path / "board") as store:
@@ -168,10 +138,6 @@ def test_an_unusable_index_is_rebuilt_on_opening(tmp_path, filled, key, harm):
         path = store.folder.index
     if harm == "missing":
         path.unlink()
-    elif harm == "empty":
-        path.write_bytes(b"")
-    elif harm == "noise":
-        path.write_bytes(os.urandom(10_000))
     elif harm == "torn":
         data = path.read_bytes()
         path.write_bytes(data[:4096] + bytes(len(data) - 8192) + data[-4096:])
@@ -212,13 +178,11 @@ def test_an_index_that_is_behind_catches_up_and_one_with_a_wrong_head_is_rebuilt
         assert derived(store) == expected
 
 
-@pytest.mark.parametrize("which", ["index.sqlite", "index.sqlite*"])
-def test_an_index_deleted_while_in_use_is_rebuilt_by_the_next_process(tmp_path, key, which):
+def test_an_index_deleted_while_in_use_is_rebuilt_by_the_next_process(tmp_path, key):
     with tiny_board(tmp_path / "board") as first, Store.open(tmp_path / "board") as second:
         put_submission(first, key, 0)
         assert len(second.entries()) == 1
-        for path in (tmp_path / "board").glob(which):
-            path.unlink()
+        first.folder.index.unlink()
         put_submission(first, key, 1)
         assert first.folder.index.exists()
         put_submission(second, key, 2)
@@ -227,10 +191,6 @@ def test_an_index_deleted_while_in_use_is_rebuilt_by_the_next_process(tmp_path, 
         put_submission(second, key, 3)
         assert derived(first) == derived(second)
         assert [entry.sequence for entry in first.log()] == [0, 1, 2, 3, 4]
-    with Store.open(tmp_path / "board") as third:
-        expected = derived(third)
-        third.reindex()
-        assert derived(third) == expected
 
 
 def test_read_only_opening_writes_nothing(tmp_path, key):
@@ -289,15 +249,7 @@ def test_a_board_on_a_read_only_disk_is_read(tmp_path, key, killed):
             Store.open(board)
 
 
-def insist(call):
-    """Repeat an operation that fails if the index is deleted meanwhile, until it succeeds."""
-    while True:
-        with contextlib.suppress(BoardError):
-            return call()
-
-
-@pytest.mark.parametrize("deleted", [0, 20], ids=["", "while the index is deleted"])
-def test_transactions_of_processes_do_not_overlap(tmp_path, key, deleted):
+def test_transactions_of_processes_do_not_overlap(tmp_path, key):
     tiny_board(tmp_path / "board").close()
     children = []
     for worker in range(3):
@@ -305,19 +257,15 @@ def test_transactions_of_processes_do_not_overlap(tmp_path, key, deleted):
         if child == 0:
             status = 1
             try:
-                with insist(lambda: Store.open(tmp_path / "board")) as store:
+                with Store.open(tmp_path / "board") as store:
                     for number in range(10 * worker, 10 * worker + 4):
-                        signed = insist(partial(put_artefacts, store, key, number))
-                        insist(partial(store.receive, signed))
+                        put_submission(store, key, number)
                 status = 0
             except BaseException:
                 traceback.print_exc()
             finally:
                 os._exit(status)
         children.append(child)
-    for _ in range(deleted):
-        (tmp_path / "board" / "index.sqlite").unlink(missing_ok=True)
-        time.sleep(0.02)
     assert [os.waitpid(child, 0)[1] for child in children] == [0, 0, 0]
     with Store.open(tmp_path / "board") as store:
         assert len(store.entries()) == 12
@@ -328,7 +276,7 @@ def test_transactions_of_processes_do_not_overlap(tmp_path, key, deleted):
 
 
 def test_transactions_nest_and_one_that_fails_after_the_log_entry_loses_nothing(store, key):
-    def fails() -> None:
+    def fails():
         with store.transaction() as outer, store.transaction() as inner:
             assert isinstance(inner, Index)
             assert inner is outer

@@ -1,21 +1,26 @@
-from __future__ import annotations
+"""Objects, the lock of a board, and boards without `flock`: read, but not written."""
 
+import json
 import os
 import stat
+import subprocess
+import sys
 import threading
-from collections.abc import Iterator
+import time
+from pathlib import Path
 
 import pytest
 
 from leaderboard.errors import BoardError, Rejection, TamperedError
-from leaderboard.store import Store
+from leaderboard.store import Store, files
+from leaderboard.store.files import FolderLock
 from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import tiny_board
 
 KEY = "ab" * 32
 
 
-def files(store: Store) -> list[str]:
+def stored(store):
     return [path.name for path in store.folder.objects.rglob("*") if path.is_file()]
 
 
@@ -30,7 +35,7 @@ def test_an_object_is_stored_once_and_read_back_unchanged(store):
 
 
 def test_an_upload_of_other_bytes_or_that_breaks_off_leaves_nothing(store):
-    def broken() -> Iterator[bytes]:
+    def broken():
         yield b"half"
         raise ConnectionAbortedError
 
@@ -39,14 +44,14 @@ def test_an_upload_of_other_bytes_or_that_breaks_off_leaves_nothing(store):
     assert refused.value.code == "artefact_digest"
     with pytest.raises((BoardError, ConnectionAbortedError)):
         store.put_object(sha256_of(b"half and half"), broken(), by=KEY)
-    assert files(store) == []
+    assert stored(store) == []
 
 
 def test_a_stream_is_stopped_at_the_limit_and_leaves_nothing(tmp_path):
     with tiny_board(tmp_path / "board", limits={"artefact_bytes": 1000}) as store:
         read = 0
 
-        def endless() -> Iterator[bytes]:
+        def endless():
             nonlocal read
             while True:
                 read += 100
@@ -56,7 +61,7 @@ def test_a_stream_is_stopped_at_the_limit_and_leaves_nothing(tmp_path):
             store.put_object(sha256_of(b""), endless(), by=KEY)
         assert refused.value.code == "too_large"
         assert read == 1100
-        assert files(store) == []
+        assert stored(store) == []
 
 
 def test_altered_missing_and_misnamed_objects_are_not_returned(store):
@@ -88,7 +93,7 @@ def test_many_threads_upload_the_same_object_once(store):
     data = os.urandom(50_000)
     new: list[bool] = []
 
-    def upload() -> None:
+    def upload():
         new.append(store.put_object(sha256_of(data), [data], by=KEY))
 
     threads = [threading.Thread(target=upload) for _ in range(8)]
@@ -98,5 +103,60 @@ def test_many_threads_upload_the_same_object_once(store):
         thread.join()
     assert len(new) == 8
     assert any(new)
-    assert files(store) == [store.folder.object(sha256_of(data)).name]
+    assert stored(store) == [store.folder.object(sha256_of(data)).name]
     assert store.total_bytes() == len(data)
+
+
+WITHOUT_POSIX = """
+import sys
+for name in ("fcntl", "resource", "pwd", "grp", "termios"):
+    sys.modules[name] = None
+from leaderboard.cli import main
+for command in ("rank", "verify"):
+    sys.argv = ["sme-leaderboard", command, "examples/board", "--json"]
+    try:
+        main()
+    except SystemExit as ended:
+        assert not ended.code, command
+"""
+
+
+def test_readers_share_the_lock_and_a_writer_excludes_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "BUSY_SECONDS", 0.05)
+    one, other = FolderLock(tmp_path), FolderLock(tmp_path)
+    with one.hold(exclusive=False), other.hold(exclusive=False):
+        pass
+    with one.hold(exclusive=True):
+        start = time.monotonic()
+        with pytest.raises(BoardError, match="another process"), other.hold(exclusive=False):
+            pass
+        assert time.monotonic() - start >= 0.05
+    with other.hold(exclusive=True):
+        pass
+    one.close()
+    one.close()
+    with pytest.raises(BoardError, match="closed"), one.hold(exclusive=False):
+        pass
+    other.close()
+
+
+def test_a_board_is_read_but_not_written_without_flock(store, submit, monkeypatch):
+    signed = submit()
+    monkeypatch.setattr(files, "fcntl", None)
+    with Store.open(store.folder.path, read_only=True) as reader:
+        assert [entry.id for entry in reader.entries()] == [signed.id]
+    with pytest.raises(BoardError, match="only be written on Linux and macOS"):
+        Store.open(store.folder.path)
+
+
+def test_reading_commands_run_without_posix_modules():
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_POSIX],
+        cwd=Path(__file__).parents[3],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    rows, report = done.stdout.split("\n{", 1)
+    assert json.loads(rows)
+    assert json.loads("{" + report)

@@ -1,16 +1,10 @@
 """Seasons on a board: the order of things, what the clock forbids, and an index that follows."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import pytest
 
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.master import Master
-from leaderboard.documents.season import Reveal, Season
+from leaderboard.documents.season import Reveal
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.scoring.verify import verify
 from leaderboard.store import Store
@@ -32,11 +26,11 @@ ONLINE, OFFLINE = "sealed-online", "sealed-offline"
 ANSWER = {"sha256": "sha256:" + "a" * 64, "size": 512}
 
 
-def reveal(season: Season, master: Master = MASTER) -> Reveal:
+def reveal(season, master=MASTER):
     return Reveal(season=season.digest, master=master.raw.hex())
 
 
-def play(store: Store, key: SigningKey, move: Any) -> tuple[Season, Season]:
+def play(store, key, move):
     """Both kinds of season, from their announcement to their results."""
     offline, online = tiny_season(OFFLINE), tiny_season(ONLINE)
     entry = signed_entry(store, offline, key, [ANSWER, None])
@@ -54,7 +48,7 @@ def play(store: Store, key: SigningKey, move: Any) -> tuple[Season, Season]:
     return offline, online
 
 
-def derived(store: Store) -> list[object]:
+def derived(store):
     with store.reading() as index:
         return list(index.derived_rows())
 
@@ -121,7 +115,7 @@ def test_the_same_request_is_the_same_ticket_and_another_the_next(store, key):
 
 @pytest.mark.parametrize("track", [OFFLINE, ONLINE])
 def test_the_clock_decides_and_no_earlier_clock_reopens(store, key, track, monkeypatch):
-    def attempt(season: Season) -> object:
+    def attempt(season):
         if track == OFFLINE:
             return store.enter(signed_entry(store, season, key, [None, None]))
         return store.start_ticket(signed_request(store, season, key))
@@ -265,7 +259,7 @@ def test_an_entrants_name_is_nobody_elses_and_no_entry_is_ranked_before_the_reve
     assert store.head == before
 
 
-def test_what_processes_that_die_write_of_seasons_is_logged_or_not(tmp_path: Path, key, later):
+def test_what_processes_that_die_write_of_seasons_is_logged_or_not(tmp_path, key, later):
     season = tiny_season()
     with tiny_board(tmp_path / "board") as store:
         store.announce(season)
@@ -276,8 +270,8 @@ def test_what_processes_that_die_write_of_seasons_is_logged_or_not(tmp_path: Pat
         store.announce(online)
         request, other = (signed_request(store, online, key, nonce) for nonce in (0, 1))
 
-    def after_every_death(work: Callable[[Store], object]) -> Store:
-        def run() -> None:
+    def after_every_death(work):
+        def run():
             with Store.open(tmp_path / "board") as opened:
                 work(opened)
 
