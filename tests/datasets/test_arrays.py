@@ -1,28 +1,15 @@
 """`Transitions` and its conversion for d3rlpy: all rows are aligned."""
 
 import dataclasses
-import importlib.util
-import json
-import os
-import subprocess
-import sys
-import textwrap
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import sme_registry
 from sme_registry.datasets import DatasetRecipe, to_d3rlpy
 from sme_registry.datasets.collect import collect
 from sme_registry.datasets.recipe import parse_behaviour
 from sme_registry.spec import SMESpec
 from sme_registry.task import materialize
-
-# An interpreter that has d3rlpy, whose legacy gym would warn in this one at every import.
-D3RLPY = os.environ.get("SME_D3RLPY_PYTHON") or (
-    sys.executable if importlib.util.find_spec("d3rlpy") else None
-)
 
 
 def made(**fields):
@@ -91,46 +78,3 @@ def test_d3rlpy_gets_copies(fragile):
         for array in given.values():
             array[:] = -1.0
         assert fragile.digest == before
-
-
-SCRIPT = """
-    import json, sys, warnings
-    warnings.simplefilter("ignore")
-    import numpy as np
-    from d3rlpy.dataset import MDPDataset
-    stored = np.load(sys.argv[1])
-    dataset = MDPDataset(**{name: stored[name] for name in stored.files})
-    picker = dataset.transition_picker
-    rows = []
-    for episode in dataset.episodes:
-        for index in range(episode.transition_count):
-            one = picker(episode, index)
-            rows.append([one.observation, one.action, one.reward, one.next_observation,
-                         [float(one.terminal)]])
-    np.savez(sys.argv[2], **{str(i): np.array(column) for i, column in enumerate(zip(*rows))})
-    print(json.dumps([len(dataset.episodes), len(rows)]))
-"""
-
-
-@pytest.mark.skipif(D3RLPY is None, reason="d3rlpy is not installed (SME_D3RLPY_PYTHON names one)")
-@pytest.mark.parametrize("final_observations", [False, True])
-def test_d3rlpy_reads_the_transitions_of_the_task(fragile, final_observations, tmp_path):
-    given = to_d3rlpy(fragile, final_observations=final_observations)
-    np.savez(tmp_path / "given.npz", **given)
-    done = subprocess.run(
-        [D3RLPY, "-c", textwrap.dedent(SCRIPT), tmp_path / "given.npz", tmp_path / "seen.npz"],
-        capture_output=True, text=True, timeout=300, check=False,
-        env={**os.environ, "PYTHONPATH": str(Path(sme_registry.__file__).parents[1])},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    episodes, count = json.loads(done.stdout.splitlines()[-1])
-    assert episodes == len(fragile.ends)
-    kept = np.ones(250, bool) if final_observations else ~fragile.timeouts
-    assert count == kept.sum()
-    seen = np.load(tmp_path / "seen.npz")
-    np.testing.assert_array_equal(seen["0"], fragile.observations[kept])
-    np.testing.assert_array_equal(seen["1"], fragile.actions[kept])
-    np.testing.assert_allclose(seen["2"][:, 0], fragile.rewards[kept], atol=1e-7)
-    np.testing.assert_array_equal(seen["4"][:, 0] > 0, fragile.terminations[kept])
-    going_on = ~fragile.terminations[kept]
-    np.testing.assert_array_equal(seen["3"][going_on], fragile.next_observations[kept][going_on])

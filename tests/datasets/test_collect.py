@@ -8,7 +8,7 @@ from scipy.stats import kstest
 
 import sme_registry
 from sme_registry.datasets import DatasetRecipe, replay
-from sme_registry.datasets.behaviour import EpisodeStream, OptimalPolicy, noise_task
+from sme_registry.datasets.behaviour import noise_task
 from sme_registry.datasets.collect import collect
 from sme_registry.datasets.recipe import parse_behaviour
 from sme_registry.errors import (
@@ -202,15 +202,6 @@ def test_the_mean_similarity_is_one_minus_a_sixth_of_nu_over_the_draws_of_the_no
     assert bunched > 0.87
 
 
-def test_given_its_noise_policy_the_mean_similarity_is_exact():
-    of = recipe(acting=[(0.8, 1.0)], transitions=20_000, seed=4)
-    data = collected(of)
-    noise = noise_task(materialize(of.spec), 4).optimal_action(data.states)
-    missed = np.abs(noise - data.optimal_actions).mean(axis=1)
-    error = (data.similarities - (1 - 0.4 * missed)).std() / np.sqrt(len(data))
-    assert abs(data.similarities.mean() - (1 - 0.4 * missed.mean())) < 4 * error
-
-
 def test_random_actions_are_uniform_and_drawn_at_every_step():
     data = collected(recipe(acting=[("random", 1.0)], transitions=5_000))
     assert len(np.unique(data.actions)) > 19_000
@@ -325,22 +316,3 @@ def test_replay_detects_a_change_in_any_array_and_row(driven, row):
     shifted = dataclasses.replace(data, actions=np.roll(data.actions, 1, axis=0))
     with pytest.raises(FingerprintMismatchError, match="row 0"):
         replay(shifted, of, task)
-
-
-def test_random_numbers_depend_on_the_episode_only():
-    alone, beside = EpisodeStream(1, "x", 1, 3, ahead=2), EpisodeStream(1, "x", 5, 3, ahead=7)
-    alone.begin(0, 4)
-    for lane in range(5):
-        beside.begin(lane, lane)
-    numbers = np.array([beside.next() for _ in range(9)])
-    np.testing.assert_array_equal(numbers[:, 4], np.array([alone.next()[0] for _ in range(9)]))
-    assert len(np.unique(numbers)) == numbers.size
-
-
-def test_the_optimal_policy_has_the_same_bits_in_any_batch():
-    task = materialize(SMESpec(complexity=10))
-    s = np.random.default_rng(0).random((50, 8))
-    together = OptimalPolicy(task, 50)(s).copy()
-    np.testing.assert_allclose(together, task.optimal_action(s), atol=1e-12)
-    for lane in (0, 17, 49):
-        np.testing.assert_array_equal(OptimalPolicy(task, 1)(s[lane : lane + 1])[0], together[lane])

@@ -227,12 +227,6 @@ class TestTheSameCommand:
             first, second = (folder / NAME / "data" / file for folder in (root, tmp_path))
             assert first.read_bytes() == second.read_bytes()
 
-    def test_with_another_seed_gives_other_ones(self, root, tmp_path):
-        make_dataset("Default", mix=[(0.5, 0.5), ("random", 0.5)], transitions=250, seed=8,
-                     name=NAME, folder=tmp_path)  # fmt: skip
-        digests = {open_dataset(NAME, folder).record.arrays_digest for folder in (root, tmp_path)}
-        assert len(digests) == 2
-
 
 class TestNames:
     @pytest.mark.parametrize(
@@ -467,19 +461,6 @@ class TestAMisplacedSet:
         monkeypatch.setenv("MINARI_DATASETS_PATH", str(copied))
         with pytest.warns(UserWarning, match=f"does not match id '{NAME}'"):
             assert list(minari.list_local_datasets()) == [NAME]
-
-    def test_opens_but_fails_the_location_check_by_any_name(self, misplaced, copied, monkeypatch):
-        monkeypatch.chdir(copied / misplaced)
-        for path in (misplaced, copied / misplaced, ".", "data"):
-            with pytest.raises(SpecError, match=f"contains the data set {NAME}"):
-                storage.check_location(open_dataset(path, copied), copied)
-
-    def test_outside_the_root_is_checked_by_the_end_of_its_path(self, copied, tmp_path):
-        for place, right in [("a/sme/tests-v0", True), ("mine", False), ("sme/copy-v0", False)]:
-            shutil.copytree(copied / NAME, tmp_path / place)
-            dataset, error = open_dataset(tmp_path / place), f"back to a folder {NAME}"
-            with nullcontext() if right else pytest.raises(SpecError, match=error):
-                storage.check_location(dataset, copied)
 
     def test_a_symbolic_link_in_the_right_place_is_correct(self, copied, tmp_path):
         (copied / NAME).rename(tmp_path / "elsewhere")

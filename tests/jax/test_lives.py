@@ -19,7 +19,6 @@ from sme_registry.jax.env import observe as observe_in_jax
 from sme_registry.jax.lives import Lives
 from sme_registry.jax.ppo import PPO, PPOProgram
 from sme_registry.jax.program import StepLog
-from sme_registry.jax.task import Shape
 from sme_registry.jax.td3 import TD3, TD3Program
 from sme_registry.spec import StreamSpec
 from sme_registry.task import materialize_stream, observe, step
@@ -193,20 +192,6 @@ def test_a_restored_life_goes_on_with_the_same_bits(algorithm, saved_at):
     one.finish()
     other.finish()
     np.testing.assert_equal(one.save(), other.save())
-
-
-def test_tasks_of_one_layer_and_of_several_are_padded_apart():
-    lives = Lives([CURRICULUM, CURRICULUM], Shape(5, 4, 6, 8), jax.devices()[0])
-    shallow, *deep = (lives.at(lifetime) for lifetime in (0, 14, 28))
-    assert lives.at(13) is shallow
-    assert shallow.inner is None
-    assert shallow.output.W.shape == (2, 4, 5)
-    assert [params.inner.stacked.W.shape for params in deep] == [(2, 4, 8, 8)] * 2
-    assert lives.separable
-    exact = cached_lives(CURRICULUM).at(28)
-    assert exact.inner.stacked.W.shape == (1, 1, 4, 4)
-    sparse_later = stream_of((BASE.derive(k=1, D=0.0), 9), (BASE, 9), switch="step")
-    assert not cached_lives(sparse_later).separable
 
 
 @cache

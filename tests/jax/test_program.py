@@ -129,14 +129,6 @@ def test_the_state_of_another_program_is_refused():
     np.testing.assert_equal(two.save(), program(BASE_LANES).save())
 
 
-def test_only_lanes_with_weights_that_are_not_finite_have_failed():
-    broken = program(BASE_LANES)
-    assert not broken.failed().any()
-    actor = broken.state.weights["actor.weight"].at[2, 0, 0].set(jnp.nan)
-    broken.state = broken.state._replace(weights={**broken.state.weights, "actor.weight": actor})
-    assert broken.failed().tolist() == [False, False, True, False]
-
-
 def test_too_many_lanes_for_the_memory_are_refused_with_the_number_that_fits():
     memory = available_memory()
     assert memory is not None

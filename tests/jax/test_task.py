@@ -50,11 +50,6 @@ def test_dtypes_are_those_of_the_oracle_and_of_states():
     assert task_params(SMESpec(), states="pairs").W.dtype == jnp.uint32
 
 
-def test_hidden_width_of_a_task_without_inner_layers_does_not_split_groups():
-    assert Shape.of(SMESpec(hidden_width=16)) == Shape.of(SMESpec(hidden_width=64))
-    assert Shape.of(SMESpec(complexity=2, hidden_width=16)) == Shape(8, 4, 2, 16)
-
-
 def test_a_list_of_names_or_fields_has_an_axis_of_lanes_and_any_shape_that_covers_it():
     assert task_params(["SME/Default-v1", {"seed": 0}]).W.shape == (2, 4, 8)
     assert task_params([SMESpec()]).W.shape == (1, 4, 8)
@@ -70,9 +65,7 @@ TEAM = SMESpec.from_dict({"action_dim": 2, "team": {"agents": [{"action_dim": 1}
     [
         ([SMESpec(), SMESpec(complexity=2)], {}, r"complexity=1 .* 2: must be 1 for all"),
         (SMESpec(), {"shape": Shape(8, 3, 1, 0)}, r"shape.action_dim=3: must be at least 4"),
-        (SMESpec(), {"shape": (2, 2)}, r"^shape=.*: must be a Shape of state_dim, action"),
         (SMESpec(), {"shape": (8, 4, 1, "wide")}, r"^shape=.*: must be a Shape of state_dim"),
-        (SMESpec(), {"shape": 3}, r"^shape=.*: must be a Shape of state_dim, action"),
         ([], {}, r"specs=\[\]: must have at least one"),
         (SMESpec(), {"states": "int"}, r"states='int': must be 'float64' or 'pairs'"),
         (SMESpec(), {"dtype": jnp.bfloat16}, r"dtype=.*: must be float64 or float32"),

@@ -12,6 +12,7 @@ import pytest
 from rich.console import Console
 
 from sme_registry import EvaluationReport, SMESpec, evaluate
+from sme_registry.cli.train_suite import equal_runs
 from sme_registry.errors import (
     MissingDependencyError,
     OptionError,
@@ -19,8 +20,9 @@ from sme_registry.errors import (
     SMEError,
 )
 from sme_registry.io import file_lock
+from sme_registry.spec import Suite
 from sme_registry.training import RunRecord, train
-from sme_registry.training.episodes import Episode, read_episodes
+from sme_registry.training.episodes import COLUMNS, Episode, EpisodeLog, read_episodes
 from tests.training.runs import NARROW, PROTOCOL, TINY, copy_files, short
 
 pytest.importorskip("stable_baselines3")
@@ -249,20 +251,15 @@ def test_a_folder_with_other_files_is_never_touched(tmp_path):
     [
         ({"task": "Defalt"}, "Did you mean 'Default"),
         ({"task": {"state_dim": 2**20, "action_dim": 2**20}}, "state_dim"),
-        ({"task": {"state_dim": 0}}, "state_dim=0"),
         ({"algorithm": "TD4"}, "Did you mean 'TD3'"),
         ({"resume": True}, "contains no run to resume. Leave out --resume"),
         ({"hyperparameters": {"buffer_size": 10**15}}, "rejects the task or .*buffer_size"),
         ({"hyperparameters": {"gama": 0.9}}, "Did you mean 'gamma'"),
         ({"hyperparameters": {"learning_rate": "fast"}}, "rejects the task or"),
         ({"steps": 0}, "steps=0"),
-        ({"steps": True}, "steps=True"),
-        ({"seed": 2**32}, "seed="),
         ({"num_envs": 5000}, "num_envs=5000"),
-        ({"checkpoint_every": 0}, "checkpoint_every=0"),
         ({"action_range": "both"}, "action_range='both'"),
         ({"protocol": "papr-v1"}, "Did you mean"),
-        ({"protocol": {"states": 4}}, "states=4"),
     ],
 )
 def test_invalid_arguments_raise_typed_errors_and_create_no_folder(change, message, tmp_path):
@@ -281,3 +278,31 @@ def test_missing_stable_baselines_names_the_extra(tmp_path, monkeypatch):
 def test_importing_the_package_of_training_imports_no_torch():
     code = "import sys, sme_registry.training; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize(("seeds", "runs"), [([1], 10), ([1, 2, 3], 12), (list(range(15)), 15)])
+def test_by_default_all_instances_of_a_class_have_equally_many_runs(seeds, runs):
+    suite = Suite.from_dict({"classes": [{"name": "one", "setting": {"k": 2}, "seeds": seeds}]})
+    assert equal_runs(suite) == runs
+
+
+def episode(number):
+    return Episode(number, 20 * number, 1.5, 20, 0.25, 0.9, 0, 0.5)
+
+
+def test_a_row_cut_short_and_rows_after_the_checkpoint_are_dropped(tmp_path):
+    path = tmp_path / "episodes.csv"
+    log = EpisodeLog(path)
+    assert path.read_text() == ",".join(COLUMNS) + "\n"
+    for number in (1, 2, 3):
+        log.add(episode(number))
+        assert len(read_episodes(path)) == number  # on disk before the next one begins
+    log.close()
+    with path.open("a") as stream:
+        stream.write("4,80,1.5,2")
+    assert read_episodes(path) == [episode(1), episode(2), episode(3)]
+    EpisodeLog(path, up_to_step=45).close()
+    assert read_episodes(path) == [episode(1), episode(2)]
+    path.write_text("a,b\n1,2\n")
+    with pytest.raises(OptionError, match="columns"):
+        read_episodes(path)

@@ -1,13 +1,17 @@
-"""Ours beside d3rlpy's, from the same weights on the same batch; skipped where it is not installed.
+"""Our data sets, BC and IQL beside d3rlpy's: the same rows, losses, updates and actions.
 
-d3rlpy brings the retired `gym`, so it has an environment of its own, beside the repository's:
+Run by hand: d3rlpy brings the retired `gym`, so it has an environment of its own, beside the
+repository's.
 
     python3 -m venv ../d3rlpy
-    ../d3rlpy/bin/pip install -c constraints.txt -e '.[offline]' pytest hypothesis d3rlpy==2.8.0
-    ../d3rlpy/bin/python -m pytest tests/offline/test_against_d3rlpy.py
+    ../d3rlpy/bin/pip install -c constraints.txt -e '.[offline]' pytest-benchmark d3rlpy==2.8.0
+    ../d3rlpy/bin/python -m pytest benchmarks/against_d3rlpy.py
 """
 
+from __future__ import annotations
+
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,26 +21,30 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # of the libraries below it
     d3rlpy = pytest.importorskip("d3rlpy")
 
-from sme_registry.offline.bc import BC  # noqa: E402
-from sme_registry.offline.hyperparameters import (  # noqa: E402
+from sme_registry import SMESpec, materialize
+from sme_registry.datasets import DatasetRecipe, to_d3rlpy
+from sme_registry.datasets.collect import collect
+from sme_registry.datasets.recipe import parse_behaviour
+from sme_registry.offline.bc import BC
+from sme_registry.offline.hyperparameters import (
     BCHyperparameters,
     IQLHyperparameters,
 )
-from sme_registry.offline.iql import IQL  # noqa: E402
-from sme_registry.offline.networks import Batch  # noqa: E402
+from sme_registry.offline.iql import IQL
+from sme_registry.offline.networks import Batch
 
 SEEN, ACTED, ROWS = 10, 4, 256
 
 
 @pytest.fixture
-def batch():
+def batch() -> Batch:
     torch.manual_seed(1)
     u = torch.rand(ROWS, ACTED) * 2 - 1
     continues = (torch.rand(ROWS, 1) < 0.9).float()
     return Batch(torch.rand(ROWS, SEEN), u, torch.rand(ROWS, SEEN), torch.rand(ROWS, 1), continues)
 
 
-def as_theirs(batch):
+def as_theirs(batch: Batch) -> Any:
     from d3rlpy.torch_utility import TorchMiniBatch
 
     return TorchMiniBatch(
@@ -52,13 +60,13 @@ def as_theirs(batch):
     )
 
 
-def theirs(config):
+def theirs(config: Any) -> Any:
     algorithm = config.create(device="cpu:0")
     algorithm.create_impl((SEEN,), ACTED)
     return algorithm.impl
 
 
-def give(ours, to):
+def give(ours: torch.nn.Module, to: torch.nn.Module) -> None:
     """Their network gets our weights; both hold them in the same order of layers."""
     own, other = list(ours.parameters()), shaped(to)
     assert [p.shape for p in own] == [p.shape for p in other]
@@ -67,19 +75,19 @@ def give(ours, to):
             target.copy_(source)
 
 
-def shaped(network):
+def shaped(network: torch.nn.Module) -> list[torch.nn.Parameter]:
     """Their layers' weights and biases, encoder first, without log σ."""
     named = dict(network.named_parameters())
     encoder = [p for name, p in named.items() if name.startswith("_encoder")]
     return encoder + [p for name, p in named.items() if name.startswith(("_fc", "_mu"))]
 
 
-def close(ours, to):
+def close(ours: torch.nn.Module, to: torch.nn.Module) -> None:
     for mine, other in zip(ours.parameters(), shaped(to), strict=True):
         torch.testing.assert_close(mine, other, rtol=1e-5, atol=1e-7)
 
 
-def test_a_step_of_bc_is_the_same(batch):
+def test_a_step_of_bc_is_the_same(batch: Batch) -> None:
     ours = BC(SEEN, ACTED, BCHyperparameters())
     impl = theirs(d3rlpy.algos.BCConfig(batch_size=ROWS))
     give(ours.actor, impl.policy)
@@ -89,7 +97,9 @@ def test_a_step_of_bc_is_the_same(batch):
     close(ours.actor, impl.policy)
 
 
-def test_the_losses_of_iql_are_the_same_and_so_are_critics_and_value_after_a_step(batch):
+def test_the_losses_of_iql_are_the_same_and_so_are_critics_and_value_after_a_step(
+    batch: Batch,
+) -> None:
     ours = IQL(SEEN, ACTED, IQLHyperparameters())
     impl = theirs(d3rlpy.algos.IQLConfig())
     modules = impl.modules
@@ -123,7 +133,7 @@ def test_the_losses_of_iql_are_the_same_and_so_are_critics_and_value_after_a_ste
         close(mine, other)
 
 
-def test_the_policy_acts_the_same(batch):
+def test_the_policy_acts_the_same(batch: Batch) -> None:
     from sme_registry.offline import OfflinePolicy
     from sme_registry.offline.networks import weights
 
@@ -138,3 +148,29 @@ def test_the_policy_acts_the_same(batch):
     np.testing.assert_allclose(
         OfflinePolicy(weights(ours.actor))(observations), algorithm.predict(observations), atol=1e-6
     )
+
+
+@pytest.mark.parametrize("final_observations", [False, True])
+def test_d3rlpy_reads_the_transitions_of_the_task(final_observations: bool) -> None:
+    spec = SMESpec(horizon=20, D=0.05)
+    recipe = DatasetRecipe(spec=spec, behaviours=(parse_behaviour(0.8),), transitions=250)
+    ours = collect(recipe, materialize(spec))
+    assert ours.terminations.any()
+    assert ours.timeouts.any()
+    given = to_d3rlpy(ours, final_observations=final_observations)
+    dataset = d3rlpy.dataset.MDPDataset(**given)
+    assert len(dataset.episodes) == len(ours.ends)
+    theirs = [
+        dataset.transition_picker(episode, index)
+        for episode in dataset.episodes
+        for index in range(episode.transition_count)
+    ]
+    kept = np.ones(250, bool) if final_observations else ~ours.timeouts
+    assert len(theirs) == kept.sum()
+    for row, one in zip(np.flatnonzero(kept), theirs, strict=True):
+        np.testing.assert_array_equal(one.observation, ours.observations[row])
+        np.testing.assert_array_equal(one.action, ours.actions[row])
+        np.testing.assert_allclose(one.reward[0], ours.rewards[row], atol=1e-7)
+        assert (one.terminal > 0) == ours.terminations[row]
+        if not ours.terminations[row]:
+            np.testing.assert_array_equal(one.next_observation, ours.next_observations[row])
