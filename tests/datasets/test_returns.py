@@ -152,7 +152,10 @@ def test_the_interval_of_random_actions_contains_their_mean(source):
     random = np.random.default_rng(3)
     act: Any
     if source == "policy":
-        act, fault = (lambda o: random.random((len(o), 1))), "the policy is stochastic"
+        act, fault = (
+            lambda o: random.random((len(o), 1)) * (o[:, :1] > 0),  # 0 in the state 0
+            "the policy is stochastic",
+        )
     else:
         act, fault = (lambda o: o[:, 1:2]), "the task has 1 distractors"
         spec = spec.derive(observation={"distractors": 1})

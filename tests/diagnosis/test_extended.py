@@ -247,6 +247,9 @@ def test_the_capacity_probe_sees_what_the_agent_sees(monkeypatch):
     pytest.importorskip("torch")
     monkeypatch.setattr(networks, "GRADIENT_STEPS", 1000)  # it tells how far it is
     subject = load_policy(network(), EXTENDED)
-    measured = diagnose(subject, states=64, episodes=8, probe_capacity=True).measurements
+    said = []
+    found = diagnose(subject, states=64, episodes=8, probe_capacity=True, progress=said.append)
+    assert any("capacity, 1,000 of 1,000 gradient steps" in each for each in said)
+    measured = found.measurements
     assert measured.capacity.layers == (EXTENDED.observation_dim, 16, EXTENDED.action_dim)
     assert measured.capacity.test_normalised_regret < 0.5

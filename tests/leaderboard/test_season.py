@@ -342,7 +342,9 @@ def test_the_class_with_the_fewest_runs_decides_on_a_rank(tmp_path, key, later, 
 
 
 @pytest.mark.parametrize(("needed", "reason"), [(4, ""), (5, "too_few_runs")])
-def test_the_tickets_of_each_method_have_their_own_scores_and_rank(tmp_path, key, needed, reason):
+def test_the_tickets_of_each_method_have_their_own_scores_and_rank(
+    tmp_path, key, later, needed, reason
+):
     season = tiny_season("sealed-online")
     with tiny_board(tmp_path / "board", runs_to_rank=needed) as store:
         store.announce(season)
@@ -356,6 +358,9 @@ def test_the_tickets_of_each_method_have_their_own_scores_and_rank(tmp_path, key
                 runs = [run.model_copy(update={"wd_regret": 0.5}) for run in result.runs]
                 result = sealed_result(season, request.id, runs, {}, 100, result.stepping)
             store.end_ticket(season.digest, number + 1, result)
+        later()
+        reveal(store, season)
+        assert score_entries(store, season.id) == 0
         rows = season_rankings(store, season, "wd_regret")["generic"]
     shown = [(row.entry.method, row.value.value, row.entry.runs, row.reason) for row in rows]
     assert shown == [("Good", 0.5, 4, reason), ("Bad", 1.0, 4, reason)]

@@ -66,6 +66,7 @@ def test_a_hidden_task_is_stepped_as_the_same_task_is_here(server, action_range)
     assert hidden.metadata["autoreset_mode"] == here.metadata["autoreset_mode"]
     observation, info = hidden.reset(seed=5)
     assert info == {}
+    assert hidden.np_random.random() == np.random.default_rng(5).random()
     assert np.array_equal(observation, here._batch.observe())
     for actions in random_actions(3, 20, low=hidden.action_space.low.min()):
         # Actions travel as float32 of the unit range.
