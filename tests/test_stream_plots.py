@@ -148,7 +148,6 @@ def test_reports_are_read_from_files_and_folders(tmp_path):
         (plots.retention_map, 3, "runs=3: must be a StreamReport"),
         (plots.performance_curve, ["missing.json"], "missing.json"),
         (plots.plasticity_curve, lambda: [report(0), report(0, 2)], "different values of stream"),
-        (plots.plasticity_curve, lambda: {"a": report(0), "b": report(0, 2)}, "stream_digest"),
         (plots.plasticity_curve, plain, "has no fresh agents"),
         (plots.dynamic_regret_curve, plain, "has no dynamic regret"),
     ],

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.engine.ledger import Ledger
 
 PROTOCOL = {"states_per_region": 2, "epsilons": [1.0]}
 STARTED, GATE = "started", "gate"
@@ -89,6 +90,15 @@ def surroundings(folder, cell, progress=None, model_path=None):
     threads = f"{os.environ['OMP_NUM_THREADS']} {numba.get_num_threads()}"
     (folder / "threads").write_text(threads)
     return run_cell(cell)
+
+
+def numbers(study):
+    """All results but their times, and the versions of what else this process has loaded."""
+    documents = {key: result.to_dict() for key, result in Ledger(study).results().items()}
+    for document in documents.values():
+        del document["timing"]
+        document.get("report", document.get("stream_report"))["versions"] = {}
+    return documents
 
 
 def starts(folder):

@@ -1,8 +1,5 @@
 """Studies that have been run: folders with real results of learners that learn in milliseconds."""
 
-from collections.abc import Callable
-from typing import Any
-
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.ledger import Ledger
@@ -21,7 +18,6 @@ CLASSES = {
     "complexity-10": {"complexity": 10, "policy_init": "unit_variance"},
     "plane": {"state_dim": 2, "action_dim": 2, "complexity": 10},
 }
-Choice = Callable[[Any], bool]  # of the plan's cells
 
 
 def study_file(classes=CLASSES, learners=LEARNERS, **fields):

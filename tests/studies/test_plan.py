@@ -1,11 +1,8 @@
 """Plans: how those of the catalogue were made, what they take, how they are cut, by command."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -22,7 +19,7 @@ ABLATIONS = catalogue.find(StudyFile, "paper-ablations")
 THREE = ("-a", "PPO", "-a", "TD3", "-a", "SAC")
 
 # The plans of the catalogue are what these commands write, with a description.
-MADE_BY: dict[str, tuple[str, ...]] = {
+MADE_BY = {
     "smoke": (
         *("--suite", "smoke", *THREE, "-a", "reference:linear", "--seeds", "2"),
         *("-n", "250", "-n", "PPO=2048", "--evaluations", "10", "--protocol", "quick-v1"),
@@ -44,7 +41,7 @@ MADE_BY: dict[str, tuple[str, ...]] = {
 OFFLINE = "offline-quality"
 
 
-def offline_quality() -> StudyPlan:
+def offline_quality():
     """METHOD, section 4: three depths, five qualities, BC and IQL; no command writes such names."""
     setting = {name: value for name, value in SMESpec().to_dict().items() if name != "seed"}
     return StudyPlan.from_dict(
@@ -76,37 +73,37 @@ def offline_quality() -> StudyPlan:
 
 
 @pytest.fixture(autouse=True)
-def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "120")
 
 
-def good(*arguments: str | Path) -> str:
+def good(*arguments):
     return commands.good("study", *arguments).stdout
 
 
-def refused(*arguments: str | Path) -> str:
+def refused(*arguments):
     message = commands.refused("study", *arguments)
     assert len(message.splitlines()) == 1
     return message
 
 
 class TestCatalogue:
-    def test_every_plan_is_made_by_a_command_that_is_written_down(self) -> None:
+    def test_every_plan_is_made_by_a_command_that_is_written_down(self):
         assert {file.name for file in catalogue.entries(StudyFile)} == {*MADE_BY, OFFLINE}
 
     @pytest.mark.parametrize("name", MADE_BY)
-    def test_a_plan_is_what_its_command_writes(self, name: str) -> None:
+    def test_a_plan_is_what_its_command_writes(self, name):
         file = catalogue.find(StudyFile, name)
         path = f"{file.versioned_name}.json"
         good("new", path, "--name", name, "--description", file.description, *MADE_BY[name])
         assert file.description
         assert Path(path).read_text() == (catalogue.spec_folder() / "studies" / path).read_text()
 
-    def test_the_offline_study_is_the_papers(self) -> None:
+    def test_the_offline_study_is_the_papers(self):
         assert catalogue.find(StudyFile, OFFLINE).plan == offline_quality()
 
-    def test_the_papers_ablations_are_what_the_paper_did(self) -> None:
+    def test_the_papers_ablations_are_what_the_paper_did(self):
         plan = ABLATIONS.plan
         assert plan.classes == catalogue.find(SuiteFile, "paper-ablations").suite.classes
         axes = {member.name.rsplit("-", 1)[0] for member in plan.classes[1:]}
@@ -120,7 +117,7 @@ class TestCatalogue:
 
 
 class TestScaled:
-    def test_budgets_replace_the_plans_and_leave_references_alone(self) -> None:
+    def test_budgets_replace_the_plans_and_leave_references_alone(self):
         smoke = catalogue.find(StudyFile, "smoke")
         cut = scaled(smoke, steps=100, steps_of={"TD3": 50}, seeds=1, evaluations=3)
         steps = {planned.algorithm: planned.cell.steps for planned in cut.plan.cells}
@@ -130,7 +127,7 @@ class TestScaled:
         assert (cut.name, cut.digest) == ("smoke-scaled", cut.plan.digest)
         assert scaled(cut, seeds=2).name == "smoke-scaled"
 
-    def test_more_seeds_keep_every_cell_of_fewer_and_as_many_the_plan(self) -> None:
+    def test_more_seeds_keep_every_cell_of_fewer_and_as_many_the_plan(self):
         few, many = (
             {planned.cell.digest for planned in scaled(ABLATIONS, seeds=seeds).plan.cells}
             for seeds in (2, 4)
@@ -138,13 +135,13 @@ class TestScaled:
         assert few < many
         assert scaled(ABLATIONS, steps=100_000, seeds=10) is ABLATIONS
 
-    def test_bad_budgets_are_refused(self) -> None:
+    def test_bad_budgets_are_refused(self):
         with pytest.raises(UnknownNameError, match="Did you mean 'PPO'"):
             scaled(ABLATIONS, steps_of={"PPo": 1})
         with pytest.raises(SpecError, match=r"seeds=0: must be an integer in \[1"):
             scaled(ABLATIONS, seeds=0)
 
-    def test_a_selection_has_any_pattern_of_a_kind_and_both_kinds(self) -> None:
+    def test_a_selection_has_any_pattern_of_a_kind_and_both_kinds(self):
         found = selected(ABLATIONS.plan.cells, ["class=k-*", "class=default", "algorithm=[PT]*"])
         assert {cell.class_name for cell in found} == {"k-5", "k-10", "k-25", "k-100", "default"}
         assert {cell.algorithm for cell in found} == {"PPO", "TD3"}
@@ -159,23 +156,21 @@ class TestEstimate:
         ("jobs", "workers", "ends"),
         [([], 2, 0), ([3], 4, 3), ([3, 3, 3], 1, 9), ([1, 5, 2, 2], 2, 5), ([4, 1, 1, 4], 2, 6)],
     )
-    def test_a_job_begins_as_soon_as_somebody_is_free(
-        self, jobs: list[float], workers: int, ends: float
-    ) -> None:
+    def test_a_job_begins_as_soon_as_somebody_is_free(self, jobs, workers, ends):
         assert makespan(jobs, workers) == ends
 
-    def test_without_results_it_is_between_a_quick_core_and_a_slow_one(self) -> None:
+    def test_without_results_it_is_between_a_quick_core_and_a_slow_one(self):
         by_algorithm = {cell.algorithm: cell.cell for cell in ABLATIONS.plan.cells[:3]}
         ppo, td3 = (Estimator().seconds(by_algorithm[name]) for name in ("PPO", "TD3"))
         assert 60 < ppo.low < 80 < 130 < ppo.high < 180
         assert 1200 < td3.low < 1250 < 2100 < td3.high < 2200
 
-    def test_a_deep_task_takes_longer_to_judge(self) -> None:
+    def test_a_deep_task_takes_longer_to_judge(self):
         cells = {cell.class_name: cell.cell for cell in ABLATIONS.plan.cells}
         low = {name: Estimator().seconds(cells[name]).low for name in ("default", "complexity-50")}
         assert low["complexity-50"] > low["default"] + 10
 
-    def test_what_has_finished_replaces_the_table_for_its_algorithm_alone(self) -> None:
+    def test_what_has_finished_replaces_the_table_for_its_algorithm_alone(self):
         few, many = (small_file(1, evaluations=n).plan.cells[0].cell for n in (10, 20))
         result = run_cell(few)
         slow = result.model_copy(
@@ -195,13 +190,7 @@ class TestEstimate:
 
 
 class TestCommands:
-    def test_the_help_has_examples(self) -> None:
-        for command in ("new", "plan", "run", "status"):
-            text = good(command, "--help")
-            assert "Examples:" in text
-            assert text.count(f"sme study {command}") >= 3
-
-    def test_a_plan_says_what_it_takes_before_anything_runs(self) -> None:
+    def test_a_plan_says_what_it_takes_before_anything_runs(self):
         made = json.loads(good("plan", "paper-ablations", "--cores", "64", "-j", "2", "--json"))
         assert (made["cells"], made["done"]) == (780, 0)
         assert (len(made["classes"]), made["algorithms"]) == (26, ["PPO", "TD3", "SAC"])
@@ -214,14 +203,12 @@ class TestCommands:
             assert words in text
         assert "From a table of costs, not from results: PPO, SAC, TD3" in text
 
-    def test_the_plans_of_the_catalogue_are_listed(self) -> None:
+    def test_the_plans_of_the_catalogue_are_listed(self):
         names = [entry["name"] for entry in json.loads(good("plan", "--json"))]
         assert names == catalogue.names(StudyFile)
         assert all(name in good("plan") for name in names)
 
-    def test_scales_and_selections_mean_the_same_to_plan_run_and_status(
-        self, tmp_path: Path
-    ) -> None:
+    def test_scales_and_selections_mean_the_same_to_plan_run_and_status(self, tmp_path):
         small_file(seeds=4, algorithms=["optimal", "constant"]).write(tmp_path / "p.json")
         cut = ("--seeds", "3", "--only", "algorithm=opt*")
         assert json.loads(good("plan", "p.json", *cut, "--json"))["cells"] == 3
@@ -239,7 +226,7 @@ class TestCommands:
         assert (planned["cells"], planned["done"]) == (4, 3)
         assert planned["estimated_from_results"] == ["reference:optimal"]
 
-    def test_status_shows_what_is_done_what_failed_and_what_is_left(self, tmp_path: Path) -> None:
+    def test_status_shows_what_is_done_what_failed_and_what_is_left(self, tmp_path):
         file = small_file(seeds=3)
         run_study(file, tmp_path / "s", executor="in-process", run=raising, progress=False)
         text = good("status", "s")
@@ -248,7 +235,7 @@ class TestCommands:
         text = good("status", "s", "--seeds", "5")
         assert "on one core" in text
 
-    def test_a_new_plan_has_what_was_asked_for(self) -> None:
+    def test_a_new_plan_has_what_was_asked_for(self):
         options = ("--action-range", "unit", "--action-range", "symmetric", "--seeds", "4")
         algorithms = ("-a", "PPO", "-a", "TQC=sb3_contrib:TQC", "-a", "reference:random")
         good("new", "mine.json", "-t", "Default", "--suite", "smoke", *algorithms, *options)
@@ -272,44 +259,30 @@ class TestCommands:
         ("command", "words"),
         [
             ("plan smoek", "Did you mean 'smoke"),
-            ("plan missing.json", "cannot be read"),
             ("plan smoke --steps many", "--steps 'many'"),
-            ("plan smoke --steps 5 --steps 6", "given twice"),
-            ("plan smoke --steps PP=6", "Did you mean 'PPO'"),
             ("plan smoke --only class=defalt", "Did you mean 'default'"),
-            ("plan smoke --seeds 0", "seeds=0"),
             ("plan smoke --agents torch", "agents='torch': must be 'sb3' or 'jax'"),
             ("run smoke -f s --ray local --executor processes", "--ray local"),
             ("run smoke -f s --jobs 0", "--jobs"),
             ("run smoke", "--folder"),
             ("run smoke -f s --agents jax --device abacus", "'abacus'"),
             ("status nowhere", "contains no study"),
-            ("sweep -t Default -a PPO -f s", "--sweep: is required"),
             ("new x -t Default -a PPO", "must end in .json"),
-            ("new x.json -a PPO", "--suite"),
             ("new x.json -t Default", "--algorithm"),
             ("new x.json -t Default -a PPO -a PPO", "appears twice"),
-            ("new x.json -t Default -a PPO --seeds 0", "seeds=0"),
             ("new x.json -t Team2 -a offline:bc", "because data sets are"),
             ("new x.json -t Default -a independent:PPO", "needs a team"),
-            ("new x.json -t Team2 -a independent:TD3", "on-policy"),
             ("new x.json -t Default -a PPO --set PPO.n_stepz=64", "Did you mean 'n_steps'"),
             ("new x.json -t Default -a PPO --set n=64", "ALGORITHM.NAME"),
             ("new x.json -t Default -a PPO --sweep k", "FIELD=VALUE"),
-            ("new x.json -t Default -a PPO --sweep kk=1,2", "'k'"),
             ("new x.json --suite smoke -a PPO --sweep k=1", "one --task"),
-            ("new x.json -t Default -a PP0", "Did you mean 'PPO'"),
             ("new x.json -t Default -a nomod:foo", "No module named 'nomod'"),
             ("new x.json -t Default -a reference:liner", "Did you mean 'linear'"),
-            ("new x.json -t Default -a offline:bcc", "Did you mean 'bc'"),
             ("new x.json -t Default -a jax:A2C", "one of jax:PPO, jax:TD3"),
             ("new x.json -t Team2 -a jax:PPO", "cannot learn a task for 2 agents"),
-            ("new x.json -t Plane1 -a jax:PPO --set jax-PPO.n_stepz=6", "Did you mean 'n_steps'"),
         ],
     )
-    def test_bad_input_is_one_line_and_writes_nothing(
-        self, command: str, words: str, tmp_path: Path
-    ) -> None:
+    def test_bad_input_is_one_line_and_writes_nothing(self, command, words, tmp_path):
         assert words in refused(*command.split())
         assert list(tmp_path.iterdir()) == []
 
@@ -317,7 +290,7 @@ class TestCommands:
 class TestAgents:
     """The same plan with agents in JAX is another plan, whose results are other results."""
 
-    def test_only_what_learns_online_changes_and_names_stay(self) -> None:
+    def test_only_what_learns_online_changes_and_names_stay(self):
         bc = {"name": "BC", "uses": "offline:bc", "hyperparameters": {"nu": 0.5}}
         file = small_file(algorithms=["constant", bc, {"name": "slow", "uses": "ppo"}])
         changed = with_agents(file, "jax")
@@ -339,17 +312,17 @@ class TestAgents:
         back = with_agents(with_agents(ABLATIONS, "jax"), "sb3")
         assert back.plan == ABLATIONS.plan
 
-    @pytest.mark.parametrize("uses", ["A2C", "sb3_contrib:TQC", "jax:DQN", "independent:PPO"])
-    def test_an_algorithm_that_jax_does_not_have_is_refused_by_name(self, uses: str) -> None:
+    @pytest.mark.parametrize("uses", ["A2C", "independent:PPO"])
+    def test_an_algorithm_that_jax_does_not_have_is_refused_by_name(self, uses):
         agents = {"agents": [{"action_dim": 1}, {"action_dim": 1}]}
         team = {"state_dim": 2, "action_dim": 2, "team": agents}
         classes = [{"name": "t", "setting": team, "seeds": [1]}]
-        fields: dict[str, Any] = {"classes": classes} if "independent" in uses else {}
+        fields = {"classes": classes} if "independent" in uses else {}
         file = small_file(algorithms=[{"name": "other", "uses": uses}], **fields)
         with pytest.raises(UnknownNameError, match=f"algorithm 'other': uses='{uses}'.*jax:PPO"):
             with_agents(file, "jax")
 
-    def test_both_implementations_are_two_algorithms_of_one_plan(self) -> None:
+    def test_both_implementations_are_two_algorithms_of_one_plan(self):
         good("new", "both.json", "-t", "Default", "-a", "PPO", "-a", "jax:PPO", "-a", "TD3")
         algorithms = StudyFile.read("both.json").plan.algorithms
         assert [(one.name, one.uses) for one in algorithms] == [
@@ -362,7 +335,7 @@ class TestAgents:
         assert (algorithm.name, algorithm.uses, algorithm.steps) == ("PPO", "jax:PPO", 7)
 
 
-def test_a_plan_of_what_is_not_installed_is_planned_with_a_note(tmp_path: Path) -> None:
+def test_a_plan_of_what_is_not_installed_is_planned_with_a_note(tmp_path):
     theirs = [{"name": name, "uses": "theirs:make"} for name in ("one", "other")]
     small_file(algorithms=["constant", *theirs]).write(tmp_path / "p.json")
     result = commands.good("study", "plan", "p.json", "--json")
@@ -374,9 +347,7 @@ def test_a_plan_of_what_is_not_installed_is_planned_with_a_note(tmp_path: Path) 
     assert "theirs:make" in refused("new", "n.json", "--from", "p.json")
 
 
-def test_a_plan_is_written_where_the_learners_are_not_installed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_plan_is_written_where_the_learners_are_not_installed(monkeypatch):
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     result = commands.good("study", "new", "n.json", "-t", "Default", "-a", "PPO", "-a", "TD3")
     note = "cannot run here: training: Stable-Baselines3 is not installed"
@@ -384,22 +355,13 @@ def test_a_plan_is_written_where_the_learners_are_not_installed(
     assert [one.uses for one in StudyFile.read("n.json").plan.algorithms] == ["PPO", "TD3"]
 
 
-def test_a_plan_with_a_changed_digest_is_refused(tmp_path: Path) -> None:
-    plain: dict[str, Any] = small_file().to_dict()
-    plain["plan"]["seeds"] = 3
-    (tmp_path / "p.json").write_text(json.dumps(plain))
-    text = refused("plan", "p.json")
-    assert "digest=" in text
-    assert "`sme study new NEW.json --from p.json`" in text
-
-
 class TestEdited:
     """A plan that was changed by hand becomes a file again by the command that the error names."""
 
-    def written(self, form: str) -> StudyPlan:
+    def written(self, form):
         """Write edited.json, with hyperparameters; the plan that it is meant to be."""
         file = small_file()
-        plain: dict[str, Any] = file.to_dict()
+        plain = file.to_dict()
         plain["plan"]["algorithms"][0].update(uses="PPO", hyperparameters={"n_steps": 64})
         if form == "no digest":
             del plain["digest"]
@@ -407,10 +369,12 @@ class TestEdited:
         return StudyPlan.from_dict(plain["plan"])
 
     @pytest.mark.parametrize("form", ["old digest", "no digest", "bare"])
-    def test_the_error_names_the_command_that_makes_it_a_file(self, form: str) -> None:
+    def test_the_error_names_the_command_that_makes_it_a_file(self, form):
         plan = self.written(form)
         for command in (("plan",), ("run", "-f", "study")):
-            assert "`sme study new NEW.json --from edited.json`" in refused(*command, "edited.json")
+            text = refused(*command, "edited.json")
+            assert "`sme study new NEW.json --from edited.json`" in text
+            assert ("digest=" in text) == (form == "old digest")
         good("new", "new.json", "--from", "edited.json")
         file = StudyFile.read("new.json")
         assert file.plan == plan
@@ -419,7 +383,7 @@ class TestEdited:
         assert (file.name, file.description) == expected
         assert json.loads(good("plan", "new.json", "--json"))["digest"] == plan.digest
 
-    def test_it_may_take_a_name_and_the_place_of_what_was_edited(self) -> None:
+    def test_it_may_take_a_name_and_the_place_of_what_was_edited(self):
         plan = self.written("old digest")
         itself = ("new", "edited.json", "--from", "edited.json")
         assert "--force" in refused(*itself)
@@ -427,7 +391,7 @@ class TestEdited:
         file = StudyFile.read("edited.json")
         assert (file.name, file.description, file.plan) == ("other", "", plan)
 
-    def test_a_plan_of_the_catalogue_is_copied_to_be_edited(self) -> None:
+    def test_a_plan_of_the_catalogue_is_copied_to_be_edited(self):
         good("new", "mine.json", "--from", "paper-ablations")
         assert StudyFile.read("mine.json") == ABLATIONS
 
@@ -439,7 +403,7 @@ class TestEdited:
             ("--name a\tb", "name='a\\tb'"),
         ],
     )
-    def test_what_the_plan_says_already_is_no_option(self, option: str, words: str) -> None:
+    def test_what_the_plan_says_already_is_no_option(self, option, words):
         self.written("bare")
         assert words in refused("new", "new.json", "--from", "edited.json", *option.split(" "))
         assert not Path("new.json").exists()
@@ -448,19 +412,13 @@ class TestEdited:
         ("text", "words"),
         [
             ("[]", "must be an object"),
-            ('{"plan": []}', "must be an object"),
             ('{"classes": [}', "edited.json"),
             ('{"seeds": 3}', "algorithms: missing"),
         ],
     )
-    def test_what_is_no_plan_is_refused(self, text: str, words: str) -> None:
+    def test_what_is_no_plan_is_refused(self, text, words):
         Path("edited.json").write_text(text)
         result = commands.sme("study", "new", "new.json", "--from", "edited.json")
         assert result.exit_code == 2
         assert words in result.stderr
         assert not Path("new.json").exists()
-
-
-def test_a_plan_is_a_document_whose_digest_ignores_names_outside_it() -> None:
-    plan = small_file().plan
-    assert StudyPlan.from_dict(json.loads(json.dumps(plan.to_dict()))).digest == plan.digest

@@ -1,7 +1,5 @@
 """Suites and plans with streams, by command: what they hold, what they run, who refuses them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -9,10 +7,6 @@ import pytest
 from typer.testing import CliRunner
 
 from leaderboard.cli import app as leaderboard
-from leaderboard.cli.options import find_suite
-from leaderboard.documents.board import BoardDocument
-from leaderboard.documents.keys import SigningKey
-from leaderboard.errors import BoardError
 from sme_registry import SMESpec, StreamSpec, load, save
 from sme_registry.errors import SpecError
 from sme_registry.spec import StreamFile, StudyFile, StudyPlan, Suite, SuiteFile, catalogue
@@ -27,33 +21,33 @@ STREAM = StreamSpec(
 
 
 @pytest.fixture(autouse=True)
-def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "160")
     save(STREAM, "mine.json")
 
 
-def good(*arguments: str | Path) -> str:
+def good(*arguments):
     return commands.good(*arguments).stdout
 
 
-def refused(*arguments: str | Path) -> str:
+def refused(*arguments):
     message = commands.refused(*arguments)
     assert len(message.splitlines()) == 1
     return message
 
 
-def new_suite(*others: str) -> Suite:
+def new_suite(*others):
     good("suite", "new", "lives.json", "-t", "mine.json", "--instances", "3", *others)
     return SuiteFile.read("lives.json").suite
 
 
-def new_plan(*arguments: str) -> StudyFile:
+def new_plan(*arguments):
     good("study", "new", "plan.json", "--force", *arguments)
     return StudyFile.read("plan.json")
 
 
-def test_the_suite_of_the_catalogue_has_ten_draws_of_each_of_its_streams() -> None:
+def test_the_suite_of_the_catalogue_has_ten_draws_of_each_of_its_streams():
     suite = catalogue.find(SuiteFile, "continual").suite
     streams = {file.name: file.stream for file in catalogue.entries(StreamFile)}
     assert not suite.classes
@@ -62,24 +56,22 @@ def test_the_suite_of_the_catalogue_has_ten_draws_of_each_of_its_streams() -> No
     assert len({stream.digest for stream in suite.stream_instances}) == 60
 
 
-def test_a_suite_has_a_class_for_a_stream_beside_tasks() -> None:
+def test_a_suite_has_a_class_for_a_stream_beside_tasks():
     suite = new_suite("-t", "Default")
     assert suite.stream_instances == tuple(STREAM.draw(number) for number in range(3))
     assert [member.name for member in suite.classes] == ["Default"]
     assert suite.runs == {"Default": 3, "mine": 3}
     wider = commands.good("suite", "new", "wider.json", "--suite", "lives.json", "-t", "Switch5")
     assert "3 classes, 7 instances" in wider.stderr
-    assert [member.name for member in SuiteFile.read("wider.json").suite.streams] == [
-        "mine",
-        "Switch5",
-    ]
+    members = SuiteFile.read("wider.json").suite.streams
+    assert [member.name for member in members] == ["mine", "Switch5"]
     good("validate", "lives.json", "wider.json")
     assert "appears twice" in refused(
         "suite", "new", "x.json", "-t", "mine.json", "-t", "mine.json"
     )
 
 
-def test_a_suite_of_streams_is_shown_with_names_to_train_by() -> None:
+def test_a_suite_of_streams_is_shown_with_names_to_train_by():
     shown = good("show", "continual")
     assert "Cycle2" in shown
     assert "120,000" in shown
@@ -93,25 +85,20 @@ def test_a_suite_of_streams_is_shown_with_names_to_train_by() -> None:
     assert entries[-1] == {"class": "mine", "draw": 2, "digest": suite.stream_instances[2].digest}
     assert "To train on these tasks: sme study new" in good("show", "lives.json")
     listed = good("list", "--kind", "suite").splitlines()
-    assert next(line for line in listed if line.startswith("continual")).split()[1:4] == [
-        "6",
-        "0",
-        "60",
-    ]
+    (line,) = (line for line in listed if line.startswith("continual"))
+    assert line.split()[1:4] == ["6", "0", "60"]
 
 
-def test_every_task_and_every_phase_of_every_draw_is_certified() -> None:
+def test_every_task_and_every_phase_of_every_draw_is_certified():
     save(TASK, "task.json")
     new_suite("-t", "task.json")
     certified = json.loads(good("certify", "lives.json", "--json"))
     phases = [f"lives/mine draw {draw} phase {phase}" for draw in range(3) for phase in (0, 1)]
-    assert [entry["task"] for entry in certified] == [
-        *(f"lives/task seed {seed}" for seed in range(3)),
-        *phases,
-    ]
+    tasks = [f"lives/task seed {seed}" for seed in range(3)]
+    assert [entry["task"] for entry in certified] == tasks + phases
 
 
-def test_a_plan_has_a_life_and_fresh_agents_for_each_run() -> None:
+def test_a_plan_has_a_life_and_fresh_agents_for_each_run():
     arguments = ("--instances", "2", "-a", "TD3", "--seeds", "2", "--evaluations", "12")
     plan = new_plan("-t", "mine.json", *arguments).plan
     assert not plan.classes
@@ -126,7 +113,7 @@ def test_a_plan_has_a_life_and_fresh_agents_for_each_run() -> None:
     assert from_suite.streams == catalogue.find(SuiteFile, "continual").suite.streams
 
 
-def test_a_life_that_is_a_fresh_agent_itself_has_none() -> None:
+def test_a_life_that_is_a_fresh_agent_itself_has_none():
     drift = {"rotation": 1.0, "increments": 2}
     alone = StreamSpec(phases=[{"spec": TASK, "steps": 40, "drift": drift}])
     twice = StreamSpec(phases=alone.phases, cycles=2)
@@ -137,7 +124,7 @@ def test_a_life_that_is_a_fresh_agent_itself_has_none() -> None:
     assert found == [("alone", None, alone), ("twice", None, twice), ("twice", 0, alone)]
 
 
-def test_cells_that_streams_share_count_once() -> None:
+def test_cells_that_streams_share_count_once():
     file = catalogue.find(StudyFile, "continual")
     assert len(file.plan.cells) == 135
     entry = json.loads(good("study", "plan", "continual", "--json"))
@@ -153,30 +140,26 @@ def test_cells_that_streams_share_count_once() -> None:
     ("arguments", "message"),
     [
         (("-n", "100"), "steps=100: lives have the steps of their streams"),
-        (("-n", "TD3=100"), r"steps={'TD3': 100}: lives have the steps of their streams"),
         (("--sweep", "k=1,2"), "--sweep: varies a field of a task, and 'mine.json' is a stream"),
         (("-a", "offline:bc"), "algorithms.1.uses='offline:bc': cannot live in a stream"),
-        (("-a", "reference:linear"), "uses='reference:linear': cannot live in a stream"),
         (("-a", "independent:PPO"), "uses='independent:PPO': cannot live in a stream"),
         (("--instances", "0"), "instances=0: must be"),
     ],
 )
-def test_what_a_plan_of_streams_cannot_have_is_refused(
-    arguments: tuple[str, ...], message: str
-) -> None:
+def test_what_a_plan_of_streams_cannot_have_is_refused(arguments, message):
     assert message in refused(
         "study", "new", "plan.json", "-t", "mine.json", "-a", "TD3", *arguments
     )
     assert not Path("plan.json").exists()
 
 
-def test_steps_are_those_of_single_tasks_beside_streams() -> None:
+def test_steps_are_those_of_single_tasks_beside_streams():
     tasks = ("-t", "Default", "-t", "mine.json")
     plan = new_plan(*tasks, "-a", "TD3", "-n", "77", "--seeds", "1").plan
     assert [place.cell.steps for place in plan.cells] == [77, 128, 40, 24]
 
 
-def test_rollouts_that_do_not_end_where_phases_do_are_named_with_a_better_length() -> None:
+def test_rollouts_that_do_not_end_where_phases_do_are_named_with_a_better_length():
     chosen = ("-a", "PPO", "-a", "TD3", "-a", "short=PPO", "--set", "short.n_steps=8")
     chosen += ("--set", "short.batch_size=8")
     tasks = ("-t", "mine.json", "-t", "Switch5")
@@ -190,7 +173,7 @@ def test_rollouts_that_do_not_end_where_phases_do_are_named_with_a_better_length
     assert uneven_rollouts(catalogue.find(StudyFile, "continual").plan) == []
 
 
-def test_the_better_length_suits_every_stream() -> None:
+def test_the_better_length_suits_every_stream():
     twelve = StreamSpec(phases=[{"spec": STREAM.phases[0].spec, "steps": 12}] * 2)
     save(twelve, "twelve.json")
     chosen = ("-a", "PPO", "--set", "PPO.n_steps=8", "--set", "PPO.batch_size=4")
@@ -199,7 +182,7 @@ def test_the_better_length_suits_every_stream() -> None:
     assert (uneven.streams, uneven.better) == (("twelve",), 4)  # 6 would suit twelve alone
 
 
-def test_a_suite_of_streams_is_trained_on_for_the_steps_of_its_streams() -> None:
+def test_a_suite_of_streams_is_trained_on_for_the_steps_of_its_streams():
     new_suite()
     message = refused("train", "--suite", "lives.json", "-n", "100")
     assert "--steps: is that of each stream here. Leave it out" in message
@@ -208,39 +191,29 @@ def test_a_suite_of_streams_is_trained_on_for_the_steps_of_its_streams() -> None
     assert "cannot live in a stream" in refused("train", "--suite", "lives.json", "--independent")
 
 
-def test_leaderboards_refuse_streams() -> None:
-    suite = new_suite()
-    with pytest.raises(SpecError, match=r"has streams \(mine\), and a leaderboard needs single"):
-        suite.refuse_streams("a leaderboard")
+def test_leaderboards_refuse_streams():
+    new_suite()
     result = CliRunner().invoke(leaderboard, ["init", "board", "--suite", "lives.json"])
     assert result.exit_code == 2, result.output
     assert "suite: has streams (mine)" in result.stderr
-    with pytest.raises(SpecError, match="and a leaderboard needs single tasks"):
-        find_suite("continual")  # which every command with --suite calls
-    fields = {"title": "x", "suite_name": "lives-v1", "protocol_name": "quick-v1", "protocol": {}}
-    key = SigningKey.generate().public
-    with pytest.raises((SpecError, BoardError), match=r"suite: has streams \(mine\)"):
-        BoardDocument.from_dict({**fields, "suite": suite, "key": key})
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"draws": [0, 0]}, r"streams.0.draws=\[0, 0\]: must be distinct"),
-        ({"draws": [-1]}, "streams.0.draws.0=-1: must be"),
         ({"draw": [1]}, "streams.0.draw=.*unknown field. Did you mean 'draws'"),
-        ({"stream": "Swich5"}, "Did you mean"),
         ({"name": "default"}, "the name 'default' appears twice"),
     ],
 )
-def test_a_wrong_class_of_streams_is_named(change: dict[str, object], message: str) -> None:
+def test_a_wrong_class_of_streams_is_named(change, message):
     classes = [{"name": "default", "setting": {}, "seeds": [0]}]
     member = {"name": "s", "stream": "Switch5", **change}
     with pytest.raises(SpecError, match=message):
         Suite.from_dict({"classes": classes, "streams": [member]})
 
 
-def test_a_plan_with_a_life_of_more_visits_than_are_evaluated_is_refused() -> None:
+def test_a_plan_with_a_life_of_more_visits_than_are_evaluated_is_refused():
     stream = StreamSpec(phases=STREAM.phases, cycles=501)
     fields = new_plan("-t", "mine.json", "-a", "TD3").plan.to_dict()
     fields["streams"].append({"name": "long", "stream": stream.to_dict()})
@@ -248,7 +221,7 @@ def test_a_plan_with_a_life_of_more_visits_than_are_evaluated_is_refused() -> No
         StudyPlan.from_dict(fields)
 
 
-def test_steps_that_are_not_those_of_the_stream_are_refused() -> None:
+def test_steps_that_are_not_those_of_the_stream_are_refused():
     plan = new_plan("-t", "mine.json", "-a", "TD3").plan
     fields = plan.to_dict()
     fields["algorithms"][0]["steps"] = 100

@@ -1,17 +1,12 @@
 """`uses`: every kind of name, and what is said of those that lead nowhere."""
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from sme_registry import SMESpec
 from sme_registry.errors import OptionError, UnknownNameError
-from sme_registry.studies.engine.algorithms import find_algorithm, reference_name
+from sme_registry.studies.engine.algorithms import find_algorithm
 from sme_registry.training.learners import new_learner
 
 sb3 = pytest.importorskip("stable_baselines3")
@@ -28,30 +23,30 @@ def nothing(env, *, seed):
 
 
 @pytest.fixture
-def env() -> Any:
+def env():
     from sme_registry.sb3 import SMEVecEnv
 
     return SMEVecEnv(SPEC)
 
 
 @pytest.fixture
-def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def own_module(tmp_path, monkeypatch):
     (tmp_path / "own_learners.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
     yield tmp_path
     sys.modules.pop("own_learners", None)
 
 
-def made(uses: str, env: Any, **hyperparameters: Any) -> Any:
+def made(uses, env, **hyperparameters):
     return new_learner(uses, env, seed=1, steps=100, hyperparameters=hyperparameters)
 
 
 @pytest.mark.parametrize("name", ["PPO", "Td3", "ddpg"])
-def test_sb3s_algorithms_are_found_in_any_case(name: str) -> None:
+def test_sb3s_algorithms_are_found_in_any_case(name):
     assert find_algorithm(name) is getattr(sb3, name.upper())
 
 
-def test_a_class_of_sb3s_kind_is_used_as_it_is(env: Any) -> None:
+def test_a_class_of_sb3s_kind_is_used_as_it_is(env):
     contrib = pytest.importorskip("sb3_contrib")
     tqc = made("sb3_contrib:TQC", env, top_quantiles_to_drop_per_net=3, train_freq=[2, "episode"])
     assert type(tqc) is contrib.TQC
@@ -63,16 +58,9 @@ def test_a_class_of_sb3s_kind_is_used_as_it_is(env: Any) -> None:
     assert made("TD3", env, buffer_size=50).replay_buffer.buffer_size == 50
 
 
-def test_a_function_of_a_module_in_this_folder_makes_the_learner(
-    env: Any, own_module: Path
-) -> None:
-    learner = made("own_learners:small", env, width=5)
-    assert learner.policy.net_arch == [5]
-
-
-def test_an_installed_entry_point_is_found_by_its_name(
-    env: Any, own_module: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_function_makes_the_learner_by_its_module_or_an_installed_entry_point(
+    env, own_module, monkeypatch
+):
     info = own_module / "own_learners-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: own-learners\nVersion: 1.0\n")
@@ -80,6 +68,7 @@ def test_an_installed_entry_point_is_found_by_its_name(
         "[sme_registry.algorithms]\nsmall-ppo = own_learners:small\nlost = own_learners:lost\n"
     )
     monkeypatch.syspath_prepend(str(own_module))
+    assert made("own_learners:small", env, width=5).policy.net_arch == [5]
     assert made("small-ppo", env).policy.net_arch == [8]
     with pytest.raises(UnknownNameError, match="Did you mean 'small-ppo'"):
         find_algorithm("smal-ppo")
@@ -97,18 +86,9 @@ def test_an_installed_entry_point_is_found_by_its_name(
         ("own_learners:number", OptionError, "is of type int: must be a class"),
     ],
 )
-def test_a_name_that_leads_nowhere_is_explained(
-    name: str, error: type[Exception], said: str, own_module: Path
-) -> None:
+def test_a_name_that_leads_nowhere_is_explained(name, error, said, own_module):
     with pytest.raises(error, match=said):
         find_algorithm(name)
-
-
-def test_a_reference_is_told_from_what_learns() -> None:
-    assert reference_name("reference:constant") == "constant"
-    assert reference_name("PPO") is None
-    with pytest.raises(UnknownNameError, match="must be one of reference:optimal"):
-        reference_name("reference:nobody")
 
 
 @pytest.mark.parametrize(
@@ -122,8 +102,6 @@ def test_a_reference_is_told_from_what_learns() -> None:
         ("own_learners:nothing", {}, "returned a NoneType, which has no learn and no predict"),
     ],
 )
-def test_what_an_algorithm_does_not_take_or_make_is_refused(
-    uses: str, settings: dict[str, Any], said: str, env: Any, own_module: Path
-) -> None:
+def test_what_an_algorithm_does_not_take_or_make_is_refused(uses, settings, said, env, own_module):
     with pytest.raises(OptionError, match=said):
         made(uses, env, **settings)

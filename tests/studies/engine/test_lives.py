@@ -21,6 +21,7 @@ from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.engine.runner import run_study
 from sme_registry.studies.engine.status import label, study_status
 from sme_registry.training.snapshots import Snapshots
+from tests.studies.cells import numbers
 
 pytest.importorskip("stable_baselines3")
 
@@ -202,7 +203,6 @@ def test_a_learner_that_observes_the_phase_is_shown_the_one_in_force():
     stream = stream_of(TASK, OTHER, cycles=2, observes_phase=True)
     result = run_cell(life(stream, f"{__name__}:knowing"))
     assert max(result.curve.regret) < 1e-5
-    assert result.stream_report is not None
     assert np.abs(matrix(result.stream_report)).max() < 1e-6
 
 
@@ -313,15 +313,6 @@ def jax_file():
     """Two lives, on two draws of a stream."""
     stream = {"name": "switch", "stream": stream_of(TASK, OTHER).to_dict(), "draws": [0, 1]}
     return plan_file("jax:PPO", streams=[stream])
-
-
-def numbers(study):
-    """All results but their times, and the versions of what else this process has loaded."""
-    documents = {key: result.to_dict() for key, result in Ledger(study).results().items()}
-    for document in documents.values():
-        del document["timing"]
-        document.get("report", document.get("stream_report"))["versions"] = {}
-    return documents
 
 
 @pytest.fixture

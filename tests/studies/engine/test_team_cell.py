@@ -1,16 +1,12 @@
 """Cells of teams: one model for all agents, or one for each, and the regret of every agent."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from sme_registry import load, studies
-from sme_registry.spec import Cell, StudyFile, StudyPlan
+from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellResult
@@ -22,7 +18,7 @@ pytest.importorskip("stable_baselines3")
 AGENTS = ["agent_0", "agent_1"]
 
 
-def plan(*uses: str) -> StudyPlan:
+def plan(*uses):
     settings = {"hyperparameters": {"n_steps": 8, "batch_size": 16, "n_epochs": 1}, "steps": None}
     setting = {name: value for name, value in load("Team2").to_dict().items() if name != "seed"}
     return StudyPlan.from_dict(
@@ -45,12 +41,12 @@ def plan(*uses: str) -> StudyPlan:
     )
 
 
-def cell(uses: str) -> Cell:
+def cell(uses):
     return next(each.cell for each in plan(uses).cells if each.class_name == "team")
 
 
 @pytest.mark.parametrize("uses", ["PPO", "independent:PPO", "reference:linear"])
-def test_a_team_has_the_regret_of_each_agent(uses: str) -> None:
+def test_a_team_has_the_regret_of_each_agent(uses):
     result = run_cell(cell(uses))
     assert list(result.report.agents) == list(result.curve.agents_regret) == AGENTS
     of_agents = np.array(list(result.curve.agents_regret.values()))
@@ -67,17 +63,8 @@ def test_a_team_has_the_regret_of_each_agent(uses: str) -> None:
         assert (again.curve, again.report) == (result.curve, result.report)
 
 
-def test_a_single_agents_result_has_no_fields_of_teams() -> None:
-    single = next(each.cell for each in plan("PPO").cells if each.class_name == "single")
-    plain = run_cell(single.model_copy(update={"uses": "reference:constant", "steps": 0,
-                                               "hyperparameters": {}})).to_dict()  # fmt: skip
-    assert "agents_regret" not in plain["curve"]
-    assert "agents_online_regret" not in plain
-    assert "agents" not in plain["report"]
-
-
 @pytest.fixture(scope="module")
-def mixed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def mixed(tmp_path_factory):
     """A study of references on a team and on a single agent."""
     folder = tmp_path_factory.mktemp("mixed")
     document = plan("reference:linear", "reference:constant")
@@ -88,7 +75,7 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_frames_have_columns_of_each_agent(mixed: Path) -> None:
+def test_the_frames_have_columns_of_each_agent(mixed):
     results, curves = studies.load(mixed)
     team, single = (results[results.class_name == name] for name in ("team", "single"))
     for name in AGENTS:
@@ -97,14 +84,18 @@ def test_the_frames_have_columns_of_each_agent(mixed: Path) -> None:
         assert np.array_equal(wd[f"wd_regret/{name}"], wd[f"normalised_regret/{name}"])
         assert curves[curves.class_name == "team"][f"regret/{name}"].between(0, 1).all()
     assert curves[curves.class_name == "single"]["regret/agent_0"].isna().all()
+    for result in Ledger(mixed).results().values():
+        document, of_team = result.to_dict(), result.cell.spec.team is not None
+        assert ("agents_regret" in document["curve"]) == ("agents" in document["report"]) == of_team
+        assert "agents_online_regret" not in document
 
 
-def test_the_report_has_a_table_and_a_figure_of_the_agents(mixed: Path) -> None:
+def test_the_report_has_a_table_and_a_figure_of_the_agents(mixed):
     pytest.importorskip("matplotlib")
     from sme_registry.studies.report.figures.comparisons import draw_agents
 
     analysis = analysed(mixed)
-    tables: dict[str, Any] = {table.name: table.frame for table in text_tables(analysis)}
+    tables = {table.name: table.frame for table in text_tables(analysis)}
     assert list(tables["agents-wd-regret"].agent) == AGENTS
     assert "agents" in csv_tables(analysis)
     (picture,) = draw_agents(analysis, ("svg",))

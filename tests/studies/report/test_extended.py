@@ -1,47 +1,41 @@
 """Studies of tasks with limits or distractors: their columns and metrics, and what layers keep."""
 
-from __future__ import annotations
-
 import re
-from typing import Any
 
 import pandas as pd
 import pytest
 
 from sme_registry.errors import UnknownNameError
 from sme_registry.evaluation.observation import LayerProbe
-from sme_registry.spec import StudyFile, StudyPlan
+from sme_registry.spec import StudyPlan
 from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.report import exports, frames
-from sme_registry.studies.report.analysis import Analysis, analyse
+from sme_registry.studies.report.analysis import analyse
 from sme_registry.studies.report.compare import compare
 from sme_registry.studies.report.frames import study_frames
 from sme_registry.studies.report.tables import METRICS, layers
 from tests.studies.cells import small_file
 
-FIELDS: dict[str, dict[str, Any]] = {
+FIELDS = {
     "plain": {},
     "safe": {"safety": {"tightness": 0.4}},
     "driven": {"observation": {"distractors": 3, "dynamics": "driven"}},
     "mixed": {"observation": {"mixing": "nonlinear"}},
 }
-Study = tuple[StudyFile, dict[str, CellResult]]
 
 
 @pytest.fixture(scope="module")
-def study() -> Study:
+def study():
     """Two references on these classes; learners' costs, probes and invariance are made up."""
     small = {"state_dim": 2, "action_dim": 2}
     classes = [{"name": n, "setting": small | own, "seeds": [1, 2]} for n, own in FIELDS.items()]
     algorithms = ["linear_least_squares", "constant"]
     file = small_file(seeds=2, algorithms=algorithms, classes=classes)
-    results: dict[str, CellResult] = {}
+    results = {}
     for number, planned in enumerate(file.plan.cells):
         result = run_cell(planned.cell)
         report = result.report
-        assert report is not None
-        changes: dict[str, Any] = {}
+        changes = {}
         if planned.class_name == "safe" and planned.algorithm == "constant":
             changes["online_cost"] = number / 100
         if report.observation is not None and planned.class_name == "driven":
@@ -59,11 +53,11 @@ def study() -> Study:
 
 
 @pytest.fixture(scope="module")
-def analysis(study: Study) -> Analysis:
+def analysis(study):
     return analyse(*study, draws=200)
 
 
-def only(study: Study, name: str) -> Study:
+def only(study, name):
     """The study of this class alone; results of the others are ignored."""
     file, results = study
     fields = file.plan.to_dict()
@@ -71,7 +65,7 @@ def only(study: Study, name: str) -> Study:
     return file.model_copy(update={"plan": StudyPlan.from_dict(fields)}), results
 
 
-def test_rows_have_the_numbers_of_their_reports(study: Study) -> None:
+def test_rows_have_the_numbers_of_their_reports(study):
     file, results = study
     rows = study_frames(file.plan, results).results
     documented = set(re.findall(r"\w+", str(frames.__doc__)))
@@ -104,7 +98,7 @@ def test_rows_have_the_numbers_of_their_reports(study: Study) -> None:
     assert set(zip(trained.class_name, trained.algorithm, strict=True)) == {("safe", "constant")}
 
 
-def test_plans_without_limits_and_observations_have_no_such_columns(study: Study) -> None:
+def test_plans_without_limits_and_observations_have_no_such_columns(study):
     columns = {}
     for name in ("plain", "safe", "driven"):
         file, results = only(study, name)
@@ -120,9 +114,7 @@ def test_plans_without_limits_and_observations_have_no_such_columns(study: Study
     assert columns["plain"] <= columns["safe"] & columns["driven"]
 
 
-def test_the_metrics_of_a_class_are_those_that_its_tasks_have(
-    study: Study, analysis: Analysis
-) -> None:
+def test_the_metrics_of_a_class_are_those_that_its_tasks_have(study, analysis):
     of_regret = {"wd_regret", "ood_regret", "ood_decay"}
     metrics = {
         name: set(rows.metric) - of_regret for name, rows in analysis.levels.groupby("class_name")
@@ -148,7 +140,7 @@ def test_the_metrics_of_a_class_are_those_that_its_tasks_have(
     assert row.iqm > 0
 
 
-def test_comparisons_have_the_metrics_too(study: Study) -> None:
+def test_comparisons_have_the_metrics_too(study):
     file, results = study
     pair = "constant", "linear_least_squares"
     table = compare(study_frames(file.plan, results), *pair, ["wd_cost", "wd_invariance"])
@@ -160,9 +152,7 @@ def test_comparisons_have_the_metrics_too(study: Study) -> None:
         compare(plain, *pair, ["wd_cost"])
 
 
-def test_tables_for_people_show_them_and_what_the_layers_keep(
-    study: Study, analysis: Analysis
-) -> None:
+def test_tables_for_people_show_them_and_what_the_layers_keep(study, analysis):
     tables = {table.name: table.frame for table in exports.text_tables(analysis)}
     assert list(tables["levels-wd-cost"]["class"]) == ["safe"]
     assert tables["layers"].to_numpy().tolist() == [
@@ -176,7 +166,7 @@ def test_tables_for_people_show_them_and_what_the_layers_keep(
     assert "layers" not in {table.name for table in exports.text_tables(plain)}
 
 
-def test_what_layers_keep_is_the_iqm_over_runs() -> None:
+def test_what_layers_keep_is_the_iqm_over_runs():
     probes = pd.DataFrame({"run": range(4), "state_r2": [0.2, -100.0, 0.6, 0.4]})
     kept = layers(probes.assign(class_name="driven", algorithm="PPO", layer=0, distractor_r2=0.25))
     assert kept.state_r2.tolist() == pytest.approx([0.3])

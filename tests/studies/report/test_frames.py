@@ -1,30 +1,30 @@
-"""`sme_registry.studies.load`: the finished runs of a study as tidy data frames."""
+"""The finished runs of a study as tidy data frames, and two of its algorithms in pairs of runs."""
 
-from __future__ import annotations
-
+import json
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from sme_registry import studies
-from sme_registry.errors import OptionError
+from sme_registry.errors import OptionError, UnknownNameError
+from sme_registry.statistics import iqm
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.report import frames
+from sme_registry.studies.report.classes import ALL
+from sme_registry.studies.report.compare import comparison_tables
+from tests.commands import good
 
 
 @pytest.fixture(scope="module")
-def loaded(finished: Path) -> studies.StudyFrames:
+def loaded(finished):
     return studies.load(finished)
 
 
-def test_results_have_one_row_per_run_and_region_in_the_plans_order(
-    loaded: studies.StudyFrames,
-) -> None:
+def test_results_have_one_row_per_run_and_region_in_the_plans_order(loaded):
     places = loaded.results[["class_name", "algorithm", "run", "region"]]
     assert len(places) == 73 * 3
     assert not places.duplicated().any()
@@ -36,9 +36,7 @@ def test_results_have_one_row_per_run_and_region_in_the_plans_order(
     assert list(first.region) == ["WD", "OOD 1", "OOD 2"] * 5
 
 
-def test_every_row_has_the_numbers_of_its_report(
-    finished: Path, loaded: studies.StudyFrames
-) -> None:
+def test_every_row_has_the_numbers_of_its_report(finished, loaded):
     results = Ledger(finished).results()
     for row in loaded.results.itertuples():
         report = results[row.key].report
@@ -55,7 +53,7 @@ def test_every_row_has_the_numbers_of_its_report(
         assert (row.spec_digest, row.complexity, row.k) == (spec.digest, spec.complexity, spec.k)
 
 
-def test_curves_have_one_row_per_evaluation(finished: Path, loaded: studies.StudyFrames) -> None:
+def test_curves_have_one_row_per_evaluation(finished, loaded):
     results = Ledger(finished).results()
     runs = frames.runs(loaded.results).set_index(frames.RUN).key
     assert len(loaded.curves) == 73 * 20
@@ -66,15 +64,13 @@ def test_curves_have_one_row_per_evaluation(finished: Path, loaded: studies.Stud
             assert tuple(rows[field]) == getattr(curve, field)
 
 
-def test_final_return_is_in_percent_of_the_optimum(loaded: studies.StudyFrames) -> None:
+def test_final_return_is_in_percent_of_the_optimum(loaded):
     last = loaded.curves.groupby(frames.RUN).episode_return.apply(lambda x: x.iloc[-2:].mean())
     expected = frames.runs(loaded.results).set_index(frames.RUN).final_return
     assert np.allclose(last / 20 * 100, expected.reindex(last.index))
 
 
-def test_every_column_is_documented_and_is_there_without_results(
-    finished: Path, loaded: studies.StudyFrames, tmp_path: Path
-) -> None:
+def test_every_column_is_documented_and_is_there_without_results(finished, loaded, tmp_path):
     documented = set(re.findall(r"\w+", str(frames.__doc__)))
     (tmp_path / "plan.json").write_bytes((finished / "plan.json").read_bytes())
     for empty, full in zip(studies.load(tmp_path), loaded, strict=True):
@@ -83,12 +79,7 @@ def test_every_column_is_documented_and_is_there_without_results(
         pd.testing.assert_series_equal(empty.dtypes, full.dtypes)
 
 
-def test_a_folder_without_a_study_is_rejected(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="holds no study"):
-        studies.load(tmp_path)
-
-
-def test_the_public_names_load_on_first_use() -> None:
+def test_the_public_names_load_on_first_use():
     for name in studies.__all__:
         assert getattr(studies, name).__name__ == name
     assert set(studies.__all__) <= set(dir(studies))
@@ -96,7 +87,7 @@ def test_the_public_names_load_on_first_use() -> None:
         _ = studies.nothing
 
 
-def test_only_results_need_pandas() -> None:
+def test_only_results_need_pandas():
     script = (
         "import sys; sys.modules['pandas'] = None\n"
         "from sme_registry import studies\n"
@@ -111,3 +102,82 @@ def test_only_results_need_pandas() -> None:
         [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=120
     )
     assert "[studies]" in done.stdout
+
+
+def row(table, class_name, metric="wd_regret"):
+    return table[(table.class_name == class_name) & (table.metric == metric)].iloc[0]
+
+
+def test_the_difference_is_that_of_runs_with_one_instance_and_seed(loaded):
+    table = studies.compare(loaded, "Alpha", "Beta")
+    runs = loaded.results.drop_duplicates(["class_name", "algorithm", "run"])
+    regrets = runs[runs.class_name == "k-25"].pivot_table("wd_regret", "run", "algorithm")
+    both = regrets[["Alpha", "Beta"]].dropna()
+    found = row(table, "k-25")
+    assert (found.pairs, found.enough_pairs, found.verdict) == (3, False, "indication")
+    assert found.difference == pytest.approx(float(iqm(both.Alpha - both.Beta)))
+    assert found.first_level == pytest.approx(float(iqm(both.Alpha)))
+    assert found.low < found.difference < found.high < 0
+
+
+def test_all_classes_is_the_mean_of_the_classes(loaded):
+    table = studies.compare(loaded, "Alpha", "Beta", ["ood_regret"])
+    classes = table[table.class_name != ALL]
+    total = row(table, ALL, "ood_regret")
+    assert total.difference == pytest.approx(classes.difference.mean())
+    assert total.pairs == classes.pairs.sum() == 23
+
+
+def test_the_difference_the_other_way_round_is_its_mirror_image(loaded):
+    one, other = (studies.compare(loaded, *pair) for pair in (("Alpha", "Beta"), ("Beta", "Alpha")))
+    assert np.allclose(one.difference, -other.difference)
+    assert np.allclose(one.low, -other.high)
+    mirrored = {"better": "worse", "worse": "better", "open": "open", "indication": "indication"}
+    assert list(other.verdict) == [mirrored[verdict] for verdict in one.verdict]
+
+
+def test_a_single_pair_has_no_interval(loaded):
+    first = studies.StudyFrames(loaded.results[loaded.results.run == 0], loaded.curves)
+    table = studies.compare(first, "Alpha", "Beta")
+    assert table.low.isna().all()
+    assert set(table.verdict) == {"open"}
+
+
+def test_bad_names_are_refused(loaded, finished):
+    with pytest.raises(UnknownNameError, match="Did you mean 'Alpha'"):
+        studies.compare(loaded, "Alfa", "Beta")
+    with pytest.raises(UnknownNameError, match="Did you mean 'wd_regret'"):
+        studies.compare(loaded, "Alpha", "Beta", ["wd_regrt"])
+    with pytest.raises(OptionError, match="given twice"):
+        studies.compare(finished, "Alpha", "Alpha")
+
+
+def test_the_command_writes_tables_and_figures(finished, tmp_path):
+    pytest.importorskip("matplotlib")
+    command = ["study", "compare", str(finished), "Alpha", "Beta", "--out", str(tmp_path), "--json"]
+    assert json.loads(good(*command).stdout) == json.loads(
+        (tmp_path / "differences.json").read_text()
+    )
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "differences.csv", "differences.json", "differences-wd-regret.tex",
+        "differences-ood-regret.tex", "differences.png", "differences.pdf",
+        "learning-curves-by-class.png", "learning-curves-by-class.pdf",
+    }  # fmt: skip
+    text = good(*command[:-3]).stdout
+    assert "Alpha − Beta" in text
+    assert "(n = 3)" in text
+    few = "With fewer than 5 pairs on a class, an interval covers"
+    assert few in " ".join(text.split())
+    source = (tmp_path / "differences-wd-regret.tex").read_text()
+    assert "\\label{tab:differences-wd-regret-Alpha-Beta}" in source
+    assert few in " ".join(source.split())
+
+
+def test_pairs_that_share_an_instance_are_no_independent_draws_of_the_task(loaded):
+    table = studies.compare(loaded, "Alpha", "Beta")
+    assert (table.instances == table.pairs).all()
+    assert "share an instance" not in comparison_tables(table)[0].note
+    shared = loaded.results.assign(spec_digest=loaded.results.class_name)
+    table = studies.compare(studies.StudyFrames(shared, loaded.curves), "Alpha", "Beta")
+    assert set(table[table.class_name != ALL].instances) == {1}
+    assert "share an instance" in comparison_tables(table)[0].note

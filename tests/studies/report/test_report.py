@@ -1,15 +1,13 @@
 """`sme study report` writes complete and deterministic files."""
 
-from __future__ import annotations
-
 import csv
 import re
 import shutil
+import subprocess
 from html.parser import HTMLParser
-from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from sme_registry.errors import OptionError
@@ -17,9 +15,9 @@ from sme_registry.io import read_json
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.findings import Findings, findings
 from sme_registry.studies.report.frames import plan_file
+from sme_registry.studies.report.latex import latex_table
 from tests.commands import good, refused
 
 pytest.importorskip("matplotlib")
@@ -41,18 +39,18 @@ class Page(HTMLParser):
 
     VOID = frozenset({"meta", "img", "br", "link", "input"})
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
-        self.open: list[str] = []
-        self.ids: list[str] = []
-        self.links: list[str] = []
-        self.loads: list[str] = []
-        self.images: list[dict[str, str | None]] = []
+        self.open = []
+        self.ids = []
+        self.links = []
+        self.loads = []
+        self.images = []
         self.text = ""
         self.feed(text)
         self.text = " ".join(self.text.split())
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         attributes = dict(attrs)
         if tag not in self.VOID:
             self.open.append(tag)
@@ -65,14 +63,14 @@ class Page(HTMLParser):
         sources = {"src", "data", "srcset"} & attributes.keys()
         self.loads += [str(attributes[name]) for name in sources]
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         assert self.open.pop() == tag
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         if not {"style", "script"} & set(self.open):
             self.text += data
 
-    def assert_whole(self) -> None:
+    def assert_whole(self):
         """Every tag is closed, no id appears twice, and every link within the page leads to one."""
         assert self.open == []
         assert len(set(self.ids)) == len(self.ids)
@@ -80,13 +78,11 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def report(
-    finished: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, dict[str, Figure]]:
+def report(finished, tmp_path_factory):
     """Its folder, in every format but PDF, and its figures by name."""
     folder, figures, save = tmp_path_factory.mktemp("report"), [], Figure.savefig
 
-    def saved(figure: Figure, *args: Any, **options: Any) -> None:
+    def saved(figure, *args, **options):
         save(figure, *args, **options)
         if options["format"] == "png":
             figures.append(figure)
@@ -99,13 +95,11 @@ def report(
 
 
 @pytest.fixture(scope="module")
-def written(report: tuple[Path, dict[str, Figure]]) -> Path:
+def written(report):
     return report[0]
 
 
-def test_within_and_out_of_distribution_are_compared_on_one_range(
-    report: tuple[Path, dict[str, Figure]],
-) -> None:
+def test_within_and_out_of_distribution_are_compared_on_one_range(report):
     folder, figures = report
     assert figures.keys() == FIGURES
     files = list((folder / "figures").iterdir())
@@ -117,8 +111,8 @@ def test_within_and_out_of_distribution_are_compared_on_one_range(
 
 
 def test_the_command_writes_the_same_files_into_the_study_or_another_folder(
-    finished: Path, written: Path, tmp_path: Path
-) -> None:
+    finished, written, tmp_path
+):
     study, out = tmp_path / "study", tmp_path / "elsewhere"
     shutil.copytree(finished, study)
     good("study", "report", study, "--format", "html,pdf,csv,latex")
@@ -136,9 +130,7 @@ def test_the_command_writes_the_same_files_into_the_study_or_another_folder(
     assert (out / "tables" / "contrasts.csv").is_file()
 
 
-def test_the_page_is_whole_loads_nothing_and_says_where_its_numbers_come_from(
-    written: Path, analysis: Analysis
-) -> None:
+def test_the_page_is_whole_loads_nothing_and_says_where_its_numbers_come_from(written, analysis):
     html = (written / "index.html").read_text()
     page = Page(html)
     page.assert_whole()
@@ -162,9 +154,7 @@ def test_the_page_is_whole_loads_nothing_and_says_where_its_numbers_come_from(
     assert all(f"<td>{row.iqm:.2f} [" in html for row in levels.itertuples())
 
 
-def test_findings_and_every_number_of_the_tables_are_written_as_data(
-    written: Path, analysis: Analysis
-) -> None:
+def test_findings_and_every_number_of_the_tables_are_written_as_data(written, analysis):
     read = Findings.from_dict(read_json(written / "findings.json"), "findings.json")
     assert read == findings(analysis)
     assert len(analysis.results) == 73 * 3
@@ -178,7 +168,7 @@ def test_findings_and_every_number_of_the_tables_are_written_as_data(
         assert np.array_equal(values, numbers.to_numpy(), equal_nan=True)
 
 
-def test_latex_tables_are_ascii_and_as_wide_as_they_say(written: Path) -> None:
+def test_latex_tables_are_ascii_and_as_wide_as_they_say(written):
     files = list((written / "tables").glob("*.tex"))
     assert len(files) == 21
     for path in files:
@@ -194,9 +184,7 @@ def test_latex_tables_are_ascii_and_as_wide_as_they_say(written: Path) -> None:
             assert not re.search(r"(?<!\\)[_%#]", row)
 
 
-def test_maps_and_explorers_show_the_models_that_were_kept(
-    tmp_path: Path, drawn: list[Any]
-) -> None:
+def test_maps_and_explorers_show_the_models_that_were_kept(tmp_path, drawn):
     pytest.importorskip("stable_baselines3")
     setting = {"state_dim": 2, "action_dim": 2}
     plan = StudyPlan.from_dict(
@@ -234,9 +222,7 @@ def test_maps_and_explorers_show_the_models_that_were_kept(
     assert "explorers/" not in text
 
 
-def test_other_formats_and_folders_without_a_study_or_results_are_refused(
-    finished: Path, tmp_path: Path
-) -> None:
+def test_other_formats_and_folders_without_a_study_or_results_are_refused(finished, tmp_path):
     for formats in (["gif"], []):
         with pytest.raises(OptionError, match="must be of html, png, pdf, csv, latex"):
             write_report(finished, tmp_path, formats)
@@ -246,9 +232,7 @@ def test_other_formats_and_folders_without_a_study_or_results_are_refused(
     assert "none of its 75 runs has finished" in refused("study", "report", tmp_path)
 
 
-def test_cells_that_no_run_asked_for_are_not_missing(
-    finished: Path, tmp_path: Path, drawn: list[Any]
-) -> None:
+def test_cells_that_no_run_asked_for_are_not_missing(finished, tmp_path, drawn):
     study = tmp_path / "study"
     shutil.copytree(finished, study)
     ledger = Ledger(study)
@@ -260,3 +244,34 @@ def test_cells_that_no_run_asked_for_are_not_missing(
     page, _ = write_report(study, formats=["html"])
     text = Page(page.read_text()).text
     assert "15 of 16 runs have finished. The plan has 59 more" in text  # one has failed
+
+
+NAMES = [
+    "PPO", "SAC", "learning rate 0.0001 with a name that goes on",
+    "ProximalPolicyOptimizationWithClippingAndManyOtherThings", "TD3 (symmetric)", "TD3 (unit)",
+    "B.9+c-(d)", "constant ½",
+]  # fmt: skip
+CLASSES = ["default", "a-very-long-class-name-with_under_scores-and-k-25-r_min-0_5", "all classes"]
+ENTRY = "+0.123 [−0.456, +0.789] (n = 3)"
+
+
+def latex(algorithms, classes=3):
+    frame = pd.DataFrame({"class": [CLASSES[i % 3] for i in range(classes)]})
+    for name in NAMES[:algorithms]:
+        frame[name] = ENTRY
+    caption = "Difference of WD regret. IQM over pairs, 95 % interval. *: worse, †: better."
+    return latex_table(frame, names=1, caption=caption, label=f"t{algorithms}-{classes}")
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="needs pdflatex")
+def test_pdflatex_finds_no_overfull_box(tmp_path):
+    tables = "\n".join(latex(n, 6) + "\\clearpage" for n in (1, 2, 3, 8))
+    packages = "\\usepackage{booktabs,tabularx,array}"
+    document = f"\\documentclass[twocolumn]{{article}}{packages}\\begin{{document}}\n{tables}"
+    (tmp_path / "paper.tex").write_text(document + "\n\\end{document}\n", encoding="ascii")
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, check=False)
+    log = (tmp_path / "paper.log").read_text(encoding="latin-1")
+    assert done.returncode == 0, log
+    assert "Overfull" not in log
+    assert "too large" not in log

@@ -1,43 +1,32 @@
 """Learning from data in a study's report, with synthetic scores."""
 
-from __future__ import annotations
-
-import dataclasses
-from pathlib import Path
-from typing import Any
-
-import numpy as np
 import pandas as pd
 import pytest
 
-from sme_registry.spec import StudyFile
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.engine.result import CellResult, OfflineResult
-from sme_registry.studies.report.analysis import Analysis, analyse
+from sme_registry.studies.engine.result import OfflineResult
+from sme_registry.studies.report.analysis import analyse
 from sme_registry.studies.report.classes import ALL
 from sme_registry.studies.report.exports import offline_tables
-from sme_registry.studies.report.tables import CURVES
 from sme_registry.terminal.templates import fixed
-from tests.studies.finished import analysed, study_file
+from tests.studies.finished import study_file
 
 pytest.importorskip("matplotlib")
 
-from sme_registry.studies.report.figures import draw_figures
-from sme_registry.studies.report.figures.curves import draw_offline
 from sme_registry.studies.report.findings import findings
-from sme_registry.studies.report.offline_findings import Learner, offline_findings
+from sme_registry.studies.report.offline_findings import offline_findings
 from sme_registry.studies.report.write import write_report
 from tests.studies.report.test_findings import assert_worded
 
-CLASSES: dict[str, dict[str, Any]] = {"shallow": {}, "deep": {"complexity": 3}}
+CLASSES = {"shallow": {}, "deep": {"complexity": 3}}
 NUS = (0.0, 0.5)
 # Over the behaviour policy, by learner and class: BC imitates, IQL surpasses and then collapses.
 CHANGES = {("BC", "shallow"): 0.004, ("BC", "deep"): -0.15,
            ("IQL", "shallow"): 0.05, ("IQL", "deep"): -0.4}  # fmt: skip
 
 
-def planned(**fields: Any) -> StudyFile:
+def planned(**fields):
     algorithms = [
         {"name": f"{name} ({nu:g})", "uses": f"offline:{name.lower()}", "action_range": "unit",
          "hyperparameters": {"nu": nu}}
@@ -47,9 +36,9 @@ def planned(**fields: Any) -> StudyFile:
     return study_file(CLASSES, **{"algorithms": algorithms, **fields})
 
 
-def results(file: StudyFile) -> dict[str, CellResult]:
+def results(file):
     """The reports of a constant, with scores that were never reached."""
-    constants: dict[str, CellResult] = {}
+    constants = {}
     finished = {}
     for place in file.plan.cells:
         cell = place.cell
@@ -74,26 +63,26 @@ def results(file: StudyFile) -> dict[str, CellResult]:
     return finished
 
 
-def hash_of(class_name: str, nu: float, run: int) -> int:
+def hash_of(class_name, nu, run):
     return 1000 * list(CLASSES).index(class_name) + 100 * NUS.index(nu) + run
 
 
 @pytest.fixture(scope="module")
-def file() -> StudyFile:
+def file():
     return planned()
 
 
 @pytest.fixture(scope="module")
-def done(file: StudyFile) -> dict[str, CellResult]:
+def done(file):
     return results(file)
 
 
 @pytest.fixture(scope="module")
-def analysis(file: StudyFile, done: dict[str, CellResult]) -> Analysis:
+def analysis(file, done):
     return analyse(file, done, draws=300)
 
 
-def test_learners_are_named_without_their_nu_and_data_sets_count_once(analysis: Analysis) -> None:
+def test_learners_are_named_without_their_nu_and_data_sets_count_once(analysis):
     rows = analysis.offline[["class_name", "nu", "learner", "data_sets"]]
     assert list(rows.itertuples(index=False, name=None)) == [
         (name, nu, learner, 5) for name in CLASSES for nu in NUS for learner in ("BC", "IQL")
@@ -106,7 +95,7 @@ def test_learners_are_named_without_their_nu_and_data_sets_count_once(analysis: 
         assert row.low < row.improvement < row.high
 
 
-def test_learners_of_one_kind_are_named_by_their_settings_other_than_nu() -> None:
+def test_learners_of_one_kind_are_named_by_their_settings_other_than_nu():
     algorithms = [
         {"name": name, "uses": "offline:iql", "action_range": "unit", "hyperparameters": settings}
         for name, settings in (("IQL a", {"nu": 0.5}), ("IQL b", {"nu": 0.5, "expectile": 0.9}))
@@ -118,15 +107,15 @@ def test_learners_of_one_kind_are_named_by_their_settings_other_than_nu() -> Non
     ] * 2  # fmt: skip
 
 
-def of_learner(analysis: Analysis, name: str) -> Learner:
+def of_learner(analysis, name):
     return next(each for each in offline_findings(analysis).learners if each.name == name)
 
 
-def places(differences: Any) -> list[tuple[str, float]]:
+def places(differences):
     return [(place.class_name, place.nu) for place in differences]
 
 
-def test_findings_name_who_imitates_who_surpasses_and_who_collapses(analysis: Analysis) -> None:
+def test_findings_name_who_imitates_who_surpasses_and_who_collapses(analysis):
     offline = offline_findings(analysis)
     behaviour = offline.behaviour
     assert (offline.example, offline.nu) == ("BC (0)", 0.0)
@@ -144,19 +133,15 @@ def test_findings_name_who_imitates_who_surpasses_and_who_collapses(analysis: An
     assert places(iql.places["below"]) == deep
     assert [place.difference for place in iql.places["below"]] == pytest.approx([-0.4, -0.4])
     for learner in (bc, iql):
-        assert learner.depth is not None
         assert (learner.depth.verdict, learner.depth.class_name) == ("collapses", "deep")
         assert (len(learner.depth.places), learner.depth.runs) == (2, 10)
         assert not learner.depth.few_runs
         assert not {"above_few", "below_few", "single_above"} & set(learner.places)
-    assert iql.depth is not None
     assert places(iql.depth.at_constant) == deep
 
 
 @pytest.mark.parametrize("runs", [1, 4])
-def test_few_runs_give_indications_at_most(
-    file: StudyFile, done: dict[str, CellResult], drawn: list[Any], runs: int
-) -> None:
+def test_few_runs_give_indications_at_most(file, done, runs):
     keys = {place.cell.digest for place in file.plan.cells if place.run < runs}
     few = analyse(file, {key: done[key] for key in keys}, draws=300)
     assert set(few.offline.low.isna()) == {runs < 4}
@@ -165,15 +150,11 @@ def test_few_runs_give_indications_at_most(
     assert ("above_few" in iql.places) == (runs > 1)
     assert ("single_above" in iql.places) == (runs == 1)
     assert iql.surpasses == (runs > 1)
-    assert iql.depth is not None
     assert iql.depth.few_runs
     assert_worded(few, findings(few))
-    (picture,) = draw_offline(few, ("svg",))
-    assert ("there is no interval" in picture.caption) == (runs < 4)
-    assert ("bootstrap intervals of the mean" in picture.caption) == (runs == 4)
 
 
-def test_only_learners_with_equal_data_are_compared(analysis: Analysis) -> None:
+def test_only_learners_with_equal_data_are_compared(analysis):
     rows = analysis.improvements[analysis.improvements.group == ALL]
     pairs = set(zip(rows["first"], rows["second"], strict=True))
     learners = {("BC (0)", "IQL (0)"), ("BC (0.5)", "IQL (0.5)")}
@@ -185,46 +166,17 @@ def test_only_learners_with_equal_data_are_compared(analysis: Analysis) -> None:
     assert [[rival.algorithm for rival in b.rivals] for b in best] == [["IQL (0)"], ["IQL (0.5)"]]
 
 
-def test_learning_curves_of_many_learners_are_wrapped_and_over_gradient_steps(
-    analysis: Analysis, drawn: list[Any]
-) -> None:
-    names = [f"BC ({i})" for i in range(10)]
-    steps = np.arange(1, 4)
-    curves = pd.concat(
-        pd.DataFrame(
-            {"class_name": c, "algorithm": name, "measure": measure, "step": steps,
-             "median": steps + i, "q25": steps + i, "q75": steps + i, "runs": 1, "window": 1}
-        )
-        for i, name in enumerate(names)
-        for c in CLASSES
-        for measure in CURVES
-    )  # fmt: skip
-    runs = pd.concat([analysis.runs[:1].assign(algorithm=name) for name in names])
-    empty = {name: getattr(analysis, name)[:0] for name in ("contrasts", "profiles", "offline")}
-    many = dataclasses.replace(
-        analysis, algorithms=tuple(names), learners=tuple(names), runs=runs, learning_curves=curves,
-        offline_runs=analysis.offline_runs[:0], **empty,
-    )  # fmt: skip
-    pictures, _ = draw_figures(many, ("svg",), {})
-    assert pictures[-1].name == "learning-curves-complexity"
-    figure = drawn[-1]
-    figure.canvas.draw()  # lays it out
-    shown = [axes for axes in figure.axes if axes.get_visible()]
-    assert [axes.get_title() for axes in shown if axes.get_title()] == names
-    assert [axes.get_xlabel() for axes in shown if axes.get_xlabel()] == ["gradient steps"] * 10
-    assert len({round(axes.get_position().x0, 6) for axes in shown}) == 4
-    assert len({axes.get_ylim() for axes in shown}) == 1  # of all learners, not of a row
-
-
 def test_learning_from_data_comes_first_in_the_report_and_has_every_format(
-    file: StudyFile, done: dict[str, CellResult], tmp_path: Path, drawn: list[Any]
-) -> None:
+    file, done, tmp_path, drawn
+):
     ledger = Ledger(tmp_path / "study")
     ledger.write_plan(file)
     for result in done.values():
         ledger.write(result)
     out = tmp_path / "out"
     write_report(tmp_path / "study", out)
+    labels = {axes.get_xlabel() for figure in drawn for axes in figure.axes}
+    assert "gradient steps" in labels
     for ending in ("png", "pdf"):
         assert (out / "figures" / f"offline-improvement.{ending}").exists()
     page = (out / "index.html").read_text()
@@ -242,7 +194,7 @@ def test_learning_from_data_comes_first_in_the_report_and_has_every_format(
     assert list(rows.improvement) == pytest.approx(list(difference), abs=1e-12)
 
 
-def test_the_table_has_the_behaviour_policy_next_to_the_learners(analysis: Analysis) -> None:
+def test_the_table_has_the_behaviour_policy_next_to_the_learners(analysis):
     similarities, improvements = (table.frame for table in offline_tables(analysis))
     constant = fixed(analysis.offline.constant_similarity[0], 3)
     assert similarities.iloc[0].to_dict() == {
@@ -255,13 +207,3 @@ def test_the_table_has_the_behaviour_policy_next_to_the_learners(analysis: Analy
     }
     assert improvements.BC[0].startswith("+0.004 [")
     assert improvements.IQL.iloc[-1].endswith(" *")
-
-
-def test_a_study_without_offline_runs_has_no_offline_findings_and_figures(
-    finished: Path,
-) -> None:
-    online = analysed(finished, draws=100)
-    assert online.offline.empty
-    assert not online.has_offline_runs
-    assert findings(online).offline is None
-    assert list(draw_offline(online, ("svg",))) == []

@@ -296,9 +296,6 @@ def test_findings_name_what_each_agent_was_made_to_do(study):
     assert changes["Forgetful", "plasticity_ratio"].verdict == "open"
 
 
-Ends = tuple[float, ...]  # IQM, low, high
-
-
 def changed(analysis, metric, ends, runs=5):
     """Tables with another IQM and interval of a metric, for all algorithms or by algorithm."""
     rows = analysis.streams.metrics.copy()
