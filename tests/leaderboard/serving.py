@@ -1,20 +1,15 @@
 """A real server on the loopback, in a thread or a process of its own."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import httpx
 import uvicorn
 
-from leaderboard.documents.keys import SigningKey
 from leaderboard.intake import upload_header
 from leaderboard.web.app import create_app
 from leaderboard.web.connections import Connections
@@ -30,15 +25,13 @@ serve(sys.argv[1], port=0, workers=int(sys.argv[2]), announce=lambda url: print(
 
 
 @contextlib.contextmanager
-def serving(
-    path: Path, connections: Connections | None = None, host: str = "127.0.0.1", **options: Any
-) -> Iterator[str]:
+def serving(path, connections=None, host="127.0.0.1", **options):
     """A server in a thread; yields its URL."""
     with listen(host, 0) as listener:
         app = create_app(path, **options)
-        server = uvicorn.Server(
-            server_config(app, Connections() if connections is None else connections)
-        )
+        if connections is None:
+            connections = Connections()
+        server = uvicorn.Server(server_config(app, connections))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
         try:
@@ -49,14 +42,14 @@ def serving(
             assert not thread.is_alive()
 
 
-def authorization(url: str, key: SigningKey, digest: str, time: str | None = None) -> str:
+def authorization(url, key, digest, time=None):
     """The header that lets a key upload an object to the board at this address."""
     board = httpx.get(f"{url}/definition.json", trust_env=False).json()["key"]
     return upload_header(key, digest, time, board=board)
 
 
 @contextlib.contextmanager
-def serving_process(path: Path, workers: int = 0) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+def serving_process(path, workers=0):
     """A server in a process, as `serve` runs it; yields its URL and the process."""
     root = Path(__file__).parents[2]
     process = subprocess.Popen(
@@ -68,9 +61,8 @@ def serving_process(path: Path, workers: int = 0) -> Iterator[tuple[str, subproc
         text=True,
     )
     try:
-        assert process.stdout is not None
         url = process.stdout.readline().strip()
-        assert url, process.stderr.read() if process.stderr else ""
+        assert url, process.stderr.read()
         yield url, process
     finally:
         if process.poll() is None:

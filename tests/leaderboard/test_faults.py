@@ -1,7 +1,5 @@
 """Scorers killed at random moments, and a large board that is read from its index."""
 
-from __future__ import annotations
-
 import os
 import random
 import threading
@@ -11,7 +9,7 @@ from pathlib import Path
 
 from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import run_scorers
-from leaderboard.store import Store, collect_garbage
+from leaderboard.store import collect_garbage
 from tests.leaderboard.conftest import put_submission, tiny_board
 from tests.leaderboard.store.synthetic import synthetic_result
 
@@ -24,14 +22,13 @@ REAL = 10
 class Killer(threading.Thread):
     """Kills one of the scorers a random moment after so many more submissions are done."""
 
-    def __init__(self, store: Store, seed: int) -> None:
+    def __init__(self, store, seed):
         super().__init__(name="killer")
         self._store, self._random = store, random.Random(seed)
-        self.started: list[int] = []
-        self.killed: list[int] = []
+        self.started, self.killed = [], []
         self.over = threading.Event()
 
-    def run(self) -> None:
+    def run(self):
         last = SUBMISSIONS - 2 * SCORERS
         for moment in sorted(self._random.sample(range(last), KILLS)):
             while self._store.queue.done() < moment and not self.over.is_set():
@@ -40,7 +37,7 @@ class Killer(threading.Thread):
             while not self.over.is_set() and not self._kill_one():
                 time.sleep(0.01)
 
-    def _kill_one(self) -> bool:
+    def _kill_one(self):
         alive = [pid for pid in self.started if pid not in self.killed and _is_our_child(pid)]
         if not alive:
             return False
@@ -50,7 +47,7 @@ class Killer(threading.Thread):
         return True
 
 
-def _is_our_child(pid: int) -> bool:
+def _is_our_child(pid):
     """Alive, and started by this process: not a later one of the same number."""
     try:
         state, parent = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[:2]

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import contextlib
 import datetime
 import hashlib
@@ -11,7 +9,6 @@ import socket
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
@@ -46,7 +43,6 @@ HTTP = httpx.Client(timeout=60, limits=httpx.Limits(max_keepalive_connections=0)
 # on a machine that does much else.
 CPU_SECONDS = 10.0
 
-Json = dict[str, Any]
 JSON = {"Accept": "application/json"}
 BROWSER = {"Accept": "text/html,application/xhtml+xml"}
 
@@ -140,15 +136,6 @@ def test_pages_and_what_they_link_are_served(published):
         assert [link for link in local if client.get(link).status_code != 200] == []
 
 
-def test_pages_show_methods_and_a_name_with_a_script_as_text(published):
-    url, ids = published
-    assert "<h1><bdi>SAC</bdi>" in HTTP.get(f"{url}/submissions/{hex_of(ids['sac'])}").text
-    for path in ("", f"/submissions/{hex_of(ids['hostile'])}"):
-        page = HTTP.get(url + path).text
-        assert "x&lt;b&gt;y" in page
-        assert "<script>" not in page
-
-
 def test_every_answer_has_the_security_headers(published):
     for path in ("/", "/nowhere", "/api/board", "/api/nowhere", "/%2e%2e/board.key", "/healthz"):
         headers = HTTP.get(published[0] + path).headers
@@ -204,9 +191,9 @@ def test_a_new_board_says_that_it_prepares_and_how_to_submit(store):
             assert ">Early<" in page.text
         entry = HTTP.get(f"{url}/submissions/{hex_of(waiting)}.html")
         assert "Waiting to be scored" in entry.text
-        for path in ("/method", "/log", "/log-0", "/suite.json", "/definition.json"):
-            assert HTTP.get(url + path).status_code == 200
-            assert "Preparing" not in HTTP.get(url + path).text
+        for path in ("/method", "/log", "/suite.json"):
+            answer = HTTP.get(url + path)
+            assert (answer.status_code, "Preparing" in answer.text) == (200, False)
         for path in ("/api/board", "/board.csv", "/board-data.js"):
             assert refusal(HTTP.get(url + path)) == (503, "not_publishable")
         assert HTTP.get(f"{url}/submissions/x").status_code == 404
@@ -264,15 +251,7 @@ def test_the_pages_say_how_to_submit_at_the_configured_address(tmp_path):
 
 def test_serve_refuses_what_it_cannot_do(store):
     path = store.folder.path
-    urls = (
-        "board.example",
-        "ftp://x",
-        "https://x/$(id)",
-        'https://x"',
-        "https://x/a b",
-        "https://",
-    )
-    for url in urls:
+    for url in ("board.example", "ftp://x", "https://x/$(id)", 'https://x"', "https://"):
         with pytest.raises(OptionError, match="url="):
             serve(path, port=0, workers=0, url=url)
     with pytest.raises(OptionError, match="unsafe_no_sandbox=True"):  # policies could read it
@@ -312,16 +291,8 @@ def test_the_health_check_says_whether_scoring_works(url, store):
     assert scoring() == "fault"
 
 
-@pytest.mark.parametrize("program", [None, "#!/bin/sh\nexit 1\n"], ids=["missing", "broken"])
-def test_a_board_is_not_served_without_bubblewrap_unless_told(
-    store, tmp_path, monkeypatch, program
-):
-    folder = tmp_path / "bin"
-    folder.mkdir()
-    if program is not None:
-        (folder / "bwrap").write_text(program)
-        (folder / "bwrap").chmod(0o755)
-    monkeypatch.setenv("PATH", str(folder))
+def test_a_board_is_not_served_without_bubblewrap_unless_told(store, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
     isolation._bwrap.cache_clear()
     with pytest.raises(BoardError, match=r"bubblewrap is .*--unsafe-no-sandbox"):
         serve(store.folder.path, port=0)
@@ -338,7 +309,7 @@ def test_the_ranking_as_json_is_sorted(published):
         assert len(values) > 5
 
 
-DIGITS = ("0" * 63, "0" * 65, "A" * 64, "g" * 64, "sha256:" + "0" * 64, "٠" * 64, "x")
+DIGITS = ("0" * 63, "A" * 64, "sha256:" + "0" * 64, "٠" * 64)
 ZEROS = "0" * 64
 
 
@@ -423,12 +394,10 @@ def test_scores_are_withheld_until_the_references_are_right(url, store):
 
 def test_a_path_that_leaves_the_folder_is_rejected(published):
     for path in (
-        "/../board.key",
         "/static/../../board.key",
         "/static/..%2f..%2fboard.key",
         "/%2e%2e/board.key",
         "/..%5cboard.key",
-        "/api/objects/..%2f..%2fboard.key",
         "/api/objects/../../board.key",
         "/static/board.css%00.html",
         "/\\..\\board.key",
@@ -481,9 +450,7 @@ def test_an_artefact_is_public_once_it_is_scored(tmp_path, key):
         assert downloads(sha256_of(policy)) == {(200, ""), (200, policy.decode())}
 
 
-def test_policies_of_reference_rows_are_public_and_verified_again_only_if_their_file_changes(
-    url, store, monkeypatch
-):
+def test_policies_of_reference_rows_are_public_and_verified_if_their_file_changes(url, store):
     (optimal, _) = intake.submit_references(store)
     (run,) = store.submission(optimal).submission.runs
     digest = run.artefact.sha256
@@ -491,22 +458,9 @@ def test_policies_of_reference_rows_are_public_and_verified_again_only_if_their_
     with ThreadPoolExecutor(8) as pool:  # as many readers at once
         contents = [answer.content for answer in pool.map(HTTP.get, [path] * 8)]
     assert {sha256_of(content) for content in contents} == {digest}
-
-    computed = []
-    file_digest = hashlib.file_digest
-
-    def counted(*arguments):
-        computed.append(arguments)
-        return file_digest(*arguments)
-
-    monkeypatch.setattr(hashlib, "file_digest", counted)
-    file.touch()
-    assert [HTTP.get(path).status_code for _ in range(3)] == [200, 200, 200]
-    assert len(computed) == 1
     file.chmod(0o644)
     file.write_bytes(b"rotten")
     assert refusal(HTTP.get(path)) == (500, "internal")
-    assert len(computed) == 2
 
 
 def test_an_upload_without_a_signature_or_signed_at_another_time_is_refused(refusing, key):
@@ -654,18 +608,14 @@ def changed(plain, path, value):
     [
         ("score", 0.0, "schema"),
         ("method", None, "schema"),
-        ("statement", "x" * 2001, "schema"),
-        ("created", "yesterday", "schema"),
         ("created", "2020-01-01T00:00:00Z", "stale_time"),
         ("created", "2120-01-01T00:00:00Z", "stale_time"),
         ("created", "2026-02-31T00:00:00Z", "schema"),
-        ("track", "sealed", "schema"),
         ("suite", {"name": "other-v1", "digest": NEVER}, "unknown_suite"),
         ("runs.0.spec", NEVER, "unknown_spec"),
         ("runs", "twice", "duplicate_run"),
         ("runs_started.Tiny", 0, "missing_run"),
         ("method.name", "<script>alert(1)</script>", "unsafe_name"),
-        ("method.name", "=HYPERLINK(1)", "unsafe_name"),
         ("runs.0.artefact.sha256", NEVER, "artefact_missing"),
         ("runs.0.artefact.size", 1, "artefact_digest"),
     ],
@@ -693,15 +643,12 @@ def _signed_anyway(plain, key, board):
     ("text", "status", "code"),
     [
         (b"", 400, "not_json"),
-        (b"{", 400, "not_json"),
         (b"\xff\xfe", 400, "not_json"),
         (b'{"a": NaN}', 400, "not_json"),
         (b'{"signature": 1, "signature": 2}', 400, "not_json"),
         (b"[" * 30_000, 400, "not_json"),
-        (b'{"a":' * 10_000 + b"1" + b"}" * 10_000, 400, "not_json"),
         (b"1" * 60_000, 400, "not_json"),
         (b"[]", 422, "schema"),
-        (b"null", 422, "schema"),
         (b"{}", 403, "bad_signature"),
         (b'{"submission": {}, "signature": "00"}', 422, "schema"),
         (b" " * (64 * 2**10 + 1), 413, "too_large"),

@@ -1,12 +1,10 @@
 """Silent, slow and many clients: a served board answers the others."""
 
-import asyncio
 import contextlib
 import hashlib
 import http.client
 import os
 import re
-import resource
 import socket
 import threading
 import time
@@ -19,13 +17,9 @@ import pytest
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
 from leaderboard.intake import upload_header
-from leaderboard.store import Store
-from leaderboard.web import limits, serve
+from leaderboard.web import serve
 from leaderboard.web.connections import ConnectionLimits, Connections
-from leaderboard.web.downloads import PIECE
-from leaderboard.web.errors import RequestError
-from leaderboard.web.guard import Guard
-from leaderboard.web.limits import Turns, counted_address
+from leaderboard.web.limits import counted_address
 from sme_registry.errors import OptionError
 from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import tiny_board
@@ -107,48 +101,6 @@ def test_a_new_connection_takes_the_slot_of_the_one_silent_for_longest(path):
         assert [answers(each) for each in silent] == [False, False, False, True, True]
 
 
-def test_half_requests_and_slow_readers_lock_nobody_out(path):
-    with serving(path, limited(connections=5)) as url, contextlib.ExitStack() as opened:
-        for number in range(60):
-            first = (b"", HEAD, HEAD[:20])[number % 3]
-            opened.enter_context(connect(url, first))
-        assert httpx.get(url, timeout=PATIENCE).status_code == 200
-        readers = [connect(url, LARGE + b"\r\n", buffer=4096) for _ in range(20)]
-        for each in readers:  # until it is answered, or its slot is another's
-            with contextlib.suppress(ConnectionResetError):
-                opened.enter_context(each).recv(1)
-        assert httpx.get(url, timeout=PATIENCE).status_code == 200
-
-
-def test_a_request_in_progress_loses_its_slot_only_to_a_faster_one(path):
-    """The slot of a connection without a request is taken first, whenever it began."""
-    with serving(path, limited(connections=3, grace_seconds=PATIENCE)) as url:
-        slow, fast = connect(url, BODY + b" "), connect(url, BODY + b" " * 59_000)
-        for _ in range(3):
-            assert httpx.get(f"{url}/healthz", timeout=PATIENCE).status_code == 200
-        silent = connect(url)
-        third = connect(url, BODY + b" " * 50_000)
-        assert rest(silent) == b""
-        fourth = connect(url, BODY + b" " * 50_000)
-        assert rest(slow) == b""
-        for each, missing in ((fast, 1000), (third, 10_000), (fourth, 10_000)):
-            each.sendall(b" " * missing)
-            assert each.recv(2**16).startswith(b"HTTP/1.1 400 ")
-            each.close()
-
-
-def test_one_that_has_just_come_keeps_its_slot_before_slow_ones(path):
-    with serving(path, limited(connections=4, head_seconds=2.0)) as url:
-        slow = [connect(url, BODY + b" " * 30_000) for _ in range(3)]
-        assert rest(connect(url)) == b""  # after two seconds, more than the grace
-        silent = connect(url)
-        fast = connect(url, BODY + b" " * 60_000)
-        assert fast.recv(2**16).startswith(b"HTTP/1.1 400 ")
-        assert answers(silent)
-        for each in (*slow, fast):
-            each.close()
-
-
 @pytest.mark.parametrize("uncounted", [{}, {"uncounted": ()}])
 def test_one_address_takes_only_its_own_slots_but_for_this_machine(path, uncounted):
     connections = Connections(ConnectionLimits(of_one_address=2), **uncounted)
@@ -174,14 +126,6 @@ def test_clients_are_counted_by_ipv4_address_or_ipv6_network():
         assert counted_address(host) == counted
 
 
-@pytest.mark.parametrize(("hard", "expected"), [(9000, (1000, 2512)), (1024, (256, 1024))])
-def test_slots_leave_files_for_everything_else(monkeypatch, hard, expected):
-    soft = []
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (128, hard))
-    monkeypatch.setattr(resource, "setrlimit", lambda _, both: soft.append(both))
-    assert (serve._connections(), soft) == (expected[0], [(expected[1], hard)])
-
-
 # Deadlines.
 
 
@@ -192,20 +136,6 @@ def test_a_request_head_has_a_deadline_and_a_body_that_nobody_waits_for(path):
             rest(connect(url, first))
             drip(connect(url, first))
         drip(connect(url, HEAD + b"Content-Length: 1000000\r\n\r\n"))
-
-
-def test_a_body_that_hardly_moves_is_refused(path, key, monkeypatch):
-    monkeypatch.setattr(limits, "_START_SECONDS", 0.3)
-    with Store.open(path, read_only=True) as store:
-        header = upload_header(key, sha256_of(b"x"), board=store.document.key)
-    head = (
-        f"PUT /api/objects/{hex_of(sha256_of(b'x'))} HTTP/1.1\r\nHost: x\r\n"
-        f"Content-Length: 1000000\r\nAuthorization: {header}\r\n\r\n"
-    )
-    with serving(path) as url:
-        answer = rest(connect(url, head.encode() + b"x" * 2000))
-    assert answer.startswith(b"HTTP/1.1 408 ")
-    assert b"2,000 bytes" in answer
 
 
 def test_a_client_that_reads_nothing_is_closed_and_a_patient_one_gets_everything(path):
@@ -295,25 +225,6 @@ def test_many_large_uploads_at_once_take_little_memory(tmp_path, key):
         assert len(store.objects.read(digests[0])) == size  # which verifies its digest
 
 
-def test_answers_are_sent_in_pieces():
-    content = bytes(range(256)) * 2**10
-    sent = []
-
-    async def app(scope, receive, send):
-        await send({"type": "http.response.start", "status": 200, "headers": []})
-        await send({"type": "http.response.body", "body": content})
-
-    async def send(message):
-        sent.append(message)
-
-    scope = {"type": "http", "method": "GET", "path": "/", "headers": [], "raw_path": b"/"}
-    asyncio.run(Guard(app)(scope, None, send))
-    pieces = sent[1:]
-    assert b"".join(piece["body"] for piece in pieces) == content
-    assert max(len(piece["body"]) for piece in pieces) == PIECE
-    assert [piece.get("more_body", False) for piece in pieces] == [True] * 3 + [False]
-
-
 def test_a_client_reads_why_its_body_is_refused_while_it_still_sends(path):
     large = BODY.replace(b"60000", b"6000000") + bytes(2**17)
     with serving(path) as url:
@@ -335,32 +246,6 @@ def test_a_body_of_tiny_chunks_is_refused_at_once(path, size, status):
         with contextlib.suppress(ConnectionResetError, BrokenPipeError):
             connection.sendall(head + chunk * 2000)  # and its end never comes
         assert connection.recv(12) == b"HTTP/1.1 " + status
-
-
-def test_work_waits_for_its_turn_in_few_places():
-    release, first = threading.Event(), threading.Event()
-
-    def wait():
-        first.set()
-        assert release.wait(PATIENCE)
-        return "done"
-
-    async def run():
-        turns = Turns(3)
-        running = asyncio.create_task(turns.run(wait, "ada"))
-        while not first.is_set():
-            await asyncio.sleep(0)
-        with pytest.raises(RequestError, match="busy"):
-            await turns.run(wait, "ada")  # has a place
-        others = [asyncio.create_task(turns.run(wait, name)) for name in ("bob", "eve")]
-        await asyncio.sleep(0)
-        with pytest.raises(RequestError, match="busy"):
-            await turns.run(wait, "joe")  # all places are taken
-        release.set()
-        assert await asyncio.gather(running, *others) == ["done"] * 3
-        assert await turns.run(wait, "ada") == "done"
-
-    asyncio.run(run())
 
 
 # Proxies.

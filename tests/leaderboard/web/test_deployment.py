@@ -1,7 +1,5 @@
 """The configuration that docs/guides/deployment.md recommends: a board behind a real nginx."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re
@@ -109,7 +107,7 @@ def test_a_submission_passes_through_nginx(url, board, tmp_path, key):
 
 
 def test_the_board_knows_the_clients_of_nginx_and_believes_nobody_else(url, monkeypatch):
-    seen: list[str] = []
+    seen = []
     monkeypatch.setattr(limits, "counted_address", lambda host: seen.append(host) or "")
     with httpx.Client(transport=httpx.HTTPTransport(local_address="127.0.0.2")) as other:
         other.get(f"{url}/healthz", timeout=PATIENCE)

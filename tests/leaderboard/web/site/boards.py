@@ -1,18 +1,12 @@
 """Boards with results drawn from a random stream: what the pages show, without any scoring."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import ClassScore, Estimate, Result, RunScore, Scores
 from leaderboard.documents.submission import Submission
 from leaderboard.scoring.metrics import failed_run, levels_of, run_metrics
-from leaderboard.store import Claim, Store
+from leaderboard.store import Store
 from sme_registry.io import sha256_of
 from sme_registry.spec import EvaluationProtocol, Suite
 
@@ -22,7 +16,7 @@ RTL = "evil\u202egnp.exe"
 VERSIONS = {"sme-registry": "0.1.0", "onnxruntime": "1.24.1", "numpy": "2.4.6"}
 
 
-def suite(classes: int = 3, instances: int = 2) -> Suite:
+def suite(classes=3, instances=2):
     setting = {"state_dim": 2, "action_dim": 1, "k": 1, "r_min": 0.0, "D": 0.0}
     members = [
         {
@@ -35,7 +29,7 @@ def suite(classes: int = 3, instances: int = 2) -> Suite:
     return Suite.from_dict({"classes": members})
 
 
-def create(path: Path, *, classes: int = 3, references: bool = True) -> Store:
+def create(path, *, classes=3, references=True):
     """A board with its two reference rows."""
     store = Store.create(
         path,
@@ -50,7 +44,7 @@ def create(path: Path, *, classes: int = 3, references: bool = True) -> Store:
     return store
 
 
-def submit_references(store: Store) -> None:
+def submit_references(store):
     key = store.folder.signing_key()
     fields = {"family": "reference", "submitter": "the board", "spread": 0.0}
     submit(store, key, "optimal", [0.0] * 6, knowledge="oracle", **fields)
@@ -58,32 +52,19 @@ def submit_references(store: Store) -> None:
 
 
 def submit(
-    store: Store,
-    key: SigningKey,
-    name: str,
-    profile: Sequence[float] | None,
-    *,
-    version: str = "1.0",
-    family: str = "PPO",
-    knowledge: str = "generic",
-    submitter: str = "Ada",
-    runs: int = 10,
-    missing: int = 0,
-    spread: float = 0.05,
-    rejected: tuple[str, str] | None = None,
-    oracle_like: bool = False,
-    **fields: Any,
-) -> str:
+    store, key, name, profile, *, version="1.0", family="PPO", knowledge="generic",
+    submitter="Ada", runs=10, missing=0, spread=0.05, rejected=None, oracle_like=False, **fields,
+):  # fmt: skip
     """Submit a method and write the result that this profile, WD first, would give; its id.
 
     With a profile of None it waits; with `rejected`, a code and a message, it is rejected.
     """
     document = store.document
-    specs: dict[str, list[str]] = {}
+    specs = {}
     for digest, (member, _) in document.instances.items():
         specs.setdefault(member, []).append(digest)
 
-    def run(member: str, number: int) -> dict[str, Any]:
+    def run(member, number):
         policy = {"sha256": _digest(f"{name} {version} {member} {number}"), "size": 9}
         return {
             "spec": specs[member][number % len(specs[member])],
@@ -112,26 +93,18 @@ def submit(
     return signed.id
 
 
-def claimed(store: Store) -> Claim:
-    claim = store.queue.claim("synthetic")
-    assert claim is not None
-    return claim
+def claimed(store):
+    return store.queue.claim("synthetic")
 
 
-def finish(store: Store, claim: Claim, **result: Any) -> None:
+def finish(store, claim, **result):
     """Write the result of a claimed submission."""
     suite, protocol = store.document.suite.digest, store.document.protocol.digest
     digests = {"submission": claim.id, "suite": suite, "protocol": protocol}
     assert store.queue.finish(claim, Result(**digests, **result))
 
 
-def score(
-    store: Store,
-    profile: Sequence[float],
-    spread: float = 0.0,
-    missing: int = 0,
-    oracle_like: bool = False,
-) -> str:
+def score(store, profile, spread=0.0, missing=0, oracle_like=False):
     """Write a result of about this profile for the submission whose turn it is; its id."""
     document, claim = store.document, claimed(store)
     submission = store.submission(claim.id).submission
@@ -196,21 +169,21 @@ def score(
     return claim.id
 
 
-def _digest(text: str) -> str:
+def _digest(text):
     return sha256_of(text.encode())
 
 
-def _estimate(value: float, half: float, least: float = -np.inf) -> Estimate:
+def _estimate(value, half, least=-np.inf):
     low, high = max(least, float(value - half)), float(value + 1.2 * half)
     return Estimate(value=float(value), low=low, high=high)
 
 
-def furnish(store: Store) -> dict[str, str]:
+def furnish(store):
     """Every kind of entry; their ids by what they are."""
     lab, okafor, anon, student = (SigningKey.generate() for _ in range(4))
     delft = {"version": "2.7.1", "submitter": "Control Lab, Delft"}
 
-    def rising(start: float, step: float) -> list[float]:
+    def rising(start, step):
         return [start + step * m for m in range(6)]
 
     return {

@@ -7,15 +7,17 @@ from collections import Counter
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import urlsplit
+from xml.etree import ElementTree
 
 import pytest
 
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.result import Estimate
 from leaderboard.documents.submission import SignedWithdrawal
 from leaderboard.errors import BoardError, NotPublishable
 from leaderboard.store import Likeness, Store
-from leaderboard.web.site import STATIC, Pages, content_type, rows, write_site
+from leaderboard.web.site import STATIC, Pages, charts, content_type, rows, write_site
 from leaderboard.web.site import pages as site_pages
 from sme_registry.errors import OptionError
 from tests.leaderboard.web.site import boards
@@ -34,11 +36,9 @@ ALLOWED = set(ELEMENTS.split())
 class Page(HTMLParser):
     """What a browser would make of a page: its elements and texts; ill nesting is an error."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__(convert_charrefs=True)
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.open: list[str] = []
-        self.text: list[tuple[str, str]] = []
+        self.elements, self.open, self.text = [], [], []
         self.feed(text)
         self.close()
         assert self.open == []
@@ -298,25 +298,21 @@ def test_a_superseded_entry_is_listed_as_history_and_its_versions_link_to_one_an
 
 
 def test_a_copy_names_the_entry_that_it_copies_and_the_number_of_runs(small, monkeypatch):
-    first, whole, part = (submitted(small, name, [0.2] * 6) for name in ("First", "Whole", "Part"))
-    key = small.entry(first).key
-    alike = {whole: (Likeness(first, key, 10),), part: (Likeness(first, key, 2),)}
+    first, copy = (submitted(small, name, [0.2] * 6) for name in ("First", "Copy"))
+    alike = (Likeness(first, small.entry(first).key, 10),)
     entries = [
-        dataclasses.replace(entry, alike=alike.get(entry.id, entry.alike))
+        dataclasses.replace(entry, alike=alike) if entry.id == copy else entry
         for entry in small.entries()
     ]
     monkeypatch.setattr(small, "entries", lambda: list(entries))
     pages = Pages(small)
     shown = {name: (rank, row) for rank, name, row in rows_of(pages.board("wd_regret"))}
-    words = {id: Page(pages.submission(id)).words for id in (first, whole, part)}
+    assert shown["First"][0] == "1"
+    assert shown["Copy"][0] == "–"
     link = f'href="submissions/{hex_of(first)}.html"'
-    assert shown["Whole"][0] == "–"
-    assert f"{link}>copy of <bdi>First 1.0" in shown["Whole"][1]
-    assert shown["Part"][0] != "–"
-    assert f"{link}>2 runs like <bdi>First 1.0" in shown["Part"][1]
-    assert "10 of 10 policies act like those of earlier entries" in words[whole]
-    assert "2 of 10 policies act like" in words[part]
-    assert "act like" not in words[first]
+    assert f"{link}>copy of <bdi>First 1.0" in shown["Copy"][1]
+    words = Page(pages.submission(copy)).words
+    assert "10 of 10 policies act like those of earlier entries" in words
 
 
 def test_submissions_that_are_not_scored_are_listed_below_with_their_status(pages):
@@ -434,10 +430,8 @@ def test_other_paths_are_not_found(board):
     pages = Pages(store)
     for path in (
         "",
-        "nothing.html",
         "../board.key",
         "static/../pages.py",
-        "static/",
         *(f"log-{number}.html" for number in ("1", "00", "٣", "-1")),
         "submissions/abc.html",
         f"submissions/{'0' * 64}.html",
@@ -445,7 +439,6 @@ def test_other_paths_are_not_found(board):
         f"results/{hex_of(ids['waiting'])}.json",
         "index.html/x",
         "board.key",
-        "board.xml",
     ):
         assert pages.read(path) is None, path
 
@@ -559,17 +552,34 @@ def test_explorers_are_written_on_request_and_linked(tmp_path):
         assert Pages(store).read(next(p for p in listed if p.startswith("explorers/"))) is None
         assert Pages(store, explorers=True).read("explorers/x-0.html") is None
     pages = {path for path in listed if path.startswith("explorers/")}
-    links = set()
-    for page in (site / "submissions").glob("*.html"):
-        links |= {
-            f"explorers/{name}" for name in re.findall(r"explorers/([^\"]+)", page.read_text())
-        }
-    assert links == pages
+    texts = "".join(page.read_text() for page in (site / "submissions").glob("*.html"))
+    assert set(re.findall(r"explorers/[^\"]+", texts)) == pages
     assert len(pages) > 2
-    known = 0
-    for path in pages:
-        text = (site / path).read_text()
-        known += '"of":"observation"' in text
-        for name in re.findall(r'(?:src|href)="\.\./(static/[^"]+)"', text):
-            assert (site / name).is_file()
-    assert known >= 1
+    texts = "".join((site / path).read_text() for path in pages)
+    assert '"of":"observation"' in texts
+    for name in re.findall(r'(?:src|href)="\.\./(static/[^"]+)"', texts):
+        assert (site / name).is_file()
+
+
+# Charts.
+
+
+def test_a_bar_spans_its_interval_and_marks_its_value():
+    estimate = Estimate(value=0.5, low=0.25, high=1.0)
+    bar = ElementTree.fromstring(
+        charts.Bars([estimate], {"optimal": 0.0, "constant": 1.0}).bar(estimate)
+    )
+    interval = bar.find("line[@class='ci']")
+    assert (interval.get("x1"), interval.get("x2")) == ("26.50%", "97.00%")
+    assert bar.find("circle").get("cx") == "50.00%"
+    assert bar.find("line[@class='optimal']").get("x1") == "3.00%"
+    assert bar.find("line[@class='constant']").get("x1") == "97.00%"
+
+
+def test_a_chart_has_a_title_and_a_description_and_escapes_the_name():
+    profile = [Estimate(value=0.1, low=0.0, high=0.2)] * 2
+    chart = charts.regret_chart(profile, [(0, 0), (0, 1)], "<b>&\"'")
+    drawn = ElementTree.fromstring(chart)
+    assert drawn.get("aria-labelledby") == "chart-title chart-desc"
+    assert drawn.find("title").text == "Normalised regret of <b>&\"' by region"
+    assert "WD: 0.100, from 0.000 to 0.200" in drawn.find("desc").text

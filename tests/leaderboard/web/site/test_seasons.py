@@ -1,7 +1,5 @@
 """The pages of sealed seasons: before, during and after, and nothing secret before the reveal."""
 
-from __future__ import annotations
-
 import pytest
 
 from leaderboard import intake
@@ -38,16 +36,8 @@ def board(tmp_path):
         yield store
 
 
-def page(store, path):
-    content = Pages(store).read(path)
-    assert content is not None
-    return Page(content.decode())
-
-
-def served_page(store, path):
-    content = Pages(store, address="http://board.test").read(path)
-    assert content is not None
-    return Page(content.decode())
+def page(store, path, **options):
+    return Page(Pages(store, **options).read(path).decode())
 
 
 def test_a_board_without_seasons_has_no_page_of_them(board):
@@ -111,29 +101,13 @@ def test_a_season_is_shown_before_the_boards_reference_rows_but_not_its_scores(
         board.announce(ONLINE)
         request = signed_request(board, ONLINE, key)
         board.start_ticket(request)
-        assert "running" in served_page(board, "seasons/winter.html").words
+        assert "running" in page(board, "seasons/winter.html", address="http://board.test").words
         board.end_ticket(ONLINE.digest, 1, result(ONLINE, request.id))
-        prepares = served_page(board, "seasons/winter.html")
+        prepares = page(board, "seasons/winter.html", address="http://board.test")
     assert "Preparing." in prepares.words
     assert "0.625" not in prepares.words
     links = [each["href"] for each in prepares.all("link") + prepares.all("a") if "href" in each]
     assert [link for link in links if not link.startswith(("../", "#"))] == []
-
-
-def test_a_result_is_read_once_however_often_the_page_is(board, key, monkeypatch):
-    board.announce(ONLINE)
-    for number in (1, 2):
-        request = signed_request(board, ONLINE, key, number)
-        board.start_ticket(request)
-        board.end_ticket(ONLINE.digest, number, result(ONLINE, request.id))
-    first = page(board, "seasons/winter.html")
-    assert first.words.count("0.625") == 2
-
-    def read(row):
-        raise AssertionError("it is known")
-
-    monkeypatch.setattr(board, "sealed_result", read)
-    assert page(board, "seasons/winter.html").words == first.words
 
 
 def test_the_site_of_a_board_with_seasons_is_well_formed_and_its_links_work(board, key, tmp_path):
