@@ -3,6 +3,7 @@ import os
 import shutil
 import sqlite3
 import traceback
+from pathlib import Path
 
 import pytest
 
@@ -191,6 +192,9 @@ def test_an_index_deleted_while_in_use_is_rebuilt_by_the_next_process(tmp_path, 
         put_submission(second, key, 3)
         assert derived(first) == derived(second)
         assert [entry.sequence for entry in first.log()] == [0, 1, 2, 3, 4]
+        held = [os.path.realpath(each) for each in Path("/proc/self/fd").glob("*")]  # on Linux
+        old = [each for each in held if each.startswith(str(tmp_path)) and "(deleted)" in each]
+        assert old == []
 
 
 def test_read_only_opening_writes_nothing(tmp_path, key):

@@ -289,6 +289,8 @@ def test_findings_name_what_each_agent_was_made_to_do(study):
         for life in switch.lives
     }
     assert verdicts == {"Forgetful": "open", "Tired": "above", "Stubborn": "above"}
+    tired = related.lives[0]  # more in each visit
+    assert tired.last_plasticity_ratio.value > tired.plasticity_ratio.value
     changes = {(c.algorithm, c.metric): c for c in found.changes}
     assert {change.class_name for change in found.changes} == {"Related"}  # not Cycle
     assert all(change.related for change in found.changes)
