@@ -1,7 +1,5 @@
 """Chromium for tests of pages: skipped where it is not installed, except in CI."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import http.server

@@ -6,9 +6,7 @@ import os
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from filelock import FileLock
@@ -42,14 +40,14 @@ settings.register_profile(
 settings.load_profile("deterministic")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     """Give the long files to workers first."""
     rank = {name: place for place, name in enumerate(LONG)}
     items.sort(key=lambda item: rank.get(item.nodeid.partition("::")[0], len(rank)))
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _forgets_compiled_programs() -> Iterator[None]:
+def _forgets_compiled_programs():
     """The programs that a file compiled in JAX go with it: hundreds of them take gigabytes."""
     yield
     if jax := sys.modules.get("jax"):
@@ -60,9 +58,7 @@ def _forgets_compiled_programs() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def once(
-    tmp_path_factory: pytest.TempPathFactory, worker_id: str
-) -> Callable[[str, Callable[[Path], Any]], Path]:
+def once(tmp_path_factory, worker_id):
     """`once(name, make)`: the folder that `make(folder)` filled, in one worker for all of them.
 
     Nobody changes it: a test that writes works on a copy.
@@ -70,7 +66,7 @@ def once(
     base = tmp_path_factory.getbasetemp()
     shared = base if worker_id == "master" else base.parent
 
-    def made(name: str, make: Callable[[Path], Any]) -> Path:
+    def made(name, make):
         folder, complete = shared / "once" / name, shared / "once" / f"{name}.complete"
         folder.parent.mkdir(exist_ok=True)
         with FileLock(folder.with_name(f"{name}.lock")):
@@ -84,14 +80,14 @@ def once(
 
 
 @pytest.fixture
-def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+def figures(monkeypatch):
     """Every figure drawn in a test, as it was when it was saved."""
     from matplotlib.figure import Figure
 
     drawn = []
     save = Figure.savefig
 
-    def saving(figure: Figure, *args: Any, **kw: Any) -> Any:
+    def saving(figure, *args, **kw):
         drawn.append(figure)
         return save(figure, *args, **kw)
 

@@ -1,11 +1,7 @@
 """Whether a figure can be read: what is where, in pixels, after Matplotlib has laid it out."""
 
-from __future__ import annotations
 
-from typing import Any
-
-
-def assert_readable(figure: Any) -> None:
+def assert_readable(figure):
     """Assert that no legend covers a panel, and that every text and legend is inside the figure."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -32,7 +28,7 @@ def assert_readable(figure: Any) -> None:
         assert _inside(figure._suptitle.get_window_extent(renderer), figure.bbox)
 
 
-def _inside(box: Any, outer: Any, margin: float = 1.5) -> bool:
+def _inside(box, outer, margin=1.5):
     return bool(
         box.x0 >= outer.x0 - margin
         and box.y0 >= outer.y0 - margin
@@ -41,7 +37,7 @@ def _inside(box: Any, outer: Any, margin: float = 1.5) -> bool:
     )
 
 
-def _overlap(one: Any, other: Any, margin: float = 1.0) -> bool:
+def _overlap(one, other, margin=1.0):
     return bool(
         min(one.x1, other.x1) - max(one.x0, other.x0) > margin
         and min(one.y1, other.y1) - max(one.y0, other.y0) > margin

@@ -80,6 +80,6 @@ def spec_fields(
     return fields
 
 
-def specs(team: bool | None = None, *, plain: bool = False) -> st.SearchStrategy[SMESpec]:
+def specs(team=None, *, plain=False):
     """Valid specs; see `spec_fields`."""
     return spec_fields(team, plain=plain).map(SMESpec.from_dict)

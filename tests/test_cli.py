@@ -38,21 +38,21 @@ COMMANDS = [
 
 
 @pytest.fixture(autouse=True)
-def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _elsewhere(tmp_path, monkeypatch):
     """Every command runs in an empty folder, on a terminal of known width."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.setenv("PYTHONPATH", str(Path(sme_registry.__file__).parents[1]))
 
 
-def test_show_does_not_call_another_task_by_a_name_of_the_catalogue() -> None:
+def test_show_does_not_call_another_task_by_a_name_of_the_catalogue():
     good("new", "mine.json", "--k", "2", "--name", "Default")
     title = good("show", "mine.json").stdout.splitlines()[0]
     assert load("mine.json").content_name in title
     assert "Default-v1" not in title
 
 
-def test_suite_writes_a_file_of_tasks_files_sweeps_and_another_suite(tmp_path: Path) -> None:
+def test_suite_writes_a_file_of_tasks_files_sweeps_and_another_suite(tmp_path):
     good("new", "k2.json", "--k", "2", "--seed", "7")
     printed = good(
         "suite", "new", "mine.json", "-t", "Default", "-t", "k2.json", "--instances", "3"
@@ -78,7 +78,7 @@ def test_suite_writes_a_file_of_tasks_files_sweeps_and_another_suite(tmp_path: P
     assert "--suite FILE" in refused("train", SMESpec(k=2, seed=8).digest)
 
 
-def test_train_refuses_what_a_stream_cannot_have() -> None:
+def test_train_refuses_what_a_stream_cannot_have():
     stream = refused("train", "Switch5", "--set", "complexity=3")
     assert "--set complexity: Switch5 is a stream." in stream
     for field in ("cycles", "phases.0.steps"):
@@ -90,7 +90,7 @@ def test_train_refuses_what_a_stream_cannot_have() -> None:
     assert "num_envs=2: must be 1 on a stream" in refused("train", "Switch5", "--num-envs", "2")
 
 
-def test_train_takes_a_task_or_a_suite_and_refuses_options_of_the_other() -> None:
+def test_train_takes_a_task_or_a_suite_and_refuses_options_of_the_other():
     assert "--suite" in refused("train")
     assert "TASK" in refused("train", "Default", "--suite", "smoke")
     assert "--num-envs" in refused("train", "--suite", "smoke", "--num-envs", "2")
@@ -101,13 +101,13 @@ def test_train_takes_a_task_or_a_suite_and_refuses_options_of_the_other() -> Non
     assert not list(Path().iterdir())
 
 
-def test_help_lists_every_command_and_the_version_is_the_packages() -> None:
+def test_help_lists_every_command_and_the_version_is_the_packages():
     text = good("--help").stdout
     assert all(command in text for command in COMMANDS)
     assert good("--version").stdout.strip() == f"sme {sme_registry.__version__}"
 
 
-def test_the_command_alone_shows_the_help_and_nothing_else() -> None:
+def test_the_command_alone_shows_the_help_and_nothing_else():
     result = sme()
     assert result.exit_code == 2
     assert "Commands" in result.output
@@ -125,14 +125,14 @@ def test_the_help_of_each_command_has_examples(command: str) -> None:
     "arguments",
     [("frob",), ("train",), ("list", "--kind", "x"), ("new",), ("train", "Default", "-n", "many")],
 )
-def test_a_usage_error_is_one_line_that_points_to_the_help(arguments: tuple[str, ...]) -> None:
+def test_a_usage_error_is_one_line_that_points_to_the_help(arguments):
     message = refused(*arguments)
     assert len(message.splitlines()) == 1
     assert "--help`." in message
 
 
 class TestList:
-    def test_json_holds_the_whole_catalogue_and_nothing_else(self) -> None:
+    def test_json_holds_the_whole_catalogue_and_nothing_else(self):
         entries = json.loads(good("list", "--json").stdout)
         expected = [name for kind in KINDS for name in catalogue.names(kind)]
         assert [entry["name"] for entry in entries] == expected
@@ -140,7 +140,7 @@ class TestList:
             if entry["kind"] == "env":
                 assert SMESpec.from_dict(entry["spec"]).digest == entry["digest"]
 
-    def test_tables_name_every_entry_and_count_the_agents(self) -> None:
+    def test_tables_name_every_entry_and_count_the_agents(self):
         text = good("list").stdout
         for kind in KINDS:
             assert all(name in text for name in catalogue.names(kind))
@@ -148,7 +148,7 @@ class TestList:
             (row,) = [line for line in text.splitlines() if f"SME/{name}-v1" in line]
             assert row.split()[1] == agents
 
-    def test_filters_by_kind_and_tag(self) -> None:
+    def test_filters_by_kind_and_tag(self):
         suites = json.loads(good("list", "--kind", "suite", "--json").stdout)
         assert {entry["kind"] for entry in suites} == {"suite"}
         tagged = json.loads(good("list", "--tag", "paper", "--json").stdout)
@@ -162,13 +162,13 @@ class TestShow:
     @pytest.mark.parametrize(
         "name", ["Default", "Default-v1", "SME/Default-v1", "sha256:66e9b7a9a266"]
     )
-    def test_a_task_is_found_under_each_of_its_names(self, name: str) -> None:
+    def test_a_task_is_found_under_each_of_its_names(self, name):
         shown = json.loads(good("show", name, "--json").stdout)
         assert shown["name"] == "Default-v1"
         assert shown["digest"] == load("Default").digest
         assert SMESpec.from_dict(shown["spec"]) == load("Default")
 
-    def test_derived_facts_are_those_of_the_environment(self) -> None:
+    def test_derived_facts_are_those_of_the_environment(self):
         facts = json.loads(good("show", "Interval25", "--json").stdout)["derived"]
         task = sme_registry.materialize(load("Interval25"))
         numbers = task.W.size + task.b.size + sum(W.size + b.size for W, b in task.policies[0])
@@ -176,7 +176,7 @@ class TestShow:
         assert facts["parameter_memory_bytes"] == 8 * numbers
         assert (facts["largest_return"], facts["payouts_in_a_full_episode"]) == (100, 4)
 
-    def test_limits_and_what_the_agent_sees_are_fields_and_facts(self) -> None:
+    def test_limits_and_what_the_agent_sees_are_fields_and_facts(self):
         observation = {"distractors": 32, "dynamics": "driven", "mixing": "nonlinear"}
         options = ("--safety", '{"tightness": 0.2}', "--observation", json.dumps(observation))
         good("new", "a.json", *options)
@@ -197,14 +197,14 @@ class TestShow:
         assert "limits" not in text
         assert re.search(r"^safety +None$", text, re.M)
 
-    def test_the_classes_of_a_suite_differ_in_the_fields_of_a_block(self) -> None:
+    def test_the_classes_of_a_suite_differ_in_the_fields_of_a_block(self):
         good("new", "a.json", "--safety", '{"tightness": 0.2}')
         good("suite", "new", "s.json", "-t", "a.json", "--sweep", "safety.tightness=0.1,0.4")
         text = good("show", "s.json").stdout
         assert re.search(r"safety-tightness-0_1 +safety\.tightness=0\.1 ", text)
         assert re.search(r"safety-tightness-0_4 +safety\.tightness=0\.4 ", text)
 
-    def test_who_owns_and_sees_and_is_paid_for_what_is_a_table(self) -> None:
+    def test_who_owns_and_sees_and_is_paid_for_what_is_a_table(self):
         text = good("show", "TeamBlind4").stdout
         rows = [line for line in text.splitlines() if line.startswith("agent_")]
         cells = [re.split("  +", row) for row in rows]
@@ -218,7 +218,7 @@ class TestShow:
         assert "all channels" in good("show", "TeamShared2").stdout
         assert "Agents" not in good("show", "Default").stdout
 
-    def test_the_agents_of_the_json_are_those_of_the_environment(self) -> None:
+    def test_the_agents_of_the_json_are_those_of_the_environment(self):
         derived = json.loads(good("show", "DuoDeep", "--json").stdout)["derived"]
         env = sme_registry.make_parallel("DuoDeep")
         assert [agent["name"] for agent in derived["agents"]] == env.possible_agents
@@ -231,7 +231,7 @@ class TestShow:
             assert (agent["observation_dim"],) == space.shape
         assert "agents" not in json.loads(good("show", "Default", "--json").stdout)["derived"]
 
-    def test_people_see_the_fields_of_every_kind(self) -> None:
+    def test_people_see_the_fields_of_every_kind(self):
         text = good("show", "Survival25").stdout
         for words in ("state_dim", load("Survival25").digest, "largest_return", "0.25"):
             assert words in text
@@ -239,7 +239,7 @@ class TestShow:
         assert "complexity=10" in good("show", "core").stdout
         assert "epsilons" in good("show", "paper-v1").stdout
 
-    def test_a_suite_lists_its_instances_by_names_to_train_by(self, tmp_path: Path) -> None:
+    def test_a_suite_lists_its_instances_by_names_to_train_by(self, tmp_path):
         file = catalogue.find(SuiteFile, "smoke")
         shown = json.loads(good("show", "smoke", "--json").stdout)
         assert json.loads(good("show", shown["digest"], "--json").stdout) == shown
@@ -267,7 +267,7 @@ class TestShow:
         assert f"7777  {suite.instances[0].digest[:19]}\n" in text
         assert "sme train" not in text
 
-    def test_the_exported_schema_is_the_models(self) -> None:
+    def test_the_exported_schema_is_the_models(self):
         schema = json.loads(good("show", "--json-schema", "spec").stdout)
         assert schema["properties"].keys() == SMESpec.model_fields.keys()
         assert schema["additionalProperties"] is False
@@ -285,12 +285,12 @@ class TestShow:
             (("Default", "--json-schema", "spec"), "one or the other"),
         ],
     )
-    def test_bad_input(self, arguments: tuple[str, ...], message: str) -> None:
+    def test_bad_input(self, arguments, message):
         assert message in refused("show", *arguments)
 
 
 class TestNew:
-    def test_every_field_given_is_in_the_file_and_the_rest_is_default(self, tmp_path: Path) -> None:
+    def test_every_field_given_is_in_the_file_and_the_rest_is_default(self, tmp_path):
         fields = {
             "--state-dim": 5, "--action-dim": 3, "--k": 4, "--r-min": 0.25, "--D": 0.5,
             "--complexity": 2, "--horizon": 40, "--hidden-width": 16,
@@ -307,13 +307,13 @@ class TestNew:
         good("new", "plain.json")
         assert load(tmp_path / "plain.json") == SMESpec()
 
-    def test_every_field_of_a_spec_has_an_option_with_a_description(self) -> None:
+    def test_every_field_of_a_spec_has_an_option_with_a_description(self):
         text = good("new", "--help").stdout
         for field in SMESpec.model_fields.keys() - {"schema_version"}:
             assert f"--{field.replace('_', '-')} " in text
         assert "None" not in text
 
-    def test_from_derives_and_its_file_is_loaded_by_its_path(self, tmp_path: Path) -> None:
+    def test_from_derives_and_its_file_is_loaded_by_its_path(self, tmp_path):
         printed = good("new", "a.json", "--from", "HardDeep", "--k", "5").stdout
         spec = load(tmp_path / "a.json")
         assert spec == load("HardDeep").derive(k=5)
@@ -321,7 +321,7 @@ class TestNew:
         good("new", "b.json", "--from", "a.json", "--seed", "0x1F")
         assert load(tmp_path / "b.json") == spec.derive(seed="0x1f")
 
-    def test_a_team_is_given_as_json_or_as_a_file(self, tmp_path: Path) -> None:
+    def test_a_team_is_given_as_json_or_as_a_file(self, tmp_path):
         team = {"agents": [{"action_dim": 1, "observes": [0, 3]}, {"action_dim": 3}]}
         (tmp_path / "who.json").write_text(json.dumps(team))
         good("new", "a.json", "--team", json.dumps(team | {"reward": "team"}))
@@ -342,9 +342,7 @@ class TestNew:
             (("--from", "Team8", "--agents", "3", "--channels-each", "1"), [1] * 3, "individual"),
         ],
     )
-    def test_a_team_of_equals_is_given_by_numbers(
-        self, options: tuple[str, ...], channels: list[int], reward: str, tmp_path: Path
-    ) -> None:
+    def test_a_team_of_equals_is_given_by_numbers(self, options, channels, reward, tmp_path):
         good("new", "team.json", *options)
         spec = load(tmp_path / "team.json")
         assert spec.team is not None
@@ -352,7 +350,7 @@ class TestNew:
         assert {agent.observes for agent in spec.team.agents} == {"all"}
         assert (spec.action_dim, spec.team.reward) == (sum(channels), reward)
 
-    def test_a_file_that_is_there_is_replaced_only_by_force(self, tmp_path: Path) -> None:
+    def test_a_file_that_is_there_is_replaced_only_by_force(self, tmp_path):
         good("new", "a.json", "--seed", "1")
         before = (tmp_path / "a.json").read_bytes()
         assert "--force" in refused("new", "a.json", "--seed", "2")
@@ -401,21 +399,17 @@ class TestNew:
             (("--tag", "a/b"), "tags"),
         ],
     )
-    def test_bad_input_leaves_no_file(
-        self, options: tuple[str, ...], message: str, tmp_path: Path
-    ) -> None:
+    def test_bad_input_leaves_no_file(self, options, message, tmp_path):
         assert message in refused("new", "a.json", *options)
         assert list(tmp_path.iterdir()) == []
 
-    def test_a_file_without_the_ending_that_makes_it_a_path_is_refused(
-        self, tmp_path: Path
-    ) -> None:
+    def test_a_file_without_the_ending_that_makes_it_a_path_is_refused(self, tmp_path):
         assert "must end in .json" in refused("new", "mine")
         assert list(tmp_path.iterdir()) == []
 
 
 class TestValidate:
-    def test_each_kind_is_told_and_folders_are_searched(self) -> None:
+    def test_each_kind_is_told_and_folders_are_searched(self):
         results = json.loads(good("validate", catalogue.spec_folder(), "--json").stdout)
         assert {result["kind"] for result in results} == {
             "env",
@@ -427,7 +421,7 @@ class TestValidate:
         assert all(result["valid"] for result in results)
         assert len(results) == sum(len(catalogue.paths(kind)) for kind in KINDS)
 
-    def test_all_files_are_checked_and_each_bad_one_says_why(self, tmp_path: Path) -> None:
+    def test_all_files_are_checked_and_each_bad_one_says_why(self, tmp_path):
         good("new", "good.json")
         data = json.loads((tmp_path / "good.json").read_text())
         broken: dict[str, Any] = {
@@ -460,33 +454,33 @@ class TestValidate:
             assert name in results[name]["error"]
         assert "8 of 9 files are invalid" in result.stderr
 
-    def test_a_suite_with_a_wrong_digest_is_bad(self, tmp_path: Path) -> None:
+    def test_a_suite_with_a_wrong_digest_is_bad(self, tmp_path):
         plain = catalogue.find(SuiteFile, "smoke").to_dict()
         plain["suite"]["classes"][0]["seeds"] = [77]
         (tmp_path / "suite.json").write_text(json.dumps(plain))
         assert "digest=" in sme("validate", "suite.json").stdout
         refused("validate", "suite.json")
 
-    def test_an_empty_folder_is_refused(self, tmp_path: Path) -> None:
+    def test_an_empty_folder_is_refused(self, tmp_path):
         (tmp_path / "empty").mkdir()
         assert "no .json" in refused("validate", "empty")
 
 
 class TestCertify:
-    def test_a_sound_task_passes_with_its_numbers(self) -> None:
+    def test_a_sound_task_passes_with_its_numbers(self):
         (made,) = json.loads(good("certify", "Default", "--json").stdout)
         assert made == {"task": "Default", **certify(load("Default")).to_dict()}
         text = good("certify", "Default").stdout
         assert all(check.name in text for check in certify(load("Default")).checks)
 
-    def test_a_trivial_task_exits_with_one(self) -> None:
+    def test_a_trivial_task_exits_with_one(self):
         good("new", "trivial.json", "--state-dim", "2", "--action-dim", "2", "--complexity", "3")
         result = sme("certify", "trivial.json")
         assert result.exit_code == 1
         assert "refused for constant_policy_similarity" in result.stderr
         assert sme("certify", "Default", "trivial.json").exit_code == 1
 
-    def test_a_trivial_agent_among_others_is_found_and_named(self) -> None:
+    def test_a_trivial_agent_among_others_is_found_and_named(self):
         team = '{"agents": [{"action_dim": 4, "observes": [0]}, {"action_dim": 4}]}'
         good("new", "t.json", "--action-dim", "8", "--seed", "1", "--team", team)
         (made,) = json.loads(good("certify", "t.json", "--json").stdout)
@@ -497,7 +491,7 @@ class TestCertify:
         # Nothing else shows it.
         assert {check["outcome"] for check in checks.values()} == {"passed", "reported"}
 
-    def test_a_suite_is_certified_task_by_task(self) -> None:
+    def test_a_suite_is_certified_task_by_task(self):
         text = good("certify", "smoke").stdout
         assert len(text.splitlines()) == len(catalogue.find(SuiteFile, "smoke").suite.instances)
 
@@ -509,14 +503,14 @@ class TestCertify:
             (("Default", "--seed", "-1"), "seed=-1"),
         ],
     )
-    def test_bad_input(self, arguments: tuple[str, ...], message: str) -> None:
+    def test_bad_input(self, arguments, message):
         assert message in refused("certify", *arguments)
 
 
 QUICK = ("--protocol", "quick-v1")
 
 
-def save_life() -> None:
+def save_life():
     """Write life.json, two phases in two cycles."""
     spec = load("Plane1", SMESpec).derive(hidden_width=8, horizon=20)
     phases = [{"spec": each, "steps": 60} for each in (spec, spec.derive(seed=1))]
@@ -531,9 +525,7 @@ def save_life() -> None:
             ("random", "uniform_random", 0.02),
         ],
     )
-    def test_a_reference_policy_scores_as_in_every_report(
-        self, policy: str, reference: str, close: float
-    ) -> None:
+    def test_a_reference_policy_scores_as_in_every_report(self, policy, reference, close):
         report = json.loads(good("evaluate", policy, "Default", *QUICK, "--json").stdout)
         team = json.loads(good("evaluate", policy, "TeamBlind4", *QUICK, "--json").stdout)
         assert list(team["agents"]) == [f"agent_{i}" for i in range(4)]
@@ -544,7 +536,7 @@ def save_life() -> None:
         if policy == "constant":
             assert "agent_3" in good("evaluate", policy, "TeamBlind4", *QUICK).stdout
 
-    def test_a_function_is_the_policy_that_a_team_shares(self, tmp_path: Path) -> None:
+    def test_a_function_is_the_policy_that_a_team_shares(self, tmp_path):
         (tmp_path / "shared_for_the_test.py").write_text(
             "import numpy as np\n"
             "def act(observations):\n"
@@ -556,9 +548,7 @@ def save_life() -> None:
         assert report["regions"][0]["normalised_regret"] == pytest.approx(1.0)
         assert "for each agent in turn" in refused("evaluate", "math:sqrt", "Team4", *QUICK)
 
-    def test_the_folder_gets_report_and_figures_and_is_not_overwritten(
-        self, tmp_path: Path
-    ) -> None:
+    def test_the_folder_gets_report_and_figures_and_is_not_overwritten(self, tmp_path):
         good("evaluate", "constant", "Plane1", *QUICK, "--out", "ev")
         names = sorted(path.name for path in (tmp_path / "ev").iterdir())
         assert names == [
@@ -571,7 +561,7 @@ def save_life() -> None:
         good("evaluate", "random", "Plane1", *QUICK, "--out", "ev", "--force")
         assert EvaluationReport.read(tmp_path / "ev/evaluation.json").policy == "random"
 
-    def test_a_function_of_ones_own_is_evaluated_in_the_range_it_says(self, tmp_path: Path) -> None:
+    def test_a_function_of_ones_own_is_evaluated_in_the_range_it_says(self, tmp_path):
         (tmp_path / "mine_for_the_test.py").write_text(
             "import numpy as np\n"
             "def act(observations):\n    return np.zeros((len(observations), 4))\n"
@@ -583,7 +573,7 @@ def save_life() -> None:
         lower = json.loads(good(*arguments).stdout)["regions"][0]["similarity"]
         assert lower < half - 0.1
 
-    def test_overrides_evaluate_the_derived_task(self) -> None:
+    def test_overrides_evaluate_the_derived_task(self):
         text = good(
             "evaluate", "constant", "Default", *QUICK, "--set", "complexity=3", "--json"
         ).stdout
@@ -606,15 +596,11 @@ def save_life() -> None:
             (("optimal", "Default", "--set", "k=2", "--set", "k=3"), "twice"),
         ],
     )
-    def test_bad_input_writes_nothing(
-        self, arguments: tuple[str, ...], message: str, tmp_path: Path
-    ) -> None:
+    def test_bad_input_writes_nothing(self, arguments, message, tmp_path):
         assert message in refused("evaluate", *arguments, "--out", "ev")
         assert list(tmp_path.iterdir()) == []
 
-    def test_a_policy_for_a_whole_life_is_reported_with_its_dynamic_regret(
-        self, tmp_path: Path
-    ) -> None:
+    def test_a_policy_for_a_whole_life_is_reported_with_its_dynamic_regret(self, tmp_path):
         save_life()
         result = good("evaluate", "constant", "life.json", *QUICK, "--out", "ev")
         report = StreamReport.read(tmp_path / "ev/stream.json")
@@ -627,7 +613,7 @@ def save_life() -> None:
         assert names == {"stream", "retention_map", "performance_curve", "dynamic_regret_curve"}
         assert "--force" in refused("evaluate", "random", "life.json", *QUICK, "--out", "ev")
 
-    def test_a_life_has_a_policy_for_each_visit(self) -> None:
+    def test_a_life_has_a_policy_for_each_visit(self):
         save_life()
         life = ("evaluate", "optimal", "constant", "constant", "optimal", "life.json", *QUICK)
         others = ("--initial", "constant", "--fresh", "linear", "--fresh", "constant")
@@ -655,19 +641,17 @@ def save_life() -> None:
             (("random", "Default", "--initial", "random"), "--initial: is for streams"),
         ],
     )
-    def test_a_bad_life_writes_nothing(
-        self, arguments: tuple[str, ...], message: str, tmp_path: Path
-    ) -> None:
+    def test_a_bad_life_writes_nothing(self, arguments, message, tmp_path):
         save_life()
         assert message in refused("evaluate", *arguments, *QUICK, "--out", "ev")
         assert [path.name for path in tmp_path.iterdir()] == ["life.json"]
 
-    def test_a_life_of_more_visits_than_are_evaluated_is_refused(self) -> None:
+    def test_a_life_of_more_visits_than_are_evaluated_is_refused(self):
         save(StreamSpec(phases=load("Cycle2").phases, cycles=10**6), "long.json")
         message = "cycles × phases=2,000,000: must be at most 1,000"
         assert message in refused("evaluate", "random", "random", "long.json", *QUICK)
 
-    def test_a_zip_that_is_no_model_is_refused(self, tmp_path: Path) -> None:
+    def test_a_zip_that_is_no_model_is_refused(self, tmp_path):
         (tmp_path / "a.zip").write_bytes(b"not a zip")
         assert "not a model" in refused("evaluate", "a.zip", "Default")
 
@@ -676,9 +660,7 @@ SHORT = ("train", "Plane1", "-n", "120", *QUICK)
 
 
 class TestTrain:
-    def test_it_trains_on_a_stream_and_shows_what_was_retained_and_what_it_cost(
-        self, tmp_path: Path
-    ) -> None:
+    def test_it_trains_on_a_stream_and_shows_what_was_retained_and_what_it_cost(self, tmp_path):
         pytest.importorskip("stable_baselines3")
         task = SMESpec(state_dim=2, action_dim=2, horizon=20)
         phases = [{"spec": task, "steps": 40}, {"spec": task.derive(seed=1), "steps": 40}]
@@ -694,7 +676,7 @@ class TestTrain:
         assert (folder / "snapshots" / "visit-01.zip").exists()
         assert "All files are in runs/mine-PPO-seed0/" in result.stdout
 
-    def test_it_trains_reports_and_says_where(self, tmp_path: Path) -> None:
+    def test_it_trains_reports_and_says_where(self, tmp_path):
         pytest.importorskip("stable_baselines3")
         result = good(*SHORT, "--json")
         printed = json.loads(result.stdout)
@@ -710,7 +692,7 @@ class TestTrain:
         )
         assert again["regions"] == printed["evaluation"]["regions"]
 
-    def test_agents_in_jax_have_a_folder_of_their_own(self, tmp_path: Path) -> None:
+    def test_agents_in_jax_have_a_folder_of_their_own(self, tmp_path):
         pytest.importorskip("stable_baselines3")
         pytest.importorskip("jax")
         narrow = ("--set", "n_steps=32", "--set", "batch_size=32", "--set", "n_epochs=1")
@@ -746,14 +728,12 @@ class TestTrain:
             (("--checkpoint-every", "0"), "checkpoint_every=0"),
         ],
     )
-    def test_bad_input_writes_nothing(
-        self, options: tuple[str, ...], message: str, tmp_path: Path
-    ) -> None:
+    def test_bad_input_writes_nothing(self, options, message, tmp_path):
         pytest.importorskip("stable_baselines3")
         assert message in refused(*SHORT, *options)
         assert list(tmp_path.iterdir()) == []
 
-    def test_hyperparameters_come_from_options_and_a_file(self, tmp_path: Path) -> None:
+    def test_hyperparameters_come_from_options_and_a_file(self, tmp_path):
         pytest.importorskip("stable_baselines3")
         (tmp_path / "settings.json").write_text('{"gamma": 0.9}')
         file = ("--hyperparameters", "settings.json")
@@ -766,9 +746,7 @@ class TestTrain:
         assert printed["run"]["spec"]["k"] == 2
         assert "sets it, too" in refused(*SHORT, *file, "--set", "gamma=0.8")
 
-    def test_a_team_is_trained_with_its_regret_shown_and_its_model_evaluated(
-        self, tmp_path: Path
-    ) -> None:
+    def test_a_team_is_trained_with_its_regret_shown_and_its_model_evaluated(self, tmp_path):
         pytest.importorskip("stable_baselines3")
         command = ("train", "SME/Team2-v1", "-n", "300", "--set", "horizon=20", *QUICK)
         result = good(*command, "--out", "run", "--json")
@@ -786,7 +764,7 @@ class TestTrain:
         assert "shape" in refused("evaluate", "run/model.zip", "Team4", *QUICK)
         assert "shape" in refused("evaluate", "run/model.zip", "Default", *QUICK)
 
-    def test_an_interrupt_says_how_to_go_on_and_going_on_works(self, tmp_path: Path) -> None:
+    def test_an_interrupt_says_how_to_go_on_and_going_on_works(self, tmp_path):
         pytest.importorskip("stable_baselines3")
         command = ("train", "Plane1", "--out", "run", "--checkpoint-every", "50", *QUICK)
         process = subprocess.Popen(
@@ -818,7 +796,7 @@ class TestTrain:
 
 
 class TestDemo:
-    def test_it_leaves_figures_and_a_report_that_links_them(self, tmp_path: Path) -> None:
+    def test_it_leaves_figures_and_a_report_that_links_them(self, tmp_path):
         pytest.importorskip("stable_baselines3")
         result = good("demo", "--steps", "200", "--out", "demo")
         names = {path.name for path in (tmp_path / "demo").iterdir()}
@@ -839,14 +817,14 @@ class TestDemo:
 
 
 @pytest.mark.parametrize("arguments", [("list",), ("show", "TeamBlind4"), ("show", "Défaut")])
-def test_output_is_utf8_where_the_system_has_another_encoding(arguments: tuple[str, ...]) -> None:
+def test_output_is_utf8_where_the_system_has_another_encoding(arguments):
     environment = os.environ | {"PYTHONIOENCODING": "cp1252"}  # a pipe on Windows
     process = subprocess.run([*SME, *arguments], capture_output=True, check=False, env=environment)
     assert "Traceback" not in process.stderr.decode()
     assert (process.stdout + process.stderr).decode().isascii() is False
 
 
-def test_the_installed_command_prints_pure_json_or_one_line_and_its_exit_code() -> None:
+def test_the_installed_command_prints_pure_json_or_one_line_and_its_exit_code():
     listed, unknown = (
         subprocess.run([*SME, *arguments], capture_output=True, check=False, text=True)
         for arguments in (("list", "--json"), ("show", "Defalt"))
@@ -861,7 +839,7 @@ def test_the_installed_command_prints_pure_json_or_one_line_and_its_exit_code() 
 @pytest.mark.parametrize(
     "arguments", [("list",), ("show", "core", "--json"), ("show", "Default", "--json")]
 )
-def test_a_reader_that_leaves_early_is_no_error(arguments: tuple[str, ...]) -> None:
+def test_a_reader_that_leaves_early_is_no_error(arguments):
     read, write = os.pipe()
     process = subprocess.Popen([*SME, *arguments], stdout=write, stderr=subprocess.PIPE, text=True)
     os.close(write)

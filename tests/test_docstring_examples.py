@@ -12,8 +12,6 @@ import doctest
 import importlib
 import inspect
 import shutil
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,7 +30,7 @@ FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 SHORT_PPO = {"n_steps": 128, "batch_size": 64, "n_epochs": 1}
 
 
-def public_things() -> dict[str, Any]:
+def public_things():
     """The functions and classes that users import, by their names."""
     modules = ["sme_registry", *(f"sme_registry.{name}" for name in sme_registry._SUBMODULES)]
     found: dict[Any, str] = {}
@@ -46,7 +44,7 @@ def public_things() -> dict[str, Any]:
     return {name: thing for thing, name in found.items()}
 
 
-def is_record(thing: Any) -> bool:
+def is_record(thing):
     """Whether it only holds fields, which functions return and its docstring describes."""
     return inspect.isclass(thing) and (
         issubclass(thing, BaseModel | BaseException | tuple) or dataclasses.is_dataclass(thing)
@@ -57,7 +55,7 @@ THINGS = public_things()
 FINDER = doctest.DocTestFinder(recurse=False)
 
 
-def example_of(name: str) -> doctest.DocTest | None:
+def example_of(name):
     return next((test for test in FINDER.find(THINGS[name], name) if test.examples), None)
 
 
@@ -65,7 +63,7 @@ WITH_EXAMPLE = [name for name in THINGS if example_of(name)]
 
 
 @pytest.fixture(scope="session")
-def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def prepared(tmp_path_factory):
     """What the examples find in their folder."""
     folder = tmp_path_factory.mktemp("examples")
     quick: dict[str, Any] = {"protocol": "quick-v1", "progress": False}
@@ -110,7 +108,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def desk(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def desk(prepared, tmp_path, monkeypatch):
     """A copy of it, so that no example needs another to have run."""
     shutil.copytree(prepared, tmp_path / "desk")
     monkeypatch.chdir(tmp_path / "desk")
@@ -120,19 +118,19 @@ def desk(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ite
     sme_registry.registration.gymnasium.registry.update(registered)
 
 
-def test_the_public_things_are_those_of_every_submodule() -> None:
+def test_the_public_things_are_those_of_every_submodule():
     assert {"sme_registry.make", "sme_registry.plots.decay_curve"} <= THINGS.keys()
     assert len(THINGS) > 150
 
 
 @pytest.mark.parametrize("name", [name for name in THINGS if not is_record(THINGS[name])])
-def test_a_public_function_or_class_has_an_example(name: str) -> None:
+def test_a_public_function_or_class_has_an_example(name):
     assert name in WITH_EXAMPLE
 
 
 @pytest.mark.usefixtures("desk")
 @pytest.mark.parametrize("name", WITH_EXAMPLE)
-def test_the_example_holds(name: str) -> None:
+def test_the_example_holds(name):
     test = example_of(name)
     assert test is not None
     test.globs = {"np": np, "sme_registry": sme_registry}

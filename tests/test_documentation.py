@@ -36,9 +36,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
         ),
     ],
 )  # fmt: skip
-def test_the_python_of_a_page_runs_from_top_to_bottom(
-    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.M | re.S)
     assert blocks
@@ -80,13 +78,7 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(
         ),
     ],
 )
-def test_a_tutorial_works_from_top_to_bottom(
-    name: str,
-    packages: str,
-    shorter: dict[str, str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_tutorial_works_from_top_to_bottom(name, packages, shorter, tmp_path, monkeypatch):
     for package in packages.split():
         pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
@@ -108,9 +100,7 @@ def test_a_tutorial_works_from_top_to_bottom(
                     subprocess.run(shlex.split(line), check=True)
 
 
-def test_the_page_on_the_leaderboard_leads_from_an_own_suite_to_a_rank(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_page_on_the_leaderboard_leads_from_an_own_suite_to_a_rank(tmp_path, monkeypatch):
     for package in ("torch", "onnx", "onnxruntime"):
         pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
@@ -125,7 +115,7 @@ def test_the_page_on_the_leaderboard_leads_from_an_own_suite_to_a_rank(
     assert re.search(r"^ *1  PPO", output, re.M)
 
 
-def run(program: str, command: str) -> str:
+def run(program, command):
     """The output of a command of the documentation, which must succeed; with a key of its own."""
     from leaderboard.cli import app as leaderboard
     from sme_registry.cli import app as sme
@@ -139,7 +129,7 @@ def run(program: str, command: str) -> str:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_relative_link_leads_to_a_file(page: Path) -> None:
+def test_every_relative_link_leads_to_a_file(page):
     links = re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text())
     missing = [link for link in links if not (page.parent / link).exists()]
     assert not missing
@@ -151,11 +141,11 @@ GENERATED: dict[str, Callable[[], str]] = runpy.run_path(str(ROOT / "docs" / "ge
 
 
 @pytest.mark.parametrize("name", GENERATED)
-def test_a_generated_page_is_what_make_docs_writes(name: str) -> None:
+def test_a_generated_page_is_what_make_docs_writes(name):
     assert (ROOT / "docs" / name).read_text() == GENERATED[name](), "run `make docs`"
 
 
-def test_the_readme_names_every_environment_and_suite() -> None:
+def test_the_readme_names_every_environment_and_suite():
     readme = (ROOT / "README.md").read_text()
     table = readme.split("| `SME/…-v1` |")[1].split("\n\n")[0]
     named = {
@@ -167,7 +157,7 @@ def test_the_readme_names_every_environment_and_suite() -> None:
     assert all(f"`{suite}`" in readme for suite in names(SuiteFile))
 
 
-def test_the_table_of_fields_has_every_field_its_default_and_its_meaning() -> None:
+def test_the_table_of_fields_has_every_field_its_default_and_its_meaning():
     table = re.findall(r"^\| `(\w+)` \| .* \| (.*?) \| (.*?) \|$", specs_page(), re.M)
     fields = {
         name: field
@@ -181,7 +171,7 @@ def test_the_table_of_fields_has_every_field_its_default_and_its_meaning() -> No
         assert f"{meaning.partition(';')[0]}." == fields[name].description
 
 
-def test_the_table_of_safety_and_observation_has_every_field() -> None:
+def test_the_table_of_safety_and_observation_has_every_field():
     page = (ROOT / "docs" / "guides" / "safety_and_observation.md").read_text()
     documented = re.findall(r"^\| `((?:safety|observation)\.\w+)` \|", page, re.M)
     kinds = {"safety": SafetySpec, "observation": ObservationSpec}
@@ -189,7 +179,7 @@ def test_the_table_of_safety_and_observation_has_every_field() -> None:
     assert documented == fields
 
 
-def test_the_checks_of_the_page_are_those_of_a_certificate(tmp_path: Path) -> None:
+def test_the_checks_of_the_page_are_those_of_a_certificate(tmp_path):
     from sme_registry.cli import app as sme
 
     page = (ROOT / "docs" / "guides" / "safety_and_observation.md").read_text()
@@ -206,29 +196,29 @@ def test_the_checks_of_the_page_are_those_of_a_certificate(tmp_path: Path) -> No
         assert float(value) == pytest.approx(checks[name].value, rel=0.05)
 
 
-def specs_page() -> str:
+def specs_page():
     return (ROOT / "docs" / "guides" / "specs.md").read_text()
 
 
-def number(text: str) -> float | str:
+def number(text):
     try:
         return float(text)
     except ValueError:
         return text
 
 
-def first_column(table: str) -> list[str]:
+def first_column(table):
     return [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
 
 
-def expand(pattern: str) -> list[str]:
+def expand(pattern):
     """`Plane{1,10}` to `Plane1` and `Plane10`, as a shell does."""
     parts = [part.split(",") for part in re.split(r"[{}]", pattern)]
     return ["".join(combination) for combination in product(*parts)]
 
 
 @pytest.mark.parametrize("package", ["sme_registry", "leaderboard"])
-def test_the_map_of_the_code_lists_every_module_of_a_package(package: str) -> None:
+def test_the_map_of_the_code_lists_every_module_of_a_package(package):
     table = (ROOT / "CONTRIBUTING.md").read_text().split(f"`{package}`", 1)[1].split("\n\n")[1]
     listed = set(re.findall(r"`(\w+)`", "\n".join(first_column(table))))
     modules = {path.stem for path in (ROOT / package).glob("[!_]*.py")}

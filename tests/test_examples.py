@@ -1,7 +1,5 @@
 """The examples run, and name the packages that they lack."""
 
-from __future__ import annotations
-
 import os
 import re
 import runpy
@@ -16,7 +14,7 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 PPO_EXAMPLES = [example for example in EXAMPLES if example.stem.endswith("_ppo")]
 
 
-def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+def run(*arguments):
     return subprocess.run(
         [sys.executable, *arguments],
         capture_output=True,
@@ -34,13 +32,8 @@ def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     ],
 )
 def test_without_torchrl_an_example_helps_or_says_what_is_wrong(
-    example: str,
-    arguments: list[str],
-    code: int,
-    message: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    example, arguments, code, message, monkeypatch, capsys
+):
     for package in ("tensordict", "torchrl"):
         monkeypatch.setitem(sys.modules, package, None)  # its import fails
     monkeypatch.setattr(sys, "argv", [example, *arguments])
@@ -52,7 +45,7 @@ def test_without_torchrl_an_example_helps_or_says_what_is_wrong(
 
 
 @pytest.mark.parametrize("example", PPO_EXAMPLES, ids=lambda path: path.stem)
-def test_ppo_of_a_framework_lowers_the_exact_regret(example: Path) -> None:
+def test_ppo_of_a_framework_lowers_the_exact_regret(example):
     """Where the framework is missing, the example says so in one line."""
     done = run(example, "--steps", "4096")
     print(done.stdout)  # for `make frameworks`
@@ -66,7 +59,7 @@ def test_ppo_of_a_framework_lowers_the_exact_regret(example: Path) -> None:
     assert after < 0.8 * before
 
 
-def test_the_torchrl_example_trains() -> None:
+def test_the_torchrl_example_trains():
     pytest.importorskip("torchrl")
     done = run(ROOT / "examples" / "torchrl_team.py", "--env", "Team2", "--steps", "4096")
     assert done.returncode == 0, done.stderr
@@ -79,7 +72,7 @@ def test_the_torchrl_example_trains() -> None:
     assert all(end < 0.7 * start for start, end in zip(before, after, strict=True))
 
 
-def test_the_sb3_contrib_example_trains_all_algorithms() -> None:
+def test_the_sb3_contrib_example_trains_all_algorithms():
     pytest.importorskip("sb3_contrib")
     done = run(ROOT / "examples" / "sb3_contrib_cell.py", "--env", "Plane1", "--steps", "64")
     assert done.returncode == 0, done.stderr

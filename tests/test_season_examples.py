@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ SPEC = SMESpec.from_dict({**FIELDS, "seed": 3})
 
 
 @pytest.fixture(scope="module")
-def family() -> ModuleType:
+def family():
     pytest.importorskip("torch")
     name = "season_family"
     found = importlib.util.spec_from_file_location(name, FOLDER / "family.py")
@@ -33,7 +32,7 @@ def family() -> ModuleType:
 
 
 @pytest.fixture(scope="module")
-def data() -> SealedDataset:
+def data():
     recipe = {"behaviours": [{"kind": "mixture", "nu": 0.5}], "transitions": 1500, "seed": 1}
     return SealedDataset.collect(DatasetRecipe.from_dict({"spec": SPEC.to_dict(), **recipe}))
 
@@ -56,7 +55,7 @@ def test_a_guess_with_the_weights_of_a_task_is_its_optimum(family, policy_init):
     np.testing.assert_allclose(guess.act(observations), task.optimal_action(states), atol=1e-5)
 
 
-def sizes(W: np.ndarray, rows: bool) -> np.ndarray:
+def sizes(W, rows):
     """The norms of a matrix's rows, or its singular values: what the family fixes."""
     return np.linalg.norm(W, axis=1) if rows else np.linalg.svd(W, compute_uv=False)
 

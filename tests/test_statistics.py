@@ -1,7 +1,5 @@
 """Statistics over runs: against hand-computed values, and the formulas of Agarwal et al. 2021."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -9,7 +7,6 @@ import pytest
 import scipy.stats
 
 from sme_registry import statistics
-from sme_registry.statistics import Array
 
 CLASSES = {
     "easy": np.array([[0.1, 1.0], [0.2, 3.0], [0.15, 2.0], [0.9, 2.5], [0.12, 1.5]]),
@@ -24,22 +21,22 @@ GOLDEN = (
 )
 
 
-def scores(seed: int, *shape: int) -> Array:
+def scores(seed, *shape):
     return np.asarray(np.random.default_rng(seed).random(shape))
 
 
 # The oracle: what rliable computes of `[runs, tasks]`, written out.
 
 
-def oracle_profile(runs: Array, tau: float) -> float:
+def oracle_profile(runs, tau):
     return float(np.mean([np.mean(column > tau) for column in runs.T]))
 
 
-def oracle_gap(runs: Array, target: float) -> float:
+def oracle_gap(runs, target):
     return float(target - np.mean(np.minimum(runs, target)))
 
 
-def oracle_improvement(x: Array, y: Array) -> float:
+def oracle_improvement(x, y):
     """The mean over tasks of the Mann-Whitney U over the number of pairs."""
     found = [
         scipy.stats.mannwhitneyu(a, b, alternative="greater").statistic / (len(a) * len(b))
@@ -48,7 +45,7 @@ def oracle_improvement(x: Array, y: Array) -> float:
     return float(np.mean(found))
 
 
-def by_task(runs: Array) -> dict[str, Array]:
+def by_task(runs):
     return {str(task): column for task, column in enumerate(runs.T)}
 
 
@@ -56,7 +53,7 @@ def by_task(runs: Array) -> dict[str, Array]:
     ("runs", "expected"),
     [([5.0], 5.0), ([1, 2, 6], 3.0), ([9, 1, 2, 4], 3.0), ([100, 1, 2, 3, 4, 5, 6, -50], 3.5)],
 )
-def test_the_iqm_leaves_out_a_quarter_of_the_runs_at_each_end(runs: list[float], expected: float):
+def test_the_iqm_leaves_out_a_quarter_of_the_runs_at_each_end(runs, expected):
     assert statistics.iqm(runs) == expected
     assert statistics.iqm(runs) == pytest.approx(scipy.stats.trim_mean(runs, 0.25))
 
@@ -82,9 +79,7 @@ def test_an_interval_is_the_same_on_every_machine_and_of_its_seed():
     assert np.any(other != low)
 
 
-def test_an_interval_does_not_depend_on_the_order_of_classes_or_on_drawing_in_parts(
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_an_interval_does_not_depend_on_the_order_of_classes_or_on_drawing_in_parts(monkeypatch):
     whole = statistics.stratified_bootstrap(CLASSES, 300, "s")
     turned = {name: CLASSES[name] for name in reversed(CLASSES)}
     found = statistics.stratified_bootstrap(turned, 300, "s")
@@ -96,7 +91,7 @@ def test_an_interval_does_not_depend_on_the_order_of_classes_or_on_drawing_in_pa
 @pytest.mark.parametrize(
     "statistic", [statistics.mean, statistics.median, statistics.optimality_gap, statistics.iqm]
 )
-def test_every_statistic_is_resampled_as_the_whole_class_would_be(statistic: statistics.Statistic):
+def test_every_statistic_is_resampled_as_the_whole_class_would_be(statistic):
     """Of two runs there are four samples: the interval is known from listing them."""
     runs = np.array([[0.2], [0.8]])
     low, high = statistics.stratified_bootstrap({"": runs}, 4000, "s", statistic)

@@ -1,7 +1,5 @@
 """The import contract of pyproject.toml holds, and would notice if it did not."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
@@ -13,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
+def lint_imports(folder):
     """Run import-linter on the `sme_registry` of a folder, by the pyproject.toml beside it."""
     return subprocess.run(
         [sys.executable, "-c", "from importlinter.cli import lint_imports_command as c; c()"],
@@ -45,7 +43,7 @@ IN_A_FUNCTION = {
 
 
 @pytest.fixture
-def copy(tmp_path: Path) -> Path:
+def copy(tmp_path):
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     for package in ("sme_registry", "leaderboard"):
         ignore = shutil.ignore_patterns("__pycache__")
@@ -53,12 +51,12 @@ def copy(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_import_contract_holds() -> None:
+def test_the_import_contract_holds():
     result = lint_imports(ROOT)
     assert result.returncode == 0, result.stdout + result.stderr
 
 
-def test_every_import_against_the_order_is_named(copy: Path) -> None:
+def test_every_import_against_the_order_is_named(copy):
     planted = {module: f"import {name}" for module, name in AT_THE_TOP.items()}
     planted |= {m: f"def _late():\n    import {name}" for m, name in IN_A_FUNCTION.items()}
     for module, text in planted.items():
@@ -71,7 +69,7 @@ def test_every_import_against_the_order_is_named(copy: Path) -> None:
         assert f"sme_registry.{importer} -> {imported} (" in result.stdout, module
 
 
-def test_a_module_without_a_place_in_the_order_breaks_the_contract(copy: Path) -> None:
+def test_a_module_without_a_place_in_the_order_breaks_the_contract(copy):
     (copy / "sme_registry" / "unplaced.py").write_text("import sme_registry.errors\n")
     result = lint_imports(copy)
     assert result.returncode == 1, result.stdout + result.stderr

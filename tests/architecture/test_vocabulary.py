@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Iterator
-from typing import Any, get_args
+from typing import get_args
 
 import pytest
 from pydantic import BaseModel
@@ -16,13 +15,13 @@ from sme_registry.spec import Real, StrictModel, StudyFile, catalogue
 from tests.vocabulary import QUANTITIES, SYNONYMS
 
 
-def documents() -> list[type[StrictModel]]:
+def documents():
     """Every document and part of one, in both packages."""
     for package in (sme_registry, leaderboard):
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             importlib.import_module(module.name)
 
-    def below(model: type[StrictModel]) -> Iterator[type[StrictModel]]:
+    def below(model):
         for kind in model.__subclasses__():
             yield kind
             yield from below(kind)
@@ -35,7 +34,7 @@ def documents() -> list[type[StrictModel]]:
     return sorted(ours, key=lambda kind: (kind.__module__, kind.__name__))
 
 
-def holds_numbers(annotation: Any) -> bool:
+def holds_numbers(annotation):
     """Whether values of a type are numbers, estimates of numbers, or collections of either."""
     if annotation in (int, float):
         return True
@@ -44,12 +43,12 @@ def holds_numbers(annotation: Any) -> bool:
     return any(holds_numbers(part) or type(part) is int for part in get_args(annotation))
 
 
-def numbers(model: type[BaseModel]) -> list[str]:
+def numbers(model):
     """The fields of a document that hold numbers."""
     return [name for name, field in model.model_fields.items() if holds_numbers(field.annotation)]
 
 
-def unnamed(model: type[BaseModel]) -> list[str]:
+def unnamed(model):
     """What is wrong with the names of a document's fields."""
     return [
         *(f"{name}: not in tests/vocabulary.py" for name in numbers(model)
@@ -59,13 +58,13 @@ def unnamed(model: type[BaseModel]) -> list[str]:
     ]  # fmt: skip
 
 
-def test_every_number_in_a_document_has_the_name_of_its_quantity() -> None:
+def test_every_number_in_a_document_has_the_name_of_its_quantity():
     models = documents()
     assert len(models) > 100
     assert {model.__qualname__: names for model in models if (names := unnamed(model))} == {}
 
 
-def columns() -> set[str]:
+def columns():
     """The columns of numbers in episodes.csv and in a study's data frames."""
     pytest.importorskip("pandas")
     from sme_registry.studies.report.frames import study_frames
@@ -78,11 +77,11 @@ def columns() -> set[str]:
     return numeric | set(episodes.COLUMNS)
 
 
-def test_every_column_of_numbers_has_the_name_of_its_quantity() -> None:
+def test_every_column_of_numbers_has_the_name_of_its_quantity():
     assert columns() - QUANTITIES.keys() == set()
 
 
-def test_a_new_synonym_is_noticed() -> None:
+def test_a_new_synonym_is_noticed():
     class Planted(BaseModel):
         similarity: Real
         decay: Real
@@ -99,7 +98,7 @@ def test_a_new_synonym_is_noticed() -> None:
     ]
 
 
-def test_the_vocabulary_has_no_unused_name() -> None:
+def test_the_vocabulary_has_no_unused_name():
     used = {name for model in documents() for name in numbers(model)}
     assert set(QUANTITIES) - used - columns() == set()
     assert not QUANTITIES.keys() & SYNONYMS.keys()

@@ -7,9 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sme_registry.compiled import Engine
 from sme_registry.compiled.values import LANE_STATE, LANE_VALUES, REWARD
-from sme_registry.task import Task
 
 
 @dataclass
@@ -31,14 +29,12 @@ class Result:
 class Lane:
     """One lane of a single agent: an episode stepped by an engine's single-lane entry points."""
 
-    def __init__(
-        self, task: Task, engine: Engine, state: Any, t: int = 0, r_cum: float = 0.0
-    ) -> None:
+    def __init__(self, task, engine, state, t=0, r_cum=0.0):
         self.task, self.engine = task, engine
         self.buffer, self.numbers = engine.new_lane()
         self.numbers[LANE_STATE:] = state
 
-    def step(self, action: Any) -> Result | None:
+    def step(self, action):
         """One step with a float32 or float64 action; None where it was refused."""
         A, S = self.task.spec.action_dim, self.task.spec.state_dim
         optimal, observation = np.empty(A), np.empty(S + 2, np.float32)
@@ -52,9 +48,7 @@ class Lane:
         return Result(state, observation, optimal, *values, end in (1.0, 3.0), end >= 2.0)
 
 
-def step_batch(
-    task: Task, engine: Engine, states: Any, t: Any, r_cum: Any, actions: Any
-) -> Result | None:
+def step_batch(task, engine, states, t, r_cum, actions):
     """One step of a batch: `states` `[B, S]`, `r_cum` `[B, n]`. None where it was refused."""
     B, S, A, n = len(states), task.spec.state_dim, task.spec.action_dim, len(task.names)
     moved, observation, optimal = (

@@ -1,7 +1,5 @@
 """The benchmarks' plain NumPy baseline is the same environment: only then is it a measure."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,7 @@ from sme_registry import SMESpec, materialize
 SPEC = SMESpec(k=3, r_min=0.1, complexity=3)
 
 
-def test_the_plain_environment_is_ours_step_for_step() -> None:
+def test_the_plain_environment_is_ours_step_for_step():
     plain, ours = PlainEnv(materialize(SPEC)), sme_registry.make(SPEC).unwrapped
     random = np.random.default_rng(0)
     seen, _ = plain.reset(seed=7)
@@ -28,7 +26,7 @@ def test_the_plain_environment_is_ours_step_for_step() -> None:
             np.testing.assert_allclose(value, mine[4][key], atol=1e-12, rtol=0)
 
 
-def test_the_plain_batch_is_ours_step_for_step() -> None:
+def test_the_plain_batch_is_ours_step_for_step():
     plain = PlainBatch(materialize(SPEC), 70)
     ours = sme_registry.make_vec(SPEC, 70)
     ours.reset(seed=0, options={"state": plain.s})

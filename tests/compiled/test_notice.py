@@ -1,29 +1,25 @@
 """Whoever watches a terminal or a notebook is told why the first environment takes seconds."""
 
-from __future__ import annotations
-
 import io
 import sys
 import threading
-
-import pytest
 
 from sme_registry.compiled import notice
 
 
 class Terminal(io.StringIO):
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.written = threading.Event()
 
-    def isatty(self) -> bool:
+    def isatty(self):
         return True
 
-    def flush(self) -> None:
+    def flush(self):
         self.written.set()
 
 
-def test_a_terminal_is_told_while_it_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_terminal_is_told_while_it_waits(monkeypatch):
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr(notice, "_PATIENCE", 0.0)
@@ -33,9 +29,7 @@ def test_a_terminal_is_told_while_it_waits(monkeypatch: pytest.MonkeyPatch) -> N
     assert terminal.getvalue().count("\n") == 1
 
 
-def test_a_log_and_a_terminal_that_does_not_wait_are_told_nothing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_log_and_a_terminal_that_does_not_wait_are_told_nothing(monkeypatch):
     for stream, patience in ((Terminal(), 3600.0), (io.StringIO(), 0.0)):
         monkeypatch.setattr(sys, "stderr", stream)
         monkeypatch.delitem(sys.modules, "ipykernel", raising=False)

@@ -5,9 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import h5py
 import minari
@@ -34,7 +31,7 @@ ID = "sealed/autumn/deep-0-v0"
 
 
 @pytest.fixture(scope="module")
-def dataset() -> SealedDataset:
+def dataset():
     return SealedDataset.collect(RECIPE)
 
 
@@ -125,26 +122,26 @@ def test_nothing_is_replaced_and_a_bad_id_or_file_is_named(dataset, tmp_path):
         SealedDataset.read(path)
 
 
-def _external(group: h5py.Group, secret: Path) -> None:
+def _external(group, secret):
     group.create_dataset("observations", shape=(2, 4), dtype="f4", external=[(str(secret), 0, 32)])
 
 
-def _linked(group: h5py.Group, secret: Path) -> None:
+def _linked(group, secret):
     with h5py.File(secret.with_suffix(".hdf5"), "w") as other:
         other["private"] = np.ones((2, 4), "f4")
     group["observations"] = h5py.ExternalLink(str(secret.with_suffix(".hdf5")), "private")
 
 
-def _references(group: h5py.Group, secret: Path) -> None:
+def _references(group, secret):
     group.create_dataset("observations", data=[group.ref, group.ref], dtype=h5py.ref_dtype)
 
 
-def _made(**options: Any) -> Callable[[h5py.Group, Path], None]:
+def _made(**options):
     """Observations that are created with these options."""
     return lambda group, _: group.create_dataset("observations", **options)
 
 
-def stranger(folder: Path) -> h5py.File:
+def stranger(folder):
     """The file of a data set that somebody else has written."""
     (folder / "data").mkdir()
     return h5py.File(folder / "data" / "main_data.hdf5", "w")

@@ -9,12 +9,9 @@ change with the dynamics, so a changed file is a new version of every task: the 
 changed, and writes only with `--change-dynamics`.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -29,7 +26,7 @@ TASKS = (
 )  # fmt: skip
 
 
-def digests() -> dict[str, dict[str, str]]:
+def digests():
     """The digest of every name in the catalogue, by kind."""
     return {
         kind.content: {file.versioned_name: file.digest for file in catalogue.entries(kind)}
@@ -37,7 +34,7 @@ def digests() -> dict[str, dict[str, str]]:
     }
 
 
-def one_step(name: str) -> list[dict[str, Any]]:
+def one_step(name):
     """Steps of one task: inside the cube, at its corners, and outside; actions good and clipped."""
     task = load_task(name)
     S, A = task.spec.state_dim, task.spec.action_dim
@@ -61,7 +58,7 @@ def one_step(name: str) -> list[dict[str, Any]]:
     return cases
 
 
-def main(arguments: list[str]) -> int:
+def main(arguments):
     """Write both files; 1 where that would change what is released."""
     path = FOLDER / "digests.json"
     present, found = (json.loads(path.read_text()) if path.exists() else {}), digests()

@@ -95,7 +95,7 @@ def test_a_write_interrupted_before_the_rename_leaves_the_old_file_alone(tmp_pat
     path = tmp_path / "file"
     path.write_text("old")
 
-    def interrupt(handle: int) -> None:
+    def interrupt(handle):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(os, "fsync", interrupt)

@@ -1,7 +1,5 @@
 """Memory that a machine has to spare, read from a copy of its files."""
 
-from __future__ import annotations
-
 import os
 import sys
 

@@ -1,11 +1,7 @@
 """A board so small that scoring takes a moment, and policies that are real ONNX files."""
 
-from __future__ import annotations
-
 import functools
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
 
 import pytest
 
@@ -25,7 +21,7 @@ from tests.leaderboard.sealing import move_clock
 Submit = Callable[..., SignedSubmission]
 
 
-def tiny_suite(instances: int = 1) -> Suite:
+def tiny_suite(instances=1):
     """One class of the smallest tasks, S = 2 and A = 1."""
     setting = {"state_dim": 2, "action_dim": 1}
     return Suite.from_dict(
@@ -33,7 +29,7 @@ def tiny_suite(instances: int = 1) -> Suite:
     )
 
 
-def tiny_board(path: Path, *, instances: int = 1, **fields: Any) -> Store:
+def tiny_board(path, *, instances=1, **fields):
     """A new board of 200 states in each region; the caller closes it."""
     settings = {"runs_to_rank": 1, "draws": 100, **fields}
     return Store.create(
@@ -48,7 +44,7 @@ def tiny_board(path: Path, *, instances: int = 1, **fields: Any) -> Store:
 
 
 @functools.cache
-def linear_onnx(number: int, observation_dim: int = 4, action_dim: int = 1) -> bytes:
+def linear_onnx(number, observation_dim=4, action_dim=1):
     """A policy a = clip(s W + number/1000, 0, 1), one of its own for each number."""
     import numpy as np
     import onnx
@@ -76,9 +72,7 @@ def linear_onnx(number: int, observation_dim: int = 4, action_dim: int = 1) -> b
     return model.SerializeToString()
 
 
-def tiny_submission(
-    store: Store, key: SigningKey, number: int = 0, **fields: Any
-) -> tuple[SignedSubmission, dict[str, bytes]]:
+def tiny_submission(store, key, number=0, **fields):
     """A signed submission, valid on a tiny board, and its artefacts by their digests.
 
     Another number is another policy.
@@ -112,9 +106,7 @@ def tiny_submission(
     return Submission.from_dict(plain).signed(key, store.document.key), {digest: data}
 
 
-def put_submission(
-    store: Store, key: SigningKey, number: int = 0, **fields: Any
-) -> SignedSubmission:
+def put_submission(store, key, number=0, **fields):
     """`tiny_submission`, with its artefacts on the board and waiting to be scored."""
     signed, artefacts = tiny_submission(store, key, number, **fields)
     for digest, data in artefacts.items():
@@ -123,7 +115,7 @@ def put_submission(
     return signed
 
 
-def put_policy(store: Store, key: SigningKey, data: bytes, number: int = 0) -> SignedSubmission:
+def put_policy(store, key, data, number=0):
     """`put_submission`, with one run: this artefact on the suite's first instance."""
     digest = sha256_of(data)
     store.put_object(digest, [data], by=key.public)
@@ -136,31 +128,29 @@ def put_policy(store: Store, key: SigningKey, data: bytes, number: int = 0) -> S
     return put_submission(store, key, number, runs=[run])
 
 
-def signed_withdrawal(
-    store: Store, id: str, key: SigningKey, reason: str = "a test"
-) -> SignedWithdrawal:
+def signed_withdrawal(store, id, key, reason="a test"):
     """A withdrawal of a submission of a board, signed by this key."""
     return SignedWithdrawal.create(id, key, reason, board=store.document.key)
 
 
 @pytest.fixture
-def key() -> SigningKey:
+def key():
     return SigningKey.generate()
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
+def store(tmp_path):
     with tiny_board(tmp_path / "board") as made:
         yield made
 
 
 @pytest.fixture
-def later(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+def later(monkeypatch):
     """Moves the clock behind the close of tiny seasons."""
     return functools.partial(move_clock, monkeypatch)
 
 
 @pytest.fixture
-def submit(store: Store, key: SigningKey) -> Submit:
+def submit(store, key):
     """Puts the tiny submission of a number on the board of `store`, signed by `key`."""
     return functools.partial(put_submission, store, key)

@@ -5,17 +5,13 @@ from __future__ import annotations
 import datetime
 from typing import Any
 
-import pytest
-
-from leaderboard.documents.entry import Entry, SignedEntry, SignedTicketRequest, TicketRequest
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.entry import Entry, TicketRequest
 from leaderboard.documents.master import Master
-from leaderboard.documents.result import SealedResult, Stepping
-from leaderboard.documents.season import Season, Terms
+from leaderboard.documents.result import Stepping
+from leaderboard.documents.season import Terms
 from leaderboard.documents.submission import now, shifted, utc
 from leaderboard.scoring.metrics import failed_run
 from leaderboard.scoring.sealed import sealed_result
-from leaderboard.store import Store
 from sme_registry import EvaluationProtocol
 
 MASTER = Master(bytes(range(32)))
@@ -25,12 +21,12 @@ AFTERWARDS = utc(shifted(datetime.datetime.now(datetime.UTC), datetime.timedelta
 SETTING = {"state_dim": 2, "action_dim": 1, "complexity": 5, "hidden_width": 8}
 
 
-def moment(days: float) -> str:
+def moment(days):
     """The time so many days from now."""
     return utc(datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days))
 
 
-def move_clock(monkeypatch: pytest.MonkeyPatch, time: str = AFTERWARDS) -> None:
+def move_clock(monkeypatch, time=AFTERWARDS):
     """Set the clock by which boards decide on seasons and date their log."""
     for module in ("sealed", "log"):
         monkeypatch.setattr(f"leaderboard.store.{module}.now", lambda: time)
@@ -39,7 +35,7 @@ def move_clock(monkeypatch: pytest.MonkeyPatch, time: str = AFTERWARDS) -> None:
 OPENS, CLOSES = moment(-1), moment(1)  # the same in every document of a run
 
 
-def tiny_terms(track: str = "sealed-offline", instances: int = 2, **fields: Any) -> Terms:
+def tiny_terms(track="sealed-offline", instances=2, **fields):
     """The terms of an open season of one class, with digests of nothing offline."""
     online = track == "sealed-online"
     member: dict[str, Any] = {"name": "deep", "setting": SETTING, "instances": instances}
@@ -70,12 +66,12 @@ def tiny_terms(track: str = "sealed-offline", instances: int = 2, **fields: Any)
 NOTHING = "sha256:" + "0" * 64
 
 
-def tiny_season(track: str = "sealed-offline", **fields: Any) -> Season:
+def tiny_season(track="sealed-offline", **fields):
     """`tiny_terms`, committed to `MASTER`."""
     return tiny_terms(track, **fields).commit(MASTER)
 
 
-def manifest(season: Season, key: SigningKey, **fields: Any) -> dict[str, Any]:
+def manifest(season, key, **fields):
     """What entries and requests have in common."""
     return {
         "season": season.digest,
@@ -86,7 +82,7 @@ def manifest(season: Season, key: SigningKey, **fields: Any) -> dict[str, Any]:
     }
 
 
-def failed_result(season: Season, subject: str) -> SealedResult:
+def failed_result(season, subject):
     """The result of an entry or a ticket of which every run failed, without a step."""
     hidden = list(season.hidden)
     runs = [failed_run(season.protocol, each.member.name, None) for each in hidden]
@@ -98,17 +94,13 @@ def failed_result(season: Season, subject: str) -> SealedResult:
     return sealed_result(season, subject, runs, {"synthetic": "1"}, 100, steps)
 
 
-def signed_entry(
-    store: Store, season: Season, key: SigningKey, answers: list[Any], **fields: Any
-) -> SignedEntry:
+def signed_entry(store, season, key, answers, **fields):
     """An entry for a board, of answers that need not be on it."""
     plain = manifest(season, key, answers=answers, **fields)
     return Entry.from_dict(plain).signed(key, store.document.key)
 
 
-def signed_request(
-    store: Store, season: Season, key: SigningKey, nonce: int = 0, **fields: Any
-) -> SignedTicketRequest:
+def signed_request(store, season, key, nonce=0, **fields):
     """A request for a ticket of a board."""
     names = {"nonce": f"{nonce:064x}", "answers_key": key.of_answers(f"{nonce:064x}").public}
     plain = manifest(season, key, **{**names, **fields})

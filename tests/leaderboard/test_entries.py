@@ -1,9 +1,6 @@
 """Entries of a sealed-offline season: what a board accepts, and what it refuses with which code."""
 
-from __future__ import annotations
-
 import json
-from typing import Any
 
 import httpx
 import numpy as np
@@ -18,7 +15,6 @@ from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, Envelope
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.intake import entries
 from leaderboard.scoring.verify import verify
-from leaderboard.store import Store
 from sme_registry.errors import SpecError
 from sme_registry.io import sha256_of
 from sme_registry.sealed import pack_table
@@ -32,25 +28,25 @@ GOOD = pack_table(np.full((300, 1), 0.5, np.float32))
 NOT_FINITE = GOOD.replace(b"\0\0\0?", b"\0\0\xc0\x7f")
 
 
-def entry(store: Store, key: SigningKey, *answers: bytes | None, **fields: Any) -> SignedEntry:
+def entry(store, key, *answers, **fields):
     named = [
         None if data is None else {"sha256": sha256_of(data), "size": len(data)} for data in answers
     ]
     return signed_entry(store, SEASON, key, named, **fields)
 
 
-def send(store: Store, signed: SignedEntry, *answers: bytes) -> bool:
+def send(store, signed, *answers):
     return intake.enter(
         store, signed, answers={sha256_of(data): data for data in answers}.__getitem__
     )
 
 
 @pytest.fixture(autouse=True)
-def announced(store: Store) -> None:
+def announced(store):
     store.announce(SEASON)
 
 
-def refused(store: Store, signed: SignedEntry, *answers: bytes) -> str:
+def refused(store, signed, *answers):
     before = store.head
     with pytest.raises(Rejection) as error:
         send(store, signed, *answers)
@@ -61,7 +57,7 @@ def refused(store: Store, signed: SignedEntry, *answers: bytes) -> str:
 def test_an_entry_is_stored_once_with_its_answers(store, key, monkeypatch):
     read, read_answers = [], entries.read_answers
 
-    def reading(data: bytes, *form: Any) -> Any:
+    def reading(data, *form):
         read.append(data)
         return read_answers(data, *form)
 
@@ -120,7 +116,7 @@ def test_what_changes_between_the_check_and_the_record_is_checked_again(store, k
         patch.setattr(room, lambda *_: path.unlink())
         assert refused(store, signed, GOOD) == "artefact_missing"
 
-    def taken(*arguments: Any) -> Any:
+    def taken(*arguments):
         other = SigningKey.generate()
         name = {"name": f"Tester {key.public[:8]}", "key": other.public}
         store.enter(signed_entry(store, SEASON, other, [None, None], submitter=name))
@@ -198,7 +194,7 @@ def test_entries_over_http_have_the_same_codes(store, key):
         httpx.Client(base_url=url, trust_env=False) as client,
     ):
 
-        def post(season: str, data: bytes) -> tuple[int, str]:
+        def post(season, data):
             answer = client.post(f"/api/seasons/{season}/entries", content=data)
             return answer.status_code, answer.json().get("code", "")
 

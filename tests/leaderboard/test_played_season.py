@@ -1,16 +1,11 @@
 """The seasons of `docs/results/season.md`: small, whole, and open to anyone's replay."""
 
-from __future__ import annotations
-
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from leaderboard.documents.result import SealedResult
 from leaderboard.errors import BoardError, TamperedError
-from leaderboard.scoring.ranking import RankedRow
 from leaderboard.scoring.season import counting, season_rankings
 from leaderboard.sealed import verify_season
 from leaderboard.store import Store
@@ -18,7 +13,7 @@ from leaderboard.store import Store
 BOARD = Path(__file__).resolve().parents[2] / "docs" / "results" / "season" / "board"
 
 
-def results(store: Store, season: str) -> dict[str, SealedResult]:
+def results(store, season):
     """The counting results of a season by method."""
     found = {}
     for row in counting(store, store.season(season)):
@@ -28,14 +23,14 @@ def results(store: Store, season: str) -> dict[str, SealedResult]:
     return found
 
 
-def tops(ranked: list[RankedRow]) -> Iterator[tuple[str, float]]:
+def tops(ranked):
     """Methods and their N₀."""
     for row in ranked:
         assert row.entry.scores is not None
         yield row.entry.method, row.entry.scores.wd_regret.value
 
 
-def test_both_seasons_are_ranked_as_the_page_says() -> None:
+def test_both_seasons_are_ranked_as_the_page_says():
     with Store.open(BOARD, read_only=True) as store:
         for season, best in (("winter", ["SAC", "PPO"]), ("autumn", ["IQL", "BC"])):
             document = store.season(season)
@@ -50,7 +45,7 @@ def test_both_seasons_are_ranked_as_the_page_says() -> None:
     assert sum(path.stat().st_size for path in BOARD.rglob("*") if path.is_file()) < 3_500_000
 
 
-def test_the_online_season_is_replayed_from_its_journals() -> None:
+def test_the_online_season_is_replayed_from_its_journals():
     with Store.open(BOARD, read_only=True) as store:
         report = verify_season(store, "winter")
         assert (report.entries, report.results) == (5, 5)
@@ -58,7 +53,7 @@ def test_the_online_season_is_replayed_from_its_journals() -> None:
             assert {each.steps for each in result.stepping} <= {0, 10_000}
 
 
-def test_the_offline_season_is_replayed_from_its_master() -> None:
+def test_the_offline_season_is_replayed_from_its_master():
     """Its data sets are not committed; another processor may round them otherwise."""
     with Store.open(BOARD, read_only=True) as store:
         try:
@@ -71,7 +66,7 @@ def test_the_offline_season_is_replayed_from_its_master() -> None:
 
 
 @pytest.mark.parametrize("kind", ["journal", "npy"])
-def test_an_altered_byte_is_found(tmp_path: Path, kind: str) -> None:
+def test_an_altered_byte_is_found(tmp_path, kind):
     board = tmp_path / "board"
     shutil.copytree(BOARD, board)
     file = next(board.glob(f"seasons/*/tickets/1/2.{kind}"))

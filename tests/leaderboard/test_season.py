@@ -1,13 +1,10 @@
 """An offline season from its plan to its replay: what is published, scored, ranked and verified."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +28,6 @@ from leaderboard.scoring.publication import (
 from leaderboard.scoring.sealed import instances, score_run, sealed_result
 from leaderboard.scoring.season import by_key, counting, score_entries, season_rankings
 from leaderboard.sealed import verify_season
-from leaderboard.store import Store
 from sme_registry import materialize
 from sme_registry.datasets import SealedDataset
 from sme_registry.errors import SMEError
@@ -51,32 +47,30 @@ from tests.leaderboard.sealing import (
 )
 
 
-def plan(**fields: Any) -> dict[str, Any]:
+def plan(**fields):
     terms = tiny_terms(**fields).to_dict()
     del terms["published"]
     return terms
 
 
 @pytest.fixture(scope="module")
-def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def published(tmp_path_factory):
     folder = tmp_path_factory.mktemp("season") / "published"
     create_season(read_plan(plan()), MASTER, folder)
     return folder
 
 
 @pytest.fixture(scope="module")
-def season(published: Path) -> Season:
+def season(published):
     return read_season(published)
 
 
-def challenges(folder: Path) -> list[np.ndarray]:
+def challenges(folder):
     hidden = read_season(folder).hidden
     return [unpack_table(challenge_path(folder, each).read_bytes(), 4) for each in hidden]
 
 
-def enter(
-    store: Store, season: Season, key: SigningKey, answers: list[np.ndarray | None], **fields: Any
-) -> str:
+def enter(store, season, key, answers, **fields):
     files = [None if each is None else pack_table(each) for each in answers]
     digests = [None if each is None else sha256_of(each) for each in files]
     named = [
@@ -89,15 +83,15 @@ def enter(
     return signed.id
 
 
-def method(name: str, knowledge: str = "generic") -> dict[str, Any]:
+def method(name, knowledge="generic"):
     return {"name": name, "version": "1", "family": "test", "knowledge": knowledge}
 
 
-def halves(folder: Path) -> list[np.ndarray]:
+def halves(folder):
     return [np.full((len(each), 1), 0.5, np.float32) for each in challenges(folder)]
 
 
-def optima(season: Season, folder: Path) -> list[np.ndarray]:
+def optima(season, folder):
     """What nobody but the organiser can answer."""
     tasks = [materialize(each.spec) for each in instances(season, MASTER)]
     return [
@@ -106,11 +100,11 @@ def optima(season: Season, folder: Path) -> list[np.ndarray]:
     ]
 
 
-def reveal(store: Store, season: Season) -> None:
+def reveal(store, season):
     store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
 
 
-def false_season(store: Store, terms: Terms) -> Season:
+def false_season(store, terms):
     """A season of an organiser's own making, announced though it is over, and revealed."""
     season = terms.commit(MASTER)
     path = store.season_folder(season.digest)
@@ -221,7 +215,7 @@ def test_a_season_is_scored_ranked_and_replayed(store, key, season, published, l
     assert [row.entrant.id for row in counting(store, season)] == [last, family, failed, near]
     passes = []
 
-    def counted(policies: Any, *arguments: Any) -> Any:
+    def counted(policies, *arguments):
         passes.append(len(policies))
         return evaluate_many(policies, *arguments)
 
@@ -261,7 +255,7 @@ def test_a_replay_finds_scores_that_do_not_follow(store, key, season, published,
         verify_season(store, season.id)
     rank = store.rank
 
-    def better(result: Any) -> bool:
+    def better(result):
         run = result.runs[0]
         regrets = (0.5 * run.normalised_regret[0], *run.normalised_regret[1:])
         lower = run.model_copy(update={"normalised_regret": regrets})

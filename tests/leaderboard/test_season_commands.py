@@ -1,11 +1,8 @@
 """The commands of an offline season, as they are typed, on a folder and over HTTP."""
 
-from __future__ import annotations
-
 import json
 import stat
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +23,7 @@ ENTER = ("--method", "Test", "--submitter", "A Lab")
 
 
 @pytest.fixture(autouse=True)
-def _home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _home(tmp_path, monkeypatch):
     """A board, a key and the plan of a season."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "160")
@@ -39,13 +36,13 @@ def _home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def season() -> Path:
+def season():
     good("season", "new", "board", PLAN)
     good("season", "publish", "board", "autumn")
     return Path("autumn")
 
 
-def facts(*arguments: str) -> Any:
+def facts(*arguments):
     return json.loads(good("season", *arguments, "--json"))
 
 
@@ -106,7 +103,7 @@ def test_a_class_that_a_table_solves_is_warned_of_and_a_false_plan_is_refused(tm
     assert "season_unknown" in fails(1, "season", "show", "board", "winter")
 
 
-def entered(*arguments: str | Path) -> list[np.ndarray | None]:
+def entered(*arguments):
     """The answers of an entry that is sent."""
     id = good("enter", "board", "autumn", *arguments, *ENTER).strip()
     with Store.open("board", read_only=True) as store:

@@ -1,9 +1,6 @@
 """The commands of online seasons, as an entrant types them: a ticket, then its answers."""
 
-from __future__ import annotations
-
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +13,13 @@ from leaderboard.sealed.attendant import Attendant
 from leaderboard.store import Store
 from leaderboard.web import client
 from sme_registry.sealed import Instance, Ticket
-from tests.leaderboard.sealed.playing import Board, online_board
+from tests.leaderboard.sealed.playing import online_board
 from tests.leaderboard.serving import serving
 from tests.leaderboard.test_cli import board_command, fails
 
 
 @pytest.fixture
-def board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Board:
+def board(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "160")
     monkeypatch.setenv(KEY_VARIABLE, str(tmp_path / "my.key"))
@@ -31,19 +28,19 @@ def board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Board:
 
 
 @pytest.fixture
-def url(board: Board, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+def url(board, monkeypatch):
     monkeypatch.setattr(Attendant, "_start", lambda _: None)  # nothing is scored
     with serving(board.path, season_secrets=[board.secret]) as url:
         yield url
 
 
-def start(code: int, url: str, *more: str | Path, season: str = "sealed-online") -> str:
+def start(code, url, *more, season="sealed-online"):
     """What the command writes that starts a ticket."""
     names = "--method", "PPO", "--submitter", "A Lab"
     return command(code, "ticket", url, season, *names, *more)
 
 
-def command(code: int, *arguments: str | Path) -> str:
+def command(code, *arguments):
     """What a command writes that ends with this exit code."""
     if code:
         return fails(code, *arguments)
@@ -52,7 +49,7 @@ def command(code: int, *arguments: str | Path) -> str:
     return result.output
 
 
-def policy(observations: np.ndarray) -> np.ndarray:
+def policy(observations):
     """A policy as `module:function` names it."""
     return observations[:, :1]
 
@@ -116,7 +113,7 @@ def test_files_of_actions_answer_challenges_that_were_fetched(url, board):
 def test_an_interrupted_request_gets_the_same_ticket(url, monkeypatch):
     request = client.request_ticket
 
-    def interrupted(*arguments: object) -> Ticket:
+    def interrupted(*arguments):
         request(*arguments)  # type: ignore[arg-type]
         raise BoardError("the answer was lost")
 

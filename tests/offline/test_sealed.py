@@ -23,7 +23,7 @@ SHORT = {"steps": 20, "batch_size": 32, "hyperparameters": {"hidden": [16]}}
 
 
 @pytest.fixture(scope="module")
-def dataset() -> SealedDataset:
+def dataset():
     return SealedDataset.collect(RECIPE)
 
 

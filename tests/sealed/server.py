@@ -6,17 +6,14 @@ import contextlib
 import http.client
 import http.server
 import threading
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from email.message import Message
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 
 from leaderboard.documents.keys import SigningKey
-from leaderboard.scoring.sealed import Instance, instances
+from leaderboard.scoring.sealed import instances
 from leaderboard.sealed.attendant import Attendant
 from leaderboard.store import Store
 from sme_registry.envs import SMEVectorEnv
@@ -48,28 +45,28 @@ class Server:
     """What happens to the next requests, one each: "lose request", "lose answer", "cut answer", or
     a status such as "503"; then all is well."""
 
-    def start(self) -> None:
+    def start(self):
         """Get a new ticket, as another entrant."""
         self.requests, self.faults = [], []
         self.ticket = self.board.ticket(self.behind, SigningKey.generate(), NONCE)
 
-    def hidden(self, instance: int) -> Instance:
+    def hidden(self, instance):
         """What is hidden of an instance."""
         number = str(self.ticket.ticket)
         return list(instances(self.board.season, MASTER, number, f"{NONCE:064x}"))[instance]
 
-    def seed(self, instance: int) -> int:
+    def seed(self, instance):
         """The seed of an instance's first lane."""
         return int.from_bytes(MASTER.secret("starts", self.hidden(instance).place))
 
-    def local(self, instance: int, lanes: int, action_range: str = "unit") -> SMEVectorEnv:
+    def local(self, instance, lanes, action_range="unit"):
         """The hidden task of an instance here, at the start of its first episodes."""
         hidden = self.hidden(instance)
         env = SMEVectorEnv(hidden.spec, lanes, action_range=action_range, autoreset_mode="SameStep")
         env.reset(seed=self.seed(instance))
         return env
 
-    def answers(self, instance: int) -> np.ndarray:
+    def answers(self, instance):
         """The answers that the board has."""
         with Store.open(self.board.path, read_only=True) as store:
             folder = store.season_folder(self.board.season.digest)
@@ -77,7 +74,7 @@ class Server:
 
 
 @contextlib.contextmanager
-def serving_season(folder: Path) -> Iterator[Server]:
+def serving_season(folder):
     """A board in a folder, served with a relay by threads of this process; it scores nothing."""
     board = online_board(folder, classes=CLASSES)
     with pytest.MonkeyPatch.context() as patch:
@@ -90,7 +87,7 @@ def serving_season(folder: Path) -> Iterator[Server]:
 
 
 @contextlib.contextmanager
-def _relay(server: Server) -> Iterator[None]:
+def _relay(server):
     """Let a server be reached through a relay, below the path /board."""
     behind = urlsplit(server.behind).netloc
 
@@ -98,7 +95,7 @@ def _relay(server: Server) -> Iterator[None]:
         protocol_version = "HTTP/1.1"
         disable_nagle_algorithm = True
 
-        def respond(self) -> None:
+        def respond(self):
             body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
             action = self.path.rpartition("/")[2].partition("?signature")[0]
             server.requests.append(f"{self.command} {action}")
@@ -121,10 +118,10 @@ def _relay(server: Server) -> Iterator[None]:
 
         do_GET = do_PUT = do_POST = respond
 
-        def log_message(self, *_: object) -> None:
+        def log_message(self, *_):
             pass
 
-    def forwarded(method: str, path: str, headers: Message, body: bytes) -> tuple[int, bytes]:
+    def forwarded(method, path, headers, body):
         connection = http.client.HTTPConnection(behind)
         with contextlib.closing(connection):
             chosen = {name: headers[name] for name in ("Authorization", "Content-Type")}

@@ -7,7 +7,6 @@ import pickle
 import socket
 import ssl
 import time
-from collections.abc import Iterator
 
 import gymnasium
 import numpy as np
@@ -28,13 +27,13 @@ from sme_registry.evaluation.references import NAMES, SHORT_NAMES
 from sme_registry.sealed import Instance, Ticket, actions_in, connection
 from sme_registry.spec import Setting
 from tests.leaderboard.sealed.playing import ROWS
-from tests.sealed.server import BUDGET, Server, serving_season
+from tests.sealed.server import BUDGET, serving_season
 
 WAYS_TO_FAIL = ["lose request", "lose answer", "cut answer", "503", "507"]
 
 
 @pytest.fixture
-def waits(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+def waits(monkeypatch):
     """How long the client would have waited between attempts."""
     waited: list[float] = []
     monkeypatch.setattr(connection, "_sleep", waited.append)
@@ -42,18 +41,18 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 @pytest.fixture(scope="module")
-def season(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+def season(tmp_path_factory):
     with serving_season(tmp_path_factory.mktemp("season")) as server:
         yield server
 
 
 @pytest.fixture
-def server(season: Server, waits: list[float]) -> Server:
+def server(season, waits):
     season.start()
     return season
 
 
-def random_actions(lanes: int, count: int, low: float = 0.0) -> np.ndarray:
+def random_actions(lanes, count, low=0.0):
     return np.random.default_rng(0).uniform(low - 0.1, 1.1, (count, lanes, 2)).astype(np.float32)
 
 
@@ -133,7 +132,7 @@ def test_a_request_is_sent_in_one_piece(server, monkeypatch):
     hidden.reset()
     sent, send = [], socket.socket.sendall
 
-    def record(self: socket.socket, data: bytes) -> None:
+    def record(self, data):
         if data.startswith(b"POST /board"):  # not what the relay sends on
             sent.append(data)
         send(self, data)
@@ -169,7 +168,7 @@ def test_after_an_interrupted_step_a_reset_goes_on(server, monkeypatch):
     first, second, third = random_actions(2, 3)
     read = http.client.HTTPResponse.read
 
-    def interrupted(*_: object) -> bytes:
+    def interrupted(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(http.client.HTTPResponse, "read", interrupted)
@@ -234,7 +233,7 @@ def test_steps_need_a_reset_and_resets_have_no_options(server):
 def test_a_server_that_cannot_be_reached_is_reported_soon(
     server, waits, monkeypatch, error, message, least, most
 ):
-    def fails(_: object) -> None:
+    def fails(_):
         raise error
 
     clock = iter(range(1000))
@@ -277,7 +276,7 @@ def test_an_answer_that_is_too_long_is_not_read_to_its_end(server, monkeypatch):
 
 
 def test_answers_are_the_policy_s_actions_in_the_challenge_states(server, tmp_path):
-    def policy(observations: np.ndarray) -> np.ndarray:
+    def policy(observations):
         actions = 2.0 * observations[:, :2] - 1.0
         observations[:] = 0.0  # a policy may write into what it is given
         return actions
@@ -326,7 +325,7 @@ def test_the_last_answers_may_be_repeated_after_they_have_ended_the_ticket(serve
             hidden.send_answers(answers + 1)
 
 
-def has_ended(instance: Instance) -> bool:
+def has_ended(instance):
     """Whether the server has closed the ticket."""
     try:
         instance.challenge()

@@ -1,10 +1,7 @@
 """Trainers work in hidden tasks as they do in others: SB3's, this project's, a loop of one file."""
 
-from __future__ import annotations
-
 import re
 import shlex
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,19 +20,19 @@ from sme_registry.sealed.sb3 import SealedVecEnv
 from sme_registry.sealed.wire import Steps
 from sme_registry.training.learners import new_learner
 from tests.leaderboard.sealed.playing import ROWS
-from tests.sealed.server import BUDGET, Server, serving_season
+from tests.sealed.server import BUDGET, serving_season
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
-def season(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+def season(tmp_path_factory):
     with serving_season(tmp_path_factory.mktemp("season")) as server:
         yield server
 
 
 @pytest.fixture
-def server(season: Server) -> Server:
+def server(season):
     season.start()
     return season
 

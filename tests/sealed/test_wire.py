@@ -1,7 +1,5 @@
 """The messages of sealed-online seasons: what is sent arrives, and nothing else is read."""
 
-from __future__ import annotations
-
 import io
 import os
 
@@ -36,11 +34,11 @@ TICKET = {
 }
 
 
-def random(*shape: int) -> np.ndarray:
+def random(*shape):
     return np.random.default_rng(0).random(shape, dtype=np.float32)
 
 
-def saved(array: np.ndarray) -> bytes:
+def saved(array):
     stream = io.BytesIO()
     np.save(stream, array)
     return stream.getvalue()
@@ -77,7 +75,7 @@ def test_the_bytes_of_a_request_are_little_endian():
     assert body == b"\1\0\0\0\0\0\0\0\0\0\0\x3f"
 
 
-def steps(terminated: list[bool], truncated: list[bool]) -> Steps:
+def steps(terminated, truncated):
     return Steps(
         random(LANES, S + 2), random(LANES), np.array(terminated), np.array(truncated),
         random(LANES, S + 2)[::-1],
@@ -112,12 +110,12 @@ def test_a_table_is_the_file_that_numpy_reads_and_writes(rows):
         assert np.array_equal(unpack_table(data, A, rows), table)
 
 
-def other_header(shape: str) -> bytes:
+def other_header(shape):
     data = pack_table(random(4, A))
     return data.replace(f"({4}, {A})".encode(), shape.encode())
 
 
-def long_header() -> bytes:
+def long_header():
     """Valid, but longer than `table_bytes` allows for."""
     header, data = pack_table(random(4, A)).split(b"\n", 1)
     header = header[10:].ljust(2000) + b"\n"

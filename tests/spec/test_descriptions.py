@@ -16,7 +16,7 @@ from sme_registry.spec.descriptions import allowed, summary
 from sme_registry.spec.validation_errors import allowed_values
 
 
-def public_documents() -> list[type[StrictModel]]:
+def public_documents():
     """The documents that a package of `sme_registry` exports."""
     found = set()
     for module in pkgutil.walk_packages(sme_registry.__path__, "sme_registry."):

@@ -217,7 +217,7 @@ NAMES = sorted(path.stem for path in (VECTORS / "input").glob("*.json"))
 NUMBERS = [line.split() for line in (VECTORS / "numbers.txt").read_text().splitlines()]
 
 
-def number(bits: str) -> float:
+def number(bits):
     return struct.unpack(">d", bytes.fromhex(bits))[0]
 
 

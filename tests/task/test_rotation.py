@@ -22,7 +22,7 @@ TEAM = {
 }
 
 
-def rotation(theta: float, state_dim: int, seed: int = 0) -> np.ndarray:
+def rotation(theta, state_dim, seed=0):
     spec = SMESpec(state_dim=state_dim, seed=seed).model_copy(update={"rotation": theta})
     return draw._rotation(spec, "policy/0/rotation", state_dim)
 

@@ -3,14 +3,11 @@
 python contents.py FOLDER        with one wheel and one sdist in it
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tarfile
 import tomllib
 import zipfile
-from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
 ROOT = Path(__file__).parents[2]
@@ -21,7 +18,7 @@ METADATA = {"METADATA", "RECORD", "WHEEL", "entry_points.txt", "licenses/LICENSE
 WRITTEN = {"PKG-INFO"}
 
 
-def source_files() -> set[str]:
+def source_files():
     """The files of this source tree: those that Git tracks or would; in an sdist, all."""
     if (ROOT / ".git").exists():
         command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
@@ -31,7 +28,7 @@ def source_files() -> set[str]:
     return {path.as_posix() for path in files if not _cache(path.as_posix())} - WRITTEN
 
 
-def faults_of_wheel(path: Path) -> list[str]:
+def faults_of_wheel(path):
     """What is wrong with a wheel."""
     with zipfile.ZipFile(path) as archive:
         sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
@@ -42,7 +39,7 @@ def faults_of_wheel(path: Path) -> list[str]:
     return _faults(path, sizes, expected)
 
 
-def faults_of_sdist(path: Path) -> list[str]:
+def faults_of_sdist(path):
     """What is wrong with an sdist, and which new file of the tree is in neither list."""
     with tarfile.open(path) as archive:
         sizes = {entry.name.partition("/")[2]: entry.size for entry in archive if entry.isfile()}
@@ -53,14 +50,14 @@ def faults_of_sdist(path: Path) -> list[str]:
     return faults + [f"{name}: neither published nor in NOT_PUBLISHED" for name in forgotten]
 
 
-def _below(chosen: Iterable[str]) -> set[str]:
+def _below(chosen):
     """The source files in some folders, and some files."""
     folders = {PurePosixPath(name) for name in chosen}
     paths = map(PurePosixPath, source_files())
     return {str(path) for path in paths if folders & {path, *path.parents}}
 
 
-def _faults(path: Path, sizes: dict[str, int], expected: set[str]) -> list[str]:
+def _faults(path, sizes, expected):
     faults = [f"{name}: is missing" for name in sorted(expected - sizes.keys())]
     faults += [f"{name}: does not belong here" for name in sorted(sizes.keys() - expected)]
     faults += [f"{name}: is a cache" for name in sizes if _cache(name)]
@@ -68,11 +65,11 @@ def _faults(path: Path, sizes: dict[str, int], expected: set[str]) -> list[str]:
     return [f"{path.name}: {fault}" for fault in faults]
 
 
-def _cache(name: str) -> bool:
+def _cache(name):
     return "__pycache__" in name or name.endswith((".pyc", ".pyo"))
 
 
-def main(folder: str) -> None:
+def main(folder):
     (wheel,), (sdist,) = (list(Path(folder).glob(end)) for end in ("*.whl", "*.tar.gz"))
     faults = faults_of_wheel(wheel) + faults_of_sdist(sdist)
     if faults:

@@ -12,7 +12,6 @@ import io
 import json
 import sys
 import traceback
-from collections.abc import Iterator
 from importlib.metadata import distribution
 from typing import Any
 
@@ -63,14 +62,14 @@ ARGUMENTS = {
 }
 
 
-def leaves(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+def leaves(command, path=()):
     """The names of a command and of all commands in it."""
     yield path
     for name, child in getattr(command, "commands", {}).items():
         yield from leaves(child, (*path, name))
 
 
-def run(main: Any, program: str, arguments: tuple[str, ...]) -> dict[str, Any]:
+def run(main, program, arguments):
     """Call an entry point as its script does."""
     sys.argv = [program, *arguments]
     out, err = io.StringIO(), io.StringIO()
@@ -96,13 +95,13 @@ class Without(importlib.machinery.PathFinder):
     missing: frozenset[str] = frozenset()
 
     @classmethod
-    def find_spec(cls, fullname: str, path: Any = None, target: Any = None) -> Any:
+    def find_spec(cls, fullname, path=None, target=None):
         if fullname.partition(".")[0] in cls.missing:
             return None
         return super().find_spec(fullname, path, target)
 
 
-def everything(chosen: list[str]) -> Iterator[dict[str, Any]]:
+def everything(chosen):
     import typer
 
     package = distribution("sme-registry")

@@ -4,8 +4,6 @@ python smoke.py numba        where the extra `fast` is installed
 python smoke.py numpy        where only the core is
 """
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -21,13 +19,13 @@ from sme_registry.spec import EnvFile
 from sme_registry.spec.catalogue import entries, spec_folder
 
 
-def expect(holds: bool, what: str) -> None:
+def expect(holds, what):
     if not holds:
         raise SystemExit(f"FAILED: {what}")
     print(f"ok: {what}")
 
 
-def sme(*arguments: str) -> subprocess.CompletedProcess[str]:
+def sme(*arguments):
     """Run the installed command."""
     command = Path(sysconfig.get_path("scripts")) / "sme"
     return subprocess.run(
@@ -35,7 +33,7 @@ def sme(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def main(backend: str) -> None:
+def main(backend):
     package = Path(sme_registry.__file__).parent
     site = Path(sysconfig.get_path("purelib"))
     expect(package.parent == site, f"the package is the installed one, in {site}")
@@ -65,7 +63,7 @@ def main(backend: str) -> None:
     _, rewards, *_ = vector.step(np.full((32, 4), 0.5))
     expect(rewards.shape == (32,), "a native batch steps")
 
-    def constant(observations: np.ndarray) -> np.ndarray:
+    def constant(observations):
         return np.full((len(observations), 4), 0.5)
 
     report = sme_registry.evaluate(constant, "SME/Default-v1", protocol="quick-v1")

@@ -7,7 +7,6 @@ import tarfile
 import tomllib
 import zipfile
 from email import message_from_string
-from pathlib import Path
 
 import pytest
 import yaml
@@ -30,7 +29,7 @@ CFF_KEYS = {
 }  # fmt: skip
 
 
-def in_clone(name: str) -> Path:
+def in_clone(name):
     path = ROOT / name
     if not path.exists() and not (ROOT / ".git").exists():
         pytest.skip("an sdist has no workflows")

@@ -12,7 +12,6 @@ import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ EXTRAS = [extra for extra in PROJECT["optional-dependencies"] if extra != "dev"]
 HINT = re.compile(r"pip install .*\[(\w+)\]")
 
 
-def closure(extra: str) -> set[str]:
+def closure(extra):
     """The installed distributions that the package with an extra needs."""
     waiting = [(Requirement(f"{NAME}[{extra}]" if extra else NAME), "")]
     visited: set[tuple[str, str]] = set()
@@ -46,11 +45,11 @@ def closure(extra: str) -> set[str]:
     return {name for name, _ in visited}
 
 
-def normalised(name: str) -> str:
+def normalised(name):
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
-def missing(extra: str) -> list[str]:
+def missing(extra):
     """The modules of this environment that one with this extra alone would not have."""
     present = closure(extra)
     return [
@@ -60,7 +59,7 @@ def missing(extra: str) -> list[str]:
     ]
 
 
-def outcomes(extra: str, folder: Path, commands: list[str]) -> list[dict[str, Any]]:
+def outcomes(extra, folder, commands):
     """What every `--help`, or these commands, answer where only this extra is installed."""
     folder.mkdir(parents=True)
     request = json.dumps({"missing": missing(extra), "commands": commands})
@@ -86,7 +85,7 @@ def outcomes(extra: str, folder: Path, commands: list[str]) -> list[dict[str, An
     return result
 
 
-def checked(outcome: dict[str, Any], extra: str) -> list[str]:
+def checked(outcome, extra):
     """The extras that an answer names, after the rules that hold for every answer."""
     context = json.dumps(outcome, indent=1)
     if outcome["command"].endswith("--help"):
@@ -102,10 +101,10 @@ def checked(outcome: dict[str, Any], extra: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def asked(once: Callable[[str, Callable[[Path], Any]], Path]) -> dict[str, list[str]]:
+def asked(once):
     """For each extra the commands that asked for it where only the core is installed."""
 
-    def core(folder: Path) -> None:
+    def core(folder):
         asked: dict[str, list[str]] = {extra: [] for extra in EXTRAS}
         for outcome in outcomes("", folder / "core", []):
             for extra in checked(outcome, ""):
@@ -116,18 +115,14 @@ def asked(once: Callable[[str, Callable[[Path], Any]], Path]) -> dict[str, list[
     return result
 
 
-def test_with_the_core_alone_commands_answer_and_name_their_extras(
-    asked: dict[str, list[str]],
-) -> None:
+def test_with_the_core_alone_commands_answer_and_name_their_extras(asked):
     needed = {extra for extra, commands in asked.items() if commands}
     assert needed >= {"train", "plot", "studies", "offline", "leaderboard"}
     assert "sme study plan smoke" in asked["train"]
 
 
 @pytest.mark.parametrize("extra", EXTRAS)
-def test_with_an_extra_alone_the_commands_that_asked_for_it_get_further(
-    extra: str, asked: dict[str, list[str]], tmp_path: Path
-) -> None:
+def test_with_an_extra_alone_the_commands_that_asked_for_it_get_further(extra, asked, tmp_path):
     if asked[extra]:
         answers = outcomes(extra, tmp_path / "work", asked[extra])
         assert any(not checked(outcome, extra) for outcome in answers)

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from leaderboard.sealed.ticket import RunningTicket
 from leaderboard.store import Store
 from leaderboard.web.serve import listen, url_of
 from sme_registry import sealed
-from tests.leaderboard.sealed.playing import LANES, Board
+from tests.leaderboard.sealed.playing import LANES
 
 _SERVE = """
 import sys
@@ -44,7 +43,7 @@ class Entrant:
     seen: hashlib._Hash = field(default_factory=hashlib.sha256)
     error: BaseException | None = None
 
-    def play(self, url: str, requests: int, together: threading.Barrier) -> None:
+    def play(self, url, requests, together):
         """Begin, and when all others have begun take random steps until so many are answered."""
         try:
             instance = sealed.Instance(url, self.ticket, 0, lanes=LANES)
@@ -59,7 +58,7 @@ class Entrant:
             self.error = error
 
 
-def actions_of(ticket: int, requests: int) -> Iterator[np.ndarray]:
+def actions_of(ticket, requests):
     """The actions of an entrant, `[L, A]` each."""
     random = np.random.default_rng(ticket)
     for _ in range(requests):
@@ -67,7 +66,7 @@ def actions_of(ticket: int, requests: int) -> Iterator[np.ndarray]:
 
 
 @contextlib.contextmanager
-def killable(board: Board) -> Iterator[tuple[str, KillableServer]]:
+def killable(board):
     """A server on one port; yields its URL and what kills it."""
     with listen("127.0.0.1", 0) as listener:
         url = url_of(listener)
@@ -81,14 +80,14 @@ def killable(board: Board) -> Iterator[tuple[str, KillableServer]]:
 class KillableServer:
     """A server in a process, which starts again on its port after each kill."""
 
-    def __init__(self, board: Board, url: str) -> None:
+    def __init__(self, board, url):
         self._command = [
             *(sys.executable, "-c", _SERVE, str(board.path), str(board.secret)),
             url.rpartition(":")[2],
         ]
         self.start()
 
-    def start(self) -> None:
+    def start(self):
         root = str(Path(__file__).parents[3])
         self._process = subprocess.Popen(
             self._command, stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": root}, text=True
@@ -97,17 +96,17 @@ class KillableServer:
         assert self._process.stdout.readline(), "the server did not start"
 
     @property
-    def pid(self) -> int:
+    def pid(self):
         """Of the present process."""
         return self._process.pid
 
-    def kill(self) -> None:
+    def kill(self):
         """End it as a loss of its process would."""
         self._process.send_signal(signal.SIGKILL)
         self._process.communicate()
 
 
-def step_through_kills(board: Board, tickets: int, requests: int, kills: int) -> float:
+def step_through_kills(board, tickets, requests, kills):
     """Let entrants step at once while the server is killed, evenly over their requests.
 
     Their answers must be those of a replay of their own actions, and so must be the journals. The
@@ -140,7 +139,7 @@ def step_through_kills(board: Board, tickets: int, requests: int, kills: int) ->
     return time.monotonic() - begun
 
 
-def check(board: Board, entrant: Entrant, requests: int) -> None:
+def check(board, entrant, requests):
     """Compare an entrant's answers and journal with a replay of the actions it sent."""
     if entrant.error is not None:
         raise entrant.error

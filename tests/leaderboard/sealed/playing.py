@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import httpx
 import numpy as np
@@ -13,7 +12,7 @@ import numpy as np
 from leaderboard.documents.entry import SignedTicketRequest
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.season import Season
-from leaderboard.documents.submission import Envelope, SignedManifest
+from leaderboard.documents.submission import Envelope
 from leaderboard.errors import Rejection
 from leaderboard.intake import start_ticket, upload_header
 from leaderboard.sealed import Tickets
@@ -37,23 +36,23 @@ class Board(NamedTuple):
     season: Season
     secret: Path
 
-    def request(self, key: SigningKey, nonce: int = 0, **fields: Any) -> SignedTicketRequest:
+    def request(self, key, nonce=0, **fields):
         """A signed request for a ticket."""
         with Store.open(self.path) as store:
             return signed_request(store, self.season, key, nonce, **fields)
 
-    def send(self, url: str, request: SignedManifest, key: SigningKey) -> httpx.Response:
+    def send(self, url, request, key):
         """What a served board answers to a request for a ticket that a key sends."""
         path = url + sealed.tickets_path(self.season.id)
         headers = {"Authorization": upload_header(key, request.id, board=request.board)}
         return httpx.post(path, content=request.to_bytes(), headers=headers, trust_env=False)
 
-    def ticket(self, url: str, key: SigningKey, nonce: int = 0) -> sealed.Ticket:
+    def ticket(self, url, key, nonce=0):
         """A new ticket of a served board."""
         return client.request_ticket(url, self.season.id, self.request(key, nonce), key)
 
 
-def online_board(folder: Path, limits: dict[str, int] | None = None, **fields: Any) -> Board:
+def online_board(folder, limits=None, **fields):
     """A board with an open season of one class, 64 steps on each of two instances."""
     season = tiny_season("sealed-online", **fields)
     secret = MASTER.write(folder / "season.master")
@@ -63,7 +62,7 @@ def online_board(folder: Path, limits: dict[str, int] | None = None, **fields: A
 
 
 @contextlib.contextmanager
-def playing(board: Board) -> Iterator[Played]:
+def playing(board):
     """A ticket of a board, whose season is stepped in this process."""
     with Store.open(board.path) as store:
         played = Played(board, store)
@@ -76,45 +75,45 @@ def playing(board: Board) -> Iterator[Played]:
 class Played:
     """An entrant of a board without a server."""
 
-    def __init__(self, board: Board, store: Store) -> None:
+    def __init__(self, board, store):
         self.board, self.store = board, store
         self.key = SigningKey.generate()
         self.tickets = Tickets(store, board.secret)
         self.take_ticket()
 
-    def take_ticket(self, nonce: int = 0) -> None:
+    def take_ticket(self, nonce=0):
         """Start a ticket; what follows is of this one."""
         self.request = self.board.request(self.key, nonce)
         envelope = Envelope.read(self.request.to_bytes(), SignedTicketRequest)
         self.number, _ = start_ticket(self.store, envelope, self.board.season.digest)
         self.token = self.tickets.ticket(self.number).document.token
 
-    def restart(self) -> None:
+    def restart(self):
         """As after a kill: nothing but the files is left."""
         self.tickets.close()
         self.tickets = Tickets(self.store, self.board.secret)
 
     @property
-    def folder(self) -> Path:
+    def folder(self):
         """Of the ticket."""
         return self.store.season_folder(self.board.season.digest).ticket(self.number)
 
-    def status(self, instance: int = 0) -> sealed.InstanceStatus:
+    def status(self, instance=0):
         return self.tickets.status(self.number, self.token).instances[instance]
 
-    def start(self, lanes: int = LANES, instance: int = 0) -> bytes:
+    def start(self, lanes=LANES, instance=0):
         return self.tickets.start(self.number, self.token, instance, lanes)
 
-    def send(self, body: bytes, instance: int = 0) -> bytes:
+    def send(self, body, instance=0):
         return self.tickets.step(self.number, self.token, instance, body)
 
-    def step(self, number: int, value: float = 0.3, instance: int = 0, lanes: int = LANES) -> bytes:
+    def step(self, number, value=0.3, instance=0, lanes=LANES):
         return self.send(request(number, value, lanes), instance)
 
-    def finish(self, instance: int = 0) -> None:
+    def finish(self, instance=0):
         self.tickets.finish(self.number, self.token, instance)
 
-    def answer(self, table: Any, instance: int = 0) -> bool:
+    def answer(self, table, instance=0):
         data = table if isinstance(table, bytes) else sealed.pack_table(table)
         journal = NOTHING
         with contextlib.suppress(Rejection):  # as long as steps may follow
@@ -122,7 +121,7 @@ class Played:
         signature = self.signature(data, journal, instance)
         return self.tickets.answer(self.number, self.token, instance, data, signature)
 
-    def signature(self, data: bytes, journal: str, instance: int = 0) -> str:
+    def signature(self, data, journal, instance=0):
         """The entrant's, of these answers and this digest of the steps."""
         signer = self.request.signer(self.key)
         assert signer is not None
@@ -135,14 +134,14 @@ class Played:
         )
         return signer.sign(statement)
 
-    def score(self) -> bool:
+    def score(self):
         """Score the ticket, and log its result; False if it has one."""
         season = self.board.season
         result = score_ticket(self.store, season, MASTER, self.number)
         return self.store.end_ticket(season.digest, self.number, result)
 
 
-def request(number: int, value: float = 0.3, lanes: int = LANES) -> bytes:
+def request(number, value=0.3, lanes=LANES):
     """The body of a request for steps whose actions are all the same."""
     form = sealed.StepFormat(lanes, 2, 1)
     return form.pack_request(number, np.full((lanes, 1), value, np.float32))

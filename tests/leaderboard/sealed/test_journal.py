@@ -15,17 +15,17 @@ LANES, A = 3, 2
 HEADER, RECORD = 28, 8 + 4 * LANES * A + 4
 
 
-def actions(number: int) -> bytes:
+def actions(number):
     return bytes([number]) * (4 * LANES * A)
 
 
-def contents(journal: Journal) -> list[bytes]:
+def contents(journal):
     for each in journal.actions():
         assert each.shape == (LANES, A)
     return [each.tobytes() for each in journal.actions()]
 
 
-def written(path: Path, count: int) -> None:
+def written(path, count):
     journal = Journal.create(path, LANES, A)
     for number in range(1, count + 1):
         journal.append(actions(number))
@@ -49,12 +49,12 @@ def test_a_torn_record_is_cut_off_and_the_next_one_takes_its_place(tmp_path):
         assert contents(Journal.open(path)) == [actions(1), actions(2), actions(9)]
 
 
-def lose_a_page(data: bytes) -> bytes:
+def lose_a_page(data):
     """As a loss of power leaves a page that was not written."""
     return data[: HEADER + RECORD] + bytes(RECORD - 1) + data[HEADER + 2 * RECORD - 1 :]
 
 
-def lose_a_record(data: bytes) -> bytes:
+def lose_a_record(data):
     return data[: HEADER + RECORD] + data[HEADER + 2 * RECORD :]
 
 
@@ -94,14 +94,14 @@ def test_a_full_disk_adds_nothing(tmp_path, monkeypatch, written_before, is_undo
     journal.append(actions(1))
     write, left = os.write, written_before
 
-    def fills_up(handle: int, data: bytes) -> int:
+    def fills_up(handle, data):
         nonlocal left
         if not left:
             raise OSError(errno.ENOSPC, "No space left on device")
         count, left = min(left, len(data)), 0
         return write(handle, data[:count])
 
-    def fails(handle: int, size: int) -> None:
+    def fails(handle, size):
         raise OSError(errno.EIO, "Input/output error")
 
     monkeypatch.setattr(os, "write", fills_up)
@@ -122,7 +122,7 @@ def test_what_was_added_is_flushed_to_the_disk_once_and_again_if_that_failed(tmp
     flushed: list[int] = []  # sizes of the file
     failing = False
 
-    def flush(handle: int) -> None:
+    def flush(handle):
         if failing:
             raise OSError(errno.EIO, "Input/output error")
         flushed.append(os.fstat(handle).st_size)

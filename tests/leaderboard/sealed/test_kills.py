@@ -1,7 +1,5 @@
 """No step is lost or doubled when the server is killed; `benchmarks/sealed_kills.py` has more."""
 
-from __future__ import annotations
-
 from tests.leaderboard.sealed.killing import step_through_kills
 from tests.leaderboard.sealed.playing import LANES, online_board
 from tests.leaderboard.sealing import SETTING

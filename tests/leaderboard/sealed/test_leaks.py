@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import pickle
-from collections.abc import Iterator
 from unittest.mock import Mock
 
 import httpx
@@ -19,14 +18,14 @@ from leaderboard.sealed.ticket import RunningTicket
 from leaderboard.store import Store
 from sme_registry import SMEError, materialize, sealed
 from sme_registry.io import sha256_of
-from tests.leaderboard.sealed.playing import LANES, Board, online_board, playing, request
+from tests.leaderboard.sealed.playing import LANES, online_board, playing, request
 from tests.leaderboard.sealing import MASTER
 from tests.leaderboard.serving import serving
 
 KEY = SigningKey.generate()
 
 
-def secrets_of(board: Board, store: Store) -> list[bytes]:
+def secrets_of(board, store):
     """What must not be found: master, seeds and digests as texts and bytes, the task's numbers."""
     row = store.ticket(board.season.digest, 1)
     ticket = RunningTicket(store, board.season, MASTER, row)
@@ -45,7 +44,7 @@ def secrets_of(board: Board, store: Store) -> list[bytes]:
     return [*(text.encode() for text in texts), *raw]
 
 
-def everything(url: str, board: Board, client: httpx.Client) -> Iterator[httpx.Response]:
+def everything(url, board, client):
     """The answers to every request of an entrant, and to a refused one of each kind."""
     signed = board.request(KEY)
     started = board.send(url, signed, KEY)
@@ -55,10 +54,10 @@ def everything(url: str, board: Board, client: httpx.Client) -> Iterator[httpx.R
     assert signer is not None
     token = {"Authorization": sealed.bearer(ticket.token)}
 
-    def at(action: str) -> str:
+    def at(action):
         return url + sealed.instance_path(board.season.id, 1, 0, action)
 
-    def step(number: int, value: float = 0.5) -> httpx.Response:
+    def step(number, value=0.5):
         return client.post(at("steps"), content=request(number, value), headers=token)
 
     yield client.get(f"{url}/api/seasons")
@@ -94,7 +93,7 @@ def test_no_answer_file_or_log_holds_a_secret(tmp_path, caplog):
     board = online_board(tmp_path)
     answered: list[bytes] = []
 
-    def record(answer: httpx.Response) -> None:
+    def record(answer):
         answered.append(answer.read())
         answered.extend(b": ".join(header) for header in answer.headers.raw)
 

@@ -1,9 +1,6 @@
 """Seasons over HTTP, with the client that entrants use, and what follows a ticket that is over."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Iterator
 
 import httpx
 import numpy as np
@@ -17,7 +14,7 @@ from leaderboard.intake import start_ticket, upload_header
 from leaderboard.sealed.scores import score_ticket
 from leaderboard.store import Store
 from sme_registry import sealed
-from tests.leaderboard.sealed.playing import LANES, Board, online_board, request
+from tests.leaderboard.sealed.playing import LANES, online_board, request
 from tests.leaderboard.sealing import MASTER, manifest, moment, tiny_season
 from tests.leaderboard.serving import serving
 
@@ -26,7 +23,7 @@ MORE_SEASONS = {"second": {}, "few": {"tickets": 1}, "coming": {"opens": moment(
 
 
 @pytest.fixture(scope="module")
-def board(tmp_path_factory: pytest.TempPathFactory) -> Board:
+def board(tmp_path_factory):
     """Several seasons of one master, in which each test plays with a key of its own."""
     board = online_board(tmp_path_factory.mktemp("online"))
     with Store.open(board.path) as store:
@@ -39,22 +36,22 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Board:
 
 
 @pytest.fixture(scope="module")
-def url(board: Board) -> Iterator[str]:
+def url(board):
     with serving(board.path, season_secrets=[board.secret]) as url:
         yield url
 
 
-def another(board: Board, name: str) -> Board:
+def another(board, name):
     """The same board, and another of its seasons."""
     with Store.open(board.path, read_only=True) as store:
         return board._replace(season=store.season(name))
 
 
-def outcome(answer: httpx.Response) -> tuple[int, str]:
+def outcome(answer):
     return answer.status_code, answer.json().get("code", "")
 
 
-def played(url: str, ticket: sealed.Ticket, number: int, steps: int) -> None:
+def played(url, ticket, number, steps):
     """Random steps on an instance, then the constant ½ as answers."""
     with sealed.Instance(url, ticket, number, lanes=LANES) as instance:
         instance.begin()

@@ -1,9 +1,5 @@
 """The regret of a ticket's steps, from its journal."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -17,7 +13,7 @@ SPEC = SMESpec(state_dim=3, action_dim=2, complexity=5, horizon=4, seed=12)
 START = Start(SPEC, 5)
 
 
-def journal(folder: Path, actions: np.ndarray) -> Journal:
+def journal(folder, actions):
     """A journal of actions `[requests, L, A]`."""
     made = Journal.create(folder / "0.journal", actions.shape[1], 2)
     for each in actions:
@@ -25,7 +21,7 @@ def journal(folder: Path, actions: np.ndarray) -> Journal:
     return made
 
 
-def regrets(actions: np.ndarray) -> np.ndarray:
+def regrets(actions):
     """The regret of a single lane's actions, and of ½ in the same states, `[requests, 2]`."""
     env, rows = SMEEnv(SPEC), []
     env.reset(seed=START.seed)

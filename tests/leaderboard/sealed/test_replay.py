@@ -1,16 +1,10 @@
 """A revealed online season is replayed from its journals: what was altered is named."""
 
-from __future__ import annotations
-
 import shutil
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from leaderboard.documents.board import SeasonFolder
-from leaderboard.documents.result import SealedResult
 from leaderboard.documents.season import Reveal
 from leaderboard.errors import TamperedError
 from leaderboard.scoring.season import season_rankings
@@ -21,12 +15,12 @@ from leaderboard.sealed.scores import score_ticket
 from leaderboard.store import Store
 from leaderboard.store.log import Log
 from sme_registry import sealed
-from tests.leaderboard.sealed.playing import LANES, ROWS, Board, online_board, playing
+from tests.leaderboard.sealed.playing import LANES, ROWS, online_board, playing
 from tests.leaderboard.sealing import AFTERWARDS, MASTER, moment, move_clock, signed_request
 
 
 @pytest.fixture(scope="module")
-def revealed(tmp_path_factory: pytest.TempPathFactory) -> Board:
+def revealed(tmp_path_factory):
     """Two tickets, whose actions are all of one level. Nobody changes it."""
     board = online_board(tmp_path_factory.mktemp("revealed"))
     with playing(board) as played:
@@ -79,18 +73,18 @@ def test_altered_journals_and_answers_are_found(revealed, tmp_path):
         assert verify_season(store, revealed.season.id).results == 2
 
 
-def replace_answers(folder: Path) -> None:
+def replace_answers(folder):
     (folder / "0.npy").write_bytes(sealed.pack_table(np.full((ROWS, 1), 0.75)))
 
 
-def replace_journal(folder: Path) -> None:
+def replace_journal(folder):
     (folder / "0.journal").unlink()
     journal = Journal.create(folder / "0.journal", LANES, 1)
     journal.append(np.full((LANES, 1), 0.75, "<f4").tobytes())
     journal.end()
 
 
-def remove_signature(folder: Path) -> None:
+def remove_signature(folder):
     (folder / "0.json").unlink()
 
 
@@ -127,7 +121,7 @@ def test_a_result_that_does_not_follow_is_found(revealed, monkeypatch, part, cha
     with Store.open(revealed.path, read_only=True) as store:
         stored = store.sealed_result
 
-        def lie(row: Any) -> SealedResult:
+        def lie(row):
             result = stored(row)
             assert result is not None
             if part == "scores":
@@ -143,14 +137,14 @@ def test_a_result_that_does_not_follow_is_found(revealed, monkeypatch, part, cha
             verify_season(store, revealed.season.id)
 
 
-def logged(monkeypatch: pytest.MonkeyPatch, time: str, store: Store, *record: Any) -> None:
+def logged(monkeypatch, time, store, *record):
     """Log something that a board must refuse, at a time, as an organiser's own board may do."""
     monkeypatch.setattr("leaderboard.store.log.now", lambda: time)
     with store.transaction():
         store.record(*record)
 
 
-def reveal(board: Board, folder: SeasonFolder) -> tuple[Any, ...]:
+def reveal(board, folder):
     """What `Database.record` needs to log the reveal of a season."""
     document = Reveal(season=board.season.digest, master=MASTER.raw.hex())
     return "revealed", board.season.digest, document, folder.reveal

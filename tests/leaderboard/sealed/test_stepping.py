@@ -1,7 +1,5 @@
 """The lanes of a hidden instance equal single environments."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from leaderboard.sealed.stepping import Lanes, Start

@@ -7,9 +7,6 @@ import errno
 import os
 import pickle
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -36,7 +33,7 @@ from sme_registry import materialize
 from sme_registry.io import sha256_of
 from sme_registry.sealed import StepFormat, pack_table, unpack_table
 from tests.leaderboard.conftest import tiny_board
-from tests.leaderboard.sealed.playing import LANES, ROWS, Played, online_board, playing, request
+from tests.leaderboard.sealed.playing import LANES, ROWS, online_board, playing, request
 from tests.leaderboard.sealing import MASTER, NOTHING, SETTING, moment, tiny_season
 
 WIRE = StepFormat(LANES, 2, 1)
@@ -45,27 +42,27 @@ WALL, UPTIME = time.time, time.monotonic
 
 
 @pytest.fixture
-def played(tmp_path: Path) -> Iterator[Played]:
+def played(tmp_path):
     with playing(online_board(tmp_path)) as ready:
         yield ready
 
 
-def set_clocks(monkeypatch: pytest.MonkeyPatch, forward: float, passed: float = 0.0) -> None:
+def set_clocks(monkeypatch, forward, passed=0.0):
     """Let so many hours pass, and set the wall clock so many hours forward."""
     monkeypatch.setattr(time, "time", lambda: WALL() + 3600.0 * (forward + passed))
     monkeypatch.setattr(time, "monotonic", lambda: UPTIME() + 3600.0 * passed)
 
 
-def fails(number: int) -> Callable[..., Any]:
+def fails(number):
     """A call of the system that fails."""
 
-    def call(*_: Any, **__: Any) -> Any:
+    def call(*_, **__):
         raise OSError(number, os.strerror(number))
 
     return call
 
 
-def refused(code: str, *arguments: Any, **others: Any) -> str:
+def refused(code, *arguments, **others):
     """The message of a refusal with this code."""
     call, *rest = arguments
     with pytest.raises(Rejection) as caught:
@@ -75,7 +72,7 @@ def refused(code: str, *arguments: Any, **others: Any) -> str:
 
 
 @pytest.fixture(scope="module")
-def many(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Played]:
+def many(tmp_path_factory):
     """A board on which one key may take many tickets."""
     folder, fields = tmp_path_factory.mktemp("many"), {"tickets": 1000, "tickets_per_key": 1000}
     with playing(online_board(folder, {"submissions_per_day": 1000}, **fields)) as ready:
@@ -136,7 +133,7 @@ def test_each_step_is_taken_once_whatever_happens(many, events, lanes):
         assert status.phase == ("answering" if taken == most else "stepping")
 
 
-def runs_out(*_: Any) -> None:
+def runs_out(*_):
     raise MemoryError
 
 
@@ -292,7 +289,7 @@ def test_an_altered_request_holds_up_no_other_ticket(played, monkeypatch):
 
 
 def test_a_clock_set_forward_ends_tickets_after_a_minute(played, monkeypatch):
-    def over(hours: float, seconds: float) -> list[int]:
+    def over(hours, seconds):
         set_clocks(monkeypatch, hours, seconds / 3600.0)
         return played.tickets.over()
 
@@ -321,7 +318,7 @@ def test_a_closed_ticket_takes_nothing_from_requests_in_progress(played):
 
 
 def test_steps_that_arrive_while_an_unplayed_ticket_is_closed_are_scored(played, monkeypatch):
-    def late(ticket: RunningTicket) -> None:
+    def late(ticket):
         ticket.instance(0).start(LANES)
         ticket.instance(0).step(request(1))
         close(ticket)
@@ -367,7 +364,7 @@ def test_a_ticket_takes_nothing_while_it_is_scored_and_what_it_took_is_flushed(p
     process.join.assert_called_once()
 
 
-def ended(code: int) -> Any:
+def ended(code):
     """A process that has ended."""
     return Mock(exitcode=code, is_alive=lambda: False)
 
@@ -383,7 +380,7 @@ def test_tickets_that_could_not_be_scored_are_tried_again_one_by_one(played, mon
     started: list[list[int]] = []
     codes: list[bool] = []
 
-    def start(attendant: Attendant) -> Any:
+    def start(attendant):
         board = played.board
         started.append(attendant._numbers)
         if len(started) == 1:
@@ -393,7 +390,7 @@ def test_tickets_that_could_not_be_scored_are_tried_again_one_by_one(played, mon
         codes.append(bool(end.value.code))
         return ended(int(codes[-1]))
 
-    def attend(seconds: float) -> list[list[int]]:
+    def attend(seconds):
         set_clocks(monkeypatch, 0, passed=25 + seconds / 3600)
         attendant.attend()
         attendant.attend()
@@ -426,10 +423,10 @@ def test_journals_and_answers_count_on_the_board(tmp_path, lanes):
         played.finish()
         played.answer(HALF)
 
-        def written() -> int:
+        def written():
             return sum(path.stat().st_size for path in played.folder.glob("0.*"))
 
-        def counted() -> int:
+        def counted():
             return played.store.total_bytes() - len(played.request.to_bytes())
 
         assert 4 * 1000 < written() <= counted() == played_bytes(season)
@@ -474,7 +471,7 @@ def test_answers_that_do_not_reach_the_disk_are_sent_again(played, monkeypatch, 
 
 
 def test_instances_used_long_ago_leave_memory_and_large_ones_take_more(played, monkeypatch):
-    def ready() -> list[bool]:
+    def ready():
         instances = played.tickets.ticket(played.number).instances
         return [each.is_ready for each in instances]
 

@@ -53,7 +53,7 @@ def submit_references(store):
 
 def submit(
     store, key, name, profile, *, version="1.0", family="PPO", knowledge="generic",
-    submitter="Ada", runs=10, missing=0, spread=0.05, rejected=None, oracle_like=False, **fields,
+    submitter="Ada", runs=10, missing=0, spread=0.05, rejected=None, oracle_like=False, **fields
 ):  # fmt: skip
     """Submit a method and write the result that this profile, WD first, would give; its id.
 
