@@ -1,5 +1,6 @@
 """The import contract of pyproject.toml holds, and would notice if it did not."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -74,3 +75,72 @@ def test_a_module_without_a_place_in_the_order_breaks_the_contract(copy):
     result = lint_imports(copy)
     assert result.returncode == 1, result.stdout + result.stderr
     assert "unplaced" in result.stdout
+
+
+HEAVY = {
+    "torch", "jax", "ray", "matplotlib", "numba", "scipy.stats", "stable_baselines3", "pygame",
+    "pandas", "h5py", "minari", "d3rlpy", "onnxruntime", "typer", "filelock", "jinja2",
+}  # fmt: skip
+
+
+def run(script):
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=120,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_importing_the_package_loads_nothing_heavy():
+    loaded = set(run("import json, sys, sme_registry; print(json.dumps(list(sys.modules)))"))
+    assert "sme_registry" in loaded
+    assert not loaded & HEAVY
+
+
+def test_making_and_stepping_with_numpy_loads_nothing_heavy():
+    script = (
+        "import os; os.environ['SME_BACKEND'] = 'numpy'\n"
+        "import json, sys, gymnasium, sme_registry\n"
+        "env = gymnasium.make('SME/Default-v1'); env.reset(seed=0)\n"
+        "env.step(env.action_space.sample())\n"
+        "print(json.dumps(list(sys.modules)))"
+    )
+    assert not set(run(script)) & HEAVY
+
+
+WITHOUT_POSIX = """
+import importlib, os, pkgutil, signal, sys
+
+# As on Windows. What other packages need of these they have loaded before.
+import sme_registry, filelock, multiprocessing.resource_tracker, subprocess, tempfile
+for name in ("stable_baselines3", "minari", "numba"):
+    try:
+        importlib.import_module(name)
+    except ImportError:
+        pass
+for name in [name for name in sys.modules if name.split(".")[0] == "sme_registry"]:
+    del sys.modules[name]
+for name in ("fcntl", "grp", "pty", "pwd", "resource", "syslog", "termios", "tty"):
+    sys.modules[name] = None
+for name in ("pthread_sigmask", "SIGKILL", "SIGHUP", "SIGALRM", "alarm", "setitimer"):
+    delattr(signal, name)
+for name in ("fork", "geteuid", "getuid", "fchmod", "killpg", "setsid", "O_DIRECTORY"):
+    delattr(os, name)
+
+import sme_registry
+for module in pkgutil.walk_packages(sme_registry.__path__, "sme_registry."):
+    importlib.import_module(module.name)
+"""
+
+
+def test_every_module_is_imported_without_posix():
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_POSIX],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert done.returncode == 0, done.stderr

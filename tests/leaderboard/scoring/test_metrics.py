@@ -6,8 +6,22 @@ import numpy as np
 import pytest
 
 from benchmarks.interval_coverage import DISTRIBUTIONS, simulate
-from leaderboard.scoring.metrics import run_metrics
+from leaderboard.artefact.answers import read_answers
+from leaderboard.documents.master import Place
+from leaderboard.errors import Rejection
+from leaderboard.scoring.metrics import failed_run, run_metrics
 from leaderboard.scoring.ranking import rank_ranges
+from leaderboard.scoring.sealed import (
+    challenge,
+    instances,
+    score_run,
+    sealed_result,
+)
+from leaderboard.scoring.tables import EASY, table_regret
+from sme_registry import evaluate
+from sme_registry.sealed import pack_table
+from sme_registry.spec import Setting
+from tests.leaderboard.sealing import MASTER, tiny_season
 
 LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 
@@ -85,3 +99,91 @@ def test_ranks_match_counting_every_pair():
         assert (actual[0].tolist(), actual[1].tolist()) == (first, last)
         assert (actual[0] <= actual[1]).all()
     assert [len(ranks) for ranks in rank_ranges([], [])] == [0, 0]
+
+
+SEASON = tiny_season("sealed-online")
+FIRST, SECOND = instances(SEASON, MASTER, "1", "a" * 64)
+
+
+def policy(observations):
+    """A policy whose actions depend on the state and leave the cube."""
+    return 1.5 * observations[:, :1] - 0.2
+
+
+def test_answers_score_what_their_policy_scores():
+    shown = challenge(FIRST.spec, FIRST.protocol)
+    assert shown.shape == (FIRST.rows, 4) == (300, 4)
+    assert shown.dtype == np.float32
+    run, versions = score_run(FIRST, policy(shown), "sha256:" + "1" * 64)
+    report = evaluate(policy, FIRST.spec, FIRST.protocol)
+    assert run.normalised_regret == tuple(region.normalised_regret for region in report.regions)
+    assert run.similarity == tuple(region.similarity for region in report.regions)
+    assert run.spec is None
+    assert run.evaluation_seed is None
+    assert "numpy" in versions
+
+
+def test_the_order_of_answers_matters_and_each_is_used_once():
+    shown = challenge(FIRST.spec, FIRST.protocol)
+    right, _ = score_run(FIRST, policy(shown), None)
+    wrong, _ = score_run(FIRST, policy(shown)[::-1], None)
+    assert wrong.wd_regret != right.wd_regret
+    with pytest.raises(ValueError, match="301 answers to 300 challenge states"):
+        score_run(FIRST, np.zeros((301, 1), np.float32), None)
+
+
+def test_tasks_and_states_are_an_instances_own_and_a_tickets():
+    others = instances(SEASON, MASTER, "2", "a" * 64)
+    everyone = [FIRST, SECOND, *others, *instances(SEASON, MASTER, "1", "b" * 64)]
+    assert len({each.spec.digest for each in everyone}) == 6
+    assert len({each.protocol.seed for each in everyone}) == 6
+    text = repr([FIRST, SECOND])  # shows no secret
+    assert str(FIRST.spec.seed)[2:] not in text
+    assert str(FIRST.protocol.seed) not in text
+    assert FIRST.place == Place(SEASON.id, "deep", 0, "1", "a" * 64)
+    [again, _] = instances(SEASON, MASTER, "1", "a" * 64)
+    np.testing.assert_array_equal(
+        challenge(again.spec, again.protocol), challenge(FIRST.spec, FIRST.protocol)
+    )
+
+
+def test_wrong_answers_are_refused():
+    tables = [
+        (pack_table(np.zeros((299, 1))), "answer_shape"),
+        (pack_table(np.zeros((300, 2))), "answer_shape"),
+        (b"\x93NUMPY garbage", "answer_shape"),
+        (pack_table(np.full((300, 1), np.nan)), "answer_not_finite"),
+        (pack_table(np.full((300, 1), np.inf)), "answer_not_finite"),
+    ]
+    for data, code in tables:
+        with pytest.raises(Rejection) as error:
+            read_answers(data, FIRST.spec, FIRST.protocol)
+        assert error.value.code == code
+
+
+def test_a_result_averages_instances_and_an_unanswered_one_scores_1():
+    run, versions = score_run(FIRST, policy(challenge(FIRST.spec, FIRST.protocol)), None)
+    failed, _ = score_run(SECOND, None, None)
+    assert failed == failed_run(SEASON.protocol, "deep", None)
+    result = sealed_result(SEASON, "sha256:" + "2" * 64, [run, failed], versions, 100)
+    assert result.scores.wd_regret.value == pytest.approx((run.wd_regret + 1) / 2)
+    low, high = result.scores.wd_regret.ends
+    assert low < result.scores.wd_regret.value < high
+    assert [member.runs for member in result.classes] == [2]
+
+
+# A table of the nearest states
+
+
+def setting(state_dim):
+    return Setting(state_dim=state_dim, action_dim=1, complexity=5, hidden_width=16)
+
+
+def test_few_state_channels_are_filled_by_a_table_and_many_are_not():
+    one, eight = table_regret(setting(1), 1000), table_regret(setting(8), 1000)
+    assert one < 0.01 < EASY < 0.2 < eight < 0.6
+
+
+def test_more_rows_make_a_better_table_and_one_row_is_enough():
+    one, hundred, thousands = (table_regret(setting(2), rows) for rows in (1, 100, 3000))
+    assert thousands < hundred < one < 2

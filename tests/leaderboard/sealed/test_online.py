@@ -14,8 +14,9 @@ from leaderboard.intake import start_ticket, upload_header
 from leaderboard.sealed.scores import score_ticket
 from leaderboard.store import Store
 from sme_registry import sealed
+from tests.leaderboard.sealed.killing import step_through_kills
 from tests.leaderboard.sealed.playing import LANES, online_board, request
-from tests.leaderboard.sealing import MASTER, manifest, moment, tiny_season
+from tests.leaderboard.sealing import MASTER, SETTING, manifest, moment, tiny_season
 from tests.leaderboard.serving import serving
 
 OTHER = SigningKey.generate()
@@ -240,3 +241,9 @@ def test_large_bodies_numbers_and_other_methods_are_refused(url, board, key):
         (404, "not_found"),
     ]
     assert status["instances"][0]["used"] == 0
+
+
+def test_entrants_go_on_when_their_server_is_killed(tmp_path):
+    member = {"name": "deep", "setting": SETTING, "instances": 1, "budget": 60 * LANES}
+    board = online_board(tmp_path, classes=[member])
+    step_through_kills(board, tickets=3, requests=60, kills=1)

@@ -12,9 +12,11 @@ from leaderboard.scoring.verify import verify
 from leaderboard.sealed import verify_season
 from leaderboard.sealed.journal import Journal
 from leaderboard.sealed.scores import score_ticket
+from leaderboard.sealed.stepping import Lanes, Start
 from leaderboard.store import Store
 from leaderboard.store.log import Log
-from sme_registry import sealed
+from sme_registry import SMESpec, sealed
+from sme_registry.envs import SMEEnv
 from tests.leaderboard.sealed.playing import LANES, ROWS, online_board, playing
 from tests.leaderboard.sealing import AFTERWARDS, MASTER, moment, move_clock, signed_request
 
@@ -191,3 +193,37 @@ def test_a_reveal_before_the_close_is_found(tmp_path, monkeypatch):
         logged(monkeypatch, moment(0), store, *reveal(board, folder))
         with pytest.raises(TamperedError, match=r"reveal\.json: was logged at"):
             verify_season(store, board.season.id)
+
+
+SPEC = SMESpec(state_dim=3, action_dim=2, complexity=5, horizon=3, k=2, D=0.1, seed=11)
+SEED = 2**255 + 3
+
+
+def test_steps_and_regret_are_those_of_single_environments():
+    lanes, unmeasured = Lanes(Start(SPEC, SEED), 3), Lanes(Start(SPEC, SEED), 3)
+    singles = [SMEEnv(SPEC) for _ in range(3)]
+    first = [env.reset(seed=SEED + lane)[0] for lane, env in enumerate(singles)]
+    np.testing.assert_array_equal(lanes.observation, first)
+    random = np.random.default_rng(1)
+    seen = set()
+    for _ in range(60):
+        actions = random.random((3, 2), dtype=np.float32) * 1.2 - 0.1
+        regret = half = 0.0
+        expected = []
+        for lane, env in enumerate(singles):
+            half += float(env.task.regret(env.state, np.full(2, 0.5)))
+            observation, reward, terminated, truncated, info = env.step(actions[lane])
+            regret += info["regret"]
+            last = np.zeros(5, np.float32)
+            if terminated or truncated:
+                last, observation = observation, env.reset()[0]
+            expected.append((observation, np.float32(reward), terminated, truncated, last))
+            seen.add((terminated, truncated))
+        steps, measured = lanes.step_with_regret(actions)
+        plain = unmeasured.step(actions)
+        for got, same, wanted in zip(steps, plain, zip(*expected, strict=True), strict=True):
+            np.testing.assert_array_equal(got, wanted)
+            np.testing.assert_array_equal(same, wanted)
+        np.testing.assert_array_equal(lanes.observation, steps.observation)
+        np.testing.assert_allclose(measured, (regret, half), rtol=1e-12)
+    assert {(False, False), (True, False), (False, True)} <= seen

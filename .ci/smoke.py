@@ -20,6 +20,7 @@ from sme_registry.spec.catalogue import entries, spec_folder
 
 
 def expect(holds, what):
+    """Say what holds, or end with what does not."""
     if not holds:
         raise SystemExit(f"FAILED: {what}")
     print(f"ok: {what}")
@@ -34,6 +35,7 @@ def sme(*arguments):
 
 
 def main(backend):
+    """Use the installed package as a reader of the README would."""
     package = Path(sme_registry.__file__).parent
     site = Path(sysconfig.get_path("purelib"))
     expect(package.parent == site, f"the package is the installed one, in {site}")
