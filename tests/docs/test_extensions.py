@@ -6,8 +6,6 @@ import re
 
 import nbclient
 import nbformat
-import numpy as np
-import numpy.typing as npt
 import pytest
 
 from tests.docs.conftest import ROOT
@@ -15,7 +13,6 @@ from tests.docs.conftest import ROOT
 pytest.importorskip("sphinx")
 
 import command_reference
-import contents
 import docstrings
 import links
 import python_reference
@@ -23,7 +20,6 @@ import schema_files
 import tutorial_cells
 from docutils import nodes
 from docutils.utils import new_document
-from sphinx.util.typing import stringify_annotation
 
 import sme_registry
 from sme_registry.cli.show import _SCHEMAS
@@ -106,25 +102,12 @@ def test_links_out_of_docs_lead_to_pages_of_the_site_or_nowhere():
     assert rewritten("[teams.md](teams.md#a) says") == "[](teams.md#a) says"
 
 
-def test_an_index_contains_the_pages_that_it_links_to():
-    text = "[a](a.md) [b](b.md#x) [a](a.md) [c](../guides/c.md) [d](https://x.org/d.md)"
-    assert contents.members(text) == ["a", "b"]
-    assert contents.members("[x](guides/index.md), [y](guides/y.md)", front=True) == [
-        "guides/index"
-    ]
-
-
 def test_a_docstring_becomes_rst_with_its_formulas_and_doctests_untouched():
     text = "Mean |a| of `x*` and\n`y`s.\n\n    a* = b |c|\n\nThen π* is.\n\n>>> f(*x)\n3"
     assert docstrings.as_rst(text.split("\n")) == [
         r"Mean \|a\| of ``x*`` and", r"``y``\ s.", "", "::", "", "    a* = b |c|", "",
         r"Then π\* is.", "", ">>> f(*x)", "3",
     ]  # fmt: skip
-
-
-def test_a_signature_names_the_types_of_numpy():
-    array, like = (stringify_annotation(t, "smart") for t in (npt.NDArray[np.int64], npt.ArrayLike))
-    assert docstrings.short_types(f"(x: {like}) -> {array}") == "(x: ArrayLike) -> NDArray[int64]"
 
 
 def test_every_command_and_option_is_in_the_reference():

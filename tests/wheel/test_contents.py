@@ -2,6 +2,7 @@
 
 import json
 import re
+import runpy
 import shutil
 import tarfile
 import tomllib
@@ -12,8 +13,11 @@ import pytest
 import yaml
 
 import sme_registry
-from tests.wheel.contents import NOT_PUBLISHED, ROOT, faults_of_sdist, faults_of_wheel
+from tests.wheel.conftest import ROOT
 
+CONTENTS = runpy.run_path(str(ROOT / ".ci" / "contents.py"))
+NOT_PUBLISHED = CONTENTS["NOT_PUBLISHED"]
+faults_of_sdist, faults_of_wheel = CONTENTS["faults_of_sdist"], CONTENTS["faults_of_wheel"]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 DECLARED = {
     entry.rpartition(" ")[2]

@@ -10,7 +10,7 @@ import tomllib
 import zipfile
 from pathlib import Path, PurePosixPath
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 BUILD = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]
 LARGEST = 500_000  # bytes of one file
 NOT_PUBLISHED = {".gitattributes", ".github"}
@@ -70,6 +70,7 @@ def _cache(name):
 
 
 def main(folder):
+    """Name what is wrong with the wheel and the sdist in a folder, and end with an error."""
     (wheel,), (sdist,) = (list(Path(folder).glob(end)) for end in ("*.whl", "*.tar.gz"))
     faults = faults_of_wheel(wheel) + faults_of_sdist(sdist)
     if faults:
