@@ -41,7 +41,7 @@ def observations(draw: st.DrawFn) -> dict[str, Any]:
     """What an agent may see in place of the state; fields that have a default may be left out."""
     mixing = draw(st.sampled_from(["none", "orthogonal", "nonlinear"]))
     m = draw(st.integers(1 if mixing == "none" else 0, 5))
-    fields: dict[str, Any] = {"distractors": m, "mixing": mixing}
+    fields = {"distractors": m, "mixing": mixing}
     if m and draw(st.booleans()):
         fields["dynamics"] = draw(st.sampled_from(["noise", "autonomous", "driven"]))
     if mixing == "nonlinear" and draw(st.booleans()):

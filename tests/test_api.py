@@ -34,7 +34,7 @@ def test_a_public_name_can_be_imported_and_is_documented():
 
 
 def test_star_import_gives_the_public_names():
-    namespace: dict[str, object] = {}
+    namespace = {}
     exec("from sme_registry import *", namespace)
     assert set(sme_registry.__all__) <= namespace.keys()
 

@@ -5,14 +5,11 @@ run of PPO in `runs/ppo`, a life in a stream in `runs/life`, a data set in `data
 in `study`, and a ticket of a sealed season in `ticket.json`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import doctest
 import importlib
 import inspect
 import shutil
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +30,7 @@ SHORT_PPO = {"n_steps": 128, "batch_size": 64, "n_epochs": 1}
 def public_things():
     """The functions and classes that users import, by their names."""
     modules = ["sme_registry", *(f"sme_registry.{name}" for name in sme_registry._SUBMODULES)]
-    found: dict[Any, str] = {}
+    found = {}
     for name in modules:
         module = importlib.import_module(name)
         for public in getattr(module, "__all__", ()):
@@ -66,7 +63,7 @@ WITH_EXAMPLE = [name for name in THINGS if example_of(name)]
 def prepared(tmp_path_factory):
     """What the examples find in their folder."""
     folder = tmp_path_factory.mktemp("examples")
-    quick: dict[str, Any] = {"protocol": "quick-v1", "progress": False}
+    quick = {"protocol": "quick-v1", "progress": False}
     task = sme_registry.load("Default")
     phases = [{"spec": task, "steps": 128}, {"spec": task.derive(complexity=2), "steps": 128}]
     for name, document in (("ppo", task), ("life", StreamSpec(phases=phases))):
@@ -134,6 +131,6 @@ def test_the_example_holds(name):
     test = example_of(name)
     assert test is not None
     test.globs = {"np": np, "sme_registry": sme_registry}
-    output: list[str] = []
+    output = []
     result = doctest.DocTestRunner(optionflags=FLAGS).run(test, out=output.append)
     assert not result.failed, "".join(output)

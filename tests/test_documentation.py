@@ -1,15 +1,11 @@
 """The documentation is true: its code runs, its links lead somewhere, its lists are complete."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import shlex
 import subprocess
-from collections.abc import Callable
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -40,7 +36,7 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.M | re.S)
     assert blocks
-    namespace: dict[str, Any] = {"__name__": "page"}
+    namespace = {"__name__": "page"}
     for block in blocks:
         exec(compile(block, page, "exec"), namespace)
 
@@ -86,7 +82,7 @@ def test_a_tutorial_works_from_top_to_bottom(name, packages, shorter, tmp_path, 
     for full, short in shorter.items():
         assert full in page
         page = page.replace(full, short)
-    namespace: dict[str, Any] = {"__name__": "page"}
+    namespace = {"__name__": "page"}
     for language, block in re.findall(r"^```(python|sh)\n(.*?)^```", page, re.M | re.S):
         if language == "python":
             exec(compile(block, "page", "exec"), namespace)
@@ -135,9 +131,7 @@ def test_every_relative_link_leads_to_a_file(page):
     assert not missing
 
 
-GENERATED: dict[str, Callable[[], str]] = runpy.run_path(str(ROOT / "docs" / "generate.py"))[
-    "PAGES"
-]
+GENERATED = runpy.run_path(str(ROOT / "docs" / "generate.py"))["PAGES"]
 
 
 @pytest.mark.parametrize("name", GENERATED)

@@ -3,7 +3,6 @@
 import importlib
 import pickle
 import sys
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -112,7 +111,7 @@ def test_sb3s_algorithms_learn_on_it(algorithm, kwargs):
 
 
 def test_sb3s_wrappers_and_its_evaluation_work_on_it():
-    env: Any = VecNormalize(VecFrameStack(VecCheckNan(VecMonitor(SMEVecEnv(HARD, 3))), 2))
+    env = VecNormalize(VecFrameStack(VecCheckNan(VecMonitor(SMEVecEnv(HARD, 3))), 2))
     env.seed(0)
     env.reset()
     rng = np.random.default_rng(0)

@@ -2,7 +2,6 @@
 
 import io
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +25,7 @@ from sme_registry.studies.engine.checks import check_task
 from sme_registry.training import checkpoint, numpy_policy
 
 SPEC = SMESpec(state_dim=3, action_dim=2, horizon=20, safety={"tightness": 0.2}, seed=5)
-SMALL: dict[str, Any] = {"n_steps": 64, "n_epochs": 2, "seed": 3}
+SMALL = {"n_steps": 64, "n_epochs": 2, "seed": 3}
 PROTOCOL = {"states_per_region": 50}
 ALGORITHMS = ["PPOLagrangian", "PPOProjection"]
 
@@ -74,7 +73,7 @@ def test_without_a_multiplier_it_is_ppo_bit_for_bit(count):
 
 
 def test_the_multiplier_follows_the_mean_cost_of_the_rollout_down_to_0():
-    costs: list[float] = []
+    costs = []
     settings = SMALL | {"cost_limit": 0.02, "multiplier_learning_rate": 3.0}
     model = PPOLagrangian("MlpPolicy", lanes(2), **settings)
     expected = 0.0
@@ -104,7 +103,7 @@ def test_a_multiplier_lowers_the_cost_and_the_critic_of_costs_learns():
         seed=1,
     )
     untrained = {k: v.clone() for k, v in model.cost_critic.state_dict().items()}
-    costs: list[float] = []
+    costs = []
     model.learn(2_560, callback=noting(costs))
     assert np.mean(costs[-640:]) < 0.5 * np.mean(costs[:640])
     # With γ = 0.5 the costs from a state on are about twice its mean cost.
@@ -130,7 +129,7 @@ def test_a_saved_model_keeps_its_multiplier_and_critic_but_not_its_last_rollout(
 @pytest.mark.parametrize("action_range", ["unit", "symmetric"])
 def test_projected_actions_never_cost_anything(action_range):
     env = lanes(2, action_range=action_range)
-    costs: list[float] = []
+    costs = []
 
     model = PPOProjection("MlpPolicy", env, **SMALL)
     # Biased towards high actions, so that most of them would be above the limits.
@@ -272,7 +271,7 @@ def test_a_run_logs_and_draws_the_cost_of_its_episodes(algorithm, tmp_path):
 
 
 def test_a_stopped_run_resumes_with_its_multiplier(tmp_path, monkeypatch):
-    settings: dict[str, Any] = {
+    settings = {
         "algorithm": "PPOLagrangian", "folder": tmp_path / "run", "checkpoint_every": 64,
         "protocol": PROTOCOL, "progress": False,
     }  # fmt: skip

@@ -1,7 +1,5 @@
 """Recorded regret is that of `info`, in every kind of loop, and the file is that of `sme train`."""
 
-from typing import Any
-
 import gymnasium
 import numpy as np
 import pytest
@@ -33,8 +31,8 @@ def actions(lanes=1):
 def by_hand(env, taken, seed=0):
     """Return, length, mean regret, mean similarity and end of each episode."""
     env.reset(seed=seed)
-    episodes: list[tuple[float, ...]] = []
-    rows: list[tuple[float, ...]] = []
+    episodes = []
+    rows = []
     for action in taken:
         _, reward, terminated, truncated, info = env.step(action)
         rows.append((reward, info["regret"], info["similarity"]))
@@ -89,14 +87,14 @@ def test_a_vector_records_the_same_episodes_in_every_mode(kind, mode):
     lanes, mode_ = 3, AutoresetMode(mode)
     taken = actions(lanes)
     if kind == "native":
-        envs: Any = sme_registry.make_vec(SPEC, lanes, autoreset_mode=mode)
+        envs = sme_registry.make_vec(SPEC, lanes, autoreset_mode=mode)
     else:
         makers = [lambda: sme_registry.make(SPEC)] * lanes
         envs = SyncVectorEnv(makers, autoreset_mode=mode_)
     recorded = RecordVectorRegret(envs)
     recorded.reset(seed=0)
     ended = np.zeros(lanes, bool)
-    used: list[list[Any]] = [[] for _ in range(lanes)]
+    used = [[] for _ in range(lanes)]
     in_infos = 0
     for action in taken:
         if mode_ is AutoresetMode.DISABLED and ended.any():
@@ -122,7 +120,7 @@ def test_a_vector_records_the_same_episodes_in_every_mode(kind, mode):
 def test_it_stands_beside_gymnasiums_statistics():
     env = RecordRegret(RecordEpisodeStatistics(sme_registry.make(SPEC)))
     env.reset(seed=0)
-    info: dict[str, Any] = {}
+    info = {}
     while "episode" not in info:
         info = env.step(np.ones(1, np.float32))[-1]
     assert {"r", "l", "t", "regret", "similarity", "online_regret"} == set(info["episode"])
@@ -217,7 +215,7 @@ def test_recorded_episodes_have_their_cost(kind, tmp_path):
     taken = high_actions(lanes, 4)
     infos = {}
     if kind == "single":
-        env: Any = RecordRegret(sme_registry.make(LIMITED), path)
+        env = RecordRegret(sme_registry.make(LIMITED), path)
         env.reset(seed=0)
         for action in taken[:, 0]:
             infos = env.step(action)[4]
@@ -250,9 +248,9 @@ def test_steps_above_a_limit_by_more_than_rounding_are_violations(
         safety={"tightness": tightness},
         policy_init="unit_variance",
     )
-    single: Any = RecordRegret(sme_registry.make(spec))
-    ours: Any = RecordVectorRegret(sme_registry.make_vec(spec, 2))
-    gymnasiums: Any = RecordVectorRegret(
+    single = RecordRegret(sme_registry.make(spec))
+    ours = RecordVectorRegret(sme_registry.make_vec(spec, 2))
+    gymnasiums = RecordVectorRegret(
         gymnasium.vector.SyncVectorEnv([lambda: sme_registry.make(spec)])
     )
     finished = []

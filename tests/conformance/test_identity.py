@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -111,7 +110,7 @@ def test_env_specs_present_the_horizon_as_the_episodes_longest_length(overrides)
     ]
     for env in made:
         assert env.spec.max_episode_steps == horizon
-        recreate: Any = gymnasium.make_vec if env is made[1] else gymnasium.make
+        recreate = gymnasium.make_vec if env is made[1] else gymnasium.make
         for spec in (env.spec, EnvSpec.from_json(env.spec.to_json())):
             again = recreate(spec)
             assert again.spec == env.spec
@@ -128,7 +127,7 @@ def test_the_time_limit_of_a_recreated_environment_changes_no_number():
         expect_same("reset", limited.reset(seed=seed), env.reset(seed=seed))
         ended = False
         while not ended:
-            unwrapped: Any = env.unwrapped
+            unwrapped = env.unwrapped
             action = mixed_actions(unwrapped.task.optimal_action(unwrapped.state), rng)
             step = env.step(action)
             expect_same("step", limited.step(action), step)
@@ -193,7 +192,7 @@ def test_a_symmetric_id_is_the_same_task_with_other_actions():
         sme_registry.make("sme_registry:SME/DefaultSymmetric-v1"),
         sme_registry.make_vec("DefaultSymmetric"),
     ):
-        unwrapped: Any = env.unwrapped
+        unwrapped = env.unwrapped
         assert unwrapped.sme_spec == default
         assert env.action_space.low.min() == -1.0
         assert env.spec.id == "SME/DefaultSymmetric-v1"
@@ -223,7 +222,7 @@ def test_batches_and_env_specs_with_overrides_do_not_keep_the_name_either():
     mode = gymnasium.vector.AutoresetMode.SAME_STEP
     env = gymnasium.make_vec("SME/Default-v1", num_envs=2, horizon=5, autoreset_mode=mode)
     assert env.spec.id == f"SME/{env.unwrapped.sme_spec.content_name}-v1"
-    again: Any = gymnasium.make_vec(EnvSpec.from_json(env.spec.to_json()))
+    again = gymnasium.make_vec(EnvSpec.from_json(env.spec.to_json()))
     assert again.num_envs == 2
     assert again.metadata["autoreset_mode"] is mode
     assert again.unwrapped.sme_spec == env.unwrapped.sme_spec

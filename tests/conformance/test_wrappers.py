@@ -1,7 +1,5 @@
 """The wrappers that people put around environments work on these, and none changes the task."""
 
-from typing import Any
-
 import gymnasium
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ from sme_registry.errors import WrapperError
 
 T = 8
 LOW, HIGH = np.float32(-1.0), np.float32(1.0)
-AROUND_SINGLES: dict[str, Any] = {
+AROUND_SINGLES = {
     name: getattr(wrappers, name)
     for name in (
         "Autoreset", "ClipAction", "FlattenObservation", "NormalizeObservation", "NormalizeReward",

@@ -5,9 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+import sme_registry
 from sme_registry.datasets import DatasetRecipe, to_d3rlpy
+from sme_registry.datasets.behaviour import EpisodeStream, constant_policy
 from sme_registry.datasets.collect import collect
 from sme_registry.datasets.recipe import parse_behaviour
+from sme_registry.datasets.scores import reference_scores, whole_episodes
 from sme_registry.spec import SMESpec
 from sme_registry.task import materialize
 
@@ -78,3 +81,94 @@ def test_d3rlpy_gets_copies(fragile):
         for array in given.values():
             array[:] = -1.0
         assert fragile.digest == before
+
+
+def scored(acting=((0.5, 1.0),), transitions=2_000, **fields):
+    spec = SMESpec.from_dict(fields)
+    behaviours = tuple(parse_behaviour(what, weight) for what, weight in acting)
+    recipe = DatasetRecipe(spec=spec, behaviours=behaviours, transitions=transitions)
+    task = materialize(spec)
+    found = collect(recipe, task)
+    return reference_scores(recipe, task, found), found, task
+
+
+def test_scores_on_the_data_sets_states_are_exact():
+    scores, found, task = scored()
+    half = np.full_like(found.optimal_actions, 0.5)
+    assert scores.constant.similarity == pytest.approx(task.similarity(found.states, half).mean())
+    assert scores.constant.step_reward == pytest.approx(task.step_reward(found.states, half).mean())
+    acted = found.actions.astype(float)
+    assert scores.behaviour.similarity == pytest.approx(
+        task.similarity(found.states, acted).mean(), abs=1e-12
+    )
+    best = task.optimal_action(found.states)
+    assert scores.optimum.similarity == task.similarity(found.states, best).mean() == 1.0
+    assert scores.optimum.step_reward == task.step_reward(found.states, best).mean() == 1.0
+
+
+@pytest.mark.parametrize("fields", [{}, {"k": 7, "r_min": 0.3, "D": 0.2}, {"complexity": 10}])
+def test_the_optimums_return_is_the_horizon(fields):
+    scores, _, task = scored(transitions=100, **fields)
+    assert scores.optimum.rollouts.mean_return == 100.0
+    env = sme_registry.make(task.spec)
+    env.reset(seed=0)
+    total, ended = 0.0, False
+    while not ended:
+        optimal = task.optimal_action(env.unwrapped.state)
+        _, reward, terminated, truncated, _ = env.step(optimal)
+        total, ended = total + reward, terminated or truncated
+    assert total == pytest.approx(100.0, abs=1e-9)
+
+
+def test_the_returns_are_those_of_single_environments():
+    task = materialize(SMESpec(k=3, D=0.02))
+    starts = EpisodeStream(4, "start", 20, 8, ahead=1)
+    returns, similarities, steps = whole_episodes(task, constant_policy(task), starts, 20)
+    assert len(set(steps)) > 3  # they end at different steps
+    again = EpisodeStream(4, "start", 1, 8, ahead=1)
+    env = sme_registry.make(task.spec)
+    for episode in range(20):
+        again.begin(0, episode)
+        env.reset(options={"state": again.next()[0]})
+        total, similarity, count, ended = 0.0, 0.0, 0, False
+        while not ended:
+            _, reward, terminated, truncated, info = env.step(np.full(4, 0.5, np.float32))
+            total, similarity, count = total + reward, similarity + info["similarity"], count + 1
+            ended = terminated or truncated
+        assert (total, count) == (pytest.approx(returns[episode]), steps[episode])
+        assert similarity == pytest.approx(similarities[episode])
+
+
+def test_the_behaviour_score_is_the_weighted_mean_over_behaviours():
+    scores, found, _ = scored([(0.0, 0.25), ("random", 0.75)])
+    best, worst = scores.behaviours
+    assert best.similarity > 0.999999
+    assert worst.similarity < 0.75
+    whole = 0.25 * best.rollouts.mean_return + 0.75 * worst.rollouts.mean_return
+    assert scores.behaviour.rollouts.mean_return == pytest.approx(whole)
+    assert scores.behaviour.similarity == found.similarities.mean()
+
+
+def test_rollouts_of_the_behaviour_agree_with_the_data_set():
+    scores, found, _ = scored(transitions=10_000)
+    returns = np.add.reduceat(found.rewards, np.arange(0, 10_000, 100))
+    error = np.hypot(scores.behaviour.rollouts.standard_error, returns.std() / 10)
+    assert abs(scores.behaviour.rollouts.mean_return - returns.mean()) < 4 * error
+
+
+def test_a_horizon_too_long_for_episodes_has_no_rollouts():
+    scores, _, _ = scored(transitions=50, horizon=10**6)
+    assert scores.behaviour.rollouts is None
+    assert scores.constant.rollouts is None
+    assert scores.optimum.rollouts.mean_return == 10**6
+
+
+@pytest.mark.parametrize("reward", ["individual", "team"])
+def test_a_teams_scores_are_the_mean_over_its_agents(reward):
+    team = {"agents": [{"action_dim": 1}, {"action_dim": 3}], "reward": reward}
+    scores, found, task = scored(team=team)
+    half = np.full_like(found.optimal_actions, 0.5)
+    each = task.similarities_of(half, found.optimal_actions)
+    assert scores.constant.similarity == pytest.approx(each.mean())
+    paid_for = task.similarity_of(half, found.optimal_actions) if reward == "team" else each
+    assert scores.constant.step_reward == pytest.approx(task.reward_of(paid_for).mean())

@@ -1,7 +1,5 @@
 """Sealed data sets: what an agent saw, in Minari's format, and nothing that tells the task."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os
@@ -91,8 +89,8 @@ def test_nothing_in_the_files_tells_the_task(dataset, tmp_path):
         *("action_space", "data_format", "dataset_id", "dataset_size", "jpeg_encoding"),
         *("minari_version", "observation_space", "total_episodes", "total_steps"),
     }
-    names: set[str] = set()
-    attributes: set[str] = set()
+    names = set()
+    attributes = set()
     with h5py.File(path / "main_data.hdf5") as file:
         attributes |= set(file.attrs)
         for episode in file.values():

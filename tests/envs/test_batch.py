@@ -3,8 +3,6 @@
 import copy
 import pickle
 import weakref
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -113,7 +111,7 @@ def torch_tensor(array):
     return pytest.importorskip("torch").from_numpy(array)
 
 
-HOLDERS: dict[str, Callable[[Any], Any]] = {
+HOLDERS = {
     "itself": lambda array: array,
     "a view of a slice": lambda array: array[..., 1:].T[:],
     "strides": lambda array: np.lib.stride_tricks.as_strided(array),

@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -194,7 +193,7 @@ def drawn(lanes=3, **kwargs):
 def test_frames_are_those_of_single_environments(mode, action_range):
     batch = drawn(2, autoreset_mode=mode, action_range=action_range)
     make = lambda: SMEEnv(TASK, render_mode="rgb_array", action_range=action_range)  # noqa: E731
-    singles: Any = SyncVectorEnv([make] * 2, autoreset_mode=AutoresetMode(mode))
+    singles = SyncVectorEnv([make] * 2, autoreset_mode=AutoresetMode(mode))
     for env in (batch, singles):
         env.reset(seed=1)
         env.action_space.seed(0)

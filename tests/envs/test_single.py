@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -174,7 +173,7 @@ def test_an_unusable_action_is_refused_and_nothing_moves(action_range):
 
 def test_a_step_before_reset_or_after_the_end_is_refused():
     env = SMEEnv("Plane1", horizon=2)
-    actions: Any = np.zeros(2, np.float32), np.zeros(2), [0, 0]
+    actions = np.zeros(2, np.float32), np.zeros(2), [0, 0]
     for message in ("has not begun", "has ended"):
         for action in actions:
             with pytest.raises(EpisodeError, match=message):
@@ -229,7 +228,7 @@ def test_an_episode_pickled_under_one_back_end_goes_on_under_the_other(name, mon
     for here, there in (("numba", "numpy"), ("numpy", "numba")):
         for make in (SMEEnv, lambda name, **kw: sme_registry.make_vec(name, 3, **kw)):
             monkeypatch.setenv("SME_BACKEND", here)
-            env: Any = make(name, D=0.0, horizon=12)
+            env = make(name, D=0.0, horizon=12)
             env.reset(seed=0)
             action = np.full(env.action_space.shape, 0.25, np.float32)
             env.step(action)

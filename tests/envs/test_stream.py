@@ -2,7 +2,6 @@
 
 import copy
 import functools
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -59,9 +58,9 @@ def both_reset(batch, singles, mask, seed=None):
 @pytest.mark.parametrize("switch", ["episode", "step"])
 def test_a_batch_of_lives_equals_its_singles_in_every_bit(switch, mode):
     spec = stream(switch, observes_phase=switch == "step")
-    batch: Any = SMEStreamVectorEnv(spec, 5, autoreset_mode=mode)
+    batch = SMEStreamVectorEnv(spec, 5, autoreset_mode=mode)
     makers = [functools.partial(SMEStreamEnv, spec)] * 5
-    singles: Any = SyncVectorEnv(makers, autoreset_mode=AutoresetMode(mode))
+    singles = SyncVectorEnv(makers, autoreset_mode=AutoresetMode(mode))
     rng = np.random.default_rng(0)
     apart = 0
     for seed in (3, None):  # the second reset continues the lives

@@ -3,7 +3,6 @@
 import copy
 import functools
 import pickle
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -170,7 +169,7 @@ def test_both_back_ends_step_singles_and_batches_through_the_same_states(monkeyp
     pytest.importorskip("numba")
     for name in ("Default", "HardFragile", "StateDim64", "ActionDim16"):
         for lanes in (0, 37):
-            envs: list[Any] = []
+            envs = []
             for backend in ("numba", "numpy"):
                 monkeypatch.setenv("SME_BACKEND", backend)
                 make = functools.partial(SMEVectorEnv, num_envs=lanes) if lanes else SMEEnv

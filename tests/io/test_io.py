@@ -11,7 +11,6 @@ import pytest
 
 from sme_registry.errors import MalformedDocumentError, OptionError, SpecError
 from sme_registry.io import (
-    Arrays,
     parse_json,
     read_arrays,
     read_json,
@@ -163,7 +162,7 @@ def test_paths_and_texts_that_cannot_be_written_are_refused(tmp_path, name, cont
     assert (tmp_path / "file").read_text() == "old"
 
 
-ARRAYS: Arrays = {"a/b": np.arange(6.0).reshape(2, 3), "text": np.array("{}"), "no": np.zeros(0)}
+ARRAYS = {"a/b": np.arange(6.0).reshape(2, 3), "text": np.array("{}"), "no": np.zeros(0)}
 
 
 def test_arrays_come_back_with_their_types_and_shapes_all_or_some(tmp_path):

@@ -1,9 +1,6 @@
 """Seasons so small that scoring takes a moment."""
 
-from __future__ import annotations
-
 import datetime
-from typing import Any
 
 from leaderboard.documents.entry import Entry, TicketRequest
 from leaderboard.documents.master import Master
@@ -38,7 +35,7 @@ OPENS, CLOSES = moment(-1), moment(1)  # the same in every document of a run
 def tiny_terms(track="sealed-offline", instances=2, **fields):
     """The terms of an open season of one class, with digests of nothing offline."""
     online = track == "sealed-online"
-    member: dict[str, Any] = {"name": "deep", "setting": SETTING, "instances": instances}
+    member = {"name": "deep", "setting": SETTING, "instances": instances}
     member |= {"budget": 64} if online else {"data": {"nu": 0.5, "transitions": 300}}
     published = [
         {"class_name": "deep", "instance": i, "data": NOTHING, "challenge": NOTHING}

@@ -1,7 +1,5 @@
 """Learners on sealed data sets: the same policies as on the same rows with their task."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -43,7 +41,7 @@ def test_the_policy_is_that_of_the_same_rows_with_their_task(dataset, algorithm)
 
 
 def test_the_progress_is_reported_of_all_steps_and_faults_are_named(dataset):
-    calls: list[tuple[int, int]] = []
+    calls = []
     longer = {**SHORT, "steps": 60}
     train_sealed(dataset, algorithm="bc", progress=lambda *done: calls.append(done), **longer)
     assert calls == [(50, 60), (60, 60)]

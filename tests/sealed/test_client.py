@@ -1,7 +1,5 @@
 """Learning in hidden tasks over the network: the numbers of local tasks, and no step is lost."""
 
-from __future__ import annotations
-
 import http.client
 import pickle
 import socket
@@ -35,7 +33,7 @@ WAYS_TO_FAIL = ["lose request", "lose answer", "cut answer", "503", "507"]
 @pytest.fixture
 def waits(monkeypatch):
     """How long the client would have waited between attempts."""
-    waited: list[float] = []
+    waited = []
     monkeypatch.setattr(connection, "_sleep", waited.append)
     return waited
 

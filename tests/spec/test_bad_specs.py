@@ -8,7 +8,7 @@ import pytest
 from sme_registry.errors import SMEError, SpecError
 from sme_registry.spec import EnvFile, EvaluationProtocol, SMESpec, Suite
 
-DEEP: object = []
+DEEP = []
 for _ in range(900):
     DEEP = [DEEP]
 

@@ -13,7 +13,6 @@ import json
 import sys
 import traceback
 from importlib.metadata import distribution
-from typing import Any
 
 # Arguments that reach the optional packages of a command, and are quick where these are installed.
 ARGUMENTS = {
@@ -73,7 +72,7 @@ def run(main, program, arguments):
     """Call an entry point as its script does."""
     sys.argv = [program, *arguments]
     out, err = io.StringIO(), io.StringIO()
-    code: Any = None
+    code = None
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
             main()

@@ -4,8 +4,6 @@ An extra alone is this environment in which an import of any other package fails
 say which commands need which extra, and each extra then runs the commands that asked for it.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -14,7 +12,6 @@ import sys
 import tomllib
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import pytest
 from packaging.requirements import Requirement
@@ -29,7 +26,7 @@ HINT = re.compile(r"pip install .*\[(\w+)\]")
 def closure(extra):
     """The installed distributions that the package with an extra needs."""
     waiting = [(Requirement(f"{NAME}[{extra}]" if extra else NAME), "")]
-    visited: set[tuple[str, str]] = set()
+    visited = set()
     while waiting:
         requirement, chosen = waiting.pop()
         if requirement.marker and not requirement.marker.evaluate({"extra": chosen}):
@@ -81,8 +78,7 @@ def outcomes(extra, folder, commands):
         text=True,
     )
     assert process.returncode == 0, process.stderr
-    result: list[dict[str, Any]] = json.loads(process.stdout)
-    return result
+    return json.loads(process.stdout)
 
 
 def checked(outcome, extra):
@@ -94,7 +90,7 @@ def checked(outcome, extra):
     assert outcome["code"] in (0, 1, 2), context
     if outcome["code"] == 2:
         assert outcome["err"].splitlines()[-1].startswith("error: "), context
-    named: list[str] = HINT.findall(outcome["err"])
+    named = HINT.findall(outcome["err"])
     assert set(named) <= {*EXTRAS} - {extra}, context
     assert ("not installed" in outcome["err"]) == bool(named), context
     return named
@@ -105,14 +101,13 @@ def asked(once):
     """For each extra the commands that asked for it where only the core is installed."""
 
     def core(folder):
-        asked: dict[str, list[str]] = {extra: [] for extra in EXTRAS}
+        asked = {extra: [] for extra in EXTRAS}
         for outcome in outcomes("", folder / "core", []):
             for extra in checked(outcome, ""):
                 asked[extra].append(outcome["command"])
         (folder / "asked.json").write_text(json.dumps(asked))
 
-    result: dict[str, list[str]] = json.loads((once("extras", core) / "asked.json").read_text())
-    return result
+    return json.loads((once("extras", core) / "asked.json").read_text())
 
 
 def test_with_the_core_alone_commands_answer_and_name_their_extras(asked):

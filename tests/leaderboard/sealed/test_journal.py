@@ -1,10 +1,7 @@
 """The journal: whole records, whatever ends its writer."""
 
-from __future__ import annotations
-
 import errno
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -123,8 +120,8 @@ def test_a_full_disk_adds_nothing(tmp_path, monkeypatch, written_before, is_undo
 
 
 def test_what_was_added_is_flushed_to_the_disk_once_and_again_if_that_failed(tmp_path, monkeypatch):
-    folders: list[Path] = []
-    flushed: list[int] = []  # sizes of the file
+    folders = []
+    flushed = []  # sizes of the file
     failing = False
 
     def flush(handle):

@@ -1,7 +1,5 @@
 """Before the reveal nothing that a server writes or answers holds what only the master tells."""
 
-from __future__ import annotations
-
 import logging
 import pickle
 from unittest.mock import Mock
@@ -91,7 +89,7 @@ def everything(url, board, client):
 
 def test_no_answer_file_or_log_holds_a_secret(tmp_path, caplog):
     board = online_board(tmp_path)
-    answered: list[bytes] = []
+    answered = []
 
     def record(answer):
         answered.append(answer.read())

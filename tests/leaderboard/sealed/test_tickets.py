@@ -1,7 +1,5 @@
 """Tickets without a server: what is refused, what survives, and what a restart changes."""
 
-from __future__ import annotations
-
 import datetime
 import errno
 import os
@@ -346,7 +344,7 @@ def test_tickets_that_nobody_played_score_one_without_a_process(played, monkeypa
 def test_a_ticket_takes_nothing_while_it_is_scored_and_what_it_took_is_flushed(played, monkeypatch):
     played.start()
     played.step(1)
-    flushed: list[int] = []
+    flushed = []
     monkeypatch.setattr(os, "fdatasync", fails(errno.EIO))
     played.tickets.sync()  # a disk that fails for a moment ends no server
     monkeypatch.setattr(os, "fdatasync", flushed.append)
@@ -377,8 +375,8 @@ def test_tickets_that_could_not_be_scored_are_tried_again_one_by_one(played, mon
             played.take_ticket(number)
         played.start()
         played.step(1)
-    started: list[list[int]] = []
-    codes: list[bool] = []
+    started = []
+    codes = []
 
     def start(attendant):
         board = played.board

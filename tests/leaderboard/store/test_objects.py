@@ -91,7 +91,7 @@ def test_bytes_count_for_their_uploader_before_and_after_submission(store, key, 
 
 def test_many_threads_upload_the_same_object_once(store):
     data = os.urandom(50_000)
-    new: list[bool] = []
+    new = []
 
     def upload():
         new.append(store.put_object(sha256_of(data), [data], by=KEY))
