@@ -195,10 +195,10 @@ class TestShow:
         text = good("show", "Default").stdout
         assert "limits" not in text
         assert re.search(r"^safety +None$", text, re.M)
-        good("suite", "new", "s.json", "-t", "a.json", "--sweep", "safety.tightness=0.1,0.4")
-        assert re.search(
-            r"safety-tightness-0_4 +safety\.tightness=0\.4 ", good("show", "s.json").stdout
-        )
+        good("new", "c.json", "--safety", '{"tightness": 0.2}')
+        good("suite", "new", "s.json", "-t", "c.json", "--sweep", "safety.tightness=0.1,0.4")
+        text = good("show", "s.json").stdout
+        assert re.search(r"safety-tightness-0_4 +safety\.tightness=0\.4 ", text)
 
     def test_who_owns_and_sees_and_is_paid_for_what_is_a_table(self):
         text = good("show", "TeamBlind4").stdout
