@@ -67,13 +67,19 @@ def once(tmp_path_factory, worker_id):
     shared = base if worker_id == "master" else base.parent
 
     def made(name, make):
-        folder, complete = shared / "once" / name, shared / "once" / f"{name}.complete"
+        folder, error = shared / "once" / name, shared / "once" / f"{name}.error"
         folder.parent.mkdir(exist_ok=True)
         with FileLock(folder.with_name(f"{name}.lock")):
-            if not complete.exists():
+            if not error.exists():
                 folder.mkdir(exist_ok=True)
-                make(folder)
-                complete.touch()
+                error.write_text("it was interrupted")
+                try:
+                    make(folder)
+                except Exception as exception:
+                    error.write_text(str(exception))
+                    raise
+                error.write_text("")
+        assert error.read_text() == ""
         return folder
 
     return made

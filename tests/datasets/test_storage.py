@@ -340,17 +340,13 @@ class TestAWriterThatFails:
         assert open_dataset(NAME, copied).transitions().digest
 
     def test_a_full_disk_gives_one_line_and_leaves_nothing(self, tmp_path):
-        import resource
-
-        def limit():
-            resource.setrlimit(resource.RLIMIT_FSIZE, (60 * 1024, 60 * 1024))
-
         script = (
+            "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (60 * 1024, 60 * 1024)); "
             "from sme_registry.cli import main; import sys; "
             "sys.argv[1:] = ['dataset', 'make', 'Default', '-n', '300', '--out', sys.argv[1]]; "
             "main()"
         )
-        done = run(script, tmp_path, preexec_fn=limit)
+        done = run(script, tmp_path)
         assert done.returncode == 2, done.stderr
         assert "cannot be written: File too large" in done.stderr
         assert "Traceback" not in done.stderr

@@ -95,9 +95,10 @@ def test_steps_need_no_application_and_what_is_refused_is_answered_by_it(tmp_pat
             assert answer_on(connection)[0] == 400
         assert used() == 0
 
-        with pytest.MonkeyPatch.context() as patch, connect(url) as connection:
-            patch.delattr(SeasonRoutes, "place")
-            for number, first in ((1, 0), (2, len(BODY)), (2, 5), (3, 40)):
+        for number, first in ((1, 0), (2, len(BODY)), (2, 5), (3, 40)):
+            with pytest.MonkeyPatch.context() as patch, connect(url) as connection:
+                if first == 0:  # the application may take pieces that arrive late
+                    patch.delattr(SeasonRoutes, "place")
                 data = request(number)
                 connection.sendall(data[: len(data) - first])
                 connection.sendall(data[len(data) - first :])
