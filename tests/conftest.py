@@ -4,6 +4,7 @@ import ctypes
 import gc
 import os
 import signal
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -38,6 +39,14 @@ settings.register_profile(
     "deterministic", derandomize=True, deadline=None, database=None, max_examples=50
 )
 settings.load_profile("deterministic")
+
+
+def pytest_configure(config):
+    """Compile the step once, before the workers and their children would each do it."""
+    if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
+        kernels = "sme_registry.compiled.extension_kernels"
+        # Numba is an extra: no failure where it is missing.
+        subprocess.run([sys.executable, "-c", f"import {kernels}"], check=False)
 
 
 def pytest_collection_modifyitems(items):
