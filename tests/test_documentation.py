@@ -53,7 +53,6 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatc
                 "k=1,5,20": "k=1,20",
                 "-n 16000": "-n 500",
                 "--seeds 5": "--seeds 1",
-                "--folder runs/k": "--folder runs/k --executor in-process",
             },
         ),
         ("offline_data", "torch minari matplotlib", {"20_000": "2_000", "steps=3_000": "steps=50"}),
