@@ -25,11 +25,7 @@ __all__ = ["check_hyperparameters", "check_task", "find", "uneven_rollouts"]
 
 
 def find(uses: str) -> None:
-    """Check that an algorithm of any kind can be found.
-
-    Raises:
-      UnknownNameError, OptionError, MissingDependencyError: see `find_algorithm`.
-    """
+    """Check that an algorithm of any kind can be found."""
     if reference_name(uses) is not None or offline_name(uses) is not None:
         return
     if in_jax(uses):
@@ -47,12 +43,7 @@ def find(uses: str) -> None:
 
 
 def check_hyperparameters(algorithm: StudyAlgorithm) -> None:
-    """Check that an algorithm of a plan has hyperparameters of these names.
-
-    Raises:
-      OptionError, SpecError: it has not; suggests a similar name.
-      UnknownNameError, MissingDependencyError: it cannot be found.
-    """
+    """Check that an algorithm of a plan has hyperparameters of these names."""
     uses, chosen = algorithm.uses, algorithm.hyperparameters
     if not chosen:
         return
@@ -72,12 +63,7 @@ def check_hyperparameters(algorithm: StudyAlgorithm) -> None:
 
 
 def check_task(cell: Cell) -> None:
-    """Check that the algorithm of a cell has such tasks, where that depends on more than a team.
-
-    Raises:
-      SpecError: JAX does not have one of the fields, or agents in JAX cannot live in the stream.
-      OptionError: the algorithm needs a task with limits.
-    """
+    """Check that the algorithm of a cell has such tasks, where that depends on more than a team."""
     check_limits(cell.uses, cell.document)
     if not in_jax(cell.uses):
         return
@@ -99,14 +85,8 @@ def check_task(cell: Cell) -> None:
 class UnevenRollouts(NamedTuple):
     """An on-policy algorithm whose rollouts do not end where phases of streams do.
 
-    The policy at the end of a visit has then learned from fewer steps than a fresh agent, which
-    finishes its last rollout, and that counts as lost plasticity.
-
-    Attributes:
-      algorithm: its name in the plan.
-      n_steps: of a rollout.
-      streams: the names of the classes.
-      better: the longest shorter rollout that ends where the phases of every stream do.
+    Its policy at the end of a visit has learned from fewer steps than a fresh agent's, which counts
+    as lost plasticity; `better` is the longest shorter rollout that ends where all phases do.
     """
 
     algorithm: str

@@ -35,14 +35,7 @@ _SECONDS_BETWEEN_REPORTS = 0.5
 
 
 class Outcome(NamedTuple):
-    """How a cell ended.
-
-    Attributes:
-      entry: its result or failure.
-      model: the .zip of its model, if that is kept.
-      snapshots: of a life in a stream, its models before training and at the ends of visits, if
-        models are kept, by the names of their files (`training.snapshots`).
-    """
+    """How a cell ended, with its model and the snapshots of a life, where these are kept."""
 
     entry: CellResult | CellFailure
     model: bytes | None = None
@@ -57,30 +50,15 @@ class Executor(Protocol):
         """Jobs that can run at once."""
 
     def map(self, jobs: Jobs, progress: ReportProgress) -> Generator[Outcome, None, None]:
-        """Run cells. When the iterator is closed or raises, no cell is left running.
+        """Run jobs; when the iterator is closed or raises, no cell is left running.
 
-        Args:
-          jobs: asked for the next job whenever a worker is free; None means that no job is
-            available now, and it is asked again soon.
-          progress: called with a running job and what it reports; see `Report`.
-
-        Yields:
-          Outcomes, in the order in which cells end.
+        The next job is asked for whenever a worker is free; None means that none is available now.
+        Outcomes come in the order in which cells end.
         """
 
 
 def run_job(run: RunCell, job: Job, keep_models: bool, progress: Report) -> Iterator[Outcome]:
-    """Run a job; an exception becomes the failure of its cells, so that the process goes on.
-
-    Args:
-      run: runs a cell that is no lane of a program.
-      job: to run.
-      keep_models: whether outcomes carry the trained models.
-      progress: see `Report`.
-
-    Yields:
-      Outcomes, one for each cell.
-    """
+    """Run a job; an exception becomes the failure of its cells, so that the process goes on."""
     report, unfinished = _throttled(progress), {cell.digest: cell for cell in job.cells}
     try:
         for outcome in _outcomes(run, job, keep_models, report):
@@ -154,13 +132,7 @@ class InProcess:
 
 
 class ConcurrentExecutor(ABC):
-    """Keeps as many jobs running as there are workers.
-
-    Args:
-      jobs: at once; None for one per core that can be used.
-      run: runs a cell; importable by name.
-      keep_models: whether outcomes carry the trained model.
-    """
+    """Keeps as many jobs running as there are workers."""
 
     def __init__(
         self, jobs: int | None = None, run: RunCell = run_cell, keep_models: bool = False

@@ -75,14 +75,7 @@ class Report(Protocol):
     """What a job calls while it runs."""
 
     def __call__(self, done: int, total: int, compilations: int = 0, note: str = "", /) -> None:
-        """Report how far a job is.
-
-        Args:
-          done: steps done.
-          total: steps in all.
-          compilations: so far; the time of a step is measured where this stays the same.
-          note: to print, if any.
-        """
+        """Report how far a job is."""
 
 
 @contextlib.contextmanager
@@ -108,14 +101,7 @@ def available_cores() -> int:
 
 
 class Programs:
-    """Which cells of a plan share a program, and how many lanes it has.
-
-    Args:
-      cells: all cells of the plan; those that do not use JAX are left out.
-      platform: where they run: "cpu", "gpu" or "tpu".
-      device: the same as it was asked for; None for JAX's default.
-      most_lanes: of a program; None for a number that suits the platform.
-    """
+    """Which cells of a plan share a program, and how many lanes it has."""
 
     def __init__(
         self,
@@ -159,15 +145,7 @@ class Programs:
         return Lanes(count, shape, device, made_with=made_with, processes=processes)
 
     def without_room(self, cells: Iterable[Cell], workers: int) -> dict[str, str]:
-        """Why programs would not fit in memory beside those that run at once.
-
-        Args:
-          cells: that are to run; those that do not use JAX are left out.
-          workers: programs at once, where none has the device to itself.
-
-        Returns:
-          By the digest of a cell of each such program, a reason that says how many lanes fit.
-        """
+        """How many lanes fit in memory, by a cell of each program that would not."""
         groups: dict[Hashable, list[Cell]] = defaultdict(list)
         for cell in cells:
             if in_jax(cell.uses):
@@ -200,11 +178,7 @@ class Programs:
 
 
 def new_program(cells: Sequence[Cell], lanes: Lanes, at_once: int = 1) -> Program:
-    """The program of cells of one group, of which `at_once` are to share the memory.
-
-    Raises:
-      OptionError, MissingDependencyError, SpecError, ResourceLimitError: see `jax.run.new_program`.
-    """
+    """The program of cells of one group, of which `at_once` are to share the memory."""
     from sme_registry.jax.run import new_program
 
     cell = cells[0]
@@ -223,20 +197,12 @@ def new_program(cells: Sequence[Cell], lanes: Lanes, at_once: int = 1) -> Progra
 
 
 def platform_of(device: str | None) -> str:
-    """The platform of a device, or of JAX's default: "cpu", "gpu" or "tpu".
-
-    Raises:
-      OptionError: there is no such device.
-      MissingDependencyError: JAX is not installed.
-    """
+    """The platform of a device, or of JAX's default: "cpu", "gpu" or "tpu"."""
     return _beside_the_gpu(_platform, device)
 
 
 def _beside_the_gpu(function: Callable[..., _Returned], *arguments: Any) -> _Returned:
-    """Call a function of JAX, in a process of its own if there may be a GPU.
-
-    A process that looks for a GPU takes most of its memory.
-    """
+    """Call a function of JAX, in a process of its own where a GPU's memory might be taken."""
     if not importlib.metadata.entry_points(group="jax_plugins"):
         return function(*arguments)
     with multiprocessing.get_context("spawn").Pool(1) as pool:

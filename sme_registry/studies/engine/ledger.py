@@ -46,10 +46,6 @@ class Ledger:
 
     Reading changes nothing: a file that is corrupt or of another cell counts as absent. The holder
     of the cell's lock may `set_aside` such a file, so that two runs cannot move each other's.
-
-    Args:
-      folder: of the study; it need not exist.
-      warn: called with a message for each file that is set aside; by default Python's warnings.
     """
 
     def __init__(
@@ -59,12 +55,7 @@ class Ledger:
         self.warn = warn
 
     def plan_file(self) -> StudyFile | None:
-        """The plan that was run here last; None if there is none yet.
-
-        Raises:
-          OptionError: the folder is a file, cannot be read, or holds files but no study.
-          MalformedDocumentError, SpecError, DigestMismatchError: plan.json is not a valid plan.
-        """
+        """The plan that was run here last; None if there is none yet."""
         try:
             names = set(os.listdir(self.folder))
         except FileNotFoundError:
@@ -128,16 +119,7 @@ class Ledger:
         model: bytes | None = None,
         snapshots: Mapping[str, bytes] = MappingProxyType({}),
     ) -> None:
-        """Write a cell's result or failure, completely or not at all.
-
-        Args:
-          entry: a result, which replaces a failure of the same cell; or a failure.
-          model: the trained model's .zip, to keep with a result.
-          snapshots: further models of a life in a stream, by the names of their files.
-
-        Raises:
-          OptionError: it cannot be written; existing files are unchanged.
-        """
+        """Write a cell's result or failure, completely or not at all."""
         if isinstance(entry, CellFailure):
             write_atomically(self.failure_path(entry.key), to_json(entry.to_dict()))
             return
@@ -163,11 +145,7 @@ class Ledger:
         return self._path(FAILED, key)
 
     def lock(self, key: str) -> Lock | None:
-        """Acquire a cell's lock; None if any process, including this one, holds it already.
-
-        Raises:
-          OptionError: the lock file cannot be created.
-        """
+        """Acquire a cell's lock; None if any process, including this one, holds it already."""
         return file_lock(self.folder / LOCKS / _hex(key))
 
     def is_running(self, key: str) -> bool:
@@ -177,11 +155,7 @@ class Ledger:
     def claim_lock(self) -> Lock | None:
         """A lock to hold while claiming the cells of a program; None if another run claims now.
 
-        Two runs that claim the cells of one program at once would divide them, and both would run
-        it.
-
-        Raises:
-          OptionError: the lock file cannot be created.
+        Two runs that claim at once would divide the cells, and both would run the program.
         """
         return file_lock(self.folder / LOCKS / "programs")
 
@@ -201,11 +175,7 @@ class Ledger:
         return None
 
     def remove_states(self, own: Path) -> None:
-        """Remove the states of which every cell has a result: a retry goes on from the others.
-
-        Args:
-          own: that of a job that has ended, which is also removed if it cannot be read.
-        """
+        """Remove the states of which every cell has a result: a retry goes on from the others."""
         for path in self._states():
             keys = read_header(path).get("cells", [])
             if all(self._path(CELLS, key).exists() for key in keys) and (keys or path == own):
@@ -215,11 +185,7 @@ class Ledger:
         return sorted((self.folder / STATES).glob("*.npz"))
 
     def set_aside(self, key: str) -> None:
-        """Rename a cell's result or failure if it is invalid. The caller must hold the lock.
-
-        Raises:
-          OptionError: it cannot be renamed.
-        """
+        """Rename a cell's result or failure if it is invalid. The caller must hold the lock."""
         kinds: dict[type[Any], Path] = {
             CellResult: self._path(CELLS, key),
             CellFailure: self.failure_path(key),

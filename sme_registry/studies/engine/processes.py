@@ -41,11 +41,7 @@ _ONE_THREAD = {
 
 
 class Processes(ConcurrentExecutor):
-    """A new process (`spawn`) with one thread for each job.
-
-    The cells of a process that is killed have failed. The processes end with this one, however it
-    ends, and ignore Ctrl-C, which this process handles.
-    """
+    """A new process (`spawn`) with one thread for each job."""
 
     @property
     def workers(self) -> int:

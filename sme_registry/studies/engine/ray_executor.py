@@ -37,21 +37,7 @@ _ADDRESSES = "Give 'local', or the host:port of a running cluster of this Ray ve
 
 
 class OnRay(ConcurrentExecutor):
-    """A task on one core of a Ray cluster for each job; one whose node is lost runs again.
-
-    This process keeps the locks and writes the files, so the nodes need no shared file system,
-    only Ray and this package in the same versions. So programs save no states here.
-
-    Args:
-      address: of a running cluster, or "local" to start one here until `map` ends.
-      jobs: at once; None for the cluster's cores, as many as it has at the time.
-      run: runs a cell.
-      keep_models: whether outcomes carry the trained model.
-
-    Raises:
-      OptionError: the cluster cannot be reached.
-      MissingDependencyError: Ray is not installed.
-    """
+    """A task on one core of a Ray cluster for each job; one whose node is lost runs again."""
 
     def __init__(
         self,

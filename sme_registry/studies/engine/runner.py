@@ -55,7 +55,7 @@ def run_study(
     console: Console | None = None,
     run: RunCell = run_cell,
 ) -> StudyStatus:
-    """Run the cells of a plan that have no result in the folder.
+    """Run the cells of a plan that have no result in the folder, and return their state.
 
     Each result is written as soon as its cell ends. If this process ends early, for any reason, the
     same call continues. Cells that another process is running are waited for at the end.
@@ -65,31 +65,17 @@ def run_study(
 
     Args:
       plan_file: the plan; it becomes the folder's, and results of earlier plans stay.
-      folder: of the study; created if it does not exist.
       executor: "processes", one for each cell; "in-process"; "ray"; or an `Executor`.
       jobs: cells or programs at once; None for one per core, of this machine or of the cluster.
       ray: "local", or the address of a Ray cluster.
       retry_failed: also run the cells that failed before.
       keep_models: keep the trained models of the cells that run now. Finished cells without a model
         are reported and not run again.
-      only: `class=GLOB`, `algorithm=GLOB`: the cells to run now; see `scaling.selected`.
+      only: `class=GLOB`, `algorithm=GLOB`: the cells to run now. A cell must match any of the
+        patterns of each kind.
       device: where programs of JAX run, "cpu", "gpu" or "tpu"; None for JAX's default.
       lanes: most lanes of a program; None for a number that suits the device.
-      progress: whether to show progress.
-      console: where to show it; None for standard error.
       run: runs a cell; for processes and Ray importable by name.
-
-    Returns:
-      The state of the selected cells at the end.
-
-    Raises:
-      OptionError: the folder contains other files or cannot be written to, an argument is out of
-        range, there is no such device, or no cell uses one. Finished cells stay.
-      ResourceLimitError: the programs that run at once do not fit in memory; says how many lanes
-        of each do.
-      UnknownNameError: a pattern matches nothing, or an algorithm cannot be found.
-      MissingDependencyError: an algorithm, or Ray, needs a package that is not installed.
-      KeyboardInterrupt: interrupted; says how to continue.
 
     Examples:
       >>> from sme_registry.spec import StudyFile

@@ -30,24 +30,7 @@ def scaled(
     seeds: int | None = None,
     evaluations: int | None = None,
 ) -> StudyFile:
-    """The plan with other budgets; None keeps the plan's.
-
-    Args:
-      file: the plan.
-      steps: of every algorithm that trains, including those with a budget of their own. A life in
-        a stream has the steps of the stream.
-      steps_of: of single algorithms, by name; overrides `steps`.
-      seeds: runs of each algorithm on each class.
-      evaluations: during training.
-
-    Returns:
-      The same file if nothing changes, otherwise one named `<name>-scaled`.
-
-    Raises:
-      UnknownNameError: the plan has no algorithm of a name in `steps_of`.
-      OptionError: steps, where every class is of streams.
-      SpecError: a number is outside its range.
-    """
+    """The plan with other budgets; None keeps the plan's."""
     steps_of = dict(steps_of or {})
     known = [algorithm.name for algorithm in file.plan.algorithms]
     for name in steps_of:
@@ -74,24 +57,7 @@ def scaled(
 
 
 def with_agents(file: StudyFile, agents: str) -> StudyFile:
-    """The plan with other implementations of its algorithms.
-
-    References and offline learners stay, and so do the names: the algorithm PPO of the new plan
-    uses `jax:PPO`.
-
-    Args:
-      file: the plan.
-      agents: "jax" for programs of JAX, "sb3" for Stable-Baselines3.
-
-    Returns:
-      The same file if nothing changes, otherwise one named `<name>-jax` or `<name>-sb3`.
-
-    Raises:
-      OptionError: it is neither.
-      UnknownNameError: JAX does not have an algorithm of the plan.
-      SpecError: JAX does not have a task of the plan, such as a team's.
-      MissingDependencyError: JAX is not installed.
-    """
+    """The plan with other implementations of its algorithms."""
     choice("agents", agents, AGENTS)
     fields = file.plan.to_dict()
     for algorithm in fields["algorithms"]:
@@ -123,17 +89,7 @@ def first_places(cells: Iterable[PlannedCell]) -> dict[str, PlannedCell]:
 
 
 def selected(cells: Iterable[PlannedCell], only: Sequence[str] = ()) -> tuple[PlannedCell, ...]:
-    """The cells that match.
-
-    Args:
-      cells: of a plan.
-      only: patterns `class=GLOB` and `algorithm=GLOB`. A cell must match any of the patterns of
-        each kind that is given. No pattern selects every cell.
-
-    Raises:
-      OptionError: a pattern has another form.
-      UnknownNameError: a pattern matches nothing.
-    """
+    """The cells that match."""
     cells = tuple(cells)
     matching: dict[str, set[str]] = {}  # the names that the patterns of each kind match
     for text in only:

@@ -51,8 +51,6 @@ class StudyStatus:
     """The state of a study.
 
     Attributes:
-      folder: of the study.
-      file: its plan.
       places: the selected cells of the plan, in its order; see `study_status`. Those that any run
         asked for include all that have finished, failed or are running. Streams may share fresh
         agents, which run once and count once, except in `counts`.
@@ -124,10 +122,7 @@ class StudyStatus:
 
 
 def requested(ledger: Ledger, file: StudyFile) -> set[str] | None:
-    """Digests of a plan's cells that any run asked for; None if that is unknown.
-
-    A request whose patterns do not fit the plan counts as absent.
-    """
+    """Digests of a plan's cells that any run asked for; None if that is unknown."""
     digests: set[str] | None = None
     for only in ledger.requests(file):
         with contextlib.suppress(OptionError, UnknownNameError):
@@ -144,15 +139,9 @@ def study_status(
     """The state of the study in a folder. Changes nothing, and may be called while it runs.
 
     Args:
-      folder: of the study.
-      only: `class=GLOB`, `algorithm=GLOB`; see `scaling.selected`. Empty for every cell of the
-        plan; None for those that any run asked for.
-      scale: applied to the folder's plan first, such as a `scaling.scaled` with other budgets.
-
-    Raises:
-      OptionError: the folder contains no study.
-      UnknownNameError: a pattern matches nothing.
-      SpecError: plan.json is not a valid plan.
+      only: `class=GLOB`, `algorithm=GLOB`; empty for every cell of the plan, None for those that
+        any run asked for.
+      scale: applied to the folder's plan first.
 
     Examples:
       >>> from sme_registry.studies import study_status

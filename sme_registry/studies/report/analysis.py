@@ -107,15 +107,7 @@ def analyse(
     requested: Collection[str] | None = None,
     draws: int = statistics.DRAWS,
 ) -> Analysis:
-    """Every table of a study.
-
-    Args:
-      file: the plan.
-      finished: results by the digests of their cells; cells outside the plan are ignored.
-      errors: of failed runs, by the digests of their cells.
-      requested: digests of the cells that count as missing without a result; None for all.
-      draws: bootstrap samples of each interval.
-    """
+    """Every table of a study."""
     plan = file.plan
     results, curves = frames.study_frames(plan, finished)
     runs = frames.runs(results)

@@ -77,10 +77,7 @@ def class_infos(plan: StudyPlan) -> dict[str, ClassInfo]:
 def groups(
     classes: Mapping[str, ClassInfo], algorithms: Sequence[str], done: Collection[tuple[str, str]]
 ) -> tuple[Group, ...]:
-    """All classes, then for each axis its classes together with the first one.
-
-    `done` are the (class, algorithm) pairs with a finished run. There is no group without a class.
-    """
+    """All classes, then for each axis its classes together with the first one."""
     if not classes:
         return ()
     first, *others = classes.values()

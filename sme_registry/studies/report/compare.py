@@ -43,8 +43,6 @@ def compare(
 
     Args:
       study: the frames of `load`, or the study's folder.
-      first: an algorithm's name in the plan.
-      second: another one.
       metrics: of "wd_regret", "ood_regret", "ood_decay", "final_return", "online_regret"; where
         tasks have safety "wd_cost", "wd_safe_regret", "online_cost"; where they have distractors
         "distractor_regret", "wd_invariance".
@@ -56,11 +54,6 @@ def compare(
       different ones among the pairs; enough_pairs; and the verdict on the first algorithm: better,
       worse, open, or indication: the interval excludes 0 but rests on fewer than 5 pairs.
       `sme_registry.statistics` has the formulas.
-
-    Raises:
-      UnknownNameError: the study has no finished run of such an algorithm, or no such metric.
-      OptionError: both are the same, no class has a pair, or the folder holds no study, or one of
-        streams alone.
 
     Examples:
       >>> from sme_registry import studies
@@ -110,21 +103,10 @@ def write_comparison(
     second: str,
     metrics: Sequence[str] = DEFAULT_METRICS,
 ) -> list[Path]:
-    """Write a comparison as CSV, JSON and LaTeX, and its figures as PNG and PDF.
+    """Write a comparison into the folder `out`, and return the files.
 
-    Args:
-      folder: of the study.
-      out: the folder to write.
-      first, second, metrics: see `compare`.
-
-    Returns:
-      The files: differences.csv and .json; a .tex for each metric, which is a complete table with
-      its own caption and label; and the figures `differences`
-      and `learning-curves-by-class`.
-
-    Raises:
-      MissingDependencyError: Matplotlib is not installed.
-      UnknownNameError, OptionError: see `compare`; or a file cannot be written.
+    They are differences.csv and .json, a .tex for each metric, and the figures `differences` and
+    `learning-curves-by-class` as PNG and PDF.
 
     Examples:
       >>> from sme_registry import studies

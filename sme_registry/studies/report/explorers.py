@@ -19,13 +19,7 @@ _DIGITS = 16  # of a cell's key, in the name of its page
 
 
 class Explorer(NamedTuple):
-    """A page of one run.
-
-    Attributes:
-      label: the run, as the report names it.
-      path: in the report's folder.
-      content: HTML.
-    """
+    """A page of one run."""
 
     label: str
     path: str
@@ -33,10 +27,7 @@ class Explorer(NamedTuple):
 
 
 def explorers_of(ledger: Ledger, file: StudyFile, models: Mapping[str, Path]) -> list[Explorer]:
-    """A page for each run on a single task whose model was kept, in the plan's order.
-
-    Runs that a page cannot show, such as of tasks that are too large, have none.
-    """
+    """A page for each run on a single task whose model was kept, in the plan's order."""
     pages: dict[str, Explorer] = {}
     for planned in file.plan.cells:
         key = planned.cell.digest

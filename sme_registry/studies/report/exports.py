@@ -164,10 +164,7 @@ def _differences(analysis: Analysis, metric: Metric) -> TextTable:
 
 
 def difference_table(rows: pd.DataFrame, metric: Metric, *, levels: bool = False) -> TextTable:
-    """Paired differences of one metric: classes down, pairs of algorithms across.
-
-    With `levels`, of a single pair, the levels of both algorithms are columns as well.
-    """
+    """Paired differences of one metric: classes down, pairs of algorithms across."""
     rows = rows.assign(pair=rows["first"] + " − " + rows["second"])
     pairs = list(dict.fromkeys(rows.pair))
     between = pairs[0] if len(pairs) == 1 else f"{''.join(rows['first'][:1])} minus each other"

@@ -56,11 +56,7 @@ Position = Literal[
 
 
 class Contrast(StrictModel):
-    """The change of normalised regret from the first class to another; a row of `contrasts`.
-
-    The change is the IQM of the differences between runs of equal number, with its 95 % interval
-    (None for a single pair of runs).
-    """
+    """The change of normalised regret from the first class to another; a row of `contrasts`."""
 
     class_name: str
     axis: str  # the field in which the classes differ; `SEVERAL`; or ""
@@ -83,10 +79,7 @@ class OutOfDistribution(StrictModel):
 
 
 class AlgorithmFinding(StrictModel):
-    """Which property of the task breaks an algorithm.
-
-    Lists of contrasts hold one an axis, its largest; the largest of them is first.
-    """
+    """Which property of the task breaks an algorithm."""
 
     algorithm: str
     # By the largest change for the worse; "none_shown" if there is none, and "no_contrasts" if no

@@ -114,12 +114,7 @@ _LONGEST_WINDOW = 10
 
 
 class StudyFrames(NamedTuple):
-    """A study's finished runs; the module's docstring lists the columns.
-
-    Attributes:
-      results: one row per run and region.
-      curves: one row per run and evaluation during training.
-    """
+    """A study's finished runs; the module's docstring lists the columns."""
 
     results: pd.DataFrame
     curves: pd.DataFrame
@@ -134,18 +129,7 @@ class StudyFrames(NamedTuple):
 
 
 def load(folder: str | os.PathLike[str]) -> StudyFrames:
-    """Load the finished runs of a study.
-
-    Args:
-      folder: the study's folder.
-
-    Returns:
-      The frames; without rows if no run of the plan has finished.
-
-    Raises:
-      OptionError: the folder holds no study.
-      MalformedDocumentError, SpecError, DigestMismatchError: its plan is invalid.
-      MissingDependencyError: pandas is not installed.
+    """Load the finished runs of a study; frames without rows if there are none.
 
     Examples:
       >>> from sme_registry import studies

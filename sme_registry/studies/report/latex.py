@@ -32,15 +32,7 @@ _RUN = 8  # characters of a word that TeX may not break by itself
 def latex_table(
     frame: pd.DataFrame, *, names: int, caption: str, label: str, width: float = COLUMN_WIDTH
 ) -> str:
-    """A table as LaTeX, in one or more floats; ASCII only.
-
-    Args:
-      frame: of text; its first columns name the rows.
-      names: how many columns do.
-      caption: of the table, as plain text.
-      label: of the first float; the k-th further one is `label-k`.
-      width: of the column that it must fit, in points.
-    """
+    """A table as LaTeX, in one or more floats; ASCII only."""
     room = width - _across_width(frame, names)
     longest = max(text_width(", ".join(row[:names])) for row in _rows(frame))
     fits = room >= min(longest, _NAMES_WIDTH)

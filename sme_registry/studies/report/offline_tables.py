@@ -78,11 +78,7 @@ def offline(runs: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
 
 
 def offline_verdict(improvements: Array, low: float, high: float) -> str:
-    """Whether a learner surpasses its data, from the improvements of its runs.
-
-    `above` or `below` if `ENOUGH_RUNS` runs have an interval that excludes 0; `above_few` or
-    `below_few` if all of fewer runs, but more than one, are on one side; otherwise `open`.
-    """
+    """Whether a learner surpasses its data, from the improvements of its runs."""
     if len(improvements) >= ENOUGH_RUNS:
         return "above" if low > 0.0 else "below" if high < 0.0 else "open"
     if len(improvements) > 1 and improvements.min() > 0.0:

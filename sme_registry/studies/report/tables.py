@@ -127,10 +127,7 @@ def missing(
     errors: Mapping[str, str],
     requested: Collection[str] | None = None,
 ) -> pd.DataFrame:
-    """The requested runs that have not finished, in the plan's order; None for all runs.
-
-    Keys of `errors`, and `requested`, are the cells' digests.
-    """
+    """The requested runs that have not finished, in the plan's order; None for all runs."""
     done = set(runs.key)
     rows = [
         (cell.class_name, cell.algorithm, cell.run, errors.get(cell.cell.digest, ""))
@@ -219,10 +216,7 @@ def contrasts(
     bootstrap: Bootstrap,
     metrics: Sequence[Metric] | None = None,
 ) -> pd.DataFrame:
-    """What each class changes compared with the plan's first one, between runs of equal number.
-
-    `axes` has the axis of every class, by name; None for all metrics of the runs.
-    """
+    """What each class changes compared with the plan's first one, between runs of equal number."""
     metrics = metrics_of(runs) if metrics is None else metrics
     first = next(iter(axes), "")
     keys = [metric.key for metric in metrics]
@@ -254,12 +248,7 @@ def differences(
     draws: int = statistics.DRAWS,
     instance: str = "spec_digest",
 ) -> pd.DataFrame:
-    """How the first algorithm of each pair differs from the second, on each class and on all.
-
-    Two runs of equal number on a class have the same instance and seed, and form a pair. The
-    intervals depend only on the runs and the names, and those of B − A mirror those of A − B.
-    `instance` is the column that says on which instance a run is; None for all metrics of the runs.
-    """
+    """How the first algorithm of each pair differs from the second, on each class and on all."""
     metrics = metrics_of(runs) if metrics is None else metrics
     rows = []
     for (first, second), metric in itertools.product(pairs, metrics):
@@ -292,10 +281,7 @@ def differences(
 def _paired(
     runs: pd.DataFrame, first: str, second: str, metric: str, instance: str
 ) -> dict[str, tuple[Array, int]]:
-    """By class, `[n, 2]` values of both algorithms in runs on the same instance with one seed.
-
-    Next to them the number of different instances.
-    """
+    """By class, `[n, 2]` values of both algorithms in runs on the same instance with one seed."""
     on = ["class_name", instance, "seed"]
     left, right = (runs.loc[runs.algorithm == name, [*on, metric]] for name in (first, second))
     both = left.merge(right, on=on, suffixes=("_1", "_2")).dropna()
@@ -395,10 +381,7 @@ def improvements(
 def learning_curves(
     curves: pd.DataFrame, runs: pd.DataFrame, window: Callable[[int], int] = window
 ) -> pd.DataFrame:
-    """Median and quartiles over runs, then the running median over a window of evaluations.
-
-    `window` is the number of evaluations in it, by their number in the shortest run.
-    """
+    """Median and quartiles over runs, then the running median over a window of evaluations."""
     horizons = runs.groupby("class_name").horizon.first()
     columns = f"{_PLACE} measure:str step:int64 median q25 q75 runs:int64 window:int64"
     tables = [frame([], columns)]

@@ -18,10 +18,7 @@ ABSENT = "–"
 
 @dataclass(frozen=True, eq=False)
 class TextTable:
-    """A table for people, with the name of its files, a title, and a note on how to read it.
-
-    All columns of its frame are text; the first `names` of them name the rows.
-    """
+    """A table for people, with the name of its files, a title, and a note on how to read it."""
 
     name: str
     title: str
@@ -45,10 +42,7 @@ def wide(
     entry: Callable[[Any], str],
     order: Sequence[str] = (),
 ) -> pd.DataFrame:
-    """A long table as text: a column for each value of `across`, in the order of the rows.
-
-    `index` has the columns that name the rows, and their headings; `order` is of the new columns.
-    """
+    """A long table as text: a column for each value of `across`, in the order of the rows."""
     lines: dict[tuple[Any, ...], dict[str, str]] = {}
     for row in rows.itertuples():
         place = tuple(getattr(row, name) for name in index)

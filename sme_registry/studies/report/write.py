@@ -41,25 +41,15 @@ def write_report(
     *,
     explorers: bool = False,
 ) -> list[Path]:
-    """Write the report of a study's finished runs.
+    """Write the report of a study's finished runs, and return its files, the page first.
 
     The maps of the plane and the explorers need the models that the study kept, and loading a model
     can run code of its author. All other files of the folder are read as data.
 
     Args:
-      folder: of the study.
       out: the folder to write; None for FOLDER/report.
-      formats: of `FORMATS`.
+      formats: of "html", "png", "pdf", "csv" and "latex".
       explorers: whether to write an explorer of each kept model, to which the page links.
-
-    Returns:
-      The files written, the page first.
-
-    Raises:
-      OptionError: a format is unknown, the folder holds no study, no run has finished, or the
-        report cannot be written.
-      SpecError: the folder's plan is invalid.
-      MissingDependencyError: Matplotlib is not installed.
 
     Examples:
       >>> from sme_registry import studies

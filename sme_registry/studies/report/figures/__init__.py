@@ -31,19 +31,7 @@ _REASONS = {
 def draw_figures(
     analysis: Analysis, formats: Sequence[str], models: Mapping[str, Path]
 ) -> tuple[list[Picture], list[str]]:
-    """Draw every figure that the finished runs allow.
-
-    Args:
-      analysis: the tables, of at least one run.
-      formats: of `plots.style.FORMATS`.
-      models: paths of kept models by the digests of their cells. They are loaded.
-
-    Returns:
-      The figures, and a sentence for each that cannot be drawn.
-
-    Raises:
-      MissingDependencyError: Matplotlib is not installed.
-    """
+    """Draw every figure that the finished runs allow."""
     pictures, reasons = _draw_tasks(analysis, formats, models) if analysis.algorithms else ([], [])
     return [*pictures, *streams.draw_streams(analysis, formats)], reasons
 

@@ -35,15 +35,7 @@ HEADINGS = {"wd_regret": "within distribution (WD)", "ood_regret": "out of distr
 
 @dataclass(frozen=True)
 class Picture:
-    """A drawn figure.
-
-    Attributes:
-      name: of its files.
-      title: what it shows, in a few words.
-      caption: how to read it.
-      files: its bytes, by format.
-      is_map: whether its colours are a scale, which a dark page must not invert.
-    """
+    """A drawn figure."""
 
     name: str
     title: str
@@ -75,14 +67,7 @@ CONSTANT = Look(GREY, "", REFERENCE_DASHES["constant_half"])
 
 
 class Grid(NamedTuple):
-    """Panels in reading order.
-
-    Attributes:
-      figure: the figure that they are in.
-      files: the figure in each format, once it is finished.
-      stacks: `[panel, row]`: a panel is a stack of axes, mostly of one.
-      across: panels in a row of the grid.
-    """
+    """Panels in reading order."""
 
     figure: Figure
     files: dict[str, bytes]
@@ -118,11 +103,7 @@ def panel_grid(
     stack: int = 1,
     share_x: bool = False,
 ) -> Iterator[Grid]:
-    """A figure of panels with a common y axis; its files are complete after the block.
-
-    `heights` are those of all but the panels and of each row of panels, in inches like `width`.
-    A panel is a `stack` of axes that share x, and y with the same row of other panels.
-    """
+    """A figure of panels with a common y axis; its files are complete after the block."""
     across = min(most_across, panels)
     down = math.ceil(panels / across)
     with drawing((width, heights[0] + down * heights[1]), formats) as (figure, files):
@@ -201,10 +182,7 @@ def marks(
     upright: bool = False,
     joined: bool = False,
 ) -> None:
-    """The column `value` along x, or y if `upright`, with its intervals from `low` to `high`.
-
-    `at` has the place of each row on the other axis; `low` is NaN where there is no interval.
-    """
+    """The column `value` along x, or y if `upright`, with its intervals from `low` to `high`."""
     if joined:
         axes.plot(at, rows[value], color=look.colour, linewidth=1.1, linestyle=look.dash, alpha=0.7)
     style = look.points | {"markersize": 4.5, "markeredgewidth": 1.1, "zorder": 3}

@@ -29,12 +29,7 @@ def spacing(values: Sequence[Any]) -> Spacing:
 
 @dataclass(frozen=True)
 class Scale:
-    """The places of classes along x.
-
-    Attributes:
-      spacing: of the values.
-      at: the place of each class: its value, or its number from 0 on a nominal scale.
-    """
+    """The places of classes along x."""
 
     spacing: Spacing
     at: tuple[float, ...]

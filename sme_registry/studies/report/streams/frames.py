@@ -92,14 +92,7 @@ _RETENTION = f"{RUN_COLUMNS} region:str visit:Int64 phase:int64 normalised_regre
 
 
 class StreamFrames(NamedTuple):
-    """A study's finished lives in streams; the module's docstring lists the columns.
-
-    Attributes:
-      lives: one row per life and region.
-      visits: one row per life, visit and region.
-      retention: one row per life, region, visit and phase.
-      curves: one row per life and evaluation during training.
-    """
+    """A study's finished lives in streams; the module's docstring lists the columns."""
 
     lives: pd.DataFrame
     visits: pd.DataFrame
@@ -108,14 +101,7 @@ class StreamFrames(NamedTuple):
 
 
 class Life(NamedTuple):
-    """A finished life.
-
-    Attributes:
-      planned: its place in the plan.
-      result: its result.
-      report: what it retains, with its fresh agents if all of them have finished.
-      fresh_agents: how many of them have.
-    """
+    """A finished life."""
 
     planned: PlannedCell
     result: CellResult
@@ -124,18 +110,7 @@ class Life(NamedTuple):
 
 
 def load_streams(folder: str | os.PathLike[str]) -> StreamFrames:
-    """Load the finished lives of a study with streams.
-
-    Args:
-      folder: the study's folder.
-
-    Returns:
-      The frames; without rows if no life has finished.
-
-    Raises:
-      OptionError: the folder holds no study.
-      MalformedDocumentError, SpecError, DigestMismatchError: its plan is invalid.
-      MissingDependencyError: pandas is not installed.
+    """Load the finished lives of a study with streams; frames without rows if there are none.
 
     Examples:
       >>> from sme_registry import studies

@@ -80,13 +80,7 @@ Costs = Mapping[tuple[str, str], Sequence[DynamicRegret]]
 
 @dataclass(frozen=True)
 class StreamInfo:
-    """A class of streams of the plan.
-
-    Attributes:
-      name: in the plan.
-      stream: its first draw.
-      axis: what differs from the plan's first stream: "" for itself, `TASKS` or `SCHEDULE`.
-    """
+    """A class of streams of the plan."""
 
     name: str
     stream: StreamSpec
