@@ -68,13 +68,6 @@ def export_onnx(
       The path: opset 17, weights inside, any batch size. A `UserWarning` names the operators
       that boards do not accept, if the file has any.
 
-    Raises:
-      UnknownNameError, SpecError: no such task, or a field out of range.
-      PolicyError: the policy is none of these, has another interface, or cannot be exported; or
-        the file's actions differ from its own by more than 1e-6 beyond float32 rounding.
-      OptionError: `action_range` is invalid, or the file cannot be written.
-      MissingDependencyError: onnx, ONNX Runtime or the policy's library is not installed.
-
     Examples:
       >>> from sme_registry.evaluation import Perceptron
       >>> policy = Perceptron([(np.zeros((10, 4)), np.full(4, 0.5), "identity")])
@@ -187,15 +180,7 @@ def _loaded(policy: Any) -> Any:
 
 
 def _finished(data: bytes, observation_dim: int, form: str) -> bytes:
-    """The model with the range of its actions in its metadata, and unused nodes removed.
-
-    Args:
-      data: the model.
-      observation_dim: the width of its input.
-      form: "as written"; "folded", with sizes as numbers (`fold_shapes`); or "broadcast",
-        also without equal rows and the operator `Expand`, of a distribution's parameters for
-        example. Operators that work entry by entry broadcast in any case.
-    """
+    """The model with its action range as metadata, no unused nodes, and shapes by `form`."""
     import onnx
 
     model = onnx.load_model_from_string(data)
@@ -226,10 +211,7 @@ def _refused_by_boards(data: bytes) -> list[str]:
 
 
 def _refuse_difference(data: bytes, network: Network) -> None:
-    """Raise if the file's actions differ from the policy's, inside or outside the cube.
-
-    The second half of the observations covers the OOD shells up to ε = 1, [−½, 3/2].
-    """
+    """Raise if the file's actions differ from the policy's, inside or outside the cube."""
     random = np.random.default_rng(0)
     inside = random.random((_CHECKED_ROWS, network.observation_dim), dtype=np.float32)
     observations = np.concatenate([inside, 2.0 * inside[::-1] - np.float32(0.5)])

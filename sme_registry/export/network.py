@@ -12,13 +12,7 @@ INPUT, OUTPUT = "observations", "actions"
 
 
 class Network(NamedTuple):
-    """A policy that can be written as ONNX.
-
-    Attributes:
-      observation_dim: entries of an observation.
-      act: the policy's own actions `[B, A]` in the unit range, before they are clipped.
-      to_onnx: writes the model, which clips them.
-    """
+    """A policy that can be written as ONNX."""
 
     observation_dim: int
     act: Callable[[Observation], Any]

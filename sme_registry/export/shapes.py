@@ -20,16 +20,7 @@ _SIZES = "Shape", "Size"  # of their input they read the shape alone
 
 
 def fold_shapes(model: Any, observation_dim: int, *, broadcast: bool) -> None:
-    """Replace what is computed from shapes alone, in place.
-
-    A `Reshape` to a size that depends on the batch gets −1 there.
-
-    Args:
-      model: the model.
-      observation_dim: the width of its input.
-      broadcast: replace rows that are alike, such as `torch.ones(x.shape[0], 4)`, by one row.
-        Operators that work entry by entry broadcast it, and others, such as Concat, do not.
-    """
+    """Replace what is computed from shapes alone, in place."""
     import onnx
 
     nodes = list(model.graph.node)

@@ -26,11 +26,7 @@ _OTHER_LIBRARIES = "Give networks of other libraries, and linear maps, as a `Per
 
 
 def network(policy: Any, interface: Interface, symmetric: bool) -> Network:
-    """A module or function from observations to actions in [−1, 1] if `symmetric`, else [0, 1].
-
-    Raises:
-      PolicyError: it fails on tensors, or does not return actions `[B, A]` as one tensor.
-    """
+    """A module or function from observations to actions in [−1, 1] if `symmetric`, else [0, 1]."""
     require_packages("exporting a function", {"torch": "PyTorch"}, "train")
     module = _unit_policy(policy, symmetric)
     _refuse_output(policy, module, interface)

@@ -14,15 +14,7 @@ from sme_registry.spec import SMESpec
 
 
 def spec_with_limits(algorithm: str, env: Any) -> SMESpec:
-    """The spec of an environment's task, which must have `safety`.
-
-    Args:
-      algorithm: its name in the error's message.
-      env: a `VecEnv` of this package's environments, wrapped or not.
-
-    Raises:
-      OptionError: the task has no limits, or the environment is not one of this package.
-    """
+    """The spec of an environment's task, which must have `safety`."""
     try:
         spec: SMESpec = env.get_attr("sme_spec")[0]
     except AttributeError:
@@ -34,11 +26,7 @@ def spec_with_limits(algorithm: str, env: Any) -> SMESpec:
 
 
 def costs_in(infos: Sequence[dict[str, Any]]) -> npt.NDArray[np.float32]:
-    """The cost of a step in each lane, `[lanes]`, from its infos.
-
-    Raises:
-      OptionError: the infos have none.
-    """
+    """The cost of a step in each lane, `[lanes]`, from its infos."""
     try:
         return np.array([info["cost"] for info in infos], np.float32)
     except KeyError:

@@ -43,10 +43,6 @@ class PPOLagrangian(PPO):  # type: ignore[misc, unused-ignore]  # an untyped cla
       multiplier_learning_rate: η, at least 0; 0 keeps the multiplier.
       **settings: those of PPO.
 
-    Raises:
-      OptionError: the task has no `safety`, or an argument is out of range; in training, if the
-        environment's infos have no cost.
-
     Attributes:
       multiplier: the present λ.
 
@@ -135,10 +131,7 @@ class PPOLagrangian(PPO):  # type: ignore[misc, unused-ignore]  # an untyped cla
         self.logger.record("train/multiplier", self.multiplier)
 
     def _cost_advantages(self, costs: _Array, observations: Any) -> tuple[_Array, _Array]:
-        """Advantages and returns of costs, `[steps, lanes]` each, as PPO computes those of rewards.
-
-        An episode that was truncated is continued by the critic.
-        """
+        """Advantages and returns of costs, `[steps, lanes]` each; the critic continues cut ones."""
         steps, lanes = costs.shape
         for step, lane, observation in self._cut:
             costs[step, lane] += self.gamma * self._cost_values(observation[None])[0]

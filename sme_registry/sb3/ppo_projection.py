@@ -34,12 +34,7 @@ _MARGIN = 1e-5
 
 
 class Projection:
-    """The projection of actions onto a task's limits.
-
-    Args:
-      spec: the task; with `safety`, and states that the observation shows as they are.
-      low: the lowest action of the environment, 0 or −1; the highest is 1.
-    """
+    """The projection of actions onto a task's limits."""
 
     def __init__(self, spec: SMESpec, low: float) -> None:
         self._task, self._low = materialize(spec), low
@@ -52,13 +47,7 @@ class Projection:
 
 
 class ProjectedPolicy(ActorCriticPolicy):  # type: ignore[misc, unused-ignore]  # untyped without SB3
-    """PPO's policy, whose actions are projected where it acts; see the module.
-
-    Args:
-      *args: as in `ActorCriticPolicy`.
-      _limits_of: the spec of the task, as JSON.
-      **kwargs: as in `ActorCriticPolicy`.
-    """
+    """PPO's policy, whose actions are projected where it acts; see the module."""
 
     def __init__(self, *args: Any, _limits_of: dict[str, Any], **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -72,12 +61,7 @@ class ProjectedPolicy(ActorCriticPolicy):  # type: ignore[misc, unused-ignore]  
 
 
 class ProjectedVecEnv(VecEnvWrapper):  # type: ignore[misc, unused-ignore]  # untyped without SB3
-    """Environments that execute projected actions, so that PPO learns from the actions it samples.
-
-    Args:
-      venv: environments of this package.
-      spec: of their task.
-    """
+    """Environments that execute projected actions; PPO learns from the actions it samples."""
 
     def __init__(self, venv: Any, spec: SMESpec) -> None:
         super().__init__(venv)
@@ -104,10 +88,6 @@ class PPOProjection(PPO):  # type: ignore[misc, unused-ignore]  # an untyped cla
     """PPO with actions projected onto the limits, for tasks with `safety`; see the module.
 
     Arguments are those of PPO.
-
-    Raises:
-      OptionError: the task has no `safety`, or its observations mix the state; the environment is
-        wrapped such that observations do not begin with the state; in `set_env`, another task.
 
     Examples:
       >>> from sme_registry.sb3 import PPOProjection, SMEVecEnv

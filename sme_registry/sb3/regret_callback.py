@@ -84,9 +84,6 @@ class EpisodeSums:
           rewards: `[lanes]`.
           dones: `[lanes]`, whether an episode ended.
           infos: of each lane, as a `VecEnv` returns them.
-
-        Raises:
-          OptionError: the infos are not those of our environments.
         """
         try:
             self._sums[2] += [info["regret"] for info in infos]

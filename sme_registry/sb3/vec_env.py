@@ -110,14 +110,7 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped cl
 
 
 class _Start(NamedTuple):
-    """How an episode begins; None for the lane's own.
-
-    Attributes:
-      seed: of its team.
-      state: `[1, S]` the initial state.
-      distractors: `[1, m]` those at the start.
-      lifetime: of a stream.
-    """
+    """How an episode begins; None for the lane's own."""
 
     seed: int | None
     state: Array | None
@@ -138,11 +131,7 @@ class _SingleLane(Lane):
 
 
 class _BatchVecEnv(LanesVecEnv):
-    """Every agent of every team of a `Batch` is a lane; a single agent is a team of one.
-
-    Lane e·n + i is agent i of team e. This class leaves joint observations and actions as they are,
-    which suits a single agent.
-    """
+    """Every agent of every team of a `Batch` is a lane; a single agent is a team of one."""
 
     _lane_type = Lane
 
@@ -198,11 +187,7 @@ class _BatchVecEnv(LanesVecEnv):
         return cards.html(self, *spaces, autoreset=AutoresetMode.SAME_STEP.value)
 
     def get_images(self) -> list[Frame]:
-        """The frames of the chosen lanes or teams, each `[H, W, 3]` uint8; `render` tiles them.
-
-        Raises:
-          EpisodeError: before the first reset.
-        """
+        """The frames of the chosen lanes or teams, each `[H, W, 3]` uint8; `render` tiles them."""
         return [] if self._renderer is None else [*self._renderer.frames()]
 
     def _allocate(self) -> None:
@@ -231,24 +216,13 @@ class _BatchVecEnv(LanesVecEnv):
         return {**infos.at_reset(self._task.spec, owned.stop - owned.start), **life}
 
     def seed(self, seed: int | None = None) -> list[int | None]:
-        """Seed team e with seed + e at the next reset; None draws a seed.
-
-        Returns:
-          The seed of each lane, its team's.
-        """
+        """Seed team e with seed + e at the next reset; None draws a seed."""
         first = list(super().seed(seed))
         self._seeds = [first[lane // len(self.agents)] for lane in range(self.num_envs)]
         return self._seeds
 
     def reset(self) -> Observation:
-        """Begin an episode in every lane, with the seeds and options set before.
-
-        Returns:
-          Observations, a row for each lane, float32.
-
-        Raises:
-          StateError, OptionError: the options of `set_options` are invalid.
-        """
+        """Begin an episode in every lane, with the seeds and options set before."""
         n = len(self.agents)
         options = [self._options[team * n : (team + 1) * n] for team in range(self.num_teams)]
         starts = [*map(self._start, self._seeds[::n], options)]
@@ -290,15 +264,7 @@ class _BatchVecEnv(LanesVecEnv):
         return _Start(arguments.checked_seed(seed), state, distractors, lifetime)
 
     def step_wait(self) -> StepResult:
-        """One step of every lane.
-
-        Returns:
-          Observations and rewards, float32, and dones, each with a row for each lane; infos.
-
-        Raises:
-          ActionError: wrong shape, not numbers, or not finite; no state has changed then.
-          EpisodeError: before the first reset.
-        """
+        """One step of every lane."""
         actions = self._take_actions()
         if not self._begun.all():
             raise EpisodeError("step: the episodes have not begun. Call reset() first.")
@@ -359,9 +325,6 @@ class SMEVecEnv(_BatchVecEnv):
       render_lanes: the lanes to draw, such as `[0, 1]`; None draws each of them.
       **overrides: spec fields to change.
 
-    Raises:
-      SpecError, UnknownNameError, ResourceLimitError, OptionError: see `SMEVectorEnv`.
-
     Examples:
       >>> from sme_registry.sb3 import SMEVecEnv
       >>> env = SMEVecEnv("Default", num_envs=4)
@@ -413,9 +376,6 @@ class SMETeamVecEnv(_BatchVecEnv):
       render_mode: None or "rgb_array", for `VecVideoRecorder`.
       render_lanes: the teams to draw, such as `[0, 1]`; None draws each of them.
       **overrides: spec fields to change.
-
-    Raises:
-      SpecError, UnknownNameError, ResourceLimitError, OptionError: see `SMETeamEnv`.
 
     Examples:
       >>> from sme_registry.sb3 import SMETeamVecEnv

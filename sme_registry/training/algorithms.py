@@ -69,10 +69,7 @@ def is_on_policy(algorithm: Any) -> bool:
 
 
 def check_limits(uses: str, document: SMESpec | StreamSpec) -> None:
-    """Raise OptionError if an algorithm of `WITH_LIMITS` is to train on a task without `safety`.
-
-    Imports neither Stable-Baselines3 nor PyTorch.
-    """
+    """Raise OptionError if an algorithm of `WITH_LIMITS` is to train on a task without `safety`."""
     spec = document if isinstance(document, SMESpec) else document.phases[0].spec
     for name in WITH_LIMITS:
         if uses.removeprefix(INDEPENDENT).casefold() == name.casefold():
@@ -89,9 +86,6 @@ def full_name(uses: str, agents: str | None = None) -> str:
     Args:
       uses: the name.
       agents: whose implementation, one of `AGENTS`; None for the one that the name says.
-
-    Raises:
-      OptionError: `agents` is none of them, or "sb3" for a name in JAX.
 
     Examples:
       >>> from sme_registry.training import full_name
@@ -136,9 +130,6 @@ def folder_name(uses: str) -> str:
 def known_algorithm(name: str, algorithms: Collection[str] = tuple(ALGORITHMS)) -> str:
     """The exact name of an algorithm, whose case does not matter.
 
-    Raises:
-      UnknownNameError: no such algorithm; lists all, and suggests a similar one.
-
     Examples:
       >>> from sme_registry.training import known_algorithm
       >>> known_algorithm("td3")
@@ -154,11 +145,7 @@ def known_algorithm(name: str, algorithms: Collection[str] = tuple(ALGORITHMS)) 
 
 
 def require_sb3() -> None:
-    """Check that Stable-Baselines3 and PyTorch are installed; imports neither.
-
-    Raises:
-      MissingDependencyError: names the extra to install.
-    """
+    """Check that Stable-Baselines3 and PyTorch are installed; imports neither."""
     require_packages(
         "training", {"stable_baselines3": "Stable-Baselines3", "torch": "PyTorch"}, "train"
     )
@@ -174,18 +161,7 @@ def load_algorithm(name: str) -> Any:
 
 
 def find_algorithm(uses: str, field: str = "uses", others: Iterable[str] = ()) -> Any:
-    """The class or function that `uses` names.
-
-    Args:
-      uses: its name; see the module.
-      field: what error messages call the name.
-      others: further names that the caller knows, which error messages list.
-
-    Raises:
-      UnknownNameError: nothing has this name; the message suggests similar ones.
-      OptionError: a module or entry point cannot be imported or called.
-      MissingDependencyError: Stable-Baselines3 or PyTorch is not installed.
-    """
+    """The class or function that `uses` names."""
     require_sb3()  # every learner gets their `VecEnv`
     if ":" in uses:
         with quiet():
@@ -228,10 +204,7 @@ def is_sb3(algorithm: Any) -> bool:
 
 
 def replay_settings(algorithm: Any, transitions: int) -> dict[str, int]:
-    """The size of an off-policy algorithm's replay buffer; empty for an on-policy algorithm.
-
-    It holds all transitions, or as many as SB3's default, so results do not depend on it.
-    """
+    """The size of an off-policy algorithm's replay buffer; empty for an on-policy algorithm."""
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
     if not issubclass(algorithm, OffPolicyAlgorithm):

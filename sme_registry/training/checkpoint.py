@@ -38,18 +38,7 @@ def save(model: Any, path: Path) -> None:
 
 
 def load(algorithm: Any, path: Path, env: Any, **kwargs: Any) -> Any:
-    """The model of a checkpoint, with its replay buffer.
-
-    Args:
-      algorithm: the SB3 class of the model.
-      path: the file. Loading it can run arbitrary code, so it must come from a trusted source.
-      env: the environment to continue in.
-      **kwargs: fields of the model to change, such as `buffer_size`, which is raised to the size
-        of the stored buffer.
-
-    Raises:
-      PolicyError: the checkpoint cannot be loaded.
-    """
+    """The model of a checkpoint, with its replay buffer."""
     try:
         with zipfile.ZipFile(path) as members:
             if _MEMBER not in members.namelist():

@@ -58,9 +58,6 @@ _TYPES = (int, int, float, int, float, float, int, float)
 def read_episodes(path: Path) -> list[Episode]:
     """All complete rows; one that was cut off by a kill is skipped.
 
-    Raises:
-      OptionError: the file has other columns, or cannot be read.
-
     Examples:
       >>> from pathlib import Path
       >>> from sme_registry.training import read_episodes
@@ -93,13 +90,7 @@ def read_episodes(path: Path) -> list[Episode]:
 
 
 class EpisodeLog:
-    """Appends rows and flushes each, so that a killed run keeps all finished episodes.
-
-    Args:
-      path: the file. Rows after `up_to_step` are dropped, because a resumed run repeats them.
-      up_to_step: the step of the checkpoint to continue from; 0 starts a new file.
-      agents: names of a team's agents, each with a column; empty for a single agent.
-    """
+    """Appends rows and flushes each, so that a killed run keeps all finished episodes."""
 
     def __init__(self, path: Path, up_to_step: int = 0, agents: Sequence[str] = ()) -> None:
         self.agents = agents

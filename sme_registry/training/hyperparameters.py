@@ -28,9 +28,6 @@ _ROLLOUT, _MIN_ROLLOUT = 2048, 16  # SB3's default for PPO in one environment; o
 def nested_hyperparameters(flat: Mapping[str, Any]) -> dict[str, Any]:
     """Hyperparameters whose dotted names are resolved: `policy_kwargs.net_arch` is in a dict.
 
-    Raises:
-      OptionError: a name has an empty part, or is used both for a value and for a dict.
-
     Examples:
       >>> from sme_registry.training import nested_hyperparameters
       >>> nested_hyperparameters({"policy_kwargs.net_arch": [64, 64], "gamma": 0.9})
@@ -53,10 +50,6 @@ def nested_hyperparameters(flat: Mapping[str, Any]) -> dict[str, Any]:
 
 def read_hyperparameters(path: Path) -> dict[str, Any]:
     """The hyperparameters in a JSON file: an object of names and values.
-
-    Raises:
-      MalformedDocumentError: it cannot be read, or is no JSON.
-      OptionError: it is not an object.
 
     Examples:
       >>> from pathlib import Path
@@ -90,10 +83,6 @@ def check_hyperparameters(
       hyperparameters: names and values.
       field: what error messages call them.
       others: names that the caller accepts beside them, which the message may suggest.
-
-    Raises:
-      OptionError: it has no hyperparameter of a name; the message suggests a similar one.
-      UnknownNameError, OptionError, MissingDependencyError: see `find_algorithm`.
 
     Examples:
       >>> from sme_registry.training import check_hyperparameters
@@ -134,14 +123,7 @@ def refuse_unknown(
 
 
 def resolved(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
-    """Values for a constructor, from those of JSON.
-
-    Lists become tuples (`"train_freq": [1, "episode"]`), and in `policy_kwargs` a text
-    `module:Class` the class (`"activation_fn": "torch.nn:ReLU"`).
-
-    Raises:
-      OptionError: a class cannot be imported.
-    """
+    """JSON values for a constructor: tuples for lists, and the classes named in `policy_kwargs`."""
     values = {k: tuple(v) if isinstance(v, list) else v for k, v in hyperparameters.items()}
     policy_kwargs = values.get("policy_kwargs")
     if isinstance(policy_kwargs, Mapping):
@@ -167,22 +149,11 @@ def _policy_class(algorithm: Any) -> Any:
 def for_lanes(algorithm: Any, lanes: int, chosen: Iterable[str] = ()) -> dict[str, int]:
     """The changes to SB3's defaults that keep an algorithm the same in several lanes at once.
 
-    A lane is an environment, or one agent of a team. SB3's `n_steps` counts the steps of each lane:
-    PPO in 8 environments would collect 16,384 transitions for one update. We divide the rollout:
-    PPO collects 2,048 transitions over all lanes, with at least 16 steps in each. SB3 also counts
-    `gradient_steps` for a step of all lanes: TD3 in 8 environments would learn an eighth as often.
-    We use -1, one update for each transition.
+    A lane is an environment, or one agent of a team. SB3's `n_steps` counts the steps of each: PPO
+    in 8 would collect 16,384 transitions for one update, so the rollout of 2,048 is divided. And
+    TD3 in 8 would learn an eighth as often, so it gets one update for each transition.
 
-    On Team4, seed 0, r̃ was 0.77 after 16,384 team steps of PPO with SB3's defaults, and 0.85 with
-    2,048 transitions divided over the lanes. Mean regret then fell from 0.89 to 0.14 by step 55,000
-    and rose to 0.55 by step 100,000; with four times the rollout it fell steadily but more slowly,
-    to 0.23 at step 64,000.
-
-    Args:
-      algorithm: its SB3 class, or a function that returns a learner, which gets no changes.
-      lanes: environments, times the agents of a team.
-      chosen: names of hyperparameters that the user set; they are never changed, and neither are
-        those that depend on them.
+    On Team4, r̃ was 0.77 after 16,384 steps of PPO with SB3's defaults, and 0.85 divided.
     """
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -199,11 +170,7 @@ def for_lanes(algorithm: Any, lanes: int, chosen: Iterable[str] = ()) -> dict[st
 
 
 def parameters_of(function: Any) -> dict[str, inspect.Parameter]:
-    """The parameters of a function, or of a class's constructor.
-
-    A constructor that takes any keyword passes those that it does not name to the next class, so
-    that class's are its own.
-    """
+    """The parameters of a function, or of a class's constructor."""
     if not isinstance(function, type):
         return dict(inspect.signature(function).parameters)
     parameters: dict[str, inspect.Parameter] = {}

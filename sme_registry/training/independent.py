@@ -50,18 +50,7 @@ class _AgentLanes(LanesVecEnv):
 
 
 class IndependentLearners:
-    """The models of a team's agents, and the environments that they share.
-
-    Args:
-      record: the run's plan.
-
-    Attributes:
-      models: of each agent, by name, in the team's order.
-
-    Raises:
-      OptionError: the algorithm does not collect rollouts as SB3's on-policy algorithms do, or
-        rejects a hyperparameter's value.
-    """
+    """The models of a team's agents, and the environments that they share."""
 
     def __init__(self, record: RunRecord) -> None:
         task = materialize(record.spec)
@@ -101,13 +90,7 @@ class IndependentLearners:
         return int(next(iter(self.models.values())).n_steps)
 
     def learn(self, steps: int, on_step: OnStep, on_rollout: Callable[[], None]) -> None:
-        """Learn until `num_timesteps` is at least `steps`.
-
-        Args:
-          steps: of the team over all environments.
-          on_step: called after each step with the rewards, dones and infos of all lanes.
-          on_rollout: called before each rollout, when all models are consistent.
-        """
+        """Learn until `num_timesteps` is at least `steps`."""
         set_random_seed(self._seed)
         self.env.seed(self._seed)
         observations = self._split(self.env.reset())
@@ -135,11 +118,7 @@ class IndependentLearners:
         write_atomically(path, archive.getvalue())
 
     def load_checkpoint(self, path: Path) -> None:
-        """Continue from the models in a file, which must come from a trusted source.
-
-        Raises:
-          PolicyError: it cannot be loaded.
-        """
+        """Continue from the models in a file, which must come from a trusted source."""
         try:
             with zipfile.ZipFile(path) as members:
                 for name, model in self.models.items():

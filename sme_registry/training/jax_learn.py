@@ -44,14 +44,7 @@ class Agent(NamedTuple):
 
 
 def new_model(record: RunRecord) -> Agent:
-    """The program of a run and its model, untrained.
-
-    Raises:
-      SpecError: the task is not one that JAX has, such as a team's; or the stream, see
-        `jax.lives.check_switches`.
-      OptionError: there is no such device, or a hyperparameter has no such value.
-      ResourceLimitError: the program does not fit in the device's memory.
-    """
+    """The program of a run and its model, untrained."""
     program = jax_run.new_program(
         record.algorithm,
         [record.document],
@@ -75,13 +68,7 @@ def new_model(record: RunRecord) -> Agent:
 def learn(
     agent: Agent, record: RunRecord, folder: Path, progress: bool, console: Console | None
 ) -> tuple[RunRecord, list[Episode], Any]:
-    """Train and write a model; see `training.learn.learn`.
-
-    Raises:
-      PolicyError: the checkpoint cannot be loaded; or the weights are not finite any longer, and
-        the last checkpoint stays.
-      OptionError: a file cannot be written.
-    """
+    """Train and write a model; see `training.learn.learn`."""
     program, model = agent
     present = _PresentEpisode(record.spec)
     path = folder / checkpoint.FILE
@@ -151,15 +138,7 @@ def _check_finite(program: Program, folder: Path) -> None:
 
 
 class _PresentEpisode:
-    """The episode that goes on from one piece of a run to the next.
-
-    Args:
-      spec: the task; of a stream, that of any phase.
-
-    Attributes:
-      sums: `[4]` return, length, regret and similarity so far; with `safety` `[7]`, also the
-        summands of `EpisodeSafety`.
-    """
+    """The sums of the episode that goes on from one piece of a run to the next."""
 
     def __init__(self, spec: SMESpec) -> None:
         self._spec = spec
@@ -167,12 +146,7 @@ class _PresentEpisode:
         self.sums: npt.NDArray[np.float64] = self._zeros
 
     def add(self, last_step: int, log: StepLog) -> list[EpisodeRegret]:
-        """The episodes that ended in a piece.
-
-        Args:
-          last_step: steps of the run at the end of the piece.
-          log: of the only lane.
-        """
+        """The episodes that ended in a piece."""
         lengths = np.ones_like(log.regret)
         values = np.stack([log.reward, lengths, log.regret, log.similarity])[:, :, 0]
         if log.cost is not None and log.safe_regret is not None:

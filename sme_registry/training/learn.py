@@ -39,12 +39,7 @@ _RECENT = 20  # episodes in the running mean that the progress shows
 
 
 def new_model(record: RunRecord) -> Any:
-    """The untrained model of a run, with its environment; `IndependentLearners` for such a team.
-
-    Raises:
-      OptionError: the algorithm rejects a hyperparameter's value or the task, or returns no model
-        of Stable-Baselines3.
-    """
+    """The untrained model of a run, with its environment; `IndependentLearners` for such a team."""
     if record.independent:
         return IndependentLearners(record)
     env_class = SMEVecEnv if record.spec.team is None else SMETeamVecEnv
@@ -69,24 +64,7 @@ def new_model(record: RunRecord) -> Any:
 def learn(
     model: Any, record: RunRecord, folder: Path, progress: bool, console: Console | None
 ) -> tuple[RunRecord, list[Episode], Any]:
-    """Train and write a model.
-
-    Args:
-      model: the one of `new_model`; a resumed run continues that of its checkpoint.
-      record: the run's plan.
-      folder: the run's folder.
-      progress: whether to show progress.
-      console: where.
-
-    Returns:
-      The record with its progress, all episodes, and a policy for `evaluate`: the model, or for
-      independent learners a dict of each agent's.
-
-    Raises:
-      PolicyError: the checkpoint cannot be loaded; or the weights are not finite any longer, and
-        the last checkpoint stays.
-      OptionError: a file cannot be written.
-    """
+    """Train and write a model."""
     env = model.env
     model = _continued(model, record, folder)
     lanes_of_a_step = 1 if record.independent else record.agents  # SB3 counts each agent's steps
@@ -172,12 +150,7 @@ def _check_finite(model: Any, log: RunLog) -> None:
 
 
 def not_finite(steps: int, folder: Path) -> PolicyError:
-    """The error for a run whose weights are NaN or infinite; its record says that it failed.
-
-    Args:
-      steps: that it has done.
-      folder: of the run.
-    """
+    """The error for a run whose weights are NaN or infinite; its record says that it failed."""
     failure = f"the weights are not finite any longer at step {steps:,}"
     record = RunRecord.read(folder)  # of its last checkpoint
     if record is not None:
@@ -198,16 +171,7 @@ def _write_model(model: Any, folder: Path) -> None:
 
 
 class RunLog:
-    """The log, the record and the displayed progress of a run, while it trains.
-
-    Args:
-      record: the run's plan.
-      folder: its folder.
-      first_step: of the checkpoint that it continues from; 0 for a new run.
-      total: steps at its end.
-      progress: whether to show progress.
-      console: where.
-    """
+    """The log, the record and the displayed progress of a run, while it trains."""
 
     def __init__(
         self,

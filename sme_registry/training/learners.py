@@ -30,12 +30,7 @@ class Learner(Protocol):
         """Learn from at least this many steps of the environment."""
 
     def predict(self, observation: Any, *, deterministic: bool) -> Any:
-        """Actions `[B, A]` in the range of `env.action_space`, or a tuple that begins with them.
-
-        Args:
-          observation: `[B, O]` float32.
-          deterministic: always True.
-        """
+        """Actions `[B, A]` in the range of `env.action_space`, or a tuple that begins with them."""
 
 
 def new_learner(
@@ -47,20 +42,7 @@ def new_learner(
     hyperparameters: Mapping[str, Any],
     field: str = "uses",
 ) -> Learner:
-    """Create a learner.
-
-    Args:
-      uses: its name.
-      env: the SB3 `VecEnv` in which it learns.
-      seed: of its random numbers.
-      steps: of training, over all lanes of the environment.
-      hyperparameters: those that differ from its defaults, as JSON values (`resolved`).
-      field: what error messages call the name.
-
-    Raises:
-      UnknownNameError, OptionError, MissingDependencyError: see `find_algorithm`; or it does
-        not accept the hyperparameters, or returns something that is not a learner.
-    """
+    """Create a learner."""
     algorithm = find_algorithm(uses, field)
     refuse_unknown(algorithm, uses, hyperparameters)
     settings = resolved(hyperparameters)

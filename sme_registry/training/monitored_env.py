@@ -21,15 +21,7 @@ from sme_registry.spec import SMESpec, StreamSpec
 
 
 class MonitoredTeamVecEnv(SMETeamVecEnv):
-    """Teams as an SB3 `VecEnv` (`SMETeamVecEnv`), with their steps counted.
-
-    Attributes:
-      steps: steps of the team taken so far, over all environments.
-      regret: sum of their regret, the mean over the team's agents.
-      agents_regret: the same of each agent, `[n]`.
-      seconds: CPU time of this thread spent in them.
-      after_step: see `MonitoredVecEnv`.
-    """
+    """Teams as an SB3 `VecEnv` (`SMETeamVecEnv`), with their steps counted."""
 
     def __init__(
         self, spec: SMESpec, num_envs: int, *, action_range: Literal["unit", "symmetric"]
@@ -57,20 +49,7 @@ class MonitoredTeamVecEnv(SMETeamVecEnv):
 
 
 class MonitoredVecEnv(LanesVecEnv):
-    """One environment of a task or a stream as an SB3 `VecEnv`, with its steps counted.
-
-    The same numbers, bit for bit, as `SMEVecEnv` with one environment, without the overhead of a
-    batch, which counts compared with PPO's 0.5 ms a step.
-
-    Attributes:
-      steps: environment steps taken so far.
-      regret: sum of their regret.
-      cost: sum of their cost; None for a task without `safety`.
-      info: of the last step; empty before the first.
-      seconds: CPU time of this thread spent in them.
-      after_step: called with `steps` after each step; its time is not in `seconds`. An exception
-        that it raises ends the training.
-    """
+    """One environment as an SB3 `VecEnv`, its steps counted, without the overhead of a batch."""
 
     def __init__(
         self, document: SMESpec | StreamSpec, *, action_range: Literal["unit", "symmetric"]

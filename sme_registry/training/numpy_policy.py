@@ -45,10 +45,6 @@ def numpy_policy(
       A callable from observations `[B, O]` (of a stream that shows the phase, with its
       one-hot) to actions `[B, A]` in units of the unit range, which the environment clips.
 
-    Raises:
-      SpecError: the task is a team's.
-      PolicyError, OptionError: see `as_policy`.
-
     Examples:
       >>> from sme_registry.evaluation import load_sb3
       >>> from sme_registry.training import numpy_policy
@@ -67,12 +63,7 @@ def numpy_policy(
 
 
 def numpy_team_policy(model: Any, spec: SMESpec, *, action_range: str | None = None) -> TeamPolicy:
-    """The same for a team: of one model that all agents share, or of a dict from agent to model.
-
-    Raises:
-      SpecError: the task has a single agent.
-      PolicyError, OptionError: see `as_policy`.
-    """
+    """The same for a team: of one model that all agents share, or of a dict from agent to model."""
     policy = as_policy(model, spec, action_range=action_range)
     if not isinstance(policy, TeamPolicy):
         raise SpecError("team: must not be null here. Evaluate a single agent with `evaluate`.")

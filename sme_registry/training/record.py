@@ -112,11 +112,7 @@ class RunRecord(StrictModel):
 
     @classmethod
     def read(cls, folder: Path) -> RunRecord | None:
-        """The record of a folder; None if it contains no run.
-
-        Raises:
-          MalformedDocumentError, SpecError: the file exists but is not a valid record.
-        """
+        """The record of a folder; None if it contains no run."""
         path = folder / RECORD
         return cls.from_dict(read_json(path), str(path)) if path.exists() else None
 
@@ -139,12 +135,7 @@ class RunRecord(StrictModel):
         return self.model_copy(update=changes)
 
     def continuing(self, previous: RunRecord, folder: Path) -> RunRecord:
-        """This plan, with the progress and the hyperparameters of the run that it continues.
-
-        Raises:
-          OptionError: the run has another plan, or has done more steps. Hyperparameters may be left
-            out of this one.
-        """
+        """This plan, with the progress and the hyperparameters of the run that it continues."""
         fields = (
             "stream_digest",
             "spec_digest",

@@ -44,23 +44,7 @@ def write_report(
     progress: bool,
     console: Console | None,
 ) -> tuple[EvaluationReport | StreamReport, tuple[Path, ...]]:
-    """Evaluate a finished run; write its report, and its figures if Matplotlib is installed.
-
-    Args:
-      model: the trained model.
-      record: of the run.
-      episodes: all its finished episodes.
-      folder: its folder, which for a life in a stream holds its snapshots.
-      progress: whether to show progress.
-      console: where.
-
-    Returns:
-      The report and the paths of the figures.
-
-    Raises:
-      PolicyError: actions of the model are invalid, or a snapshot is missing or damaged.
-      OptionError: a file cannot be written.
-    """
+    """Evaluate a finished run; write its report, and its figures if Matplotlib is installed."""
     states = record.protocol.states_per_region * len(record.protocol.edges)
     with Progress("evaluating", states, console=console, unit="states", enabled=progress) as bar:
 

@@ -167,15 +167,6 @@ def train(
     Returns:
       The finished run.
 
-    Raises:
-      UnknownNameError, SpecError: no such task, algorithm or protocol, or a field is out of range;
-        or a stream that agents in JAX cannot live through.
-      OptionError: another argument is out of range; or the folder contains another run, a finished
-        run, no run to resume or other files, is in use by another process, or is not writable.
-      PolicyError: the checkpoint cannot be loaded, or the weights are not finite any longer.
-      ResourceLimitError: the task would not fit in memory.
-      MissingDependencyError: Stable-Baselines3, PyTorch or JAX is not installed.
-
     Examples:
       >>> from sme_registry.training import train
       >>> result = train(

@@ -30,22 +30,7 @@ def new_sb3_model(
     hyperparameters: Mapping[str, Any],
     steps: int,
 ) -> Any:
-    """An untrained model. Make it before the training, so that what it refuses is refused then.
-
-    Its replay buffer is no larger than the training needs, as in JAX: whoever loads the model gets
-    one of this size.
-
-    Args:
-      uses: `jax:PPO`, `jax:TD3` or `jax:SAC`.
-      document: the task or the stream in whose observations the model acts.
-      seed: of the run.
-      action_range: of the policy's actions.
-      hyperparameters: of the run.
-      steps: that it trains.
-
-    Raises:
-      OptionError: Stable-Baselines3 rejects a hyperparameter's value or the task.
-    """
+    """An untrained model. Make it before the training, so that what it refuses is refused then."""
     settings = dict(hyperparameters)
     if "buffer_size" in settings:
         settings["buffer_size"] = min(settings["buffer_size"], max(1, steps))
@@ -60,14 +45,7 @@ def new_sb3_model(
 
 
 def set_weights(model: Any, weights: Mapping[str, npt.NDArray[Any]], steps: int) -> None:
-    """Give a model the weights of an agent in JAX; its optimiser stays new.
-
-    Args:
-      model: of `new_sb3_model`.
-      weights: of one lane, by the names of the policy's `state_dict`; others are tensors of the
-        model itself.
-      steps: that were trained.
-    """
+    """Give a model the weights of an agent in JAX; its optimiser stays new."""
     names = model.policy.state_dict().keys()
     tensors = {name: torch.from_numpy(np.array(value)) for name, value in weights.items()}
     model.policy.load_state_dict({name: tensors[name] for name in names})

@@ -42,16 +42,7 @@ def folder_of_cell(study: Path, key: str) -> Path:
 
 
 class Snapshots:
-    """The files of a life's models in a folder.
-
-    Args:
-      folder: the folder, created with the first of them.
-      stream: the stream.
-
-    Attributes:
-      initial: the file of the model before training.
-      visits: the files of the models at the end of each visit, in order.
-    """
+    """The files of a life's models in a folder."""
 
     def __init__(self, folder: Path, stream: StreamSpec) -> None:
         count = stream.visits

@@ -15,14 +15,7 @@ from sme_registry.spec import StreamSpec
 
 
 class VisitEnds:
-    """Calls a function at the end of each visit, while steps are counted.
-
-    Args:
-      stream: the stream, in which there is one life.
-      on_visit: called with the index of the visit in the life.
-      steps: already taken, of a run that is resumed; the visits that ended before are over. One
-        that ends at them is called for.
-    """
+    """Calls a function at the end of each visit, while steps are counted."""
 
     def __init__(
         self, stream: StreamSpec, on_visit: Callable[[int], object], steps: int = 0

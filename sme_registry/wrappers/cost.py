@@ -23,9 +23,6 @@ class StepWithCost(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
     Args:
       env: an environment of this package, wrapped or not, whose task has `safety`.
 
-    Raises:
-      OptionError: the task has no limits.
-
     Examples:
       >>> from sme_registry.wrappers import StepWithCost
       >>> env = StepWithCost(sme_registry.make("Safety20"))
@@ -50,12 +47,7 @@ class StepWithCost(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
 
 
 def spec_of(wrapper: str, env: Any) -> Any:
-    """The spec of an environment or a vector of this package; OptionError for any other.
-
-    Args:
-      wrapper: its name in the error's message.
-      env: an environment or a vector, wrapped or not.
-    """
+    """The spec of an environment or a vector of this package; OptionError for any other."""
     try:
         return env.unwrapped.sme_spec
     except AttributeError:

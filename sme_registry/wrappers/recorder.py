@@ -49,13 +49,7 @@ class Recorder:
         ended: Mask,
         safety: Array | None = None,
     ) -> dict[str, Array]:
-        """Add a step of each lane, `[B]` each; those whose regret is NaN began an episode instead.
-
-        `safety` is that of `safety_of_step`, `[3, B]`.
-
-        Returns:
-          What `info["episode"]` has, `[B]` each, 0 where no episode ended; empty if none did.
-        """
+        """Add a step of each lane, `[B]` each, and get `info["episode"]`; NaN regret begins one."""
         stepped = ~np.isnan(regret)
         values = np.array([rewards, np.ones(len(regret)), regret, similarity])
         self._sums += np.where(stepped, values, 0.0)

@@ -23,10 +23,6 @@ class RecordRegret(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
         None writes none.
       force: replace an existing file.
 
-    Raises:
-      OptionError: the file exists and `force` is false, or it cannot be written; at the first step,
-        if the environment's info has no regret.
-
     Attributes:
       episodes: the finished episodes, oldest first, as `plots.training_curve` takes them.
 

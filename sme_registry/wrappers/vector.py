@@ -27,9 +27,6 @@ class RecordVectorRegret(VectorWrapper, RecordConstructorArgs):
       path: see `RecordRegret`.
       force: see `RecordRegret`.
 
-    Raises:
-      OptionError: see `RecordRegret`.
-
     Attributes:
       episodes: see `RecordRegret`.
 

@@ -20,9 +20,6 @@ class VectorStepWithCost(VectorWrapper, RecordConstructorArgs):
     Args:
       envs: a vector of `make_vec`, wrapped or not, whose task has `safety`.
 
-    Raises:
-      OptionError: the task has no limits, or the vector is not one of `make_vec`.
-
     Examples:
       >>> from sme_registry.wrappers import VectorStepWithCost
       >>> envs = VectorStepWithCost(sme_registry.make_vec("Safety20", 3))

@@ -30,11 +30,7 @@ def independent_name(uses: str) -> str | None:
 
 
 def named_after(prefix: str, uses: str, known: Collection[str]) -> str | None:
-    """The name after a prefix; None if `uses` does not begin with it.
-
-    Raises:
-      UnknownNameError: the name is unknown; the message lists the known ones.
-    """
+    """The name after a prefix; None if `uses` does not begin with it."""
     if not uses.startswith(prefix):
         return None
     name = uses.removeprefix(prefix)
@@ -47,10 +43,6 @@ def named_after(prefix: str, uses: str, known: Collection[str]) -> str | None:
 
 
 def find_algorithm(uses: str) -> Any:
-    """The class or function that creates a learner, which is no reference.
-
-    Raises:
-      UnknownNameError, OptionError, MissingDependencyError: see `training.algorithms`.
-    """
+    """The class or function that creates a learner, which is no reference."""
     uses = independent_name(uses) or uses
     return algorithms.find_algorithm(uses, others=[REFERENCE + policy for policy in POLICIES])

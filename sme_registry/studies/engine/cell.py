@@ -63,12 +63,6 @@ def run_cell(
       one at the end, `training` the rest of learning, and `steps_per_second` counts training and
       environment together.
 
-    Raises:
-      UnknownNameError, OptionError, MissingDependencyError: the algorithm cannot be found or does
-        not accept the hyperparameters, or the model cannot be written.
-      ResourceLimitError: the task would not fit in memory.
-      PolicyError: the learner's actions cannot be used, or it stopped early.
-
     Examples:
       >>> from sme_registry.spec import StudyFile
       >>> from sme_registry.studies import run_cell
@@ -184,10 +178,7 @@ class _Recorder:
         return LearningCurve(**fields)
 
     def online_regret(self) -> dict[str, Any]:
-        """The online regret, the online cost, and the regret of each agent.
-
-        Nothing for a policy that took no steps.
-        """
+        """The online regret, the online cost, and the regret of each agent."""
         if not self.steps:
             return {}
         means = (self.agents_regret / self.steps).tolist()

@@ -64,14 +64,7 @@ _SNAPSHOT = "snapshot/"  # prefix of the records of lives: weights before traini
 
 
 class Ended(NamedTuple):
-    """How the cell of a lane ended.
-
-    Attributes:
-      cell: the cell.
-      ended: its result, or the reason why it has none.
-      model: its model's .zip, if that is kept.
-      snapshots: of a life, those before training and at the ends of visits, by their files' names.
-    """
+    """How the cell of a lane ended."""
 
     cell: Cell
     ended: CellResult | PolicyError
@@ -89,22 +82,7 @@ def run_lanes(
     progress: Report,
     keep_models: bool = False,
 ) -> Iterator[Ended]:
-    """Train cells as lanes of one program, and evaluate them as `run_cell` does.
-
-    Args:
-      cells: of one group; see `jobs.Programs`.
-      lanes: the program.
-      progress: see `Report`.
-      keep_models: whether to give each model as a .zip of Stable-Baselines3.
-
-    Yields:
-      Each cell as it ends.
-
-    Raises:
-      OptionError, MissingDependencyError: the algorithm, a hyperparameter or the device does not
-        exist here, or a model cannot be kept.
-      SpecError: JAX does not have one of the tasks.
-    """
+    """Train cells as lanes of one program, and evaluate them as `run_cell` does."""
     run = _Run(cells, lanes, progress, keep_models)
     if keep_models:
         _new_model(cells[0])  # what Stable-Baselines3 refuses is refused before the training
@@ -163,10 +141,7 @@ class _Run:
         self._note_failures()
 
     def results(self) -> Iterator[Ended]:
-        """Evaluate the trained policies within and out of distribution.
-
-        Those with tasks of the same draw are evaluated together, which is faster; each life alone.
-        """
+        """Evaluate the trained policies within and out of distribution."""
         draws: dict[Hashable, list[int]] = defaultdict(list)  # lanes that are evaluated together
         for lane, key in enumerate(self._keys):
             if key in self._own:
@@ -208,10 +183,7 @@ class _Run:
         return _Trained(cell, self._weights_of_life(lane), self._blocks.dynamic_regret(lane))
 
     def _begin_lives(self) -> None:
-        """Records of lives, which hold the weights of visits for as long as the program runs.
-
-        Those of the actor are enough to evaluate a visit; a model that is kept has all of them.
-        """
+        """Records of lives, which hold the weights of visits for as long as the program runs."""
         stream = self._cell.stream
         self._blocks = None if stream is None else RegretBlocks(stream, self._lanes.count)
         if stream is None or self._blocks is None:
@@ -392,13 +364,7 @@ def _new_model(cell: Cell) -> Any:
 
 
 class _Trained(NamedTuple):
-    """A cell and what it learned.
-
-    Attributes:
-      cell: the cell.
-      weights: by SB3's names; of a life those before training and at the end of each visit.
-      regret: of a life.
-    """
+    """A cell and what it learned."""
 
     cell: Cell
     weights: list[Arrays]

@@ -29,14 +29,7 @@ _COUNTED_AT_ONCE = 500  # steps; one by one they would cost a twentieth of PPO's
 
 
 class TasksInForce:
-    """The task of a cell, or those of its stream, by the steps that were taken.
-
-    Args:
-      document: the task or the stream.
-
-    Raises:
-      ResourceLimitError: the tasks would not fit in memory together.
-    """
+    """The task of a cell, or those of its stream, by the steps that were taken."""
 
     def __init__(self, document: SMESpec | StreamSpec) -> None:
         self._stream: StreamSpec | None = None
@@ -61,13 +54,7 @@ class TasksInForce:
 
 
 class Life:
-    """Records an agent's life while it trains.
-
-    Args:
-      cell: of the life.
-      run: its environment and learner, before training.
-      models: the folder for its models; None keeps none.
-    """
+    """Records an agent's life while it trains."""
 
     def __init__(self, cell: Cell, run: Training, models: Path | None) -> None:
         assert cell.stream is not None
@@ -110,11 +97,7 @@ class Life:
 
 
 def lasting_policy(cell: Cell, run: Training) -> Policy:
-    """The present policy of a single agent, which further training does not change.
-
-    Raises:
-      PolicyError: it is no network of Stable-Baselines3, and its learner cannot be copied.
-    """
+    """The present policy of a single agent, which further training does not change."""
     policy = run.policy()
     assert isinstance(policy, Policy)  # streams have no teams
     if isinstance(policy.act, Perceptron):
@@ -133,17 +116,7 @@ def lasting_policy(cell: Cell, run: Training) -> Policy:
 def life_report(
     cell: Cell, policies: Sequence[Any], initial: Any, regret: DynamicRegret
 ) -> StreamReport:
-    """The report of a cell's life with the reference agents, still without fresh agents.
-
-    Args:
-      cell: of the life.
-      policies: at the end of each visit.
-      initial: before training.
-      regret: of the training.
-
-    Raises:
-      PolicyError: a policy's actions are invalid.
-    """
+    """The report of a cell's life with the reference agents, still without fresh agents."""
     assert cell.stream is not None
     stream, range_ = cell.stream, cell.action_range
     report = evaluate_stream(

@@ -35,17 +35,7 @@ def offline_name(uses: str) -> str | None:
 
 
 def run_offline(cell: Cell, name: str, progress: Callable[[int, int], None]) -> CellResult:
-    """Collect the data, learn from it, and evaluate the policy as in every cell.
-
-    Args:
-      cell: the cell to run; its k-th evaluation follows round(steps · k / evaluations) steps.
-      name: the learner.
-      progress: called with the gradient steps done and those in all.
-
-    Raises:
-      OptionError: ν is missing, or a number is out of range.
-      SpecError: so is the recipe or a hyperparameter; or D > 0, where episodes differ in length.
-    """
+    """Collect the data, learn from it, and evaluate the policy as in every cell."""
     start = time.thread_time()
     settings: dict[str, Any] = dict(cell.hyperparameters)
     nu: Any = settings.get("nu")

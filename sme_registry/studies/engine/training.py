@@ -29,15 +29,7 @@ from sme_registry.training.numpy_policy import numpy_policy, numpy_team_policy
 
 @dataclass(frozen=True)
 class Training:
-    """What a cell trains.
-
-    Attributes:
-      env: a monitored environment, which counts the steps of the task.
-      learner: what learns in it; of a team with a model for each agent, all of them.
-      learn: trains for at least the cell's steps.
-      policy: the present policy. Training may change it.
-      save: writes the model to a path; does nothing for a learner without a model.
-    """
+    """What a cell trains."""
 
     env: Any
     learner: Any
@@ -47,11 +39,7 @@ class Training:
 
 
 def training(cell: Cell) -> Training:
-    """The environment and the learner of a cell.
-
-    Raises:
-      UnknownNameError, OptionError, MissingDependencyError: see `new_learner`.
-    """
+    """The environment and the learner of a cell."""
     if cell.spec.team is None:
         return _single(cell)
     return _shared(cell) if independent_name(cell.uses) is None else _independent(cell)
@@ -125,10 +113,7 @@ def _independent(cell: Cell) -> Training:
 def _team_environment(
     cell: Cell, uses: str, agents: int | None = None
 ) -> tuple[Any, dict[str, Any]]:
-    """The environments of a team, and hyperparameters for them.
-
-    `agents` is how many of the team act with one model; None for all.
-    """
+    """The environments of a team, and hyperparameters for them."""
     from sme_registry.training.monitored_env import MonitoredTeamVecEnv
 
     algorithm = find_algorithm(uses)
