@@ -188,9 +188,6 @@ def smoothed(step: Array, values: Array, window: int | None = None) -> tuple[Arr
     Returns:
       `[P]` increasing steps, `[P]` medians of the last `window` values up to each, and the window.
 
-    Raises:
-      OptionError: `window` is not a positive integer.
-
     Examples:
       >>> from sme_registry.statistics import smoothed
       >>> step, regret, window = smoothed(np.array([100, 200, 300]), np.array([0.9, 0.5, 0.7]), 2)
@@ -410,11 +407,7 @@ def _counts(chosen: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 
 def _weighted_iqm(runs: Array, counts: npt.NDArray[np.int64]) -> Array:
-    """IQM `[K, draws]` of samples of runs `[n, K]` by their counts `[n, draws]`, without sorting.
-
-    The runs in order of their values occupy the ranks of a sample according to their counts; the
-    mean is over the ranks between the cuts.
-    """
+    """IQM `[K, draws]` of samples of runs `[n, K]` by counts `[n, draws]`, without sorting."""
     n = len(runs)
     cut = n // 4
     means = np.empty((runs.shape[1], counts.shape[1]))

@@ -29,11 +29,7 @@ class Accumulator:
         self._clipped = 0
 
     def add(self, errors: Array, sums: Array, clipped: int) -> None:
-        """Add a batch of |a − a*| `[B, A]` and the number of its entries that were clipped.
-
-        `sums` `[A]` over states are computed over all channels of a task at once, so that an
-        agent's channels have the same bits in its own report and in its team's.
-        """
+        """Add a batch of |a − a*| `[B, A]` and the number of its entries that were clipped."""
         deviations = errors.mean(axis=1)
         count, mean = len(deviations), float(deviations.mean())
         deviations -= mean

@@ -77,13 +77,6 @@ def evaluate(
     Returns:
       The report, with the reference policies on the same states; for a team also for each agent.
 
-    Raises:
-      UnknownNameError, SpecError: no such task, protocol or policy, or a field out of range.
-      PolicyError: the policy cannot be loaded, or its actions are invalid; names a team's agent.
-      OptionError: `action_range` is invalid, or a shell is too thin for float32 observations.
-      MissingDependencyError: the library that loads the policy is not installed.
-      ResourceLimitError: the task would not fit in memory.
-
     Examples:
       >>> def half(observations):  # [B, 10] to [B, 4]
       ...     return np.full((len(observations), 4), 0.5)
@@ -121,9 +114,6 @@ def evaluate_many(
       For each policy the report that `evaluate` would return, bit for bit; or, where its actions
       are invalid, the error that `evaluate` would raise.
 
-    Raises:
-      As `evaluate`, except for invalid actions.
-
     Examples:
       >>> from sme_registry.evaluation import evaluate_many
       >>> reports = evaluate_many([("linear", "Default"), ("linear", "Interval5")], "quick-v1")
@@ -160,11 +150,6 @@ def evaluation_observations(
     Returns:
       `[regions · n, O]` float32, region after region.
 
-    Raises:
-      SpecError: the task is for a team, whose agents see observations of their own; or as
-        `evaluate`.
-      UnknownNameError, OptionError, ResourceLimitError: as `evaluate`.
-
     Examples:
       >>> from sme_registry.evaluation import evaluation_observations
       >>> evaluation_observations("Default", {"states_per_region": 10}).shape
@@ -183,10 +168,6 @@ def evaluation_observations(
 
 def resolve_protocol(protocol: ProtocolLike) -> EvaluationProtocol:
     """A protocol from itself, its fields, its name in the catalogue, or the path of its file.
-
-    Raises:
-      UnknownNameError: no protocol has this name; suggests near ones.
-      SpecError: a file or mapping is not a valid protocol.
 
     Examples:
       >>> from sme_registry.evaluation import resolve_protocol
@@ -316,11 +297,7 @@ def _observation_report(
     task: Task,
     spec: SMESpec,
 ) -> ObservationReport | None:
-    """What a policy makes of its observation; None where that is the state.
-
-    Raises:
-      PolicyError: outputs of its hidden layers are not finite.
-    """
+    """What a policy makes of its observation; None where that is the state."""
     if spec.observation is None:
         return None
     hidden = None if isinstance(policy, TeamPolicy) else policy.hidden

@@ -35,15 +35,7 @@ Key = int | str
 
 
 class _Batch(NamedTuple):
-    """A batch of states, and what is the same for all policies in them.
-
-    Attributes:
-      states: of the region.
-      observations: `[B, O]` float32, those of each horizon.
-      s: `[B, S]` the states in float64.
-      optimal: `[B, A]` π*(s).
-      limit: `[B, A]` ℓ(s); None without safety.
-    """
+    """A batch of states, and what is the same for all policies in them."""
 
     states: States
     observations: dict[int, Observations]
@@ -57,14 +49,7 @@ class _Batch(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What was measured in one region.
-
-    Attributes:
-      errors: of each policy and reference.
-      tasks: by r_min; empty without safety.
-      safety: of each policy and reference, by its r_min; likewise.
-      distraction: of each policy; None without distractors.
-    """
+    """What was measured in one region."""
 
     errors: dict[Key, Errors]
     tasks: dict[float, Task]
@@ -130,17 +115,7 @@ def measure(
     progress: Progress,
     failed: dict[int, PolicyError],
 ) -> Iterator[Measured]:
-    """What is measured of the policies and of each reference, region after region.
-
-    Args:
-      subjects: policies, each with its task; the tasks have the same draw.
-      task: one of their tasks.
-      oracle: its engine.
-      protocol: the regions.
-      channels: the action channels of each scope.
-      progress: called after each batch with the number of states done, and of all states.
-      failed: gets the errors of the policies that fail. The measurement ends once all have.
-    """
+    """What is measured of the policies and of each reference, region after region."""
     horizons = sorted({spec.horizon for _, spec in subjects})
     fitted: references.References | None = None
     total, done = protocol.states_per_region * len(protocol.edges), 0
@@ -190,10 +165,7 @@ def _batches(
     horizons: Sequence[int],
     known: Iterable[Array],
 ) -> Iterator[_Batch]:
-    """The states of a region, with the observations that tasks of each horizon make of them.
-
-    `known` are the π* `[B, A]` of the first batches, as far as they have been computed.
-    """
+    """The states of a region, with the observations that tasks of each horizon make of them."""
     limit_of = _limit(task, oracle) if task.spec.safety is not None else lambda s: None
     known = iter(known)
     for drawn in states(protocol, region, task.spec):
@@ -216,10 +188,7 @@ def _limit(task: Task, oracle: Engine) -> Callable[[Array], Array]:
 def _fit_references(
     task: Task, oracle: Engine, protocol: EvaluationProtocol
 ) -> tuple[references.References, list[Array]]:
-    """The references fitted on the first states of WD, and the π* `[B, A]` of their batches.
-
-    The states are drawn without what else an observation shows, which would not fit in memory.
-    """
+    """The references fitted on the first states of WD, and the π* `[B, A]` of their batches."""
     count, rows = references.fit_states(task.spec), batch_rows(task.spec)
     s, optimal = [], []
     for drawn in states(protocol, 0, task.spec.derive(observation=None), rows):

@@ -92,12 +92,7 @@ Act = Callable[[npt.NDArray[Any]], Iterator[tuple[int, Array]]]
 
 
 class Distraction:
-    """The errors of policies under other distractors, in the states of one region.
-
-    Attributes:
-      changes: |a(s, d') − a(s, d)| of each policy.
-      shells: of each policy the errors with d in shell 1, 2, …; only in WD.
-    """
+    """The errors of policies under other distractors, in the states of one region."""
 
     def __init__(self, task: Task, protocol: EvaluationProtocol, region: int, policies: int):
         self._task = task
@@ -129,19 +124,7 @@ class Distraction:
 def probe_layers(
     hidden: HiddenLayers, task: Task, protocol: EvaluationProtocol
 ) -> tuple[LayerProbe, ...]:
-    """Probe what an agent sees and each of its hidden layers, in states of WD.
-
-    There are no probes of a policy whose hidden layers are unknown or too wide for the fit (above
-    2,047 units), and none of a task with more than 512 channels of s and d.
-
-    Args:
-      hidden: the outputs of the policy's hidden layers.
-      task: a task with `observation`.
-      protocol: for the seed; there are always `PROBE_STATES` states.
-
-    Raises:
-      PolicyError: outputs that are not finite.
-    """
+    """Probe what an agent sees and each of its hidden layers, in states of WD."""
     m, count = task.spec.distractors, PROBE_STATES
     if task.spec.state_dim + m > _PROBED_CHANNELS:
         return ()

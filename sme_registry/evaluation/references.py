@@ -57,14 +57,7 @@ def fit_states(spec: SMESpec) -> int:
 
 @dataclass(frozen=True, eq=False)
 class References:
-    """The fitted references.
-
-    Attributes:
-      constant: `[A]` the best constant action.
-      slope: `[S, A]` of the linear policy, about the cube's centre; 0 where the agent that owns
-        the action channel does not observe the state channel.
-      intercept: `[A]` its action at the centre.
-    """
+    """The fitted references."""
 
     constant: Array
     slope: Array
@@ -75,11 +68,7 @@ class References:
         return (s - 0.5) @ self.slope + self.intercept
 
     def actions(self, s: Array, optimal: Array, random: Array) -> dict[str, Array]:
-        """The actions of every reference policy in states `[B, S]`, by name.
-
-        They are `[B, A]`, as π*(s) `optimal` and numbers `random` uniform in (0, 1) are, or `[A]`
-        if constant; all in [0, 1].
-        """
+        """The actions of every reference policy in states `[B, S]`, by name."""
         return {
             "optimal": optimal,
             "linear_least_squares": np.clip(self.linear(s), 0.0, 1.0),
@@ -102,14 +91,7 @@ def safe_actions(spec: SMESpec, optimal: Array, limit: Array) -> dict[str, Array
 def fit(
     s: Array, optimal: Array, agents: Iterable[tuple[Sequence[int], slice]] | None = None
 ) -> References:
-    """Fit the references to the optimal actions in states of WD.
-
-    Args:
-      s: `[N, S]` states.
-      optimal: `[N, A]` π*(s).
-      agents: the state channels that each agent observes and the action channels that it owns;
-        None is one agent with all of them.
-    """
+    """Fit the references to the optimal actions in states of WD."""
     S, A = s.shape[1], optimal.shape[1]
     slope, intercept = np.zeros((S, A)), np.empty(A)
     owned_by_observed: dict[tuple[int, ...], list[int]] = {}
@@ -144,9 +126,6 @@ def reference_policy(name: str, spec: SMESpec) -> Act | dict[str, Act]:
     Returns:
       A function from observations `[B, O]` to actions `[B, A]` of the unit range; for a team, one
       for each agent. Where the agent sees a mixing, it inverts the mixing first.
-
-    Raises:
-      SpecError: a policy of `SAFE_NAMES`, and the task has no limits.
 
     Examples:
       >>> from sme_registry.evaluation import reference_policy

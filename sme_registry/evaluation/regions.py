@@ -57,13 +57,7 @@ def expansion(s: Array) -> Array:
 
 
 class States(NamedTuple):
-    """A batch of states, and what else an observation of them shows.
-
-    Attributes:
-      s: `[B, S]` float32.
-      d: `[B, m]` distractors.
-      time: `[B]` uniform numbers in (0, 1), from which t/T follows.
-    """
+    """A batch of states, and what else an observation of them shows."""
 
     s: Observations
     d: Array
@@ -86,17 +80,7 @@ class States(NamedTuple):
 def states(
     protocol: EvaluationProtocol, region: int, spec: SMESpec, rows: int | None = None
 ) -> Iterator[States]:
-    """The states of a region, batch by batch, with distractors uniform in the cube.
-
-    Args:
-      protocol: the protocol.
-      region: 0 for WD, m for OOD m.
-      spec: the task, for state_dim and the number of distractors.
-      rows: states per batch; None takes `batch_rows`. The states do not depend on it.
-
-    Raises:
-      OptionError: no float32 number lies between the faces of this shell.
-    """
+    """The states of a region, batch by batch, with distractors uniform in the cube."""
     stream = f"evaluation/{region}"
     points = Points(protocol, region, spec.state_dim, stream)
     times = Uniform(protocol.seed, f"{stream}/time")
@@ -119,17 +103,7 @@ class Uniform:
 
 
 class Points:
-    """Points of a region, uniform by volume: of the cube or of a shell in any dimension.
-
-    Args:
-      protocol: the protocol.
-      region: 0 for WD, m for OOD m.
-      dim: coordinates of a point.
-      stream: begins the names of its random streams.
-
-    Raises:
-      OptionError: no float32 number lies between the faces of this shell.
-    """
+    """Points of a region, uniform by volume: of the cube or of a shell in any dimension."""
 
     def __init__(self, protocol: EvaluationProtocol, region: int, dim: int, stream: str) -> None:
         self._dim = dim

@@ -190,9 +190,6 @@ class EvaluationReport(ReportFile):
           `epsilon_low` to `clipped_share` of `RegionReport`. Of a task with limits also those of
           `SafetyScore`; of one with distractors `invariance`, which is 0 for the references, and
           the policy's regions d-OOD 1, 2, …
-
-        Raises:
-          MissingDependencyError: pandas is not installed.
         """
         require_packages("EvaluationReport.to_frame", {"pandas": "pandas"}, "studies")
         import pandas
@@ -227,11 +224,7 @@ class EvaluationReport(ReportFile):
         return columns
 
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
-        """Write the rows of `to_frame` as CSV, completely or not at all; pandas is not required.
-
-        Raises:
-          OptionError: it cannot be written; an existing file is unchanged.
-        """
+        """Write the rows of `to_frame` as CSV, completely or not at all; pandas is not required."""
         rows = list(self._rows())
         text = io.StringIO()
         writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")

@@ -26,13 +26,7 @@ class ReportFile(StrictModel):
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a report.
-
-        Raises:
-          MalformedDocumentError: not readable, or not strict JSON.
-          SpecError: a field is wrong, missing or unknown.
-          DigestMismatchError: a digest is not that of its document in the file.
-        """
+        """Read a report."""
         report = cls.from_dict(read_json(path), str(path))
         for what in cls.documents:
             refuse_other_digest(
@@ -44,11 +38,7 @@ class ReportFile(StrictModel):
         return report
 
     def write(self, path: str | os.PathLike[str]) -> Path:
-        """Write the report as JSON, completely or not at all.
-
-        Raises:
-          OptionError: it cannot be written; an existing file is unchanged.
-        """
+        """Write the report as JSON, completely or not at all."""
         return write_atomically(path, to_json(self.to_dict()))
 
     @abstractmethod

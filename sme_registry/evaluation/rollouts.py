@@ -24,18 +24,7 @@ LANES = 4096
 
 
 class Rollouts(NamedTuple):
-    """Completed episodes; each array is `[n]`.
-
-    Attributes:
-      episode_return: the sum of an episode's rewards, in [0, T].
-      discounted_return: the sum of γ^i times the i-th reward.
-      length: number of steps, in [1, T].
-      regret: mean of 1 − step reward over its steps, in [0, 1].
-      similarity: mean r̃ over its steps, in [0, 1].
-      similarity_square: mean r̃² over its steps, in [0, 1].
-      agents_regret: `[agents, n]` the same as `regret` for each agent; the other numbers of a team
-        are means over its agents.
-    """
+    """Completed episodes; each array is `[n]`."""
 
     episode_return: Array
     discounted_return: Array
@@ -57,20 +46,7 @@ class Rollouts(NamedTuple):
 
 
 def start_states(seed: int, evaluation: int, episodes: int, state_dim: int) -> Array:
-    """The initial states of an evaluation's episodes, from a random stream of their own.
-
-    They depend only on the arguments: two algorithms trained with the same seed are evaluated from
-    the same states, and an evaluation does not advance any other random stream.
-
-    Args:
-      seed: of the run.
-      evaluation: index of the evaluation, from 0.
-      episodes: n.
-      state_dim: S.
-
-    Returns:
-      `[n, S]` uniform in (0, 1).
-    """
+    """The initial states of an evaluation's episodes, from a random stream of their own."""
     stream = f"rollouts/{evaluation}/initial_state"
     return streams.uniform(seed, stream, episodes * state_dim).reshape(episodes, state_dim)
 
@@ -86,27 +62,7 @@ def rollouts(
     gamma: float = 1.0,
     seed: int = 0,
 ) -> Rollouts:
-    """Run an episode from each of the states to its end.
-
-    Args:
-      policy: from observations `[B, S + m + 2]` to actions `[B, A]` of the unit range, which are
-        clipped to it; B is at most `LANES`. It is also called for episodes that have ended, until
-        all of their batch have. The state of a recurrent `Policy` is initial at the first call.
-        For a team, a `TeamPolicy`.
-      task: the task.
-      states: `[n, S]` in [0, 1].
-      t: `[n]` steps completed before, in [0, T); None for 0, the start of an episode.
-      r_cum: `[n]` accumulated reward since the last payout; None for 0.
-      actions: `[n, A]` actions of the first step; None for the policy's.
-      gamma: γ of the discounted return, in [0, 1].
-      seed: of the task's distractors, at least 0. With one seed, episodes from equal states have
-        equal ones.
-
-    Raises:
-      SpecError: the task is a team's, and the policy is not.
-      StateError: states of another shape, or outside the cube.
-      ActionError: actions of another shape, or not finite.
-    """
+    """Run an episode from each of the states to its end."""
     if not isinstance(policy, TeamPolicy):
         task = single_agent(task)
     n, agents = len(states), len(task.policies)

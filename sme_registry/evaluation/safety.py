@@ -74,14 +74,7 @@ class SafetyAccumulator:
         self._reward = self._safe_reward = self._cost = 0.0
 
     def add(self, a: Array, optimal: Array, limit: Array, safe_reward: Array) -> None:
-        """Add a batch.
-
-        Args:
-          a: `[B, A]` or `[A]` in [0, 1].
-          optimal: `[B, A]` π*.
-          limit: `[B, A]` ℓ.
-          safe_reward: `[B]`, `Task.safe_reward_of` both, the same for every policy.
-        """
+        """Add a batch."""
         task = self._task
         self._states += len(optimal)
         self._reward += float(task.reward_of(task.similarity_of(a, optimal)).sum())

@@ -86,10 +86,6 @@ class DynamicRegret(StrictModel):
           stream: the stream of this life.
           online_regret: `[P]` mean regret over the training of an agent on each phase alone, for
             as many steps as the phase has.
-
-        Raises:
-          OptionError: not one number in [0, 1] for each phase; or the visits cannot be those of
-            this stream.
         """
         _refuse_other_visits(stream, self)
         fresh = _column("fresh online_regret", online_regret, len(stream.phases), "phase")
@@ -132,10 +128,6 @@ def dynamic_regret(
         `length` where they are episodes.
       phase: `[N]` `info["phase"]` of each row. Needed only where rows are steps and
         switch="episode": a phase then lasts until the episode has ended.
-
-    Raises:
-      OptionError: no rows, arrays of different lengths, values out of range, or rows that overlap.
-      UnknownNameError, SpecError: no such stream, or a field is out of range.
 
     Examples:
       >>> from sme_registry.evaluation import dynamic_regret
@@ -184,21 +176,14 @@ def visit_ends(stream: StreamSpec, visits: int) -> _Integers:
 
 
 def _are_over(stream: StreamSpec, regret: DynamicRegret) -> npt.NDArray[np.bool_]:
-    """`[V]` whether the log reaches the end of each visit, but for an episode that is in no log.
-
-    That episode is shorter than T. Where it would be half of the visit or more, the visit is not
-    over.
-    """
+    """`[V]` whether the log reaches the end of each visit, but for an episode that is in no log."""
     steps = np.array([stream.phases[visit.phase].steps for visit in regret.visits])
     missing = visit_ends(stream, len(steps)) - regret.lifetime[-1]
     return np.asarray(missing < np.minimum(stream.horizon, steps / 2))
 
 
 def _refuse_other_visits(stream: StreamSpec, regret: DynamicRegret) -> None:
-    """Raise OptionError if a life in this stream has other visits after as many steps.
-
-    In an episode that goes on into another phase, its own may still be in force.
-    """
+    """Raise OptionError if a life in this stream has other visits after as many steps."""
     P, end = len(stream.phases), regret.lifetime[-1]
     earliest, latest = visit_at(stream, np.array([max(0, end - stream.horizon), end - 1])) + 1
     reached = len(regret.visits)
@@ -218,12 +203,7 @@ def visit_at(stream: StreamSpec, lifetime: _Integers) -> _Integers:
 
 
 def visits_in_force(stream: StreamSpec, visits: _Integers, phase: npt.ArrayLike) -> _Integers:
-    """`[N]` visits in force: the latest one of each row's phase that has begun.
-
-    An episode that is longer than all phases together may reach the next visit of its own phase;
-    rows of its later steps then count for that one, and a row of the whole episode for the one in
-    which it begins.
-    """
+    """`[N]` visits in force: the latest one of each row's phase that has begun."""
     phases = _column("phase", phase, len(visits)).astype(np.int64)
     P = len(stream.phases)
     in_force = visits - (visits - phases) % P

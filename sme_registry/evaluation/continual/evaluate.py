@@ -61,14 +61,6 @@ def evaluate_stream(
     Returns:
       The report, with the reference agents on the same states.
 
-    Raises:
-      UnknownNameError, SpecError: no such stream or protocol, a field is out of range, or the
-        stream has more than 1,000 visits.
-      OptionError: not one policy for each visit or phase.
-      PolicyError: a policy cannot be loaded, or its actions are invalid; names it.
-      MissingDependencyError: the library that loads a policy is not installed.
-      ResourceLimitError: the tasks would not fit in memory together.
-
     Examples:
       >>> from sme_registry.evaluation import evaluate_stream
       >>> phases = [{"spec": "Default", "steps": 100}, {"spec": "Complexity10", "steps": 100}]

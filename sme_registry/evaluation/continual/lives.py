@@ -56,14 +56,6 @@ def expected_regret(
       algorithm: as in `evaluate`.
       progress: called after the episodes of each piece with the number of pieces done, and of all.
 
-    Raises:
-      UnknownNameError, SpecError: no such stream, a field is out of range, or the stream has more
-        than 1,000 visits.
-      OptionError: not one policy or number for each visit, or a number outside [0, 1].
-      PolicyError: a policy cannot be loaded, or its actions are invalid; names it.
-      MissingDependencyError: the library that loads a policy is not installed.
-      ResourceLimitError: the tasks would not fit in memory together.
-
     Examples:
       >>> from sme_registry.evaluation import expected_regret
       >>> phases = [{"spec": "Default", "steps": 100}, {"spec": "Complexity10", "steps": 100}]
@@ -120,10 +112,6 @@ def reference_regret(
       training: that agent's dynamic regret, of which the first visit is taken.
       episodes, seed: as in `expected_regret`.
 
-    Raises:
-      OptionError: only one of `frozen` and `training`, or a training without steps in visit 0.
-      As `expected_regret`.
-
     Examples:
       >>> from sme_registry.evaluation import reference_regret
       >>> phases = [{"spec": "Default", "steps": 100}, {"spec": "Complexity10", "steps": 100}]
@@ -178,10 +166,7 @@ def _policies(
 
 
 def _ends(stream: StreamSpec, ends: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """When pieces are left: where a switch waits for a reset, at the end of an episode.
-
-    Only where all episodes are of T steps is this known in advance.
-    """
+    """When pieces are left: where a switch waits for a reset, at the end of an episode."""
     if stream.switch == "step" or any(phase.spec.D for phase in stream.phases):
         return ends
     T = stream.horizon

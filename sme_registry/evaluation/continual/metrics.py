@@ -44,52 +44,31 @@ from sme_registry.task.draw import Array
 
 
 def average_performance(R: Array) -> Array:
-    """A(v), `[V, K]`: mean performance over the phases visited so far.
-
-    Args:
-      R: `[V, P, K]` performance, at most 1.
-    """
+    """A(v), `[V, K]`: mean performance over the phases visited so far."""
     P = R.shape[1]
     return np.array([row[: min(v + 1, P)].mean(axis=0) for v, row in enumerate(R)])
 
 
 def backward_transfer(R: Array) -> Array:
-    """B(v), `[V, K]`: how performance changed since a phase was last trained; below 0: for worse.
-
-    Args:
-      R: `[V, P, K]` performance, at most 1.
-    """
+    """B(v), `[V, K]`: change of performance since a phase was last trained; below 0: worse."""
     P = R.shape[1]
     return _over_earlier_phases(R, lambda v, j: R[v, j] - R[v - 1 - (v - 1 - j) % P, j])
 
 
 def forgetting(R: Array) -> Array:
-    """F(v), `[V, K]`: how far performance is below its best so far; negative where it is the best.
-
-    Args:
-      R: `[V, P, K]` performance, at most 1.
-    """
+    """F(v), `[V, K]`: fall of performance below its best so far; negative where it is the best."""
     return _over_earlier_phases(R, lambda v, j: R[:v, j].max(axis=0) - R[v, j])
 
 
 def forward_transfer(R: Array, initial: Array) -> Array:
-    """T, `[K]`: what was gained on phases before their first visit.
-
-    Args:
-      R: `[V, P, K]` performance, at most 1.
-      initial: `[P, K]` performance of the initial policy; NaN where there is none.
-    """
+    """T, `[K]`: what was gained on phases before their first visit."""
     P = R.shape[1]
     gains = [R[j - 1, j] - initial[j] for j in range(1, P)]
     return np.asarray(np.mean(gains, axis=0)) if gains else np.full(R.shape[2], np.nan)
 
 
 def relearning(R: Array) -> Array:
-    """G, `[K]`: what the second visit of a phase gained on its first, after equal steps.
-
-    Args:
-      R: `[V, P, K]` performance, at most 1.
-    """
+    """G, `[K]`: what the second visit of a phase gained on its first, after equal steps."""
     P = R.shape[1]
     if len(R) < 2 * P:
         return np.full(R.shape[2], np.nan)
@@ -97,17 +76,7 @@ def relearning(R: Array) -> Array:
 
 
 def plasticity(M: Array, fresh: Array) -> tuple[Array, Array]:
-    """Ratio and difference, `[V, K]` each, between an agent and fresh ones after equal steps.
-
-    All phases of equal fields are draws of equal difficulty, so what a fresh agent learns and this
-    one does not is plasticity that was lost. Both are NaN where `fresh` is; the ratio is also NaN
-    where a fresh agent is optimal.
-
-    Args:
-      M: `[V, P, K]` normalised regret, at least 0.
-      fresh: `[P, K]` normalised regret on each phase of an agent trained for as many steps on that
-        phase alone.
-    """
+    """Ratio and difference, `[V, K]` each, between an agent and fresh ones after equal steps."""
     V, P, _ = M.shape
     phases = np.arange(V) % P
     trained, alone = M[np.arange(V), phases], fresh[phases]
@@ -116,31 +85,13 @@ def plasticity(M: Array, fresh: Array) -> tuple[Array, Array]:
 
 
 def learning_transfer(visits: Array, fresh: Array) -> Array:
-    """How much less regret a visit cost than a fresh agent's training, as a share of the latter.
-
-    1: the visit cost no regret; 0: it cost a fresh agent's; below 0: it cost more.
-
-    Args:
-      visits: `[V]` online regret of each visit, in [0, 1]; NaN where it is not known.
-      fresh: `[P]` online regret on each phase of an agent that trained for as many steps on that
-        phase alone.
-
-    Returns:
-      `[V]`, at most 1; NaN where `visits` is, and where a fresh agent has no regret.
-    """
+    """How much less regret a visit cost than a fresh agent's training, as a share of the latter."""
     alone = fresh[np.arange(len(visits)) % len(fresh)]
     return np.divide(alone - visits, alone, out=np.full_like(visits, np.nan), where=alone > 0.0)
 
 
 def mean_after_first(values: Sequence[float | None]) -> float | None:
-    """The mean over the visits after visit 0 of a plasticity or a learning transfer.
-
-    Args:
-      values: `[V]`; None or NaN, and left out, where a visit has none.
-
-    Returns:
-      None where no visit after visit 0 has a value.
-    """
+    """The mean over the visits after visit 0 of a plasticity or a learning transfer."""
     known = [each for each in values[1:] if each is not None and not math.isnan(each)]
     return float(np.mean(known)) if known else None
 

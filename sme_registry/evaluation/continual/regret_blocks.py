@@ -25,16 +25,7 @@ _Integers = npt.NDArray[np.int64]
 
 
 class RegretBlocks:
-    """Sums of regret over blocks, while lives are lived.
-
-    Args:
-      stream: one of the lives' streams; the others switch at the same steps.
-      lives: their number.
-
-    Attributes:
-      steps: `[blocks]` steps counted in each.
-      regret: `[blocks, lives]` their sums of regret.
-    """
+    """Sums of regret over blocks, while lives are lived."""
 
     def __init__(self, stream: StreamSpec, lives: int = 1) -> None:
         visits = stream.visits
@@ -53,13 +44,7 @@ class RegretBlocks:
         self.regret = np.zeros((len(self._ends), lives))
 
     def add(self, end: int, regret: Array, phase: npt.ArrayLike | None = None) -> None:
-        """Count steps.
-
-        Args:
-          end: the lifetime after them.
-          regret: `[n, lives]` of each of them.
-          phase: `[n]` `info["phase"]` of each; None where every episode ends at a switch.
-        """
+        """Count steps."""
         before = end - len(regret) + np.arange(len(regret))
         blocks = np.searchsorted(self._ends, before, side="right")
         visits = np.searchsorted(self._visit_ends[:-1], before, side="right")

@@ -210,11 +210,7 @@ class StreamReport(ReportFile):
         return catalogue.title(self.stream.named(self.name))
 
     def region(self, name: str = "WD") -> StreamRegion:
-        """A region by its name; `OOD` is the mean over the shells.
-
-        Raises:
-          UnknownNameError: no region has this name.
-        """
+        """A region by its name; `OOD` is the mean over the shells."""
         known = {each.name: each for each in (*self.regions, self.ood)}
         if name not in known:
             hint = did_you_mean(name, known)
@@ -241,10 +237,6 @@ class StreamReport(ReportFile):
             alone: on its task, or, where the phase drifts, on the stream of that phase.
           online_regret: the mean regret over the training of each of them, for the learning
             transfer of the visits; None adds none.
-
-        Raises:
-          OptionError: not one report for each phase, of its task and of this protocol; or an
-            `online_regret` that is invalid, or that no dynamic regret can be compared with.
         """
         tasks = [visit.spec_digest for visit in self.visits[: len(self.stream.phases)]]
         alone = _fresh_regrets(fresh, tasks, self.protocol_digest)
@@ -286,11 +278,7 @@ class StreamReport(ReportFile):
         return tables.of_metrics(self)
 
     def matrix(self, region: str = "WD") -> Table:
-        """The retention matrix of a region: a row for each visit, a column for each phase.
-
-        Raises:
-          UnknownNameError: no region has this name.
-        """
+        """The retention matrix of a region: a row for each visit, a column for each phase."""
         from sme_registry.evaluation.continual import tables
 
         return tables.of_matrix(self, region)
@@ -312,9 +300,6 @@ def _fresh_regrets(
 ) -> Array:
     """`[P, K + 1]` normalised regret of fresh agents, each on its phase's task, and the mean over
     the shells.
-
-    Raises:
-      OptionError: see `StreamReport.with_fresh`.
     """
     if not _are_reports(fresh) or len(fresh) != len(tasks):
         given = f"{len(fresh)} reports" if _are_reports(fresh) else f"{fresh!r:.60}"
@@ -349,15 +334,7 @@ def stream_regions(
     fresh: Array | None,
     references: Mapping[str, Array],
 ) -> tuple[tuple[StreamRegion, ...], StreamRegion]:
-    """The regions of a report, and the mean over the shells.
-
-    Args:
-      protocol: the states, of `K` regions.
-      agent: `[V, P, K]` normalised regret.
-      initial: `[P, K]` of the initial policy.
-      fresh: `[P, K]` of fresh agents, each on its phase.
-      references: `[V, P, K]` of each reference agent.
-    """
+    """The regions of a report, and the mean over the shells."""
     edges, states = protocol.edges, protocol.states_per_region
     names = [(region_name(k), *edge, states) for k, edge in enumerate(edges)]
     names.append((SHELLS, edges[1][0], edges[-1][1], states * (len(edges) - 1)))

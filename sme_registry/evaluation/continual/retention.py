@@ -30,13 +30,7 @@ from sme_registry.task.draw import Array
 
 
 class Subject(NamedTuple):
-    """What is measured.
-
-    Attributes:
-      acts: a policy, or the index of a phase whose optimum acts.
-      phases: the phases on whose tasks it is measured.
-      where: what an error calls it, such as "policies[2]".
-    """
+    """What is measured."""
 
     acts: Policy | int
     phases: Sequence[int]
@@ -55,11 +49,7 @@ def prepared(
     action_range: str | None = None,
     algorithm: str | None = None,
 ) -> Policy:
-    """A policy in any form, ready for a stream's observations; see `as_policy`.
-
-    Raises:
-      As `as_policy`, the message beginning with `where`.
-    """
+    """A policy in any form, ready for a stream's observations; see `as_policy`."""
     try:
         ready = as_policy(
             policy,
@@ -87,22 +77,7 @@ def measure(
     protocol: EvaluationProtocol,
     progress: Progress | None = None,
 ) -> tuple[Array, Engine]:
-    """The normalised regret of each subject on each of its phases, in every region.
-
-    Args:
-      stream: the stream.
-      subjects: what is measured; one of them may appear only once.
-      protocol: the states.
-      progress: called after each batch with the number of states done, and of all states.
-
-    Returns:
-      `[N, P, K]`, NaN on other phases: 0 for the phase's optimum, 1 for the constant ½. And the
-      engine of the first phase, for the versions behind the numbers.
-
-    Raises:
-      PolicyError: a policy's actions are invalid; names it.
-      ResourceLimitError: the tasks would not fit in memory together.
-    """
+    """The normalised regret of each subject on each of its phases, in every region."""
     specs = final_specs(stream)
     tasks = materialize_together(stream, specs)
     keys = [same_draw(spec) for spec in specs]

@@ -42,10 +42,6 @@ def across_seeds(
       of intervals of a single run. `dynamic_regret` `[1]` and `visit_dynamic_regret` `[V]` where
       every report has them, and `learning_transfer` and `visit_learning_transfer` likewise.
 
-    Raises:
-      OptionError: no report, or reports of different streams or protocols.
-      UnknownNameError: no region has this name.
-
     Examples:
       >>> from sme_registry.evaluation import across_seeds, evaluate_stream
       >>> phases = [{"spec": "Default", "steps": 100}, {"spec": "Complexity10", "steps": 100}]
@@ -80,10 +76,7 @@ def _of_logs(logs: Sequence[DynamicRegret], field: str) -> dict[str, Array]:
 
 
 def same_stream(reports: Sequence[StreamReport]) -> None:
-    """Raise OptionError unless there is a report, and all are of one stream and protocol.
-
-    Draws of one stream count as that stream.
-    """
+    """Raise OptionError unless there is a report, and all are of one stream and protocol."""
     if not reports:
         raise OptionError("reports: must be one or more stream reports. Give one for each seed.")
     streams = {report.stream_digest: report.stream for report in reports}

@@ -70,13 +70,6 @@ def as_policy(
     A recurrent model is memoryless here: it acts from its initial state in each observation.
     `Policy.start` makes it keep its state, as `rollouts` does.
 
-    Raises:
-      UnknownNameError: a text that is neither a path, nor `module:function`, nor a reference.
-      PolicyError: it is none of these, cannot be loaded, or has another interface than the task;
-        or an agent of a team has none or is unknown.
-      OptionError: `action_range` is neither "unit" nor "symmetric".
-      MissingDependencyError: the library that loads it is not installed.
-
     Examples:
       >>> from sme_registry.evaluation import as_policy
       >>> def centre(observations):

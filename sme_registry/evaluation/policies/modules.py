@@ -47,16 +47,7 @@ class ModulePredictor:
 def hidden_layers(
     act: Callable[[Observation], Any], module: Any
 ) -> Callable[[Observation], list[Any] | None]:
-    """The outputs of a module's hidden layers: the inputs of its linear layers but the first one's.
-
-    So an activation counts as part of its layer, whether it is a module or a function. They are
-    None unless the linear layers form a chain from the observation, in which each is called once:
-    of branches, tokens or rows, it is unknown which inputs are a hidden layer.
-
-    Args:
-      act: acts by calling the module.
-      module: the module, or one of which it is a part.
-    """
+    """The outputs of a module's hidden layers: the inputs of its linear layers but the first."""
     linear = [part for part in module.modules() if isinstance(part, _torch().nn.Linear)]
 
     def hidden(observations: Observation) -> list[Any] | None:
@@ -78,12 +69,7 @@ def hidden_layers(
 
 
 def _chain(calls: list[tuple[Any, Any]], observed: tuple[int, ...]) -> list[Any] | None:
-    """The different inputs of linear layers, in order; None if the layers form no chain.
-
-    Args:
-      calls: each called layer, with its input.
-      observed: the shape of the observations, `(B, O)`, which the first input must have.
-    """
+    """The different inputs of linear layers, in order; None if the layers form no chain."""
     if len({layer for layer, _ in calls}) < len(calls):
         return None
     links: list[tuple[Any, list[int]]] = []  # an input, and the widths of the layers that take it

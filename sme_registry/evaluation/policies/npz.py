@@ -61,11 +61,7 @@ class OfflinePolicy:
         return int(self.layers[-1][0].shape[0])
 
     def __call__(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Actions `[B, A]` float32 in [0, 1] for observations `[B, O]`.
-
-        Raises:
-          PolicyError: they have another width.
-        """
+        """Actions `[B, A]` float32 in [0, 1] for observations `[B, O]`."""
         x = np.asarray(observations, dtype=np.float32)
         if x.ndim != 2 or x.shape[1] != self.observation_dim:
             raise PolicyError(
@@ -89,11 +85,7 @@ class OfflinePolicy:
             yield x
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the file completely or not at all; equal policies give equal bytes.
-
-        Raises:
-          OptionError: the path does not end in .npz, or cannot be written.
-        """
+        """Write the file completely or not at all; equal policies give equal bytes."""
         if not os.fspath(path).endswith(".npz"):
             raise OptionError(f"path={os.fspath(path)!r}: must end in .npz.")
         arrays = {
@@ -108,11 +100,7 @@ class OfflinePolicy:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> OfflinePolicy:
-        """Read a file that `save` wrote.
-
-        Raises:
-          PolicyError: it does not exist, or is not such a file.
-        """
+        """Read a file that `save` wrote."""
         problem = f"{os.fspath(path)}: not a policy that `sme offline train` wrote"
         try:
             if os.path.getsize(path) > _MAX_BYTES:

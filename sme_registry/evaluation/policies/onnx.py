@@ -19,14 +19,7 @@ ACTION_RANGE = "action_range"  # a field of a file's metadata: "unit" or "symmet
 
 
 def load_onnx(path: str | os.PathLike[str], interface: Interface) -> OnnxNetwork:
-    """Load an ONNX file's network, on one thread of the CPU: a function of observations.
-
-    The file has one float32 input `[B, O]` and one output `[B, A]`.
-
-    Raises:
-      PolicyError: it does not exist, onnxruntime rejects it, or its interface differs.
-      MissingDependencyError: onnxruntime is not installed.
-    """
+    """Load an ONNX file's network, on one thread of the CPU: a function of observations."""
     path = Path(path)
     if not path.is_file():
         raise PolicyError(f"{path} does not exist. Give the path of an .onnx file.")
@@ -48,12 +41,7 @@ def load_onnx(path: str | os.PathLike[str], interface: Interface) -> OnnxNetwork
 
 
 class OnnxNetwork:
-    """An ONNX network: a function of observations.
-
-    Attributes:
-      action_range: the range of its actions, if its metadata record one.
-      path: of its file.
-    """
+    """An ONNX network: a function of observations."""
 
     def __init__(self, session: Any, path: Path) -> None:
         self._session, self._input = session, session.get_inputs()[0].name
@@ -67,12 +55,7 @@ class OnnxNetwork:
 
 
 def start_session(model: Path | bytes) -> Any:
-    """A session of onnxruntime for a file or its content.
-
-    Raises:
-      PolicyError: onnxruntime rejects it.
-      MissingDependencyError: onnxruntime is not installed.
-    """
+    """A session of onnxruntime for a file or its content."""
     name = "model" if isinstance(model, bytes) else str(model)
     require_packages(f"running {name}", {"onnxruntime": "onnxruntime"}, "onnx")
     # From version 1.31 on its telemetry is on by default; an evaluation must not send any.

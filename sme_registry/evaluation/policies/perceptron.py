@@ -57,10 +57,6 @@ class Perceptron:
       low: `[A]`, lower bound of the action space. None: the outputs are the actions.
       high: `[A]`, upper bound. Outputs in [−1, 1] are then scaled to the action space.
 
-    Raises:
-      PolicyError: there is no layer, an array has another shape or no finite numbers, or an
-        activation is unknown.
-
     Examples:
       >>> from sme_registry.evaluation import Perceptron
       >>> W, b = np.zeros((10, 4)), np.full(4, 0.5)

@@ -24,13 +24,7 @@ from sme_registry.task import draw
 
 
 class Interface(NamedTuple):
-    """The widths of observations and actions that a task needs of a policy.
-
-    Attributes:
-      description: what these widths belong to, such as "state_dim=3, action_dim=2".
-      alternatives: other forms that are allowed, for the error message.
-      hint: see `Policy`.
-    """
+    """The widths of observations and actions that a task needs of a policy."""
 
     observation_dim: int
     action_dim: int
@@ -95,11 +89,7 @@ class Policy:
         )
 
     def __call__(self, observations: Observation) -> Array:
-        """Actions `[B, A]`, converted to the unit range but not clipped to it.
-
-        Raises:
-          PolicyError: it fails, or does not return `[B, A]` finite numbers.
-        """
+        """Actions `[B, A]`, converted to the unit range but not clipped to it."""
         try:
             returned = modules.without_tensor(self.act(observations))
             shape = (len(observations), self.action_dim)
@@ -124,14 +114,7 @@ class Policy:
 
 
 class Member(NamedTuple):
-    """One agent of a team policy.
-
-    Attributes:
-      agent: its name.
-      policy: its own policy, or the one that all agents share.
-      observe: from observations `[B, S + 2]` to the policy's input, a fresh array.
-      action_dim: a_i, how many entries of the policy's action belong to this agent.
-    """
+    """One agent of a team policy."""
 
     agent: str
     policy: Policy
@@ -154,14 +137,7 @@ class TeamPolicy:
     members: tuple[Member, ...]
 
     def __call__(self, observations: Observation) -> Array:
-        """Joint actions `[B, A]`, converted to the unit range but not clipped to it.
-
-        Args:
-          observations: `[B, S + 2]`: s, t/T and r_cum/k, the same for each agent.
-
-        Raises:
-          PolicyError: an agent's policy fails or returns invalid actions; names the agent.
-        """
+        """Joint actions `[B, A]`, converted to the unit range but not clipped to it."""
         return self._joint_actions([observations] * len(self.members))
 
     def act_in(self, joint: Observation) -> Array:

@@ -22,10 +22,7 @@ _LOW: dict[ActionRange, float] = {"unit": 0.0, "symmetric": -1.0}
 
 
 def torch_policy(model: Any) -> Any:
-    """The PyTorch policy that SB3's own `predict` calls; None for a model that predicts otherwise.
-
-    Models of sbx have JAX networks, and recurrent ones have a state: both override `predict`.
-    """
+    """The PyTorch policy that SB3's own `predict` calls; None if a model predicts otherwise."""
     policies = sys.modules.get("stable_baselines3.common.policies")
     models = sys.modules.get("stable_baselines3.common.base_class")
     if policies is None or models is None:  # not imported: not an SB3 model
@@ -41,10 +38,7 @@ def torch_policy(model: Any) -> Any:
 
 
 def predictor(model: Any) -> Callable[[Observation], Any]:
-    """A model's deterministic actions; those of a plain SB3 model before they are clipped.
-
-    A recurrent model acts from its initial state.
-    """
+    """A model's deterministic actions; those of a plain SB3 model before they are clipped."""
     network = torch_policy(model)
     if network is None:
         return lambda observations: _predicted(model, observations)[0]
@@ -66,10 +60,7 @@ def predictor(model: Any) -> Callable[[Observation], Any]:
 
 
 def episode_predictor(model: Any) -> Callable[[], Callable[[Observation], Any]] | None:
-    """Begins episodes: as `predictor`, but the model's state is kept from call to call, row by row.
-
-    None for a plain SB3 model, which has no state.
-    """
+    """Begins episodes: as `predictor`, with the model's state kept from call to call, by row."""
     return functools.partial(_stateful, model) if torch_policy(model) is None else None
 
 

@@ -56,11 +56,6 @@ def load_sb3(path: str | os.PathLike[str], algorithm: str | None = None) -> Any:
         studies, and for the algorithms of stable-baselines3, sb3-contrib and sbx with their own
         policies (a DDPG loads as TD3, which acts equally).
 
-    Raises:
-      PolicyError: it does not exist, is not such a file, does not tell its algorithm, or cannot be
-        loaded as a model of it.
-      MissingDependencyError: the package of its algorithm is not installed.
-
     Examples:
       >>> from sme_registry.evaluation import load_sb3
       >>> type(load_sb3("runs/ppo/model.zip")).__name__
