@@ -81,27 +81,9 @@ def diagnose(
 ) -> AnyDiagnosis:
     """Measure a policy and the references, and answer every question about its regret.
 
-    Of a team, it measures every agent over its own action channels, and answers who is to blame
-    for the team's regret. Of a life in a stream, it measures the networks at the ends of the
-    visits, and answers which phases were costly, forgotten or not learnt, and whether plasticity
-    was lost.
-
-    Args:
-      subject: from `load_run`, `load_cell` or `load_policy`.
-      against: another run of a single agent, e.g. with a single axis changed. It is measured in
-        the same way.
-      probe_capacity: fit a network of the same layers to a*; tens of seconds. Ignored if the
-        policy's network is unknown. Single agents on one task only.
-      states: uniform states, in [64, 1,000,000]; fewer are used if a state is large.
-      episodes: in [8, 10,000]; fewer are used if a state is large. None are run of a life.
-      seed: of everything random here, at least 0.
-      progress: called with a description of each step.
-
-    Raises:
-      OptionError: an argument is out of range, or needs a single agent.
-      PolicyError: the policy's actions are invalid.
-      MissingDependencyError: the probe needs PyTorch, which is not installed.
-      ResourceLimitError: the task does not fit in memory.
+    Of a team, it measures every agent over its own action channels, and answers who is to blame for
+    the team's regret. Of a life in a stream, it measures the networks at the ends of the visits,
+    and answers which phases were costly, forgotten or not learnt, and whether plasticity was lost.
 
     Examples:
       >>> from sme_registry.diagnosis import diagnose, load_policy

@@ -62,43 +62,25 @@ class Verdict(StrictModel):
 
 
 class Difference(StrictModel):
-    """A quantity of this run and of the other run.
+    """A quantity of this run and of the other run."""
 
-    Attributes:
-      quantity: its name.
-      value: of this run.
-      other: of the other run.
-    """
-
-    quantity: str
-    value: Real
-    other: Real
+    quantity: str  # its name
+    value: Real  # of this run
+    other: Real  # of the other run
 
 
 class Comparison(StrictModel):
-    """This run compared with another; pairs are (this run, other run).
+    """This run compared with another; pairs are (this run, other run)."""
 
-    Attributes:
-      name: of the other run.
-      spec_fields: those that differ.
-      plan_fields: likewise.
-      differences: of the main quantities.
-      answers: to each question whose answers differ.
-    """
-
-    name: str
-    spec_fields: dict[str, tuple[JsonValue, JsonValue]]
-    plan_fields: dict[str, tuple[JsonValue, JsonValue]]
-    differences: TupleOf[Difference]
-    answers: dict[str, tuple[Answer, Answer]]
+    name: str  # of the other run
+    spec_fields: dict[str, tuple[JsonValue, JsonValue]]  # those that differ
+    plan_fields: dict[str, tuple[JsonValue, JsonValue]]  # likewise
+    differences: TupleOf[Difference]  # of the main quantities
+    answers: dict[str, tuple[Answer, Answer]]  # to each question whose answers differ
 
 
 def verdict_on(question: str, verdicts: Sequence[Verdict]) -> Verdict:
-    """The verdict on a question, by its name in data or as people read it.
-
-    Raises:
-      UnknownNameError: there is no such question.
-    """
+    """The verdict on a question, by its name in data or as people read it."""
     by_name = {verdict.question: verdict for verdict in verdicts}
     name = "_".join(question.replace("_", " ").casefold().split())
     if name in by_name:
@@ -148,11 +130,7 @@ class Diagnosis(StrictModel):
     versions: dict[str, str]
 
     def verdict(self, question: str) -> Verdict:
-        """The verdict on a question, such as "credit assignment" or "credit_assignment".
-
-        Raises:
-          UnknownNameError: there is no such question.
-        """
+        """The verdict on a question, such as "credit assignment" or "credit_assignment"."""
         return verdict_on(question, self.verdicts)
 
     def _repr_markdown_(self) -> str:
@@ -163,13 +141,7 @@ class Diagnosis(StrictModel):
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a diagnosis.json.
-
-        Raises:
-          MalformedDocumentError: the file is not readable or not strict JSON.
-          SpecError: a field is invalid, missing or unknown.
-          DigestMismatchError: `spec_digest` is not the digest of `spec`.
-        """
+        """Read a diagnosis.json."""
         diagnosis = cls.from_dict(read_json(path), str(path))
         refuse_other_digest(
             diagnosis.spec_digest,

@@ -36,14 +36,7 @@ _TINY = 1e-12
 
 
 def limits(task: Task, states: Sample, run: Trajectories, report: SafetyReport) -> Limits:
-    """What a policy does to the limits, in uniform states and in those of its episodes.
-
-    Args:
-      task: a task with `safety`.
-      states: uniform in the cube.
-      run: the policy's episodes.
-      report: of the policy's evaluation.
-    """
+    """What a policy does to the limits, in uniform states and in those of its episodes."""
     limit, tightest = task.limit(states.s), 2.0 * _tightness(task)
     above = [a - limit for a in (states.a, states.optimal)]
     own, optimal = ((excess > TOLERANCE).mean(axis=0) for excess in above)
@@ -88,14 +81,7 @@ class _Draws(NamedTuple):
 
 
 def distraction(policy: Policy, task: Task, states: Sample, seed: int) -> Distraction:
-    """How much of a policy's regret is owed to the distractors, in a few uniform states.
-
-    Args:
-      policy: on a task with distractors.
-      task: the task.
-      states: uniform in the cube.
-      seed: of the distractors.
-    """
+    """How much of a policy's regret is owed to the distractors, in a few uniform states."""
     m, numbers = task.spec.distractors, task.spec.observation_dim + task.spec.action_dim
     few = min(_STATES, len(states.s), max(8, MAX_NUMBERS // (_DRAWS * numbers)))
     s, d, time = states.drawn

@@ -41,12 +41,7 @@ _MAX_CHANNELS = 32
 
 
 def draw(diagnosis: Diagnosis, folder: Path, log: Log | None = None) -> tuple[Path, ...]:
-    """Write the figures into a folder, as PNG and PDF; the training's only where there is a log.
-
-    Raises:
-      MissingDependencyError: Matplotlib is not installed.
-      OptionError: a file cannot be written.
-    """
+    """Write the figures into a folder, as PNG and PDF; the training's only where there is a log."""
     figures: dict[str, Callable[[Figure, Measurements], None]] = {
         "where_channels": _channels,
         "where_states": partial(_states, threshold=diagnosis.thresholds["explained_variance"]),

@@ -28,12 +28,7 @@ RANK_SHARE = 0.99  # 1 − δ of the singular values' sum
 
 
 def network_state(network: Perceptron, observations: Observation) -> NetworkState | None:
-    """Measure a network in some states; None if it has no hidden layer.
-
-    Args:
-      network: from observations to actions; its last layer is the output.
-      observations: `[n, O]`, such as of uniform states.
-    """
+    """Measure a network in some states; None if it has no hidden layer."""
     *hidden, _ = zip(network.outputs(observations), network.layers, strict=True)
     if not hidden:
         return None

@@ -71,18 +71,7 @@ def exploration_sd(
 def probe_capacity(
     network: Perceptron, task: Task, states: int, seed: int, progress: Callable[[int], None]
 ) -> CapacityProbe:
-    """Fit a network of the same layers to the optimal actions.
-
-    Args:
-      network: its layers are used, its weights are not.
-      task: the task.
-      states: in the training set; at most 50,000.
-      seed: of the states and of the initial weights.
-      progress: called with the number of gradient steps done, every 1,000 steps.
-
-    Raises:
-      MissingDependencyError: PyTorch is not installed.
-    """
+    """Fit a network of the same layers to the optimal actions."""
     require_packages("probe_capacity", {"torch": "PyTorch"}, "train")
     import torch
 

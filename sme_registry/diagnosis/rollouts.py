@@ -128,11 +128,7 @@ def episodes_of(
     episodes: int,
     seed: int,
 ) -> tuple[dict[str, Trajectories], ...]:
-    """Whole episodes of the policy and of references, from the same initial states.
-
-    Returns:
-      For each agent, its trajectories under the policy and under each reference.
-    """
+    """Whole episodes of the policy and of references, from the same initial states."""
     S, T = task.spec.state_dim, task.spec.horizon
     n = max(8, min(episodes, MAX_NUMBERS // (T * (S + 8))))
     starts = streams.uniform(seed, "diagnosis/starts", n * S).reshape(n, S)

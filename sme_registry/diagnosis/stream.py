@@ -80,13 +80,7 @@ class _States:
         self._observation = drawn.observation(drawn.s, spec.horizon)
 
     def of(self, network: Perceptron | None, phase: int | None) -> NetworkState | None:
-        """The state of a network; None of an unknown one.
-
-        Args:
-          network: the network.
-          phase: that it observes if the agent observes the phase; None for a fresh agent, which
-            knows of one phase only.
-        """
+        """The state of a network; None of an unknown one."""
         if network is None:
             return None
         if phase is None or not self._stream.observes_phase:

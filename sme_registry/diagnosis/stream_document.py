@@ -20,21 +20,13 @@ PhaseOutcome = Literal["retained", "forgotten", "not_learnt"]
 
 
 class NetworkState(StrictModel):
-    """The hidden layers of the policy's network in uniform states; see `hidden_layers`.
+    """The hidden layers of the policy's network in uniform states; see `hidden_layers`."""
 
-    Attributes:
-      hidden: units of each layer.
-      dormant_units: share of all hidden units.
-      saturated_units: likewise, of tanh.
-      effective_rank: of the last hidden layer.
-      weight_norm: Euclidean norm of the weights of all layers, without biases.
-    """
-
-    hidden: TupleOf[Integer]
-    dormant_units: Real
-    saturated_units: Real
-    effective_rank: Integer
-    weight_norm: Real
+    hidden: TupleOf[Integer]  # units of each layer
+    dormant_units: Real  # share of all hidden units
+    saturated_units: Real  # likewise, of tanh
+    effective_rank: Integer  # of the last hidden layer
+    weight_norm: Real  # Euclidean norm of the weights of all layers, without biases
 
     @property
     def inactive_units(self) -> float:
@@ -43,51 +35,29 @@ class NetworkState(StrictModel):
 
 
 class VisitDiagnosis(StrictModel):
-    """One visit of the life.
+    """One visit of the life."""
 
-    Attributes:
-      visit: its number, from 0.
-      phase: the index of its phase.
-      lifetime: environment steps at its end.
-      steps: that it lasts.
-      dynamic_regret: of its steps in the log; None without one.
-      online_regret: its mean; None without a log, and where no step was counted.
-      normalised_regret: at its end, on its own phase.
-      network: at its end; None if unknown.
-    """
-
-    visit: Integer
-    phase: Integer
-    lifetime: Integer
-    steps: Integer
-    dynamic_regret: Real | None
-    online_regret: Real | None
-    normalised_regret: Real
-    network: NetworkState | None
+    visit: Integer  # its number, from 0
+    phase: Integer  # the index of its phase
+    lifetime: Integer  # environment steps at its end
+    steps: Integer  # that it lasts
+    dynamic_regret: Real | None  # of its steps in the log; None without one
+    online_regret: Real | None  # its mean; None without a log, and where no step was counted
+    normalised_regret: Real  # at its end, on its own phase
+    network: NetworkState | None  # at its end; None if unknown
 
 
 class PhaseDiagnosis(StrictModel):
-    """One phase of the stream.
+    """One phase of the stream."""
 
-    Attributes:
-      phase: its index.
-      outcome: whether the agent knows it at the end.
-      best_normalised_regret: lowest at the end of one of its visits.
-      final_normalised_regret: at the end of the life.
-      initial_normalised_regret: before training.
-      fresh_normalised_regret: of an agent that trained on this phase alone.
-      fresh_online_regret: of its training.
-      fresh_network: at the end of its training.
-    """
-
-    phase: Integer
-    outcome: PhaseOutcome
-    best_normalised_regret: Real
-    final_normalised_regret: Real
-    initial_normalised_regret: Real | None
-    fresh_normalised_regret: Real | None
-    fresh_online_regret: Real | None
-    fresh_network: NetworkState | None
+    phase: Integer  # its index
+    outcome: PhaseOutcome  # whether the agent knows it at the end
+    best_normalised_regret: Real  # lowest at the end of one of its visits
+    final_normalised_regret: Real  # at the end of the life
+    initial_normalised_regret: Real | None  # before training
+    fresh_normalised_regret: Real | None  # of an agent that trained on this phase alone
+    fresh_online_regret: Real | None  # of its training
+    fresh_network: NetworkState | None  # at the end of its training
 
 
 class StreamDiagnosis(StrictModel):
@@ -128,11 +98,7 @@ class StreamDiagnosis(StrictModel):
     versions: dict[str, str]
 
     def verdict(self, question: str) -> Verdict:
-        """The verdict on a question, such as "forgetting" or "loss of plasticity".
-
-        Raises:
-          UnknownNameError: there is no such question.
-        """
+        """The verdict on a question, such as "forgetting" or "loss of plasticity"."""
         return verdict_on(question, self.verdicts)
 
     def _repr_markdown_(self) -> str:

@@ -37,12 +37,7 @@ _Fill: TypeAlias = Callable[["Figure", StreamSubject, StreamDiagnosis], None]
 def draw_stream(
     diagnosis: StreamDiagnosis, folder: Path, subject: StreamSubject
 ) -> tuple[Path, ...]:
-    """Write the figures into a folder, as PNG and PDF; the network's only where it is known.
-
-    Raises:
-      MissingDependencyError: Matplotlib is not installed.
-      OptionError: a file cannot be written.
-    """
+    """Write the figures into a folder, as PNG and PDF; the network's only where it is known."""
     figures = {
         "which_phases": _drawn(_which_phases, subject, diagnosis),
         "what_is_retained": retention_map(subject.report),

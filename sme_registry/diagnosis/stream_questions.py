@@ -52,12 +52,7 @@ _why = partial(add_to, STREAM_QUESTIONS, "why")
 
 
 def outcome_of(best: float, final: float) -> PhaseOutcome:
-    """What became of a phase.
-
-    Args:
-      best: the lowest normalised regret at the end of one of its visits.
-      final: that at the end of the life.
-    """
+    """What became of a phase."""
     if best >= _T["unlearnt"]:
         return "not_learnt"
     return "forgotten" if final - best >= _T["difference"] else "retained"

@@ -41,13 +41,7 @@ class StreamSubject:
 
 
 def life_of_run(folder: Path, name: str, record: RunRecord, plan: dict[str, Any]) -> StreamSubject:
-    """The life of a run of `sme train`.
-
-    Raises:
-      OptionError: the life has not ended, or a file is missing or of another stream.
-      MalformedDocumentError, SpecError: stream.json is damaged.
-      PolicyError, MissingDependencyError: a model cannot be loaded.
-    """
+    """The life of a run of `sme train`."""
     assert record.stream is not None  # of a life
     kept = snapshots.Snapshots(folder / snapshots.FOLDER, record.stream)
     path = folder / FILE
@@ -76,19 +70,7 @@ def life_of_run(folder: Path, name: str, record: RunRecord, plan: dict[str, Any]
 def life_in_cell(
     study: Path, name: str, path: Path, cell: Cell, plan: dict[str, Any]
 ) -> StreamSubject:
-    """The life of a cell of a study, with its fresh agents where all have finished.
-
-    Args:
-      study: its folder.
-      name: of the cell.
-      path: of the cell's result.
-      cell: the cell.
-      plan: algorithm, seed, steps and so on.
-
-    Raises:
-      MalformedDocumentError, SpecError: a result is damaged.
-      PolicyError, MissingDependencyError: a model cannot be loaded.
-    """
+    """The life of a cell of a study, with its fresh agents where all have finished."""
     assert cell.stream is not None  # of a life
     report = _report(read_json(path), path)
     assert isinstance(report, StreamReport)

@@ -92,10 +92,6 @@ def load_policy(
 
     `log` is the episodes.csv of its training, as `sme train` and `wrappers.RecordRegret` write it.
 
-    Raises:
-      OptionError: the log has other columns, or cannot be read.
-      PolicyError, OptionError, MissingDependencyError: see `as_policy`.
-
     Examples:
       >>> from sme_registry.diagnosis import load_policy
       >>> load_policy("linear", sme_registry.load("Default")).name
@@ -116,11 +112,6 @@ def load_policy(
 
 def load_run(folder: str | Path) -> AnySubject:
     """A run of `sme train`, finished or not; a life in a stream only when it has ended.
-
-    Raises:
-      OptionError: the folder holds no run, or the run has neither a model nor a checkpoint yet.
-      MalformedDocumentError, SpecError: run.json is damaged.
-      PolicyError, MissingDependencyError: its model cannot be loaded.
 
     Examples:
       >>> from sme_registry.diagnosis import load_run
@@ -180,17 +171,6 @@ def _team_policy(policy: Any, spec: SMESpec, action_range: str | None) -> TeamPo
 
 def load_cell(study: str | Path, key: str) -> AnySubject:
     """A finished cell of a study that kept its model; a life in a stream also without its models.
-
-    Args:
-      study: the study's folder.
-      key: the cell's digest, with or without `sha256:`, or its first digits.
-
-    Raises:
-      OptionError: the folder holds no study, the cell's model was not kept, or each agent of a
-        team has its own.
-      UnknownNameError: no finished cell, or more than one, has such a key.
-      MalformedDocumentError, SpecError: its result is damaged.
-      PolicyError, MissingDependencyError: its model cannot be loaded.
 
     Examples:
       >>> from sme_registry.diagnosis import load_cell

@@ -100,11 +100,7 @@ def _measurements(
 
 
 def _questions(spec: SMESpec) -> tuple[str, ...]:
-    """The questions of a single agent's diagnosis that have an answer for an agent of a team.
-
-    Those about training rest on the log, the exploration or the network of a single learner with a
-    reward of its own. Sparsity needs a reward of its own as well.
-    """
+    """The questions of a single agent's diagnosis that have an answer for an agent of a team."""
     own_reward = spec.team is not None and spec.team.reward == "individual"
     return (*WHERE, "sparsity") if own_reward else tuple(WHERE)
 

@@ -21,39 +21,23 @@ __all__ = ["AgentDiagnosis", "Credit", "TeamDiagnosis"]
 
 
 class Credit(StrictModel):
-    """An agent's part in the team's regret; means over states.
+    """An agent's part in the team's regret; means over states."""
 
-    Attributes:
-      regret_share: in units of regret: over the agents, they add up to the team's regret.
-      difference_reward: in [0, 1]; these do not add up, because the step reward is clipped.
-    """
-
-    regret_share: Real
-    difference_reward: Real
+    regret_share: Real  # in units of regret: over the agents, they add up to the team's regret
+    difference_reward: Real  # in [0, 1]; these do not add up, because the step reward is clipped
 
 
 class AgentDiagnosis(StrictModel):
-    """One agent of a team, measured over its own action channels.
+    """One agent of a team, measured over its own action channels."""
 
-    Attributes:
-      name: of the agent.
-      state_channels: that it observes, from 1.
-      action_channels: that it owns, from 1.
-      level: its normalised regret, ranked among the constant ½, the linear policy and 0.
-      uniform: in uniform states.
-      visited: in the states that the team visits.
-      verdicts: on its own policy.
-      measurements: what the verdicts rest on.
-    """
-
-    name: str
-    state_channels: TupleOf[Integer]
-    action_channels: TupleOf[Integer]
-    level: Level
-    uniform: Credit
-    visited: Credit
-    verdicts: TupleOf[Verdict]
-    measurements: Measurements
+    name: str  # of the agent
+    state_channels: TupleOf[Integer]  # that it observes, from 1
+    action_channels: TupleOf[Integer]  # that it owns, from 1
+    level: Level  # its normalised regret, ranked among the constant ½, the linear policy and 0
+    uniform: Credit  # in uniform states
+    visited: Credit  # in the states that the team visits
+    verdicts: TupleOf[Verdict]  # on its own policy
+    measurements: Measurements  # what the verdicts rest on
 
 
 class TeamDiagnosis(StrictModel):
@@ -91,19 +75,11 @@ class TeamDiagnosis(StrictModel):
     versions: dict[str, str]
 
     def verdict(self, question: str) -> Verdict:
-        """The verdict on a question about the team, such as "blame".
-
-        Raises:
-          UnknownNameError: there is no such question.
-        """
+        """The verdict on a question about the team, such as "blame"."""
         return verdict_on(question, self.verdicts)
 
     def agent(self, name: str) -> AgentDiagnosis:
-        """One agent, by its name.
-
-        Raises:
-          UnknownNameError: the team has no such agent.
-        """
+        """One agent, by its name."""
         by_name = {agent.name: agent for agent in self.agents}
         if name not in by_name:
             hint = did_you_mean(name, by_name)

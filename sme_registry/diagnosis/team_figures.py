@@ -31,12 +31,7 @@ _MAX_AGENTS = 32
 
 
 def draw_team(diagnosis: TeamDiagnosis, folder: Path) -> tuple[Path, ...]:
-    """Write the figure into a folder, as PNG and PDF.
-
-    Raises:
-      MissingDependencyError: Matplotlib is not installed.
-      OptionError: a file cannot be written.
-    """
+    """Write the figure into a folder, as PNG and PDF."""
     with styled():
         figure = new_figure((8.2, 4.0))
         entitle(figure, title(diagnosis))

@@ -18,16 +18,12 @@ __all__ = ["View", "view_of"]
 
 
 class View(NamedTuple):
-    """The forms of one diagnosis.
+    """The forms of one diagnosis."""
 
-    Attributes:
-      terminal: what `sme diagnose` prints, part by part.
-      markdown: the page, which shows figures of the same folder, given by their names.
-      draw: writes the figures of the diagnosis of a subject into a folder, as PNG and PDF.
-    """
-
-    terminal: Callable[[], Iterator[RenderableType]]
+    terminal: Callable[[], Iterator[RenderableType]]  # what `sme diagnose` prints, part by part
+    # the page, which shows figures of the same folder, given by their names
     markdown: Callable[[Sequence[str]], str]
+    # writes the figures of the diagnosis of a subject into a folder, as PNG and PDF
     draw: Callable[[Path, Any], tuple[Path, ...]]
 
 

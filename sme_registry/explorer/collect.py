@@ -51,26 +51,7 @@ def facts(
     seed: int = 0,
     remark: str = "",
 ) -> dict[str, Any]:
-    """The data of a page.
-
-    Args:
-      spec: the task.
-      subject: the policy, with what is known about its training; None for the task alone.
-      report: of its evaluation; None leaves out the regions and the layers.
-      channels: pairs of inputs, from 1, over which a policy whose network is unknown is sampled;
-        empty for the first two.
-      episodes: to run for the regret over the episode; at least 1.
-      seed: of their start states and of the linear policy's fit.
-      remark: a text above the map.
-
-    Returns:
-      Plain JSON data.
-
-    Raises:
-      OptionError: a pair of channels that the task does not have, or too many inputs for a page.
-      ResourceLimitError: the task's networks are too large for a page.
-      PolicyError: the policy fails.
-    """
+    """The data of a page."""
     refuse_large(spec)
     pairs = [_pair(pair, networks.point_width(spec)) for pair in channels]
     name = None if subject is None else _name(subject)

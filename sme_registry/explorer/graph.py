@@ -28,19 +28,13 @@ _BINARY = {"Add": np.add, "Sub": np.subtract, "Mul": np.multiply, "Div": np.divi
 
 
 class GraphNode(NamedTuple):
-    """A node of a graph.
+    """A node of a graph."""
 
-    Attributes:
-      operator: of ONNX, such as "Gemm".
-      inputs: names of the values that it reads; empty for an optional one that is missing.
-      outputs: names of the values that it computes.
-      attributes: by name: integers, floats, lists of them, and tensors as arrays.
-    """
-
-    operator: str
+    operator: str  # of ONNX, such as "Gemm"
+    # names of the values that it reads; empty for an optional one that is missing
     inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    attributes: Mapping[str, Any]
+    outputs: tuple[str, ...]  # names of the values that it computes
+    attributes: Mapping[str, Any]  # by name: integers, floats, lists of them, and tensors as arrays
 
 
 class _UnknownGraph(Exception):
@@ -99,18 +93,7 @@ def program_of_graph(
     output: str,
     width: int,
 ) -> Program | None:
-    """The program of a graph.
-
-    Args:
-      nodes: each after those that compute its inputs.
-      constants: the arrays of its initializers, by name.
-      input: name of its input `[B, width]`.
-      output: name of its output `[B, A]`.
-      width: columns of the input.
-
-    Returns:
-      The program; None if an operator or a form of it is not known here, or it is too large.
-    """
+    """The program of a graph."""
     reader = _Reader(constants, input, width)
     try:
         for node in nodes:

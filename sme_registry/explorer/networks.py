@@ -50,11 +50,7 @@ def point_width(spec: SMESpec) -> int:
 
 
 def optimal(task: Task) -> Program:
-    """π* of a point; of a team, each agent's from what it observes.
-
-    Raises:
-      ResourceLimitError: it has too many weights for a page.
-    """
+    """π* of a point; of a team, each agent's from what it observes."""
     spec = task.spec
     build = ProgramBuilder(point_width(spec), "π*")
     actions = [
@@ -113,9 +109,6 @@ def policy_program(policy: Policy | TeamPolicy, spec: SMESpec) -> Program | None
 
     The program is used only if its actions equal the policy's own in probes inside and outside the
     cube, to `TOLERANCE`.
-
-    Raises:
-      PolicyError: the policy fails.
     """
     build = ProgramBuilder(spec.observation_dim)
     try:

@@ -31,13 +31,7 @@ _ESCAPES = {
 
 
 def page(facts: dict[str, Any], static: str = "") -> str:
-    """The page of some facts; equal facts give equal pages.
-
-    Args:
-      facts: of `collect.facts`.
-      static: where `STATIC` lies beside the page, such as "../static/", for sites that forbid
-        inline code; empty for one file that needs no other.
-    """
+    """The page of some facts; equal facts give equal pages."""
     title = f"{facts['name']} on {facts['title']}" if facts["name"] else facts["title"]
     script, style = STATIC["explorer.js"], STATIC["explorer.css"]
     sources = ("'self' file:",) * 2 if static else tuple(f"'{_hash(x)}'" for x in (script, style))

@@ -60,23 +60,16 @@ UNARY = frozenset(_UNARY)
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One step of a program.
+    """One step of a program."""
 
-    Attributes:
-      op: one of those in the module's first lines.
-      inputs: the values that it reads, by their numbers.
-      arrays: W and b, or v, by these names.
-      numbers: other parameters by name, such as low and high.
-      columns: the columns that `columns` takes.
-      width: columns of its value.
-    """
-
-    op: str
-    inputs: tuple[int, ...]
-    width: int
+    op: str  # one of those in the module's first lines
+    inputs: tuple[int, ...]  # the values that it reads, by their numbers
+    width: int  # columns of its value
+    # W and b, or v, by these names
     arrays: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
+    # other parameters by name, such as low and high
     numbers: Mapping[str, float] = field(default_factory=dict)
-    columns: tuple[int, ...] = ()
+    columns: tuple[int, ...] = ()  # the columns that `columns` takes
 
     def compute(self, values: list[Array]) -> Array:
         """Its value `[B, width]`, from all earlier values."""
@@ -98,15 +91,10 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """A function from rows `[B, n]` to rows `[B, width]`; deterministic.
+    """A function from rows `[B, n]` to rows `[B, width]`; deterministic."""
 
-    Attributes:
-      inputs: n.
-      steps: in order.
-    """
-
-    inputs: int
-    steps: tuple[Step, ...]
+    inputs: int  # n
+    steps: tuple[Step, ...]  # in order
 
     @property
     def width(self) -> int:
@@ -135,12 +123,7 @@ class Program:
 
 
 class ProgramBuilder:
-    """A program under construction. Values are referred to by number; 0 is the input.
-
-    Args:
-      inputs: n, columns of the input.
-      what: what error messages call the network.
-    """
+    """A program under construction. Values are referred to by number; 0 is the input."""
 
     def __init__(self, inputs: int, what: str = "network") -> None:
         self.inputs, self._what = inputs, what

@@ -30,19 +30,7 @@ def write_explorer(
     episodes: int = EPISODES,
     seed: int = 0,
 ) -> Path:
-    """Write a page completely or not at all; equal arguments give equal bytes.
-
-    Args:
-      path: the .html file; its folder is created, and an existing file is replaced.
-      shown, report, channels, episodes, seed: see `explorer_page`.
-
-    Returns:
-      The path.
-
-    Raises:
-      OptionError: another ending than .html, or the file cannot be written; and as `explorer_page`.
-      ResourceLimitError, PolicyError: see `explorer_page`.
-    """
+    """Write a page completely or not at all; equal arguments give equal bytes."""
     if Path(path).suffix != ".html":
         raise OptionError(f"{os.fspath(path)}: must end in .html.")
     content = explorer_page(shown, report=report, channels=channels, episodes=episodes, seed=seed)
@@ -61,22 +49,10 @@ def explorer_page(
 ) -> str:
     """The page of a task, or of a policy on its task, as HTML; equal arguments give equal text.
 
-    Args:
-      shown: a task; or a policy on its task, as `diagnosis.load_run`, `load_cell` and `load_policy`
-        return it.
-      report: of the policy's evaluation, whose regions and probes the page shows; None for none.
-      channels: pairs of inputs, from 1 (state channels, then distractors), over which a policy is
-        sampled whose network is unknown; empty for the first two.
-      episodes: to run for the regret over the episode, at least 1.
-      seed: of their start states.
-      static: the address of a folder with the files of `STATIC`, relative to the page, for a site
-        that forbids inline code; empty for a page that needs no other file.
-      remark: a text above the map.
-
-    Raises:
-      OptionError: a life in a stream, or other channels than the task has.
-      ResourceLimitError: the networks of the task are too large for a page.
-      PolicyError: the policy fails.
+    `channels` are pairs of inputs, from 1 (state channels, then distractors), over which a policy
+    whose network is unknown is sampled. `static` is the address of a folder with the files of
+    `STATIC`, relative to the page, for a site that forbids inline code; a page without it needs no
+    other file. `remark` is a text above the map.
     """
     if isinstance(shown, StreamSubject):
         raise OptionError(
