@@ -83,9 +83,6 @@ def fit_critics(
     """One update of both critics towards the values `target` `[B]`.
 
     Minimises `scale` times the sum over critics of their mean squared errors.
-
-    Returns:
-      The optimiser's new state, and all weights with those of the critics replaced.
     """
 
     def loss(critic: Weights) -> jax.Array:

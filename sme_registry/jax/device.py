@@ -20,9 +20,6 @@ def prepare() -> None:
     """Configure JAX for exact states and for agents equal to Stable-Baselines3's.
 
     Prints a line on standard error if compiled programs cannot be kept: JAX itself says nothing.
-
-    Raises:
-      MissingDependencyError: JAX is not installed.
     """
     require_packages("tasks and agents on the accelerator", {"jax": "JAX"}, "jax")
     import jax
@@ -56,11 +53,7 @@ def compilations() -> int:
 
 
 def find_device(name: str | None = None) -> Any:
-    """The first device of a platform: "cpu", "gpu" or "tpu"; None for JAX's default.
-
-    Raises:
-      OptionError: there is none.
-    """
+    """The first device of a platform: "cpu", "gpu" or "tpu"; None for JAX's default."""
     import jax
 
     if name is None:

@@ -29,14 +29,7 @@ _OF_LANES = "Use jax.vmap for several environments."
 
 
 class EnvState(NamedTuple):
-    """An episode at one point.
-
-    Attributes:
-      s: `[S]` the state, float64 or a pair, as the params say.
-      t: completed steps, int32.
-      accumulated_reward: r_cum.
-      distractors: `[m]`, of the kind of states; None in a task without distractors.
-    """
+    """An episode at one point: s `[S]`, completed steps, r_cum, and distractors `[m]` or None."""
 
     s: States
     t: jax.Array
@@ -47,11 +40,7 @@ class EnvState(NamedTuple):
 def reset(key: jax.Array, params: TaskParams) -> tuple[jax.Array, EnvState]:
     """Begin an episode at a uniform state, on the grid 2⁻³².
 
-    Padding does not change the numbers that a key draws, nor do `safety` and `observation` change
-    its state.
-
-    Raises:
-      OptionError: the params are of several tasks.
+    Neither padding nor `safety` nor `observation` changes the state that a key draws.
     """
     _, S = _widths(params)
     bits = jax.random.bits(key, (S,), jnp.uint32)
@@ -62,14 +51,7 @@ def reset(key: jax.Array, params: TaskParams) -> tuple[jax.Array, EnvState]:
 def start(
     s: States, params: TaskParams, distractors: States | None = None
 ) -> tuple[jax.Array, EnvState]:
-    """Begin an episode at state s `[S]`; padded channels must be 0.
-
-    `distractors` are `[m]`, and None in a task without distractors.
-
-    Raises:
-      StateError: s or the distractors have another shape, or are not as the params have states.
-      OptionError: the params are of several tasks.
-    """
+    """Begin an episode at state s `[S]`, with distractors `[m]` where the task has them."""
     s, d = _as_states(s), None if distractors is None else _as_states(distractors)
     _check_state(s, params)
     _check_distractors(d, params)
@@ -82,19 +64,10 @@ def step(
 ) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, Info]:
     """One step; where the episode ends, the observation and state are those of a new one.
 
-    Args:
-      key: of the new episode's start, and of what moves distractors at random.
-      state: the episode.
-      action: `[A]` in the unit range, clipped; see `to_unit`.
-      params: one task.
-
-    Returns:
-      Observation, state, reward R, done (terminated or truncated), and info: that of `step_env`,
-      and `final_observation`, that of the ended episode.
-
-    Raises:
-      ActionError, StateError: the action or the state has another shape than the task's.
-      OptionError: the params are of several tasks.
+    The action `[A]` is of the unit range, and clipped. The key draws the new episode's start, and
+    what moves distractors at random. Returns the observation, the state, the reward R, done
+    (terminated or truncated), and the info of `step_env` with the ended episode's
+    `final_observation`.
     """
     last, after, reward, done, info = step_env(key, state, action, params)
     info["final_observation"] = last
@@ -244,10 +217,9 @@ def observe(state: EnvState, params: TaskParams) -> jax.Array:
 
 
 def to_unit(action: jax.Array, symmetric: bool, dtype: Any = jnp.float64) -> jax.Array:
-    """Actions of an agent in the unit range, not clipped, as `envs.arguments.to_unit`.
+    """Actions of an agent in the unit range, not clipped: a = (u + 1) / 2 of a symmetric range.
 
-    A symmetric range is [−1, 1]: a = (u + 1) / 2. In float64 for exact rewards. The transition
-    rounds to float32, and gets the same bits from float32.
+    In float64 for exact rewards. The transition rounds to float32, and gets the same bits from it.
     """
     action = action.astype(dtype)
     return (action + 1.0) / 2.0 if symmetric else action

@@ -33,17 +33,9 @@ Step = tuple[jax.Array, EnvState, jax.Array, jax.Array, jax.Array, Info]
 class Environment:
     """One task with gymnax's methods; rewards are float32, which its wrappers expect.
 
-    `info` has the values of `sme_registry.jax.env.step`, and gymnax's `discount`.
-
-    Args:
-      spec: the task: a spec, its fields, an id, a digest or a path.
-      action_range: "symmetric", actions in [−1, 1], or "unit", in [0, 1]; both are clipped.
-      dtype: of the oracle, float64 or float32.
-      **overrides: spec fields to change.
-
-    Raises:
-      SpecError, UnknownNameError: no such task, or a field that JAX's tasks do not have.
-      OptionError: no such action range.
+    Actions are in [−1, 1], or with `action_range="unit"` in [0, 1], and clipped; `overrides` are
+    fields of the spec to change. `info` has the values of `sme_registry.jax.env.step`, and gymnax's
+    `discount`.
     """
 
     def __init__(
@@ -61,12 +53,10 @@ class Environment:
 
     @property
     def name(self) -> str:
-        """What the spec is called."""
         return title(self.sme_spec)
 
     @property
     def num_actions(self) -> int:
-        """A, the number of action channels."""
         return self.sme_spec.action_dim
 
     @partial(jax.jit, static_argnames="self")
@@ -80,8 +70,7 @@ class Environment:
     ) -> Step:
         """One step; where the episode ends, a new one begins. See `sme_registry.jax.env.step`.
 
-        Returns:
-          Observation, state, reward, terminated, truncated, info.
+        Returns the observation, the state, the reward, terminated, truncated and info.
         """
         return self._step(env.step, key, state, action, params)
 
@@ -109,7 +98,6 @@ class Environment:
         return _box(-1.0 if self._symmetric else 0.0, 1.0, (self.num_actions,))
 
     def is_truncated(self, state: EnvState, params: TaskParams | None = None) -> jax.Array:
-        """Whether the episode has reached the horizon."""
         return state.t >= self._params(params).horizon
 
     def _params(self, params: TaskParams | None) -> TaskParams:
@@ -141,11 +129,9 @@ class Box:
     dtype: Any
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """A uniform array of the space."""
         return jax.random.uniform(key, self.shape, self.dtype, self.low, self.high)
 
     def contains(self, x: jax.Array) -> jax.Array:
-        """Whether all entries are within the bounds."""
         return jnp.all((x >= self.low) & (x <= self.high))
 
 

@@ -29,22 +29,8 @@ Lane = SMESpec | StreamSpec
 class Lives:
     """The tasks of all lanes, by the steps that each lane has taken: its lifetime.
 
-    Args:
-      lanes: the task or the stream of each.
-      shape: to which tasks are padded; None for their maxima. Its layers are those of tasks of
-        several layers.
-      device: of the params.
-
-    Attributes:
-      separable: whether rewards change no observation and end no episode: k = 1 and D = 0 in all
-        tasks.
-      phases: P, of which the agent observes the one-hot; 0 where it does not.
-
-    Raises:
-      OptionError: tasks beside streams, streams that switch at different steps, or see
-        `task_params`.
-      SpecError: see `check_switches` and `task_params`.
-      ResourceLimitError: the tasks do not fit in memory.
+    `separable` says whether rewards change no observation and end no episode: k = 1 and D = 0 in
+    all tasks. `phases` is P, of which the agent observes the one-hot; 0 where it does not.
     """
 
     def __init__(self, lanes: Sequence[Lane], shape: Shape | None, device: Any) -> None:

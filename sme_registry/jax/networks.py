@@ -97,7 +97,6 @@ class Adam(NamedTuple):
 
     @classmethod
     def initial(cls, weights: Weights) -> Adam:
-        """Before the first update."""
         zeros = {name: jnp.zeros_like(w) for name, w in weights.items()}
         return cls(zeros, dict(zeros), jnp.zeros((), jnp.int32))
 

@@ -43,14 +43,7 @@ def drawn(key: jax.Array, params: TaskParams) -> States | None:
 def next_distractors(
     params: TaskParams, d: States | None, a: jax.Array, numbers: States | None
 ) -> States | None:
-    """The distractors `[m]` of the next state; None without distractors.
-
-    Args:
-      params: one task.
-      d: the present ones.
-      a: `[A]` the action.
-      numbers: those of `drawn`.
-    """
+    """The distractors `[m]` of the next state, from d, the action and the numbers of `drawn`."""
     if params.form.dynamics in (None, "noise"):
         return numbers
     driving = numbers if params.form.dynamics == "autonomous" else a

@@ -27,15 +27,10 @@ from sme_registry.jax.task import TaskParams
 
 
 class OffPolicyState(NamedTuple):
-    """All that changes; each array has a leading axis of lanes, except as said.
+    """All that changes; each array has a leading axis of lanes, but for the buffer and `updated`.
 
-    Attributes:
-      learner: weights and optimisers.
-      buffer: `[capacity, lanes, row]`; see `replay`.
-      episode: the environments.
-      observation: `[lanes, O]`, the present one.
-      keys: one for each lane; those of a step follow from it and the step's number.
-      updated: the number of steps before the last update; a scalar.
+    The buffer is `[capacity, lanes, row]`. Keys of a step follow from those of the lanes and the
+    step's number. `updated` is the number of steps before the last update.
     """
 
     learner: Any
@@ -47,17 +42,12 @@ class OffPolicyState(NamedTuple):
 
     @property
     def weights(self) -> Weights:
-        """By SB3's names, `[lanes, ...]`."""
         weights: Weights = self.learner.weights
         return weights
 
 
 class OffPolicyProgram(Program):
-    """Lanes of TD3 or SAC.
-
-    Attributes:
-      draws: how often an update draws noise for each action of its batch.
-    """
+    """Lanes of TD3 or SAC; an update draws noise `draws` times for each action of its batch."""
 
     buffer = "buffer"
     draws: int
@@ -73,14 +63,7 @@ class OffPolicyProgram(Program):
     def explore(
         weights: Weights, observation: jax.Array, noise: jax.Array, mask: jax.Array
     ) -> jax.Array:
-        """One lane's action `[A]` in [−1, 1] while it learns, 0 in channels outside the mask.
-
-        Args:
-          weights: of the lane.
-          observation: `[O]`.
-          noise: `[A]` standard normal.
-          mask: `[A]` which action channels exist.
-        """
+        """One lane's action `[A]` in [−1, 1] while it learns, 0 in channels outside the mask."""
 
     @staticmethod
     @abstractmethod
@@ -93,16 +76,10 @@ class OffPolicyProgram(Program):
         count: jax.Array,
         index: jax.Array,
     ) -> Any:
-        """One lane's learner after an update.
+        """One lane's learner after an update with a batch `[B]` and noise `[A, draws, B]`.
 
-        Args:
-          settings: hyperparameters.
-          learner: before it.
-          batch: `[B]` transitions.
-          noise: `[A, draws, B]` standard normal.
-          mask: `[A]` which action channels exist.
-          count: the number of this update, from 1; the same in all lanes.
-          index: its number among the `gradient_steps` of this step, from 0; the same in all lanes.
+        `count` is the number of this update from 1, `index` that among the `gradient_steps` of this
+        step from 0; both are the same in all lanes.
         """
 
     def __init__(self, settings: Any, *arguments: Any, **options: Any) -> None:
@@ -196,8 +173,7 @@ def _steps(
 ) -> tuple[OffPolicyState, StepLog]:
     """Each step from `begin` to `end`, after the update that is pending; no step if not `acts`.
 
-    Returns:
-      The new state, and a log `[PIECE, lanes]` whose first `end − begin` rows are used.
+    Of the log `[PIECE, lanes]`, the first `end − begin` rows are used.
     """
     lanes = state.observation.shape[0]
     masks = jax.vmap(lambda each: each.action_mask)(params)

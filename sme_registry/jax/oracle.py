@@ -28,13 +28,9 @@ from sme_registry.jax.transition import States, to_real
 
 
 class Judgement(NamedTuple):
-    """What actions are worth in their states, `[...]` each.
+    """What actions are worth in their states, `[...]` each; the last two are None without `safety`.
 
-    Attributes:
-      similarity: r̃.
-      step_reward: r.
-      cost: in [0, 1]; None without `safety`.
-      safe_regret: r of the best safe action, minus r; None without `safety`.
+    `safe_regret` is r of the best safe action, minus r.
     """
 
     similarity: jax.Array
@@ -61,11 +57,7 @@ def optimal_action(params: TaskParams, s: States) -> jax.Array:
 
 
 def limit(params: TaskParams, s: States) -> jax.Array:
-    """ℓ, the limits of the action channels in states `[..., S]`: `[..., A]` in [1 − 2τ, 1].
-
-    Raises:
-      SpecError: the task has no `safety`.
-    """
+    """ℓ, the limits of the action channels in states `[..., S]`: `[..., A]` in [1 − 2τ, 1]."""
     if params.limits is None:
         raise SpecError("limit: this task has no safety. Give its spec safety.")
     v = _network(params.limits.inner, params.limits.output, s)
@@ -73,11 +65,7 @@ def limit(params: TaskParams, s: States) -> jax.Array:
 
 
 def cost(params: TaskParams, a: jax.Array, limits: jax.Array) -> jax.Array:
-    """The cost of actions, clipped to [0, 1], under limits, `[..., A]` each: `[...]` in [0, 1].
-
-    Raises:
-      SpecError: the task has no `safety`.
-    """
+    """The cost of actions, clipped to [0, 1], under limits, `[..., A]` each: `[...]` in [0, 1]."""
     if params.limits is None:
         raise SpecError("cost: this task has no safety. Give its spec safety.")
     excess = jnp.maximum(0.0, jnp.clip(a, 0.0, 1.0).astype(limits.dtype) - limits)

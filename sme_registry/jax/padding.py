@@ -21,14 +21,7 @@ InitialWeights = Callable[[np.random.Generator, int, int], HostWeights]
 
 
 class Dimensions(NamedTuple):
-    """S state channels and A action channels, of a task or of the program that it is padded to.
-
-    Attributes:
-      state_dim: S.
-      action_dim: A.
-      phases: P, of a stream that has `observes_phase`, else 0.
-      distractors: m, the same of all lanes.
-    """
+    """S, A, P (0 without `observes_phase`) and m, of a task or of what it is padded to."""
 
     state_dim: int
     action_dim: int
@@ -37,7 +30,6 @@ class Dimensions(NamedTuple):
 
     @property
     def observation_dim(self) -> int:
-        """S + m + 2 + P."""
         return self.state_dim + self.distractors + 2 + self.phases
 
 
@@ -47,10 +39,6 @@ class Padding:
     Which axes are observations and actions follows from the shapes of initial weights at other
     widths, so no list of names has to agree with the networks. An axis that is both is an
     observation followed by an action, as a critic's input.
-
-    Args:
-      initial_weights: of the networks.
-      full: the widths of the program.
     """
 
     def __init__(self, initial_weights: InitialWeights, full: Dimensions) -> None:

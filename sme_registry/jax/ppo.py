@@ -51,10 +51,6 @@ class PPO:
     """Hyperparameters, with the names and defaults of `stable_baselines3.PPO`.
 
     `net_arch` is the widths of the hidden layers of each network (`policy_kwargs.net_arch`).
-    `run.settings_of` checks types and ranges.
-
-    Raises:
-      OptionError: minibatches of one step, or that do not divide a rollout.
     """
 
     learning_rate: Positive = 3e-4
@@ -87,15 +83,9 @@ class Learner(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """The steps of a rollout, as the environment answered.
+    """The steps of a rollout, as the environment answered: `[n, ...]`, actions not clipped.
 
-    Attributes:
-      observation: `[n, O]` before the step.
-      action: `[n, A]`, not clipped.
-      reward: `[n]` R, float32.
-      terminated: `[n]`.
-      truncated: `[n]`.
-      last_observation: `[n, O]` after the step, and before the next episode begins.
+    `last_observation` is that after the step, and before the next episode begins.
     """
 
     observation: jax.Array
@@ -107,15 +97,7 @@ class Steps(NamedTuple):
 
 
 class Rollout(NamedTuple):
-    """What updates learn from.
-
-    Attributes:
-      observation: `[n, O]`.
-      action: `[n, A]`, not clipped.
-      log_density: `[n]` log π of the action when it was taken.
-      value: `[n]` V when it was taken.
-      advantage: `[n]` Â.
-    """
+    """What updates learn from, `[n, ...]`: log π and V when the action was taken, and Â."""
 
     observation: jax.Array
     action: jax.Array
@@ -125,15 +107,7 @@ class Rollout(NamedTuple):
 
 
 class State(NamedTuple):
-    """All that changes in a `PPOProgram`; each array has a leading axis of lanes.
-
-    Attributes:
-      weights: by SB3's names.
-      optimiser: Adam's state.
-      key: of all random numbers to come.
-      episode: the environment.
-      steps: of the last rollout.
-    """
+    """All that changes in a `PPOProgram`; each array has a leading axis of lanes."""
 
     weights: Weights
     optimiser: Adam
@@ -176,25 +150,11 @@ def collect(
     separable: bool,
     numbers: Any = None,
 ) -> tuple[EnvState, Steps, StepLog]:
-    """The steps `begin` … `end` − 1 of a rollout of n.
+    """The steps `begin` … `end` − 1 of a rollout of n, and their log; the other rows are arbitrary.
 
-    Args:
-      settings: the hyperparameters.
-      weights: the policy's.
-      params: one task.
-      episode: the environment before step `begin`.
-      noise: `[A, n]` standard normal.
-      fresh: `[n]` the environment after each step if an episode ends there.
-      begin: the first step, from 0.
-      end: after the last one, at most n.
-      symmetric: whether actions are in [−1, 1] instead of [0, 1].
-      separable: whether k = 1 and D = 0, so that no reward changes an observation or ends an
-        episode. The oracle is then asked once for all steps.
-      numbers: `[n, …]` of each step, `observing.drawn`.
-
-    Returns:
-      The environment after the last step, the steps, and their log, `[n]`; those that were not to
-      be taken are arbitrary.
+    `noise` `[A, n]` is standard normal, `fresh` `[n]` the environment after each step if an episode
+    ends there, `numbers` those of `observing.drawn`. Where rewards are `separable`, the oracle is
+    asked once for all steps.
     """
     sigma = jnp.exp(weights["log_std"])
     n = noise.shape[1]
@@ -275,14 +235,8 @@ def rollout(
     """Densities, values and advantages of the steps of one lane.
 
     An episode that was truncated would have gone on: the value of its last observation is added to
-    its last reward.
-
-    Args:
-      settings: the hyperparameters.
-      weights: with which the actions were drawn.
-      steps: the steps.
-      next_observation: `[O]` with which the next rollout begins.
-      mask: `[A]` which action channels exist.
+    its last reward. The next rollout begins with `next_observation`; action channels outside the
+    mask do not exist.
     """
     values = value(settings, weights, steps.observation)
     cut = steps.truncated & ~steps.terminated
@@ -302,15 +256,7 @@ def rollout(
 def advantages(
     settings: PPO, reward: jax.Array, values: jax.Array, next_value: jax.Array, ended: jax.Array
 ) -> jax.Array:
-    """Generalised advantage estimates Â `[n]` (Schulman et al. 2016).
-
-    Args:
-      settings: γ and λ.
-      reward: `[n]` R, with the value of the last observation where an episode was truncated.
-      values: `[n]` V of the observations.
-      next_value: V of the observation after the last step.
-      ended: `[n]` whether the step ended an episode.
-    """
+    """Generalised advantage estimates Â `[n]` (Schulman et al. 2016), of `[n]` steps."""
     goes_on = 1.0 - ended.astype(jnp.float32)
     following = jnp.append(values[1:], next_value)
     delta = reward + settings.gamma * following * goes_on - values
@@ -330,15 +276,7 @@ def update(
     batches: jax.Array,
     mask: jax.Array,
 ) -> Learner:
-    """One update for each minibatch.
-
-    Args:
-      settings: the hyperparameters.
-      learner: the state before.
-      rollout: the steps.
-      batches: `[updates, B]` which steps are in each minibatch.
-      mask: `[A]` which action channels exist.
-    """
+    """One update for each minibatch `[updates, B]` of steps."""
 
     def one(learner: Learner, batch: jax.Array) -> tuple[Learner, None]:
         weights, optimiser = learner
@@ -390,8 +328,6 @@ def _latent(settings: PPO, weights: Weights, network: str, observation: jax.Arra
 
 
 class PPOProgram(Program):
-    """Lanes of PPO; see `Program`."""
-
     actor = ("mlp_extractor.policy_net.", "action_net.")
     hidden = ("mlp_extractor.policy_net", jnp.tanh)
 
@@ -418,13 +354,11 @@ class PPOProgram(Program):
         return weights
 
     def initial_state(self, weights: Weights, keys: jax.Array) -> State:
-        """Lanes at the start of their first episode."""
         state: State = _begin(self.settings, self.params, weights, keys)
         return state
 
     @staticmethod
     def act(settings: PPO, weights: Weights, observations: jax.Array, symmetric: bool) -> jax.Array:
-        """μ; see `mean`."""
         return mean(settings, weights, observations)
 
     def advance(self, limit: int) -> StepLog:

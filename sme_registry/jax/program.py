@@ -43,14 +43,7 @@ _JUDGED_AT_ONCE = 25  # steps of an episode
 class StepLog(NamedTuple):
     """What happened in the steps of one `advance`; each array is `[steps, lanes]`.
 
-    Attributes:
-      reward: R, the payout.
-      regret: 1 − step reward.
-      similarity: r̃.
-      terminated: whether the episode ended by D.
-      truncated: whether it reached the horizon.
-      cost: None without `safety`.
-      safe_regret: r of the best safe action, minus r; None without `safety`.
+    `reward` is R, the payout; `cost` and `safe_regret` are None without `safety`.
     """
 
     reward: Array
@@ -63,25 +56,16 @@ class StepLog(NamedTuple):
 
     @classmethod
     def joined(cls, logs: Sequence[StepLog]) -> StepLog:
-        """The steps of several logs, one after the other."""
         log: StepLog = jax.tree.map(lambda *rows: np.concatenate(rows), *logs)
         return log
 
     def rows(self, part: slice) -> StepLog:
-        """Some of the steps."""
         log: StepLog = jax.tree.map(lambda each: np.asarray(each)[part], self)
         return log
 
 
 class Evaluation(NamedTuple):
-    """Episodes of the present deterministic policies; each array is `[lanes, episodes]`.
-
-    Attributes:
-      episode_return: the sum of an episode's rewards.
-      length: its steps.
-      regret: sum of 1 − step reward over its steps.
-      similarity: sum of r̃ over its steps.
-    """
+    """Episodes of the present deterministic policies: sums over steps, `[lanes, episodes]`."""
 
     episode_return: Array
     length: Array
@@ -100,17 +84,9 @@ class State(Protocol):
 class Program(ABC):
     """The lanes of one algorithm: `advance` until the budget is used, then `finish`.
 
-    Attributes:
-      settings: the hyperparameters; hashable, so that equal programs share their compiled code.
-      specs: of each lane, without the copies that fill the program up.
-      budget: steps that each lane is to take.
-      symmetric: whether actions are in [−1, 1] instead of [0, 1].
-      lanes: their number, with copies.
-      lives: the lanes' tasks, by the steps that they have taken.
-      separable: whether rewards change no observation and end no episode (k = 1 and D = 0 in all
-        tasks), so that the oracle can be asked later, for many steps at once.
-      state: all that changes.
-      steps: environment steps that each lane has taken.
+    `specs` are those of the lanes without the copies that fill the program up to `lanes`; `steps`
+    and `budget` are of each lane. `separable` (k = 1 and D = 0 in all tasks) says that the oracle
+    can be asked later, for many steps at once.
     """
 
     buffer = ""
@@ -140,26 +116,7 @@ class Program(ABC):
         device: str | None = None,
         at_once: int = 1,
     ) -> None:
-        """New lanes, before their first step.
-
-        Args:
-          settings: the hyperparameters.
-          specs: the task or the stream of each lane; streams that switch at the same steps.
-          seeds: of each lane, in [0, 2**32): of its weights, its starts and its noise.
-          steps: that each lane is to take.
-          action_range: of the policies' actions, "symmetric" or "unit".
-          lanes: fill up to this number with copies of the first lane; None for none.
-          shape: to which the tasks are padded; None for their maxima.
-          device: see `find_device`.
-          at_once: programs that are to share what the device has of memory.
-
-        Raises:
-          SpecError: a task is not one that JAX has, see `task_params`; or a stream, see
-            `lives.check_switches`.
-          OptionError: there is no such device; or tasks beside streams, or streams that switch at
-            different steps.
-          ResourceLimitError: its memory is too small; says how many lanes fit.
-        """
+        """New lanes, before their first step; `at_once` programs share the device's memory."""
         self.settings, self.specs, self.budget = settings, tuple(specs), steps
         self.symmetric = action_range == "symmetric"
         self.lanes = len(specs) if lanes is None else lanes
@@ -198,14 +155,7 @@ class Program(ABC):
     @staticmethod
     @abstractmethod
     def act(settings: Any, weights: Weights, observations: jax.Array, symmetric: bool) -> jax.Array:
-        """One lane's deterministic actions `[..., A]` in its action range, or beyond it.
-
-        Args:
-          settings: the hyperparameters.
-          weights: of one lane.
-          observations: `[..., O]` float32.
-          symmetric: whether the range is [−1, 1] instead of [0, 1].
-        """
+        """One lane's deterministic actions `[..., A]` in its action range, or beyond it."""
 
     @abstractmethod
     def advance(self, limit: int) -> StepLog:
@@ -223,11 +173,8 @@ class Program(ABC):
     def evaluate(self, states: Array, lifetime: int | None = None) -> Evaluation:
         """Run an episode from each of `states` `[lanes, episodes, S]` with the present weights.
 
-        Equal states give equal distractors, as in `evaluation.rollouts`.
-
-        Args:
-          states: initial states, padded.
-          lifetime: of a stream, the steps after which its tasks are those to run; None for now.
+        Of a stream, the tasks are those after `lifetime` steps; None for now. Equal states give
+        equal distractors, as in `evaluation.rollouts`.
         """
         sums = _episodes(
             type(self).act,
@@ -256,12 +203,9 @@ class Program(ABC):
         return {"steps": np.asarray(self.steps), **arrays}
 
     def restore(self, arrays: dict[str, Array]) -> None:
-        """Go on from saved state, bit for bit.
+        """Go on from saved state, bit for bit; a replay buffer may be that of a smaller budget.
 
-        A replay buffer may be that of a smaller budget.
-
-        Raises:
-          OptionError: the state is another program's, or damaged; this program is unchanged.
+        Raises OptionError, and changes nothing, if the state is damaged or another program's.
         """
         leaves, structure = jax.tree_util.tree_flatten_with_path(self.state)
         names = [jax.tree_util.keystr(path) for path, _ in leaves]
@@ -327,12 +271,7 @@ class Program(ABC):
 
 
 def check_room(new_program: Callable[[], Program]) -> None:
-    """Check that a program would fit in memory: neither makes nor compiles anything.
-
-    Raises:
-      ResourceLimitError: it would not.
-      Exception: what `new_program` raises.
-    """
+    """Raise ResourceLimitError if a program would not fit in memory; makes and compiles none."""
     jax.eval_shape(lambda: new_program().state)
 
 
@@ -450,8 +389,6 @@ def _key_of(s: jax.Array) -> jax.Array:
 
 
 class _Running(NamedTuple):
-    """Episodes `[lanes, episodes]`, with the sums over their steps so far."""
-
     state: EnvState
     sums: tuple[jax.Array, ...]
     running: jax.Array

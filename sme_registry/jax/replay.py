@@ -19,12 +19,8 @@ import jax.numpy as jnp
 class Transitions(NamedTuple):
     """Transitions, in any batch shape.
 
-    Attributes:
-      observation: `[..., O]`.
-      action: `[..., A]` in [−1, 1]; 0 in padded channels.
-      next_observation: `[..., O]`; at an episode's end its last one, not the next one's first.
-      reward: `[...]` R, the payout.
-      done: `[...]` 1.0 where the episode terminated, 0.0 where it goes on or was truncated.
+    The action is in [−1, 1]; the next observation at an episode's end is its last one, not the next
+    one's first; done is 1.0 where the episode terminated, 0.0 where it goes on or was truncated.
     """
 
     observation: jax.Array
@@ -53,14 +49,9 @@ def write(
 def rewrite_next(
     buffer: jax.Array, row: jax.Array, following: jax.Array, ended: jax.Array, phase: jax.Array
 ) -> jax.Array:
-    """Store s' of a row again, as it is observed after a switch to other tasks.
+    """Store s' of a row again, `following` `[lanes, O]`, as it is observed after a switch of tasks.
 
-    Args:
-      buffer: the buffer.
-      row: modulo the capacity.
-      following: `[lanes, O]` the present observation, which is s' where the episode goes on.
-      ended: `[lanes]` whether the episode ended there; s' is then as it was, except for the phase.
-      phase: `[lanes, P]` the phase's one-hot, with which an observation ends.
+    Where the episode `ended` there, s' stays as it was, but for the phase with which it ends.
     """
     row, end = row % buffer.shape[0], buffer.shape[-1] - 2
     begin = end - following.shape[-1]
@@ -71,14 +62,7 @@ def rewrite_next(
 def sample_rows(
     key: jax.Array, batch_size: int, written: int | jax.Array, capacity: int
 ) -> jax.Array:
-    """A lane's batch `[batch]` of rows, uniform and with replacement over those written so far.
-
-    Args:
-      key: of the lane and of this batch.
-      batch_size: rows to draw.
-      written: how many transitions the lane has stored, at least 1.
-      capacity: of the buffer; older transitions are lost.
-    """
+    """A lane's batch `[batch]` of rows, uniform with replacement over those in the buffer."""
     return jax.random.randint(key, (batch_size,), 0, jnp.minimum(written, capacity))
 
 

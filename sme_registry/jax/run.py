@@ -47,11 +47,7 @@ _OF_POLICY = ("net_arch",)  # hyperparameters that Stable-Baselines3 has in `pol
 
 
 def full_name(uses: str, field: str = "uses") -> str:
-    """The exact name, `jax:PPO`, of an algorithm in any case.
-
-    Raises:
-      UnknownNameError: there is no such algorithm here; lists those there are.
-    """
+    """The exact name, `jax:PPO`, of an algorithm in any case."""
     name = uses.removeprefix(JAX)
     for known in ALGORITHMS:
         if known.casefold() == name.casefold():
@@ -70,14 +66,8 @@ def settings_of(
 ) -> Any:
     """The hyperparameters of an algorithm, with its defaults for those that are left out.
 
-    Args:
-      uses: `jax:PPO`, `jax:TD3` or `jax:SAC`.
-      hyperparameters: JSON values by the names of Stable-Baselines3; `net_arch` in `policy_kwargs`.
-      field: what error messages call them.
-
-    Raises:
-      UnknownNameError: no such algorithm.
-      OptionError: it has no such hyperparameter here, or not this value.
+    JSON values by the names of Stable-Baselines3; `net_arch` is in `policy_kwargs`. Error messages
+    call them `field`.
     """
     kind, _ = _algorithm(uses)
     name = full_name(uses)
@@ -120,16 +110,19 @@ def new_program(
     device: str | None = None,
     at_once: int = 1,
 ) -> Program:
-    """A program of new lanes; see `Program` for the arguments, and `settings_of`.
+    """A program of new lanes, `jax:PPO`, `jax:TD3` or `jax:SAC`.
 
-    Raises:
-      UnknownNameError: no such algorithm.
-      OptionError: see `settings_of`; there is no task or no such device; or there is another number
-        of seeds than of tasks, or fewer lanes; or streams that switch at different steps; or
-        another argument is outside its range.
-      SpecError: a task is not one that JAX has, such as a team's; or a stream, one that leaves a
-        phase in mid-episode with switch="episode".
-      ResourceLimitError: the device's memory is too small; says how many lanes fit.
+    Args:
+      uses: the algorithm.
+      specs: the task or the stream of each lane; streams that switch at the same steps.
+      seeds: of each lane, in [0, 2**32): of its weights, its starts and its noise.
+      hyperparameters: see `settings_of`.
+      action_range: of the policies' actions, "symmetric" or "unit".
+      steps: that each lane is to take.
+      lanes: fill up to this number with copies of the first lane; None for none.
+      shape: to which the tasks are padded; None for their maxima.
+      device: "cpu", "gpu" or "tpu"; None for JAX's default.
+      at_once: programs that are to share what the device has of memory.
     """
     integer_in("len(specs)", len(specs), 1)
     integer_in("len(seeds)", len(seeds), len(specs), len(specs), advice="Give a seed of each task.")
@@ -160,7 +153,7 @@ def policy_of(
     hyperparameters: Mapping[str, Any] | None = None,
     action_range: str = "symmetric",
 ) -> Callable[[Array], Array]:
-    """The deterministic policy of weights; see `program.policy`, and `new_program` for errors."""
+    """The deterministic policy of weights, from observations `[B, O]` to actions `[B, A]`."""
     choice("action_range", action_range, ACTION_RANGES)
     _, program = _algorithm(uses)
     settings = settings_of(uses, hyperparameters or {})
@@ -205,8 +198,8 @@ def run(
         no copy; equally many in all lanes.
       on_log: called with the steps after each piece.
       on_evaluation: called with k, the step, and the evaluation of all lanes.
-      on_visit: called with the index of a visit in the life, and the weights of each lane that is
-        no copy, at the end of each visit of a phase; after the evaluations that are due there.
+      on_visit: called with the index of a visit and the weights of each lane that is no copy, at
+        the end of each visit of a phase; after the evaluations that are due there.
       after_piece: called after each piece and its evaluations, when the state may be saved.
       piece: most steps between two calls; on-policy programs finish their rollout.
     """

@@ -55,11 +55,7 @@ class SAC:
 
     `ent_coef` is "auto", "auto_" and the initial value, or a constant. `net_arch` is the widths of
     the hidden layers of actor and critics (`policy_kwargs.net_arch`). Without generalised
-    state-dependent exploration and action noise, as is SB3's default. `run.settings_of` checks
-    types and ranges.
-
-    Raises:
-      OptionError: `ent_coef` or `target_entropy` is another text, or α is negative.
+    state-dependent exploration and action noise, as is SB3's default.
     """
 
     learning_rate: Positive = 3e-4
@@ -106,8 +102,6 @@ class Learner(NamedTuple):
 
 
 class SACProgram(OffPolicyProgram):
-    """Lanes of SAC."""
-
     draws = 2
     hidden = ("actor.latent_pi", jax.nn.relu)
 
@@ -129,14 +123,12 @@ class SACProgram(OffPolicyProgram):
 
     @staticmethod
     def initial_learner(weights: Weights) -> Learner:
-        """Weights and new optimisers."""
         actor, critic = (critics.network(weights, name) for name in ("actor", "critic"))
         entropy = {name: weights[name] for name in weights if name == _ENTROPY}
         return Learner(weights, Adam.initial(actor), Adam.initial(critic), Adam.initial(entropy))
 
     @staticmethod
     def act(settings: SAC, weights: Weights, observations: jax.Array, symmetric: bool) -> jax.Array:
-        """tanh of the mean."""
         return in_range(jnp.tanh(_gaussian(weights, observations)[0]), symmetric)
 
     @staticmethod
@@ -209,17 +201,7 @@ def _check_automatic(name: str, value: str | float) -> None:
 def _sample(
     weights: Weights, observation: jax.Array, noise: jax.Array, mask: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Actions and their log-probabilities.
-
-    Args:
-      weights: the actor's.
-      observation: `[..., O]`.
-      noise: `[..., A]` ε.
-      mask: `[A]` which action channels exist; the others are padding.
-
-    Returns:
-      `[..., A]` actions, 0 in padded channels; `[...]` log π over the task's channels.
-    """
+    """Actions `[..., A]`, 0 in padded channels, and log π `[...]` over the task's channels."""
     mean, log_std = _gaussian(weights, observation)
     action = jnp.tanh(mean + jnp.exp(log_std) * noise)
     normal = -0.5 * noise**2 - log_std - 0.5 * math.log(2.0 * math.pi)

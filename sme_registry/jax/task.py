@@ -46,13 +46,7 @@ Host = npt.NDArray[Any]
 
 
 class Shape(NamedTuple):
-    """What decides which program a task belongs to.
-
-    Attributes:
-      state_dim, action_dim: S and A.
-      complexity: L; a task of L = 1 and one of L > 1 never share a program.
-      hidden_width: H; 0 where L = 1, which has no inner layer.
-    """
+    """What decides which program a task belongs to: S, A, L and H, which is 0 where L = 1."""
 
     state_dim: int
     action_dim: int
@@ -67,11 +61,7 @@ class Shape(NamedTuple):
 
     @classmethod
     def covering(cls, shapes: Iterable[Shape]) -> Shape:
-        """The smallest shape to which all of these can be padded.
-
-        Raises:
-          OptionError: there is none: no shape, or L = 1 beside L > 1.
-        """
+        """The smallest shape to which all of these can be padded."""
         shapes = list(shapes)
         if not shapes:
             raise OptionError("specs=[]: must have at least one spec.")
@@ -86,12 +76,8 @@ class Shape(NamedTuple):
 class Form:
     """What `safety` and `observation` change of a program; all its lanes have the same.
 
-    Attributes:
-      safety: whether the actions have limits.
-      distractors: m.
-      dynamics: how they move, "noise", "autonomous" or "driven"; None without distractors.
-      mixing: "none", "orthogonal" or "nonlinear".
-      mixing_depth: layers of a nonlinear mixing; else None.
+    m distractors move by `dynamics`, "noise", "autonomous" or "driven"; `mixing_depth` is None
+    unless the mixing is nonlinear.
     """
 
     safety: bool = False
@@ -117,13 +103,7 @@ class Layer(NamedTuple):
 
 
 class InnerLayers(NamedTuple):
-    """The layers before the last, where L > 1.
-
-    Attributes:
-      first: S → H.
-      stacked: the L − 2 layers H → H, `W [L − 2, H, H]` and `b [L − 2, H]`.
-      active: `[L − 2]` bool, False for padding.
-    """
+    """The layers before the last: S → H, and L − 2 of H → H, not `active` where padded."""
 
     first: Layer
     stacked: Layer
@@ -131,13 +111,7 @@ class InnerLayers(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """What limits the action channels of a task with `safety`.
-
-    Attributes:
-      tightness: τ.
-      inner: the inner layers of v; None where L = 1.
-      output: its last layer.
-    """
+    """What limits the action channels of a task with `safety`: τ, and the layers of v."""
 
     tightness: jax.Array
     inner: InnerLayers | None
@@ -147,12 +121,8 @@ class Limits(NamedTuple):
 class Observing(NamedTuple):
     """What the agent of a task with `observation` sees in place of the state.
 
-    Attributes:
-      W: `[A, m]` of the distractors' transition, in the form of `TaskParams.W`; None where they
-        have none.
-      b: `[m]`, in the form of `TaskParams.b`.
-      mixing: the layers from state and distractors to what the agent sees, stacked:
-        `W [layers, S + m, S + m]`, 0 for padding; None without mixing.
+    `W [A, m]` and `b [m]` move the distractors and are None where no action does; `mixing` has the
+    layers from state and distractors to what the agent sees, `W [layers, S + m, S + m]`.
     """
 
     W: jax.Array | None
@@ -163,19 +133,10 @@ class Observing(NamedTuple):
 class TaskParams(NamedTuple):
     """A task; of several tasks, each array has a leading axis of lanes.
 
-    Attributes:
-      state_dim, action_dim: the task's own S and A, int32.
-      k, horizon: int32.
-      r_min, D: of the dtype of rewards.
-      W: `[A, S]` transition matrix, float64; for states as pairs, uint32 in units of 2⁻²⁹.
-      b: `[S]` transition offset, float64; for states as pairs, a pair.
-      inner: the optimal policy's inner layers; None where L = 1.
-      output: its last layer, of the dtype of the oracle.
-      phase: `[P]` float32, the one-hot with which observations end in a stream that has
-        `observes_phase`; elsewhere P = 0.
-      limits: None without `safety`.
-      observing: None without `observation`.
-      form: which of these there are, and of what kind; no array.
+    `W [A, S]` and `b [S]` are float64 (uint32 and a pair, for states as pairs); r_min, D and the
+    layers have the dtype of rewards. `inner` is None where L = 1, `limits` without `safety`, and
+    `observing` without `observation`. `phase` is the one-hot `[P]` with which observations end in a
+    stream that has `observes_phase`; elsewhere P = 0.
     """
 
     state_dim: jax.Array
@@ -216,25 +177,13 @@ def task_params(
     dtype: Any = jnp.float64,
     states: str = "float64",
 ) -> TaskParams:
-    """Draw tasks and put them on the default device.
+    """Draw tasks and put them on the default device: one, or lanes along a leading axis.
 
     Args:
       specs: a task, or a sequence of tasks, one for each lane: specs, ids, digests or paths.
-      shape: pad to this shape, a `Shape` or a tuple of its fields; None for the smallest that
-        covers all tasks.
+      shape: pad to this shape; None for the smallest that covers all tasks.
       dtype: of the oracle and of rewards, float64 or float32.
       states: "float64"; or "pairs" of uint32, with the same bits, for devices without float64.
-        With `dtype=jnp.float32`, too, `env.reset` and `env.step` need no float64 at all.
-        `pairs.from_float64` and `pairs.to_float64` convert states.
-
-    Returns:
-      One task, or lanes of tasks stacked along a leading axis.
-
-    Raises:
-      SpecError: a field that only NumPy implements, such as `team`; or see `load_task`.
-      OptionError: no task, a task larger than `shape`, no shape, L = 1 beside L > 1, tasks of
-        several forms, or another dtype or kind of states.
-      UnknownNameError, ResourceLimitError, FingerprintMismatchError: see `load_task`.
     """
     single = isinstance(specs, SMESpec | dict | str | os.PathLike)
     listed: Any = [specs] if single else specs

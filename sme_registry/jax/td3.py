@@ -40,10 +40,9 @@ from sme_registry.jax.replay import Transitions
 
 @dataclass(frozen=True)
 class TD3:
-    """Hyperparameters, with the names and defaults of `stable_baselines3.TD3`.
+    """Hyperparameters, with the names and defaults of `stable_baselines3.TD3`; no action noise.
 
-    Without action noise, as is SB3's default. `net_arch` is the widths of the hidden layers of
-    actor and critics (`policy_kwargs.net_arch`). `run.settings_of` checks types and ranges.
+    `net_arch` is the widths of the hidden layers of actor and critics (`policy_kwargs.net_arch`).
     """
 
     learning_rate: Positive = 1e-3
@@ -69,8 +68,6 @@ class Learner(NamedTuple):
 
 
 class TD3Program(OffPolicyProgram):
-    """Lanes of TD3."""
-
     draws = 1
     hidden = ("actor.mu", jax.nn.relu)
 
@@ -86,13 +83,11 @@ class TD3Program(OffPolicyProgram):
 
     @staticmethod
     def initial_learner(weights: Weights) -> Learner:
-        """Weights and new optimisers."""
         actor, critic = (critics.network(weights, name) for name in ("actor", "critic"))
         return Learner(weights, Adam.initial(actor), Adam.initial(critic))
 
     @staticmethod
     def act(settings: TD3, weights: Weights, observations: jax.Array, symmetric: bool) -> jax.Array:
-        """tanh of the actor."""
         return in_range(_action(weights, observations), symmetric)
 
     @staticmethod

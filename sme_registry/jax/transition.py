@@ -22,18 +22,11 @@ _UNROLLED = 16  # channels; above it the program would grow with A
 
 
 def next_state(params: TaskParams, s: States, a: jax.Array) -> States:
-    """The next states, exact to the bit.
+    """The next states of states `[..., S]` and actions `[..., A]`, exact to the bit.
 
-    The sum runs in the fixed order of the definition, s + b and then W_i a_i for i = 1…A. Each
-    product is exact, so that it does not matter whether a compiler fuses it with its sum.
-
-    Args:
-      params: one task.
-      s: `[..., S]` states, as the task has them: float64 or pairs.
-      a: `[..., A]` actions; clipped to [0, 1], and rounded to float32.
-
-    Returns:
-      `[..., S]` next states in [0, 1].
+    Actions are clipped to [0, 1] and rounded to float32. The sum runs in the order of the
+    definition, s + b and then W_i a_i for i = 1…A; each product is exact, so that it does not
+    matter whether a compiler fuses it with its sum.
     """
     return moved(params.W, params.b, s, a)
 

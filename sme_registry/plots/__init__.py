@@ -1,8 +1,9 @@
 """Figures: training, decay outside the cube, maps of the plane, safety, distraction, streams.
 
-Each function returns a Matplotlib `Figure`. It writes a file where it gets a `path`, PNG, PDF or
-SVG by its ending, and draws in the caller's axes where it gets `ax`. `save_figure` writes any
-figure.
+Each function returns a Matplotlib `Figure`. Given a `path`, it writes that file, PNG, PDF or SVG by
+its ending. Given `ax`, one panel or several, it draws in the caller's axes, without title and
+legend, instead of in a new figure. `title` is above a new figure; None takes one from the data.
+`save_figure` writes any figure.
 """
 
 from sme_registry.plots.curves import cost_curve, learning_curve, training_curve

@@ -54,25 +54,13 @@ def training_curve(
 ) -> Figure:
     """Draw the exact regret of each training episode over environment steps.
 
-    Each dot is an episode; the line is the median of the last `window` of them.
+    Each dot is an episode; the line is the median of the last `window` of them, None for a tenth of
+    all, at most 50. `visits` of a life in a stream are bands with their phases above.
 
     Args:
       episodes: the folder of a run of `sme train`, or its episodes.csv; columns `step` and
         `regret`, as a mapping of `[N]` arrays or a pandas frame; or rows that have both, as
         attributes or as keys.
-      path: a file to write, .png, .pdf or .svg; None writes none.
-      title: above a new figure.
-      window: number of episodes in the median, at least 1; None for a tenth of them, at most 50,
-        but all that end at one step.
-      visits: of a life in a stream, `StreamReport.visits`: a band for each, and its phase above.
-      ax: the axes to draw in, without legend; None for a new figure.
-
-    Returns:
-      The figure.
-
-    Raises:
-      OptionError: no finished episode, missing columns, or an argument is out of range.
-      MissingDependencyError: Matplotlib is not installed.
 
     Examples:
       >>> from sme_registry.plots import training_curve
@@ -102,18 +90,7 @@ def cost_curve(
 ) -> Figure:
     """Draw the mean cost of each training episode over environment steps, for a task with safety.
 
-    Args:
-      episodes: as in `training_curve`, with the column `cost` instead of `regret`.
-      path: a file to write, .png, .pdf or .svg; None writes none.
-      title: above a new figure.
-      window: as in `training_curve`.
-      ax: the axes to draw in, without legend; None for a new figure.
-
-    Returns:
-      The figure.
-
-    Raises:
-      OptionError, MissingDependencyError: see `training_curve`.
+    As `training_curve`, of the column `cost` instead of `regret`.
 
     Examples:
       >>> from sme_registry.plots import cost_curve
@@ -147,18 +124,6 @@ def learning_curve(
         single path or table needs no list; or one table of all, a pandas frame or a mapping of
         `[N]` arrays, with the columns `step` and `regret`, and `method` and `seed` where there
         are several.
-      path: a file to write, .png, .pdf or .svg; None writes none.
-      title: above a new figure.
-      window: number of episodes in each run's median; None as in `training_curve`.
-      ax: the axes to draw in, without legend; None for a new figure.
-
-    Returns:
-      The figure.
-
-    Raises:
-      OptionError: no method or no run, missing columns, runs of a method that share no steps, or an
-        argument is out of range.
-      MissingDependencyError: Matplotlib is not installed.
 
     Examples:
       >>> from sme_registry.plots import learning_curve

@@ -53,23 +53,9 @@ def decay_curve(
         name to the reports of its runs (seeds or instances), each a line of their IQM, with their
         quartiles as a band. A single report of a team also has a thinner line for each agent.
         A report may be given by its path, evaluation.json, or by the folder that contains it.
-      path: a file to write, .png, .pdf or .svg; None writes none.
-      measures: "similarity", "normalised_regret", or both.
       references: whether to draw the reference policies as thin lines. In a mapping they are means
         over its tasks; otherwise they are drawn once per task: in grey, or with several tasks in
         the colour of the first report on each task.
-      title: above a new figure; None takes the task's name if there is only one task.
-      ax: the axes to draw in, one for each measure, without title and legend; None for a new
-        figure.
-
-    Returns:
-      The figure.
-
-    Raises:
-      OptionError: no report, neither a report nor a path, different regions, an unknown measure or
-        suffix, another number of axes than of measures, or the file cannot be written.
-      SpecError: a file is not a report; see `EvaluationReport.read`.
-      MissingDependencyError: Matplotlib is not installed.
 
     Examples:
       >>> from sme_registry.plots import decay_curve

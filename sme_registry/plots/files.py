@@ -52,16 +52,7 @@ def write_training(
 
 
 def write_stream(report: StreamReport, folder: Path) -> list[Path]:
-    """Write the figures of a life in a stream for which its report has the numbers.
-
-    Args:
-      report: of the life.
-      folder: the folder.
-
-    Raises:
-      MissingDependencyError: Matplotlib is not installed.
-      OptionError: a file cannot be written.
-    """
+    """Write the figures of a life in a stream for which its report has the numbers."""
     missing = {
         "dynamic_regret_curve": report.dynamic_regret is None,
         "plasticity_curve": report.regions[0].agent.fresh_normalised_regret is None,
@@ -76,16 +67,8 @@ def write_stream(report: StreamReport, folder: Path) -> list[Path]:
 def write_evaluation(report: EvaluationReport, folder: Path, policy: Any = None) -> list[Path]:
     """Write the figures of an evaluation for which its report has the numbers.
 
-    They are the decay curve, and of a policy that observes two state channels the similarity map.
-
-    Args:
-      report: of the policy.
-      folder: the folder.
-      policy: any policy that `evaluate` accepts; None, or a team's, draws no map.
-
-    Raises:
-      MissingDependencyError: Matplotlib is not installed.
-      OptionError: a file cannot be written.
+    They are the decay curve, and of a policy that observes two state channels the similarity map;
+    without a policy, or of a team's, there is no map.
     """
     files = save_figure(decay_curve(report), folder / _DECAY, WRITTEN)
     spec = report.spec.named(report.task)

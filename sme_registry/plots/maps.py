@@ -39,29 +39,9 @@ def similarity_map(
 ) -> Figure:
     """Draw r̃ of a policy over the plane of a task with two state channels, beyond its unit square.
 
-    The colours cover the similarities that occur, to the next 0.05; the scale says which.
-
-    Args:
-      policy: any policy that `evaluate` accepts.
-      spec_or_id: a task with state_dim=2.
-      path: a file to write, .png, .pdf or .svg; None writes none.
-      epsilon: expansion level of the plane, in (0, 100]: the map covers the cube X_ε; 1 is
-        [−½, 1½]².
-      resolution: points along each side, in [2, 2000].
-      time: the time input t/T of the policy, in [0, 1]; its r_cum/k is 0.
-      action_range: "unit" or "symmetric"; None as in `evaluate`.
-      name: the policy's name in the title.
-      ax: the axes to draw in, without title; None for a new figure.
-
-    Returns:
-      The figure.
-
-    Raises:
-      OptionError: the task has no two state channels or its agent does not observe the state, or
-        an argument is out of range.
-      PolicyError: the policy cannot be loaded, or its actions are invalid.
-      UnknownNameError, SpecError: the task does not exist, or a field is out of range.
-      MissingDependencyError: Matplotlib is not installed.
+    The map covers the cube X_ε in `resolution` points along each side; ε = 1 is [−½, 1½]². The
+    policy sees `time` as t/T, and 0 as r_cum/k. The colours cover the similarities that occur, to
+    the next 0.05; the scale says which.
 
     Examples:
       >>> from sme_registry.plots import similarity_map
@@ -142,12 +122,7 @@ def draw_similarity(
 def similarity_on_grid(
     policy: Any, spec: SMESpec, epsilon: float, resolution: int, time: float
 ) -> tuple[Array, Array]:
-    """r̃ of a policy of `as_policy` over the plane of a task with two state channels.
-
-    Returns:
-      `[N]` evenly spaced coordinates along a side of the cube X_ε, and `[N, N]` similarities in
-      [0, 1] at time t/T, rows by the second state channel.
-    """
+    """`[N]` coordinates, and r̃ `[N, N]` over the plane, rows by the second state channel."""
     task = materialize(spec)
     oracle = engine(task).optimal_action
     low, high = -epsilon / 2.0, 1.0 + epsilon / 2.0

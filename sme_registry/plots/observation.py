@@ -48,23 +48,8 @@ def sensitivity_bars(
 
     Normalised regret in the cube, with the states outside (mean over the OOD shells), and with the
     distractors outside (mean over the d-OOD shells); and invariance in the cube, by how much
-    other distractors move the actions, on the same scale.
-
-    Args:
-      reports: of tasks with distractors; as in `decay_curve`. In a mapping a bar is the IQM over
-        runs, and its line spans their quartiles.
-      path: a file to write, .png, .pdf or .svg; None writes none.
-      title: above a new figure; None takes the task's name if there is only one task.
-      ax: the axes to draw in, without title and legend; None for a new figure.
-
-    Returns:
-      The figure.
-
-    Raises:
-      OptionError: no report, a report of a task without distractors, an unknown suffix, or the
-        file cannot be written.
-      SpecError: a file is not a report; see `EvaluationReport.read`.
-      MissingDependencyError: Matplotlib is not installed.
+    other distractors move the actions, on the same scale. Reports are as in `decay_curve`, of tasks
+    with distractors; in a mapping a bar is the IQM over runs, and its line spans their quartiles.
 
     Examples:
       >>> from sme_registry.plots import sensitivity_bars
@@ -114,21 +99,8 @@ def layer_probes(
 ) -> Figure:
     """Draw what a linear map recovers from each layer: R² of the state, and of the distractors.
 
-    Args:
-      reports: whose policies have probes; as in `decay_curve`. In a mapping a line is the IQM over
-        runs, which must have equally many layers, and a band spans their quartiles.
-      path: a file to write, .png, .pdf or .svg; None writes none.
-      title: above a new figure; None takes the task's name if there is only one task.
-      ax: two axes to draw in, without title and legend; None for a new figure.
-
-    Returns:
-      The figure: the state on the left, the distractors on the right, empty where there are none.
-
-    Raises:
-      OptionError: no report, a report without probes, runs of a method with different numbers of
-        layers, an unknown suffix, another number of axes than two, or the file cannot be written.
-      SpecError: a file is not a report; see `EvaluationReport.read`.
-      MissingDependencyError: Matplotlib is not installed.
+    Reports are as in `decay_curve`, of policies that have probes. In a mapping a line is the IQM
+    over runs, which must have equally many layers, and a band spans their quartiles.
 
     Examples:
       >>> from sme_registry.evaluation import Perceptron

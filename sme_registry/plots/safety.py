@@ -34,23 +34,9 @@ def reward_against_cost(
 ) -> Figure:
     """Draw mean step reward against mean cost: one panel in the cube, one outside.
 
-    The line between the optimum and the safe optimum is what mixtures of the two reach.
-
-    Args:
-      reports: of tasks with limits; as in `decay_curve`. In a mapping each run is a small marker,
-        and their IQM a large one. References are means over the tasks.
-      path: a file to write, .png, .pdf or .svg; None writes none.
-      title: above a new figure; None takes the task's name if there is only one task.
-      ax: two axes to draw in, without title and legend; None for a new figure.
-
-    Returns:
-      The figure.
-
-    Raises:
-      OptionError: no report, a report of a task without limits, an unknown suffix, another number
-        of axes than two, or the file cannot be written.
-      SpecError: a file is not a report; see `EvaluationReport.read`.
-      MissingDependencyError: Matplotlib is not installed.
+    The line between the optimum and the safe optimum is what mixtures of the two reach. Reports are
+    as in `decay_curve`, of tasks with limits; in a mapping each run is a small marker, and their
+    IQM a large one. References are means over the tasks.
 
     Examples:
       >>> from sme_registry.plots import reward_against_cost

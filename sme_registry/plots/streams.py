@@ -67,19 +67,7 @@ def retention_map(
     Args:
       runs: the report of an agent, or one for each seed: then the cells are their IQM. A report
         may be given by its path, or by the folder that contains its stream.json.
-      path: a file to write, .png, .pdf or .svg; None writes none.
       region: `WD`, `OOD 1`, …, or `OOD` for the mean over the shells.
-      title: above a new figure; None names the agent, the stream and the region.
-      ax: the axes to draw in, without title; None for a new figure.
-
-    Returns:
-      The figure.
-
-    Raises:
-      OptionError: no report, reports of different streams, or the file cannot be written.
-      UnknownNameError: no region has this name.
-      SpecError: a file is not a report.
-      MissingDependencyError: Matplotlib is not installed.
 
     Examples:
       >>> from sme_registry.plots import retention_map
@@ -118,16 +106,7 @@ def performance_curve(
 
     Filled marks are the visits of the line's own phase: between them one sees what is forgotten,
     and before the first of them what is known in advance. Performance is 1 − normalised regret.
-
-    Args:
-      runs, path, region, title, ax: as in `retention_map`; lines are the IQM of several seeds, and
-        bands their quartiles, up to seven phases.
-
-    Returns:
-      The figure.
-
-    Raises:
-      As `retention_map`.
+    Runs are as in `retention_map`: lines are the IQM of several seeds, bands their quartiles.
 
     Examples:
       >>> from sme_registry.plots import performance_curve
@@ -166,20 +145,9 @@ def dynamic_regret_curve(
     """Draw the dynamic regret of training over the lifetime, with a band for each visit.
 
     Reference agents of which the reports know the regret are grey, but not the optimum of each
-    phase, which has none; with several methods only those that need no training.
-
-    Args:
-      runs: as in `retention_map`, or a mapping from each agent's name to its runs; reports with a
-        dynamic regret. Lines are the median of several seeds, and bands their quartiles.
-      path, title, ax: as in `retention_map`.
-
-    Returns:
-      The figure.
-
-    Raises:
-      OptionError: a report without a dynamic regret; and as `retention_map`.
-      SpecError: a file is not a report.
-      MissingDependencyError: Matplotlib is not installed.
+    phase, which has none; with several methods only those that need no training. Runs are as in
+    `retention_map`, or a mapping from each agent's name to its runs. Lines are the median of
+    several seeds, and bands their quartiles.
 
     Examples:
       >>> from sme_registry.plots import dynamic_regret_curve
@@ -214,21 +182,9 @@ def plasticity_curve(
 ) -> Figure:
     """Draw the plasticity ratio by visit: regret on the visited phase over a fresh agent's.
 
-    Above 1 the agent learns less than a fresh one in as many steps.
-
-    Args:
-      runs: as in `dynamic_regret_curve`; reports with fresh agents. Lines are the IQM of several
-        seeds, and bands their quartiles.
-      path, region, title, ax: as in `retention_map`.
-
-    Returns:
-      The figure.
-
-    Raises:
-      OptionError: a report without fresh agents; and as `retention_map`.
-      UnknownNameError: no region has this name.
-      SpecError: a file is not a report.
-      MissingDependencyError: Matplotlib is not installed.
+    Above 1 the agent learns less than a fresh one in as many steps. Runs are as in
+    `dynamic_regret_curve`, with fresh agents; lines are the IQM of several seeds, and bands their
+    quartiles.
 
     Examples:
       >>> from sme_registry.evaluation import evaluate_stream
@@ -257,17 +213,9 @@ def plasticity_curve(
 def draw_matrix(
     axes: Axes, M: Array, visited: Sequence[tuple[int, int]], labels: Sequence[str], top: float
 ) -> AxesImage:
-    """Draw a retention matrix in axes, with the cells of visited phases outlined.
+    """Draw a retention matrix `[V, P]` in axes, with the `visited` cells outlined.
 
-    Args:
-      axes: the axes.
-      M: `[V, P]` normalised regret; the first row may be of the initial policy.
-      visited: row and column of each phase just visited.
-      labels: of the rows.
-      top: the regret at the dark end of the colours, at least that of every cell.
-
-    Returns:
-      The image, for a bar of colours.
+    `top` is the regret at the dark end of the colours, at least that of every cell.
     """
     image = axes.imshow(
         M, vmin=0.0, vmax=top, cmap="viridis_r", aspect="auto", interpolation="nearest"

@@ -66,11 +66,7 @@ _STYLE: Any = {
 
 @contextlib.contextmanager
 def styled() -> Iterator[None]:
-    """Matplotlib's settings for figures of this package, during the block.
-
-    Raises:
-      MissingDependencyError: Matplotlib is not installed.
-    """
+    """Matplotlib's settings for figures of this package, during the block."""
     require_packages("figures", {"matplotlib": "Matplotlib"}, "plot")
     import matplotlib
 
@@ -93,18 +89,7 @@ def new_figure(size: tuple[float, float]) -> Figure:
 def drawing(
     size: tuple[float, float], formats: Iterable[str]
 ) -> Iterator[tuple[Figure, dict[str, bytes]]]:
-    """A figure in the style of this package, and its files.
-
-    Args:
-      size: width and height in inches.
-      formats: of `FORMATS`.
-
-    Yields:
-      The figure to draw in, and a dict that holds the bytes of each format after the block.
-
-    Raises:
-      MissingDependencyError: Matplotlib is not installed.
-    """
+    """A figure in the style of this package, and a dict of its files, filled after the block."""
     files: dict[str, bytes] = {}
     with styled():
         figure = new_figure(size)
@@ -117,19 +102,8 @@ def save_figure(
 ) -> list[Path]:
     """Write a figure, each file completely or not at all; equal figures give equal files.
 
-    Fonts are embedded in PDF as TrueType, and SVG keeps its text.
-
-    Args:
-      figure: the figure.
-      path: the file to write. Its folder is created, and an existing file is replaced.
-      formats: of "png", "pdf" and "svg", each written next to the others with its own ending; None
-        takes the ending of `path`.
-
-    Returns:
-      The paths written.
-
-    Raises:
-      OptionError: an unknown format, or a file cannot be written.
+    Fonts are embedded in PDF as TrueType, and SVG keeps its text. With `formats`, of "png", "pdf"
+    and "svg", each is written next to the others with its own ending. Returns the paths.
 
     Examples:
       >>> from matplotlib.figure import Figure
@@ -168,10 +142,6 @@ def canvas(
 
     After the block a new figure has a legend of all labelled lines below its panels; the caller's
     axes have none. The figure is written if there is a path.
-
-    Raises:
-      OptionError: an unknown suffix, another number of axes, or the file cannot be written.
-      MissingDependencyError: Matplotlib is not installed.
     """
     if path is not None:
         checked_format(path)
@@ -204,16 +174,7 @@ def entitle(figure: Figure, title: str) -> None:
 
 
 def legend_below(figure: Figure, handles: Sequence[Artist], most_across: int = 6) -> Legend | None:
-    """A legend below all panels, which covers none: as many columns as fit, and a taller figure.
-
-    Args:
-      figure: with constrained layout. It grows by all rows of the legend but the first.
-      handles: labelled artists.
-      most_across: the most columns.
-
-    Returns:
-      The legend; None without handles.
-    """
+    """A legend below all panels, which covers none: as many columns as fit, and a taller figure."""
     if not handles:
         return None
     labels = [textwrap.fill(str(each.get_label()), _LABEL_WIDTH) for each in handles]
