@@ -1,12 +1,8 @@
-"""`Transitions`: a data set as aligned NumPy arrays, one row for each transition.
+"""`Transitions`: a data set as aligned NumPy arrays, one row (s, a, R, s') for each transition.
 
-Row i is (s, a, R, s'): observation, action, reward and next observation, with the exact values that
-only an SME provides: π*(s), r̃, r and the regret 1 − r. `N` transitions, `S` state_dim, `A`
-action_dim, `n` agents (1 without a team), `m` distractors (0 without `observation`), `O` = S + m +
-1 + n entries of an observation.
-
-Rows of one trajectory are contiguous and in order. All arrays have the same number of rows, so
-observations and actions cannot be misaligned.
+`N` transitions, `S` state_dim, `A` action_dim, `n` agents (1 without a team), `m` distractors (0
+without `observation`), `O` = S + m + 1 + n entries of an observation. Rows of one trajectory are
+contiguous and in order.
 """
 
 from __future__ import annotations
@@ -41,21 +37,16 @@ class Transitions:
       timeouts: `[N]` bool: the trajectory ends here but the task continues. Bootstrap from
         `next_observations`. Never true together with a termination.
       optimal_actions: `[N, A]` float64 in [0, 1], π*(s).
-      regrets: `[N]` float64 in [0, 1], 1 − r; of a team `[N, n]`, one column for each agent.
-      similarities: `[N]` float64 in [0, 1], r̃; of a team `[N, n]`.
-      step_rewards: `[N]` float64 in [0, 1], r; of a team `[N, n]`.
-      states: `[N, S]` float64 in [0, 1], before the step, to the bit.
-      next_states: `[N, S]` float64, to the bit.
+      regrets, similarities, step_rewards: `[N]` float64 in [0, 1]: 1 − r, r̃ and r; of a team
+        `[N, n]`, one column for each agent.
+      states, next_states: `[N, S]` float64 in [0, 1], to the bit.
       episodes: `[N]` int64, index of the row's trajectory, from 0; non-decreasing.
       components: `[N]` int64, index of the recipe's behaviour policy that acted.
       agent_rewards: `[N, n]` float64, R of each agent of a team; None for a single agent.
-      costs: `[N]` float64 in [0, 1], the cost of the action; this and the next three are None
-        without `safety`.
-      limits: `[N, A]` float64 in [0, 1], ℓ(s).
-      safe_actions: `[N, A]` float64 in [0, 1], min(π*(s), ℓ(s)).
+      costs, limits, safe_actions: `[N]`, `[N, A]`, `[N, A]` float64 in [0, 1]: the cost of the
+        action, ℓ(s), and min(π*(s), ℓ(s)); None without `safety`, as is the next.
       safe_regrets: `[N]` float64 in [−1, 1], the step reward of the safe action minus r.
-      distractors: `[N, m]` float64 in [0, 1], before the step; both are None without distractors.
-      next_distractors: `[N, m]` float64.
+      distractors, next_distractors: `[N, m]` float64 in [0, 1]; None without distractors.
     """
 
     observations: Observation
@@ -81,7 +72,6 @@ class Transitions:
     next_distractors: Array | None = None
 
     def __len__(self) -> int:
-        """N, the number of transitions."""
         return len(self.rewards)
 
     def columns(self) -> dict[str, npt.NDArray[Any]]:
@@ -96,7 +86,6 @@ class Transitions:
 
     @property
     def digest(self) -> str:
-        """`digest_of` all arrays."""
         return digest_of(self.columns())
 
 
@@ -113,7 +102,7 @@ def digest_of(arrays: Mapping[str, npt.NDArray[Any]]) -> str:
 def to_d3rlpy(
     transitions: Transitions, *, final_observations: bool = False
 ) -> dict[str, npt.NDArray[Any]]:
-    """The arguments of d3rlpy's `MDPDataset`: `MDPDataset(**to_d3rlpy(transitions))`.
+    """The arguments of d3rlpy's `MDPDataset`, as copies: `MDPDataset(**to_d3rlpy(transitions))`.
 
     d3rlpy uses row i + 1 as the observation after row i. The last row of a trajectory that ended
     without a termination has no successor, so d3rlpy drops it: one row in T, and every trajectory
@@ -121,15 +110,6 @@ def to_d3rlpy(
     observation with an action and a reward of 0, which d3rlpy uses as a successor and not as a
     transition, so no row is lost. Do not use it for algorithms that read rows instead of
     transitions, such as return-conditioned sequence models.
-
-    Args:
-      transitions: of N rows.
-      final_observations: add the final observation of each trajectory that did not terminate.
-
-    Returns:
-      `observations` `[N, O]` float32, `actions` `[N, A]` float32, `rewards` `[N]` float32,
-      `terminals` `[N]` and `timeouts` `[N]` float32 of 0 and 1; with `final_observations` one more
-      row for each timeout. All arrays are copies.
 
     Examples:
       >>> from sme_registry.datasets import open_dataset, to_d3rlpy

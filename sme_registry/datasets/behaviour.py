@@ -58,10 +58,10 @@ class OptimalPolicy:
 
 
 class EpisodeStream:
-    """Uniform numbers of a named stream, a separate part of it for each episode.
+    """Uniform numbers of a named stream, `width` a step, a separate part of it for each episode.
 
     Episode e reads from word 4 · 2¹²⁸ e onwards, so its numbers do not depend on its lane or on the
-    other episodes. Each lane uses `width` numbers a step, and reads those of `ahead` steps at once.
+    other episodes. Each lane reads those of `ahead` steps at once.
     """
 
     def __init__(
@@ -74,7 +74,6 @@ class EpisodeStream:
         self._lanes = np.arange(lanes)
 
     def begin(self, lane: int, episode: int) -> None:
-        """Start a lane at the first number of an episode."""
         generator = bit_generator(self._seed, self._name)
         generator.advance(episode << 128)
         self._generators[lane] = generator
@@ -96,18 +95,15 @@ class EpisodeStream:
 
 @dataclass(frozen=True)
 class BehaviourPolicy:
-    """A policy that acts in all lanes.
+    """A policy that acts in all lanes: actions `[B, A]` for states `[B, S]` and joint observations.
 
-    Attributes:
-      act: actions `[B, A]` for states `[B, S]` and joint observations `[B, O]`.
-      stream: the random numbers that it uses; None if it is deterministic.
+    `stream` has the random numbers that it uses; it is None if the policy is deterministic.
     """
 
     act: Callable[[Array, Observation], Array]
     stream: EpisodeStream | None = None
 
     def begin(self, lane: int, episode: int) -> None:
-        """Begin an episode in a lane."""
         if self.stream is not None:
             self.stream.begin(lane, episode)
 
@@ -120,16 +116,7 @@ def behaviour_policy(
     policy: Any = None,
     stream: str = "dataset",
 ) -> BehaviourPolicy:
-    """The policy of a recipe's behaviour with this index, in B lanes.
-
-    Args:
-      recipe, index, task, lanes: the recipe, the behaviour in it, the recipe's task, and B.
-      policy: for a behaviour of kind "policy": anything that `evaluate` accepts.
-      stream: prefix of the names of its random streams.
-
-    Raises:
-      PolicyError, MissingDependencyError: the policy cannot be used.
-    """
+    """The policy of a recipe's behaviour with this index; `policy` is the user's, for its kind."""
     behaviour, name = recipe.behaviours[index], f"{stream}/{index}"
     if behaviour.nu is not None:
         return _mixture(task, recipe.seed, behaviour.nu, name, lanes)

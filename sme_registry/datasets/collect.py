@@ -68,22 +68,11 @@ def collect(
     lanes: int | None = None,
     progress: ReportProgress | None = None,
 ) -> Transitions:
-    """Generate the transitions of a recipe.
+    """Generate the transitions of a recipe, one behaviour after another.
 
-    Args:
-      recipe: the recipe.
-      task: its materialised task.
-      policies: the user's policies, by the index of their behaviour.
-      lanes: episodes at once; None takes at most 512. The numbers do not depend on it.
-      progress: called after each step with the transitions collected and their total.
-
-    Returns:
-      Exactly `recipe.transitions` of them, one behaviour after another.
-
-    Raises:
-      OptionError: the sub-cube is too small.
-      ResourceLimitError: the data set would not fit in memory.
-      PolicyError, MissingDependencyError: a policy cannot be used.
+    `task` is the recipe's, materialised; `policies` are the user's by the index of their behaviour.
+    `lanes` episodes run at once (at most 512 by default); the numbers do not depend on it.
+    `progress` is called after each step with the transitions collected and their total.
 
     Examples:
       >>> from sme_registry.datasets import DatasetRecipe, collect
@@ -131,14 +120,8 @@ def collect(
 def play(task: Task, policy: BehaviourPolicy, starts: EpisodeStream, lanes: int) -> Iterator[Rows]:
     """Play episodes 0, 1, 2, … without end, each in the first lane that is free.
 
-    The first numbers of an episode in `starts` are its initial state, which determines its
-    distractors, too.
-
-    Yields:
-      A step of all lanes; the arrays are valid until the next one.
-
-    Raises:
-      PolicyError: the policy fails.
+    Yields a step of all lanes, whose arrays are valid until the next one. The first numbers of an
+    episode in `starts` are its initial state, which determines its distractors, too.
     """
     batch = Batch(task, lanes)
     episode, t = np.zeros((2, lanes), np.int64)
@@ -198,8 +181,6 @@ def _too_small(recipe: DatasetRecipe, reason: str) -> OptionError:
 
 
 class _Collected:
-    """The rows so far, and whether they include the first `wanted` by episode and step."""
-
     def __init__(self, wanted: int) -> None:
         self._wanted = wanted
         self._parts: list[Rows] = []
@@ -208,7 +189,6 @@ class _Collected:
         self.count = 0
 
     def add(self, rows: Rows) -> None:
-        """Add one step of some lanes, with no episode twice."""
         self._parts.append(rows)
         last = int(rows.episode.max(initial=0))
         if last >= len(self._rows_of):
@@ -224,7 +204,6 @@ class _Collected:
         return self._settled + running >= self._wanted
 
     def rows(self) -> Rows:
-        """The first `wanted` rows, by episode and step."""
         episode = np.concatenate([part.episode for part in self._parts])
         t = np.concatenate([part.t for part in self._parts])
         first = np.lexsort((t, episode))[: self._wanted]

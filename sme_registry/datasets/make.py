@@ -63,21 +63,11 @@ def make_dataset(
         E(s) − ε of a state is its distance from the data.
       protocol: for the evaluation of policies that learn from the data set; stored in its record.
       action_range: of the policies' actions in `mix`; None takes their own.
-      name: Minari's id, `[namespace/]name-v<number>`; None generates a descriptive one.
+      name: Minari's id, `[namespace/]name-v<number>`; None generates a descriptive one. A name that
+        is taken is a NameTakenError, which compares the two recipes.
       folder: the root of all data sets; None for Minari's folder.
       force: replace an existing data set of this package.
       progress: called after each step with the transitions collected and their total.
-
-    Returns:
-      The data set.
-
-    Raises:
-      UnknownNameError, SpecError: no such task or protocol, or a field is outside its range.
-      OptionError: Minari does not accept the name, the sub-cube is too small, or writing fails.
-      NameTakenError: the name is taken; the message compares the two recipes.
-      PolicyError: a policy cannot be used.
-      ResourceLimitError: the data set would not fit in memory.
-      MissingDependencyError: Minari or h5py is not installed.
 
     Examples:
       >>> from sme_registry.datasets import make_dataset

@@ -62,7 +62,6 @@ def require_minari() -> None:
 
 
 def minari_dataset(data_folder: Path) -> Any:
-    """The `minari.MinariDataset` of a folder; see `require_minari`."""
     require_minari()
     import minari
 
@@ -101,10 +100,7 @@ def minari_metadata(dataset_id: str, record: DatasetRecord, size_bytes: int) -> 
 def plain_metadata(
     dataset_id: str, widths: tuple[int, int], episodes: int, steps: int, size_bytes: int
 ) -> dict[str, Any]:
-    """The metadata that Minari needs; nothing in it is about the task but its dimensions.
-
-    `widths` are those of observations and actions.
-    """
+    """The metadata that Minari needs; nothing in it is about the task but its dimensions."""
     import minari
     from minari.serialization import serialize_space
 
@@ -138,21 +134,13 @@ def visible_episode(
     last_observation: Observation,
     **arrays: npt.NDArray[Any],
 ) -> Episode:
-    """An episode as its agent saw it.
-
-    Args:
-      number: from 0.
-      observations: `[T, O]` before each step.
-      last_observation: `[1, O]` after the last one.
-      arrays: `[T, …]` actions, rewards, terminations and truncations.
-    """
+    """An episode as its agent saw it: `[T, …]` arrays of its steps, and `[1, O]` after the last."""
     seen = np.concatenate([observations, last_observation])
     attributes = {"id": number, "total_steps": len(observations)}
     return Episode(attributes, {"observations": seen, **arrays}, {})
 
 
 def to_hdf5(transitions: Transitions, record: DatasetRecord) -> bytes:
-    """The content of `main_data.hdf5`; the same arrays give the same bytes."""
     return hdf5_content(_episodes(transitions, record.recipe.spec))
 
 
@@ -188,7 +176,7 @@ def truncations_of(transitions: Transitions, spec: SMESpec) -> Mask:
 
 
 def hdf5_content(episodes: Iterable[Episode]) -> bytes:
-    """The content of `main_data.hdf5` with these episodes.
+    """The content of `main_data.hdf5` with these episodes; the same arrays give the same bytes.
 
     Built in memory, so that a full disk fails one write instead of HDF5 in the middle of its work.
     h5py's low-level interface takes half the time: short episodes are many tiny objects.
@@ -225,11 +213,6 @@ def hdf5_content(episodes: Iterable[Episode]) -> bytes:
 
 
 def read_hdf5(path: Path, record: DatasetRecord) -> Transitions:
-    """The arrays of a `main_data.hdf5`.
-
-    Raises:
-      OSError, KeyError, ValueError, RuntimeError: h5py cannot read it, or a part is missing.
-    """
     import h5py
 
     spec = record.recipe.spec
@@ -263,10 +246,6 @@ def read_visible(path: Path) -> dict[str, npt.NDArray[Any]]:
     """The arrays of a `main_data.hdf5` that agents see, with the truncations.
 
     The file may be a stranger's: it is read only as far as it is what `hdf5_content` writes.
-
-    Raises:
-      OSError, KeyError, ValueError, RuntimeError, MemoryError: h5py cannot read it, a part is
-        missing, or not as it is written.
     """
     import h5py
 
@@ -329,7 +308,6 @@ class _Arrays:
         self._left = path.stat().st_size
 
     def get(self, group: Any, name: str) -> npt.NDArray[Any]:
-        """An array of a group. Raises ValueError if it is not what `hdf5_content` writes."""
         import h5py
 
         _refuse_link(group, name)
@@ -352,7 +330,6 @@ class _Arrays:
         return array
 
     def visible(self, episode: Any) -> dict[str, npt.NDArray[Any]]:
-        """The columns of an episode's group that an agent sees, without truncations."""
         observations = self.get(episode, "observations")
         return {
             "observations": observations[:-1],

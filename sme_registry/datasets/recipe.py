@@ -122,10 +122,6 @@ class DatasetRecipe(Document):
 
     @property
     def shares(self) -> tuple[int, ...]:
-        """The number of transitions of each behaviour; they add up to N.
-
-        The boundaries between behaviours are rounded, so each is within one of its exact share.
-        """
         weights = itertools.accumulate(behaviour.weight for behaviour in self.behaviours)
         boundaries = [0, *(round(self.transitions * min(w, 1.0)) for w in weights)]
         boundaries[-1] = self.transitions
@@ -135,8 +131,7 @@ class DatasetRecipe(Document):
     def expected_similarity(self) -> float | None:
         """Mean r̃ for independent and uniform a* and ã; None if a policy is the user's.
 
-        A mixture of ν has 1 − ν/6, since E α = ν/2 and E |ã − a*| = 1/3; uniformly random actions
-        have 1 − 1/3, since a* is uniform.
+        1 − ν/6 of a mixture, since E α = ν/2 and E |ã − a*| = 1/3; 1 − 1/3 of random actions.
         """
         if any(behaviour.kind == "policy" for behaviour in self.behaviours):
             return None
@@ -145,7 +140,6 @@ class DatasetRecipe(Document):
         )
 
     def differences(self, other: DatasetRecipe) -> list[str]:
-        """The fields in which another recipe differs: `transitions 100, requested 200`."""
         return _differences("", self.to_dict(), other.to_dict())
 
 
@@ -169,17 +163,7 @@ def _differences(path: str, ours: Any, theirs: Any) -> list[str]:
 
 
 def parse_behaviour(policy: Any, weight: float = 1.0, action_range: str | None = None) -> Behaviour:
-    """The behaviour for a policy as `make_dataset` accepts it.
-
-    Args:
-      policy: ν as a number; "random"; or a callable, a model, or the path of a .zip or .onnx file.
-      weight: its share.
-      action_range: of the policy's actions; None takes its own.
-
-    Raises:
-      SpecError: ν or the weight is outside its range.
-      PolicyError: the file does not exist.
-    """
+    """The behaviour for a policy as `make_dataset` accepts it."""
     fields: dict[str, Any]
     if type(number := plain_number(policy)) in (int, float):
         fields = {"kind": "mixture", "nu": float(number)}
@@ -201,7 +185,6 @@ def parse_behaviour(policy: Any, weight: float = 1.0, action_range: str | None =
 
 
 def policy_digest(path: Path) -> str:
-    """The SHA-256 digest of a policy's file; raises PolicyError if it cannot be read."""
     try:
         with path.open("rb") as stream:
             return "sha256:" + hashlib.file_digest(stream, "sha256").hexdigest()

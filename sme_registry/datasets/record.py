@@ -17,12 +17,7 @@ KEY = "sme"
 
 
 class Seeds(StrictModel):
-    """Seeds of the task and of the data (starts, α, ã and random actions).
-
-    Attributes:
-      task: of the task.
-      data: of the data.
-    """
+    """Seeds of the task and of the data (starts, α, ã and random actions)."""
 
     task: Seed
     data: Seed
@@ -34,10 +29,8 @@ class DatasetRecord(StrictModel):
     Attributes:
       schema_version: version of the record's format.
       recipe: all that the data set was generated from.
-      recipe_digest: the recipe's digest.
-      spec_digest: the task's digest.
+      recipe_digest, spec_digest, protocol_digest: of the recipe, its task and its protocol.
       task: what the task's file calls it.
-      protocol_digest: the protocol's digest.
       seeds: of the task and of the data.
       nu: ν if a single mixture acted; null for other or several behaviours.
       trajectories: E, the number of Minari episodes.
@@ -61,12 +54,7 @@ class DatasetRecord(StrictModel):
 
     @classmethod
     def from_dict(cls, data: Any, source: str = "") -> Self:
-        """Validate plain data, and the digests of its documents; errors call it `source`.
-
-        Raises:
-          SpecError: a field is invalid, or the schema version is not 1.
-          DigestMismatchError: a digest does not match its document.
-        """
+        """Validate plain data, and the digests of its documents; errors call it `source`."""
         version = data.get("schema_version") if isinstance(data, dict) else None
         if type(version) is int and version != 1:
             age = "an older" if version < 1 else "a newer"

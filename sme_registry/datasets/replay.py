@@ -30,8 +30,7 @@ _BLOCK = 4096
 def replay(transitions: Transitions, recipe: DatasetRecipe, task: Task) -> None:
     """Check a data set against its recipe's task, as materialised on this machine.
 
-    Raises:
-      FingerprintMismatchError: names the first array and row that differ from the task's.
+    A FingerprintMismatchError names the first array and row that differ from the task's.
 
     Examples:
       >>> from sme_registry.datasets import open_dataset, replay
@@ -96,7 +95,6 @@ def replay(transitions: Transitions, recipe: DatasetRecipe, task: Task) -> None:
 def _replay_safety(
     transitions: Transitions, task: Task, a: Array, optimal: Array, step_reward: Array
 ) -> None:
-    """Check the limits, safe actions, costs and safe regrets of a task with `safety`."""
     columns = transitions.columns()
     limit = task.limit(transitions.states)
     safe_regret = task.safe_reward_of(optimal, limit) - step_reward
@@ -107,7 +105,6 @@ def _replay_safety(
 
 
 def _replay_distractors(transitions: Transitions, task: Task, a: Array) -> None:
-    """Check the distractors of a task with some."""
     columns, spec = transitions.columns(), task.spec
     for name in ("distractors", "next_distractors"):
         d = columns[name]
@@ -143,7 +140,6 @@ def _same(
     expected: npt.NDArray[Any],
     tolerance: float | Array = 0.0,
 ) -> None:
-    """Raise with the first row that differs from the expected values, and by how much."""
     difference = np.abs(values.astype(np.float64) - expected.astype(np.float64))
     wrong = ~(difference <= tolerance)
     if wrong.any():

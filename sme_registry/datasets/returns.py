@@ -57,13 +57,9 @@ class Estimate(NamedTuple):
 class ExactReturn:
     """The returns of a policy from `M` states.
 
-    Attributes:
-      undiscounted: `[M]` each: mean, low and high.
-      discounted: the same with `gamma`.
-      lengths: `[M]` mean steps to the end of the episode.
-      similarity: `[M]` mean r̃ over them.
-      gamma: γ.
-      rollouts: episodes from each state; 1 for a deterministic policy.
+    `undiscounted` and, with γ, `discounted` have a mean, low and high of `[M]` each; `lengths`
+    `[M]` are the mean steps to the end of the episode, `similarity` `[M]` the mean r̃ over them,
+    and `rollouts` the episodes from each state.
     """
 
     undiscounted: Estimate
@@ -78,9 +74,6 @@ class ExactReturn:
 
         The interval assumes that the states are independent draws from a distribution. For rows of
         the same trajectories it is too narrow.
-
-        Raises:
-          OptionError: there is only one state.
         """
         if len(self.lengths) < 2:
             raise OptionError("states: an interval over states requires at least 2 of them.")
@@ -99,12 +92,12 @@ def exact_return(
     rollouts: int = 1,
     action_range: str | None = None,
 ) -> ExactReturn:
-    """Run a policy from states of a task to the end of the episode.
+    """Run a policy from `M` states of a single-agent task to the end of the episode.
 
     Args:
       policy: anything that `evaluate` accepts: a callable `[B, O] → [B, A]`, a model, or the
         path of one.
-      spec: a single-agent task: a spec, its fields, an id, a digest or a path.
+      spec: a spec, its fields, an id, a digest or a path.
       states: `[M, S]` in [0, 1]; `Transitions.states` are exact, its observations are rounded.
       t: `[M]` or one number, steps completed before, in [0, T).
       r_cum: `[M]` or one number, the rewards since the last payout, in [0, t mod k].
@@ -115,16 +108,6 @@ def exact_return(
         for a stochastic one, whose mean gets a 95 % interval (Student's t). On a task with
         distractors also more than 1: each episode draws them anew, at its start too.
       action_range: of the policy's actions; None takes its own, and "unit" for a callable.
-
-    Returns:
-      The returns.
-
-    Raises:
-      UnknownNameError, SpecError: no such task, or it is a team's.
-      StateError: states, t or r_cum have the wrong shape or impossible values.
-      OptionError: another argument is out of range, or `rollouts` is 1 and the policy is
-        stochastic or the task has distractors.
-      PolicyError: the policy cannot be used.
 
     Examples:
       >>> from sme_registry.datasets import exact_return, open_dataset, positions
@@ -169,16 +152,8 @@ def positions(
 ) -> dict[str, Any]:
     """The states, times and accumulated rewards of rows of a data set, for `exact_return`.
 
-        exact_return(policy, spec, **positions(transitions, spec, rows))
-
-    Args:
-      transitions: a single-agent data set.
-      spec: its task.
-      rows: `[M]` indices, or a mask; None for all.
-
-    Returns:
-      `states` `[M, S]` and `t` `[M]`, exact, and `r_cum` `[M]` as an observation stores it, to a
-      relative precision of 6e-8.
+    `rows` are indices or a mask; None for all. `states` `[M, S]` and `t` `[M]` are exact, `r_cum`
+    `[M]` is as an observation stores it, to a relative precision of 6e-8.
 
     Examples:
       >>> from sme_registry.datasets import open_dataset, positions
@@ -196,7 +171,6 @@ def positions(
 def _starts(
     spec: SMESpec, states: npt.ArrayLike, t: npt.ArrayLike, r_cum: npt.ArrayLike
 ) -> tuple[Array, Steps, Array]:
-    """States `[M, S]`, steps `[M]` and accumulated rewards `[M]`, checked."""
     S, T, k = spec.state_dim, spec.horizon, spec.k
     M = len(states) if isinstance(states, np.ndarray | list | tuple) else 0
     if M == 0:

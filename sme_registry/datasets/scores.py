@@ -34,10 +34,9 @@ Share = Annotated[Real, Field(ge=0, le=1)]
 
 
 class Rollouts(StrictModel):
-    """Whole episodes of a policy.
+    """Whole episodes of a policy; 0 of them if the values are exact without rollouts.
 
     Attributes:
-      episodes: 0 if the values are exact without rollouts.
       mean_return: mean sum of rewards, in [0, T].
       standard_error: of that mean, over episodes.
       similarity: mean r̃ over all steps.
@@ -64,14 +63,7 @@ class PolicyScore(StrictModel):
 
 
 class ReferenceScores(StrictModel):
-    """The reference scores of a data set.
-
-    Attributes:
-      constant: of a = ½, the lower reference.
-      behaviour: of the policies that collected the data set.
-      behaviours: each over the rows in which it acted.
-      optimum: of π*.
-    """
+    """The scores of a = ½, of the behaviour, of each of its policies on its rows, and of π*."""
 
     constant: PolicyScore
     behaviour: PolicyScore
@@ -85,7 +77,7 @@ def reference_scores(
     transitions: Transitions,
     policies: dict[int, object] | None = None,
 ) -> ReferenceScores:
-    """The scores of the data set's behaviour, of a = ½ and of π*; `policies` as in `collect`."""
+    """The reference scores of a data set; `policies` as in `collect`."""
     T = recipe.spec.horizon
     episodes = min(EPISODES, _MAX_STEPS // T)
 
@@ -142,11 +134,7 @@ def _constant_values(task: Task, transitions: Transitions) -> tuple[Array, Array
 def whole_episodes(
     task: Task, policy: BehaviourPolicy, starts: EpisodeStream, count: int
 ) -> tuple[Array, Array, Array]:
-    """Play the first `count` episodes of `collect.play`, all at once.
-
-    Returns:
-      `[count]` each: return, sum of r̃, and number of steps; for a team the means over its agents.
-    """
+    """Return, sum of r̃ and steps `[count]` of the first episodes of `play`; means over agents."""
     running, sums = np.ones(count, bool), np.zeros((3, count))
     for step in play(task, policy, starts, count):
         similarity, reward = (step.values[:, row].mean(axis=1) for row in (SIMILARITY, REWARD))

@@ -59,11 +59,7 @@ class SealedDataset:
 
     @classmethod
     def collect(cls, recipe: DatasetRecipe, progress: ReportProgress | None = None) -> Self:
-        """Generate the transitions of a recipe of mixtures.
-
-        Raises:
-          ResourceLimitError: the data set would not fit in memory.
-        """
+        """Generate the transitions of a recipe of mixtures."""
         rows = collect(recipe, materialize(recipe.spec), progress=progress)
         return cls(
             observations=rows.observations,
@@ -76,12 +72,7 @@ class SealedDataset:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a data set's folder, which contains `data/`.
-
-        Raises:
-          MissingDependencyError: Minari or h5py is not installed.
-          MalformedDocumentError: it cannot be read.
-        """
+        """Read a data set's folder, which contains `data/`."""
         require_minari()
         file = Path(path) / "data" / DATA
         try:
@@ -92,16 +83,13 @@ class SealedDataset:
             ) from None
 
     def __len__(self) -> int:
-        """N, the number of transitions."""
         return len(self.rewards)
 
     def columns(self) -> dict[str, npt.NDArray[Any]]:
-        """The arrays by name, in the order of this class."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @property
     def digest(self) -> str:
-        """`sha256:` and 64 hex digits over the names, types, shapes and bytes of all arrays."""
         return digest_of(self.columns())
 
     def agrees_with(self, other: Self) -> bool:
@@ -118,19 +106,9 @@ class SealedDataset:
         )
 
     def write(self, dataset_id: str, folder: str | os.PathLike[str]) -> Path:
-        """Write the data set in Minari's format, completely or not at all.
+        """Write the data set in Minari's format, completely or not at all; returns its folder.
 
-        Args:
-          dataset_id: Minari's id, `[namespace/]name-v<number>`.
-          folder: the root of all data sets.
-
-        Returns:
-          Its folder.
-
-        Raises:
-          NameTakenError: the folder exists.
-          OptionError: Minari does not accept the id, or writing fails.
-          MissingDependencyError: Minari or h5py is not installed.
+        `dataset_id` is Minari's, `[namespace/]name-v<number>`; `folder` the root of all data sets.
         """
         require_minari()
         root = Path(folder)

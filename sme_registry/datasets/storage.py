@@ -61,30 +61,18 @@ class Dataset:
 
     @property
     def recipe(self) -> DatasetRecipe:
-        """All that it was generated from."""
         return self.record.recipe
 
     @property
     def size_bytes(self) -> int:
-        """Total size of its files."""
         return sum(file.stat().st_size for file in (self.path / "data").iterdir())
 
     def minari(self) -> Any:
-        """The data set as a `minari.MinariDataset`.
-
-        Raises:
-          MissingDependencyError: Minari is not installed.
-        """
+        """The data set as a `minari.MinariDataset`."""
         return minari_dataset(self.path / "data")
 
     def transitions(self) -> Transitions:
-        """All transitions as aligned arrays, bit for bit as they were written.
-
-        Raises:
-          MissingDependencyError: Minari or h5py is not installed.
-          MalformedDocumentError: the file cannot be read.
-          DigestMismatchError: the arrays were changed after the data set was generated.
-        """
+        """All transitions as aligned arrays, bit for bit as they were written."""
         require_minari()
         path = self.path / "data" / DATA
         try:
@@ -130,13 +118,7 @@ def check_id(dataset_id: str) -> str:
 
 
 def check_target(target: Path, folder: Path, recipe: DatasetRecipe, force: bool) -> None:
-    """Check that a data set may be written to a path in the root of all data sets.
-
-    Raises:
-      NameTakenError: the target exists, and `force` is false or it is not a data set of this
-        package.
-      OptionError: the target is inside another data set, or cannot be written.
-    """
+    """Check that a data set may be written to a path in the root of all data sets."""
     for parent in target.relative_to(folder).parents:
         if parent != Path() and (folder / parent / "data").exists():
             raise OptionError(
@@ -185,12 +167,7 @@ def write_dataset(
     *,
     force: bool = False,
 ) -> Dataset:
-    """Write a data set completely or not at all; with `force` an old one remains until then.
-
-    Raises:
-      OptionError: the folder cannot be written to.
-      NameTakenError: see `check_target`.
-    """
+    """Write a data set completely or not at all; with `force` an old one remains until then."""
     target = folder / dataset_id
     check_target(target, folder, record.recipe, force)
     content = to_hdf5(transitions, record)
@@ -202,7 +179,6 @@ def write_dataset(
 def write_minari(
     target: Path, folder: Path, content: bytes, metadata: dict[str, Any], *, force: bool
 ) -> None:
-    """Write the files of a data set in the root of all data sets, completely or not at all."""
     with build_folder(target, force=force) as building:
         _write_namespaces(target.parent, folder)
         (building / "data").mkdir()
@@ -224,15 +200,8 @@ def open_dataset(
 ) -> Dataset:
     """Open a data set of this package by its id or its path. Reads only the metadata.
 
-    Args:
-      id_or_path: an id, or the path of a data set's folder (or of the `data/` in it).
-      folder: the root of all data sets; None for Minari's folder.
-
-    Raises:
-      UnknownNameError: no such data set exists.
-      MalformedDocumentError: it was not written by this package, or its metadata cannot be read.
-      SpecError: a field of its record is invalid, or its schema version is not supported.
-      DigestMismatchError: its spec, recipe or protocol was changed.
+    The path is that of its folder, or of the `data/` in it; `folder` is the root of all data sets,
+    None for Minari's. Its digests are checked, its arrays are not: `Dataset.transitions` does.
 
     Examples:
       >>> from sme_registry.datasets import open_dataset
@@ -267,7 +236,6 @@ def _read_metadata(path: Path) -> dict[str, Any]:
 
 
 def _dataset(path: Path, metadata: dict[str, Any]) -> Dataset:
-    """The data set of a folder and its metadata, which must hold a record."""
     source = path / "data" / METADATA
     record = DatasetRecord.from_dict(metadata[KEY], str(source))
     for field, expected in (
@@ -283,13 +251,10 @@ def _dataset(path: Path, metadata: dict[str, Any]) -> Dataset:
 
 
 def check_location(dataset: Dataset, folder: str | os.PathLike[str] | None = None) -> None:
-    """Check that the path of a data set agrees with its id.
+    """Raise SpecError if the path of a data set disagrees with its id, which would open another.
 
     Inside the root of all data sets (None for Minari's folder), the path relative to it must equal
     the id, as in Minari; elsewhere the path must end with the id.
-
-    Raises:
-      SpecError: they differ, so the id would open another data set or none.
 
     Examples:
       >>> from sme_registry.datasets import check_location, open_dataset
@@ -310,11 +275,7 @@ def check_location(dataset: Dataset, folder: str | os.PathLike[str] | None = Non
 def list_datasets(
     folder: str | os.PathLike[str] | None = None,
 ) -> tuple[list[Dataset], dict[Path, str]]:
-    """All data sets of this package in a root (None for Minari's folder), and the invalid ones.
-
-    Returns:
-      The valid data sets in order of their ids, and by its path the error of each broken or
-      misplaced one.
+    """All data sets of this package in a root, by id, and by its path the error of each broken one.
 
     Examples:
       >>> from sme_registry.datasets import list_datasets
@@ -338,7 +299,6 @@ def list_datasets(
 
 
 def _folders(root: Path) -> Iterator[tuple[str, Path]]:
-    """`(id, folder)` of everything that Minari considers a data set, in order."""
     for folder, children, _ in os.walk(root, followlinks=True):
         path = Path(folder)
         if "data" in children and path != root:

@@ -15,8 +15,6 @@ from sme_registry.offline.networks import Batch, Learner, mlp
 
 
 class BC(Learner):
-    """A policy from observations `[B, O]` to actions `[B, A]`, and its optimiser."""
-
     def __init__(
         self, observation_dim: int, action_dim: int, hyperparameters: BCHyperparameters
     ) -> None:

@@ -32,7 +32,7 @@ class BCHyperparameters(StrictModel):
     """Hyperparameters of behaviour cloning.
 
     Attributes:
-      hidden: of the policy's hidden layers.
+      hidden: widths of the policy's hidden layers.
       learning_rate: of Adam.
     """
 
@@ -44,7 +44,7 @@ class IQLHyperparameters(StrictModel):
     """Hyperparameters of implicit Q-learning.
 
     Attributes:
-      hidden: of the hidden layers of policy, critics and value function.
+      hidden: widths of the hidden layers of policy, critics and value function.
       learning_rate: of Adam, for all networks.
       discount: γ.
       expectile: τ of the value function; ½ gives the mean, values near 1 the maximum.
@@ -73,12 +73,7 @@ _FIELDS: dict[str, type[Hyperparameters]] = {"bc": BCHyperparameters, "iql": IQL
 
 
 def resolve_hyperparameters(algorithm: str, changes: Mapping[str, Any] | None) -> Hyperparameters:
-    """The hyperparameters of an algorithm of `ALGORITHMS`: its defaults, with changes.
-
-    Raises:
-      OptionError: `changes` is not a mapping.
-      SpecError: a field is unknown, or its value is out of range.
-    """
+    """The hyperparameters of an algorithm of `ALGORITHMS`: its defaults, with changes."""
     if changes is not None and not isinstance(changes, Mapping):
         raise OptionError(f"hyperparameters={changes!r:.60}: must be a mapping of names to values.")
     return _FIELDS[algorithm].from_dict(dict(changes or {}), "hyperparameters")

@@ -55,7 +55,6 @@ class IQL(Learner):
         self._target_parameters: list[Tensor] = list(self.targets.parameters())
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """The terms of the loss: `value`, `critic` and `actor`."""
         inputs = torch.cat([batch.observations, batch.actions], dim=1)
         with torch.no_grad():
             q = torch.minimum(*(target(inputs) for target in self.targets))
@@ -77,7 +76,6 @@ class IQL(Learner):
         }
 
     def step(self, batch: Batch) -> dict[str, Tensor]:
-        """One gradient step; see `Learner.step`. The targets then follow the critics."""
         losses = super().step(batch)
         with torch.no_grad():  # the targets must not track gradients
             torch._foreach_lerp_(

@@ -44,12 +44,9 @@ def learn(
 ) -> Iterator[Section]:
     """Train up to each of the increasing steps in `evaluate_at`.
 
-    The type of the hyperparameters determines the learner. The seed is that of initial weights and
-    shuffles. `report` is called with the steps done, every 50 steps and after each section.
-    PyTorch's number of threads and global generator are unchanged whenever this is suspended.
-
-    Raises:
-      PolicyError: weights or losses are no longer finite.
+    The seed is that of initial weights and shuffles. `report` is called with the steps done, every
+    50 steps and after each section. PyTorch's number of threads and global generator are unchanged
+    whenever this is suspended.
     """
     initial, shuffles = (streams.raw_bits(seed, "offline/learner", 2) >> np.uint64(1)).tolist()
     dims = transitions.observations.shape[1], transitions.actions.shape[1]

@@ -34,11 +34,7 @@ class Batch(NamedTuple):
 
 
 class Learner(ABC):
-    """An offline learner: networks, and one optimiser of all their losses.
-
-    Attributes:
-      actor: from observations to the argument of tanh, whose value is the policy's u.
-    """
+    """Networks, and one optimiser of all their losses; the policy's u is tanh of the actor."""
 
     actor: nn.Sequential
 
@@ -59,7 +55,6 @@ class Learner(ABC):
 
 
 def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
-    """Fully connected layers with ReLU between them, with PyTorch's initialisation."""
     widths = [inputs, *hidden]
     layers: list[nn.Module] = []
     for before, after in itertools.pairwise(widths):
@@ -68,7 +63,6 @@ def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
 
 
 def weights(network: nn.Sequential) -> list[Layer]:
-    """Copies of `(W [out, in], b [out])` of each layer."""
     return [
         (layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy())
         for layer in network
@@ -77,11 +71,10 @@ def weights(network: nn.Sequential) -> list[Layer]:
 
 
 class Batches:
-    """An endless iterator over batches of shuffled rows of a data set.
+    """An endless iterator over batches of shuffled rows; every row is used once before any repeats.
 
-    Every row is used once before any repeats. The data set is one float32 matrix, so that one
-    gather gets all columns of a batch; one for each column would take as long as a network. The
-    batch size is at most the rows of the data set; the generator is that of the shuffles.
+    The data set is one float32 matrix, so that one gather gets all columns of a batch; one for each
+    column would take as long as a network.
     """
 
     def __init__(

@@ -17,8 +17,7 @@ class Evaluation(StrictModel):
 
     Attributes:
       step: gradient steps before it.
-      similarity: mean r̃ over all steps of all episodes.
-      similarity_sd: standard deviation over these steps.
+      similarity, similarity_sd: mean and standard deviation of r̃ over all steps of all episodes.
       episode_return: mean over the episodes.
       losses: terms of the loss of the last batch, by name.
     """
@@ -34,8 +33,7 @@ class BehaviourQuality(StrictModel):
     """Exact statistics of the data set's transitions.
 
     Attributes:
-      similarity: mean r̃.
-      similarity_sd: standard deviation of r̃.
+      similarity, similarity_sd: mean and standard deviation of r̃.
       step_reward: mean r.
     """
 
@@ -59,12 +57,10 @@ class OfflineRecord(StrictModel):
       dataset_digest: of its arrays.
       recipe_digest: the recipe's; null if only the arrays were passed.
       transitions: N, the size of the data set.
-      spec: the task.
-      spec_digest: the task's digest.
+      spec, spec_digest: the task, and its digest.
       behaviour: of the data set's transitions.
       evaluations: in order; last, the policy's.
-      wall_seconds: of the training and its evaluations.
-      cpu_seconds: processor time of the same.
+      wall_seconds, cpu_seconds: time of the training and its evaluations.
       cpu_ms_per_step: of a gradient step, without evaluations.
       versions: of Python and the packages that the numbers depend on.
     """
@@ -101,13 +97,6 @@ class OfflineRecord(StrictModel):
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> OfflineRecord:
-        """Read the record of an offline training.
-
-        Raises:
-          MalformedDocumentError: the file cannot be read or is not strict JSON.
-          SpecError: a field is invalid, missing or unknown.
-          DigestMismatchError: `spec_digest` does not match the spec.
-        """
         record = cls.from_dict(read_json(path), str(path))
         refuse_other_digest(
             record.spec_digest, record.spec, f"{os.fspath(path)}: spec_digest", "Train again."

@@ -1,7 +1,4 @@
-"""`train_sealed`: train BC or IQL on a sealed data set, whose task is hidden.
-
-The learners are those of `train_offline`. Nothing is evaluated: only the season's board can.
-"""
+"""`train_sealed`: train BC or IQL on a sealed data set, whose task is hidden."""
 
 from __future__ import annotations
 
@@ -29,25 +26,8 @@ def train_sealed(
 ) -> OfflinePolicy:
     """Train BC or IQL on a sealed data set, on the CPU and one thread.
 
-    Args:
-      data: the data set, or the path of its folder.
-      algorithm: "bc" or "iql", in any case.
-      steps: gradient steps, at least 1.
-      batch_size: transitions in each, in [1, N].
-      seed: of initial weights and shuffles, in [0, 2⁵³).
-      hyperparameters: changes to the defaults, see `offline.hyperparameters`.
-      progress: called with the steps done, and their total.
-
-    Returns:
-      The policy; its `save` writes an .npz file.
-
-    Raises:
-      UnknownNameError: no such algorithm.
-      SpecError: a hyperparameter is unknown or out of range.
-      OptionError: another argument is out of range.
-      MalformedDocumentError: the data set cannot be read.
-      PolicyError: the training diverged.
-      MissingDependencyError: PyTorch, or for a path Minari, is not installed.
+    The learners and arguments are those of `train_offline`. Nothing is evaluated: only the season's
+    board can. `data` may be the path of its folder; the policy's `save` writes an .npz file.
 
     Examples:
       >>> from sme_registry.datasets import DatasetRecipe, SealedDataset

@@ -45,7 +45,7 @@ class DataSource(NamedTuple):
 
 
 def data_source(data: Any, spec: SpecLike | None, protocol: ProtocolLike | None) -> DataSource:
-    """Load and check the data of a training; see `train_offline` for arguments and errors."""
+    """Load and check the data of a training; see `train_offline`."""
     if isinstance(data, Transitions):
         if spec is None:
             raise OptionError("spec=None: is required with arrays. Give the spec of their task.")
@@ -74,7 +74,6 @@ def data_source(data: Any, spec: SpecLike | None, protocol: ProtocolLike | None)
 
 
 def _single_agent(spec: SMESpec) -> Task:
-    """The task of a spec; raises SpecError if it is a team's."""
     if spec.team is not None:
         raise SpecError(
             f"team: the data set has {len(spec.team.agents)} agents, and a policy that sees all "

@@ -92,23 +92,12 @@ def train_offline(
       evaluations: number of evaluations during training, evenly spaced, in [1, steps]; the last one
         is at the end.
       episodes: of each evaluation, in [1, 4096].
-      hyperparameters: changes to the defaults, see `offline.hyperparameters`.
+      hyperparameters: changes to the defaults, see `BCHyperparameters` and `IQLHyperparameters`.
       spec: the task of arrays: a spec, its fields, an id, a digest or a path.
       protocol: of the final evaluation; None takes the data set's, and "paper-v1" for arrays.
       folder: output folder, created if it is missing. None writes nothing.
       force: replace an earlier training in the folder.
       progress: called with the steps done, their total, and a note.
-
-    Returns:
-      The policy, the record and the report.
-
-    Raises:
-      UnknownNameError: no such data set, algorithm, task or protocol.
-      SpecError: a hyperparameter is unknown or out of range, or the task is a team's.
-      OptionError: another argument is out of range, or the folder contains something else.
-      MalformedDocumentError, DigestMismatchError: the data set cannot be read, or was changed.
-      PolicyError: the training diverged.
-      MissingDependencyError: PyTorch is not installed, or Minari, which files require.
 
     Examples:
       >>> from sme_registry.offline import train_offline

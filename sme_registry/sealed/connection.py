@@ -34,15 +34,8 @@ _now, _sleep = time.monotonic, time.sleep
 class Connection:
     """An HTTP connection to a server, kept open between requests. Not for several threads.
 
-    Args:
-      url: the server's, http(s)://host[:port][/path].
-      token: a ticket's, which every request carries.
-      insecure: allow plain http to other machines, in a network that you trust.
-      patience: seconds for which a request is repeated after the first answer has shown that the
-        server exists.
-
-    Raises:
-      OptionError: the URL or the patience is invalid.
+    A request is repeated for `patience` seconds after the first answer has shown that the server
+    exists. `insecure` allows plain http to other machines, in a network that you trust.
     """
 
     def __init__(
@@ -55,17 +48,10 @@ class Connection:
         self._answered = False
 
     def request(self, method: str, path: str, body: bytes = b"", *, most: int) -> bytes:
-        """The body of the answer to a request.
+        """The body of the answer to a request, of at most `most` bytes.
 
-        Args:
-          method: of HTTP.
-          path: below the server's URL.
-          body: what is sent.
-          most: bytes of an answer.
-
-        Raises:
-          SealedError: the server refuses it, stays unreachable, or answers with more bytes.
-          BudgetSpentError: it is for steps, and the instance has none left.
+        A refusal, no answer, and a longer one are SealedErrors; BudgetSpentError if it is for
+        steps and the instance has none left.
         """
         wait, started = _FIRST_WAIT, _now()
         while True:
@@ -100,7 +86,6 @@ class Connection:
             wait = min(2 * wait, _LONGEST_WAIT)
 
     def close(self) -> None:
-        """Close the connection; the next request opens another one."""
         if self._http is not None:
             self._http.close()
             self._http = None

@@ -19,16 +19,7 @@ from sme_registry.spec import ActionRange
 
 
 class Lanes:
-    """The lanes of an instance: actions of an environment's range in, what the server shows out.
-
-    Args:
-      instance: the hidden task.
-      action_range: "unit" or "symmetric".
-
-    Attributes:
-      instance: the hidden task.
-      action_space, observation_space: of one lane.
-    """
+    """The lanes of an instance: actions of an environment's range in, what the server shows out."""
 
     def __init__(self, instance: Instance, action_range: ActionRange) -> None:
         self.instance = instance
@@ -40,11 +31,7 @@ class Lanes:
         self._has_begun = False
 
     def begin(self, seed: Any, options: dict[str, Any] | None) -> Float32:
-        """The present observations `[L, S + 2]`; no episode is cut short.
-
-        Raises:
-          OptionError: there are options, or the seed is no integer of at least 0.
-        """
+        """The present observations `[L, S + 2]`; no episode is cut short."""
         arguments.checked_seed(seed)
         if options:
             raise OptionError(
@@ -56,12 +43,6 @@ class Lanes:
         return observation
 
     def step(self, actions: Any) -> Steps:
-        """One step of every lane.
-
-        Raises:
-          EpisodeError: before the first reset.
-          ActionError: not numbers, not `[L, A]`, or not finite; nothing is sent then.
-        """
         if not self._has_begun:
             raise EpisodeError("step: the episodes have not begun. Call reset() first.")
         unit = arguments.to_unit(actions, self._shape, self._rescaled)
@@ -74,12 +55,8 @@ class SealedEnv(gymnasium.Env[Observation, Action]):
     """A hidden task of a ticket, stepped by the season's server.
 
     Spaces, rewards and ends of episodes are those of `SMEEnv`; infos are empty. The server draws
-    the initial states: `seed` has no effect on them. `reset` within an episode does not end it: it
+    the initial states: `seed` seeds `np_random` only. `reset` within an episode does not end it: it
     returns the present observation, also in a new process that goes on where another one stopped.
-
-    Args:
-      instance: the hidden task, with one lane.
-      action_range: "unit" or "symmetric".
 
     Examples:
       >>> from sme_registry.sealed import Instance, SealedEnv
@@ -104,19 +81,7 @@ class SealedEnv(gymnasium.Env[Observation, Action]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin the next episode, or go on with the present one.
-
-        Args:
-          seed: seeds `np_random` only.
-          options: there are none.
-
-        Returns:
-          The observation `[S + 2]`, and an empty info.
-
-        Raises:
-          OptionError: an option, or a seed that is no integer of at least 0.
-          SealedError: the server refuses it, or gives no answer.
-        """
+        """Begin the next episode, or go on with the present one."""
         if self._next is None or options or seed is not None:
             [self._next] = self._lanes.begin(seed, options)
         super().reset(seed=seed)
@@ -124,20 +89,7 @@ class SealedEnv(gymnasium.Env[Observation, Action]):
         return observation, {}
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One step.
-
-        Args:
-          action: `[A]`, finite; clipped to the action range.
-
-        Returns:
-          Observation `[S + 2]`, reward, terminated, truncated, and an empty info.
-
-        Raises:
-          ActionError: wrong shape, not numbers, or not finite; nothing is sent then.
-          EpisodeError: before the first reset, or after the end of an episode.
-          BudgetSpentError: the budget is spent.
-          SealedError: the server refuses it, or gives no answer.
-        """
+        """One step; an action that is not finite, or not `[A]`, is never sent."""
         if self._next is not None:
             raise EpisodeError("step: the episode has ended. Call reset() first.")
         steps = self._lanes.step([action])
@@ -158,10 +110,6 @@ class SealedVectorEnv(VectorEnv[Observation, Array, Array]):
     Spaces, rewards and ends of episodes are those of `SMEVectorEnv`, whose autoreset mode is
     "SameStep": an ended lane's observation is the first of its next episode, and the last of the
     ended one is in `infos["final_obs"]`. Seeds and resets are as in `SealedEnv`.
-
-    Args:
-      instance: the hidden task.
-      action_range: "unit" or "symmetric".
 
     Examples:
       >>> from sme_registry.sealed import Instance, SealedVectorEnv
@@ -187,19 +135,7 @@ class SealedVectorEnv(VectorEnv[Observation, Array, Array]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin, or go on with the present episodes.
-
-        Args:
-          seed: seeds `np_random` only.
-          options: there are none.
-
-        Returns:
-          The observations `[L, S + 2]`, and an empty info.
-
-        Raises:
-          OptionError: an option, or a seed that is no integer of at least 0.
-          SealedError: the server refuses it, or gives no answer.
-        """
+        """Begin, or go on with the present episodes."""
         first = seed[0] if isinstance(seed, list) else seed
         observation = self._lanes.begin(first, options)
         super().reset(seed=first)
@@ -208,20 +144,7 @@ class SealedVectorEnv(VectorEnv[Observation, Array, Array]):
     def step(  # type: ignore[override]  # Gymnasium types all three arrays alike; ends are bool
         self, actions: Any
     ) -> tuple[Observation, Float32, Mask, Mask, dict[str, Any]]:
-        """One step of every lane.
-
-        Args:
-          actions: `[L, A]`, finite; clipped to the action range.
-
-        Returns:
-          Observations `[L, S + 2]`, rewards `[L]`, terminated `[L]`, truncated `[L]`, infos.
-
-        Raises:
-          ActionError: wrong shape, not numbers, or not finite; nothing is sent then.
-          EpisodeError: before the first reset.
-          BudgetSpentError: the budget does not suffice for a step of every lane.
-          SealedError: the server refuses it, or gives no answer.
-        """
+        """One step of every lane; see `SealedEnv.step`."""
         steps = self._lanes.step(actions)
         ended: Mask = steps.terminated | steps.truncated
         infos: dict[str, Any] = {}
@@ -257,10 +180,6 @@ def make(
       insecure: allow plain http to other machines, in a network that you trust.
       patience: seconds for which a request is repeated while the server gives no answer.
 
-    Raises:
-      OptionError: the URL is invalid, or an argument is out of range.
-      SpecError: the ticket's file is missing, or is no ticket.
-
     Examples:
       >>> from sme_registry import sealed
       >>> env = sealed.make("https://board.example", "ticket.json")
@@ -283,13 +202,8 @@ def make_vec(
 ) -> SealedVectorEnv:
     """A vector environment of a hidden task: `num_envs` lanes in one request.
 
-    Args:
-      num_envs: L, copies of the task, at most the ticket's `lanes`; it cannot be changed after the
-        first step.
-      url, ticket, instance, action_range, insecure, patience: see `make`.
-
-    Raises:
-      OptionError, SpecError: see `make`.
+    `num_envs` is at most the ticket's `lanes` and cannot be changed after the first step. The other
+    arguments are those of `make`.
 
     Examples:
       >>> from sme_registry import sealed

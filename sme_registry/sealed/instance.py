@@ -37,11 +37,6 @@ WITHOUT_TASK = ("constant", "constant_half", "random", "uniform_random")
 
 
 def as_ticket(ticket: TicketLike) -> Ticket:
-    """A ticket from itself or the path of its file.
-
-    Raises:
-      SpecError: the file is missing, or is no ticket.
-    """
     return ticket if isinstance(ticket, Ticket) else Ticket.read(ticket)
 
 
@@ -49,24 +44,13 @@ class Instance:
     """A hidden task of a ticket, as its server shows it: observations, rewards and ends.
 
     Whoever holds the ticket may stop at any time and go on elsewhere: the server knows the present
-    states. But only one process at a time can step an instance.
-
-    Args:
-      url: the board's.
-      ticket: a ticket, or the path of its file.
-      instance: its number in the ticket, from 0.
-      lanes: copies that are stepped together, at most the ticket's; it cannot be changed after the
-        first step.
-      insecure, patience: see `Connection`.
+    states. But only one process at a time can step an instance. `lanes` copies are stepped
+    together; their number cannot be changed after the first step.
 
     Attributes:
       setting: all of the task's spec but its seed.
       budget: steps over all lanes.
       number: of the last steps that were taken; 0 before the first.
-
-    Raises:
-      OptionError: the URL is invalid, or a number is out of range.
-      SpecError: the ticket's file is missing, or is no ticket.
 
     Examples:
       >>> from sme_registry.sealed import Instance
@@ -110,9 +94,6 @@ class Instance:
 
         They are those of the first episodes, or those after the last steps that the server took for
         this instance, whichever process asked for them.
-
-        Raises:
-          SealedError: the server refuses it, such as other lanes than those of the first steps.
         """
         data = self._request("POST", f"start?lanes={self.lanes}", most=self._format.answer_bytes)
         number, observation = self._format.unpack_begun(data)
@@ -124,15 +105,7 @@ class Instance:
         return observation
 
     def step(self, actions: npt.NDArray[np.floating]) -> Steps:
-        """One step of every lane; call `begin` first.
-
-        Args:
-          actions: `[L, A]` of the unit range, finite; clipped.
-
-        Raises:
-          BudgetSpentError: the budget does not suffice for a step of every lane.
-          SealedError: the server refuses it, or gives no answer.
-        """
+        """One step of every lane by finite actions `[L, A]` in [0, 1]; call `begin` first."""
         body = self._format.pack_request(self.number + 1, actions)
         try:
             data = self._request("POST", "steps", body, most=self._format.answer_bytes)
@@ -150,12 +123,7 @@ class Instance:
         return self._format.unpack_steps(data)
 
     def challenge(self) -> Float32:
-        """End the stepping, and return the challenge states: observations `[rows, S + 2]`.
-
-        Raises:
-          MissingDependencyError: PyNaCl, which signs the answers, is not installed.
-          SealedError: the server refuses it, or gives no answer.
-        """
+        """End the stepping, and return the challenge states: observations `[rows, S + 2]`."""
         if self._ticket.signer is not None:
             require_signatures()  # before the stepping ends for good
         self._request("POST", "finish")
@@ -163,15 +131,10 @@ class Instance:
         return unpack_table(data, self.setting.state_dim + 2)
 
     def send_answers(self, actions: npt.NDArray[np.floating]) -> None:
-        """Sign and send the answers to the challenge; the last instance's end the ticket.
+        """Sign and send the actions `[rows, A]`; the last instance's end the ticket.
 
-        Args:
-          actions: `[rows, A]` of the unit range, finite; clipped.
-
-        Raises:
-          MissingDependencyError: PyNaCl, which signs them, is not installed.
-          SealedError: the server refuses them, such as others than those it has, or its journal
-            has other steps than this object has taken.
+        The server refuses others than those it has. Nothing is signed if its journal has other
+        steps than this object has taken.
         """
         data, signer = pack_table(actions), self._ticket.signer
         if signer is None:
@@ -187,11 +150,7 @@ class Instance:
         self._request("PUT", f"answers?signature={signer.sign(statement)}", data)
 
     def status(self) -> TicketStatus:
-        """The status of the whole ticket.
-
-        Raises:
-          SealedError: the server gives no answer, or one that is no status.
-        """
+        """The status of the whole ticket."""
         path = ticket_path(self._ticket.season, self._ticket.ticket)
         data = self._connection.request("GET", path, most=_MAX_STATUS)
         return parse_answer(TicketStatus, data)
@@ -203,7 +162,6 @@ class Instance:
         self.close()
 
     def close(self) -> None:
-        """Close the connection; the next request opens another one."""
         self._connection.close()
 
     def _journal_digest(self) -> str:
@@ -237,16 +195,7 @@ def answer(
 ) -> None:
     """End an instance's stepping, and send a policy's actions in its challenge states.
 
-    Args:
-      url: the board's.
-      ticket: a ticket, or the path of its file.
-      policy, action_range, algorithm: see `prepare_policy`.
-      instance: its number in the ticket, from 0.
-      insecure, patience: see `Connection`.
-
-    Raises:
-      SealedError: the server refuses it, or gives no answer.
-      PolicyError, OptionError, SpecError: see `prepare_policy` and `Instance`.
+    The other arguments are those of `make` and `prepare_policy`.
 
     Examples:
       >>> from sme_registry.sealed import answer
@@ -269,17 +218,9 @@ def prepare_policy(
     action_range: str | None = None,
     algorithm: str | None = None,
 ) -> Policy:
-    """A policy for the hidden tasks of a setting.
+    """A policy for the hidden tasks of a setting; arguments as `evaluate` accepts them.
 
-    Args:
-      policy: as `evaluate` accepts it.
-      setting: of the task.
-      action_range: of the policy's actions, "unit" or "symmetric"; None as in `evaluate`.
-      algorithm: the class of a model's .zip that does not tell it.
-
-    Raises:
-      PolicyError: the policy cannot be loaded, or is a reference that depends on the hidden task.
-      UnknownNameError, OptionError, MissingDependencyError: see `as_policy`.
+    A reference policy that depends on the hidden task is refused.
 
     Examples:
       >>> from sme_registry.sealed import prepare_policy
@@ -299,19 +240,7 @@ def prepare_policy(
 
 
 def actions_in(states: Float32, policy: Any, setting: Setting) -> Float32:
-    """A policy's actions in challenge states.
-
-    Args:
-      states: `[rows, S + 2]` observations.
-      policy: as `evaluate` accepts it, or prepared.
-      setting: of the task.
-
-    Returns:
-      `[rows, A]` of the unit range, finite; not clipped.
-
-    Raises:
-      PolicyError: the actions are invalid; or see `prepare_policy`.
-      UnknownNameError, OptionError, MissingDependencyError: see `prepare_policy`.
+    """A policy's actions `[rows, A]` in challenge states `[rows, S + 2]`: finite, not clipped.
 
     Examples:
       >>> from sme_registry.sealed import actions_in
@@ -330,11 +259,6 @@ def _any_spec(setting: Setting) -> SMESpec:
 
 
 def parse_answer(kind: type[_Document], data: bytes) -> _Document:
-    """A document in a server's answer.
-
-    Raises:
-      SealedError: it is none of this kind.
-    """
     try:
         return kind.from_dict(parse_json(data, "answer"))
     except (MalformedDocumentError, SpecError) as error:

@@ -23,17 +23,11 @@ from sme_registry.spec import ActionRange
 
 
 class SealedVecEnv(LanesVecEnv):
-    """The lanes of a hidden task, as SB3's `VecEnv`.
+    """The lanes of a hidden task, as SB3's `VecEnv`; arguments as in `sealed.make_vec`.
 
     As in `SMEVecEnv`, a finished lane begins its next episode at once. The server draws the initial
-    states: seeds have no effect on them. `reset` within an episode does not end it.
-
-    Args:
-      url, ticket, instance, num_envs, insecure, patience: see `sealed.make_vec`.
-      action_range: "symmetric", [−1, 1], which suits SB3's Gaussian policies; or "unit".
-
-    Raises:
-      OptionError, SpecError: see `sealed.make`.
+    states: seeds have no effect on them. `reset` within an episode does not end it. The default
+    action range, "symmetric", suits SB3's Gaussian policies.
     """
 
     def __init__(
@@ -59,15 +53,7 @@ class SealedVecEnv(LanesVecEnv):
         super().__init__([SimpleNamespace(**shared) for _ in range(num_envs)])
 
     def reset(self) -> Observation:
-        """Begin, or go on with the present episodes.
-
-        Returns:
-          Observations, a row for each lane, float32.
-
-        Raises:
-          OptionError: options were set.
-          SealedError: the server refuses it, or gives no answer.
-        """
+        """Begin, or go on with the present episodes: observations, a row for each lane, float32."""
         options = next(filter(None, self._options), None)
         observation = self._stepped.begin(None, options)
         self.reset_infos = [{} for _ in range(self.num_envs)]
@@ -75,17 +61,6 @@ class SealedVecEnv(LanesVecEnv):
         return observation
 
     def step_wait(self) -> StepResult:
-        """One step of every lane.
-
-        Returns:
-          Observations and rewards, float32, and dones, each with a row for each lane; infos.
-
-        Raises:
-          ActionError: wrong shape, not numbers, or not finite; nothing is sent then.
-          EpisodeError: before the first reset.
-          BudgetSpentError: the budget does not suffice for a step of every lane.
-          SealedError: the server refuses it, or gives no answer.
-        """
         steps = self._stepped.step(self._take_actions())
         dones = steps.terminated | steps.truncated
         cut = steps.truncated & ~steps.terminated

@@ -51,11 +51,7 @@ class Signer(Document):
     key: _Secret
 
     def sign(self, statement: Statement) -> str:
-        """The signature of a statement, 128 hex digits.
-
-        Raises:
-          MissingDependencyError: PyNaCl is not installed.
-        """
+        """The signature of a statement, 128 hex digits; requires PyNaCl."""
         require_signatures()
         from nacl.signing import SigningKey
 
@@ -64,5 +60,4 @@ class Signer(Document):
 
 
 def require_signatures() -> None:
-    """Raise `MissingDependencyError` unless answers can be signed."""
     require_packages("signatures", {"nacl": "PyNaCl"}, "leaderboard")

@@ -47,14 +47,13 @@ def instance_name(class_name: str, instance: int) -> str:
 
 
 class Place(NamedTuple):
-    """One hidden instance of a ticket: its class, and its number in it, from 0."""
+    """An instance of a ticket: its class, and its number in it, from 0."""
 
     member: TicketClass
     instance: int
 
     @property
     def name(self) -> str:
-        """Such as `deep-0`."""
         return instance_name(self.member.name, self.instance)
 
 
@@ -86,35 +85,21 @@ class Ticket(StrictModel):
 
     @property
     def places(self) -> Iterator[Place]:
-        """Every instance, in the ticket's order."""
         for member in self.classes:
             for instance in range(member.instances):
                 yield Place(member, instance)
 
     def place(self, instance: int) -> Place:
-        """Instance i of the ticket.
-
-        Raises:
-          OptionError: the ticket has no such instance.
-        """
+        """Instance i of the ticket."""
         places = list(self.places)
         return places[integer_in("instance", instance, 0, len(places) - 1)]
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Ticket:
-        """Read a ticket from its file.
-
-        Raises:
-          SpecError: the file is missing, or is no ticket.
-        """
         return cls.from_dict(read_json(path), os.fspath(path))
 
     def write(self, path: str | os.PathLike[str]) -> Path:
-        """Write the ticket into a new file that only its owner can read.
-
-        Raises:
-          OptionError: the file exists, or cannot be written.
-        """
+        """Write the ticket into a new file that only its owner can read."""
         path = Path(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -96,12 +96,7 @@ def bearer(token: str) -> str:
 
 
 class Begun(NamedTuple):
-    """The answer to `start`.
-
-    Attributes:
-      number: of the last steps that were taken; 0 before the first.
-      observation: `[L, S + 2]` the present one of each lane.
-    """
+    """The answer to `start`: the number of the last steps, and observations `[L, S + 2]`."""
 
     number: int
     observation: Observation
@@ -128,10 +123,6 @@ class Steps(NamedTuple):
 class StepFormat:
     """The messages of an instance that is stepped in some number of lanes.
 
-    Attributes:
-      lanes: L.
-      state_dim, action_dim: S and A.
-
     Examples:
       >>> from sme_registry.sealed import StepFormat
       >>> StepFormat(lanes=4, state_dim=8, action_dim=2).lanes
@@ -144,12 +135,10 @@ class StepFormat:
 
     @property
     def request_bytes(self) -> int:
-        """The size of the body of `steps`."""
         return _NUMBER_BYTES + _FLOAT.itemsize * self.lanes * self.action_dim
 
     @property
     def answer_bytes(self) -> int:
-        """The size of the answer to `steps`."""
         return _FLOAT.itemsize * self.lanes * (2 * self._width + 2)
 
     @property
@@ -157,38 +146,25 @@ class StepFormat:
         return self.state_dim + 2
 
     def pack_begun(self, begun: Begun) -> bytes:
-        """The bytes of the answer to `start`."""
         return _packed_number(begun.number) + _packed(begun.observation)
 
     def unpack_begun(self, data: bytes) -> Begun:
-        """The answer to `start` in these bytes.
-
-        Raises:
-          WireError: of another size.
-        """
         expected = _NUMBER_BYTES + _FLOAT.itemsize * self.lanes * self._width
         _check_size("start", data, expected)
         observation = np.frombuffer(data, _FLOAT, offset=_NUMBER_BYTES)
         return Begun(_number_in(data), _native(observation.reshape(self.lanes, -1)))
 
     def pack_request(self, number: int, actions: npt.NDArray[np.floating]) -> bytes:
-        """The body of `steps`: its number and actions `[L, A]` of the unit range."""
         return _packed_number(number) + _packed(actions)
 
     def unpack_request(self, data: bytes) -> tuple[int, Float32]:
-        """The number and the actions `[L, A]` in the body of `steps`; actions are not clipped.
-
-        Raises:
-          WireError: of another size.
-          ActionError: an action is not finite.
-        """
+        """The number and the actions `[L, A]` in the body of `steps`; finite, not clipped."""
         _check_size("steps", data, self.request_bytes)
         actions = np.frombuffer(data, _FLOAT, offset=_NUMBER_BYTES)
         _refuse_not_finite(actions)
         return _number_in(data), _native(actions.reshape(self.lanes, -1))
 
     def pack_steps(self, steps: Steps) -> bytes:
-        """The bytes of the answer to `steps`."""
         width = self._width
         table = np.empty((self.lanes, 2 * width + 2), _FLOAT)
         table[:, :width] = steps.observation
@@ -198,11 +174,7 @@ class StepFormat:
         return table.tobytes()
 
     def unpack_steps(self, data: bytes) -> Steps:
-        """The answer to `steps` in these bytes, as fresh arrays.
-
-        Raises:
-          WireError: of another size, or with other ends than 0, 1, 2 and 3.
-        """
+        """The answer to `steps` in these bytes, as fresh arrays."""
         _check_size("steps", data, self.answer_bytes)
         width = self._width
         table = _native(np.frombuffer(data, _FLOAT).reshape(self.lanes, -1))
@@ -253,17 +225,7 @@ def table_bytes(rows: int, columns: int) -> int:
 def unpack_table(data: bytes, columns: int, rows: int | None = None) -> Float32:
     """The table `[rows, columns]` in the bytes of an .npy file, whose reading runs no code.
 
-    Args:
-      data: the file.
-      columns: that it must have.
-      rows: that it must have; None for any number.
-
-    Returns:
-      A fresh array of float32, every entry finite.
-
-    Raises:
-      WireError: not an .npy file of version 1.0, type `<f4`, C order and this shape.
-      ActionError: an entry is not finite.
+    A fresh array of float32, every entry finite; `rows` None accepts any number of them.
 
     Examples:
       >>> from sme_registry.sealed import pack_table, unpack_table
