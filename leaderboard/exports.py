@@ -15,7 +15,8 @@ from leaderboard.documents.result import METRICS, Estimate, Metric
 from leaderboard.documents.submission import now
 from leaderboard.scoring.ranking import RankedRow
 from sme_registry.io import to_json as plain_to_json
-from sme_registry.terminal import escape_latex, fixed
+from sme_registry.io.markup import escape_latex
+from sme_registry.io.terminal import fixed
 
 Rows = list[RankedRow]
 Head = tuple[int, str]

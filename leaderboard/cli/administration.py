@@ -20,7 +20,8 @@ from leaderboard.cli.options import (
     open_board,
 )
 from leaderboard.errors import BoardError
-from sme_registry.terminal import Progress, err, out, print_json, templates
+from sme_registry.io.markup import plural
+from sme_registry.io.terminal import Progress, err, out, print_json
 
 if TYPE_CHECKING:
     from leaderboard.artefact.isolation import Isolation
@@ -104,7 +105,7 @@ def init(
     kind = "a practice board" if document.practice else "a board"
     out().print(f"Created {folder}: {kind} with suite {name} and protocol {protocol_name}.")
     out().print(
-        f"A ranked entry needs {templates.plural(runs, 'trained policy', 'trained policies')}: at "
+        f"A ranked entry needs {plural(runs, 'trained policy', 'trained policies')}: at "
         f"least {runs_to_rank} in each class ({classes}), equally many on each of its instances "
         f"({instances} in the suite).",
         soft_wrap=True,
@@ -177,7 +178,7 @@ def score_waiting(board: Path, workers: int, isolation: Isolation) -> None:
     out().print(f"{', '.join(parts)}." + (f" Done before: {len(before)}." if before else ""))
     faulty = [entry for entry in entries if entry.status == "waiting" and entry.faults]
     for entry in faulty:
-        times = templates.plural(entry.faults, "attempt")
+        times = plural(entry.faults, "attempt")
         err().print(
             f"{entry.id} ({entry.method}) keeps waiting after {times}: {entry.fault}",
             soft_wrap=True,

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from leaderboard.cli import administration, demo, entries, results, seasons, submissions, tickets
 from leaderboard.errors import Rejection, TamperedError
 from sme_registry.errors import SealedError
-from sme_registry.terminal import CommandGroup, application
+from sme_registry.io.terminal import CommandGroup, application
 
 
 class _Commands(CommandGroup):

@@ -15,8 +15,8 @@ from leaderboard.documents.board import Folder
 from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import BoardError
 from sme_registry.errors import OptionError
+from sme_registry.io.terminal import err, out
 from sme_registry.spec import EvaluationProtocol, Suite, SuiteFile
-from sme_registry.terminal import err, out
 
 if TYPE_CHECKING:
     from sme_registry.training import RunRecord

@@ -30,7 +30,7 @@ from leaderboard.cli.options import (
 from leaderboard.documents.keys import SigningKey
 from sme_registry.errors import OptionError
 from sme_registry.io import sha256_of
-from sme_registry.terminal import Progress, err, out
+from sme_registry.io.terminal import Progress, err, out
 
 
 def enter(

@@ -65,7 +65,7 @@ def open_board(board: Path) -> Store:
       BoardError, TamperedError: as `Store.open`.
     """
     from leaderboard.store import Store
-    from sme_registry.terminal import Progress, err
+    from sme_registry.io.terminal import Progress, err
 
     log = Folder(board).log
     entries = sum(1 for _ in os.scandir(log)) if log.is_dir() else 0

@@ -16,16 +16,9 @@ from leaderboard.documents.season import Reveal
 from leaderboard.errors import Rejection
 from sme_registry.errors import OptionError
 from sme_registry.io import read_json, refuse_existing
-from sme_registry.terminal import (
-    Progress,
-    Table,
-    err,
-    fixed,
-    out,
-    print_json,
-    print_pairs,
-    templates,
-)
+from sme_registry.io.markup import plural
+from sme_registry.io.tables import Table
+from sme_registry.io.terminal import Progress, err, fixed, out, print_json, print_pairs
 
 if TYPE_CHECKING:
     from leaderboard.documents.season import Terms
@@ -191,7 +184,7 @@ def reveal(board: BoardFolder, season: SeasonId, secret: SecretFile = None) -> N
         count = len(store.entrants(row.digest))
         with Progress("scoring", count, console=err(), unit="entries") as progress:
             scored = score_entries(store, row.digest, progress.update_of)
-    entries = templates.plural(scored, "entry", "entries")
+    entries = plural(scored, "entry", "entries")
     out().print(f"{row.id}: revealed, {entries} scored.")
 
 

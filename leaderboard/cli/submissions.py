@@ -33,8 +33,8 @@ from leaderboard.documents.submission import Knowledge, SignedWithdrawal
 from leaderboard.errors import Rejection
 from sme_registry.errors import OptionError
 from sme_registry.io import refuse_existing
+from sme_registry.io.terminal import Progress, err, out, print_json
 from sme_registry.spec import SuiteFile, catalogue
-from sme_registry.terminal import Progress, err, out, print_json
 
 if TYPE_CHECKING:
     from leaderboard.documents.board import BoardDocument

@@ -28,7 +28,8 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import Rejection
 from sme_registry.errors import OptionError
 from sme_registry.io import choice, refuse_existing, refuse_unwritable, write_atomically
-from sme_registry.terminal import Progress, Table, err, out
+from sme_registry.io.tables import Table
+from sme_registry.io.terminal import Progress, err, out
 
 if TYPE_CHECKING:
     from sme_registry.sealed import Place, Ticket

@@ -30,11 +30,7 @@ from leaderboard.scoring.score import Progress, score_submission
 from leaderboard.store import LEASE_SECONDS, Claim, Store
 from sme_registry.errors import MissingDependencyError, SMEError
 from sme_registry.io import integer_in
-from sme_registry.terminal.interrupts import (
-    block_interrupts,
-    defer_interrupts,
-    unblock_interrupts,
-)
+from sme_registry.io.system import block_interrupts, defer_interrupts, unblock_interrupts
 
 _POLL_SECONDS = 0.2
 _STOP_SECONDS = 10.0

@@ -17,7 +17,7 @@ from sme_registry.cli.new import new
 from sme_registry.cli.show import show
 from sme_registry.cli.train import train
 from sme_registry.cli.validate import validate
-from sme_registry.terminal import application
+from sme_registry.io.terminal import application
 
 app = application(
     "sme",

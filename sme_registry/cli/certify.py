@@ -9,6 +9,7 @@ from rich.markup import escape
 
 from sme_registry.cli.arguments import Json, find_any
 from sme_registry.errors import UnknownNameError
+from sme_registry.io.terminal import err, out, print_json
 from sme_registry.spec import (
     EnvFile,
     ProtocolFile,
@@ -19,7 +20,6 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
-from sme_registry.terminal import err, out, print_json
 
 if TYPE_CHECKING:
     from sme_registry.task.certificate import Certificate

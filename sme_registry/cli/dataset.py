@@ -22,8 +22,9 @@ from sme_registry.cli.arguments import (
     changes,
 )
 from sme_registry.errors import OptionError, SMEError
+from sme_registry.io.tables import Table
+from sme_registry.io.terminal import Progress, err, failure, out, print_json, print_pairs
 from sme_registry.spec import catalogue
-from sme_registry.terminal import Progress, Table, err, failure, out, print_json, print_pairs
 
 if TYPE_CHECKING:
     from sme_registry.datasets import Dataset

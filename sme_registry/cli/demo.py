@@ -13,8 +13,9 @@ from sme_registry.cli.arguments import Force
 from sme_registry.cli.files import write_run_explorer
 from sme_registry.evaluation import EvaluationReport
 from sme_registry.io import write_atomically
-from sme_registry.terminal import Table, err, out
-from sme_registry.terminal.templates import environment
+from sme_registry.io.markup import environment
+from sme_registry.io.tables import Table
+from sme_registry.io.terminal import err, out
 
 if TYPE_CHECKING:
     from sme_registry.training import TrainingResult

@@ -14,8 +14,8 @@ from sme_registry.cli.arguments import ActionRange, Force, Json, Out, SpecChange
 from sme_registry.cli.files import can_draw, print_written
 from sme_registry.errors import OptionError
 from sme_registry.io import refuse_existing, to_json, write_atomically
+from sme_registry.io.terminal import err, out, print_json
 from sme_registry.spec import EnvFile, catalogue
-from sme_registry.terminal import err, out, print_json
 
 if TYPE_CHECKING:
     from sme_registry.diagnosis import AnyDiagnosis, AnySubject

@@ -22,9 +22,9 @@ from sme_registry.cli.files import can_draw, print_tables, print_written
 from sme_registry.errors import OptionError
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.io import refuse_existing
+from sme_registry.io.terminal import Progress, err, print_json
 from sme_registry.spec import EnvFile, StreamFile, StreamSpec, catalogue
 from sme_registry.task import load_document
-from sme_registry.terminal import Progress, err, print_json
 
 
 def _complete_policy(incomplete: str) -> list[str]:

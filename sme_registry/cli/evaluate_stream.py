@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from sme_registry.cli.files import can_draw, print_tables, print_written
 from sme_registry.errors import OptionError
 from sme_registry.io import refuse_existing
+from sme_registry.io.terminal import Progress, err, print_json
 from sme_registry.spec import EvaluationProtocol, StreamSpec
-from sme_registry.terminal import Progress, err, print_json
 
 if TYPE_CHECKING:
     from sme_registry.evaluation import StreamReport

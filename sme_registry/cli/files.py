@@ -11,7 +11,8 @@ from rich.markup import escape
 
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.io import install_command, is_installed, refuse_existing
-from sme_registry.terminal import Table, err, out, print_json
+from sme_registry.io.tables import Table
+from sme_registry.io.terminal import err, out, print_json
 
 
 def check_document_path(path: Path, *, force: bool) -> None:

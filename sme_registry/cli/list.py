@@ -11,6 +11,8 @@ from rich.markup import escape
 
 from sme_registry.cli.arguments import KINDS, Json, kind_of
 from sme_registry.errors import UnknownNameError
+from sme_registry.io.tables import Table
+from sme_registry.io.terminal import out, print_json
 from sme_registry.spec import (
     EnvFile,
     ProtocolFile,
@@ -21,7 +23,6 @@ from sme_registry.spec import (
     catalogue,
 )
 from sme_registry.spec.envelope import Envelope
-from sme_registry.terminal import Table, out, print_json
 
 Kind = enum.StrEnum("Kind", ["env", "stream", "suite", "protocol", "study"])
 

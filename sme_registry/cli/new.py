@@ -17,8 +17,8 @@ from sme_registry.cli.arguments import Force, json_or_text
 from sme_registry.cli.files import check_document_path
 from sme_registry.errors import OptionError
 from sme_registry.io import integer_in, read_json
+from sme_registry.io.terminal import err, out
 from sme_registry.spec import EnvFile, SMESpec, catalogue
-from sme_registry.terminal import err, out
 
 _MOST_AGENTS = 2**12  # the spec allows far fewer; a list of billions would fill the memory
 _NO_OPTION = ("schema_version", "team")

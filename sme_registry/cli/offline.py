@@ -10,7 +10,8 @@ from rich.markup import escape
 
 from sme_registry.cli.arguments import DatasetsFolder, Force, Json, Out, changes
 from sme_registry.cli.files import print_training
-from sme_registry.terminal import Progress, Table, err, out
+from sme_registry.io.tables import Table
+from sme_registry.io.terminal import Progress, err, out
 
 app = typer.Typer(no_args_is_help=True)
 

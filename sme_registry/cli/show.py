@@ -14,6 +14,8 @@ from sme_registry.cli.arguments import KINDS, Json, find_any
 from sme_registry.cli.files import print_tables
 from sme_registry.cli.list import study_table, summary
 from sme_registry.errors import OptionError
+from sme_registry.io.tables import Table
+from sme_registry.io.terminal import out, print_json, print_pairs
 from sme_registry.spec import (
     EnvFile,
     ProtocolFile,
@@ -31,7 +33,6 @@ from sme_registry.spec import (
 from sme_registry.spec.envelope import Envelope
 from sme_registry.spec.protocol import EvaluationProtocol
 from sme_registry.spec.resolve import known_specs, known_streams
-from sme_registry.terminal import Table, out, print_json, print_pairs
 
 Schema = enum.StrEnum(
     "Schema",

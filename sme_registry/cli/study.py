@@ -23,8 +23,9 @@ from sme_registry.cli.study_plan import (
     unique,
 )
 from sme_registry.errors import OptionError
+from sme_registry.io.tables import Table
+from sme_registry.io.terminal import duration_range, err, out, print_json
 from sme_registry.spec import StudyFile, catalogue
-from sme_registry.terminal import Table, duration_range, err, out, print_json
 
 if TYPE_CHECKING:
     from sme_registry.studies.engine.status import CellStatus, State, StudyStatus

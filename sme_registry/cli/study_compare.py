@@ -9,7 +9,8 @@ import typer
 from rich.markup import escape
 
 from sme_registry.cli.arguments import Json
-from sme_registry.terminal import Table, out, print_json
+from sme_registry.io.tables import Table
+from sme_registry.io.terminal import out, print_json
 
 
 def compare(

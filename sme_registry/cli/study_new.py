@@ -14,9 +14,9 @@ from sme_registry.cli.plan_options import PlanOptions, with_options
 from sme_registry.cli.study_plan import check_algorithms, warn_of_uneven_rollouts
 from sme_registry.errors import MissingDependencyError, OptionError
 from sme_registry.io import read_json
+from sme_registry.io.terminal import err, out
 from sme_registry.spec import StudyFile
 from sme_registry.spec.resolve import is_path
-from sme_registry.terminal import err, out
 
 _ALLOWED_WITH_FROM = ("path", "name", "description", "source", "force")
 

@@ -12,8 +12,9 @@ from rich.markup import escape
 from sme_registry.cli.arguments import Json, find_file
 from sme_registry.cli.list import number_of_cells, study_table, summary
 from sme_registry.errors import OptionError, SMEError
+from sme_registry.io.tables import Table
+from sme_registry.io.terminal import duration_range, err, out, print_json
 from sme_registry.spec import PlannedCell, StudyAlgorithm, StudyFile, StudyPlan, catalogue
-from sme_registry.terminal import Table, duration_range, err, out, print_json
 
 Steps = Annotated[
     list[str] | None,

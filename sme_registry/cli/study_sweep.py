@@ -12,8 +12,8 @@ from rich.markup import escape
 from sme_registry.cli.plan_options import PlanOptions, with_options
 from sme_registry.cli.study_plan import Jobs
 from sme_registry.errors import OptionError
+from sme_registry.io.terminal import err, out
 from sme_registry.spec import StudyFile
-from sme_registry.terminal import err, out
 
 
 @with_options(PlanOptions)

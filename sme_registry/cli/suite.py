@@ -11,9 +11,9 @@ from rich.markup import escape
 from sme_registry.cli.arguments import Force
 from sme_registry.cli.files import check_document_path
 from sme_registry.cli.plan_options import ClassOptions, with_options
+from sme_registry.io.markup import plural
+from sme_registry.io.terminal import CommandGroup, err, out
 from sme_registry.spec import Suite, SuiteFile
-from sme_registry.terminal import CommandGroup, err, out
-from sme_registry.terminal.templates import plural
 
 
 class _NewByDefault(CommandGroup):

@@ -12,9 +12,9 @@ from sme_registry.cli.files import print_training, write_run_explorer
 from sme_registry.cli.study_plan import Jobs
 from sme_registry.cli.train_suite import refuse_fields, refuse_without_suite, train_suite
 from sme_registry.errors import OptionError
+from sme_registry.io.terminal import err
 from sme_registry.spec import EnvFile, SMESpec, StreamFile, StreamSpec, SuiteFile, catalogue
 from sme_registry.task import load_document
-from sme_registry.terminal import err
 
 
 def train(

@@ -11,8 +11,8 @@ from rich.markup import escape
 from sme_registry.cli.arguments import find_file
 from sme_registry.errors import OptionError
 from sme_registry.io import integer_in
+from sme_registry.io.terminal import err
 from sme_registry.spec import StudyFile, StudyPlan, Suite, SuiteFile
-from sme_registry.terminal import err
 
 RUNS = 10
 """Runs on each class by default: those that a leaderboard requires for a rank."""

@@ -10,8 +10,8 @@ from rich.markup import escape
 
 from sme_registry.cli.arguments import Json, kind_of, read_any
 from sme_registry.errors import OptionError, SMEError
+from sme_registry.io.terminal import out, print_json
 from sme_registry.spec import EnvFile, StreamFile, StudyFile, SuiteFile
-from sme_registry.terminal import out, print_json
 
 
 def validate(

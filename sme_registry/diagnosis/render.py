@@ -13,8 +13,8 @@ from sme_registry.diagnosis.team_document import TeamDiagnosis
 from sme_registry.diagnosis.verdicts import COMPARISON_REASONS
 from sme_registry.evaluation.report import LABELS
 from sme_registry.evaluation.tables import SAFETY_REFERENCES
+from sme_registry.io.markup import environment as sentence_environment
 from sme_registry.spec import SMESpec, catalogue
-from sme_registry.terminal.templates import environment as sentence_environment
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -116,7 +116,7 @@ def terminal(diagnosis: Diagnosis) -> Iterator[RenderableType]:
     """What `sme diagnose` prints, part by part."""
     from rich.markup import escape
 
-    from sme_registry.terminal import Answers, Paragraph, Table
+    from sme_registry.io.tables import Answers, Paragraph, Table
 
     yield f"[bold]{escape(title(diagnosis))}[/]"
     yield Paragraph(headline(diagnosis))

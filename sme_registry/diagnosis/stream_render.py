@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 from sme_registry.diagnosis.document import Verdict
 from sme_registry.diagnosis.render import COLOURS, answers, label, reason_in_words, templates, words
 from sme_registry.diagnosis.stream_document import NetworkState, StreamDiagnosis
+from sme_registry.io.tables import Answers, Paragraph, Table
+from sme_registry.io.terminal import fixed
 from sme_registry.spec import catalogue
-from sme_registry.terminal import Answers, Paragraph, Table, fixed
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

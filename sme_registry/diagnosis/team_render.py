@@ -17,7 +17,8 @@ from sme_registry.diagnosis.render import (
     words,
 )
 from sme_registry.diagnosis.team_document import TeamDiagnosis
-from sme_registry.terminal import Answers, Paragraph, Table, fixed
+from sme_registry.io.tables import Answers, Paragraph, Table
+from sme_registry.io.terminal import fixed
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from sme_registry.io.markup import card, folded, pairs_html, table_html
 from sme_registry.spec import SMESpec, StreamSpec, cards, fields
-from sme_registry.terminal.html import card, folded, pairs_html, table_html
 
 _STATUS = {"created": "not begun", "running": "running", "ended": "ended"}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sme_registry.evaluation.report import LABELS, EvaluationReport
-from sme_registry.terminal.svg import Line, line_chart
+from sme_registry.io.markup import Line, line_chart
 
 REFERENCES = ("constant_half", "linear_least_squares", "optimal")
 """The references that are drawn; the table has them all."""

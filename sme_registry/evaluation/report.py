@@ -33,7 +33,7 @@ from sme_registry.spec.document import StrictModel
 if TYPE_CHECKING:
     import pandas
 
-    from sme_registry.terminal import Table
+    from sme_registry.io.tables import Table
 
 NOT_COMPARABLE = (
     "Levels ε are not comparable between different state_dim: with more channels, the states of "

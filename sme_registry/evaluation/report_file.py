@@ -12,7 +12,7 @@ from sme_registry.io import read_json, to_json, write_atomically
 from sme_registry.spec.document import StrictModel, refuse_other_digest
 
 if TYPE_CHECKING:
-    from sme_registry.terminal import Table
+    from sme_registry.io.tables import Table
 
 
 class ReportFile(StrictModel):
@@ -55,7 +55,7 @@ class ReportFile(StrictModel):
 
     def _repr_html_(self) -> str:
         """The curve and the tables, for notebooks."""
-        from sme_registry.terminal.html import card, table_html
+        from sme_registry.io.markup import card, table_html
 
         return card(self.chart(), *map(table_html, self.tables()))
 

@@ -10,7 +10,7 @@ from rich.markup import escape
 from sme_registry.evaluation.observation import ObservationReport
 from sme_registry.evaluation.report import LABELS, NOT_COMPARABLE, EvaluationReport
 from sme_registry.evaluation.safety import SafetyReport
-from sme_registry.terminal import Table
+from sme_registry.io.tables import Table
 
 SAFETY_REFERENCES = ("optimal", "safe_optimal", "shrunk_optimal", "constant_half")
 """The references whose safety is shown; the report has it of all."""

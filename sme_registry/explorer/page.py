@@ -15,7 +15,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from sme_registry.terminal.templates import environment
+from sme_registry.io.markup import environment
 from sme_registry.version import __version__
 
 __all__ = ["STATIC", "page"]

@@ -1,23 +1,30 @@
-"""Files, locks, digests, strict JSON, arrays, servers, spare memory, packages, argument checks."""
+"""Files, checks of arguments, and the machine; terminal, tables and markup are imported by name."""
 
-from sme_registry.io.arrays import Arrays, read_arrays, write_arrays
-from sme_registry.io.checks import choice, integer_in, number_in
-from sme_registry.io.digests import sha256_of
+from sme_registry.io.checks import Address, choice, integer_in, number_in, printable, server_address
 from sme_registry.io.files import (
+    MAX_DOCUMENT_BYTES,
     TEMPORARY,
+    Arrays,
+    Lock,
     atomic_file,
     build_folder,
     claim_folder,
+    file_lock,
+    is_locked,
+    parse_json,
+    read_arrays,
+    read_json,
     refuse_existing,
     refuse_unwritable,
+    sha256_of,
     sync_folder,
     temporary_beside,
+    to_json,
+    write_arrays,
     write_atomically,
 )
-from sme_registry.io.json_files import MAX_DOCUMENT_BYTES, parse_json, read_json, to_json
-from sme_registry.io.locks import Lock, file_lock, is_locked
-from sme_registry.io.memory import available_memory
-from sme_registry.io.packages import (
+from sme_registry.io.system import (
+    available_memory,
     import_object,
     install_command,
     is_installed,
@@ -25,7 +32,6 @@ from sme_registry.io.packages import (
     require_packages,
     versions,
 )
-from sme_registry.io.servers import Address, printable, server_address
 
 __all__ = [
     "MAX_DOCUMENT_BYTES",

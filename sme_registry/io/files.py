@@ -1,20 +1,34 @@
-"""Files and folders that are written completely or not at all.
+"""Files and folders written completely or not at all, strict JSON, named arrays, digests and locks.
 
-Both are written to a temporary path next to the target, which is then renamed to the target. A
-killed process leaves the old target and at most temporary paths that `TEMPORARY` matches.
+A temporary path next to the target is renamed to the target: a killed process leaves the old target
+and at most temporary paths that `TEMPORARY` matches.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
 import os
 import secrets
 import shutil
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
-from sme_registry.errors import OptionError
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.errors import MalformedDocumentError, OptionError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+if TYPE_CHECKING:
+    import filelock
+
 
 TEMPORARY = ".*.tmp*"  # the last star: SQLite adds suffixes for its own temporary files
 
@@ -224,3 +238,200 @@ def _flush(folder: Path) -> None:
             with open(os.path.join(parent, name), "rb") as stream:
                 os.fsync(stream.fileno())
         sync_folder(parent)
+
+
+MAX_DOCUMENT_BYTES = 64 * 2**20
+
+
+def parse_json(text: str | bytes, source: str = "document") -> Any:
+    """Parse strict JSON text; error messages call it `source`, such as its path.
+
+    Raises:
+      MalformedDocumentError: it is not strict JSON; with line and column if they are known.
+    """
+
+    def reject_constant(name: str) -> NoReturn:
+        raise MalformedDocumentError(f"{source}: {name} is not valid JSON. Use a finite number.")
+
+    def reject_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        mapping: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in mapping:
+                raise MalformedDocumentError(
+                    f"{source}: the key {key!r:.80} occurs twice. Remove one of them."
+                )
+            mapping[key] = value
+        return mapping
+
+    try:
+        if isinstance(text, bytes):
+            text = text.decode("utf-8")
+        return json.loads(text, parse_constant=reject_constant, object_pairs_hook=reject_duplicates)
+    except MalformedDocumentError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise MalformedDocumentError(f"{source}: {_reason(error)}") from None
+
+
+def _reason(error: ValueError | RecursionError) -> str:
+    if isinstance(error, UnicodeDecodeError):
+        return f"not UTF-8 text (byte {error.start}). Save it as UTF-8 JSON."
+    if isinstance(error, json.JSONDecodeError):
+        if error.doc.startswith("\ufeff"):
+            return "starts with a byte order mark (BOM). Save it as UTF-8 without BOM."
+        return f"not JSON: {error.msg} at line {error.lineno}, column {error.colno}."
+    if isinstance(error, RecursionError):
+        return "nested too deeply. Valid documents have at most ten levels."
+    return f"cannot be parsed: {error}."  # an integer of thousands of digits
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    """Read a strict JSON file.
+
+    Raises:
+      MalformedDocumentError: the file does not exist or cannot be read, is too large, or is not
+        strict JSON.
+    """
+    path = Path(path)
+    try:
+        if path.is_file() and path.stat().st_size > MAX_DOCUMENT_BYTES:
+            raise MalformedDocumentError(
+                f"{path}: larger than {MAX_DOCUMENT_BYTES // 2**20} MiB, the limit for documents."
+            )
+        text = path.read_bytes()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise MalformedDocumentError(f"{path}: cannot be read: {reason}.") from None
+    return parse_json(text, str(path))
+
+
+def to_json(value: Any) -> str:
+    """Plain data as indented JSON text with a final newline. Raises ValueError for NaN."""
+    return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+Arrays = dict[str, npt.NDArray[Any]]
+
+
+def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    """Write arrays of numbers or text, and remove what killed writes left of the file.
+
+    They may be gigabytes: no copy is made in memory. The folder is created if it is missing.
+
+    Raises:
+      OptionError: the file cannot be written; an existing one is unchanged.
+    """
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for rest in path.parent.glob(TEMPORARY):
+            if rest.name.startswith(f".{path.name}."):
+                rest.unlink(missing_ok=True)
+        with atomic_file(path) as stream:
+            np.savez(stream, **arrays)  # type: ignore[arg-type]
+    except (OSError, ValueError) as error:
+        raise unwritable(path, error) from None
+
+
+def read_arrays(path: str | os.PathLike[str], names: Collection[str] | None = None) -> Arrays:
+    """The arrays of a file; with `names`, these alone, and no others are read.
+
+    Raises:
+      OptionError: there is no such file, or it is damaged or lacks one of the names.
+    """
+    try:
+        # Opened here: NumPy leaves a file open that is no archive.
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            return {name: archive[name] for name in (archive.files if names is None else names)}
+    except Exception as error:  # of many kinds, by what is damaged
+        raise OptionError(
+            f"{os.fspath(path)}: cannot be read: {type(error).__name__}: {error}. Remove it."
+        ) from error
+
+
+def sha256_of(data: bytes) -> str:
+    """The SHA-256 digest of bytes: `sha256:` and 64 lower-case hex digits."""
+    return "sha256:" + hashlib.sha256(data).hexdigest()
+
+
+_POLL_SECONDS = 0.002
+
+
+class Lock:
+    """A lock that this process holds until it releases or drops this object.
+
+    As a context manager it is released at the end of the block.
+    """
+
+    def __init__(self, lock: filelock.BaseFileLock) -> None:
+        self._lock = lock
+
+    def release(self) -> None:
+        """Release the lock. Releasing twice does nothing."""
+        self._lock.release()
+
+    def __enter__(self) -> Lock:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+
+def file_lock(path: str | os.PathLike[str], *, timeout: float = 0.0) -> Lock | None:
+    """Acquire the exclusive lock of a file, which is created with its folder if it is missing.
+
+    Args:
+      path: the lock file.
+      timeout: seconds to wait for another holder; 0 tries once, a negative number waits forever.
+
+    Returns:
+      The lock, or None if another process, or another lock of this one, still holds it.
+
+    Raises:
+      OptionError: the file cannot be created, or its file system has no locks.
+    """
+    import filelock  # on first use: most programs take no lock
+
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # No fallback to a lock that consists of the file's existence: it would survive a kill.
+        lock = filelock.FileLock(path, thread_local=False, fallback_to_soft=False)
+        lock.acquire(timeout=timeout, poll_interval=_POLL_SECONDS)
+    except filelock.Timeout:
+        return None
+    except (OSError, ValueError, NotImplementedError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise OptionError(
+            f"{path}: cannot be locked: {reason}. Give a folder that you may write to, on a file "
+            "system that supports locks."
+        ) from None
+    return Lock(lock)
+
+
+def is_locked(path: str | os.PathLike[str]) -> bool:
+    """Whether a lock file is held, by this process or another one. Creates no file.
+
+    Where the system has `flock`, reading the file suffices, and asking does not hold up others.
+    """
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        if fcntl is not None:
+            fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            return False
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(handle)
+    try:
+        # Waiting a moment keeps two simultaneous questions from answering each other's with yes.
+        lock = file_lock(path, timeout=5 * _POLL_SECONDS)
+    except OptionError:
+        return False
+    if lock is None:
+        return True
+    lock.release()
+    return False

@@ -7,11 +7,11 @@ from typing import Any
 
 from rich.markup import escape
 
+from sme_registry.io.markup import card, pairs_html, table_html
+from sme_registry.io.tables import Table
 from sme_registry.spec import catalogue, fields
 from sme_registry.spec.sme_spec import SMESpec
 from sme_registry.spec.stream import StreamSpec
-from sme_registry.terminal import Table
-from sme_registry.terminal.html import card, pairs_html, table_html
 
 SHORT = len("sha256:") + 12
 """Characters of a digest that name a task."""

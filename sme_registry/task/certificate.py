@@ -11,7 +11,7 @@ from sme_registry.task.streams import uniform
 from sme_registry.task.task import Task
 
 if TYPE_CHECKING:
-    from sme_registry.terminal import Table
+    from sme_registry.io.tables import Table
 
 Outcome = Literal["passed", "warning", "refused", "reported"]
 _WORST_FIRST: tuple[Outcome, ...] = ("refused", "warning")
@@ -87,7 +87,7 @@ class Certificate:
         """
         from rich.markup import escape
 
-        from sme_registry.terminal import Table
+        from sme_registry.io.tables import Table
 
         columns = {"": "name", "check": "name", "value": "number", "passes in": "name"}
         table = Table(title, columns | ({"meaning": "text"} if meanings else {}))
@@ -99,7 +99,7 @@ class Certificate:
 
     def _repr_html_(self) -> str:
         """A card for notebooks: the outcome, and every check with its meaning."""
-        from sme_registry.terminal.html import card, table_html
+        from sme_registry.io.markup import card, table_html
 
         return card(table_html(self.table(f"{self.digest}\n{self.outcome}", meanings=True)))
 

@@ -19,11 +19,11 @@ from sme_registry.envs.episode_safety import EpisodeSafety, safety_of_step
 from sme_registry.errors import OptionError
 from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.io import is_installed, read_arrays, write_arrays, write_atomically
+from sme_registry.io.system import defer_interrupts
 from sme_registry.jax import run as jax_run
 from sme_registry.jax.program import Program, StepLog
 from sme_registry.sb3 import EpisodeRegret
 from sme_registry.spec import SMESpec
-from sme_registry.terminal.interrupts import defer_interrupts
 from sme_registry.training import checkpoint
 from sme_registry.training.episodes import Episode
 from sme_registry.training.learn import RunLog, not_finite

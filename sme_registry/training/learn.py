@@ -21,9 +21,9 @@ from stable_baselines3.common.vec_env import VecMonitor
 from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.io import is_installed, write_atomically
+from sme_registry.io.system import defer_interrupts
+from sme_registry.io.terminal import Progress
 from sme_registry.sb3 import EpisodeRegret, EpisodeSums, RegretCallback, SMETeamVecEnv, SMEVecEnv
-from sme_registry.terminal.interrupts import defer_interrupts
-from sme_registry.terminal.progress import Progress
 from sme_registry.training import checkpoint
 from sme_registry.training import episodes as episode_files
 from sme_registry.training.algorithms import is_sb3, short_name, silence

@@ -22,10 +22,10 @@ from sme_registry.evaluation import (
 )
 from sme_registry.evaluation.measure import Progress as OnBatch
 from sme_registry.io import is_installed
+from sme_registry.io.terminal import Progress
 from sme_registry.plots import files as plot_files
 from sme_registry.plots.streams import FILE as STREAM
 from sme_registry.spec import StreamSpec
-from sme_registry.terminal.progress import Progress
 from sme_registry.training import episodes as episode_files
 from sme_registry.training import snapshots
 from sme_registry.training.algorithms import short_name

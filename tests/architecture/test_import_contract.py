@@ -32,7 +32,7 @@ AT_THE_TOP = {
     "plots/style.py": "stable_baselines3",
     "studies/engine/runner.py": "pandas",
     "teams.py": "sme_registry.registration",
-    "io/locks.py": "sme_registry.terminal",
+    "io/files.py": "sme_registry.spec",
 }
 IN_A_FUNCTION = {
     "errors.py": "sme_registry.registration",

@@ -11,7 +11,7 @@ from sme_registry import SMESpec
 from sme_registry.diagnosis import diagnose, load_policy
 from sme_registry.evaluation import Perceptron
 from sme_registry.evaluation.references import reference_policy
-from sme_registry.terminal import out
+from sme_registry.io.terminal import out
 
 SPEC = SMESpec(horizon=20)
 DEEP = SMESpec(horizon=20, complexity=10, seed=1)

@@ -106,7 +106,7 @@ def test_other_names_and_places_are_refused(tmp_path):
 
 
 def test_a_missing_package_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr("sme_registry.io.packages.is_installed", lambda name: name != "onnx")
+    monkeypatch.setattr("sme_registry.io.system.is_installed", lambda name: name != "onnx")
     with pytest.raises(MissingDependencyError, match=r"onnx is not installed.*\[onnx\]"):
         export_onnx(Perceptron(LAYERS), SPEC, tmp_path / "policy.onnx")
 

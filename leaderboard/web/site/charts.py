@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from markupsafe import Markup, escape
 
 from leaderboard.documents.result import Estimate
-from sme_registry.terminal import Scale, fixed
+from sme_registry.io.markup import Scale
+from sme_registry.io.terminal import fixed
 
 Edges = Sequence[tuple[float, float]]
 

@@ -32,7 +32,7 @@ from sme_registry.spec.document import StrictModel
 from sme_registry.task.draw import Array
 
 if TYPE_CHECKING:
-    from sme_registry.terminal import Table
+    from sme_registry.io.tables import Table
 
 SHELLS = "OOD"
 LABELS = {

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from rich.markup import escape
 
 from sme_registry.evaluation.continual.report import LABELS, METRICS, StreamReport
-from sme_registry.terminal import Table
+from sme_registry.io.tables import Table
 
 
 def of_metrics(report: StreamReport) -> Table:

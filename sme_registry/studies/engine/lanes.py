@@ -34,6 +34,7 @@ from sme_registry.evaluation.continual import DynamicRegret, RegretBlocks
 from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.evaluation.rollouts import start_states
 from sme_registry.io import Arrays, to_json
+from sme_registry.io.system import end_with_parent
 from sme_registry.spec import Cell
 from sme_registry.studies.engine.jobs import (
     CPU,
@@ -52,7 +53,6 @@ from sme_registry.studies.engine.result import (
     Timing,
     report_field,
 )
-from sme_registry.terminal.interrupts import end_with_parent
 from sme_registry.training.record import versions_for
 from sme_registry.training.snapshots import Snapshots
 

@@ -19,6 +19,7 @@ from multiprocessing import connection
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sme_registry.io.system import block_interrupts, defer_interrupts, end_with_parent
 from sme_registry.spec import Cell
 from sme_registry.studies.engine.executors import (
     POLL_SECONDS,
@@ -30,7 +31,6 @@ from sme_registry.studies.engine.executors import (
     run_job,
 )
 from sme_registry.studies.engine.jobs import CPU, Job, available_cores, child_environment
-from sme_registry.terminal.interrupts import block_interrupts, defer_interrupts, end_with_parent
 
 _SECONDS_TO_END = 10.0
 # One thread for each library that would take every core: the jobs share the cores, one each.

@@ -19,6 +19,7 @@ from rich.console import Console
 
 from sme_registry.errors import OptionError, ResourceLimitError, UnknownNameError
 from sme_registry.io import Lock, integer_in
+from sme_registry.io.terminal import Progress, duration
 from sme_registry.spec import Cell, PlannedCell, StudyFile, StudyPlan
 from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine import checks
@@ -32,7 +33,6 @@ from sme_registry.studies.engine.ray_executor import OnRay
 from sme_registry.studies.engine.result import CellFailure, CellResult
 from sme_registry.studies.engine.scaling import first_places, selected
 from sme_registry.studies.engine.status import StudyStatus, label, plan_status
-from sme_registry.terminal import Progress, duration
 from sme_registry.training.record import versions_for
 
 _SHARE_FOR_A_PACE = 0.02  # of a job, before its pace is measured

@@ -10,6 +10,7 @@ from typing import Any
 
 import pandas as pd
 
+from sme_registry.io.markup import fixed, signed
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.offline_tables import OFFLINE_INTERVAL
 from sme_registry.studies.report.streams.texts import stream_csv, stream_tables
@@ -22,7 +23,6 @@ from sme_registry.studies.report.text import (
     wide,
     with_interval,
 )
-from sme_registry.terminal.templates import fixed, signed
 
 CSV_TABLES = (
     "results", "curves", "counts", "missing", "contrasts", "levels", "regions", "aggregates",

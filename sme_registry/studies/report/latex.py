@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from sme_registry.terminal import escape_latex
+from sme_registry.io.markup import escape_latex
 
 __all__ = ["COLUMN_WIDTH", "latex_table", "text_width"]
 

@@ -17,6 +17,8 @@ from pathlib import Path
 import pandas as pd
 from markupsafe import Markup
 
+from sme_registry.io.markup import environment, plural
+from sme_registry.io.terminal import duration
 from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.status import run_label
 from sme_registry.studies.report.analysis import Analysis
@@ -25,8 +27,6 @@ from sme_registry.studies.report.explorers import Explorer
 from sme_registry.studies.report.figures import Picture
 from sme_registry.studies.report.findings import Findings
 from sme_registry.studies.report.text import TextTable
-from sme_registry.terminal import duration
-from sme_registry.terminal.templates import environment, plural
 
 __all__ = ["page"]
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import pandas as pd
 
+from sme_registry.io.markup import fixed, signed
 from sme_registry.studies.report.latex import latex_table
 from sme_registry.studies.report.tables import ENOUGH_RUNS, Metric
-from sme_registry.terminal.templates import fixed, signed
 
 ABSENT = "–"
 

@@ -455,7 +455,7 @@ def test_bad_arguments_are_refused_and_nothing_is_written(options, error, words,
 
 
 def test_a_terminal_has_bars_and_anything_else_lines(study, monkeypatch):
-    monkeypatch.setattr("sme_registry.terminal.Progress._line_is_due", lambda *_: True)
+    monkeypatch.setattr("sme_registry.io.terminal.Progress._line_is_due", lambda *_: True)
     _, output = quick(small_file(seeds=2), study)
     assert "study small-v1: 1 of 2 cells · about" in output
     screen = io.StringIO()

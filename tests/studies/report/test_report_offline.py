@@ -3,13 +3,13 @@
 import pandas as pd
 import pytest
 
+from sme_registry.io.markup import fixed
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import OfflineResult
 from sme_registry.studies.report.analysis import analyse
 from sme_registry.studies.report.classes import ALL
 from sme_registry.studies.report.exports import offline_tables
-from sme_registry.terminal.templates import fixed
 from tests.studies.finished import study_file
 
 pytest.importorskip("matplotlib")

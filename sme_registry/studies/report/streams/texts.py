@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 
 from sme_registry.evaluation.continual.report import LABELS
+from sme_registry.io.markup import fixed
 from sme_registry.studies.report.streams.analysis import StreamAnalysis
 from sme_registry.studies.report.streams.tables import (
     BY_VISIT,
@@ -25,7 +26,6 @@ from sme_registry.studies.report.text import (
     slug,
     wide,
 )
-from sme_registry.terminal.templates import fixed
 
 CSV_TABLES = (
     "metrics", "visit_metrics", "matrices", "contrasts", "differences", "references", "regret",

@@ -13,9 +13,9 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from sme_registry.cli import app
-from sme_registry.terminal import Scale, Table, out
-from sme_registry.terminal.html import card, folded, pairs_html, table_html
-from sme_registry.terminal.svg import Line, line_chart
+from sme_registry.io.markup import Line, Scale, card, folded, line_chart, pairs_html, table_html
+from sme_registry.io.tables import Table
+from sme_registry.io.terminal import out
 
 WIDTHS = (60, 80, 200)
 COLUMNS = {"id": "name", "n": "number", "of all": "number", "about it": "text"}

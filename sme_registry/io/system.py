@@ -1,16 +1,21 @@
-"""Installed packages: their versions, how to install missing ones, and objects in them by name."""
+"""This process and its machine: installed packages, spare memory, and interrupts."""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import importlib.util
 import json
+import multiprocessing
 import os
 import platform
 import re
 import shlex
 import shutil
+import signal
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+import threading
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -178,3 +183,117 @@ def import_object(name: str, field: str, error: type[SMEError]) -> Any:
         ) from reason
     finally:
         sys.path.remove(folder)
+
+
+_PROC = Path("/proc")
+_CGROUPS = Path("/sys/fs/cgroup")
+
+
+def available_memory() -> int | None:
+    """Memory in bytes that a process can use before the system ends one for lack of it.
+
+    Outside Linux, all memory of the machine; None where even that is unknown.
+    """
+    try:
+        lines = (_PROC / "meminfo").read_text().splitlines()
+    except OSError:
+        if not hasattr(os, "sysconf"):
+            return None
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    kibibytes = {line.partition(":")[0]: int(line.split()[1]) for line in lines}
+    spare = [limit - used for limit, used in _cgroup_memory()]
+    return max(0, min([kibibytes["MemAvailable"] * 1024, *spare]))
+
+
+def _cgroup_memory() -> Iterator[tuple[int, int]]:
+    """Limit and use, in bytes, of each control group with a limit that this process is in."""
+    try:
+        membership = (_PROC / "self" / "cgroup").read_text()
+    except OSError:  # a kernel without control groups
+        return
+    for line in membership.splitlines():
+        _, controllers, path = line.split(":", 2)
+        if not controllers:  # version 2
+            root, names = _CGROUPS, ("memory.max", "memory.current", "inactive_file")
+        elif "memory" in controllers.split(","):
+            root = _CGROUPS / "memory"
+            names = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+        else:
+            continue
+        group = root / path.lstrip("/")
+        for folder in (group, *group.parents):
+            if folder.is_relative_to(root):
+                yield from _limit_and_use(folder, *names)
+
+
+def _limit_and_use(
+    folder: Path, limit_name: str, use_name: str, cache_name: str
+) -> Iterator[tuple[int, int]]:
+    try:
+        limit = (folder / limit_name).read_text().strip()
+        use = int((folder / use_name).read_text())
+        statistics = dict(map(str.split, (folder / "memory.stat").read_text().splitlines()))
+    except OSError:  # the root has no limit, and in a container the outer folders are not visible
+        return
+    if limit != "max":
+        yield int(limit), use - int(statistics.get(cache_name, "0"))
+
+
+@contextlib.contextmanager
+def defer_interrupts() -> Iterator[None]:
+    """Deliver an interrupt only after the block, so that the files it writes agree.
+
+    Inside `torch.save`, an interrupt would become a PyTorch error about a broken archive.
+    """
+    received: list[int] = []
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGINT, lambda *_: received.append(1)) if in_main_thread else None
+    try:
+        yield
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGINT, before)
+    if received:
+        signal.raise_signal(signal.SIGINT)
+
+
+@contextlib.contextmanager
+def block_interrupts() -> Iterator[None]:
+    """Processes started inside the block begin with interrupts blocked.
+
+    A terminal sends Ctrl-C to all of them; one that is still importing would print a traceback.
+    `unblock_interrupts`, or ignoring the signal, ends the block in the child. Windows has no signal
+    masks, so there this does nothing.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    resource_tracker.ensure_running()  # starting it later would unblock the signal
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def unblock_interrupts() -> None:
+    """Accept interrupts in a process that began with them blocked, including one already sent."""
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+def end_with_parent() -> None:
+    """End this process when its parent ends, for any reason."""
+    if sys.platform == "linux":
+        set_parent_death_signal = 1  # PR_SET_PDEATHSIG
+        ctypes.CDLL(None).prctl(set_parent_death_signal, signal.SIGKILL)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait_for_parent() -> None:
+        parent.join()  # returns at the end of a pipe that only the parent holds
+        os._exit(1)
+
+    threading.Thread(target=wait_for_parent, daemon=True).start()

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from sme_registry.terminal import Progress, duration, duration_range, err
-from sme_registry.terminal.interrupts import defer_interrupts
+from sme_registry.io.system import defer_interrupts
+from sme_registry.io.terminal import Progress, duration, duration_range, err
 
 
 def test_without_a_terminal_it_prints_lines_and_in_one_it_draws_a_bar():
@@ -45,7 +45,7 @@ def test_durations_are_in_words():
 def clock(monkeypatch):
     """Time as a test sets it."""
     clock = SimpleNamespace(now=0.0)
-    monkeypatch.setattr("sme_registry.terminal.progress.time.monotonic", lambda: clock.now)
+    monkeypatch.setattr("sme_registry.io.terminal.time.monotonic", lambda: clock.now)
     return clock
 
 

@@ -1,0 +1,318 @@
+"""HTML for notebooks, charts as SVG, text for LaTeX, and Jinja2 templates; all text is escaped.
+
+Cards have no scripts; their colours and fonts are those of the page, light or dark.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from rich.text import Text
+
+from sme_registry.io.tables import Row, Table
+
+# Notebooks have rules for tables, such as `.jp-RenderedHTMLCommon td`: these are more specific.
+_STYLE = (
+    "<style>"
+    ".sme-card.sme-card{overflow-x:auto;font-variant-numeric:tabular-nums}"
+    ".sme-card table.sme-table{border-collapse:collapse;margin:.5em 0;color:inherit;width:auto}"
+    ".sme-card table.sme-table caption{caption-side:top;text-align:left;padding:.2em .6em;"
+    "color:inherit;font-size:1em;font-weight:normal;font-style:normal}"
+    ".sme-card table.sme-table tr>*{padding:.15em .6em;text-align:left;vertical-align:top;"
+    "white-space:normal;max-width:30em}"
+    ".sme-card table.sme-table tr>.text:last-child{min-width:12em}"
+    ".sme-card table.sme-table tr>.num{text-align:right;white-space:nowrap}"
+    ".sme-card table.sme-table tr>.name{white-space:nowrap}"
+    ".sme-card table.sme-table tr.bold>*{font-weight:bold}"
+    ".sme-card table.sme-table tbody+tbody{border-top:1px solid rgba(128,128,128,.5)}"
+    ".sme-card small,.sme-card summary{overflow-wrap:anywhere}"
+    "</style>"
+)
+_MOST_ROWS = 60  # of a table: a card stays below 20 kB
+_CLASSES = {"number": "num", "name": "name", "text": "text"}
+
+
+def card(*parts: str) -> str:
+    """What a notebook shows of an object: tables and charts, one below the other.
+
+    Args:
+      *parts: HTML of this module or of `svg`.
+    """
+    return f'{_STYLE}<div class="sme-card">{"".join(parts)}</div>'
+
+
+def folded(summary: str, *parts: str) -> str:
+    """Parts of a card that open on a click."""
+    return f"<details><summary>{escape(summary)}</summary>{''.join(parts)}</details>"
+
+
+def table_html(table: Table) -> str:
+    """A table of the terminal as HTML: title, headings, rows, sections and caption.
+
+    Of Rich's styles it keeps bold rows. A long table ends with the number of rows left out.
+    """
+    kinds = [column.kind for column in table.columns]
+    sections = [[_row("th", [column.heading for column in table.columns], kinds)]]
+    for row in table.rows[:_MOST_ROWS]:
+        if row is None:
+            sections.append([])
+        else:
+            sections[-1].append(_row("td", row.cells, kinds, row))
+    if more := sum(row is not None for row in table.rows[_MOST_ROWS:]):
+        rest = f"<tr><td colspan={len(kinds)}>… {more:,} more</td></tr>"
+        sections.append([rest])
+    bodies = "".join(f"<tbody>{''.join(rows)}</tbody>" for rows in sections if rows)
+    title = _caption(_text(table.title)) if table.title else ""
+    caption = f"<small>{_text(table.caption)}</small>" if table.caption else ""
+    return f'<table class="sme-table">{title}{bodies}</table>{caption}'
+
+
+def pairs_html(title: str, pairs: Mapping[str, Any]) -> str:
+    """Names and values, one per row, under a title."""
+    rows = "".join(
+        f'<tr><th class="name">{escape(name)}</th><td>{escape(str(value))}</td></tr>'
+        for name, value in pairs.items()
+    )
+    return f'<table class="sme-table">{_caption(escape(title))}{rows}</table>'
+
+
+def _caption(html: str) -> str:
+    """The title of a table, its first line in bold."""
+    if not html:
+        return ""
+    first, *rest = html.split("<br>", 1)
+    return f"<caption>{'<br>'.join([f'<b>{first}</b>', *rest])}</caption>"
+
+
+def _row(tag: str, cells: Any, kinds: list[str], row: Row | None = None) -> str:
+    styled = (
+        f'<{tag} class="{_CLASSES[kind]}">{_text(cell)}</{tag}>'
+        for cell, kind in zip(cells, kinds, strict=True)
+    )
+    bold = row is not None and "bold" in row.style.split()
+    return f"<tr{' class=bold' * bold}>{''.join(styled)}</tr>"
+
+
+def _text(cell: Text | str) -> str:
+    """A cell, heading or title: spaces at its start, line breaks and text in bold are kept."""
+    text = cell if isinstance(cell, Text) else Text.from_markup(cell, emoji=False)
+    lead = len(text.plain) - len(text.plain.lstrip(" "))
+    bold = [span for span in text.spans if "bold" in str(span.style).split()]
+    parts, at = [], lead
+    for span in bold:
+        start, end = max(span.start, at), max(span.end, at)
+        parts += [escape(text.plain[at:start]), f"<b>{escape(text.plain[start:end])}</b>"]
+        at = end
+    html = "".join([*parts, escape(text.plain[at:])])
+    return "&nbsp;" * lead + html.replace("\n", "<br>")
+
+
+_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
+_WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 540.0, 240.0, 44.0, 410.0, 12.0, 194.0
+_LINE = 15.0  # between two lines of text
+_MAX_LABELS = 8  # below the x axis
+_STROKES = {
+    "main": 'stroke="#2b87d8" stroke-width="2.5"',
+    "other": 'stroke="#d9822b" stroke-width="1.2" stroke-opacity=".8"',
+    "reference": 'stroke="currentColor" stroke-width="1.3" stroke-opacity=".55" '
+    'stroke-dasharray="5 3"',
+}
+
+
+@dataclass(frozen=True)
+class Scale:
+    """An axis.
+
+    Attributes:
+      low, high: its ends; `low < high`.
+      ticks: round numbers from end to end.
+    """
+
+    low: float
+    high: float
+    ticks: tuple[float, ...]
+
+    @classmethod
+    def covering(cls, *values: float) -> Scale:
+        """The scale of about four round steps that covers the values."""
+        low, high = min(values, default=0.0), max(values, default=1.0)
+        high = high if high - low > 1e-9 else low + 1.0
+        raw = (high - low) / 4
+        power = 10.0 ** math.floor(math.log10(raw))
+        step = next(factor * power for factor in _STEPS if factor * power >= raw * (1 - 1e-9))
+        first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+        ticks = tuple(round(index * step, 12) + 0.0 for index in range(first, last + 1))
+        return cls(ticks[0], ticks[-1], ticks)
+
+    def part(self, value: float) -> float:
+        """The position of a value along the axis, 0 at its low end and 1 at its high end."""
+        return (min(max(value, self.low), self.high) - self.low) / (self.high - self.low)
+
+
+class Line(NamedTuple):
+    """A line of a chart.
+
+    Attributes:
+      label: at its end, of at most 17 characters; empty for none.
+      values: one for each position on the x axis, finite.
+      kind: "main" for what the chart is about, "other" for what stands beside it, "reference".
+    """
+
+    label: str
+    values: Sequence[float]
+    kind: Literal["main", "other", "reference"] = "main"
+
+
+def line_chart(title: str, positions: Sequence[str], lines: Sequence[Line], below: str = "") -> str:
+    """A chart of lines over named positions, labelled at their ends.
+
+    Args:
+      title: what it shows, for screen readers; the values of labelled lines are added.
+      positions: names of the positions on the x axis.
+      lines: drawn in this order; the y axis covers 0, 1 and all values.
+      below: the title of the x axis.
+
+    Returns:
+      An `<svg>` element of about 3 kB that shrinks with the page.
+    """
+    scale = Scale.covering(0.0, 1.0, *(value for line in lines for value in line.values))
+    step = (_RIGHT - _LEFT) / len(positions)
+    xs = [_LEFT + step * (index + 0.5) for index in range(len(positions))]
+
+    def y(value: float) -> float:
+        return _BOTTOM - (_BOTTOM - _TOP) * scale.part(value)
+
+    parts = [
+        f'<path d="M{_LEFT:.0f} {y(tick):.1f}H{_RIGHT:.0f}" stroke="currentColor" '
+        'stroke-opacity=".18"/>'
+        + _svg_text(_LEFT - 6, y(tick) + 4, f"{tick:g}".replace("-", "−"), "end")
+        for tick in scale.ticks
+    ]
+    every = 1 + (len(positions) - 1) // _MAX_LABELS
+    parts += [
+        _svg_text(x, _BOTTOM + _LINE + 3, name, "middle")
+        for x, name in list(zip(xs, positions, strict=True))[::every]
+    ]
+    parts.append(_svg_text((_LEFT + _RIGHT) / 2, _HEIGHT - 8, below, "middle") if below else "")
+    for line in lines:
+        points = [(x, y(value)) for x, value in zip(xs, line.values, strict=True)]
+        path = " ".join(f"{x:.1f},{height:.1f}" for x, height in points)
+        parts.append(f'<polyline points="{path}" fill="none" {_STROKES[line.kind]}/>')
+        if line.kind == "main":
+            dots = (f'<circle cx="{x:.1f}" cy="{height:.1f}" r="3.5"/>' for x, height in points)
+            parts.append(f'<g fill="#2b87d8">{"".join(dots)}</g>')
+    labelled = [line for line in lines if line.label]
+    heights = _apart([y(line.values[-1]) for line in labelled])
+    for line, height in zip(labelled, heights, strict=True):
+        end = y(line.values[-1])
+        parts.append(
+            f'<path d="M{xs[-1] + 5:.1f} {end:.1f}L{_RIGHT + 4:.1f} {height:.1f}" fill="none" '
+            f"{_STROKES['reference']}/>"
+            + _svg_text(_RIGHT + 8, height + 4, line.label, "start", bold=line.kind == "main")
+        )
+    values = "; ".join(
+        f"{line.label}: {', '.join(f'{value:.2f}' for value in line.values)}" for line in labelled
+    )
+    return (
+        f'<svg viewBox="0 0 {_WIDTH:.0f} {_HEIGHT:.0f}" width="{_WIDTH:.0f}" role="img" '
+        f'style="max-width:100%;height:auto" font-family="system-ui,sans-serif" font-size="13" '
+        f'aria-label="{escape(f"{title}. {values}")}">{"".join(parts)}</svg>'
+    )
+
+
+def _apart(heights: Sequence[float]) -> list[float]:
+    """Heights of labels near the given ones, at least a line of text apart."""
+    order = sorted(range(len(heights)), key=lambda i: heights[i])
+    placed = list(heights)
+    for above, i in pairwise(order):
+        placed[i] = max(placed[i], placed[above] + _LINE)
+    overflow = max((placed[i] for i in order), default=0.0) - _BOTTOM
+    limit = _BOTTOM
+    for i in reversed(order if overflow > 0 else []):
+        placed[i] = min(placed[i], limit)
+        limit = placed[i] - _LINE
+    return placed
+
+
+def _svg_text(x: float, y: float, text: str, anchor: str, *, bold: bool = False) -> str:
+    weight = ' font-weight="bold"' if bold else ""
+    return (
+        f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="currentColor"{weight}>'
+        f"{escape(text)}</text>"
+    )
+
+
+_COMMANDS = {
+    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#",
+    "_": r"\_", "%": r"\%", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+    "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}",
+    "−": "$-$", "–": "--", "½": r"$\frac12$", "ε": r"$\varepsilon$", "†": r"$^\dagger$",
+    "τ": r"$\tau$", "ν": r"$\nu$", "≥": r"$\geq$", "±": r"$\pm$", "’": "'", "*": "$^*$",
+}  # fmt: skip
+
+
+def escape_latex(text: str) -> str:
+    """Text as LaTeX source that prints it literally; the symbols of our labels become mathematics.
+
+    Line ends remain: text of unknown origin must be put on one line before.
+    """
+    escaped = "".join(_COMMANDS.get(letter, letter) for letter in text.replace("r̃", "\0"))
+    return escaped.replace("\0", r"$\tilde r$")
+
+
+def environment(folder: Path, *, autoescape: bool) -> Environment:
+    """The templates of a folder, with the filters of this module.
+
+    Args:
+      folder: of the templates.
+      autoescape: whether values are escaped for HTML.
+    """
+    templates = Environment(
+        loader=FileSystemLoader(folder),
+        autoescape=autoescape,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    filters = (fixed, signed, percent, thousands, conjunction, plural)
+    templates.filters |= {function.__name__: function for function in filters}
+    return templates
+
+
+def fixed(value: float, digits: int = 2) -> str:
+    """`0.44`, `−0.02`, and no negative zero."""
+    return f"{value:z.{digits}f}".replace("-", "−")
+
+
+def signed(value: float, digits: int = 2) -> str:
+    """`+0.44`, `−0.02`, `0.00`."""
+    text = fixed(value, digits)
+    return text if text.startswith("−") or float(text) == 0.0 else f"+{text}"
+
+
+def percent(value: float, digits: int = 0) -> str:
+    """`44%`."""
+    return f"{value:.{digits}%}"
+
+
+def thousands(value: float) -> str:
+    """`20,000`; a number with decimals keeps those that it needs."""
+    return f"{value:,}" if isinstance(value, int) else f"{value:,g}"
+
+
+def conjunction(names: Sequence[str]) -> str:
+    """`PPO, TD3 and SAC`."""
+    *others, last = names
+    return f"{', '.join(others)} and {last}" if others else last
+
+
+def plural(count: int, one: str, many: str = "") -> str:
+    """`1 pair`, `3 pairs`, `2 classes`."""
+    return f"{count:,} {one if count == 1 else many or f'{one}s'}"

@@ -1,0 +1,438 @@
+"""Command lines: output, numbers for people, progress, exit codes, and errors as one line."""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import io
+import os
+import re
+import sys
+import time
+from collections.abc import Callable
+from importlib import metadata
+from types import TracebackType
+from typing import Annotated, Any, Self, TextIO
+
+import typer
+from rich.cells import cell_len
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, TaskID, TextColumn
+from rich.progress import Progress as Bars
+from rich.table import Table
+from rich.text import Text
+from typer.core import TyperGroup
+
+from sme_registry.errors import SMEError
+from sme_registry.io.files import to_json
+from sme_registry.io.system import missing_dependency
+
+_SECONDS_PER_DAY = 86_400
+
+
+def fixed(value: float, digits: int = 3) -> str:
+    """A number with a fixed count of digits, and no negative zero."""
+    return f"{value:z.{digits}f}"
+
+
+def duration(seconds: float) -> str:
+    """`42 s`, `3 min 10 s`, `2 h 5 min`, `3.5 days`."""
+    whole = max(0, round(seconds))
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    if whole < 2 * _SECONDS_PER_DAY:
+        return f"{whole // 3600} h {whole % 3600 // 60} min"
+    return f"{seconds / _SECONDS_PER_DAY:.1f} days"
+
+
+def duration_range(low: float, high: float) -> str:
+    """`3 min 10 s`, or `2 h 0 min to 4 h 5 min` where the bounds differ."""
+    first, last = duration(low), duration(high)
+    return first if first == last else f"{first} to {last}"
+
+
+_UNLIMITED = 100_000  # columns: lines of a file or a pipe are never wrapped
+
+
+class _Console(Console):
+    """Never wraps lines of output that is no terminal, and leaves broken pipes to `CommandGroup`.
+
+    Rich would wrap at 80 columns, and exit with code 1 if the pipe breaks. With FORCE_COLOR, which
+    Jupyter sets for the shell cells of a notebook, it would also draw bars into a pipe: colours are
+    possible there, but nothing that moves the cursor.
+    """
+
+    def __init__(self, file: TextIO) -> None:
+        super().__init__(file=file, highlight=False)
+        if self.is_terminal and os.environ.get("FORCE_COLOR") and not file.isatty():
+            super().__init__(
+                file=file, highlight=False, force_terminal=False, color_system="standard"
+            )
+        if not self.is_terminal:
+            self.width = _UNLIMITED
+
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError
+
+
+def out() -> Console:
+    """Standard output as it is now: tests and pipes replace it."""
+    return _Console(sys.stdout)
+
+
+def err() -> Console:
+    """Standard error, for progress and errors."""
+    return _Console(sys.stderr)
+
+
+def failure(message: str) -> None:
+    """One red line on standard error."""
+    err().print(f"[bold red]error:[/] {escape(message)}", soft_wrap=True)
+
+
+def print_json(value: Any) -> None:
+    """Plain JSON, and nothing else, on standard output."""
+    sys.stdout.write(to_json(value))
+
+
+def print_pairs(title: str, pairs: dict[str, object]) -> None:
+    """Names and values, one per line, under a title.
+
+    A value with a word that is too long for the rest of the line, such as a digest, starts on a
+    line of its own.
+    """
+    console = out()
+    console.print(title)
+    column = 1 + max(map(cell_len, pairs), default=0)
+    for name, value in pairs.items():
+        text = str(value)
+        if console.width - column < max(map(cell_len, text.split()), default=0):
+            console.print(f"[cyan]{escape(name)}[/]\n  {escape(text)}", soft_wrap=True)
+            continue
+        line = Table.grid()
+        line.add_column(width=column, style="cyan")
+        line.add_row(name, Text(text))
+        console.print(line)
+
+
+_SECONDS_TO_FIRST_LINE = 5.0
+_SECONDS_BETWEEN_TENTHS = 60.0
+_SECONDS_BETWEEN_BARS = 0.5
+_PARTS_NAMED = 3  # in a line
+
+
+class Progress:
+    """Shows steps done, the rate, the time left, a note, and the parts of the job that are running.
+
+    Args:
+      title: the job, such as `training`.
+      total: its steps.
+      done: steps that were done before it started.
+      console: where to print; None for standard error. If it is no terminal, lines replace bars.
+      unit: what a step is, in the plural.
+      seconds_left: estimates the time left; by default it follows from the rate.
+      enabled: False shows nothing.
+    """
+
+    def __init__(
+        self,
+        title: str,
+        total: int,
+        *,
+        done: int = 0,
+        console: Console | None = None,
+        unit: str = "steps",
+        seconds_left: Callable[[], float] | None = None,
+        enabled: bool = True,
+    ) -> None:
+        self._title, self._unit = title, unit
+        self._total, self._done_before, self._done = total, done, done
+        self._rate_from: tuple[int, float] | None = None  # steps and time; None while it prepares
+        self._console = console or Console(stderr=True)
+        self._seconds_left, self._enabled = seconds_left, enabled
+        self._note = ""
+        self._parts: dict[str, str] = {}  # how far they are
+        self._start = self._last = time.monotonic()
+        self._share_printed = 0.0
+        self._bars: Bars | None = None
+        self._tasks: dict[str, TaskID] = {}
+
+    def __enter__(self) -> Self:
+        self._start = self._last = time.monotonic()
+        self._rate_from = self._done, self._start
+        if self._enabled and self._console.is_terminal:
+            self._bars = Bars(
+                TextColumn("{task.description}"),
+                BarColumn(bar_width=24),
+                TextColumn("{task.fields[text]}"),
+                console=self._console,
+            )
+            self._tasks[""] = self._bars.add_task(
+                escape(self._title), total=self._total, completed=self._done, text=""
+            )
+            self._bars.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for name in tuple(self._parts):
+            self._remove(name)
+        if self._bars is not None:
+            self._draw()
+            self._bars.stop()
+        elif self._enabled and error is None and self._done_before < self._done >= self._total:
+            self._print()
+
+    def prepare(self, note: str) -> None:
+        """Show at once what precedes or slows the first steps, such as a compilation.
+
+        Until `prepared`, neither a rate nor the time left is shown: both would be wrong.
+        """
+        self._note, self._rate_from = note, None
+        if self._bars is not None:
+            self._draw()
+        else:
+            self.message(f"{self._title}: {note}")
+
+    def prepared(self) -> None:
+        """Measure the rate from here on, if it is not measured yet."""
+        self._rate_from = self._rate_from or (self._done, time.monotonic())
+
+    def update(self, done: int, note: str | None = None, *, total: int | None = None) -> None:
+        """Set how far the job is; cheap enough to call at every step.
+
+        Args:
+          done: steps done, including those before the start.
+          note: more text to show; None keeps the last one.
+          total: steps of the job, if they have changed.
+        """
+        self._done = done
+        self._note = self._note if note is None else note
+        self._total = self._total if total is None else total
+        self._refresh()
+
+    def update_of(self, done: int, total: int) -> None:
+        """Set how far the job is and how long it is, as callbacks `(done, total)` report it."""
+        self.update(done, total=total)
+
+    def start_part(self, name: str, note: str = "") -> None:
+        """Show a part of the job that runs from now on, and what it does first."""
+        self._parts[name] = f"({note})" if note else "0%"
+        if self._bars is not None:
+            label = f"  {escape(name)}"
+            self._tasks[name] = self._bars.add_task(label, total=1.0, text=note or "starting")
+        self._refresh()
+
+    def update_part(self, name: str, share: float, note: str = "") -> None:
+        """Set how far a part is, from 0 to 1."""
+        self._parts[name] = f"{share:.0%}"
+        if self._bars is not None:
+            self._bars.update(self._tasks[name], completed=share, text=note)
+        self._refresh()
+
+    def end_part(self, name: str) -> None:
+        """Stop showing a part; of one that was never started this does nothing."""
+        self._remove(name)
+        self._refresh()
+
+    def message(self, text: str) -> None:
+        """Print a line of its own, above the bars."""
+        if self._enabled:
+            self._console.print(escape(text), highlight=False, soft_wrap=True)
+
+    def _remove(self, name: str) -> None:
+        self._parts.pop(name, None)
+        if self._bars is not None and name in self._tasks:
+            self._bars.remove_task(self._tasks.pop(name))
+
+    def _refresh(self) -> None:
+        now = time.monotonic()
+        if not self._enabled:
+            return
+        if self._bars is not None:
+            if now - self._last >= _SECONDS_BETWEEN_BARS:
+                self._last = now
+                self._draw()
+        elif self._done < self._total and self._line_is_due(now):  # the last one is at the end
+            self._last, self._share_printed = now, self._done / self._total
+            self._print()
+
+    def _line_is_due(self, now: float) -> bool:
+        if now - self._start >= max(_SECONDS_TO_FIRST_LINE, 2 * (self._last - self._start)):
+            return True
+        another_tenth = self._done / self._total - self._share_printed >= 0.1
+        return another_tenth and now - self._last >= _SECONDS_BETWEEN_TENTHS
+
+    def _draw(self) -> None:
+        assert self._bars is not None
+        done, text = min(self._done, self._total), " · ".join(self._summary())
+        self._bars.update(self._tasks[""], completed=done, total=self._total, text=text)
+
+    def _print(self) -> None:
+        self.message(f"{self._title}: {' · '.join([*self._summary(), *self._running()])}")
+
+    def _summary(self) -> list[str]:
+        """`4 of 10 steps`, the rate, the time left, the note."""
+        now = time.monotonic()
+        done_before, start = self._rate_from or (self._done, now)
+        rate = (self._done - done_before) / max(now - start, 1e-9)
+        parts = [f"{self._done:,} of {self._total:,} {self._unit}"]
+        if rate > 0 and self._seconds_left is None:
+            parts.append(_rate(rate, self._unit))
+        if self._done >= self._total:
+            parts.append("done")
+        elif self._seconds_left is not None:
+            parts.append(f"about {duration(self._seconds_left())} left")
+        elif rate > 0:
+            parts.append(f"about {duration((self._total - self._done) / rate)} left")
+        return [*parts, self._note] if self._note else parts
+
+    def _running(self) -> list[str]:
+        if not self._parts:
+            return []
+        parts = [f"{name} {state}" for name, state in self._parts.items()]
+        more = f", and {len(parts) - _PARTS_NAMED} more" if len(parts) > _PARTS_NAMED else ""
+        return [f"running: {', '.join(parts[:_PARTS_NAMED])}{more}"]
+
+
+def _rate(rate: float, unit: str) -> str:
+    """`280 steps/s`; where a step takes longer than a second, `3 s per run`."""
+    if rate < 1 and unit.endswith("s"):
+        one = f"{unit[:-3]}y" if unit.endswith("ies") else unit[:-1]
+        return f"{duration(1 / rate)} per {one}"
+    return f"{rate:,.0f} {unit}/s"
+
+
+class CommandGroup(TyperGroup):
+    """Commands that report invalid input as one line on standard error and an exit code.
+
+    Attributes:
+      exit_codes: exit codes of error types; the first match counts. Any other `SMEError` is 2.
+      extra: the extra of our package that these commands need, if there is one.
+    """
+
+    exit_codes: tuple[tuple[type[SMEError], int], ...] = ()
+    extra: str = ""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        _show_literally(self)
+
+    def main(self, *args: Any, **options: Any) -> Any:
+        """Run the command line, and exit with its exit code."""
+        options |= {"standalone_mode": False, "prog_name": self.name}
+        _use_utf8()
+        try:
+            code = super().main(*args, **options)
+            sys.stdout.flush()
+        except BrokenPipeError:
+            sys.exit(_discard_output())
+        except Exception as error:
+            # Usage errors are Click's, which only some versions of Typer include: they are
+            # recognised by their method `format_message`.
+            if not hasattr(error, "format_message"):
+                raise
+            context = getattr(error, "ctx", None)
+            command = context.command_path if context is not None else self.name
+            message = error.format_message().replace("Value error, ", "").rstrip(".")
+            if message:  # empty if the help was printed instead
+                stop = "" if message.endswith(("?", "!")) else "."
+                failure(f"{message}{stop} See `{command} --help`.")
+            sys.exit(getattr(error, "exit_code", 2))
+        sys.exit(code if isinstance(code, int) else 0)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command; invalid input and interrupts end it without a traceback."""
+        try:
+            return super().invoke(ctx)
+        except SMEError as error:
+            failure(str(error))
+            codes = (code for kind, code in self.exit_codes if isinstance(error, kind))
+            raise typer.Exit(next(codes, 2)) from None
+        except ModuleNotFoundError as error:
+            missing = missing_dependency(error, self.extra)
+            if missing is None:
+                raise
+            failure(str(missing))
+            raise typer.Exit(2) from None
+        except BrokenPipeError:
+            raise typer.Exit(_discard_output()) from None
+        except KeyboardInterrupt as stopped:
+            failure(str(stopped) or "interrupted: no file is incomplete.")
+            raise typer.Exit(130) from None
+
+
+def _show_literally(command: Any) -> None:
+    """Make the help of a command and of all in it show as it is written, in paragraphs.
+
+    Markdown would remove asterisks, backticks and angle brackets, and Rich's markup brackets.
+    """
+    for each in (command, *command.params):
+        if getattr(each, "help", None):
+            each.help = escape(_in_paragraphs(inspect.cleandoc(each.help)))
+    for child in getattr(command, "commands", {}).values():
+        _show_literally(child)
+
+
+def _in_paragraphs(text: str) -> str:
+    """Text with one line per paragraph; indented ones, the examples, follow without empty lines."""
+    paragraphs = [re.sub(r"\n\s*", " ", part) for part in re.split(r"\n\s*\n", text)]
+    return re.sub(r"(?m)^( .*)\n\n(?= )", r"\1\n", "\n\n".join(paragraphs))
+
+
+def _show_version(context: typer.Context, wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"{context.info_name} {metadata.version('sme-registry')}")
+        raise typer.Exit
+
+
+def application(
+    program: str, description: str, commands: type[CommandGroup] = CommandGroup
+) -> typer.Typer:
+    """Create the application to which a program's commands are added; it has `--version`."""
+    app = typer.Typer(
+        name=program,
+        help=description,
+        cls=commands,
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        rich_markup_mode="rich",
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+
+    @app.callback()
+    def options(
+        version: Annotated[
+            bool,
+            typer.Option(
+                "--version", callback=_show_version, is_eager=True, help="Show the version."
+            ),
+        ] = False,
+    ) -> None:
+        pass
+
+    return app
+
+
+def _use_utf8() -> None:
+    """Print UTF-8 also where the system's default is another encoding, as in pipes on Windows."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.encoding.lower() != "utf-8":
+            stream.reconfigure(encoding="utf-8")
+
+
+def _discard_output() -> int:
+    """Handle a reader that has closed the pipe (`sme list | head`), which is no error: code 0.
+
+    Otherwise Python would report at exit that it cannot flush its output.
+    """
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
