@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from sme_registry.io import available_memory, memory
+from sme_registry.io import available_memory, system
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 
@@ -28,8 +28,8 @@ def groups(monkeypatch, tmp_path):
             (group / limit_name).write_text(number + "\n")
             (group / use_name).write_text(f"{use * MIB}\n")
             (group / "memory.stat").write_text(f"anon 1\n{cache_name} {cache * MIB}\n")
-        monkeypatch.setattr(memory, "_PROC", tmp_path)
-        monkeypatch.setattr(memory, "_CGROUPS", tmp_path / "groups")
+        monkeypatch.setattr(system, "_PROC", tmp_path)
+        monkeypatch.setattr(system, "_CGROUPS", tmp_path / "groups")
         return available_memory() // MIB
 
     return made
@@ -67,7 +67,7 @@ def test_this_machine_has_memory_to_spare():
 def test_without_control_groups_or_a_list_of_memory_all_of_the_machine_counts(
     monkeypatch, tmp_path
 ):
-    monkeypatch.setattr(memory, "_PROC", tmp_path)
+    monkeypatch.setattr(system, "_PROC", tmp_path)
     assert available_memory() == os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     (tmp_path / "meminfo").write_text("MemTotal: 256 kB\nMemAvailable: 64 kB\n")
     assert available_memory() == 64 * 1024

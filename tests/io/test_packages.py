@@ -13,7 +13,7 @@ import pytest
 
 import sme_registry
 from sme_registry.errors import MissingDependencyError
-from sme_registry.io import install_command, missing_dependency, packages, require_packages
+from sme_registry.io import install_command, missing_dependency, require_packages, system
 from tests.wheel.test_extras import closure, normalised
 
 ROOT = Path(sme_registry.__file__).parents[1]
@@ -33,8 +33,8 @@ def test_a_copy_is_installed_again_from_its_origin(monkeypatch, tmp_path):
     ):
         # As pip records it, in direct_url.json.
         recorded = SimpleNamespace(read_text=lambda name: origin and json.dumps(origin))  # noqa: B023
-        monkeypatch.setattr(packages, "_SOURCE", tmp_path / "site-packages")
-        monkeypatch.setattr(packages.metadata, "distribution", lambda name: recorded)  # noqa: B023
+        monkeypatch.setattr(system, "_SOURCE", tmp_path / "site-packages")
+        monkeypatch.setattr(system.metadata, "distribution", lambda name: recorded)  # noqa: B023
         assert requirement(install_command("plot")) == expected
         assert "-e" not in shlex.split(install_command("plot"))
 
@@ -50,7 +50,7 @@ def test_missing_packages_are_named_with_the_extra_and_the_alternative():
 
 
 @pytest.mark.skipif(
-    not packages._extras(), reason="reads the extras of the installed package; it is not installed"
+    not system._extras(), reason="reads the extras of the installed package; it is not installed"
 )
 def test_a_failed_import_is_explained_by_the_extra_that_has_the_module():
     def extra(module, *preferred):
@@ -89,7 +89,7 @@ def hints():
     return found
 
 
-@pytest.mark.skipif(not packages._extras(), reason="reads the extras of the installed package")
+@pytest.mark.skipif(not system._extras(), reason="reads the extras of the installed package")
 def test_every_hint_names_an_extra_that_has_the_missing_module():
     distributions, found = metadata.packages_distributions(), hints()
     assert len(found) > 20
