@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sme_registry.envs.episode_safety import EpisodeSafety, safety_of_step
+from sme_registry.envs.episodes import EpisodeSafety, safety_of_step
 from sme_registry.errors import OptionError
 from sme_registry.spec import SMESpec
 

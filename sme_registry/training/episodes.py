@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from sme_registry.envs.episode_safety import EpisodeSafety
+from sme_registry.envs.episodes import EpisodeSafety
 from sme_registry.errors import OptionError
 from sme_registry.io import write_atomically
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from rich.console import Console
 from stable_baselines3.common.logger import configure
 
-from sme_registry.envs.episode_safety import EpisodeSafety, safety_of_step
+from sme_registry.envs.episodes import EpisodeSafety, safety_of_step
 from sme_registry.errors import OptionError
 from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.io import is_installed, read_arrays, write_arrays, write_atomically

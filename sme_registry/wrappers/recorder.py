@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sme_registry.envs.episode_safety import EpisodeSafety
+from sme_registry.envs.episodes import EpisodeSafety
 from sme_registry.envs.types import Array, Mask
 from sme_registry.errors import OptionError
 from sme_registry.io import refuse_existing

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
-from sme_registry.envs.episode_safety import safety_of_step
+from sme_registry.envs.episodes import safety_of_step
 from sme_registry.wrappers.recorder import Recorder, measured
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv, VectorWrapper
 
-from sme_registry.envs.episode_safety import safety_of_step
+from sme_registry.envs.episodes import safety_of_step
 from sme_registry.spec import SMESpec
 from sme_registry.wrappers.recorder import Recorder, measured
 

@@ -1,0 +1,221 @@
+"""`Episodes`: the exact regret of every episode, summed from the steps of parallel environments.
+
+A training loop, a callback or a wrapper adds rewards and infos; a team's episode is one of all its
+agents. `B` lanes, `n` agents of each, `N` steps. Sums are `[7, B, n]`:
+
+    return, length, regret, similarity;  and of a task with `safety`: cost, violations, safe regret
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.envs.types import Array
+from sme_registry.errors import OptionError
+from sme_registry.spec import SMESpec
+
+# Excess over the limits, summed over channels, up to which an action is safe: evaluation's
+# tolerance of one channel or, where A > 16, what rounding to float32 can add to a safe action.
+_TOLERANCE, _ROUNDING = 1e-6, 6e-8
+
+_PLAIN, _SAFETY = ("regret", "similarity"), ("cost", "safe_regret")
+_REGRET, _SAFETY_SUMS = 2, slice(4, 7)
+
+
+class EpisodeSafety(NamedTuple):
+    """Means over the steps of an episode of a task with `safety`.
+
+    Attributes:
+      cost: the mean cost, in [0, 1].
+      violating_share: the share of steps whose action was above its limits by more than 10⁻⁶,
+        summed over channels (6·10⁻⁸ A where A > 16), in [0, 1]. Infos have no action, so this is
+        not evaluation's rule, by which one channel must be: it differs where several are above by
+        less.
+      safe_regret: mean step reward that the best safe action earns more, in [−1, 1]; negative
+        where the agent earned by violating.
+    """
+
+    cost: float
+    violating_share: float
+    safe_regret: float
+
+
+class Episode(NamedTuple):
+    """A finished episode; of a team, one episode of the whole team.
+
+    Attributes:
+      episode: its number, from 1.
+      step: environment steps over all environments when it ended; a step of a team is one step of
+        all its agents.
+      episode_return: sum of its rewards, in [0, T]. For a team, this, `regret` and `similarity`
+        are means over its agents.
+      length: number of steps.
+      regret: mean of 1 − r over its steps, in [0, 1]; exact.
+      similarity: mean r̃ over its steps, in [0, 1]; exact.
+      terminated: 1 if it ended by D, 0 if it reached the horizon.
+      wall_seconds: since the beginning when it ended.
+      agents_regret: mean regret of each agent, in the team's order; empty for a single agent.
+      safety: what it cost; None for a task without `safety`.
+    """
+
+    episode: int
+    step: int
+    episode_return: float
+    length: int
+    regret: float
+    similarity: float
+    terminated: int
+    wall_seconds: float
+    agents_regret: tuple[float, ...] = ()
+    safety: EpisodeSafety | None = None
+
+
+class Episodes:
+    """The present episode of each lane, and the finished ones.
+
+    Attributes:
+      finished: the episodes, oldest first.
+      steps: environment steps so far, over all lanes.
+      sums: `[7, B, n]` over the present episodes; a program can save and restore them.
+    """
+
+    def __init__(
+        self,
+        lanes: int = 1,
+        agents: int = 1,
+        spec: Callable[[], SMESpec] | None = None,
+        *,
+        steps: int = 0,
+        clock: Callable[[], float] | None = None,
+    ) -> None:
+        """`spec` is called once, where infos have costs; `clock` gives an episode's seconds."""
+        self.finished: list[Episode] = []
+        self.steps = steps
+        self.sums = np.zeros((7, lanes, agents))
+        self._spec = cache(spec) if spec is not None else None
+        self._start, self._clock = time.monotonic(), clock
+        self._counted, self._total_regret = 0, 0.0
+
+    @property
+    def online_regret(self) -> float:
+        """Mean regret over all steps that were added; NaN before the first."""
+        return self._total_regret / self._counted if self._counted else float("nan")
+
+    def begin(self, lanes: Any = slice(None)) -> None:
+        """Forget the present episodes of some lanes."""
+        self.sums[:, lanes] = 0.0
+
+    def add(
+        self,
+        rewards: npt.ArrayLike,
+        info: Mapping[str, Any],
+        terminated: npt.ArrayLike,
+        ended: npt.ArrayLike,
+    ) -> list[Episode]:
+        """Add one or more steps of every lane; returns the episodes that ended in them.
+
+        Each argument, and each entry of `info`, has an entry for each step, lane and agent:
+        `[B]`, `[N, B]` or `[N, B, n]`, or flat in that order. Where the regret is NaN, the lane
+        began an episode instead.
+        """
+        shape = (-1, *self.sums.shape[1:])
+        try:
+            regret, similarity = (_numbers(info[key], shape) for key in _PLAIN)
+        except KeyError as error:
+            raise OptionError(
+                f"the environment's info has no {error}. Use an environment of sme_registry, with "
+                "wrappers that keep its info."
+            ) from None
+        stepped = ~np.isnan(regret)
+        plain = [_numbers(rewards, shape), stepped, regret, similarity]
+        values = np.array([*plain, *self._safety(info, shape)])
+        if not stepped.all():
+            values[:, ~stepped] = 0.0
+            regret = regret[stepped]
+        self._counted += regret.size
+        self._total_regret += float(regret.sum())
+        steps = self.steps + np.cumsum(np.count_nonzero(stepped[..., 0], axis=1))
+        ends = (np.reshape(ended, shape) & stepped)[..., 0]
+        failures = np.reshape(terminated, shape)[..., 0]
+        begin, before = 0, len(self.finished)
+        for row in np.flatnonzero(ends.any(axis=1)).tolist():
+            self._sum(values[:, begin : row + 1])
+            self.steps, begin = int(steps[row]), row + 1
+            for lane in np.flatnonzero(ends[row]).tolist():
+                self._finish(lane, bool(failures[row, lane]), "cost" in info)
+        self._sum(values[:, begin:])
+        self.steps = int(steps[-1])
+        return self.finished[before:]
+
+    def _sum(self, values: Array) -> None:
+        sums = self.sums[: len(values)]
+        if values.shape[1] == 1:
+            sums += values[:, 0]
+        else:  # one step after the other: the same bits, however many come at once
+            steps = np.concatenate([sums[:, None], values], axis=1)
+            sums[:] = np.add.accumulate(steps, axis=1)[:, -1]
+
+    def _safety(self, info: Mapping[str, Any], shape: tuple[int, ...]) -> tuple[Array, ...]:
+        """Cost, violations and safe regret, `[N, B, n]` each; nothing without `safety`."""
+        if "cost" not in info:
+            return ()
+        if self._spec is None:
+            raise OptionError("Episodes: the task has safety. Give spec, such as lambda: env.spec.")
+        cost, safe_regret = (_numbers(info[key], shape) for key in _SAFETY)
+        return cost, _violations(cost, self._spec()), safe_regret
+
+    def _finish(self, lane: int, terminated: bool, has_safety: bool) -> None:
+        sums = self.sums[:, lane]
+        episode_return, length, regret, similarity = sums[:4].mean(axis=1).tolist()
+        by_agent = sums[_REGRET] / length if sums.shape[1] > 1 else ()
+        safety = (sums[_SAFETY_SUMS, 0] / length).tolist()
+        seconds = time.monotonic() - self._start if self._clock is None else self._clock()
+        self.finished.append(
+            Episode(
+                episode=len(self.finished) + 1,
+                step=self.steps,
+                episode_return=episode_return,
+                length=int(length),
+                regret=regret / length,
+                similarity=similarity / length,
+                terminated=int(terminated),
+                wall_seconds=round(seconds, 3),
+                agents_regret=tuple(map(float, by_agent)),
+                safety=EpisodeSafety(*safety) if has_safety else None,
+            )
+        )
+        self.begin(lane)
+
+
+def info_of_lanes(infos: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """What `Episodes.add` reads of infos of single lanes, as the info of all of them."""
+    keys = [key for key in (*_PLAIN, *_SAFETY) if key in infos[0]]
+    return {key: [info[key] for info in infos] for key in keys}
+
+
+def _numbers(values: Any, shape: tuple[int, ...]) -> Array:
+    return np.asarray(values, np.float64).reshape(shape)
+
+
+def _violations(cost: Array, spec: SMESpec) -> Array:
+    """1 where a step's action was above its limits, from its cost."""
+    assert spec.safety is not None  # the infos have costs
+    excess = cost * (2.0 * spec.safety.tightness * spec.action_dim)
+    return (excess > max(_TOLERANCE, _ROUNDING * spec.action_dim)).astype(np.float64)
+
+
+def safety_of_step(
+    infos: Mapping[str, Any] | Sequence[Mapping[str, Any]], spec: Callable[[], SMESpec]
+) -> Array | None:
+    """The summands of `EpisodeSafety`, `[3, B]`, of a step of each lane; None without `safety`."""
+    info = infos if isinstance(infos, Mapping) else info_of_lanes(infos)
+    if "cost" not in info:
+        return None
+    cost, safe_regret = (_numbers(info[key], (-1,)) for key in _SAFETY)
+    return np.array([cost, _violations(cost, spec()), safe_regret])
