@@ -6,17 +6,16 @@ Exit codes: 0 success; 1 a task refused by `certify`, or failed cells of a study
 
 from __future__ import annotations
 
-from sme_registry.cli import dataset, offline, study, suite
-from sme_registry.cli.certify import certify
+from sme_registry.cli import study
+from sme_registry.cli.check import certify, validate
+from sme_registry.cli.data import dataset, offline
 from sme_registry.cli.demo import demo
 from sme_registry.cli.diagnose import diagnose
 from sme_registry.cli.evaluate import evaluate
 from sme_registry.cli.explore import explore
-from sme_registry.cli.list import list_
-from sme_registry.cli.new import new
-from sme_registry.cli.show import show
+from sme_registry.cli.new import new, suite
+from sme_registry.cli.show import list_, show
 from sme_registry.cli.train import train
-from sme_registry.cli.validate import validate
 from sme_registry.io.terminal import application
 
 app = application(
@@ -45,10 +44,10 @@ app = application(
 app.command("list")(list_)
 for _command in (show, new, validate, certify, evaluate, train, diagnose, explore, demo):
     app.command()(_command)
-app.add_typer(suite.app, name="suite")
+app.add_typer(suite, name="suite")
 app.add_typer(study.app, name="study")
-app.add_typer(dataset.app, name="dataset")
-app.add_typer(offline.app, name="offline")
+app.add_typer(dataset, name="dataset")
+app.add_typer(offline, name="offline")
 
 
 def main() -> None:

@@ -9,8 +9,7 @@ import numpy as np
 import typer
 from rich.markup import escape
 
-from sme_registry.cli.arguments import Force
-from sme_registry.cli.files import write_run_explorer
+from sme_registry.cli.arguments import Force, write_run_explorer
 from sme_registry.evaluation import EvaluationReport
 from sme_registry.io import write_atomically
 from sme_registry.io.markup import environment

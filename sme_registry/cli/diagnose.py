@@ -10,8 +10,16 @@ import typer
 from rich.markup import escape
 
 from sme_registry import SMESpec, load
-from sme_registry.cli.arguments import ActionRange, Force, Json, Out, SpecChanges, changes
-from sme_registry.cli.files import can_draw, print_written
+from sme_registry.cli.arguments import (
+    ActionRange,
+    Force,
+    Json,
+    Out,
+    SpecChanges,
+    can_draw,
+    changes,
+    print_written,
+)
 from sme_registry.errors import OptionError
 from sme_registry.io import refuse_existing, to_json, write_atomically
 from sme_registry.io.terminal import err, out, print_json

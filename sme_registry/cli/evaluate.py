@@ -1,9 +1,10 @@
-"""`sme evaluate`: evaluate a policy in and out of distribution."""
+"""`sme evaluate`: a policy on a task, or the policies of a life on a stream."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
@@ -14,16 +15,24 @@ from sme_registry.cli.arguments import (
     Out,
     Protocol,
     SpecChanges,
+    can_draw,
     changed,
     changes,
+    print_tables,
+    print_written,
 )
-from sme_registry.cli.evaluate_stream import Life, evaluate_life
-from sme_registry.cli.files import can_draw, print_tables, print_written
 from sme_registry.errors import OptionError
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.io import refuse_existing
 from sme_registry.io.terminal import Progress, err, print_json
-from sme_registry.spec import EnvFile, StreamFile, StreamSpec, catalogue
+from sme_registry.spec import (
+    EnvFile,
+    EvaluationProtocol,
+    SMESpec,
+    StreamFile,
+    StreamSpec,
+    catalogue,
+)
 from sme_registry.task import load_document
 
 
@@ -110,24 +119,23 @@ def evaluate(
       sme evaluate runs/life/snapshots/visit-*.zip Switch5 --initial runs/life/snapshots/initial.zip
     """
     document = changed(load_document(task), task, changes(set_))
-    if isinstance(document, StreamSpec):
-        life = Life(policies, initial, fresh, action_range, algorithm)
-        evaluate_life(life, document, protocol, out_folder, force=force, json=json)
-        return
-    policy = _alone(policies, initial, fresh, task)
+    given = _Policies(policies, initial, fresh, action_range, algorithm)
+    _check_number(given, task, document)
     from sme_registry import evaluation
+    from sme_registry.plots.streams import FILE
 
     resolved = evaluation.resolve_protocol(protocol)
-    target = None if out_folder is None else out_folder / "evaluation.json"
+    name = FILE if isinstance(document, StreamSpec) else "evaluation.json"
+    target = None if out_folder is None else out_folder / name
     if target is not None:
         refuse_existing(target, force=force)
-    prepared = evaluation.as_policy(
-        policy, document, action_range=action_range, algorithm=algorithm
-    )
-    states = resolved.states_per_region * len(resolved.edges)
-    with Progress("evaluating", states, unit="states", console=err()) as progress:
-        report = evaluation.evaluate(prepared, document, resolved, progress=progress.update_of)
-    files = [] if target is None else [report.write(target), *_figures(report, prepared, target)]
+    if isinstance(document, StreamSpec):
+        report, draw = _on_stream(given, document, resolved)
+    else:
+        report, draw = _on_task(given, document, resolved)
+    files = []
+    if target is not None:
+        files = [report.write(target), *(draw(target.parent) if can_draw() else ())]
     if json:
         print_json(report.to_dict())
     else:
@@ -135,26 +143,90 @@ def evaluate(
     print_written(files)
 
 
-def _alone(policies: list[str], initial: str | None, fresh: list[str] | None, task: str) -> str:
-    """The one policy for a single task.
+# A report, and what draws its figures into a folder.
+_Evaluated = tuple[Any, Callable[[Path], list[Path]]]
 
-    Raises:
-      OptionError: several, or one that only a stream needs.
-    """
-    if len(policies) > 1:
+
+class _Policies(NamedTuple):
+    """The policies, as the command line has them; `initial` and `fresh` only of a stream."""
+
+    policies: list[str]
+    initial: str | None
+    fresh: list[str] | None
+    action_range: str | None
+    algorithm: str | None
+
+    def options(self) -> dict[str, Any]:
+        """How their files are read."""
+        return {"action_range": self.action_range, "algorithm": self.algorithm}
+
+
+def _check_number(given: _Policies, task: str, document: SMESpec | StreamSpec) -> None:
+    number = len(given.policies)
+    if isinstance(document, StreamSpec):
+        document.refuse_many_visits()
+        if number not in (1, document.visits):
+            raise OptionError(
+                f"{number} policies: must be one for the whole life, or {document.visits}, one at "
+                "the end of each visit."
+            )
+        return
+    if number > 1:
         raise OptionError(
-            f"{' '.join(policies):.80}: are {len(policies)} policies: must be one for the task "
+            f"{' '.join(given.policies):.80}: are {number} policies: must be one for the task "
             f"{task!r}. Only a stream needs one for each visit."
         )
-    for option, value in (("--initial", initial), ("--fresh", fresh)):
+    for option, value in (("--initial", given.initial), ("--fresh", given.fresh)):
         if value:
             raise OptionError(f"{option}: is for streams, and {task!r} is a task. Leave it out.")
-    return policies[0]
 
 
-def _figures(report: Any, policy: Any, target: Path) -> list[Path]:
-    if not can_draw():
-        return []
-    from sme_registry.plots.files import write_evaluation
+def _progress(protocol: EvaluationProtocol) -> Progress:
+    states = protocol.states_per_region * len(protocol.edges)
+    return Progress("evaluating", states, unit="states", console=err())
 
-    return write_evaluation(report, target.parent, policy)
+
+def _on_task(given: _Policies, spec: SMESpec, protocol: EvaluationProtocol) -> _Evaluated:
+    from sme_registry import evaluation
+
+    policy = evaluation.as_policy(given.policies[0], spec, **given.options())
+    with _progress(protocol) as progress:
+        report = evaluation.evaluate(policy, spec, protocol, progress=progress.update_of)
+
+    def draw(folder: Path) -> list[Path]:
+        from sme_registry.plots.files import write_evaluation
+
+        return write_evaluation(report, folder, policy)
+
+    return report, draw
+
+
+def _on_stream(given: _Policies, stream: StreamSpec, protocol: EvaluationProtocol) -> _Evaluated:
+    from sme_registry import evaluation
+
+    policies: list[Any] = [*given.policies]
+    learns = len(policies) > 1
+    if not learns:
+        task, phases = stream.phases[0].spec, stream.observed_phases
+        policy = evaluation.as_policy(policies[0], task, observed_phases=phases, **given.options())
+        policies = [policy] * stream.visits
+    with _progress(protocol) as progress:
+        report = evaluation.evaluate_stream(
+            policies,
+            stream,
+            protocol,
+            initial=given.initial,
+            fresh=given.fresh,
+            progress=progress.update_of,
+            **given.options(),
+        )
+    report = report.with_reference_regret(evaluation.reference_regret(stream))
+    if not learns:
+        report = report.with_dynamic_regret(evaluation.expected_regret(policies, stream))
+
+    def draw(folder: Path) -> list[Path]:
+        from sme_registry.plots.files import write_stream
+
+        return write_stream(report, folder)
+
+    return report, draw

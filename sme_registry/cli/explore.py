@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sme_registry.cli.arguments import ActionRange, Force, SpecChanges, changes
-from sme_registry.cli.files import print_written
+from sme_registry.cli.arguments import ActionRange, Force, SpecChanges, changes, print_written
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.io import integer_in, refuse_existing
 from sme_registry.spec import EnvFile, SMESpec, catalogue

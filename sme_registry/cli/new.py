@@ -1,4 +1,4 @@
-"""`sme new`: write a task's file."""
+"""`sme new` and `sme suite new`: write the file of a task or of a suite."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ import typer
 from rich.markup import escape
 
 from sme_registry import load
-from sme_registry.cli.arguments import Force, json_or_text
-from sme_registry.cli.files import check_document_path
+from sme_registry.cli.arguments import Force, check_document_path, json_or_text
+from sme_registry.cli.plan import ClassOptions, with_options
 from sme_registry.errors import OptionError
 from sme_registry.io import integer_in, read_json
-from sme_registry.io.terminal import err, out
-from sme_registry.spec import EnvFile, SMESpec, catalogue
+from sme_registry.io.markup import plural
+from sme_registry.io.terminal import CommandGroup, err, out
+from sme_registry.spec import EnvFile, SMESpec, Suite, SuiteFile, catalogue
 
 _MOST_AGENTS = 2**12  # the spec allows far fewer; a list of billions would fill the memory
 _NO_OPTION = ("schema_version", "team")
@@ -189,3 +190,64 @@ def _with_reward(start: SMESpec, team: Any, reward: str) -> dict[str, Any]:
     if not isinstance(team, dict):
         raise OptionError(f"--team-reward {reward}: needs a team. Add --agents or --team.")
     return {**team, "reward": reward}
+
+
+class _NewByDefault(CommandGroup):
+    """A group whose command `new` may be left out."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        named = args and args[0] in (*self.commands, *self.get_help_option_names(ctx))
+        parsed: list[str] = super().parse_args(ctx, args if named or not args else ["new", *args])
+        return parsed
+
+
+suite = typer.Typer(
+    cls=_NewByDefault,
+    no_args_is_help=True,
+    help="""Suites of your own: classes of tasks, each with several instances.
+
+    Examples:
+
+      sme suite new mine.json -t Default -t HardSparse --instances 5
+
+      sme suite new more.json --suite smoke -t Complexity50
+    """,
+)
+
+
+@suite.command("new")
+@with_options(ClassOptions)
+def new_suite(
+    path: Annotated[Path, typer.Argument(help="The file to write.", dir_okay=False)],
+    options: ClassOptions,
+    name: Annotated[str | None, typer.Option(help="By default the file's name.")] = None,
+    description: Annotated[str, typer.Option(help="One or two sentences.")] = "",
+    force: Force = False,
+) -> None:
+    """Write a suite's file: classes of tasks or streams, each with several instances.
+
+    A class is one setting under several seeds, so that a method is judged on a kind of task and not
+    on one draw. Studies, leaderboards and --suite accept the file like the name of a suite;
+    leaderboards only if it has no streams. `sme suite FILE` is short for `sme suite new FILE`.
+
+    Examples:
+
+      sme suite new mine.json -t Default -t HardSparse -t k2.json --instances 5
+
+      sme suite new intervals.json -t Default --sweep k=1,5,25 --instances 3
+
+      sme suite new more.json --suite smoke -t Complexity50
+
+      sme suite new lives.json -t Switch5 -t Related5 --instances 5
+    """
+    check_document_path(path, force=force)
+    members = Suite.from_dict(options.members())
+    file = SuiteFile(
+        name=name or path.stem, description=description, digest=members.digest, suite=members
+    )
+    file.write(path)
+    classes = plural(len(members.runs), "class", "classes")
+    tasks = f"{classes}, {plural(sum(members.runs.values()), 'instance')}"
+    out().print(f"{escape(str(path))}  {file.digest}", soft_wrap=True)
+    hint = f"{tasks}. To train an algorithm on them: sme train --suite {path} -a PPO"
+    err().print(f"[dim]{escape(hint)}[/]", soft_wrap=True)

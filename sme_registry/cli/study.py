@@ -1,8 +1,9 @@
-"""`sme study`: plan, run, inspect and report studies."""
+"""`sme study`: run, inspect, report and compare studies."""
 
 from __future__ import annotations
 
 import enum
+import re
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,17 +11,20 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from sme_registry.cli import study_compare, study_new, study_plan, study_sweep
 from sme_registry.cli.arguments import Json, Out, find_file
-from sme_registry.cli.study_plan import (
+from sme_registry.cli.plan import (
     Agents,
     Evaluations,
     Jobs,
     Only,
+    PlanOptions,
     Seeds,
     Steps,
+    new,
+    plan,
     scaled_plan,
     unique,
+    with_options,
 )
 from sme_registry.errors import OptionError
 from sme_registry.io.tables import Table
@@ -29,6 +33,7 @@ from sme_registry.spec import StudyFile, catalogue
 
 if TYPE_CHECKING:
     from sme_registry.studies.engine.status import CellStatus, State, StudyStatus
+
 
 _FAILURES_SHOWN = 20
 ExecutorName = enum.StrEnum("ExecutorName", ["processes", "in-process", "ray"])
@@ -52,13 +57,8 @@ app = typer.Typer(
       sme study compare runs/smoke PPO TD3
     """,
 )
-app.command("new")(study_new.new)
-app.command("plan")(study_plan.plan)
-app.command("sweep")(study_sweep.sweep)
-app.command("compare")(study_compare.compare)
 
 
-@app.command("run")
 def run(
     plan: Annotated[
         str,
@@ -158,7 +158,6 @@ def run(
         raise typer.Exit(1)
 
 
-@app.command("status")
 def status(
     folder: Annotated[Path, typer.Argument(help="The study's folder.")],
     only: Only = None,
@@ -186,7 +185,6 @@ def status(
     print_status(study_status(folder, only or None, scale), json)
 
 
-@app.command("report")
 def report(
     folder: Annotated[Path, typer.Argument(help="The study's folder.")],
     out_folder: Out = None,
@@ -295,3 +293,107 @@ def _counts(counts: Counter[State] | None) -> str:
     if counts["failed"]:
         text += f" [red]!{counts['failed']}[/]"
     return f"{text} [dim]/ {counts.total()}[/]"
+
+
+def compare(
+    folder: Annotated[Path, typer.Argument(help="The study's folder.")],
+    first: Annotated[str, typer.Argument(metavar="A", help="An algorithm of the plan, by name.")],
+    second: Annotated[str, typer.Argument(metavar="B", help="The one it is compared with.")],
+    metric: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--metric",
+            "-m",
+            help="wd_regret, ood_regret, ood_decay, final_return or online_regret. Repeatable; "
+            "default wd_regret and ood_regret.",
+        ),
+    ] = None,
+    out_folder: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="Also write CSV, JSON, LaTeX, and figures as PNG and PDF."
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Compare two algorithms of a study: the difference A − B on each class, with its interval.
+
+    Runs are compared in pairs: those on the same instance with the same seed. An interval that
+    excludes 0 and rests on at least 5 pairs is marked: * if A is worse, † if A is better.
+
+    Each .tex file is a complete table with its own caption and label: \\input it outside of any
+    table environment.
+
+    Examples:
+
+      sme study compare runs/smoke PPO TD3
+
+      sme study compare runs/mine slow fast --metric wd_regret --out paper/slow-fast
+
+      sme study compare runs/smoke PPO TD3 --json
+    """
+    from sme_registry.studies.report import compare as comparison
+    from sme_registry.studies.report.exports import difference_caveats
+
+    metrics = tuple(metric or comparison.DEFAULT_METRICS)
+    differences = comparison.compare(folder, first, second, metrics)
+    files = []
+    if out_folder is not None:
+        files = comparison.write_comparison(folder, out_folder, first, second, metrics)
+    if json:
+        print_json(comparison.records(differences))
+        return
+    for each in comparison.comparison_tables(differences):
+        columns = {escape(name): "number" for name in each.frame.columns} | {"class": "name"}
+        rows = (tuple(map(escape, row)) for row in each.frame.itertuples(index=False))
+        out().print(Table(f"[bold]{escape(each.title)}[/]", columns, rows))
+    caveats = comparison.implementation_caveats(folder, first, second)
+    for sentence in (*difference_caveats(differences), *caveats):
+        out().print(escape(sentence), soft_wrap=True)
+    if files:
+        out().print(f"{escape(str(out_folder))}  {len(files)} files", soft_wrap=True)
+
+
+@with_options(PlanOptions)
+def sweep(
+    folder: Annotated[
+        Path, typer.Option("--folder", "-f", help="The study's folder; created if necessary.")
+    ],
+    options: PlanOptions,
+    jobs: Jobs = None,
+) -> None:
+    """Vary a field of a task, run an algorithm on each value, and draw regret against the value.
+
+    One command for `study new --sweep`, `study run` and `study report`. Interrupt it at any time
+    and run it again to continue; add values or seeds, and only the new cells run. The report is in
+    FOLDER/report.
+
+    Examples:
+
+      sme study sweep -t Default --sweep k=1,2,5,10 -a PPO -n 20000 --seeds 5 -f runs/k
+
+      sme study sweep -t Team4 --sweep team.reward=individual,team -a PPO --seeds 3 -f runs/reward
+
+      sme study sweep -t Default --sweep k=1,5 --sweep D=0,0.25 -a PPO -a reference:linear -f runs/2
+    """
+    from sme_registry.studies import run_study, write_report
+
+    if not options.sweep:
+        raise OptionError("--sweep: is required, such as --sweep k=1,2,5,10.")
+    plan = options.plan("the options")
+    name = re.sub(r"[^A-Za-z0-9_-]+", "-", folder.resolve().name)[:64] or "sweep"
+    file = StudyFile(name=name, digest=plan.digest, plan=plan)
+    status = run_study(file, folder, jobs=jobs, console=err())
+    for path in write_report(folder):
+        if path.name == "index.html" or path.stem.startswith(
+            ("regret-", "wd-regret", "ood-regret")
+        ):
+            out().print(escape(str(path)), soft_wrap=True)
+    if status.failed:
+        failed = f"{len(status.failed)} of {len(status.cells)} cells failed"
+        err().print(f"[bold red]{failed}.[/] See `sme study status {escape(str(folder))}`.")
+        raise typer.Exit(1)
+
+
+for _command in (new, plan, sweep, compare, run, status, report):
+    app.command()(_command)

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from sme_registry import EvaluationReport, SMESpec, StreamSpec, evaluate
-from sme_registry.cli.train_suite import equal_runs
+from sme_registry.cli.train import equal_runs
 from sme_registry.errors import (
     MissingDependencyError,
     OptionError,

@@ -1,0 +1,602 @@
+"""The plan of a study: its options, its table, and `sme study plan` and `new`."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import typing
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from sme_registry.cli.arguments import (
+    Force,
+    Json,
+    Protocol,
+    check_document_path,
+    find_file,
+    json_or_text,
+)
+from sme_registry.cli.show import number_of_cells, study_table, summary
+from sme_registry.errors import MissingDependencyError, OptionError, SMEError
+from sme_registry.io import integer_in, parse_json, read_json
+from sme_registry.io.tables import Table
+from sme_registry.io.terminal import duration_range, err, out, print_json
+from sme_registry.spec import (
+    Document,
+    EnvFile,
+    PlannedCell,
+    SMESpec,
+    StreamClass,
+    StreamFile,
+    StreamSpec,
+    StudyAlgorithm,
+    StudyFile,
+    StudyPlan,
+    SuiteClass,
+    SuiteFile,
+    catalogue,
+)
+from sme_registry.spec.resolve import is_path
+from sme_registry.spec.study import INDEPENDENT
+from sme_registry.spec.sweep import sweep
+from sme_registry.task import load_document
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClassOptions:
+    """Options of a command that describe classes of tasks and streams, each with its help."""
+
+    suite: Annotated[
+        str | None,
+        typer.Option(
+            help="A suite of classes: name or path.", autocompletion=catalogue.completion(SuiteFile)
+        ),
+    ] = None
+    task: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--task",
+            "-t",
+            help="A task, or a stream, as a class of its own. Repeatable.",
+            autocompletion=catalogue.completion(EnvFile, StreamFile),
+        ),
+    ] = None
+    sweep: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FIELD=VALUE,…",
+            help="Vary a field of the --task, such as k=1,2,5 or D=0,0.25: a "
+            "class for each value. Repeatable: each sweep is an axis of its own around the task, "
+            "not a cross product.",
+        ),
+    ] = None
+    instances: Annotated[
+        int,
+        typer.Option(
+            help="Draws of each --task: its seed and those that follow; of a stream, other tasks "
+            "for all of its phases."
+        ),
+    ] = 1
+
+    def members(self) -> dict[str, list[dict[str, Any]]]:
+        """The classes of a suite, one for each task or stream, or those of the sweeps.
+
+        Returns:
+          The fields `classes` and `streams` of a suite or a plan; no field that is empty.
+        """
+        tasks = self.task or ()
+        if self.sweep and (self.suite is not None or len(tasks) != 1):
+            raise OptionError("--sweep: needs exactly one --task, and no --suite.")
+        if self.suite is None and not tasks:
+            raise OptionError("Give --suite or --task, such as --suite smoke or --task Default.")
+        instances = integer_in("instances", self.instances, 1, 10_000)
+        axes = sweep_axes(self.sweep or ())
+        classes: list[SuiteClass] = []
+        streams: list[StreamClass] = []
+        if self.suite is not None:
+            suite = find_file(SuiteFile, self.suite).suite
+            classes, streams = [*suite.classes], [*suite.streams]
+        for task in tasks:
+            document = load_document(task)
+            if isinstance(document, SMESpec):
+                classes += sweep(document, axes, name=_title(document), instances=instances)
+                continue
+            if axes:
+                raise OptionError(
+                    f"--sweep: varies a field of a task, and {task!r} is a stream. Make a stream "
+                    "for each value."
+                )
+            draws = tuple(range(instances))
+            streams.append(StreamClass(name=_title(document), stream=document, draws=draws))
+        kinds: dict[str, Sequence[Document]] = {"classes": classes, "streams": streams}
+        return {name: [each.to_dict() for each in some] for name, some in kinds.items() if some}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanOptions(ClassOptions):
+    """Options of a command that describe a plan, each with its help."""
+
+    algorithm: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--algorithm",
+            "-a",
+            metavar="[NAME=]USES",
+            help="PPO, TD3, SAC, … of Stable-Baselines3, jax:PPO, module:function, "
+            "reference:linear, reference:constant, offline:bc, … Repeatable.",
+        ),
+    ] = None
+    steps: Annotated[
+        list[str] | None,
+        typer.Option("--steps", "-n", metavar="N|ALGORITHM=N", help="Of each run. Repeatable."),
+    ] = None
+    seeds: Annotated[int, typer.Option(help="Runs of each algorithm on each class.")] = 10
+    evaluations: Annotated[int, typer.Option(help="Evaluations during each training.")] = 100
+    evaluation_episodes: Annotated[int, typer.Option(help="Episodes of each evaluation.")] = 5
+    action_range: Annotated[
+        list[str] | None,
+        typer.Option(help="symmetric or unit. Repeatable: each algorithm with each range."),
+    ] = None
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="ALGORITHM.NAME=VALUE",
+            help="A hyperparameter of an algorithm, such as slow.n_steps=64. Repeatable.",
+        ),
+    ] = None
+    agents: Agents = None
+    protocol: Protocol = "paper-v1"
+
+    def plan(self, source: str) -> StudyPlan:
+        """The plan that the options describe; errors name `source`."""
+        from sme_registry.evaluation import resolve_protocol
+
+        fields = {
+            **self.members(),
+            "algorithms": self._algorithms(),
+            "seeds": self.seeds,
+            "evaluations": self.evaluations,
+            "evaluation_episodes": self.evaluation_episodes,
+            "protocol": resolve_protocol(self.protocol).to_dict(),
+        }
+        plan = StudyPlan.from_dict(fields, source)
+        draft = StudyFile(name="draft", digest=plan.digest, plan=plan)
+        return scaled_plan(draft, self.steps, None, None, self.agents).plan
+
+    def _algorithms(self) -> list[dict[str, Any]]:
+        """Each `[NAME=]USES` with each action range."""
+        if not self.algorithm:
+            raise OptionError("--algorithm: is required, such as --algorithm PPO.")
+        from sme_registry.training.hyperparameters import nested_hyperparameters
+
+        ranges = self.action_range or ["symmetric"]
+        uses_of: list[tuple[str, str]] = []
+        for text in self.algorithm:
+            name, equals, uses = text.partition("=")
+            uses_of.append((name, uses) if equals else (_short_name(text), text))
+        settings = _hyperparameters(self.set_ or (), [name for name, _ in uses_of])
+        return [
+            {
+                "name": f"{name} ({action_range})" if len(ranges) > 1 else name,
+                "uses": uses,
+                "hyperparameters": nested_hyperparameters(settings.get(name, {})),
+                "action_range": action_range,
+                **({"steps": 0} if uses.startswith("reference:") else {}),
+            }
+            for name, uses in uses_of
+            for action_range in ranges
+        ]
+
+
+def sweep_axes(texts: typing.Iterable[str]) -> dict[str, list[Any]]:
+    """The axes of `FIELD=VALUE,…`: values are JSON, or else text, separated by commas."""
+    axes: dict[str, list[Any]] = {}
+    for text in texts:
+        field, equals, values = text.partition("=")
+        field = field.strip()
+        if not equals or not field or not values.strip():
+            raise OptionError(f"--sweep {text!r}: must be FIELD=VALUE,…, such as k=1,2,5,10.")
+        if field in axes:
+            raise OptionError(f"--sweep {text!r}: {field} is swept twice. Join their values.")
+        try:
+            axes[field] = parse_json(f"[{values}]")
+        except SMEError:
+            axes[field] = [json_or_text(value.strip()) for value in values.split(",")]
+    return axes
+
+
+def with_options(options: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the fields of a dataclass as options; it receives them as `options`."""
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        hints = typing.get_type_hints(command, include_extras=True)
+        types = typing.get_type_hints(options, include_extras=True)
+        fields = [
+            inspect.Parameter(
+                field.name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=field.default,
+                annotation=types[field.name],
+            )
+            for field in dataclasses.fields(options)
+        ]
+        parameters: list[inspect.Parameter] = []
+        for name, parameter in inspect.signature(command).parameters.items():
+            if name == "options":
+                parameters += fields
+            else:
+                kind = inspect.Parameter.KEYWORD_ONLY
+                parameters.append(parameter.replace(annotation=hints[name], kind=kind))
+
+        @functools.wraps(command)
+        def with_fields(**values: Any) -> None:
+            chosen = {field.name: values.pop(field.name) for field in fields}
+            command(options=options(**chosen), **values)
+
+        with_fields.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        with_fields.__annotations__ = {each.name: each.annotation for each in parameters}
+        return with_fields
+
+    return decorate
+
+
+def _short_name(uses: str) -> str:
+    """The name of an algorithm in a plan: `TQC`, `linear`, `jax-PPO`, `independent PPO`."""
+    from sme_registry.training.algorithms import folder_name
+
+    if uses.startswith(INDEPENDENT):
+        return f"independent {_short_name(uses.removeprefix(INDEPENDENT))}"
+    return folder_name(uses)
+
+
+def _hyperparameters(
+    pairs: typing.Iterable[str], algorithms: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    """The hyperparameters of each algorithm, from `ALGORITHM.NAME=VALUE`; flat, by dotted names."""
+    values: dict[str, dict[str, Any]] = {}
+    for pair in pairs:
+        path, equals, text = pair.partition("=")
+        owners = [name for name in algorithms if path.startswith(f"{name}.")]
+        if not equals or not owners:
+            raise OptionError(
+                f"--set {pair!r}: must be ALGORITHM.NAME=VALUE with an algorithm of the plan "
+                f"({', '.join(algorithms)}), such as {algorithms[0]}.learning_rate=0.001."
+            )
+        owner = max(owners, key=len)
+        name = path.removeprefix(f"{owner}.").strip()
+        if name in values.setdefault(owner, {}):
+            raise OptionError(f"--set {pair!r}: {path} is set twice. Remove one.")
+        values[owner][name] = json_or_text(text.strip())
+    return values
+
+
+def _title(document: SMESpec | StreamSpec) -> str:
+    """The name of a task's or a stream's class: its title, as a document's name."""
+    title = catalogue.title(document).rsplit("/", 1)[-1].removesuffix("-v1")
+    return title.replace(" (", "-").removesuffix(")")
+
+
+Steps = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--steps",
+        "-n",
+        metavar="N|ALGORITHM=N",
+        help="Steps of each training, or of one algorithm's. Repeatable.",
+    ),
+]
+Seeds = Annotated[int | None, typer.Option(help="Runs of each algorithm on each class.")]
+Evaluations = Annotated[int | None, typer.Option(help="Evaluations during each training.")]
+Agents = Annotated[
+    str | None,
+    typer.Option(
+        metavar="sb3|jax",
+        help="Implementation of PPO, TD3 and SAC: of Stable-Baselines3, or in JAX, with the "
+        "environment in one program. Default as in the plan.",
+    ),
+]
+Only = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="KIND=GLOB",
+        help="Only cells that match class=GLOB or algorithm=GLOB. Repeatable: a cell must "
+        "match one pattern of each kind given.",
+    ),
+]
+Jobs = Annotated[
+    int | None, typer.Option("--jobs", "-j", min=1, help="Cells at once; default one per core.")
+]
+
+
+def plan(
+    plan: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="PLAN",
+            help="A name or a path; without it, list the catalogue.",
+            autocompletion=catalogue.completion(StudyFile),
+        ),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option("--folder", "-f", help="Use and count the results in this study's folder."),
+    ] = None,
+    cores: Annotated[
+        int | None, typer.Option(min=1, help="Also estimate for a cluster with this many cores.")
+    ] = None,
+    jobs: Jobs = None,
+    steps: Steps = None,
+    seeds: Seeds = None,
+    evaluations: Evaluations = None,
+    agents: Agents = None,
+    only: Only = None,
+    json: Json = False,
+) -> None:
+    """Show what a study runs and how long it takes, before anything runs.
+
+    Times come from finished cells of the same algorithm in --folder. Without any, they are a range
+    from a fast core to a slow one.
+
+    Examples:
+
+      sme study plan
+
+      sme study plan paper-ablations --cores 64
+
+      sme study plan paper-ablations --steps 20000 --seeds 3 --only algorithm=PPO --only "class=k-*"
+
+      sme study plan smoke --folder runs/smoke --json
+    """
+    from sme_registry.studies.engine.estimate import Estimator, Span, makespan
+    from sme_registry.studies.engine.jobs import available_cores
+    from sme_registry.studies.engine.ledger import Ledger
+    from sme_registry.studies.engine.scaling import selected
+
+    if plan is None:
+        _list_plans(json)
+        return
+    file = scaled_plan(find_file(StudyFile, plan), steps, seeds, evaluations, agents)
+    planned = selected(file.plan.cells, only or ())
+    cells = {cell.cell.digest: cell.cell for cell in planned}
+    results = {} if folder is None else Ledger(folder).results()
+    names = {cell.algorithm for cell in planned}
+    check_algorithms((a for a in file.plan.algorithms if a.name in names), SMEError)
+    warn_of_uneven_rollouts(file.plan)
+    estimator = Estimator(results.values())
+    waiting = [cell for key, cell in cells.items() if key not in results]
+    spans = [estimator.seconds(cell) for cell in waiting]
+
+    def seconds(workers: int) -> Span:
+        return Span(*(makespan([span[i] for span in spans], workers) for i in (0, 1)))
+
+    here = jobs or available_cores()
+    workers = {"one core": 1, f"this machine, {here} at once": here}
+    if cores is not None:
+        workers[f"a cluster, {cores} cores"] = cores
+    done = len(cells) - len(waiting)
+    measured = {cell.uses for cell in waiting if estimator.knows(cell)}
+    if json:
+        print_json(
+            {
+                "study": file.versioned_name,
+                "digest": file.digest,
+                "cells": len(cells),
+                "done": done,
+                "classes": unique(cell.class_name for cell in planned),
+                "algorithms": unique(cell.algorithm for cell in planned),
+                "seeds": file.plan.seeds,
+                "estimated_from_results": sorted(measured),
+                "seconds": [
+                    {"cores": n, **seconds(n)._asdict()} for n in dict.fromkeys(workers.values())
+                ],
+            }
+        )
+        return
+    out().print(_plan_table(file, planned, estimator.seconds))
+    finished = f", {done:,} of them finished" if results else ""
+    out().print(f"{len(cells):,} cells{finished}. Estimated time:")
+    for place, n in workers.items():
+        out().print(f"  {place + ':':32}{duration_range(*seconds(n))}")
+    unmeasured = sorted({cell.uses for cell in waiting} - measured)
+    if unmeasured:
+        out().print(
+            f"[dim]From a table of costs, not from results: {escape(', '.join(unmeasured))}.[/]",
+            soft_wrap=True,
+        )
+
+
+def _list_plans(json: bool) -> None:
+    files = catalogue.entries(StudyFile)
+    if json:
+        print_json([{**summary(file), "cells": number_of_cells(file.plan)} for file in files])
+    else:
+        out().print(study_table(files))
+
+
+def _plan_table(file: StudyFile, planned: Sequence[PlannedCell], seconds: Any) -> Table:
+    classes = unique(cell.class_name for cell in planned)
+    numbers = ("classes", "runs each", "steps", "evaluations", "cells", "time per run")
+    rows = []
+    for name in unique(cell.algorithm for cell in planned):
+        places = [place for place in planned if place.algorithm == name]
+        cells = {place.cell.digest: place for place in places}.values()
+        first = places[0].cell
+        steps = [each.cell.steps for each in cells]
+        spans = [seconds(each.cell) for each in cells]
+        rows.append(
+            (
+                escape(name),
+                str(len({each.class_name for each in places})),
+                str(len({each.run for each in places})),
+                " to ".join(f"{bound:,}" for bound in sorted({min(steps), max(steps)})),
+                f"{first.evaluations:,} × {first.evaluation_episodes}",
+                f"{len(cells):,}",
+                duration_range(min(span.low for span in spans), max(span.high for span in spans)),
+            )
+        )
+    return Table(
+        f"[bold]{file.versioned_name}[/]  {escape(file.description)}",
+        {"algorithm": "name", **dict.fromkeys(numbers, "number")},
+        rows,
+        caption=f"{file.digest}\n{len(classes)} classes: {escape(', '.join(classes))}",
+    )
+
+
+def scaled_plan(
+    file: StudyFile,
+    steps: list[str] | None,
+    seeds: int | None,
+    evaluations: int | None,
+    agents: str | None = None,
+) -> StudyFile:
+    """A plan with the budgets of `--steps`, `--seeds` and `--evaluations`, and `--agents`.
+
+    Raises:
+      OptionError: `--steps` is not a number, or is given twice for an algorithm.
+      UnknownNameError, SpecError: see `scaling.scaled`.
+      SMEError: see `scaling.with_agents`.
+    """
+    from sme_registry.studies.engine.scaling import scaled, with_agents
+
+    budgets: dict[str, int] = {}
+    for text in steps or ():
+        name, _, number = text.rpartition("=")
+        if not number.replace("_", "").isdigit():
+            raise OptionError(
+                f"--steps {text!r}: must be N or ALGORITHM=N, such as --steps PPO=100000."
+            )
+        if name in budgets:
+            raise OptionError(f"--steps {text!r}: {name or 'N'} is given twice. Remove one.")
+        budgets[name] = int(number)
+    every = budgets.pop("", None)
+    file = scaled(file, steps=every, steps_of=budgets, seeds=seeds, evaluations=evaluations)
+    return file if agents is None else with_agents(file, agents)
+
+
+def check_algorithms(algorithms: Iterable[StudyAlgorithm], errors: type[SMEError]) -> None:
+    """Check a plan's algorithms; warn about those that cannot be found here by such an error.
+
+    Raises:
+      OptionError, SpecError: an algorithm has no hyperparameter of a name.
+      SMEError: it cannot be found, by an error of another type.
+    """
+    from sme_registry.studies.engine import checks
+
+    messages = []
+    for algorithm in algorithms:
+        try:
+            checks.find(algorithm.uses)
+        except errors as error:
+            unchecked = " Its hyperparameters are not checked." if algorithm.hyperparameters else ""
+            messages.append(f"{error}{unchecked}")
+        else:
+            checks.check_hyperparameters(algorithm)
+    for message in unique(messages):  # several algorithms may lack the same package
+        err().print(f"[yellow]cannot run here:[/] {escape(message)}", soft_wrap=True)
+
+
+def warn_of_uneven_rollouts(plan: StudyPlan) -> None:
+    """Print which rollouts do not end where the phases of streams do."""
+    from sme_registry.studies.engine import checks
+
+    for uneven in checks.uneven_rollouts(plan):
+        err().print(
+            f"[yellow]uneven rollouts:[/] {escape(uneven.algorithm)} on "
+            f"{escape(', '.join(uneven.streams))}: its rollouts of {uneven.n_steps:,} steps do not "
+            "end where phases do. At the end of a visit it has learned from fewer steps than a "
+            "fresh agent, which counts as lost plasticity. Use "
+            f"--set {escape(uneven.algorithm)}.n_steps={uneven.better}, and a batch_size that "
+            "divides it.",
+            soft_wrap=True,
+        )
+
+
+def unique(values: Iterable[str]) -> list[str]:
+    """The different values, in order of appearance."""
+    return list(dict.fromkeys(values))
+
+
+_ALLOWED_WITH_FROM = ("path", "name", "description", "source", "force")
+
+
+@with_options(PlanOptions)
+def new(
+    context: typer.Context,
+    path: Annotated[Path, typer.Argument(help="The file to write.", dir_okay=False)],
+    options: PlanOptions,
+    name: Annotated[str | None, typer.Option(help="Default --from's, or the file's.")] = None,
+    description: Annotated[str | None, typer.Option(help="One or two sentences.")] = None,
+    source: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="PLAN",
+            help="Instead of these options: an edited plan file, whose digest may be outdated or "
+            "missing, or the name of a plan to copy.",
+        ),
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Write a plan: which algorithms run on which tasks, how often, and for how long.
+
+    A plan is a file that a colleague can run. Reference policies learn nothing and take no steps.
+    In a stream an algorithm lives once, for the steps of the stream, and a fresh agent trains on
+    each phase alone.
+    Settings without an option are edited in the file. Editing changes the digest, so the file is
+    rejected until --from rewrites it.
+
+    Examples:
+
+      sme study new mine.json --suite smoke -a PPO -a TD3 -a reference:linear --seeds 5 -n 20000
+
+      sme study new deep.json -t Default -t Complexity10 -a TQC=sb3_contrib:TQC -n 10000
+
+      sme study new ranges.json -t Default -a PPO --action-range symmetric --action-range unit
+
+      sme study new intervals.json -t Default --sweep k=1,2,5,10 -a PPO --seeds 5 -n 20000
+
+      sme study new two.json --suite smoke -a PPO -a slow=PPO --set slow.learning_rate=0.0001
+
+      sme study new teams.json --suite teams -a PPO -a independent:PPO --seeds 3 -n 20000
+
+      sme study new lives.json -t Switch5 -t Related5 -a PPO --seeds 3 --instances 3
+
+      sme study new wider.json --from edited.json
+    """
+    check_document_path(path, force=force)
+    about = {"name": name, "description": description}
+    about = {field: text for field, text in about.items() if text is not None}
+    default_name = {"name": path.stem}
+    if source is None:
+        data = {"plan": options.plan(str(path)).to_dict()}
+        file = StudyFile.with_digest(data, str(path), **default_name | about)
+    else:
+        _refuse_other_options(context)
+        data = read_json(source) if is_path(source) else find_file(StudyFile, source).to_dict()
+        named = isinstance(data, dict) and "name" in data
+        file = StudyFile.with_digest(data, source, **({} if named else default_name) | about)
+    # A package that is not installed here may be installed where the plan runs.
+    check_algorithms(file.plan.algorithms, MissingDependencyError)
+    warn_of_uneven_rollouts(file.plan)
+    file.write(path)
+    out().print(f"{escape(str(path))}  {file.digest}", soft_wrap=True)
+    err().print(f"[dim]To see its runs and times: sme study plan {escape(str(path))}[/]")
+
+
+def _refuse_other_options(context: typer.Context) -> None:
+    """Check that no option is given that the plan of --from already sets."""
+    for option in context.params:
+        origin = context.get_parameter_source(option)
+        # By name: newer versions of Typer include their own Click.
+        if option not in _ALLOWED_WITH_FROM and origin is not None and origin.name == "COMMANDLINE":
+            raise OptionError(
+                f"--{option.replace('_', '-')}: the plan of --from already sets it. Change it in "
+                "that file, or leave out --from."
+            )
