@@ -18,7 +18,7 @@ from sme_registry.diagnosis.team import diagnose_team
 from sme_registry.diagnosis.team_document import TeamDiagnosis
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import evaluate
-from sme_registry.evaluation.policies import Perceptron
+from sme_registry.evaluation.networks import Perceptron
 from sme_registry.io import integer_in, versions
 from sme_registry.spec import EvaluationProtocol
 from sme_registry.task import Task, materialize

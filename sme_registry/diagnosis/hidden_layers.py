@@ -17,7 +17,7 @@ import numpy as np
 
 from sme_registry.diagnosis.stream_document import NetworkState
 from sme_registry.envs.types import Observation
-from sme_registry.evaluation.policies import Perceptron
+from sme_registry.evaluation.networks import Perceptron
 from sme_registry.task.draw import Array
 
 __all__ = ["DORMANT", "RANK_SHARE", "SATURATED", "network_state"]

@@ -21,7 +21,7 @@ from sme_registry.diagnosis.measurements import CapacityProbe
 from sme_registry.envs import arguments
 from sme_registry.envs.types import Observation
 from sme_registry.evaluation import Policy
-from sme_registry.evaluation.policies import Perceptron
+from sme_registry.evaluation.networks import Perceptron
 from sme_registry.evaluation.regions import States
 from sme_registry.io import require_packages
 from sme_registry.task import Task, streams

@@ -26,7 +26,7 @@ from sme_registry.diagnosis.stream_questions import (
 )
 from sme_registry.diagnosis.stream_subject import StreamSubject
 from sme_registry.evaluation import regions
-from sme_registry.evaluation.policies import Perceptron
+from sme_registry.evaluation.networks import Perceptron
 from sme_registry.io import versions
 from sme_registry.spec import EvaluationProtocol, StreamSpec
 

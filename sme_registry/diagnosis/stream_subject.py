@@ -15,7 +15,7 @@ from pydantic import JsonValue
 
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, StreamReport, load_sb3
-from sme_registry.evaluation.policies import Perceptron
+from sme_registry.evaluation.networks import Perceptron
 from sme_registry.io import read_json
 from sme_registry.plots.streams import FILE
 from sme_registry.spec import SMESpec, StreamSpec

@@ -16,16 +16,10 @@ from sme_registry.evaluation.evaluate import (
     evaluation_observations,
     resolve_protocol,
 )
+from sme_registry.evaluation.models import load_sb3
+from sme_registry.evaluation.networks import OfflinePolicy, Perceptron
 from sme_registry.evaluation.observation import Invariance, LayerProbe, ObservationReport
-from sme_registry.evaluation.policies import (
-    OfflinePolicy,
-    Perceptron,
-    Policy,
-    TeamPolicy,
-    as_policy,
-    interface_of,
-    load_sb3,
-)
+from sme_registry.evaluation.policies import Policy, TeamPolicy, as_policy, interface_of
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.region_report import ChannelReport, RegionReport
 from sme_registry.evaluation.report import AgentReport, EvaluationReport

@@ -17,8 +17,7 @@ import numpy as np
 
 from sme_registry.errors import PolicyError, ResourceLimitError
 from sme_registry.evaluation import OfflinePolicy, Perceptron, Policy, TeamPolicy
-from sme_registry.evaluation.policies.modules import ModulePredictor
-from sme_registry.evaluation.policies.onnx import OnnxNetwork
+from sme_registry.evaluation.models import ModulePredictor, OnnxNetwork
 from sme_registry.evaluation.references import References
 from sme_registry.explorer.graph import read_onnx
 from sme_registry.explorer.program import Program, ProgramBuilder

@@ -17,10 +17,8 @@ import numpy as np
 
 from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation import OfflinePolicy, Perceptron, load_sb3
-from sme_registry.evaluation.policies.forms import interface_of
-from sme_registry.evaluation.policies.onnx import ACTION_RANGE, start_session
-from sme_registry.evaluation.policies.policy import Interface
-from sme_registry.evaluation.policies.sb3 import torch_policy
+from sme_registry.evaluation.models import ACTION_RANGE, Interface, start_session, torch_policy
+from sme_registry.evaluation.policies import interface_of
 from sme_registry.export import perceptron, torch_modules
 from sme_registry.export.network import INPUT, Network
 from sme_registry.export.operators import FEED_FORWARD

@@ -17,7 +17,7 @@ import numpy as np
 
 from sme_registry.envs.types import Observation
 from sme_registry.errors import PolicyError
-from sme_registry.evaluation.policies.policy import Interface
+from sme_registry.evaluation.models import Interface
 from sme_registry.export.network import Network
 from sme_registry.export.torch_modules import traced
 from sme_registry.spec import ActionRange

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sme_registry.evaluation.policies.onnx import start_session
+from sme_registry.evaluation.models import start_session
 from sme_registry.export.network import INPUT
 
 _BATCHES = 2, 3

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from sme_registry.envs.types import Observation
 from sme_registry.errors import PolicyError
-from sme_registry.evaluation.policies.modules import device_of, evaluating
-from sme_registry.evaluation.policies.policy import Interface
+from sme_registry.evaluation.models import Interface, device_of, evaluating
 from sme_registry.export.network import INPUT, OPSET, OUTPUT, Network
 from sme_registry.io import require_packages
 

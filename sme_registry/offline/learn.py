@@ -14,7 +14,7 @@ import torch
 
 from sme_registry.datasets import SealedDataset, Transitions
 from sme_registry.errors import PolicyError
-from sme_registry.evaluation.policies.npz import Layer
+from sme_registry.evaluation.networks import OfflineLayer
 from sme_registry.offline.bc import BC
 from sme_registry.offline.hyperparameters import BCHyperparameters, Hyperparameters
 from sme_registry.offline.iql import IQL
@@ -30,7 +30,7 @@ class Section(NamedTuple):
 
     step: int  # gradient steps done
     losses: dict[str, float]  # terms of the loss of the last batch, by name
-    layers: list[Layer]  # of the policy
+    layers: list[OfflineLayer]  # of the policy
     cpu_seconds: float  # of the steps since the previous section
 
 

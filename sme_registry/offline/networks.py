@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from sme_registry.datasets import SealedDataset, Transitions
-from sme_registry.evaluation.policies.npz import Layer
+from sme_registry.evaluation.networks import OfflineLayer
 
 
 class Batch(NamedTuple):
@@ -62,7 +62,7 @@ def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Linear(widths[-1], outputs))
 
 
-def weights(network: nn.Sequential) -> list[Layer]:
+def weights(network: nn.Sequential) -> list[OfflineLayer]:
     return [
         (layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy())
         for layer in network

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from sme_registry.datasets import SealedDataset
-from sme_registry.evaluation.policies.npz import OfflinePolicy
+from sme_registry.evaluation.networks import OfflinePolicy
 from sme_registry.io import integer_in, require_packages
 from sme_registry.offline.hyperparameters import ALGORITHMS, resolve_hyperparameters
 from sme_registry.offline.train import MAX_STEPS

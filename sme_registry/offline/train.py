@@ -20,7 +20,7 @@ from typing import Any
 
 from sme_registry.datasets import Dataset, Transitions
 from sme_registry.evaluation import EvaluationReport, evaluate
-from sme_registry.evaluation.policies.npz import OfflinePolicy
+from sme_registry.evaluation.networks import OfflinePolicy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import (
     claim_folder,

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from sme_registry.errors import PolicyError
-from sme_registry.evaluation.policies import saved_sb3
+from sme_registry.evaluation.models import saved_sb3
 from sme_registry.io import write_atomically
 
 FILE = "checkpoint.zip"

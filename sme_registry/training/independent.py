@@ -28,7 +28,7 @@ from stable_baselines3.common.utils import set_random_seed
 
 from sme_registry.envs.lanes import Lane
 from sme_registry.errors import OptionError, PolicyError
-from sme_registry.evaluation.policies import saved_sb3
+from sme_registry.evaluation.models import saved_sb3
 from sme_registry.io import write_atomically
 from sme_registry.sb3 import LanesVecEnv, SMETeamVecEnv
 from sme_registry.task import materialize

@@ -17,7 +17,7 @@ from stable_baselines3.common.logger import configure
 
 from sme_registry.envs.episodes import EpisodeSafety, safety_of_step
 from sme_registry.errors import OptionError
-from sme_registry.evaluation.policies import saved_sb3
+from sme_registry.evaluation.models import saved_sb3
 from sme_registry.io import is_installed, read_arrays, write_arrays, write_atomically
 from sme_registry.io.system import defer_interrupts
 from sme_registry.jax import run as jax_run

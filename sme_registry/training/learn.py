@@ -19,7 +19,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecMonitor
 
 from sme_registry.errors import OptionError, PolicyError
-from sme_registry.evaluation.policies import saved_sb3
+from sme_registry.evaluation.models import saved_sb3
 from sme_registry.io import is_installed, write_atomically
 from sme_registry.io.system import defer_interrupts
 from sme_registry.io.terminal import Progress

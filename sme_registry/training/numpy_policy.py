@@ -20,8 +20,8 @@ import numpy as np
 
 from sme_registry.errors import PolicyError, SpecError
 from sme_registry.evaluation import Policy, TeamPolicy, as_policy
-from sme_registry.evaluation.policies.perceptron import Layer, Perceptron
-from sme_registry.evaluation.policies.sb3 import torch_policy
+from sme_registry.evaluation.models import torch_policy
+from sme_registry.evaluation.networks import Layer, Perceptron
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.task import streams
 

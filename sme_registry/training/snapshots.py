@@ -12,7 +12,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from sme_registry.evaluation.policies import saved_sb3
+from sme_registry.evaluation.models import saved_sb3
 from sme_registry.io import write_atomically
 from sme_registry.spec import StreamSpec
 

@@ -38,7 +38,7 @@ IN_A_FUNCTION = {
     "errors.py": "sme_registry.registration",
     "envs/arguments.py": "matplotlib",
     "evaluation/references.py": "torch",
-    "evaluation/policies/policy.py": "onnxruntime",
+    "evaluation/policies.py": "onnxruntime",
     "evaluation/evaluate.py": "pandas",
 }
 

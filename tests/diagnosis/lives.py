@@ -5,7 +5,7 @@ import numpy as np
 from sme_registry import SMESpec, StreamSpec
 from sme_registry.diagnosis import StreamSubject, diagnose
 from sme_registry.evaluation import dynamic_regret, evaluate_stream, resolve_protocol
-from sme_registry.evaluation.policies import Perceptron
+from sme_registry.evaluation.networks import Perceptron
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.training import RunRecord, snapshots
 from sme_registry.training.sb3_models import new_sb3_model

@@ -86,7 +86,7 @@ def test_rewards_of_an_episode_that_D_terminated_before_a_payout_have_no_credit(
 def test_the_probe_fits_what_a_network_can_represent_and_fails_at_the_rest(monkeypatch):
     torch = pytest.importorskip("torch")
     from sme_registry.diagnosis import networks
-    from sme_registry.evaluation.policies import Perceptron
+    from sme_registry.evaluation.networks import Perceptron
 
     def probe(widths, spec, states):
         *inner, last = [

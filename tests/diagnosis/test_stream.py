@@ -28,7 +28,8 @@ from sme_registry.diagnosis.stream_questions import (
 from sme_registry.diagnosis.stream_render import headline, markdown, stream_sentence, terminal
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.evaluation import StreamReport, evaluate, fresh_per_phase
-from sme_registry.evaluation.policies import Perceptron, saved_sb3
+from sme_registry.evaluation.models import saved_sb3
+from sme_registry.evaluation.networks import Perceptron
 from sme_registry.spec import EvaluationProtocol, StudyFile, StudyPlan
 from sme_registry.spec.study import Cell
 from sme_registry.studies import run_study

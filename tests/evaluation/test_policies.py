@@ -16,7 +16,7 @@ from sme_registry.errors import (
     UnknownNameError,
 )
 from sme_registry.evaluation import OfflinePolicy, as_policy, evaluate, load_sb3, references
-from sme_registry.evaluation.policies import saved_sb3
+from sme_registry.evaluation.models import saved_sb3
 from sme_registry.spec import SMESpec
 from sme_registry.training import numpy_policy
 from tests.commands import good, sme

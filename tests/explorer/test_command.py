@@ -10,7 +10,7 @@ from sme_registry import SMESpec, load, materialize
 from sme_registry.diagnosis import StreamSubject, load_policy, load_run
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import evaluate
-from sme_registry.evaluation.policies import saved_sb3
+from sme_registry.evaluation.models import saved_sb3
 from sme_registry.evaluation.rollouts import rollouts
 from sme_registry.explorer import FILE, facts, run_report, write_explorer
 from sme_registry.explorer.page import json_in_html

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sme_registry import export_onnx
-from sme_registry.evaluation.policies.onnx import start_session
+from sme_registry.evaluation.models import start_session
 from tests.export.test_export import SPEC, refused, same
 
 torch = pytest.importorskip("torch")

@@ -21,7 +21,7 @@ from sme_registry.errors import (
     SMEError,
 )
 from sme_registry.evaluation import StreamReport, load_sb3
-from sme_registry.evaluation.policies import saved_sb3
+from sme_registry.evaluation.models import saved_sb3
 from sme_registry.export import export_onnx
 from sme_registry.io import read_arrays, write_arrays
 from sme_registry.jax.run import new_program

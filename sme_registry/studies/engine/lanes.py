@@ -31,7 +31,7 @@ from sme_registry.evaluation import (
     evaluate_many,
 )
 from sme_registry.evaluation.continual import DynamicRegret, RegretBlocks
-from sme_registry.evaluation.policies import saved_sb3
+from sme_registry.evaluation.models import saved_sb3
 from sme_registry.evaluation.rollouts import start_states
 from sme_registry.io import Arrays, to_json
 from sme_registry.io.system import end_with_parent

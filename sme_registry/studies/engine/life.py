@@ -17,7 +17,7 @@ from sme_registry.errors import PolicyError
 from sme_registry.evaluation import Perceptron, Policy, StreamReport, evaluate_stream
 from sme_registry.evaluation.continual import DynamicRegret, RegretBlocks, reference_regret
 from sme_registry.evaluation.continual.retention import prepared
-from sme_registry.evaluation.policies.sb3 import torch_policy
+from sme_registry.evaluation.models import torch_policy
 from sme_registry.spec import Cell, SMESpec, StreamSpec
 from sme_registry.studies.engine.training import Training
 from sme_registry.task import Task, materialize, materialize_stream

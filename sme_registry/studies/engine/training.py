@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from sme_registry.evaluation import Policy, TeamPolicy
-from sme_registry.evaluation.policies import saved_sb3
+from sme_registry.evaluation.models import saved_sb3
 from sme_registry.io import write_atomically
 from sme_registry.spec.study import Cell
 from sme_registry.studies.engine.algorithms import find_algorithm, independent_name

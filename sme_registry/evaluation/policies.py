@@ -1,33 +1,174 @@
-"""`as_policy`: a policy in any form that Python or the command line accepts."""
+"""Policies: every form in which a user may give one, as one checked function of observations.
+
+callable · model of Stable-Baselines3, sb3-contrib or sbx, or its .zip · .onnx file · .npz file of
+an offline policy · `module:function` · name of a reference policy · for teams also a dict by agent.
+
+In a team, either each agent has its own policy of what it observes and owns,
+`[B, |O_i| + 2] → [B, a_i]`, or all share one, which is called for each agent in turn with its
+shared observation (`envs.shared`), `[B, S + 2 + n] → [B, max a_i]`. A function of the whole state
+is no team policy: under partial observation no agent could execute it.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, NamedTuple, cast
 
+import numpy as np
+
+from sme_registry.envs import arguments
 from sme_registry.envs.shared import shared_observation_of
-from sme_registry.envs.types import Observation
-from sme_registry.errors import PolicyError, UnknownNameError, did_you_mean
-from sme_registry.evaluation.policies import modules, sb3
-from sme_registry.evaluation.policies.npz import OfflinePolicy
-from sme_registry.evaluation.policies.onnx import load_onnx
-from sme_registry.evaluation.policies.perceptron import Perceptron
-from sme_registry.evaluation.policies.policy import (
-    Interface,
-    Member,
-    Policy,
-    TeamPolicy,
-    prefixed_errors,
-)
-from sme_registry.evaluation.policies.sb3_files import load_sb3
+from sme_registry.envs.types import Array, Observation
+from sme_registry.errors import ActionError, PolicyError, UnknownNameError, did_you_mean
+from sme_registry.evaluation import models
+from sme_registry.evaluation.models import Interface, load_onnx, load_sb3
+from sme_registry.evaluation.networks import OfflinePolicy, Perceptron
 from sme_registry.evaluation.references import POLICIES, reference_policy
 from sme_registry.io import choice, import_object
 from sme_registry.spec import ACTION_RANGES, ActionRange, SMESpec
 from sme_registry.task import draw
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy, ready to be called.
+
+    Attributes:
+      name: what reports call it.
+      action_range: the range of what `act` returns, "unit" or "symmetric".
+      act: observations float32 to actions; unchecked.
+      action_dim: A, entries of an action.
+      hint: a sentence about its interface, which error messages end with.
+      episodes: a new `act` for a batch of episodes that start together: it keeps the state of a
+        recurrent policy from call to call, row by row. None: it has no state.
+      hidden: observations to the outputs `[B, H]` of each hidden layer of its network, in order;
+        None, or a result of None, of an unknown one.
+    """
+
+    name: str
+    action_range: ActionRange
+    act: Callable[[Observation], Any]
+    action_dim: int
+    hint: str = ""
+    episodes: Callable[[], Callable[[Observation], Any]] | None = None
+    hidden: Callable[[Observation], Iterable[Any] | None] | None = None
+
+    def start(self) -> Policy:
+        """This policy at the start of a batch of episodes; a recurrent one keeps its state."""
+        return self if self.episodes is None else replace(self, act=self.episodes())
+
+    def in_phase(self, phase: int, count: int) -> Policy:
+        """This policy, given the one-hot of a phase, of so many, behind each observation."""
+        one_hot = np.eye(count, dtype=np.float32)[phase]
+
+        def shown(policy: Policy) -> Callable[[Observation], Array]:
+            return lambda o: policy(np.concatenate([o, np.tile(one_hot, (len(o), 1))], axis=1))
+
+        # `policy` has converted its actions to the unit range, and named its own errors.
+        return replace(
+            self,
+            action_range="unit",
+            act=shown(self),
+            episodes=lambda: shown(self.start()),
+            hidden=None,
+        )
+
+    def __call__(self, observations: Observation) -> Array:
+        """Actions `[B, A]`, converted to the unit range but not clipped to it."""
+        try:
+            returned = models.without_tensor(self.act(observations))
+            shape = (len(observations), self.action_dim)
+            a = arguments.to_unit(returned, shape, self.action_range == "symmetric")
+            if not np.isfinite(a).all():
+                raise arguments.not_finite_error()
+            return a
+        except ActionError as error:
+            raise PolicyError(
+                f"policy {self.name!r}: {error} It receives observations "
+                f"[{len(observations)}, {observations.shape[1]}] and must return one action per "
+                f"row.{self.hint and f' {self.hint}'}"
+            ) from None
+        except PolicyError:
+            raise
+        except Exception as error:
+            raise PolicyError(
+                f"policy {self.name!r} failed on observations of shape {observations.shape}: "
+                f"{type(error).__name__}: {error}{self.hint and f'. {self.hint}'}"
+                f"{models.advice_on(error)}"
+            ) from error
+
+
+class Member(NamedTuple):
+    """One agent of a team policy."""
+
+    agent: str
+    policy: Policy
+    observe: Callable[[Observation], Observation]
+    action_dim: int
+
+
+@dataclass(frozen=True)
+class TeamPolicy:
+    """A team's policies, ready to be called.
+
+    Attributes:
+      name: what reports call it.
+      action_range: "unit" or "symmetric"; "mixed" if the agents' policies differ.
+      members: the agents, in the order of the channels that they own.
+    """
+
+    name: str
+    action_range: ActionRange | Literal["mixed"]
+    members: tuple[Member, ...]
+
+    def __call__(self, observations: Observation) -> Array:
+        """Joint actions `[B, A]`, converted to the unit range but not clipped to it."""
+        return self._joint_actions([observations] * len(self.members))
+
+    def act_in(self, joint: Observation) -> Array:
+        """Joint actions `[B, A]` in episodes, where each agent has its own r_cum; see `__call__`.
+
+        Args:
+          joint: `[B, S + 1 + n]`: s, t/T, and each agent's r_cum/k.
+        """
+        shared = joint.shape[1] - len(self.members)
+        columns = [[*range(shared), shared + agent] for agent in range(len(self.members))]
+        return self._joint_actions([joint[:, own] for own in columns])
+
+    def _joint_actions(self, observations: Sequence[Observation]) -> Array:
+        """Joint actions, from the observations `[B, S + 2]` of each agent."""
+        joint = []
+        for member, seen in zip(self.members, observations, strict=True):
+            with prefixed_errors(member.agent):
+                a = member.policy(member.observe(seen))
+            joint.append(a[:, : member.action_dim])
+        return np.concatenate(joint, axis=1)
+
+    def check_team(self, spec: SMESpec) -> None:
+        """Raise `PolicyError` if a task has other agents than this policy was prepared for."""
+        prepared = [(member.agent, member.action_dim) for member in self.members]
+        agents = [] if spec.team is None else draw.agents(spec)
+        if prepared != [(agent.name, agent.action_dim) for agent in agents]:
+            raise PolicyError(
+                f"policy {self.name!r}: it acts for the agents "
+                f"{', '.join(f'{agent} ({dim} channels)' for agent, dim in prepared)}, and this "
+                "task has others. Prepare it for this task."
+            )
+
+
+@contextlib.contextmanager
+def prefixed_errors(agent: str) -> Iterator[None]:
+    """Errors of an agent's policy begin with its name."""
+    try:
+        yield
+    except PolicyError as error:
+        raise PolicyError(f"{agent}: {error}") from error.__cause__
+
 
 _SUFFIXES = (".zip", ".onnx", ".npz")
 
@@ -194,14 +335,14 @@ def _prepare(
             observations=getattr(getattr(policy, "observation_space", None), "shape", None),
             actions=getattr(getattr(policy, "action_space", None), "shape", None),
         )
-        sb3.check_not_normalised(policy)
-        act, action_range = sb3.predictor(policy), action_range or sb3.action_range_of(policy)
-        episodes = sb3.episode_predictor(policy)
-        network = sb3.torch_policy(policy)
-        hidden = None if network is None else modules.hidden_layers(act, network)
-    elif modules.is_module(policy):
-        act = modules.ModulePredictor(policy)
-        hidden = modules.hidden_layers(act, policy)
+        models.check_not_normalised(policy)
+        act, action_range = models.predictor(policy), action_range or models.action_range_of(policy)
+        episodes = models.episode_predictor(policy)
+        network = models.torch_policy(policy)
+        hidden = None if network is None else models.hidden_layers(act, network)
+    elif models.is_module(policy):
+        act = models.ModulePredictor(policy)
+        hidden = models.hidden_layers(act, policy)
     elif isinstance(policy, Perceptron | OfflinePolicy):
         hidden = policy.hidden
     elif not callable(policy):
