@@ -23,20 +23,7 @@ def integer_in(
     advice: str = "",
     error: type[SMEError] = OptionError,
 ) -> int:
-    """Check an integer argument. NumPy's integers count, booleans and floats do not.
-
-    Args:
-      name, value: of the argument, as the message shows them.
-      low, high: the smallest and the largest allowed value; None if there is no limit.
-      advice: a sentence that the message ends with, such as "Leave it out for 0."
-      error: the type of error to raise.
-
-    Returns:
-      The value as Python's int.
-
-    Raises:
-      SMEError: of that type: not an integer, or outside [low, high].
-    """
+    """Check an integer argument. NumPy's integers count, booleans and floats do not."""
     try:
         number = None if type(value).__name__ in ("bool", "bool_") else operator.index(value)
     except TypeError:
@@ -50,11 +37,7 @@ def integer_in(
 def number_in(
     name: str, value: Any, low: float, high: float = math.inf, *, advice: str = ""
 ) -> float:
-    """Check a finite number, as `integer_in` checks an integer; booleans do not count.
-
-    Raises:
-      OptionError: not a finite number, or outside [low, high].
-    """
+    """Check a finite number, as `integer_in` checks an integer; booleans do not count."""
     is_number = isinstance(value, int | float | np.number) and type(value).__name__ != "bool"
     if not is_number or not (math.isfinite(value) and low <= value <= high):
         allowed = f"of at least {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
@@ -67,11 +50,7 @@ def number_in(
 def choice(
     name: str, value: Any, allowed: Collection[str], *, error: type[SMEError] = OptionError
 ) -> str:
-    """Check that an argument is one of a few allowed names, and return it.
-
-    Raises:
-      SMEError: of type `error`: it is none of them; lists them, and suggests a similar one.
-    """
+    """Check that an argument is one of a few allowed names, and return it."""
     if isinstance(value, str) and value in allowed:
         return value
     *others, last = map(repr, allowed)
@@ -106,15 +85,7 @@ class Address(NamedTuple):
 
 
 def server_address(url: str, *, insecure: bool = False) -> Address:
-    """The address in a URL.
-
-    Args:
-      url: http(s)://host[:port][/path].
-      insecure: allow plain http to other machines.
-
-    Raises:
-      OptionError: of another form, or plain http to another machine.
-    """
+    """The address in a URL."""
     try:
         parts = urlsplit(url)
         port = parts.port

@@ -40,16 +40,7 @@ def temporary_beside(path: Path) -> Path:
 
 @contextlib.contextmanager
 def atomic_file(path: Path, *, new: bool = False) -> Iterator[BinaryIO]:
-    """A stream whose content becomes `path` if the block succeeds; otherwise nothing changes.
-
-    Args:
-      path: the target; its folder must exist.
-      new: link instead of rename, so that an existing file is never replaced.
-
-    Raises:
-      OSError: the disk is full, the folder is not writable, or with `new` the target exists; an
-        existing target is unchanged.
-    """
+    """A stream whose content becomes `path` if the block succeeds; `new` never replaces a file."""
     temporary = temporary_beside(path)
     try:
         # Not mkstemp, whose mode 0600 hides results from colleagues: the user's umask decides.
@@ -68,13 +59,7 @@ def atomic_file(path: Path, *, new: bool = False) -> Iterator[BinaryIO]:
 
 
 def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path:
-    """Write text as UTF-8, or bytes, completely or not at all; returns the path.
-
-    The folder is created if it is missing.
-
-    Raises:
-      OptionError: the folder cannot be created or written to; an existing file is unchanged.
-    """
+    """Write text as UTF-8, or bytes, completely or not at all; returns the path."""
     path = Path(path)
     try:
         data = content.encode("utf-8") if isinstance(content, str) else content
@@ -87,11 +72,7 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
 
 
 def refuse_existing(path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Return a path that a command is about to write; call it before the work, not after.
-
-    Raises:
-      OptionError: it exists and `force` is false, or nothing can be written there.
-    """
+    """Return a path that a command is about to write; call it before the work, not after."""
     path = refuse_unwritable(path)
     if os.path.lexists(path) and not force:
         raise OptionError(
@@ -101,13 +82,7 @@ def refuse_existing(path: str | os.PathLike[str], *, force: bool = False) -> Pat
 
 
 def refuse_unwritable(path: str | os.PathLike[str]) -> Path:
-    """Return a path, of a file or a folder, whose parent folders can be created and written to.
-
-    Nothing remains of the check.
-
-    Raises:
-      OptionError: they cannot.
-    """
+    """Return a path, of a file or a folder, whose parent folders can be created and written to."""
     path = Path(path)
     try:
         # As an absolute path, so that there is an existing parent. By a file rather than
@@ -124,19 +99,7 @@ def refuse_unwritable(path: str | os.PathLike[str]) -> Path:
 def claim_folder(
     folder: str | os.PathLike[str], files: Collection[str], *, force: bool = False
 ) -> Path:
-    """Create an output folder, or check that an existing one may be written to.
-
-    Nothing is removed from it.
-
-    Args:
-      folder: the folder.
-      files: names of the files and folders that the caller writes there.
-      force: whether these may be replaced; other files are refused even then.
-
-    Raises:
-      OptionError: the folder is a file, holds other files that are not hidden, holds `files` and
-        `force` is false, or cannot be created.
-    """
+    """Create an output folder; `force` allows an existing one with these files, and no others."""
     folder = Path(folder)
     if os.path.lexists(folder) and not folder.is_dir():
         raise OptionError(f"{folder}: is a file. Give a folder.")
@@ -159,22 +122,7 @@ def claim_folder(
 
 @contextlib.contextmanager
 def build_folder(target: str | os.PathLike[str], *, force: bool = False) -> Iterator[Path]:
-    """Build a folder completely or not at all.
-
-    The block writes into a temporary folder, which is flushed to disk and renamed to `target` at
-    the end. If the block fails, nothing remains of it.
-
-    Args:
-      target: the folder to build; its parent is created if it is missing.
-      force: whether an existing `target`, file or folder, is replaced. It remains in place until
-        the new one is complete, and is restored if the rename fails.
-
-    Yields:
-      The temporary folder, empty.
-
-    Raises:
-      OptionError: `target` exists and `force` is false, or writing fails, in the block or here.
-    """
+    """A temporary folder, renamed to `target` if the block succeeds; otherwise nothing changes."""
     target = refuse_existing(target, force=force)
     building, replaced = temporary_beside(target), temporary_beside(target)
     try:
@@ -244,11 +192,7 @@ MAX_DOCUMENT_BYTES = 64 * 2**20
 
 
 def parse_json(text: str | bytes, source: str = "document") -> Any:
-    """Parse strict JSON text; error messages call it `source`, such as its path.
-
-    Raises:
-      MalformedDocumentError: it is not strict JSON; with line and column if they are known.
-    """
+    """Parse strict JSON text; error messages call it `source`, such as its path."""
 
     def reject_constant(name: str) -> NoReturn:
         raise MalformedDocumentError(f"{source}: {name} is not valid JSON. Use a finite number.")
@@ -286,12 +230,7 @@ def _reason(error: ValueError | RecursionError) -> str:
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:
-    """Read a strict JSON file.
-
-    Raises:
-      MalformedDocumentError: the file does not exist or cannot be read, is too large, or is not
-        strict JSON.
-    """
+    """Read a strict JSON file."""
     path = Path(path)
     try:
         if path.is_file() and path.stat().st_size > MAX_DOCUMENT_BYTES:
@@ -314,13 +253,7 @@ Arrays = dict[str, npt.NDArray[Any]]
 
 
 def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-    """Write arrays of numbers or text, and remove what killed writes left of the file.
-
-    They may be gigabytes: no copy is made in memory. The folder is created if it is missing.
-
-    Raises:
-      OptionError: the file cannot be written; an existing one is unchanged.
-    """
+    """Write arrays of numbers or text, and remove what killed writes left of the file."""
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -334,11 +267,7 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, npt.NDArray[
 
 
 def read_arrays(path: str | os.PathLike[str], names: Collection[str] | None = None) -> Arrays:
-    """The arrays of a file; with `names`, these alone, and no others are read.
-
-    Raises:
-      OptionError: there is no such file, or it is damaged or lacks one of the names.
-    """
+    """The arrays of a file; with `names`, only these are read."""
     try:
         # Opened here: NumPy leaves a file open that is no archive.
         with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as archive:
@@ -358,10 +287,7 @@ _POLL_SECONDS = 0.002
 
 
 class Lock:
-    """A lock that this process holds until it releases or drops this object.
-
-    As a context manager it is released at the end of the block.
-    """
+    """A lock that this process holds until it releases or drops this object."""
 
     def __init__(self, lock: filelock.BaseFileLock) -> None:
         self._lock = lock
@@ -378,18 +304,7 @@ class Lock:
 
 
 def file_lock(path: str | os.PathLike[str], *, timeout: float = 0.0) -> Lock | None:
-    """Acquire the exclusive lock of a file, which is created with its folder if it is missing.
-
-    Args:
-      path: the lock file.
-      timeout: seconds to wait for another holder; 0 tries once, a negative number waits forever.
-
-    Returns:
-      The lock, or None if another process, or another lock of this one, still holds it.
-
-    Raises:
-      OptionError: the file cannot be created, or its file system has no locks.
-    """
+    """The lock of a file; None if another holder keeps it for `timeout` seconds (−1: forever)."""
     import filelock  # on first use: most programs take no lock
 
     path = Path(path)
@@ -410,10 +325,7 @@ def file_lock(path: str | os.PathLike[str], *, timeout: float = 0.0) -> Lock | N
 
 
 def is_locked(path: str | os.PathLike[str]) -> bool:
-    """Whether a lock file is held, by this process or another one. Creates no file.
-
-    Where the system has `flock`, reading the file suffices, and asking does not hold up others.
-    """
+    """Whether a lock file is held, by this process or another one. Creates no file."""
     try:
         handle = os.open(path, os.O_RDONLY)
     except OSError:

@@ -40,11 +40,7 @@ _CLASSES = {"number": "num", "name": "name", "text": "text"}
 
 
 def card(*parts: str) -> str:
-    """What a notebook shows of an object: tables and charts, one below the other.
-
-    Args:
-      *parts: HTML of this module or of `svg`.
-    """
+    """What a notebook shows of an object: tables and charts, one below the other."""
     return f'{_STYLE}<div class="sme-card">{"".join(parts)}</div>'
 
 
@@ -54,10 +50,7 @@ def folded(summary: str, *parts: str) -> str:
 
 
 def table_html(table: Table) -> str:
-    """A table of the terminal as HTML: title, headings, rows, sections and caption.
-
-    Of Rich's styles it keeps bold rows. A long table ends with the number of rows left out.
-    """
+    """A table of the terminal as HTML: title, headings, rows, sections and caption."""
     kinds = [column.kind for column in table.columns]
     sections = [[_row("th", [column.heading for column in table.columns], kinds)]]
     for row in table.rows[:_MOST_ROWS]:
@@ -171,17 +164,7 @@ class Line(NamedTuple):
 
 
 def line_chart(title: str, positions: Sequence[str], lines: Sequence[Line], below: str = "") -> str:
-    """A chart of lines over named positions, labelled at their ends.
-
-    Args:
-      title: what it shows, for screen readers; the values of labelled lines are added.
-      positions: names of the positions on the x axis.
-      lines: drawn in this order; the y axis covers 0, 1 and all values.
-      below: the title of the x axis.
-
-    Returns:
-      An `<svg>` element of about 3 kB that shrinks with the page.
-    """
+    """A chart of lines over named positions, labelled at their ends."""
     scale = Scale.covering(0.0, 1.0, *(value for line in lines for value in line.values))
     step = (_RIGHT - _LEFT) / len(positions)
     xs = [_LEFT + step * (index + 0.5) for index in range(len(positions))]
@@ -259,21 +242,13 @@ _COMMANDS = {
 
 
 def escape_latex(text: str) -> str:
-    """Text as LaTeX source that prints it literally; the symbols of our labels become mathematics.
-
-    Line ends remain: text of unknown origin must be put on one line before.
-    """
+    """Text as LaTeX that prints it literally; the symbols of our labels become mathematics."""
     escaped = "".join(_COMMANDS.get(letter, letter) for letter in text.replace("r̃", "\0"))
     return escaped.replace("\0", r"$\tilde r$")
 
 
 def environment(folder: Path, *, autoescape: bool) -> Environment:
-    """The templates of a folder, with the filters of this module.
-
-    Args:
-      folder: of the templates.
-      autoescape: whether values are escaped for HTML.
-    """
+    """The templates of a folder, with the filters of this module."""
     templates = Environment(
         loader=FileSystemLoader(folder),
         autoescape=autoescape,

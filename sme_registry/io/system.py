@@ -31,15 +31,7 @@ _EXTRA = re.compile(r"""([\w.-]+).*\bextra\s*==\s*['"]([\w-]+)['"]""")
 
 
 def versions(packages: Iterable[str], *, if_imported: Iterable[str] = ()) -> dict[str, str]:
-    """Versions of this package, of Python, and of the named packages that are installed.
-
-    Args:
-      packages: names as `pip` or as `import` has them ("stable_baselines3").
-      if_imported: packages to include only if this process has imported them.
-
-    Returns:
-      `sme_registry` and `python`, then each package in order; those not installed are absent.
-    """
+    """Versions of this package, of Python, and of the named packages that are installed."""
     installed = {"sme_registry": __version__, "python": platform.python_version()}
     for name in (*packages, *(name for name in if_imported if name in sys.modules)):
         try:
@@ -57,18 +49,7 @@ def is_installed(package: str) -> bool:
 def require_packages(
     purpose: str, packages: Mapping[str, str], extra: str, *, otherwise: str = ""
 ) -> None:
-    """Check that optional packages, full names by the name to import, are installed.
-
-    Args:
-      purpose: what needs them.
-      packages: full names by the name to import.
-      extra: the extra of our package that installs them.
-      otherwise: what to do instead of installing, such as `unset the variable`.
-
-    Raises:
-      MissingDependencyError: names the purpose, the missing packages, and the command that installs
-        them, with this extra of our package.
-    """
+    """Raise if optional packages (name to import → full name) are not installed."""
     missing = [name for package, name in packages.items() if not is_installed(package)]
     if missing:
         raise _missing(missing, extra, f"{purpose}: ", otherwise)
@@ -77,15 +58,7 @@ def require_packages(
 def missing_dependency(
     error: ModuleNotFoundError, extra: str = ""
 ) -> MissingDependencyError | None:
-    """The error to report instead of a failed import: which extra has the module.
-
-    Args:
-      error: the failed import.
-      extra: the extra to name if it has the module; otherwise the smallest that has it.
-
-    Returns:
-      None if no extra of our package has the module: then the import is a fault of ours.
-    """
+    """The error to report instead of a failed import: which extra has the module."""
     module = (error.name or "").partition(".")[0]
     package = module.lower().replace("_", "-")
     extras = {name: has for name, has in _extras().items() if package in has and name != "dev"}
@@ -96,11 +69,7 @@ def missing_dependency(
 
 
 def install_command(extra: str) -> str:
-    """The command that installs an extra in the way in which this package was installed.
-
-    It names the clone, the wheel or the repository that the package came from; only a package from
-    an index is installed again by its name alone.
-    """
+    """The command that installs an extra in the way in which this package was installed."""
     options, requirement = [], f"{_NAME}[{extra}]"
     origin = _origin()
     if (_SOURCE / "pyproject.toml").is_file():
@@ -159,14 +128,7 @@ def _extras() -> dict[str, set[str]]:
 
 
 def import_object(name: str, field: str, error: type[SMEError]) -> Any:
-    """Import an object by the name `module:attribute`. The working directory is searched first.
-
-    Importing a module runs its code.
-
-    Raises:
-      SMEError: of type `error`: the module or attribute does not exist, or importing it fails;
-        names the field that holds the name.
-    """
+    """Import an object by the name `module:attribute`. The working directory is searched first."""
     module_name, _, attribute = name.partition(":")
     folder, near = os.getcwd(), ""
     sys.path.insert(0, folder)
@@ -190,10 +152,7 @@ _CGROUPS = Path("/sys/fs/cgroup")
 
 
 def available_memory() -> int | None:
-    """Memory in bytes that a process can use before the system ends one for lack of it.
-
-    Outside Linux, all memory of the machine; None where even that is unknown.
-    """
+    """Bytes that a process can use before the system ends one; outside Linux all of the memory."""
     try:
         lines = (_PROC / "meminfo").read_text().splitlines()
     except OSError:
@@ -241,10 +200,7 @@ def _limit_and_use(
 
 @contextlib.contextmanager
 def defer_interrupts() -> Iterator[None]:
-    """Deliver an interrupt only after the block, so that the files it writes agree.
-
-    Inside `torch.save`, an interrupt would become a PyTorch error about a broken archive.
-    """
+    """Deliver an interrupt only after the block, so that the files it writes agree."""
     received: list[int] = []
     in_main_thread = threading.current_thread() is threading.main_thread()
     before = signal.signal(signal.SIGINT, lambda *_: received.append(1)) if in_main_thread else None
@@ -259,12 +215,7 @@ def defer_interrupts() -> Iterator[None]:
 
 @contextlib.contextmanager
 def block_interrupts() -> Iterator[None]:
-    """Processes started inside the block begin with interrupts blocked.
-
-    A terminal sends Ctrl-C to all of them; one that is still importing would print a traceback.
-    `unblock_interrupts`, or ignoring the signal, ends the block in the child. Windows has no signal
-    masks, so there this does nothing.
-    """
+    """Processes started inside the block begin with interrupts blocked: none prints a traceback."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

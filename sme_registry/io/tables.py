@@ -39,14 +39,7 @@ class Row(NamedTuple):
 
 
 class Table:
-    """A table that fits its console.
-
-    Args:
-      title: above it.
-      columns: heading → "name" (never wrapped), "number" (to the right) or "text" (wrapped).
-      rows: their cells, with Rich's markup.
-      caption: below it.
-    """
+    """A table that fits its console."""
 
     def __init__(
         self,
@@ -190,13 +183,7 @@ class Paragraph:
 
 
 class Answers:
-    """Questions, their answers, and sentences of evidence.
-
-    Args:
-      title: above them.
-      rows: question, answer, evidence; plain text.
-      styles: of the answers.
-    """
+    """Questions, their answers, and sentences of evidence."""
 
     def __init__(
         self, title: str, rows: Iterable[tuple[str, str, str]], styles: dict[str, str]

@@ -58,11 +58,10 @@ _UNLIMITED = 100_000  # columns: lines of a file or a pipe are never wrapped
 
 
 class _Console(Console):
-    """Never wraps lines of output that is no terminal, and leaves broken pipes to `CommandGroup`.
+    """Wraps no lines of output that is no terminal, and leaves broken pipes to `CommandGroup`.
 
-    Rich would wrap at 80 columns, and exit with code 1 if the pipe breaks. With FORCE_COLOR, which
-    Jupyter sets for the shell cells of a notebook, it would also draw bars into a pipe: colours are
-    possible there, but nothing that moves the cursor.
+    With FORCE_COLOR, which Jupyter sets for shell cells, Rich would draw bars into a pipe: colours
+    are possible there, but nothing that moves the cursor.
     """
 
     def __init__(self, file: TextIO) -> None:
@@ -99,11 +98,7 @@ def print_json(value: Any) -> None:
 
 
 def print_pairs(title: str, pairs: dict[str, object]) -> None:
-    """Names and values, one per line, under a title.
-
-    A value with a word that is too long for the rest of the line, such as a digest, starts on a
-    line of its own.
-    """
+    """Names and values, one per line, under a title."""
     console = out()
     console.print(title)
     column = 1 + max(map(cell_len, pairs), default=0)
@@ -125,17 +120,7 @@ _PARTS_NAMED = 3  # in a line
 
 
 class Progress:
-    """Shows steps done, the rate, the time left, a note, and the parts of the job that are running.
-
-    Args:
-      title: the job, such as `training`.
-      total: its steps.
-      done: steps that were done before it started.
-      console: where to print; None for standard error. If it is no terminal, lines replace bars.
-      unit: what a step is, in the plural.
-      seconds_left: estimates the time left; by default it follows from the rate.
-      enabled: False shows nothing.
-    """
+    """How far a job is: bars in a terminal, elsewhere a few lines, at most one a minute."""
 
     def __init__(
         self,
@@ -191,10 +176,7 @@ class Progress:
             self._print()
 
     def prepare(self, note: str) -> None:
-        """Show at once what precedes or slows the first steps, such as a compilation.
-
-        Until `prepared`, neither a rate nor the time left is shown: both would be wrong.
-        """
+        """Show at once what precedes the first steps; until `prepared`, no rate is shown."""
         self._note, self._rate_from = note, None
         if self._bars is not None:
             self._draw()
@@ -206,13 +188,7 @@ class Progress:
         self._rate_from = self._rate_from or (self._done, time.monotonic())
 
     def update(self, done: int, note: str | None = None, *, total: int | None = None) -> None:
-        """Set how far the job is; cheap enough to call at every step.
-
-        Args:
-          done: steps done, including those before the start.
-          note: more text to show; None keeps the last one.
-          total: steps of the job, if they have changed.
-        """
+        """Set how far the job is; cheap enough to call at every step."""
         self._done = done
         self._note = self._note if note is None else note
         self._total = self._total if total is None else total
@@ -370,10 +346,7 @@ class CommandGroup(TyperGroup):
 
 
 def _show_literally(command: Any) -> None:
-    """Make the help of a command and of all in it show as it is written, in paragraphs.
-
-    Markdown would remove asterisks, backticks and angle brackets, and Rich's markup brackets.
-    """
+    """Make the help of a command and of all in it show as it is written, in paragraphs."""
     for each in (command, *command.params):
         if getattr(each, "help", None):
             each.help = escape(_in_paragraphs(inspect.cleandoc(each.help)))
@@ -429,10 +402,7 @@ def _use_utf8() -> None:
 
 
 def _discard_output() -> int:
-    """Handle a reader that has closed the pipe (`sme list | head`), which is no error: code 0.
-
-    Otherwise Python would report at exit that it cannot flush its output.
-    """
+    """Handle a reader that has closed the pipe (`sme list | head`), which is no error: code 0."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0

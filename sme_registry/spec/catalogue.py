@@ -86,16 +86,7 @@ def entries(kind: type[_E]) -> list[_E]:
 
 
 def find(kind: type[_E], name: str, others: Iterable[str] = ()) -> _E:
-    """The file of a name, with or without its version (then the newest).
-
-    Args:
-      kind: the kind of file.
-      name: its name.
-      others: names known elsewhere, to suggest where there is no such file.
-
-    Raises:
-      UnknownNameError: there is none; the message suggests the nearest.
-    """
+    """The file of a name, with or without its version (then the newest)."""
     known = names(kind)
     if name in known:
         return cast(_E, _read(kind, spec_folder() / _FOLDERS[kind] / f"{name}.json"))
@@ -125,9 +116,8 @@ def unique_name(document: SMESpec | StreamSpec) -> str:
 def title(document: SMESpec | StreamSpec) -> str:
     """What tables and figures call a task or a stream.
 
-    `SME/Default-v1` in the catalogue; else the name of its file, or the id it is registered under;
-    else `SME/` and its name by content. A file that uses a name of the catalogue for another task
-    is followed by its name by content: `Default (sha256-…)`.
+    `SME/Default-v1` in the catalogue; else the name of its file or registration; else `SME/` and
+    its name by content. Another task's file with a catalogue name: `Default (sha256-…)`.
     """
     unique = unique_name(document)
     if unique != document.content_name or not document.name:
@@ -154,13 +144,7 @@ def symmetric_name(versioned_name: str) -> str:
 
 
 def released() -> Iterator[tuple[str, str, str]]:
-    """`(kind, versioned name, name by content)` of every environment, without validation.
-
-    The kind is "spec" for a single agent's task, "team" or "stream".
-
-    For registering the catalogue at import, which must stay cheap; making an environment validates
-    its file.
-    """
+    """`(kind, versioned name, name by content)` of every environment, not validated."""
     for path in [*paths(EnvFile), *paths(StreamFile)]:
         file = read_json(path)
         content_name = file["digest"].replace(":", "-")[: len("sha256-") + 12]

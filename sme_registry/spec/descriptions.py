@@ -28,11 +28,7 @@ _LENGTHS = {"min_length": "min", "max_length": "max"}
 
 
 def describe(kind: type[BaseModel]) -> None:
-    """Take the descriptions of a new class's fields from its docstring, which then names them all.
-
-    Args:
-      kind: the class. Behind each entry of its docstring stand the field's range and default.
-    """
+    """Take the fields' descriptions from a class's docstring, which then gives their ranges too."""
     if not kind.__doc__ or not kind.model_fields:
         return
     before, entries, after = _sections(kind.__doc__)
@@ -90,10 +86,7 @@ def default_of(field: FieldInfo) -> str:
 
 
 def _schema(annotation: Any, metadata: Sequence[Any]) -> dict[str, Any]:
-    """The JSON Schema of a type, as far as `allowed_values` reads it.
-
-    Pydantic's own takes 10 ms for `SMESpec`, so that of every class would make the import slow.
-    """
+    """A type's JSON Schema, as far as `allowed_values` reads it; Pydantic's own takes 10 ms."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return _schema(arguments[0], [*arguments[1:], *metadata])

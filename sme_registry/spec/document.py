@@ -31,11 +31,7 @@ from sme_registry.spec.validation_errors import WORDED, spec_error
 
 
 def plain_number(value: Any) -> Any:
-    """NumPy's numbers as Python's, so that a sweep over `np.arange` needs no casts.
-
-    Negative zero becomes zero: the two are equal, so they must not differ in text. Booleans and
-    everything else stay as they are.
-    """
+    """NumPy's numbers as Python's, and −0.0 as 0.0: equal values must not differ in text."""
     if type(value).__module__ == "numpy" and getattr(value, "ndim", None) == 0:
         kind = value.dtype.kind
         if kind in "iuf":
@@ -65,11 +61,6 @@ SchemaVersion = Annotated[
 
 def matching(pattern: str, allowed: str, **limits: Any) -> Any:
     """The `Field` of a text that matches a pattern.
-
-    Args:
-      pattern: a regular expression.
-      allowed: the same in words, for errors: `64 hex digits`.
-      **limits: further arguments of `pydantic.Field`.
 
     Examples:
       >>> from typing import Annotated
@@ -150,11 +141,7 @@ class StrictModel(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _plain_numbers(cls, data: Any) -> Any:
-        """`plain_number` of every value, and of the entries of lists.
-
-        Not validators of the fields' types: Pydantic's JSON Schema loses the bounds of a number
-        that has a validator of its own.
-        """
+        """`plain_number` of every value; validators of fields would cost the schema its bounds."""
         if not isinstance(data, dict):
             return data
         return {
@@ -171,18 +158,7 @@ class StrictModel(BaseModel):
 
     @classmethod
     def from_dict(cls, data: Any, source: str = "") -> Self:
-        """Validate plain data (as `json.loads` gives it).
-
-        Args:
-          data: a mapping of field names to values.
-          source: what to call it in an error, such as its path.
-
-        Returns:
-          The document.
-
-        Raises:
-          SpecError: one line for each field that is invalid, missing or unknown.
-        """
+        """Validate plain data; a `SpecError` has a line for each fault, and calls it `source`."""
         try:
             return cls.model_validate(data)
         except ValidationError as error:
@@ -194,14 +170,7 @@ class StrictModel(BaseModel):
 
 
 def refuse_other_digest(stated: str, document: Document, where: str, remedy: str) -> None:
-    """Raise `DigestMismatchError` if a document has another digest than a file states.
-
-    Args:
-      stated: the digest in the file.
-      document: the document that the same file contains.
-      where: the file and the field with the digest.
-      remedy: what to do.
-    """
+    """Raise `DigestMismatchError` if a document has another digest than a file states."""
     if stated != document.digest:
         raise DigestMismatchError(
             f"{where}={stated!r:.90}: its document has the digest {document.digest!r}. One of them "

@@ -80,16 +80,7 @@ class Envelope(StrictModel):
 
     @classmethod
     def from_dict(cls, data: Any, source: str = "") -> Self:
-        """Validate an envelope, including that its digest is its document's.
-
-        Args:
-          data: plain data.
-          source: what to call it in an error, such as its path.
-
-        Raises:
-          SpecError: a field is invalid or missing.
-          DigestMismatchError: the digest is not the document's.
-        """
+        """Validate plain data; another digest than the document's is a `DigestMismatchError`."""
         name = source or cls.__name__
         remedy = cls.remedy.format(source=name, kind=cls.__name__, content=cls.content)
         document: Any = cls.model_fields[cls.content].annotation
@@ -113,21 +104,11 @@ class Envelope(StrictModel):
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a file.
-
-        Raises:
-          MalformedDocumentError: not readable, or not strict JSON.
-          SpecError: a field is invalid.
-          DigestMismatchError: the digest is not the document's.
-        """
+        """Read and validate a file."""
         return cls.from_dict(read_json(path), str(path))
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the file completely or not at all.
-
-        Raises:
-          OptionError: it cannot be written; an existing file is unchanged.
-        """
+        """Write the file completely or not at all."""
         write_atomically(path, to_json(self.to_dict()))
 
 
@@ -196,16 +177,7 @@ class StudyFile(Envelope):
 
     @classmethod
     def with_digest(cls, data: Any, source: str, **fields: Any) -> Self:
-        """The file of an edited or bare plan, with the plan's present digest.
-
-        Args:
-          data: plain data of a file, whose digest is ignored, or of a plan.
-          source: what to call it in an error, such as its path.
-          **fields: fields of the file, such as `name`, which replace those of `data`.
-
-        Raises:
-          SpecError: a field is invalid or missing.
-        """
+        """The file of an edited or bare plan, with the plan's present digest."""
         is_file = isinstance(data, dict) and cls.content in data
         plan = StudyPlan.from_dict(data[cls.content] if is_file else data, source)
         fields = {**(data if is_file else {}), **fields}

@@ -59,20 +59,10 @@ class ResolvedStream:
 
 
 def resolve(task: SpecLike) -> ResolvedSpec:
-    """The spec of a name. Draws nothing: `sme_registry.task.load_spec` also checks the fingerprint.
+    """The spec of a name; a stream's is a `StreamError`. Draws nothing.
 
-    Args:
-      task: a spec; its fields as a mapping; an id (`SME/Default-v1`, `Default-v1`, `Default`);
-        a name by content (`SME/sha256-<12 hex>-v1`); a digest (`sha256:<64 hex>`, or any prefix
-        that only one known spec has, of 12 digits or more); or the path of a file.
-
-    Returns:
-      The spec, with the fingerprint of its file where it has one.
-
-    Raises:
-      UnknownNameError: no task has this name; the message suggests the nearest.
-      SpecError: a file or mapping is not a valid spec.
-      StreamError: it is a stream's.
+    A name is a spec or its fields; an id (`SME/Default-v1`, `Default`); a name by content; a digest
+    or a prefix of 12 digits or more that only one known spec has; or the path of a file.
     """
     try:
         return _resolve(task)
@@ -108,16 +98,7 @@ def _resolve(task: SpecLike) -> ResolvedSpec:
 
 
 def resolve_stream(stream: StreamLike) -> ResolvedStream:
-    """The stream of a name, as `resolve` finds the spec of one.
-
-    Args:
-      stream: a stream; its fields as a mapping; an id (`SME/Switch5-v1`, `SME/StreamSwitch5-v1`,
-        `Switch5`); a name by content, a digest or a prefix of one; or the path of a file.
-
-    Raises:
-      UnknownNameError: no stream has this name; the message suggests the nearest.
-      SpecError: a file or mapping is not a valid stream.
-    """
+    """The stream of a name, as `resolve` finds the spec of one."""
     if not isinstance(stream, str | os.PathLike):
         return ResolvedStream(as_stream(stream))
     name = str(stream)
@@ -145,10 +126,7 @@ def resolve_document(name: SpecLike | StreamLike) -> ResolvedSpec | ResolvedStre
 
 
 def names_stream(value: Any) -> bool:
-    """Whether a value is a stream, or the name, path or content of one, rather than of a task.
-
-    A name that nothing has is none of a stream: `resolve` then says which are near.
-    """
+    """Whether a value is a stream, or the name, path or content of one, rather than of a task."""
     if not isinstance(value, str | os.PathLike):
         return isinstance(value, StreamSpec) or (isinstance(value, dict) and "phases" in value)
     name = str(value)
@@ -182,10 +160,7 @@ def _registered(short: str, known: Mapping[str, _T]) -> _T | None:
 
 
 def refuse_symmetric_name(name: str) -> None:
-    """Raise UnknownNameError on the name of a symmetric id, such as `DefaultSymmetric`.
-
-    It presents the task of another name; a policy for one is not read as a policy for the other.
-    """
+    """Raise UnknownNameError on the name of a symmetric id, such as `DefaultSymmetric`."""
     short = re.sub(r"-v\d+$", "", name)
     if short.endswith(catalogue.SYMMETRIC):
         task = short.removesuffix(catalogue.SYMMETRIC)

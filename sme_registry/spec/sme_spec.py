@@ -380,14 +380,7 @@ class SMESpec(Setting, NamedDocument):
         return cards.html(self)
 
     def derive(self, **overrides: Any) -> SMESpec:
-        """This spec with some fields changed: another task, with another digest.
-
-        Args:
-          **overrides: spec fields and their new values.
-
-        Raises:
-          SpecError: an unknown field, or a value outside its range.
-        """
+        """This spec with some fields changed: another task, with another digest."""
         return SMESpec.from_dict({**self.to_dict(), **overrides}) if overrides else self
 
 
@@ -397,9 +390,6 @@ SpecLike: TypeAlias = SMESpec | dict[str, Any] | str | os.PathLike[str]
 
 def as_spec(value: SMESpec | dict[str, Any]) -> SMESpec:
     """A spec from itself or from plain data.
-
-    Raises:
-      SpecError: a field is wrong, missing or unknown, or `value` is neither.
 
     Examples:
       >>> from sme_registry.spec import as_spec

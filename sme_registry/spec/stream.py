@@ -269,11 +269,7 @@ class StreamSpec(NamedDocument):
         return cards.html(self)
 
     def piece_at(self, lifetime: int) -> int:
-        """The index of the piece in force after so many environment steps; the last one at the end.
-
-        Args:
-          lifetime: environment steps since the life began, at least 0.
-        """
+        """The index of the piece in force after so many environment steps; at the end the last."""
         return self.schedule.piece_at(lifetime)
 
     def next_switch(self, lifetime: int) -> int | None:
@@ -284,9 +280,6 @@ class StreamSpec(NamedDocument):
         """Visits of phases that end later than a lifetime: the index of each, and its end.
 
         Visit v is of phase v mod P, in cycle v div P. The last one goes on at its end.
-
-        Args:
-          after: environment steps since the life began, at least 0.
         """
         ends, length = [*accumulate(phase.steps for phase in self.phases)], self.cycle_steps
         P = len(ends)
@@ -298,12 +291,6 @@ class StreamSpec(NamedDocument):
         """The same stream with other tasks: number · 10⁶ is added to the seed of every phase.
 
         Phases with equal seeds have equal seeds in each draw, so what relates them is kept.
-
-        Args:
-          number: of the draw, in [0, 2³² − 1]; 0 is the stream itself.
-
-        Raises:
-          OptionError: the number is no such integer.
         """
         number = integer_in("number", number, 0, 2**32 - 1)
         return self if number == 0 else self._moved(number * BETWEEN_DRAWS)
@@ -348,9 +335,6 @@ StreamLike: TypeAlias = StreamSpec | dict[str, Any] | str | os.PathLike[str]
 
 def as_stream(value: StreamSpec | dict[str, Any]) -> StreamSpec:
     """A stream from itself or from plain data.
-
-    Raises:
-      SpecError: a field is wrong, missing or unknown, or `value` is neither.
 
     Examples:
       >>> from sme_registry.spec import as_stream

@@ -141,11 +141,7 @@ class Suite(Document):
         return tasks | {member.name: len(member.draws) for member in self.streams}
 
     def refuse_streams(self, what: str) -> None:
-        """Raise SpecError if the suite has streams.
-
-        Args:
-          what: that needs single tasks, such as "a leaderboard".
-        """
+        """Raise SpecError if the suite has streams."""
         if self.streams:
             names = ", ".join(member.name for member in self.streams)
             raise SpecError(

@@ -24,19 +24,9 @@ def sweep(
 ) -> tuple[SuiteClass, ...]:
     """The classes of a sweep: named settings that each differ from the task in one field.
 
-    Args:
-      spec: the task.
-      axes: by field, its values in the order of the classes.
-      name: of the class with the task's own setting.
-      instances: draws of each class, with the task's seed and those that follow it.
-
-    Returns:
-      One class for each value of a single axis, such as `k-1`, `k-5`. With several axes, or none,
-      the task itself comes first, and stands for its own value on each axis.
-
-    Raises:
-      OptionError: an axis has no values or the same value twice, or is the seed.
-      SpecError: no such field, or a value outside its range.
+    One class for each value of a single axis, such as `k-1`, `k-5`. With several axes, or none, the
+    task itself comes first, and stands for its own value on each axis. Each class has `instances`
+    draws, with the task's seed and those that follow it.
 
     Examples:
       >>> from sme_registry.studies import sweep
@@ -65,11 +55,7 @@ def sweep(
 
 
 def instance_seeds(seed: int | str, instances: int) -> tuple[int | str, ...]:
-    """The seeds of a class's instances: a task's own, and the integers that follow it.
-
-    Raises:
-      OptionError: a sealed task, whose seed is no integer, has a single instance.
-    """
+    """The seeds of a class's instances: a task's own, and the integers that follow it."""
     if instances == 1:
         return (seed,)
     if isinstance(seed, str):

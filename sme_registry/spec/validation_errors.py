@@ -35,16 +35,7 @@ def _shortened(text: str, length: int) -> str:
 
 
 def spec_error(error: ValidationError, source: str, schema: dict[str, Any]) -> SpecError:
-    """The first of Pydantic's errors as a SpecError, one line each.
-
-    At most 5 faults and 2,000 characters, however many there are: a document from elsewhere chooses
-    how many faults it has, and its names and values.
-
-    Args:
-      error: what the validation of a document raised.
-      source: what to call the document, such as its path.
-      schema: the JSON Schema of the document.
-    """
+    """Pydantic's first five errors as a SpecError of at most 2,000 characters, one line each."""
     lines = error.errors()
     parents = {line["loc"][:depth] for line in lines for depth in range(len(line["loc"]))}
     # Pydantic counts only valid entries: a list of one invalid entry is also "too short".

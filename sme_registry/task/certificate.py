@@ -79,12 +79,7 @@ class Certificate:
         return tuple(check for check in self.checks if check.outcome == outcome)
 
     def table(self, title: str, *, meanings: bool = False) -> Table:
-        """The checks as a table: outcome, name, value and range.
-
-        Args:
-          title: above it.
-          meanings: whether a column says what each check is about.
-        """
+        """The checks as a table: outcome, name, value and range."""
         from rich.markup import escape
 
         from sme_registry.io.tables import Table

@@ -61,17 +61,8 @@ _CONSTANT_PASSES, _CONSTANT_WARNS = (0.65, 0.80), (0.60, 0.90)  # mean r̃ of th
 def certify(task: Task | SpecLike, *, seed: int = 0) -> Certificate:
     """Measure a drawn task. The same task and seed give the same certificate.
 
-    Args:
-      task: the task, or a spec, name, digest or path, as for `load_task`.
-      seed: of the states and actions measured with, in [0, 2⁵³).
-
-    Returns:
-      The certificate; `passed` is False where the task should not be used.
-
-    Raises:
-      OptionError: the seed is not such an integer.
-      ResourceLimitError: the task, or the states to measure it with, would not fit in memory.
-      FingerprintMismatchError: this machine draws other numbers than the spec's file publishes.
+    `seed`, in [0, 2⁵³), is that of the states and actions to measure with. Where the certificate
+    has not `passed`, the task should not be used.
     """
     seed = integer_in("seed", seed, 0, 2**53 - 1, advice="Leave it out for 0.")
     if not isinstance(task, Task):
@@ -133,10 +124,10 @@ def _orthogonality_error(layer: Layer, unit_rows: bool) -> float:
 
 
 def _mixing(task: Task, seed: int, lanes: int) -> tuple[Check, ...]:
-    """Where random actions lead an ensemble that starts uniformly, and one that starts at a point.
+    """Where random actions lead an ensemble of uniform starts, and one of a single start.
 
-    The first must stay uniform. The second need not become so within an episode: a channel into
-    which the actions put little may stay in a nearly invariant set. So it has no range.
+    The second need not become uniform within an episode: a channel into which the actions put
+    little may stay in a nearly invariant set. So it has no range.
     """
     S, A = task.spec.state_dim, task.spec.action_dim
     s = numbers(task, seed, "states", lanes, S)

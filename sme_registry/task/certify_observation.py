@@ -43,13 +43,7 @@ _SINGULAR = 1.0 / float(np.finfo(np.float64).eps)  # of a matrix that float64 ca
 
 
 def observation_checks(task: Task, seed: int, states: int) -> tuple[Check, ...]:
-    """The checks of a task with `observation`; none without.
-
-    Args:
-      task: the task.
-      seed: of the states, distractors and actions to measure with.
-      states: the number of states for the mixing.
-    """
+    """The checks of a task with `observation`; none without."""
     moving = () if task.distractor_transition is None else _distractors(task, seed)
     return (*moving, *(_mixing(task, seed, states) if task.mixing else ()))
 
@@ -135,13 +129,7 @@ def _extent(layer: Layer) -> Check:
 
 
 def _invertibility(task: Task, x: Array, S: int) -> tuple[Check, Check]:
-    """How well x is recovered from M(x): locally, and by one linear map.
-
-    Args:
-      task: the task.
-      x: `[N, n]` uniform states and distractors.
-      S: the first channels, which are the state's.
-    """
+    """How well x is recovered from M(x): locally, and by one linear map."""
     N, n = x.shape
     names = "mixing_condition", "mixing_linear_r2"
     if n > _MEASURED_CHANNELS or 4 * (n + 1) > N // 2:

@@ -39,13 +39,7 @@ _BLOCK = 4_096  # states
 
 
 def safety_checks(task: Task, seed: int, states: int) -> tuple[Check, ...]:
-    """The checks of a task with `safety`; none without.
-
-    Args:
-      task: the task.
-      seed: of the states to measure with.
-      states: their number.
-    """
+    """The checks of a task with `safety`; none without."""
     if task.spec.safety is None:
         return ()
     tau = task.spec.safety.tightness

@@ -30,18 +30,8 @@ _CACHED_BYTES = 2**24  # larger tasks are drawn each time rather than kept in me
 def materialize(spec: SMESpec, fingerprint: Fingerprint | None = None) -> Task:
     """Draw the numbers of a spec. The same spec gives the same task, bit for bit on one machine.
 
-    Args:
-      spec: the spec, or its fields as a mapping.
-      fingerprint: published numbers that the task must have, such as `EnvFile.fingerprint`; None
-        compares with nothing.
-
-    Returns:
-      The task; its arrays are read-only.
-
-    Raises:
-      SpecError: `spec` is not an SMESpec or a mapping of its fields.
-      ResourceLimitError: it would not fit in memory; the message says how much it needs.
-      FingerprintMismatchError: the numbers drawn on this machine differ from the published ones.
+    The task's arrays are read-only. With a `fingerprint`, such as `EnvFile.fingerprint`, other
+    numbers are a `FingerprintMismatchError`; too large a task is a `ResourceLimitError`.
 
     Examples:
       >>> task = sme_registry.materialize(sme_registry.SMESpec(seed=3))
@@ -67,14 +57,6 @@ def materialize(spec: SMESpec, fingerprint: Fingerprint | None = None) -> Task:
 def load_task(task: SpecLike, **overrides: Any) -> Task:
     """Draw the task of a name or spec; one of a file must have its file's fingerprint.
 
-    Args:
-      task: a spec, its fields, an id, a digest, or the path of a file.
-      **overrides: spec fields to change; the derived task has no published numbers.
-
-    Raises:
-      UnknownNameError, SpecError: no such task, or a field is out of range.
-      ResourceLimitError, FingerprintMismatchError: see `materialize`.
-
     Examples:
       >>> from sme_registry.task import load_task
       >>> load_task("Default", action_dim=2).W.shape
@@ -86,13 +68,6 @@ def load_task(task: SpecLike, **overrides: Any) -> Task:
 
 def load_spec(task: SpecLike) -> SMESpec:
     """The spec of a name; one of a file is drawn to check the file's fingerprint.
-
-    Args:
-      task: a spec, its fields, an id, a digest, or the path of a file.
-
-    Raises:
-      UnknownNameError, SpecError: no such task, or a field is out of range.
-      ResourceLimitError, FingerprintMismatchError: see `materialize`.
 
     Examples:
       >>> from sme_registry.task import load_spec
@@ -106,14 +81,6 @@ def materialize_stream(
     stream: StreamSpec, fingerprints: tuple[Fingerprint, ...] = ()
 ) -> tuple[Task, ...]:
     """Draw the task of each piece of a cycle; pieces with equal specs share one.
-
-    Args:
-      stream: the stream.
-      fingerprints: published numbers of each phase's spec; empty compares with nothing.
-
-    Raises:
-      ResourceLimitError: all phases together would not fit in memory.
-      FingerprintMismatchError: a phase's numbers differ from the published ones; it is named.
 
     Examples:
       >>> from sme_registry.task import load_stream, materialize_stream
@@ -133,9 +100,6 @@ def materialize_stream(
 
 def materialize_together(stream: StreamSpec, specs: Sequence[SMESpec]) -> tuple[Task, ...]:
     """Draw the tasks of some specs of a stream; equal specs share one.
-
-    Raises:
-      ResourceLimitError: together they would not fit in memory.
 
     Examples:
       >>> from sme_registry.task import load_stream, materialize_together
@@ -157,13 +121,6 @@ def materialize_together(stream: StreamSpec, specs: Sequence[SMESpec]) -> tuple[
 
 def load_stream(stream: StreamLike) -> StreamSpec:
     """The stream of a name; one of a file is drawn to check the file's fingerprints.
-
-    Args:
-      stream: a stream, its fields, an id, a digest, or the path of a file.
-
-    Raises:
-      UnknownNameError, SpecError: no such stream, or a field is out of range.
-      ResourceLimitError, FingerprintMismatchError: see `materialize_stream`.
 
     Examples:
       >>> from sme_registry.task import load_stream

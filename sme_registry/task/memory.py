@@ -28,11 +28,7 @@ def peak_bytes(spec: SMESpec) -> int:
 
 
 def limit_bytes() -> int:
-    """The limit: 4 GiB, or the value of the environment variable SME_MEMORY_LIMIT_GIB.
-
-    Raises:
-      OptionError: the variable is not a positive number.
-    """
+    """The limit: 4 GiB, or the value of the environment variable SME_MEMORY_LIMIT_GIB."""
     text = os.environ.get(LIMIT_VARIABLE)
     if text is None:
         return int(DEFAULT_LIMIT_GIB * 2**30)

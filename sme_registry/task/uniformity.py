@@ -35,18 +35,11 @@ def lanes_followed(channels: int, action_dim: int) -> int:
 def distinct_share(
     transition: Callable[[Array, Array], Array], starts: Array, action: Array
 ) -> float:
-    """The smallest share of distinct values of a channel under constant actions.
+    """The smallest share of distinct values of a channel under constant actions, in (0, 1].
 
-    A channel must neither merge its lanes nor fall into a short cycle. A dyadic b with a dyadic
+    `[lanes, C]` starts take `CONSTANT_STEPS` steps of a `[1, A]` action, of 0, of ½ and of 1. A
+    channel must neither merge its lanes nor fall into a short cycle: a dyadic b with a dyadic
     action merges all lanes within 52 steps; float32 states cycle within about 2,000.
-
-    Args:
-      transition: `[N, C]` states and `[N, A]` actions to next states.
-      starts: `[lanes, C]`.
-      action: `[1, A]`; every lane takes `CONSTANT_STEPS` steps of it, of 0, of ½ and of 1.
-
-    Returns:
-      The share, in (0, 1], over the steps of one lane and over the lanes after the last step.
     """
     lanes, channels = starts.shape
     constants = np.concatenate([*(np.full_like(action, c) for c in (0.0, 0.5, 1.0)), action])
