@@ -94,11 +94,7 @@ def kind_of(file: Envelope) -> str:
 
 
 def read_any(path: str | os.PathLike[str]) -> Envelope:
-    """Read a file of any kind, which follows from the document in it.
-
-    Raises:
-      MalformedDocumentError, SpecError, DigestMismatchError: it is not one of these files.
-    """
+    """Read a file of any kind, which follows from the document in it."""
     data = read_json(path)
     for kind in KINDS.values():
         if isinstance(data, dict) and kind.content in data:
@@ -109,20 +105,12 @@ def read_any(path: str | os.PathLike[str]) -> Envelope:
 
 
 def find_file(kind: type[_File], name: str) -> _File:
-    """The file of one kind with a name or path.
-
-    Raises:
-      UnknownNameError, SpecError: there is none, or it is invalid.
-    """
+    """The file of one kind with a name or path."""
     return kind.read(name) if is_path(name) else catalogue.find(kind, name)
 
 
 def find_any(name: str) -> Envelope | SMESpec:
-    """The file of a name, path or digest; a spec alone if it has no file of its own.
-
-    Raises:
-      UnknownNameError: no environment, stream, suite, protocol or study has this name or digest.
-    """
+    """The file of a name, path or digest; a spec alone if it has no file of its own."""
     if is_path(name):
         return read_any(name)
     files = [file for kind in KINDS.values() for file in catalogue.entries(kind)]
@@ -146,11 +134,7 @@ def find_any(name: str) -> Envelope | SMESpec:
 
 
 def changes(pairs: list[str] | None) -> dict[str, Any]:
-    """The `field=value` pairs of `--set`; see `json_or_text` for values.
-
-    Raises:
-      OptionError: a pair has no `=`, or a field is given twice.
-    """
+    """The `field=value` pairs of `--set`; see `json_or_text` for values."""
     fields: dict[str, Any] = {}
     for pair in pairs or ():
         name, equals, text = pair.partition("=")
@@ -166,12 +150,7 @@ def changes(pairs: list[str] | None) -> dict[str, Any]:
 def changed(
     document: SMESpec | StreamSpec, name: str, fields: dict[str, Any]
 ) -> SMESpec | StreamSpec:
-    """A task with some fields changed.
-
-    Raises:
-      OptionError: the document of this name is a stream, which has none to change.
-      SpecError: a field is out of range or unknown.
-    """
+    """A task with some fields changed."""
     if isinstance(document, SMESpec):
         return document.derive(**fields)
     for field in fields:
@@ -189,11 +168,7 @@ def json_or_text(text: str) -> Any:
 
 
 def check_document_path(path: Path, *, force: bool) -> None:
-    """Check the path of a document that a command is about to write.
-
-    Raises:
-      OptionError: it does not end in .json, or exists and `force` is false.
-    """
+    """Check the path of a document that a command is about to write."""
     if path.suffix != ".json":
         raise OptionError(f"{path}: must end in .json, so that commands recognise it as a path.")
     refuse_existing(path, force=force)

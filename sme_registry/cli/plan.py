@@ -85,11 +85,7 @@ class ClassOptions:
     ] = 1
 
     def members(self) -> dict[str, list[dict[str, Any]]]:
-        """The classes of a suite, one for each task or stream, or those of the sweeps.
-
-        Returns:
-          The fields `classes` and `streams` of a suite or a plan; no field that is empty.
-        """
+        """The classes of a suite, one for each task or stream, or those of the sweeps."""
         tasks = self.task or ()
         if self.sweep and (self.suite is not None or len(tasks) != 1):
             raise OptionError("--sweep: needs exactly one --task, and no --suite.")
@@ -456,13 +452,7 @@ def scaled_plan(
     evaluations: int | None,
     agents: str | None = None,
 ) -> StudyFile:
-    """A plan with the budgets of `--steps`, `--seeds` and `--evaluations`, and `--agents`.
-
-    Raises:
-      OptionError: `--steps` is not a number, or is given twice for an algorithm.
-      UnknownNameError, SpecError: see `scaling.scaled`.
-      SMEError: see `scaling.with_agents`.
-    """
+    """A plan with the budgets of `--steps`, `--seeds` and `--evaluations`, and `--agents`."""
     from sme_registry.studies.engine.scaling import scaled, with_agents
 
     budgets: dict[str, int] = {}
@@ -481,12 +471,7 @@ def scaled_plan(
 
 
 def check_algorithms(algorithms: Iterable[StudyAlgorithm], errors: type[SMEError]) -> None:
-    """Check a plan's algorithms; warn about those that cannot be found here by such an error.
-
-    Raises:
-      OptionError, SpecError: an algorithm has no hyperparameter of a name.
-      SMEError: it cannot be found, by an error of another type.
-    """
+    """Check a plan's algorithms; warn about those that cannot be found here by such an error."""
     from sme_registry.studies.engine import checks
 
     messages = []

@@ -321,29 +321,7 @@ def train_suite(
     jobs: int | None,
     json: bool,
 ) -> None:
-    """Train on every instance of a suite and keep the models; the same call continues.
-
-    Args:
-      context: of the command, to refuse its options for a single task.
-      suite: name or path of the suite.
-      algorithm: as in `sme train`; None for the default of the suite's first task.
-      agents: as in `sme train`.
-      device: of agents in JAX.
-      steps: of each run.
-      seeds: runs on each class; None for `RUNS`, rounded up so that all instances of a class have
-        equally many.
-      folder: of the study; None for runs/SUITE-ALGORITHM.
-      action_range: "symmetric" or "unit".
-      independent: one model for each agent of a team.
-      protocol: name or path of the protocol of the evaluation after each run.
-      hyperparameters: where they differ from the algorithm's defaults.
-      jobs: runs at once; None for one per core.
-      json: print JSON.
-
-    Raises:
-      OptionError: an option is for a single task, or invalid.
-      Exit: a run failed; the exit code is 1.
-    """
+    """Train on every instance of a suite and keep the models; the same call continues."""
     from sme_registry import training
     from sme_registry.cli.plan import warn_of_uneven_rollouts
     from sme_registry.cli.study import print_status
@@ -411,20 +389,12 @@ def equal_runs(suite: Suite) -> int:
 
 
 def refuse_without_suite(context: typer.Context) -> None:
-    """Check that no option is given that only --suite has.
-
-    Raises:
-      OptionError: there is one.
-    """
+    """Check that no option is given that only --suite has."""
     _refuse_options(context, ("seeds", "jobs"), "is for --suite. Add --suite, or leave it out")
 
 
 def refuse_fields(fields: dict[str, Any]) -> None:
-    """Check that no option changes a field of the suite's tasks.
-
-    Raises:
-      OptionError: one does.
-    """
+    """Check that no option changes a field of the suite's tasks."""
     for name in fields:
         raise OptionError(
             f"--set {name}: is a field of the task, and the suite sets it. Write another suite "
