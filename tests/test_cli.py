@@ -25,7 +25,7 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
-from sme_registry.task.certify import certify
+from sme_registry.task.certificate import certify
 from tests.commands import good, refused, sme
 
 SME = [sys.executable, "-c", "from sme_registry.cli import main; main()"]

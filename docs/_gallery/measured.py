@@ -11,7 +11,7 @@ from typing import Any
 from sme_registry import evaluate
 from sme_registry.io import read_json, to_json, write_atomically
 from sme_registry.spec import SMESpec, StreamSpec
-from sme_registry.task.certify import certify
+from sme_registry.task.certificate import certify
 
 from .entries import document, entries
 

@@ -114,7 +114,7 @@ def certify(
 
       sme certify core smoke
     """
-    from sme_registry.task.certify import certify as certify_task
+    from sme_registry.task.certificate import certify as certify_task
 
     specs = [entry for name in tasks for entry in _tasks(name)]
     certificates: list[tuple[str, Certificate]] = []

@@ -10,7 +10,7 @@ import pytest
 from sme_registry import SMESpec, load
 from sme_registry.errors import OptionError
 from sme_registry.task import Layer, Task, materialize
-from sme_registry.task.certify import certify
+from sme_registry.task.certificate import certify
 
 SMALL = SMESpec(state_dim=3, action_dim=2, seed=1)
 

@@ -8,9 +8,7 @@ import pytest
 from sme_registry import SMESpec
 from sme_registry.errors import ResourceLimitError
 from sme_registry.task import Layer, Task, materialize
-from sme_registry.task.certify import certify
-from sme_registry.task.certify_observation import observation_checks
-from sme_registry.task.certify_safety import safety_checks
+from sme_registry.task.certificate import _limits, _observation, certify
 from tests.task.test_certify import check
 
 MOVING = {"distractor_row_sums", "uniform_distractors", "distinct_distractors"}
@@ -22,7 +20,7 @@ def spec(**observation):
 
 
 def measured(task, states=4_000):
-    return {each.name: each for each in observation_checks(task, 0, states)}
+    return {each.name: each for each in _observation(task, 0, states)}
 
 
 def outcome(task, name):
@@ -128,7 +126,7 @@ def test_distractors_that_collapse_or_lose_an_actions_mass_are_refused():
 
 
 def test_a_mixing_of_very_many_channels_is_not_measured_and_says_so():
-    checks = observation_checks(materialize(spec(distractors=1_100, mixing="orthogonal")), 0, 2_000)
+    checks = _observation(materialize(spec(distractors=1_100, mixing="orthogonal")), 0, 2_000)
     skipped = [each for each in checks if each.outcome == "reported"]
     assert [each.name for each in skipped] == ["mixing_condition", "mixing_linear_r2"]
     assert all(each.value is None and "1,104 channels" in each.meaning for each in skipped)
@@ -158,7 +156,7 @@ def test_the_optimum_breaks_its_limits_in_the_share_that_the_tightness_says(tigh
     shares, prices = [], []
     for seed in range(10):
         task = materialize(SAFE.derive(safety={"tightness": tightness}, seed=seed))
-        broken, uniformity, *_, price = safety_checks(task, 0, 4_000)
+        broken, uniformity, *_, price = _limits(task, 0, 4_000)
         assert (broken.low, broken.high) == (0.5 * tightness, 1.5 * tightness)
         assert uniformity.outcome == "passed"
         shares.append(broken.value)
@@ -198,7 +196,7 @@ def test_policies_that_stay_near_the_middle_seldom_reach_their_limits():
     middling = SAFE.derive(complexity=2, policy_init="semi_orthogonal", safety={"tightness": 0.1})
     spread = middling.derive(policy_init="unit_variance")
     for spec, outcome in ((middling, "refused"), (spread, "passed")):
-        broken, *_ = safety_checks(materialize(spec), 0, 4_000)
+        broken, *_ = _limits(materialize(spec), 0, 4_000)
         assert (broken.name, broken.outcome) == ("broken_limits", outcome)
 
 
