@@ -182,6 +182,20 @@ def test_only_regular_files_are_read(tmp_path, whole, monkeypatch, has_dir_fd):
     refused("artefact_path", match, bundle.artefact, digest_of(bundle))
 
 
+def test_a_file_without_permission_is_named(bundle, monkeypatch):
+    opened = os.open
+
+    def denied(path, *arguments, **options):
+        if str(path).endswith(".onnx"):
+            raise PermissionError(13, "Permission denied")
+        return opened(path, *arguments, **options)
+
+    monkeypatch.setattr(os, "open", denied)
+    monkeypatch.setattr(os, "supports_dir_fd", {denied})
+    with pytest.raises(OptionError, match="onnx: cannot be read: Permission denied"):
+        bundle.artefact(digest_of(bundle))
+
+
 # --- making ------------------------------------------------------------------------------------
 
 
