@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
 from leaderboard.documents.board import BoardDocument, Limits
 from leaderboard.documents.entry import Entry, TicketRequest
@@ -34,7 +38,7 @@ from sme_registry.spec import (
     TeamSpec,
 )
 from sme_registry.spec.catalogue import entries
-from sme_registry.spec.descriptions import allowed, default_of, summary
+from sme_registry.spec.document import WORDED, short_repr, summary
 from sme_registry.spec.fields import symbol
 
 FOLDER = Path(__file__).resolve().parent
@@ -135,10 +139,61 @@ def documents() -> str:
 
 
 def _rows(kind: type[StrictModel]) -> list[tuple[str, ...]]:
+    root = kind.model_json_schema()
+    fields = (root["$defs"][kind.__name__] if "$ref" in root else root)["properties"]
     return [
-        (f"`{name}`", allowed(field), default_of(field), field.description or "")
+        (f"`{name}`", _allowed(fields[name]), _default(field), field.description or "")
         for name, field in kind.model_fields.items()
     ]
+
+
+def _default(field: FieldInfo) -> str:
+    """A field's default as in JSON; empty where the field is required."""
+    if field.is_required():
+        return ""
+    default = field.get_default(call_default_factory=True, validated_data={})
+    if default is None:
+        return "null"
+    if isinstance(default, BaseModel):
+        return f"{type(default).__name__}()"
+    return short_repr(list(default) if isinstance(default, tuple) else default)
+
+
+def _allowed(schema: dict[str, Any]) -> str:
+    """What a JSON Schema allows, in words: `an integer in [1, 4096]`."""
+    if "anyOf" in schema:
+        return " or ".join(map(_allowed, schema["anyOf"]))
+    if "$ref" in schema:
+        return f"`{schema['$ref'].rpartition('/')[2]}`"
+    if "const" in schema or "enum" in schema:
+        return " or ".join(repr(value) for value in schema.get("enum", [schema.get("const")]))
+    match schema.get("type"):
+        case "integer":
+            return "an integer" + _interval(schema)
+        case "number":
+            return "a finite number" + _interval(schema)
+        case "string":
+            return str(schema.get(WORDED, "a string" + _length(schema, "Length", "characters")))
+        case "array":
+            return "a list" + _length(schema, "Items", "entries")
+        case "object":
+            return "an object: names with values"
+        case "boolean":
+            return "true or false"
+    return str(schema.get("type", "of another form"))
+
+
+def _interval(schema: dict[str, Any]) -> str:
+    low = f"[{schema['minimum']}" if "minimum" in schema else "(−∞"
+    high = f"{schema['maximum']}]" if "maximum" in schema else "∞)"
+    low = f"({schema['exclusiveMinimum']}" if "exclusiveMinimum" in schema else low
+    high = f"{schema['exclusiveMaximum']})" if "exclusiveMaximum" in schema else high
+    return "" if (low, high) == ("(−∞", "∞)") else f" in {low}, {high}"
+
+
+def _length(schema: dict[str, Any], of: str, unit: str) -> str:
+    shortest, longest = schema.get(f"min{of}", 0), schema.get(f"max{of}")
+    return "" if longest is None else f" of {shortest} to {longest} {unit}"
 
 
 def _short(digest: str) -> str:

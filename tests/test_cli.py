@@ -365,7 +365,7 @@ class TestNew:
             (("--team", "nowhere.json"), "cannot be read"),
             (
                 ("--safety", '{"tightness": 0.6}'),
-                "safety.tightness=0.6: must be a finite number in",
+                "safety.tightness=0.6: must be in",
             ),
             (
                 ("--observation", '{"distractors": 1000000}', "--D", "0.5", "--safety", "{}"),

@@ -72,7 +72,7 @@ class TicketRequest(SealedManifest):
       answers_key: signs the answers; null in requests that are older than it.
     """
 
-    left_out_by_default: ClassVar[tuple[str, ...]] = ("answers_key",)
+    fields_added_later: ClassVar[tuple[str, ...]] = ("answers_key",)
 
     nonce: Annotated[str, matching(r"^[0-9a-f]{64}$", "64 hex digits, drawn at random")]
     answers_key: PublicKey | None = None

@@ -209,7 +209,7 @@ class Stepping(Document):
       signed: digest of the file in which the entrant signed answers and journal; null without any.
     """
 
-    left_out_by_default: ClassVar[tuple[str, ...]] = ("signed",)
+    fields_added_later: ClassVar[tuple[str, ...]] = ("signed",)
 
     steps: Annotated[Integer, Field(ge=0)]
     normalised_online_regret: Annotated[Real, Field(ge=0)]

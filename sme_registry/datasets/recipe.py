@@ -27,9 +27,8 @@ from sme_registry.spec import (
     StrictModel,
     TupleOf,
 )
-from sme_registry.spec.document import plain_number
+from sme_registry.spec.document import plain_number, short_repr
 from sme_registry.spec.sme_spec import Seed
-from sme_registry.spec.validation_errors import short_repr
 
 _TOLERANCE = 1e-9  # of the sum of weights: ten times 0.1 is not 1 in floating point
 

@@ -29,7 +29,7 @@ from sme_registry.io import choice
 from sme_registry.jax import pairs
 from sme_registry.jax.pairs import Pair
 from sme_registry.spec import SMESpec, SpecLike
-from sme_registry.spec.validation_errors import short_repr
+from sme_registry.spec.document import short_repr
 from sme_registry.task import Task, load_task
 from sme_registry.task.draw import GRID_BITS
 

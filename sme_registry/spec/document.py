@@ -2,12 +2,18 @@
 
 digest = "sha256:" + hex(SHA-256(RFC 8785 canonical JSON of all fields)), so equal documents have
 equal digests on every machine, regardless of key order and of how a number was written.
+
+Each field has one text, its entry under "Attributes:" in the docstring of the class or of its base:
+`help`, the JSON Schema and the pages of `docs/` show it.
 """
 
 from __future__ import annotations
 
+import inspect
+import re
+import textwrap
 from collections.abc import Iterator, Sequence, Sized
-from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, TypeVar, get_args
 
 import rfc8785
 from pydantic import (
@@ -22,12 +28,133 @@ from pydantic import (
     model_serializer,
     model_validator,
 )
-from pydantic_core import CoreSchema
+from pydantic.fields import FieldInfo
+from pydantic_core import CoreSchema, ErrorDetails
 
-from sme_registry.errors import DigestMismatchError
+from sme_registry.errors import DigestMismatchError, SpecError, did_you_mean
 from sme_registry.io import sha256_of
-from sme_registry.spec.descriptions import describe, describe_schema
-from sme_registry.spec.validation_errors import WORDED, spec_error
+
+_MAX_REPR, _MAX_PATH, _MAX_FAULTS, _MAX_TEXT = 60, 120, 5, 2000  # of errors
+_LONGEST_FIELD = 100  # characters of a field in `repr`
+_ENTRY = re.compile(r"^  (\w+(?:, \w+)*): ", re.M)  # under "Attributes:"
+
+WORDED = "$comment"
+"""The keyword under which our JSON Schemas say in words what a pattern allows."""
+
+_words: dict[str, str] = {}  # of patterns
+
+
+def short_repr(value: Any) -> str:
+    """A value as an error repeats it: cut to a length that fits on a line."""
+    try:
+        text = repr(value)
+    except RecursionError:
+        text = f"a {type(value).__name__} nested too deeply"
+    return _shortened(text, _MAX_REPR)
+
+
+def _shortened(text: str, length: int) -> str:
+    return text if len(text) <= length else text[: length - 1] + "…"
+
+
+def _spec_error(error: ValidationError, source: str, model: type[BaseModel]) -> SpecError:
+    """Pydantic's first five errors, one line each: a document chooses how many it has."""
+    lines = error.errors()
+    parents = {line["loc"][:depth] for line in lines for depth in range(len(line["loc"]))}
+    # Pydantic counts only valid entries: a list of one invalid entry is also "too short".
+    lines = [line for line in lines if line["type"] != "too_short" or line["loc"] not in parents]
+    texts = [_explain(model, line) for line in lines[:_MAX_FAULTS]]
+    if len(lines) > len(texts):
+        texts.append(f"… and {len(lines) - len(texts):,} more faults.")
+    text = texts[0] if len(texts) == 1 else "".join(f"\n  {text}" for text in texts)
+    return SpecError(_shortened(f"{source}: {text}", _MAX_TEXT))
+
+
+def _explain(model: type[BaseModel], line: ErrorDetails) -> str:
+    """One of Pydantic's errors as `field=value: what is allowed. What to do.`"""
+    location, kind = line["loc"], line["type"]
+    path = _shortened(".".join(map(str, location)), _MAX_PATH)
+    value = f"{path}={short_repr(line['input'])}" if path else short_repr(line["input"])
+    siblings = _fields_at(model, location[:-1])
+    if kind == "missing":
+        return f"{path}: missing. Add it."
+    if kind == "extra_forbidden":
+        near = did_you_mean(str(location[-1])[:_MAX_PATH], siblings)
+        return f"{value}: unknown field.{near or _known(siblings)} Rename or remove it."
+    if kind == "value_error":
+        message = str(line["ctx"]["error"])
+        if not _fields_at(model, location):
+            return f"{value}: {message}"
+        return f"{path}.{message}" if path else message  # of a model: names its field
+    pattern = line.get("ctx", {}).get("pattern")
+    field = siblings.get(str(location[-1])) if location else None
+    interval = "" if field is None else _interval(field)
+    if pattern in _words:
+        allowed = f"must be {_words[pattern]}"
+    elif interval and kind.startswith(("greater_than", "less_than")):
+        allowed = f"must be{interval}"
+    else:
+        allowed = re.sub("^Input should|should", "must", line["msg"], count=1) + interval
+    if field is None or field.default is None or field.is_required():
+        return f"{value}: {allowed}. Correct it."
+    default = short_repr(field.get_default(call_default_factory=True, validated_data={}))
+    return f"{value}: {allowed}. Correct it, or leave it out for the default, {default}."
+
+
+def _interval(field: FieldInfo) -> str:
+    """` in [1, 4096]`, from the limits of a number; empty where it has none."""
+    optional = [info for option in get_args(field.annotation) for info in _annotations(option)]
+    low, high = "(−∞", "∞)"
+    for entry in [*field.metadata, *(limit for info in optional for limit in info.metadata)]:
+        low = f"[{entry.ge}" if hasattr(entry, "ge") else low
+        low = f"({entry.gt}" if hasattr(entry, "gt") else low
+        high = f"{entry.le}]" if hasattr(entry, "le") else high
+        high = f"{entry.lt})" if hasattr(entry, "lt") else high
+    return "" if (low, high) == ("(−∞", "∞)") else f" in {low}, {high}"
+
+
+def _annotations(kind: Any) -> list[FieldInfo]:
+    return [entry for entry in getattr(kind, "__metadata__", ()) if isinstance(entry, FieldInfo)]
+
+
+def _known(fields: dict[str, FieldInfo]) -> str:
+    return f" Known fields: {', '.join(fields)}." if fields else ""
+
+
+def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> dict[str, FieldInfo]:
+    """The fields of the model at a place in a document; empty where it is no model."""
+    fields = model.model_fields
+    for part in location:
+        if part in fields:
+            inner = next(_models(fields[str(part)].annotation), None)
+            fields = {} if inner is None else inner.model_fields
+    return fields
+
+
+def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+    if inspect.isclass(annotation) and issubclass(annotation, BaseModel):
+        yield annotation
+    for argument in get_args(annotation):
+        yield from _models(argument)
+
+
+def _sections(kind: type[BaseModel]) -> tuple[str, dict[str, str], str]:
+    """A docstring's text before its attributes, they by name, and the sections after them."""
+    before, _, section = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")
+    section, _, after = section.partition("\n\n")
+    parts = _ENTRY.split(section)
+    entries = {
+        name: " ".join(entry.split())
+        for names, entry in zip(parts[1::2], parts[2::2], strict=True)
+        for name in names.split(", ")
+    }
+    return before.strip(), entries, after.strip()
+
+
+def summary(kind: type[BaseModel]) -> str:
+    """A class's docstring without its fields and examples."""
+    before, _, after = _sections(kind)
+    return f"{before}\n\n{after}".partition("\n\nExamples:\n")[0].strip()
 
 
 def plain_number(value: Any) -> Any:
@@ -72,6 +199,7 @@ def matching(pattern: str, allowed: str, **limits: Any) -> Any:
       ...
       sme_registry.errors.SpecError: Colour: code='red': must be '#' and 6 hex digits. Correct it.
     """
+    _words[pattern] = allowed
     return Field(pattern=pattern, json_schema_extra={WORDED: allowed}, **limits)
 
 
@@ -89,9 +217,6 @@ Digest = Annotated[
 ]
 
 
-_LONGEST_FIELD = 100  # characters of a field in `repr`
-
-
 class _Abbreviated:
     """A long field in the `repr` of a model."""
 
@@ -106,6 +231,9 @@ class _Abbreviated:
 class StrictModel(BaseModel):
     """Frozen and strict; invalid and unknown fields are errors that say how to correct them."""
 
+    # While these have their default, they are in no JSON: older documents keep their digests.
+    fields_added_later: ClassVar[tuple[str, ...]] = ()
+
     # An instance of a subclass has more fields than its place: equal digests, unequal documents.
     model_config = ConfigDict(
         frozen=True,
@@ -119,19 +247,33 @@ class StrictModel(BaseModel):
         try:
             super().__init__(**data)
         except ValidationError as error:
-            raise spec_error(error, type(self).__name__, self.model_json_schema()) from None
+            raise _spec_error(error, type(self).__name__, type(self)) from None
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
         super().__pydantic_init_subclass__(**kwargs)
-        describe(cls)
+        before, entries, after = _sections(cls)
+        lines = []
+        for name, field in cls.model_fields.items():
+            field.description = entries.get(name, field.description)
+            if field.description:
+                text = f"  {name}: {field.description}"
+                lines.append(textwrap.fill(text, 96, subsequent_indent=" " * 4))
+        if cls.__doc__ and lines:
+            fields = "Attributes:\n" + "\n".join(lines)
+            cls.__doc__ = "\n\n".join(filter(None, (before, fields, after))) + "\n"
 
     @classmethod
     def __get_pydantic_json_schema__(
         cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
         schema = handler(core_schema)
-        describe_schema(cls, handler.resolve_ref_schema(schema))
+        place = handler.resolve_ref_schema(schema)
+        if text := summary(cls):
+            place["description"] = text
+        for name, field in cls.model_fields.items():
+            if field.description:
+                place["properties"][name]["description"] = field.description
         return schema
 
     # The mark of Pydantic's own constructors: without it, each nested model would be validated by
@@ -151,6 +293,14 @@ class StrictModel(BaseModel):
             for name, value in data.items()
         }
 
+    @model_serializer(mode="wrap")
+    def _without_later_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        fields: dict[str, Any] = handler(self)
+        for name in self.fields_added_later:
+            if getattr(self, name) == type(self).model_fields[name].default:
+                fields.pop(name, None)
+        return fields
+
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
         """The fields; a long one is shown by its type and length, so that none fills a screen."""
         for name, value in super().__repr_args__():
@@ -162,7 +312,7 @@ class StrictModel(BaseModel):
         try:
             return cls.model_validate(data)
         except ValidationError as error:
-            raise spec_error(error, source or cls.__name__, cls.model_json_schema()) from None
+            raise _spec_error(error, source or cls.__name__, cls) from None
 
     def to_dict(self) -> dict[str, Any]:
         """Every field as plain JSON data."""
@@ -186,22 +336,10 @@ def without_empty(plain: dict[str, Any], *names: str) -> dict[str, Any]:
 class Document(StrictModel):
     """A model with an identity: equal documents have equal digests, unequal ones do not."""
 
-    # Fields younger than the first documents of this kind. While they have their default they are
-    # in no JSON, so that the digests of older documents stay the same.
-    left_out_by_default: ClassVar[tuple[str, ...]] = ()
-
-    @model_serializer(mode="wrap")
-    def _without_young_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        fields: dict[str, Any] = handler(self)
-        for name in self.left_out_by_default:
-            if getattr(self, name) == type(self).model_fields[name].default:
-                fields.pop(name, None)
-        return fields
-
     def every_field(self) -> dict[str, Any]:
         """As `to_dict`, with the fields that it leaves out; for people, and to compare."""
-        young = {name: getattr(self, name) for name in self.left_out_by_default}
-        return {**young, **self.to_dict()}
+        later = {name: getattr(self, name) for name in self.fields_added_later}
+        return {**later, **self.to_dict()}
 
     def canonical_json(self) -> bytes:
         """The RFC 8785 canonical JSON of every field."""

@@ -12,8 +12,7 @@ from typing import Annotated, Any, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
-from sme_registry.spec.document import Document, Integer, Real, SchemaVersion
-from sme_registry.spec.validation_errors import short_repr
+from sme_registry.spec.document import Document, Integer, Real, SchemaVersion, short_repr
 
 
 class EvaluationProtocol(Document):

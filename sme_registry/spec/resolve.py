@@ -14,10 +14,10 @@ from typing import Any, TypeVar, cast
 from sme_registry.errors import MalformedDocumentError, SpecError, StreamError, UnknownNameError
 from sme_registry.io import read_json
 from sme_registry.spec import catalogue
+from sme_registry.spec.document import short_repr
 from sme_registry.spec.envelope import EnvFile, Fingerprint, StreamFile, SuiteFile
 from sme_registry.spec.sme_spec import SMESpec, SpecLike, as_spec
 from sme_registry.spec.stream import StreamLike, StreamSpec, as_stream
-from sme_registry.spec.validation_errors import short_repr
 
 _HEX_DIGITS = 12  # fewest digits that name a spec
 

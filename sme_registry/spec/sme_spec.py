@@ -23,6 +23,7 @@ from pydantic import (
 
 from sme_registry.errors import SpecError
 from sme_registry.spec.document import (
+    WORDED,
     Document,
     Integer,
     NamedDocument,
@@ -31,8 +32,8 @@ from sme_registry.spec.document import (
     matching,
     plain_number,
     refuse_repeated_names,
+    short_repr,
 )
-from sme_registry.spec.validation_errors import WORDED, short_repr
 
 ActionRange: TypeAlias = Literal["unit", "symmetric"]
 """The range of actions: [0, 1], the paper's, or [−1, 1], which Stable-Baselines3 prefers."""
@@ -252,7 +253,7 @@ class Setting(Document):
       observation: what the agent sees in place of the state.
     """
 
-    left_out_by_default: ClassVar[tuple[str, ...]] = ("rotation", "safety", "observation")
+    fields_added_later: ClassVar[tuple[str, ...]] = ("rotation", "safety", "observation")
 
     schema_version: SchemaVersion = 1
     state_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM)] = 8
@@ -368,7 +369,7 @@ class SMESpec(Setting, NamedDocument):
       >>> SMESpec(hidden_width=0)
       Traceback (most recent call last):
       ...
-      sme_registry.errors.SpecError: SMESpec: hidden_width=0: must be an integer in [1, 4096]. ...
+      sme_registry.errors.SpecError: SMESpec: hidden_width=0: must be in [1, 4096]. ...
     """
 
     seed: Seed = 0

@@ -24,9 +24,9 @@ from sme_registry.spec.document import (
     Real,
     SchemaVersion,
     StrictModel,
+    short_repr,
 )
 from sme_registry.spec.sme_spec import FULL_TURN, MAX_SEED, SMESpec
-from sme_registry.spec.validation_errors import short_repr
 
 MAX_PIECES = 10_000  # of one cycle
 MAX_VISITS = 1_000  # of a life that is evaluated

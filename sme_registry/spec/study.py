@@ -113,7 +113,7 @@ class Cell(Document):
       protocol: of the evaluation within and out of distribution at the end.
     """
 
-    left_out_by_default: ClassVar[tuple[str, ...]] = ("stream",)
+    fields_added_later: ClassVar[tuple[str, ...]] = ("stream",)
 
     schema_version: SchemaVersion = 1
     spec: SMESpec
@@ -221,7 +221,7 @@ class StudyPlan(Document):
       5
     """
 
-    left_out_by_default: ClassVar[tuple[str, ...]] = ("streams",)
+    fields_added_later: ClassVar[tuple[str, ...]] = ("streams",)
 
     schema_version: SchemaVersion = 1
     classes: Classes = ()

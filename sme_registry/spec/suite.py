@@ -18,10 +18,10 @@ from sme_registry.spec.document import (
     Name,
     SchemaVersion,
     refuse_repeated_names,
+    short_repr,
 )
 from sme_registry.spec.sme_spec import Seed, Setting, SMESpec
 from sme_registry.spec.stream import StreamSpec
-from sme_registry.spec.validation_errors import short_repr
 
 
 class SuiteClass(Document):
@@ -113,7 +113,7 @@ class Suite(Document):
       6
     """
 
-    left_out_by_default: ClassVar[tuple[str, ...]] = ("streams",)
+    fields_added_later: ClassVar[tuple[str, ...]] = ("streams",)
 
     schema_version: SchemaVersion = 1
     classes: Classes = ()

@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sme_registry.errors import OptionError
+from sme_registry.spec.document import short_repr
 from sme_registry.spec.sme_spec import Setting, SMESpec
 from sme_registry.spec.suite import SuiteClass
-from sme_registry.spec.validation_errors import short_repr
 
 _LONGEST_NAME = 64
 

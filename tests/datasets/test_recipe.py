@@ -79,7 +79,7 @@ FILE = "sha256:" + "0" * 64
           for nu in (-0.01, 1.01, float("nan"), float("inf"), "0.5", True)),
         *(({"behaviours": weights(*shares)}, "must add up to 1")
           for shares in ((0.5, 0.4), (0.7, 0.4), (0.5, 0.5 + 2e-9), (0.999999,))),
-        *(({"behaviours": weights(share)}, r"weight=.*must be a finite number in \(0, 1\]")
+        *(({"behaviours": weights(share)}, r"weight=.*must be .*in \(0, 1\]")
           for share in (0.0, -0.5, 1.5, float("nan"))),
         *(({"behaviours": [{"kind": kind, **own}]}, "behaviours")
           for kind, own in [("mixture", {}), ("random", {"nu": 0.5}), ("policy", {}),

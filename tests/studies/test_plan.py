@@ -138,7 +138,7 @@ class TestScaled:
     def test_bad_budgets_are_refused(self):
         with pytest.raises(UnknownNameError, match="Did you mean 'PPO'"):
             scaled(ABLATIONS, steps_of={"PPo": 1})
-        with pytest.raises(SpecError, match=r"seeds=0: must be an integer in \[1"):
+        with pytest.raises(SpecError, match=r"seeds=0: must be in \[1"):
             scaled(ABLATIONS, seeds=0)
 
     def test_a_selection_has_any_pattern_of_a_kind_and_both_kinds(self):
@@ -411,7 +411,7 @@ class TestEdited:
     @pytest.mark.parametrize(
         ("text", "words"),
         [
-            ("[]", "must be an object"),
+            ("[]", "must be a valid dictionary"),
             ('{"classes": [}', "edited.json"),
             ('{"seeds": 3}', "algorithms: missing"),
         ],
