@@ -11,7 +11,7 @@ import pytest
 from benchmarks.test_training import learner
 from sme_registry import SMESpec
 from sme_registry.spec import StreamSpec
-from sme_registry.task import load_stream
+from sme_registry.task import load
 from sme_registry.training.algorithms import one_thread
 
 pytest.importorskip("jax")
@@ -77,7 +77,7 @@ def test_training_steps_in_a_stream(compare: Any, name: str) -> None:
 
     Each part draws the random numbers of the whole rollout.
     """
-    stream = StreamSpec(phases=load_stream(f"SME/{name}-v1").phases, cycles=1000)
+    stream = StreamSpec(phases=load(f"SME/{name}-v1", StreamSpec).phases, cycles=1000)
     steps = 10 * ROLLOUT
     compare(
         f"PPO in JAX, a life in {name}", "step", training([stream]), steps,

@@ -102,9 +102,9 @@ def register(spec: SMESpec | StreamSpec, name: str) -> str:
       3
     """
     from sme_registry.envs.base import argument_of
-    from sme_registry.spec import StreamSpec, as_spec, as_stream
+    from sme_registry.spec import SMESpec, as_spec, as_stream
     from sme_registry.spec.catalogue import NAMESPACE, SYMMETRIC
-    from sme_registry.spec.resolve import names_stream, registered, registered_streams
+    from sme_registry.spec.resolve import names_stream, registered
     from sme_registry.task.streams import DYNAMICS_VERSION
 
     document = (
@@ -132,23 +132,19 @@ def register(spec: SMESpec | StreamSpec, name: str) -> str:
             f"{env_id!r} stands for another {argument_of(existing)} ({existing.digest[:19]}…). "
             "Choose another name: a released id never changes its numbers."
         )
-    if isinstance(document, StreamSpec):
-        registered_streams[env_id] = document.named(env_id)
-    else:
-        registered[env_id] = document.named(env_id)
-        if document.team is not None:
-            _register_team(env_id, document.to_dict())
-            return env_id
+    registered[env_id] = document.named(env_id)
+    if isinstance(document, SMESpec) and document.team is not None:
+        _register_team(env_id, document.to_dict())
+        return env_id
     _register(env_id, argument_of(document), document.to_dict())
     return env_id
 
 
 def _document_of(name: str) -> SMESpec | StreamSpec:
     """The spec or the stream that a name stands for; draws nothing."""
-    from sme_registry.spec.resolve import ResolvedStream, resolve_document
+    from sme_registry.spec.resolve import resolve
 
-    found = resolve_document(name)
-    return found.stream if isinstance(found, ResolvedStream) else found.spec
+    return resolve(name).document
 
 
 @overload
@@ -177,11 +173,9 @@ def load(id_or_path_or_digest: str | os.PathLike[str], kind: Any = None) -> Any:
       >>> sme_registry.load("sha256:66e9b7a9a266").content_name
       'sha256-66e9b7a9a266'
     """
-    from sme_registry.spec import SMESpec, StreamSpec
-    from sme_registry.task import load_document, load_spec, load_stream
+    from sme_registry import task
 
-    loaders: dict[Any, Any] = {SMESpec: load_spec, StreamSpec: load_stream}
-    return loaders.get(kind, load_document)(id_or_path_or_digest)
+    return task.load(id_or_path_or_digest, kind)
 
 
 def save(
@@ -263,18 +257,18 @@ def env_spec(spec: SpecLike | StreamLike, **kwargs: Any) -> EnvSpec:
     """
     from sme_registry.envs import SMEStreamEnv, arguments
     from sme_registry.envs.base import content_id
-    from sme_registry.spec import SMESpec
+    from sme_registry.spec import SMESpec, StreamSpec
     from sme_registry.spec.resolve import names_stream
-    from sme_registry.task import load_spec, load_stream
+    from sme_registry.task import load
 
     if names_stream(spec):
         for name in SMESpec.model_fields.keys() & kwargs.keys():
             arguments.refuse_override(SMEStreamEnv, name)
-        stream = load_stream(cast("StreamLike", spec))
+        stream = load(cast("StreamLike", spec), StreamSpec)
         kwargs = {"stream": stream.to_dict(), **kwargs}
         return EnvSpec(id=content_id(stream), **_ENTRY_POINTS["stream"], kwargs=kwargs)
     overrides = {name: kwargs.pop(name) for name in [*kwargs] if name in SMESpec.model_fields}
-    derived = load_spec(cast("SpecLike", spec)).derive(**overrides)
+    derived = load(cast("SpecLike", spec), SMESpec).derive(**overrides)
     kwargs = {"spec": derived.to_dict(), **kwargs}
     return EnvSpec(id=content_id(derived), **_ENTRY_POINTS["spec"], kwargs=kwargs)
 

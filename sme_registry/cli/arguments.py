@@ -33,11 +33,10 @@ from sme_registry.spec import (
 )
 from sme_registry.spec.envelope import Envelope
 from sme_registry.spec.resolve import (
+    check_not_bare,
     is_path,
     names_stream,
-    refuse_bare_spec,
     resolve,
-    resolve_stream,
 )
 
 TaskName = Annotated[
@@ -99,7 +98,7 @@ def read_any(path: str | os.PathLike[str]) -> Envelope:
     for kind in KINDS.values():
         if isinstance(data, dict) and kind.content in data:
             return kind.from_dict(data, os.fspath(path))
-    refuse_bare_spec(data, os.fspath(path))
+    check_not_bare(data, os.fspath(path))
     contents = ", ".join(repr(kind.content) for kind in KINDS.values())
     raise MalformedDocumentError(f"{os.fspath(path)}: must be an object with one of {contents}.")
 
@@ -118,10 +117,10 @@ def find_any(name: str) -> Envelope | SMESpec:
         if name in (file.name, file.versioned_name, file.digest):
             return file
     if names_stream(name):
-        stream = resolve_stream(name).stream
+        stream = resolve(name, StreamSpec).document
         return next(f for f in files if isinstance(f, StreamFile) and f.digest == stream.digest)
     try:
-        spec = resolve(name).spec
+        spec = resolve(name, SMESpec).document
     except UnknownNameError as error:
         hint = did_you_mean(name.rsplit("/", 1)[-1], [file.name for file in files])
         if hint and "Did you mean" not in str(error):

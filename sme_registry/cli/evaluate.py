@@ -33,7 +33,7 @@ from sme_registry.spec import (
     StreamSpec,
     catalogue,
 )
-from sme_registry.task import load_document
+from sme_registry.task import load
 
 
 def _complete_policy(incomplete: str) -> list[str]:
@@ -118,7 +118,7 @@ def evaluate(
 
       sme evaluate runs/life/snapshots/visit-*.zip Switch5 --initial runs/life/snapshots/initial.zip
     """
-    document = changed(load_document(task), task, changes(set_))
+    document = changed(load(task), task, changes(set_))
     given = _Policies(policies, initial, fresh, action_range, algorithm)
     _check_number(given, task, document)
     from sme_registry import evaluation

@@ -12,7 +12,7 @@ from sme_registry.cli.arguments import ActionRange, Force, SpecChanges, changes,
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.io import integer_in, refuse_existing
 from sme_registry.spec import EnvFile, SMESpec, catalogue
-from sme_registry.task import load_spec
+from sme_registry.task import load
 
 if TYPE_CHECKING:
     from sme_registry.diagnosis import AnySubject
@@ -169,7 +169,7 @@ def _shown(
         raise OptionError("--cell: names a cell of a study, --task a policy's task. Give one.")
     if task is None and cell is None and not Path(what).is_dir():
         try:
-            return load_spec(what).derive(**changes(set_))
+            return load(what, SMESpec).derive(**changes(set_))
         except UnknownNameError as error:
             if ":" not in what or what.startswith("sha256:"):
                 raise
@@ -177,7 +177,7 @@ def _shown(
     from sme_registry import diagnosis
 
     if task is not None:
-        spec = load_spec(task).derive(**changes(set_))
+        spec = load(task, SMESpec).derive(**changes(set_))
         return diagnosis.load_policy(what, spec, action_range=action_range, log=log)
     if cell is not None:
         return diagnosis.load_cell(what, cell)

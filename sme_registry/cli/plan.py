@@ -45,7 +45,7 @@ from sme_registry.spec import (
 from sme_registry.spec.resolve import is_path
 from sme_registry.spec.study import INDEPENDENT
 from sme_registry.spec.sweep import sweep
-from sme_registry.task import load_document
+from sme_registry.task import load
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +99,7 @@ class ClassOptions:
             suite = find_file(SuiteFile, self.suite).suite
             classes, streams = [*suite.classes], [*suite.streams]
         for task in tasks:
-            document = load_document(task)
+            document = load(task)
             if isinstance(document, SMESpec):
                 classes += sweep(document, axes, name=_title(document), instances=instances)
                 continue

@@ -31,7 +31,7 @@ from sme_registry.spec import (
 )
 from sme_registry.spec.envelope import Envelope
 from sme_registry.spec.protocol import EvaluationProtocol
-from sme_registry.spec.resolve import known_specs, known_streams
+from sme_registry.spec.resolve import known
 
 Kind = enum.StrEnum("Kind", ["env", "stream", "suite", "protocol", "study"])
 
@@ -357,7 +357,7 @@ def _show_suite(file: SuiteFile, json: bool) -> None:
     print_tables(shown)
     digests = [each.digest for each in (*suite.instances, *suite.stream_instances)]
     kind = "task" if suite.classes else "stream"
-    if known_specs().keys() | known_streams().keys() >= set(digests):
+    if known(SMESpec).keys() | known(StreamSpec).keys() >= set(digests):
         out().print(f"To train on a {kind}: sme train {digests[0][: cards.SHORT]}", soft_wrap=True)
     else:  # one outside the catalogue cannot be found by its digest
         out().print(f"To train on these {kind}s: sme study new plan.json -a PPO --suite FILE")

@@ -34,7 +34,7 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
-from sme_registry.task import load_document
+from sme_registry.task import load
 
 
 def train(
@@ -226,7 +226,7 @@ def train(
     refuse_without_suite(context)
     if task is None:
         raise OptionError("Give a TASK or --suite, such as Default. See `sme train --help`.")
-    document = load_document(task)
+    document = load(task)
     if isinstance(document, StreamSpec):
         overrides |= {name: settings[name] for name in settings if name in StreamSpec.model_fields}
     document = changed(document, task, overrides)

@@ -23,8 +23,8 @@ from sme_registry.datasets.storage import (
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.io import choice, versions
-from sme_registry.spec import ACTION_RANGES, ProtocolLike, SpecLike, catalogue
-from sme_registry.task import load_spec, materialize
+from sme_registry.spec import ACTION_RANGES, ProtocolLike, SMESpec, SpecLike, catalogue
+from sme_registry.task import load, materialize
 
 _PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "h5py", "minari")
 
@@ -84,7 +84,7 @@ def make_dataset(
     behaviours = tuple(parse_behaviour(policy, weight, action_range) for policy, weight in pairs)
     recipe = DatasetRecipe.from_dict(
         {
-            "spec": load_spec(spec_or_id),
+            "spec": load(spec_or_id, SMESpec),
             "behaviours": behaviours,
             "transitions": transitions,
             "seed": seed,

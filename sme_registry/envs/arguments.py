@@ -26,8 +26,9 @@ from sme_registry.errors import (
 )
 from sme_registry.io import choice, integer_in
 from sme_registry.spec import ACTION_RANGES, SMESpec, SpecLike, StreamLike, StreamSpec
-from sme_registry.spec.resolve import resolve_stream
-from sme_registry.task import Task, load_task, materialize_stream
+from sme_registry.spec.resolve import resolve
+from sme_registry.task import Task, load_task
+from sme_registry.task.loading import draw_published
 
 MAX_LIFETIME = 2**62  # at which a life may begin: its steps are counted in 64 bits
 
@@ -59,12 +60,12 @@ def load_stream_tasks(
 
     Raises:
       UnexpectedKeywordError: there is an override: a stream has no fields of a spec to change.
-      SpecError, UnknownNameError, ResourceLimitError: see `load_stream`.
+      SpecError, UnknownNameError, ResourceLimitError: see `load`.
     """
     for name in overrides:
         refuse_override(environment, name)
-    resolved = resolve_stream(stream)
-    return StreamTasks(resolved.stream, materialize_stream(resolved.stream, resolved.fingerprints))
+    resolved = resolve(stream, StreamSpec)
+    return StreamTasks(resolved.document, draw_published(resolved))
 
 
 def refuse_override(environment: type, name: str) -> NoReturn:

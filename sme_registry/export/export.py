@@ -24,8 +24,8 @@ from sme_registry.export.network import INPUT, Network
 from sme_registry.export.operators import FEED_FORWARD
 from sme_registry.export.shapes import fold_shapes, read_by
 from sme_registry.io import choice, refuse_unwritable, require_packages, write_atomically
-from sme_registry.spec import ACTION_RANGES, ActionRange, SpecLike
-from sme_registry.task import load_spec
+from sme_registry.spec import ACTION_RANGES, ActionRange, SMESpec, SpecLike
+from sme_registry.task import load
 
 TOLERANCE = 1e-6
 # Float32 networks are exact only up to rounding: trained TD3s differed from float64 by up to
@@ -112,7 +112,7 @@ def onnx_bytes(
     require_packages("exporting a policy", libraries, "onnx")
     if action_range is not None:
         choice("action_range", action_range, ACTION_RANGES)
-    interface = None if spec is None else interface_of(load_spec(spec))
+    interface = None if spec is None else interface_of(load(spec, SMESpec))
     network = _network(policy, interface, action_range, vec_normalize)
     written, width = network.to_onnx(), network.observation_dim
     # In the simplest form that makes no difference: boards accept no tensors of computed sizes.

@@ -12,7 +12,7 @@ from sme_registry.errors import OptionError, SpecError
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.offline.record import BehaviourQuality
 from sme_registry.spec import EvaluationProtocol, ProtocolLike, SMESpec, SpecLike
-from sme_registry.task import Task, load_spec, materialize
+from sme_registry.task import Task, load, materialize
 
 _CHECKED_ROWS = 64
 _TOLERANCE = 1e-6  # of π* between machines, as for fingerprints
@@ -51,12 +51,12 @@ def data_source(data: Any, spec: SpecLike | None, protocol: ProtocolLike | None)
             raise OptionError("spec=None: is required with arrays. Give the spec of their task.")
         chosen = resolve_protocol("paper-v1" if protocol is None else protocol)
         ids: dict[str, str | None] = {"dataset": None, "recipe_digest": None}
-        spec = load_spec(spec)
+        spec = load(spec, SMESpec)
         source = DataSource(data, _single_agent(spec), spec.name, chosen, ids)
     elif isinstance(data, Dataset | str | os.PathLike):
         dataset = data if isinstance(data, Dataset) else open_dataset(data)
         record, recipe = dataset.record, dataset.recipe
-        if spec is not None and (digest := load_spec(spec).digest) != record.spec_digest:
+        if spec is not None and (digest := load(spec, SMESpec).digest) != record.spec_digest:
             raise OptionError(
                 f"spec={digest[:19]}…: the data set's task is {record.spec_digest[:19]}…. Leave it "
                 "out."

@@ -15,7 +15,7 @@ from sme_registry.evaluation import as_policy
 from sme_registry.io import integer_in
 from sme_registry.plots.style import canvas, entitle, figure_of
 from sme_registry.spec import ActionRange, SMESpec, SpecLike, catalogue
-from sme_registry.task import load_spec, materialize
+from sme_registry.task import load, materialize
 from sme_registry.task.draw import Array
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def similarity_map(
       >>> from sme_registry.plots import similarity_map
       >>> figure = similarity_map("linear", "Plane10", "map.png", resolution=20)
     """
-    spec = load_spec(spec_or_id)
+    spec = load(spec_or_id, SMESpec)
     if spec.state_dim != 2:
         raise OptionError(
             f"state_dim={spec.state_dim}: must be 2 for a map. Use a task such as SME/Plane1-v1."

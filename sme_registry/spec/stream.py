@@ -73,7 +73,7 @@ class Phase(StrictModel):
         from sme_registry.spec.resolve import resolve
 
         try:
-            return {**data, "spec": resolve(named).spec.named("")}
+            return {**data, "spec": resolve(named, SMESpec).document.named("")}
         except (UnknownNameError, SpecError) as error:
             raise ValueError(f"spec: {error}") from None
 

@@ -73,10 +73,10 @@ class StreamClass(Document):
     def _name_to_stream(cls, value: Any) -> Any:
         if not isinstance(value, str | os.PathLike):
             return value
-        from sme_registry.spec.resolve import resolve_stream
+        from sme_registry.spec.resolve import resolve
 
         try:
-            return resolve_stream(value).stream.named("")
+            return resolve(value, StreamSpec).document.named("")
         except (UnknownNameError, SpecError) as error:
             raise ValueError(str(error)) from None
 

@@ -2,9 +2,7 @@
 
 from sme_registry.task.draw import Layer
 from sme_registry.task.loading import (
-    load_document,
-    load_spec,
-    load_stream,
+    load,
     load_task,
     materialize,
     materialize_stream,
@@ -17,9 +15,7 @@ __all__ = [
     "Layer",
     "Step",
     "Task",
-    "load_document",
-    "load_spec",
-    "load_stream",
+    "load",
     "load_task",
     "materialize",
     "materialize_stream",

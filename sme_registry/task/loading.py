@@ -1,7 +1,7 @@
-"""From a name or a spec to a drawn task: `materialize`, `load_spec`, `load_task`; and of streams.
+"""From a name or a spec to a drawn task: `load`, `load_task`, `materialize`; and of streams.
 
 A digest fixes a spec but not the drawn numbers, so a file also publishes a fingerprint of them.
-It is checked where the file is named: `load_spec` and `load_task` draw the task and compare. A spec
+It is checked where the file is named: `load` and `load_task` draw the task and compare. A spec
 alone has no published numbers, so `materialize(spec)` checks only a fingerprint passed to it.
 """
 
@@ -9,21 +9,17 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar, overload
 
 from sme_registry.errors import FingerprintMismatchError
-from sme_registry.spec import Fingerprint, SMESpec, SpecLike, StreamLike, StreamSpec, as_spec
-from sme_registry.spec.resolve import (
-    ResolvedSpec,
-    ResolvedStream,
-    resolve,
-    resolve_document,
-    resolve_stream,
-)
+from sme_registry.spec import Fingerprint, SMESpec, SpecLike, StreamSpec, as_spec
+from sme_registry.spec.document import NamedDocument
+from sme_registry.spec.resolve import Resolved, resolve
 from sme_registry.task import draw, memory
 from sme_registry.task.fingerprint import check_fingerprint
 from sme_registry.task.task import Task
 
+_D = TypeVar("_D", bound=NamedDocument)
 _CACHED_BYTES = 2**24  # larger tasks are drawn each time rather than kept in memory
 
 
@@ -54,27 +50,50 @@ def materialize(spec: SMESpec, fingerprint: Fingerprint | None = None) -> Task:
     return task
 
 
+@overload
+def load(name: Any, kind: type[_D]) -> _D: ...
+@overload
+def load(name: Any, kind: None = None) -> SMESpec | StreamSpec: ...
+def load(name: Any, kind: Any = None) -> Any:
+    """What a name stands for, a spec or a stream; that of a file is drawn, to check its numbers.
+
+    A name is a document, its fields, an id, a digest, or the path of a file. A `kind`, `SMESpec` or
+    `StreamSpec`, accepts no other.
+
+    Examples:
+      >>> from sme_registry.task import load
+      >>> load("Interval5").k
+      5
+      >>> len(load("Switch5").phases)
+      5
+    """
+    resolved = resolve(name, kind)
+    if resolved.fingerprints:
+        draw_published(resolved)
+    return resolved.document
+
+
 def load_task(task: SpecLike, **overrides: Any) -> Task:
     """Draw the task of a name or spec; one of a file must have its file's fingerprint.
+
+    A derived task, with `overrides` of fields, has no published numbers.
 
     Examples:
       >>> from sme_registry.task import load_task
       >>> load_task("Default", action_dim=2).W.shape
       (2, 8)
     """
-    resolved = resolve(task).derive(**overrides)
-    return materialize(resolved.spec, resolved.fingerprint)
+    resolved = resolve(task, SMESpec)
+    if overrides:
+        return materialize(resolved.document.derive(**overrides))
+    return draw_published(resolved)[0]
 
 
-def load_spec(task: SpecLike) -> SMESpec:
-    """The spec of a name; one of a file is drawn to check the file's fingerprint.
-
-    Examples:
-      >>> from sme_registry.task import load_spec
-      >>> load_spec("Interval5").k
-      5
-    """
-    return _checked_spec(resolve(task))
+def draw_published(resolved: Resolved[Any]) -> tuple[Task, ...]:
+    """The task of a spec, or those of a stream's pieces, with its file's published numbers."""
+    if isinstance(resolved.document, StreamSpec):
+        return materialize_stream(resolved.document, resolved.fingerprints)
+    return (materialize(resolved.document, *resolved.fingerprints),)
 
 
 def materialize_stream(
@@ -83,8 +102,8 @@ def materialize_stream(
     """Draw the task of each piece of a cycle; pieces with equal specs share one.
 
     Examples:
-      >>> from sme_registry.task import load_stream, materialize_stream
-      >>> tasks = materialize_stream(load_stream("Switch5"))
+      >>> from sme_registry.task import load, materialize_stream
+      >>> tasks = materialize_stream(load("Switch5"))
       >>> len(tasks)
       5
     """
@@ -102,8 +121,8 @@ def materialize_together(stream: StreamSpec, specs: Sequence[SMESpec]) -> tuple[
     """Draw the tasks of some specs of a stream; equal specs share one.
 
     Examples:
-      >>> from sme_registry.task import load_stream, materialize_together
-      >>> stream = load_stream("Switch5")
+      >>> from sme_registry.task import load, materialize_together
+      >>> stream = load("Switch5")
       >>> first, again = materialize_together(stream, [stream.phases[0].spec] * 2)
       >>> first is again
       True
@@ -117,41 +136,6 @@ def materialize_together(stream: StreamSpec, specs: Sequence[SMESpec]) -> tuple[
     )
     drawn = {spec: materialize(spec) for spec in different}
     return tuple(drawn[spec] for spec in specs)
-
-
-def load_stream(stream: StreamLike) -> StreamSpec:
-    """The stream of a name; one of a file is drawn to check the file's fingerprints.
-
-    Examples:
-      >>> from sme_registry.task import load_stream
-      >>> len(load_stream("Switch5").phases)
-      5
-    """
-    return _checked_stream(resolve_stream(stream))
-
-
-def load_document(name: SpecLike | StreamLike) -> SMESpec | StreamSpec:
-    """The stream of a name, or the spec; see `load_stream` and `load_spec` for errors.
-
-    Examples:
-      >>> from sme_registry.task import load_document
-      >>> type(load_document("Switch5")).__name__
-      'StreamSpec'
-    """
-    found = resolve_document(name)
-    return _checked_stream(found) if isinstance(found, ResolvedStream) else _checked_spec(found)
-
-
-def _checked_spec(resolved: ResolvedSpec) -> SMESpec:
-    if resolved.fingerprint is not None:
-        materialize(resolved.spec, resolved.fingerprint)
-    return resolved.spec
-
-
-def _checked_stream(resolved: ResolvedStream) -> StreamSpec:
-    if resolved.fingerprints:
-        materialize_stream(resolved.stream, resolved.fingerprints)
-    return resolved.stream
 
 
 def _draw(spec: SMESpec) -> Task:

@@ -104,9 +104,9 @@ def observe(
     A single agent observes all of it, an agent of a team only its part; see `envs.team`.
 
     Examples:
-      >>> from sme_registry.task import load_spec, observe
+      >>> from sme_registry.task import load, observe
       >>> states, steps, rewards = np.full((2, 8), 0.5), np.array([0, 50]), np.zeros((2, 1))
-      >>> observe(load_spec("Default"), states, steps, rewards)[:, 8].tolist()
+      >>> observe(load("Default"), states, steps, rewards)[:, 8].tolist()
       [0.0, 0.5]
     """
     columns = [s, (t / spec.horizon)[:, None], np.minimum(accumulated_reward / spec.k, 1.0)]

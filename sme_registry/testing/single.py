@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from typing import Any, cast
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -16,8 +16,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from sme_registry.envs import SMEEnv, SMEVectorEnv
 from sme_registry.registration import env_spec
 from sme_registry.spec import ACTION_RANGES, SMESpec, SpecLike, StreamLike, StreamSpec
-from sme_registry.spec.resolve import names_stream
-from sme_registry.task import Task, load_spec, load_stream, materialize
+from sme_registry.task import Task, load, materialize
 from sme_registry.testing import episodes
 from sme_registry.testing.comparing import (
     TOLERANCE,
@@ -66,13 +65,6 @@ def check_sme(
     check_env_spec(task)
 
 
-def load_document(task: SpecLike | StreamLike) -> SMESpec | StreamSpec:
-    """The spec or stream of a name; checks that treat both alike take either."""
-    if names_stream(task):
-        return load_stream(cast("StreamLike", task))
-    return load_spec(cast("SpecLike", task))
-
-
 def check_gymnasium(task: SpecLike | StreamLike, *, single: Make = SMEEnv) -> None:
     """Gymnasium's own `check_env` passes without warnings in both action ranges.
 
@@ -82,7 +74,7 @@ def check_gymnasium(task: SpecLike | StreamLike, *, single: Make = SMEEnv) -> No
       >>> from sme_registry.testing import check_gymnasium
       >>> check_gymnasium(sme_registry.SMESpec(horizon=5))
     """
-    document = load_document(task)
+    document = load(task)
     if document.horizon == 1:
         return
     for action_range in ACTION_RANGES:
@@ -104,7 +96,7 @@ def check_info(task: SpecLike, *, single: Make = SMEEnv, seed: int = 0) -> None:
       >>> from sme_registry.testing import check_info
       >>> check_info(sme_registry.SMESpec(horizon=5))
     """
-    spec = load_spec(task)
+    spec = load(task, SMESpec)
     for action_range in ACTION_RANGES:
         env, untouched = (single(spec, action_range=action_range) for _ in range(2))
         for each in (env, untouched):
@@ -160,7 +152,7 @@ def check_definition(task: SpecLike, *, single: Make = SMEEnv, seed: int = 0) ->
       >>> from sme_registry.testing import check_definition
       >>> check_definition(sme_registry.SMESpec(horizon=5))
     """
-    spec = load_spec(task)
+    spec = load(task, SMESpec)
     definition, rng = materialize(spec), np.random.default_rng(seed)
     for episode in range(3):
         env = single(spec)
@@ -203,7 +195,7 @@ def check_optimum(task: SpecLike, *, single: Make = SMEEnv, seed: int = 0) -> No
       >>> from sme_registry.testing import check_optimum
       >>> check_optimum(sme_registry.SMESpec(horizon=5))
     """
-    spec = load_spec(task)
+    spec = load(task, SMESpec)
     optimal = materialize(spec).optimal_action
     spec = spec.derive(horizon=min(spec.horizon, LONGEST_HORIZON))
     for action_range in ACTION_RANGES:
@@ -218,7 +210,7 @@ def check_determinism(task: SpecLike | StreamLike, *, single: Make = SMEEnv, see
       >>> from sme_registry.testing import check_determinism
       >>> check_determinism(sme_registry.SMESpec(horizon=5))
     """
-    episodes.expect_determinism(functools.partial(single, load_document(task)), seed)
+    episodes.expect_determinism(functools.partial(single, load(task)), seed)
 
 
 def check_pickling(
@@ -234,7 +226,7 @@ def check_pickling(
       >>> from sme_registry.testing import check_pickling
       >>> check_pickling(sme_registry.SMESpec(horizon=5))
     """
-    document = load_document(task)
+    document = load(task)
     batch = vector(document, 3, autoreset_mode=AutoresetMode.NEXT_STEP.value)
     episodes.expect_same_copies("single environment", single(document), document.horizon, seed)
     episodes.expect_same_copies("vector environment", batch, document.horizon, seed)
@@ -255,7 +247,7 @@ def check_vector(
       >>> from sme_registry.testing import check_vector
       >>> check_vector(sme_registry.SMESpec(horizon=5))
     """
-    document, lanes = load_document(task), 3
+    document, lanes = load(task), 3
     steps = min(document.horizon + 5, MAX_STEPS)
     if isinstance(document, StreamSpec):
         steps = min(document.steps + document.horizon, LONGEST_LIFE)
@@ -288,7 +280,7 @@ def check_env_spec(task: SpecLike | StreamLike) -> None:
       >>> from sme_registry.testing import check_env_spec
       >>> check_env_spec(sme_registry.SMESpec(horizon=5))
     """
-    expected = load_document(task)
+    expected = load(task)
     for action_range in ACTION_RANGES:
         env = _recreated(env_spec(expected, action_range=action_range))
         digest = env.unwrapped.document.digest

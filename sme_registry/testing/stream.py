@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from sme_registry.envs import SMEStreamEnv, SMEStreamVectorEnv
 from sme_registry.spec import StreamLike, StreamSpec
-from sme_registry.task import Task, load_stream, materialize_stream, observe, step
+from sme_registry.task import Task, load, materialize_stream, observe, step
 from sme_registry.testing.comparing import TOLERANCE, expect_equal, expect_near, expect_same
 from sme_registry.testing.episodes import INFO_KEYS, LONGEST_LIFE, Make, has_ended, next_action
 from sme_registry.testing.single import (
@@ -67,7 +67,7 @@ def check_stream_definition(
       >>> phases = [dict(spec=task, steps=10), dict(spec=task.derive(k=5), steps=10)]
       >>> check_stream_definition(sme_registry.StreamSpec(phases=phases))
     """
-    stream = load_stream(stream)
+    stream = load(stream, StreamSpec)
     tasks, env, rng = materialize_stream(stream), single(stream), np.random.default_rng(seed)
     for life in range(2):
         lifetime, first_seed = 0, seed + life

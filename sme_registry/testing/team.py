@@ -13,8 +13,8 @@ from scipy.special import ndtr
 
 from sme_registry.envs.arguments import from_unit
 from sme_registry.envs.team import SMETeamEnv
-from sme_registry.spec import ACTION_RANGES, SpecLike
-from sme_registry.task import Task, load_spec, materialize, observe, step
+from sme_registry.spec import ACTION_RANGES, SMESpec, SpecLike
+from sme_registry.task import Task, load, materialize, observe, step
 from sme_registry.teams import TurnBasedTeam
 from sme_registry.testing import episodes
 from sme_registry.testing.comparing import (
@@ -68,7 +68,7 @@ def check_pettingzoo(task: SpecLike, *, parallel: Make = SMETeamEnv) -> None:
       >>> from sme_registry.testing import check_pettingzoo
       >>> check_pettingzoo(sme_registry.load("Team2").derive(horizon=5))
     """
-    spec = load_spec(task)
+    spec = load(task, SMESpec)
     definition = materialize(spec)
     widths = {owned.stop - owned.start for owned in definition.owned}
     unequal = len(widths) > 1 or len({len(channels) for channels in definition.observed}) > 1
@@ -103,7 +103,7 @@ def check_team_definition(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: 
       >>> from sme_registry.testing import check_team_definition
       >>> check_team_definition(sme_registry.load("Team2").derive(horizon=5))
     """
-    spec = load_spec(task)
+    spec = load(task, SMESpec)
     definition, rng = materialize(spec), np.random.default_rng(seed)
     for action_range in ACTION_RANGES:
         symmetric = action_range == "symmetric"
@@ -158,7 +158,7 @@ def check_team_optimum(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: int
       >>> from sme_registry.testing import check_team_optimum
       >>> check_team_optimum(sme_registry.load("Team2").derive(horizon=5))
     """
-    spec = load_spec(task)
+    spec = load(task, SMESpec)
     definition = materialize(spec)
 
     def act(s: Any) -> Any:
@@ -183,7 +183,7 @@ def check_team_determinism(task: SpecLike, *, parallel: Make = SMETeamEnv, seed:
       >>> from sme_registry.testing import check_team_determinism
       >>> check_team_determinism(sme_registry.load("Team2").derive(horizon=5))
     """
-    episodes.expect_determinism(functools.partial(parallel, load_spec(task)), seed)
+    episodes.expect_determinism(functools.partial(parallel, load(task, SMESpec)), seed)
 
 
 def check_team_pickling(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: int = 0) -> None:
@@ -193,7 +193,7 @@ def check_team_pickling(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: in
       >>> from sme_registry.testing import check_team_pickling
       >>> check_team_pickling(sme_registry.load("Team2").derive(horizon=5))
     """
-    spec = load_spec(task)
+    spec = load(task, SMESpec)
     episodes.expect_same_copies("team", parallel(spec), spec.horizon, seed)
 
 
@@ -204,7 +204,7 @@ def check_turns(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: int = 0) -
       >>> from sme_registry.testing import check_turns
       >>> check_turns(sme_registry.load("Team2").derive(horizon=5))
     """
-    spec = load_spec(task)
+    spec = load(task, SMESpec)
     make = functools.partial(parallel, spec)
     direct = episodes.play(make(), seed, seed)
     # Not `aec_to_parallel`, which would return the original environment.

@@ -46,7 +46,7 @@ from sme_registry.spec import (
     catalogue,
 )
 from sme_registry.spec.study import in_jax
-from sme_registry.task import load_document, materialize, materialize_stream
+from sme_registry.task import load, materialize, materialize_stream
 from sme_registry.training import checkpoint, reports
 from sme_registry.training import episodes as episode_files
 from sme_registry.training.algorithms import (
@@ -228,7 +228,7 @@ def _plan(
     independent: bool,
 ) -> RunRecord:
     """The record of a new run, still without its algorithm."""
-    document = load_document(task)
+    document = load(task)
     stream = document if isinstance(document, StreamSpec) else None
     spec = document if isinstance(document, SMESpec) else document.phases[0].spec
     if independent and spec.team is None:

@@ -22,7 +22,6 @@ INTEGERS = {
     "hidden_width": 4096,
 }
 ONE = {"action_dim": 4}
-NAN = float("nan")
 BAD = [
     # fields, what the message must contain
     ({"k": np.True_}, ["k=np.True_: must be a valid integer in"]),

@@ -25,7 +25,7 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
-from sme_registry.spec.resolve import ResolvedSpec, resolve
+from sme_registry.spec.resolve import Resolved, resolve
 from sme_registry.task import materialize
 
 ENVS, SUITES = catalogue.entries(EnvFile), catalogue.entries(SuiteFile)
@@ -92,7 +92,7 @@ def test_the_schema_of_a_spec_states_what_is_refused_elsewhere():
 
 def published(file):
     """The task of a file, found by its name and with its published numbers."""
-    assert resolve(file.versioned_name) == ResolvedSpec(file.spec, file.fingerprint)
+    assert resolve(file.versioned_name) == Resolved(file.spec, (file.fingerprint,))
     task = materialize(file.spec, file.fingerprint)
     assert task.W.shape == (file.spec.action_dim, file.spec.state_dim)
     return task

@@ -23,7 +23,7 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
-from sme_registry.task import load_spec, load_task, materialize
+from sme_registry.task import load, load_task, materialize
 from sme_registry.task.fingerprint import check_fingerprint, fingerprint_of
 from sme_registry.task.loading import _draw_cached
 from tests.strategies import specs
@@ -117,7 +117,7 @@ def test_other_numbers_than_the_published_neither_load_nor_run(saved):
     file = EnvFile.read(changed(saved, fingerprint=good | {"next_state": off}))
     for run in (
         lambda: sme_registry.materialize(file.spec, file.fingerprint),
-        lambda: load_spec(saved),
+        lambda: load(saved, SMESpec),
         lambda: load_task(str(saved)),
         lambda: sme_registry.make(saved),
         lambda: sme_registry.make_vec(saved, 2),

@@ -25,7 +25,7 @@ from sme_registry.spec import (
     catalogue,
 )
 from sme_registry.spec.document import summary
-from sme_registry.spec.resolve import resolve, resolve_document
+from sme_registry.spec.resolve import resolve
 from sme_registry.spec.sweep import sweep
 
 DEFAULT = catalogue.find(EnvFile, "Default-v1")
@@ -55,25 +55,22 @@ def test_every_name_of_the_default_task_leads_to_it(tmp_path):
         {"complexity": 1},
         SMESpec(),
     ):
-        assert resolve(name).spec == SMESpec()
-        assert resolve_document(name).spec == SMESpec()
+        assert resolve(name).document == SMESpec()
     for spec in catalogue.entries(SuiteFile)[0].suite.instances[:3]:
-        assert resolve(spec.digest[:19]).spec == spec
+        assert resolve(spec.digest[:19]).document == spec
 
 
 def test_names_lead_to_streams_too():
     path = FOLDER / "streams" / "Cycle2-v1.json"
     for name in ("Cycle2", STREAM.digest, STREAM.stream, STREAM.stream.to_dict(), str(path)):
-        assert resolve_document(name).stream == STREAM.stream
+        assert resolve(name).document == STREAM.stream
 
 
 def test_specs_of_named_files_carry_their_fingerprint_and_others_none():
-    assert resolve("Default").fingerprint == DEFAULT.fingerprint
-    assert resolve(DEFAULT.digest).fingerprint == DEFAULT.fingerprint
-    assert resolve("Default").derive().fingerprint == DEFAULT.fingerprint
-    assert resolve("Default").derive(k=7).fingerprint is None
-    assert resolve({}).fingerprint is None
-    assert resolve(SMESpec(k=7)).fingerprint is None
+    assert resolve("Default").fingerprints == (DEFAULT.fingerprint,)
+    assert resolve(DEFAULT.digest).fingerprints == (DEFAULT.fingerprint,)
+    assert resolve({}).fingerprints == ()
+    assert resolve(SMESpec(k=7)).fingerprints == ()
 
 
 def test_the_error_of_an_unknown_name_suggests_the_nearest():
@@ -107,9 +104,9 @@ def test_what_names_nothing_at_all_is_refused():
 def test_a_bare_spec_is_distinguished_from_a_file(tmp_path):
     path = tmp_path / "bare.json"
     path.write_text(SMESpec(k=5).model_dump_json())
-    for read in (resolve, resolve_document):
+    for kind in (None, SMESpec):
         with pytest.raises(MalformedDocumentError, match=r"bare spec.*sme_registry\.save"):
-            read(path)
+            resolve(path, kind)
 
 
 def test_a_single_axis_has_one_class_for_each_value():

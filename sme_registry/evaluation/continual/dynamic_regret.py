@@ -22,7 +22,7 @@ from sme_registry.errors import OptionError
 from sme_registry.evaluation.continual import metrics
 from sme_registry.spec import Integer, Real, StreamLike, StreamSpec, TupleOf
 from sme_registry.spec.document import StrictModel
-from sme_registry.spec.resolve import resolve_stream
+from sme_registry.spec.resolve import resolve
 from sme_registry.task.draw import Array
 
 _POINTS = 400  # of the curve; more would not be visible in a figure
@@ -137,7 +137,7 @@ def dynamic_regret(
       >>> log.dynamic_regret
       150.0
     """
-    spec = resolve_stream(stream).stream
+    spec = resolve(stream, StreamSpec).document
     ends, lengths, means = _rows(step, length, regret)
     sums = means * lengths
     if spec.switch == "step":

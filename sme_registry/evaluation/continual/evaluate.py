@@ -24,7 +24,7 @@ from sme_registry.evaluation.evaluate import resolve_protocol, versions_behind
 from sme_registry.evaluation.measure import Progress
 from sme_registry.evaluation.policies import Policy
 from sme_registry.spec import ProtocolLike, StreamLike, StreamSpec
-from sme_registry.task import load_stream
+from sme_registry.task import load
 from sme_registry.task.draw import Array
 
 _Any = TypeVar("_Any")
@@ -69,7 +69,7 @@ def evaluate_stream(
       >>> len(report.visits)
       2
     """
-    stream = load_stream(stream)
+    stream = load(stream, StreamSpec)
     stream.refuse_many_visits()
     protocol = resolve_protocol(protocol)
     P = len(stream.phases)

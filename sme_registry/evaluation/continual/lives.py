@@ -28,7 +28,7 @@ from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import integer_in
 from sme_registry.spec import StreamLike, StreamSpec
-from sme_registry.task import load_stream, materialize_stream
+from sme_registry.task import load, materialize_stream
 
 EPISODES = 5000
 
@@ -64,7 +64,7 @@ def expected_regret(
       >>> 0 < regret.dynamic_regret < 200
       True
     """
-    stream = load_stream(stream)
+    stream = load(stream, StreamSpec)
     stream.refuse_many_visits()
     P = len(stream.phases)
     refuse_other_count("life", life, stream.cycles * P, "or number for each visit")
@@ -118,7 +118,7 @@ def reference_regret(
       >>> sorted(reference_regret(sme_registry.StreamSpec(phases=phases), episodes=10))
       ['constant_half', 'fresh_optimum', 'frozen_optimum']
     """
-    stream = load_stream(stream)
+    stream = load(stream, StreamSpec)
     stream.refuse_many_visits()
     if (frozen is None) != (training is None):
         raise OptionError(
