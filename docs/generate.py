@@ -37,9 +37,9 @@ from sme_registry.spec import (
     SuiteFile,
     TeamSpec,
 )
+from sme_registry.spec.cards import symbol
 from sme_registry.spec.catalogue import entries
 from sme_registry.spec.document import WORDED, short_repr, summary
-from sme_registry.spec.fields import symbol
 
 FOLDER = Path(__file__).resolve().parent
 sys.path[:0] = [str(FOLDER)]

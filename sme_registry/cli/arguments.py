@@ -31,7 +31,7 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
-from sme_registry.spec.envelope import Envelope
+from sme_registry.spec.catalogue import Envelope
 from sme_registry.spec.resolve import (
     check_not_bare,
     is_path,

@@ -43,8 +43,7 @@ from sme_registry.spec import (
     catalogue,
 )
 from sme_registry.spec.resolve import is_path
-from sme_registry.spec.study import INDEPENDENT
-from sme_registry.spec.sweep import sweep
+from sme_registry.spec.study import INDEPENDENT, sweep
 from sme_registry.task import load
 
 

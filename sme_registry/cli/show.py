@@ -27,11 +27,10 @@ from sme_registry.spec import (
     SuiteFile,
     cards,
     catalogue,
-    fields,
 )
-from sme_registry.spec.envelope import Envelope
-from sme_registry.spec.protocol import EvaluationProtocol
+from sme_registry.spec.catalogue import Envelope
 from sme_registry.spec.resolve import known
+from sme_registry.spec.suite import EvaluationProtocol
 
 Kind = enum.StrEnum("Kind", ["env", "stream", "suite", "protocol", "study"])
 
@@ -273,7 +272,7 @@ def _show_task(document: SMESpec | EnvFile, json: bool) -> None:
         print_json({**head, "spec": spec.to_dict(), "digest": spec.digest, "derived": derived})
         return
     title = spec.content_name if isinstance(document, SMESpec) else _title(document)
-    print_pairs(title, fields.values(spec))
+    print_pairs(title, cards.field_values(spec))
     if agents:
         out().print()
         out().print(cards.agents_table(agents))
@@ -317,7 +316,7 @@ def _spaces(spec: SMESpec) -> dict[str, str]:
     if spec.team is None:
         size = f"[{spec.observation_dim}] float32 in [0, 1]"
         return {
-            "observation": f"{size}: {fields.observed(spec)}",
+            "observation": f"{size}: {cards.observation_text(spec)}",
             "action": f"[{spec.action_dim}] float32 in [0, 1]",
         }
     n, widest = len(spec.team.agents), max(agent.action_dim for agent in spec.team.agents)
@@ -368,7 +367,7 @@ def _tasks_table(suite: Suite) -> Table:
     rows = [
         (
             member.name,
-            escape(cards.in_words(fields.changes(member.setting))),
+            escape(cards.in_words(cards.changed_fields(member.setting))),
             "\n".join(str(seed) for seed in member.seeds),
             "\n".join(spec.digest[: cards.SHORT] for spec in member.instances),
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from sme_registry.io.markup import card, folded, pairs_html, table_html
-from sme_registry.spec import SMESpec, StreamSpec, cards, fields
+from sme_registry.spec import SMESpec, StreamSpec, cards
 
 _STATUS = {"created": "not begun", "running": "running", "ended": "ended"}
 
@@ -55,6 +55,6 @@ def html(
 
 def _observed(document: SMESpec | StreamSpec) -> str:
     if isinstance(document, SMESpec):
-        return fields.observed(document)
+        return cards.observation_text(document)
     phase = ", one-hot of the phase" if document.observes_phase else ""
-    return fields.observed(document.phases[0].spec) + phase
+    return cards.observation_text(document.phases[0].spec) + phase

@@ -1,5 +1,13 @@
 """Documents: specs, suites, protocols and plans, frozen and hashed, and their files."""
 
+from sme_registry.spec.catalogue import (
+    EnvFile,
+    Fingerprint,
+    ProtocolFile,
+    StreamFile,
+    StudyFile,
+    SuiteFile,
+)
 from sme_registry.spec.document import (
     Digest,
     Document,
@@ -11,15 +19,6 @@ from sme_registry.spec.document import (
     TupleOf,
     matching,
 )
-from sme_registry.spec.envelope import (
-    EnvFile,
-    Fingerprint,
-    ProtocolFile,
-    StreamFile,
-    StudyFile,
-    SuiteFile,
-)
-from sme_registry.spec.protocol import EvaluationProtocol, ProtocolLike
 from sme_registry.spec.sme_spec import (
     ACTION_RANGES,
     ActionRange,
@@ -34,7 +33,7 @@ from sme_registry.spec.sme_spec import (
 )
 from sme_registry.spec.stream import Drift, Phase, Piece, StreamLike, StreamSpec, as_stream
 from sme_registry.spec.study import Cell, PlannedCell, StudyAlgorithm, StudyPlan
-from sme_registry.spec.suite import StreamClass, Suite, SuiteClass
+from sme_registry.spec.suite import EvaluationProtocol, ProtocolLike, StreamClass, Suite, SuiteClass
 
 __all__ = [
     "ACTION_RANGES",

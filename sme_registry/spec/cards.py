@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any
+import re
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
+from pydantic import BaseModel
 from rich.markup import escape
 
 from sme_registry.io.markup import card, pairs_html, table_html
 from sme_registry.io.tables import Table
-from sme_registry.spec import catalogue, fields
-from sme_registry.spec.sme_spec import SMESpec
+from sme_registry.spec import catalogue
+from sme_registry.spec.sme_spec import ObservationSpec, SafetySpec, Setting, SMESpec, TeamSpec
 from sme_registry.spec.stream import StreamSpec
 
 SHORT = len("sha256:") + 12
@@ -37,7 +40,7 @@ def parts(document: SMESpec | StreamSpec) -> list[str]:
 
 def difference(spec: SMESpec) -> str:
     """What makes a task another one than the default: `Not the default: k=3, seed=7`."""
-    changed = in_words(fields.changes(spec))
+    changed = in_words(changed_fields(spec))
     return f"Not the default: {changed}" if changed else "The default task"
 
 
@@ -54,7 +57,7 @@ def task_table(spec: SMESpec) -> Table:
         columns,
         caption=spec.digest,
     )
-    for row in fields.rows(spec):
+    for row in field_rows(spec):
         cells = [escape(str(cell)) for cell in (row.symbol, row.name, _exact(row.value))]
         if row.changed:
             default = "none" if row.default is None else _exact(row.default)
@@ -111,7 +114,7 @@ def stream_table(stream: StreamSpec, title: str) -> Table:
     """A stream's phases: when each begins, and in what its task differs from the one before."""
     before, begins, rows = SMESpec(), 0, []
     for index, phase in enumerate(stream.phases):
-        changes = in_words(fields.changes(phase.spec, before))
+        changes = in_words(changed_fields(phase.spec, before))
         if phase.drift is not None:
             to, count = _exact(phase.drift.rotation), phase.drift.increments
             drift = f"rotation drifts to {to} in {count} increments"
@@ -141,3 +144,87 @@ def _exact(value: Any) -> Any:
         return value
     short = f"{value:g}"
     return short if float(short) == value else repr(value)
+
+
+_SYMBOL = re.compile(r"^([A-Zθτm]), ")  # with which a description begins
+_BLOCKS: dict[str, type[BaseModel]] = {"safety": SafetySpec, "observation": ObservationSpec}
+_OWN_SYMBOL = re.compile(r"^[A-Za-z](_\w+)?$")  # k, D, r_min
+
+
+class FieldRow(NamedTuple):
+    """A field of a task.
+
+    Attributes:
+      name: of the field; of a field in a block with the block's name, `safety.tightness`.
+      symbol: METHOD's; empty where it has none.
+      value: in words where it is a document.
+      default: likewise; None where the default task has no such field.
+      meaning: the field's description.
+    """
+
+    name: str
+    symbol: str
+    value: Any
+    default: Any
+    meaning: str
+
+    @property
+    def changed(self) -> bool:
+        """Whether the value is not the default."""
+        return bool(self.value != self.default)
+
+
+def field_values(setting: Setting) -> dict[str, Any]:
+    """Every field for people: a team in words, the fields of other blocks by their dotted names."""
+    fields: dict[str, Any] = {}
+    every_field = setting.every_field()
+    for name in type(setting).model_fields:
+        value = every_field[name]
+        if name == "team" and setting.team is not None:
+            fields[name] = _team_summary(setting.team)
+        elif isinstance(value, dict):
+            fields |= {f"{name}.{key}": each for key, each in value.items() if each is not None}
+        else:
+            fields[name] = value
+    return fields
+
+
+def field_rows(setting: Setting) -> Iterator[FieldRow]:
+    """The fields that are set, in the order of the document, without the version of its format."""
+    default = field_values(SMESpec())
+    for name, value in field_values(setting).items():
+        if value is not None and name != "schema_version":
+            yield FieldRow(name, symbol(name), value, default.get(name), _split(name)[1])
+
+
+def changed_fields(setting: Setting, default: Setting | None = None) -> dict[str, Any]:
+    """The fields whose values are not those of the default task, or of another one."""
+    others = field_values(default or SMESpec())
+    return {k: v for k, v in field_values(setting).items() if v != others.get(k)}
+
+
+def symbol(name: str) -> str:
+    """METHOD's symbol of a field, such as `L` of `complexity`; empty where it has none."""
+    return name if _OWN_SYMBOL.match(name) else _split(name)[0]
+
+
+def observation_text(spec: SMESpec) -> str:
+    """What a single agent's observation consists of: `state, t/T, r_cum/k`."""
+    parts = f"state and {spec.distractors} distractors" if spec.distractors else "state"
+    if spec.observation is not None and spec.observation.mixing != "none":
+        parts = f"{spec.observation.mixing} mixing of {parts}"
+    return f"{parts}, t/T, r_cum/k"
+
+
+def _split(name: str) -> tuple[str, str]:
+    """The symbol with which the description of a field begins, and the rest of it."""
+    block, _, inner = name.rpartition(".")
+    kind = _BLOCKS.get(block, SMESpec)
+    text = kind.model_fields[inner].description or ""
+    found = _SYMBOL.match(text)
+    return (found[1], text[found.end() :]) if found else ("", text)
+
+
+def _team_summary(team: TeamSpec) -> str:
+    n = len(team.agents)
+    return f"{n} agent{'s' * (n > 1)}, {team.reward} reward"

@@ -13,8 +13,8 @@ from typing import Any, Generic, TypeVar, overload
 from sme_registry.errors import MalformedDocumentError, StreamError, UnknownNameError
 from sme_registry.io import read_json
 from sme_registry.spec import catalogue
+from sme_registry.spec.catalogue import EnvFile, Fingerprint, StreamFile, SuiteFile
 from sme_registry.spec.document import NamedDocument, short_repr
-from sme_registry.spec.envelope import EnvFile, Fingerprint, StreamFile, SuiteFile
 from sme_registry.spec.sme_spec import SMESpec, as_spec
 from sme_registry.spec.stream import StreamSpec, as_stream
 

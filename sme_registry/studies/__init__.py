@@ -14,7 +14,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sme_registry.spec.sweep import sweep
+    from sme_registry.spec.study import sweep
     from sme_registry.studies.engine.cell import run_cell
     from sme_registry.studies.engine.result import CellResult
     from sme_registry.studies.engine.runner import run_study
@@ -53,7 +53,7 @@ _LAZY = {
     "run_cell": "studies.engine.cell",
     "run_study": "studies.engine.runner",
     "study_status": "studies.engine.status",
-    "sweep": "spec.sweep",
+    "sweep": "spec.study",
     "write_comparison": "studies.report.compare",
     "write_report": "studies.report.write",
 }

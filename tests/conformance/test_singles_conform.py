@@ -19,7 +19,7 @@ import sme_registry
 from sme_registry import SMESpec, testing
 from sme_registry.envs import SMEVectorEnv
 from sme_registry.spec import catalogue
-from sme_registry.spec.envelope import EnvFile
+from sme_registry.spec.catalogue import EnvFile
 
 NAMES = [file.versioned_name for file in catalogue.entries(EnvFile) if file.spec.team is None]
 KINDS = ["Default", "StateDim64", "ActionDim16", "Plane10", "HardFragile", "HardSafeMixed"]

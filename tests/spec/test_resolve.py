@@ -26,7 +26,7 @@ from sme_registry.spec import (
 )
 from sme_registry.spec.document import summary
 from sme_registry.spec.resolve import resolve
-from sme_registry.spec.sweep import sweep
+from sme_registry.spec.study import sweep
 
 DEFAULT = catalogue.find(EnvFile, "Default-v1")
 FOLDER = catalogue.spec_folder()

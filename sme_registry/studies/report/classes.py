@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sme_registry.spec import ObservationSpec, StudyPlan, SuiteClass
-from sme_registry.spec.fields import symbol
+from sme_registry.spec.cards import symbol
 
 ALL = "all classes"
 SEVERAL = "several axes"
