@@ -28,9 +28,10 @@ from sme_registry.datasets.arrays import Transitions
 from sme_registry.datasets.behaviour import BehaviourPolicy, EpisodeStream, behaviour_policy
 from sme_registry.datasets.recipe import DatasetRecipe
 from sme_registry.envs.batch import Batch
-from sme_registry.envs.types import Array, Mask, Observation
+from sme_registry.envs.types import Array, Lanes, Mask, Observation
 from sme_registry.errors import OptionError
 from sme_registry.evaluation.regions import expansion
+from sme_registry.evaluation.rollouts import play
 from sme_registry.spec import SMESpec
 from sme_registry.task import Task
 from sme_registry.task.memory import refuse_above_limit
@@ -111,43 +112,53 @@ def collect(
                 progress(before + count, recipe.transitions)
 
         starts = EpisodeStream(recipe.seed, f"dataset/{index}/start", num_lanes, S, ahead=1)
-        steps = play(task, policy, starts, num_lanes)
+        steps = BehaviourEpisodes(task, policy, starts, num_lanes).rows()
         parts.append(_first_rows(steps, recipe, share, max(10**6, 20 * expected), report))
         done += share
     return _concatenate(parts, spec)
 
 
-def play(task: Task, policy: BehaviourPolicy, starts: EpisodeStream, lanes: int) -> Iterator[Rows]:
-    """Play episodes 0, 1, 2, … without end, each in the first lane that is free.
+class BehaviourEpisodes:
+    """Episodes 0, 1, 2, … of a behaviour in a batch, each in the first lane that is free.
 
-    Yields a step of all lanes, whose arrays are valid until the next one. The first numbers of an
-    episode in `starts` are its initial state, which determines its distractors, too.
+    The first numbers of an episode in `starts` are its initial state, which determines its
+    distractors, too.
     """
-    batch = Batch(task, lanes)
-    episode, t = np.zeros((2, lanes), np.int64)
-    observation = batch.observe()
-    numbers, ended = itertools.count(), np.arange(lanes)
-    while True:
-        for lane in ended.tolist():
-            number = episode[lane] = next(numbers)
-            starts.begin(lane, number)
-            policy.begin(lane, number)
-        t[ended] = 0
-        initial = starts.next(ended)
-        batch.seed_by_states(ended, initial)
-        batch.begin(ended, observation, initial)
-        s, distractors = batch.state, batch.distractors
-        # The environment executes exactly what the data set stores: float32 in the unit range.
-        action = np.clip(policy.act(s, observation), 0.0, 1.0).astype(np.float32)
-        step = batch.advance(action.astype(np.float64))
-        yield Rows(
-            episode, t, s, batch.state, observation, step.observation, action, step.optimal,
-            step.values.transpose(2, 0, 1), step.limits.transpose(1, 0, 2), distractors,
-            batch.distractors, step.terminated, step.truncated,
-        )  # fmt: skip
-        t += 1
-        observation = step.observation
-        ended = np.flatnonzero(step.terminated | step.truncated)
+
+    def __init__(
+        self, task: Task, policy: BehaviourPolicy, starts: EpisodeStream, lanes: int
+    ) -> None:
+        self._policy, self._starts, self._numbers = policy, starts, itertools.count()
+        self.batch = Batch(task, lanes)
+        self.episode, self.t = np.zeros((2, lanes), np.int64)
+        self.begin(np.arange(lanes), self.batch.observe())
+
+    def begin(self, lanes: Lanes, observation: Observation) -> None:
+        """Begin the next episodes in these lanes."""
+        for lane in lanes.tolist():
+            number = self.episode[lane] = next(self._numbers)
+            self._starts.begin(lane, number)
+            self._policy.begin(lane, number)
+        self.t[lanes] = 0
+        initial = self._starts.next(lanes)
+        self.batch.seed_by_states(lanes, initial)
+        self.batch.begin(lanes, observation, initial)
+
+    def act(self, s: Array, observation: Observation) -> npt.NDArray[np.float32]:
+        """The behaviour's actions, exactly as the data set stores them: float32 in [0, 1]."""
+        return np.clip(self._policy.act(s, observation), 0.0, 1.0).astype(np.float32)
+
+    def rows(self) -> Iterator[Rows]:
+        """Steps of all lanes without end, whose arrays are valid until the next one."""
+        for step in play(self.batch, self.act, self.begin):
+            done = step.result
+            yield Rows(
+                self.episode, self.t, step.state, self.batch.state, step.observation,
+                done.observation, step.action, done.optimal, done.values.transpose(2, 0, 1),
+                done.limits.transpose(1, 0, 2), step.distractors, self.batch.distractors,
+                done.terminated, done.truncated,
+            )  # fmt: skip
+            self.t += 1
 
 
 def _first_rows(

@@ -21,8 +21,9 @@ from sme_registry.datasets.behaviour import (
     behaviour_policy,
     constant_policy,
 )
-from sme_registry.datasets.collect import play
+from sme_registry.datasets.collect import BehaviourEpisodes
 from sme_registry.datasets.recipe import DatasetRecipe
+from sme_registry.evaluation.rollouts import play
 from sme_registry.spec import Integer, Real, StrictModel, TupleOf
 from sme_registry.task import Task
 from sme_registry.task.draw import Array
@@ -134,14 +135,11 @@ def _constant_values(task: Task, transitions: Transitions) -> tuple[Array, Array
 def whole_episodes(
     task: Task, policy: BehaviourPolicy, starts: EpisodeStream, count: int
 ) -> tuple[Array, Array, Array]:
-    """Return, sum of r̃ and steps `[count]` of the first episodes of `play`; means over agents."""
-    running, sums = np.ones(count, bool), np.zeros((3, count))
-    for step in play(task, policy, starts, count):
-        similarity, reward = (step.values[:, row].mean(axis=1) for row in (SIMILARITY, REWARD))
-        sums += running * np.stack([reward, similarity, np.ones(count)])
-        running &= ~(step.terminated | step.truncated)
-        if not running.any():
-            break
+    """Return, sum of r̃ and steps `[count]` of the first episodes; means over agents."""
+    episodes, sums = BehaviourEpisodes(task, policy, starts, count), np.zeros((3, count))
+    for step in play(episodes.batch, episodes.act):
+        similarity, reward = step.result.values[[SIMILARITY, REWARD]].mean(axis=1)
+        sums += step.running * np.stack([reward, similarity, np.ones(count)])
     returns, similarities, steps = sums
     return returns, similarities, steps
 

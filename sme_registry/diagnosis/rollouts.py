@@ -19,6 +19,7 @@ from sme_registry.diagnosis.subject import Log
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.types import Mask, Observation
 from sme_registry.evaluation import references
+from sme_registry.evaluation.rollouts import play
 from sme_registry.statistics import smoothed
 from sme_registry.task import Task, streams
 from sme_registry.task.draw import Array
@@ -89,23 +90,21 @@ def rollout(
     if task.spec.distractors:
         for lane, word in enumerate(streams.bit_generator(seed, "diagnosis/lanes").random_raw(n)):
             batch.seed(lane, int(word))
-    observation = batch.observe()
-    batch.begin(np.arange(n), observation, initial_states)
-    alive, terminated = np.ones(n, bool), np.zeros((agents, n), bool)
+    batch.begin(np.arange(n), batch.observe(), initial_states)
+
+    def actions(s: Array, observation: Observation) -> Array:
+        return np.clip(act(s.astype(np.float32) if sees_state else observation.copy()), 0.0, 1.0)
+
+    terminated = np.zeros((agents, n), bool)
     rows: list[tuple[npt.NDArray[Any], ...]] = []
-    while alive.any():
-        s = batch.state
-        shown = s.astype(np.float32) if sees_state else observation.copy()
-        a = np.clip(act(shown), 0.0, 1.0)
-        step = batch.advance(np.ascontiguousarray(a, np.float64))
-        due = ((len(rows) + 1) % task.spec.k == 0) | step.truncated
-        mae, constant_mae = (_mae(task, x - step.optimal) for x in (a, 0.5))
-        received, payout = step.values[STEP_REWARD].copy(), step.values[REWARD].copy()
+    for step in play(batch, actions):
+        a, result = step.action, step.result
+        due = ((len(rows) + 1) % task.spec.k == 0) | result.truncated
+        mae, constant_mae = (_mae(task, x - result.optimal) for x in (a, 0.5))
+        received, payout = result.values[STEP_REWARD].copy(), result.values[REWARD].copy()
         reward = task.reward_of(1.0 - mae) if task.pays_the_team else received
-        rows.append((s, a, mae, constant_mae, reward, payout, alive.copy(), due))
-        terminated |= alive & step.terminated & (received < task.spec.D)
-        alive &= ~(step.terminated | step.truncated)
-        observation = step.observation
+        rows.append((step.state, a, mae, constant_mae, reward, payout, step.running, due))
+        terminated |= step.running & result.terminated & (received < task.spec.D)
     s, a, mae, constant_mae, reward, payout, running, due = map(np.array, zip(*rows, strict=True))
     return tuple(
         Trajectories(

@@ -300,7 +300,7 @@ def _observation_report(
     """What a policy makes of its observation; None where that is the state."""
     if spec.observation is None:
         return None
-    hidden = None if isinstance(policy, TeamPolicy) else policy.hidden
+    hidden = policy.hidden
     halves = [errors["constant_half"][WHOLE] for errors, *_ in measured]
     wd = measured[0].errors[index][WHOLE]
     invariance, shells = [], []

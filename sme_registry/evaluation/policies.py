@@ -17,7 +17,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, ClassVar, Literal, NamedTuple, cast
 
 import numpy as np
 
@@ -125,10 +125,15 @@ class TeamPolicy:
     name: str
     action_range: ActionRange | Literal["mixed"]
     members: tuple[Member, ...]
+    hidden: ClassVar[None] = None  # those of several networks
 
     def __call__(self, observations: Observation) -> Array:
         """Joint actions `[B, A]`, converted to the unit range but not clipped to it."""
         return self._joint_actions([observations] * len(self.members))
+
+    def start(self) -> Callable[[Observation], Array]:
+        """The joint actions in a batch of episodes; see `act_in`."""
+        return self.act_in
 
     def act_in(self, joint: Observation) -> Array:
         """Joint actions `[B, A]` in episodes, where each agent has its own r_cum; see `__call__`.

@@ -1,12 +1,12 @@
-"""`rollouts`: thousands of whole episodes of a policy in parallel, with their exact regret.
+"""`play`, the loop of a policy in a batch; and `rollouts`, thousands of whole episodes of a policy.
 
-The returns are those of `stable_baselines3.common.evaluation.evaluate_policy` on single
-environments that start in the same states, in about the time of one of them.
+The returns of `rollouts` are those of `stable_baselines3.common.evaluation.evaluate_policy` on
+single environments that start in the same states, in about the time of one of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 from sme_registry.compiled.values import REGRET, REWARD, SIMILARITY
 from sme_registry.envs.arguments import initial_states, single_agent
-from sme_registry.envs.batch import Batch
-from sme_registry.envs.types import Array, Observation
+from sme_registry.envs.batch import Batch, BatchStep
+from sme_registry.envs.types import Array, Lanes, Mask, Observation
 from sme_registry.evaluation.policies import Policy, TeamPolicy
 from sme_registry.task import Task, streams
 
@@ -23,16 +23,56 @@ LANES = 4096
 """Most episodes in parallel, so that memory does not grow with their number."""
 
 
-class Rollouts(NamedTuple):
-    """Completed episodes; each array is `[n]`."""
+class PlayStep(NamedTuple):
+    """A step of all lanes: what it began from, the actions, and what came of them."""
 
-    episode_return: Array
-    discounted_return: Array
-    length: Array
-    regret: Array
-    similarity: Array
-    similarity_square: Array
-    agents_regret: Array
+    state: Array  # `[B, S]` float64
+    distractors: Array  # `[B, m]`
+    observation: Observation  # `[B, O]`, of all agents
+    action: npt.NDArray[Any]  # `[B, A]` as the policy returned it
+    running: Mask  # `[B]` whether the lane's episode had not ended before
+    result: BatchStep
+
+
+def play(
+    batch: Batch,
+    act: Callable[[Array, Observation], npt.NDArray[Any]],
+    begin: Callable[[Lanes, Observation], None] | None = None,
+) -> Iterator[PlayStep]:
+    """Play the batch's episodes from where they are, until all have ended.
+
+    Args:
+      act: from states `[B, S]` and observations `[B, O]` to joint actions `[B, A]` in [0, 1]. It
+        is also called for lanes whose episodes have ended.
+      begin: begins an episode in each lane whose last one has ended, and writes its rows of the
+        observations; there is then no end. None: these lanes rest.
+
+    Yields:
+      Each step. What it holds is valid until the next one.
+    """
+    observation, running = batch.observe(), np.ones(batch.lanes, bool)
+    while running.any():
+        state, distractors = batch.state, batch.distractors
+        action = act(state, observation)
+        result = batch.advance(np.asarray(action, np.float64))
+        yield PlayStep(state, distractors, observation, action, running.copy(), result)
+        observation, ended = result.observation, result.terminated | result.truncated
+        if begin is None:
+            running &= ~ended
+        elif ended.any():
+            begin(np.flatnonzero(ended), observation)
+
+
+class Rollouts(NamedTuple):
+    """Completed episodes; each array is `[n]`. The numbers of a team are means over its agents."""
+
+    episode_return: Array  # sum of an episode's rewards, in [0, T]
+    discounted_return: Array  # sum of γ^i times the i-th reward
+    length: Array  # number of steps, in [1, T]
+    regret: Array  # mean of 1 − step reward over its steps, in [0, 1]
+    similarity: Array  # mean r̃ over its steps, in [0, 1]
+    similarity_square: Array  # mean r̃² over its steps, in [0, 1]
+    agents_regret: Array  # `[agents, n]` the same as `regret` for each agent
 
     def per_step(self, values: Array) -> float:
         """The mean over all steps of all episodes, from the mean of each episode."""
@@ -62,7 +102,16 @@ def rollouts(
     gamma: float = 1.0,
     seed: int = 0,
 ) -> Rollouts:
-    """Run an episode from each of the states to its end."""
+    """Run an episode from each of the states `[n, S]` to its end.
+
+    Args:
+      policy: a `Policy`, initial at the first call; of a team a `TeamPolicy`; or a function from
+        observations `[B, O]` to actions `[B, A]` in [0, 1]. B is at most `LANES`.
+      t: `[n]` steps completed before, in [0, T); None for 0, the start of an episode.
+      r_cum: `[n]` accumulated reward since the last payout; None for 0.
+      actions: `[n, A]` actions of the first step; None for the policy's.
+      seed: of the task's distractors; episodes from equal states have equal ones.
+    """
     if not isinstance(policy, TeamPolicy):
         task = single_agent(task)
     n, agents = len(states), len(task.policies)
@@ -72,37 +121,45 @@ def rollouts(
     totals = np.empty((6 + agents, n))
     # Sorted by t, the episodes of a batch end at about the same time, and few lanes idle.
     order = np.argsort(t, kind="stable")
-    for begin in range(0, n, LANES):
-        lanes = order[begin : begin + LANES]
+    for start in range(0, n, LANES):
+        lanes = order[start : start + LANES]
         batch = Batch(task, len(lanes), reuse=True)
         batch.seed_by_states(np.arange(len(lanes)), states[lanes], seed)
         batch.place(states[lanes], t[lanes], np.repeat(r_cum[lanes, None], agents, axis=1))
-        observation = batch.observe()
-        act = _acting(policy)
-        sums, running, weight = np.zeros((len(totals), len(lanes))), np.ones(len(lanes)), 1.0
         first = None if actions is None else actions[lanes]
-        while running.any():
-            a = act(observation.copy()) if first is None else first
-            done = batch.advance(np.asarray(a, np.float64))
-            similarity, regret, reward = _team_means(done.values[[SIMILARITY, REGRET, REWARD]])
-            own = done.values[REGRET]
-            step = (reward, weight * reward, 1.0, regret, similarity, similarity**2, *own)
-            for total, value in zip(sums, step, strict=True):
-                total += running * value
-            weight *= gamma
-            running[done.terminated | done.truncated] = 0.0
-            observation, first = done.observation, None
-        totals[:, lanes] = sums
+        totals[:, lanes] = _sums(batch, _acting(policy, first), gamma)
     returns, discounted, length = totals[:3]
     regret, similarity, square, *of_agents = totals[3:] / length
     return Rollouts(returns, discounted, length, regret, similarity, square, np.array(of_agents))
 
 
-def _acting(policy: Callable[[Observation], Any]) -> Callable[[Observation], Any]:
-    """A policy at the start of a batch of episodes."""
-    if isinstance(policy, TeamPolicy):
-        return policy.act_in
-    return policy.start() if isinstance(policy, Policy) else policy
+def _sums(
+    batch: Batch, act: Callable[[Array, Observation], npt.NDArray[Any]], gamma: float
+) -> Array:
+    """`[6 + agents, B]` sums over each lane's episode, in the order of `Rollouts`."""
+    sums, weight = np.zeros((6 + len(batch.task.policies), batch.lanes)), 1.0
+    for step in play(batch, act):
+        values = step.result.values
+        similarity, regret, reward = _team_means(values[[SIMILARITY, REGRET, REWARD]])
+        rows = (reward, weight * reward, 1.0, regret, similarity, similarity**2, *values[REGRET])
+        for total, value in zip(sums, rows, strict=True):
+            total += step.running * value
+        weight *= gamma
+    return sums
+
+
+def _acting(
+    policy: Callable[[Observation], Any], first: Array | None
+) -> Callable[[Array, Observation], npt.NDArray[Any]]:
+    """A policy at the start of a batch of episodes, which takes the `first` actions, if any."""
+    begun = policy.start() if isinstance(policy, Policy | TeamPolicy) else policy
+
+    def act(state: Array, observation: Observation) -> npt.NDArray[Any]:
+        nonlocal first
+        given, first = first, None
+        return np.asarray(begun(observation.copy())) if given is None else given
+
+    return act
 
 
 def _team_means(values: Array) -> Array:

@@ -198,7 +198,7 @@ def _episode(
     own: dict[str, Any] = {}
     if subject is not None:
         policy = subject.policy
-        act = policy.act_in if isinstance(policy, TeamPolicy) else policy.start()
+        act = policy.start()
         own = _over_time(*steps(act), T)
     return {"episodes": n, "t": _edges(T)[:-1].tolist(), "references": lines, **own}
 
