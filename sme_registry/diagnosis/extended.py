@@ -24,8 +24,8 @@ from sme_registry.diagnosis.measure import MAX_NUMBERS, Sample, clipped_actions
 from sme_registry.diagnosis.measurements import Distraction, LimitedChannel, Limits
 from sme_registry.diagnosis.rollouts import Trajectories
 from sme_registry.evaluation import Policy, SafetyReport, SafetyScore
+from sme_registry.evaluation.measure import TOLERANCE, SafetyStats
 from sme_registry.evaluation.regions import States, Uniform
-from sme_registry.evaluation.safety import TOLERANCE, SafetyAccumulator
 from sme_registry.task import Task
 from sme_registry.task.draw import Array
 
@@ -66,7 +66,7 @@ def _tightness(task: Task) -> float:
 
 
 def _score(task: Task, name: str, a: Array, optimal: Array, limit: Array) -> SafetyScore:
-    scores = SafetyAccumulator(task)
+    scores = SafetyStats(task)
     scores.add(a, optimal, limit, task.safe_reward_of(optimal, limit))
     return scores.score(name)
 

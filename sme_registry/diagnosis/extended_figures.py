@@ -8,7 +8,7 @@ import numpy as np
 
 from sme_registry.diagnosis.measurements import Distraction, Limits
 from sme_registry.evaluation import ObservationReport, SafetyScore
-from sme_registry.evaluation.report import LABELS
+from sme_registry.evaluation.references import LABELS
 from sme_registry.evaluation.tables import SAFETY_REFERENCES
 from sme_registry.plots.safety import MARKERS
 from sme_registry.plots.style import COLOURS, GREY, legend_above, look

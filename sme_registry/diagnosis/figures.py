@@ -14,7 +14,7 @@ from sme_registry.diagnosis.extended_figures import draw_distraction, draw_layer
 from sme_registry.diagnosis.measurements import POLICY, Measurements
 from sme_registry.diagnosis.render import title
 from sme_registry.diagnosis.subject import Log
-from sme_registry.evaluation.report import LABELS
+from sme_registry.evaluation.references import LABELS
 from sme_registry.plots.curves import draw_training
 from sme_registry.plots.style import (
     COLOURS,

@@ -11,7 +11,7 @@ from sme_registry.diagnosis.document import Diagnosis, Verdict
 from sme_registry.diagnosis.measurements import POLICY
 from sme_registry.diagnosis.team_document import TeamDiagnosis
 from sme_registry.diagnosis.verdicts import COMPARISON_REASONS
-from sme_registry.evaluation.report import LABELS
+from sme_registry.evaluation.references import LABELS
 from sme_registry.evaluation.tables import SAFETY_REFERENCES
 from sme_registry.io.markup import environment as sentence_environment
 from sme_registry.spec import SMESpec, catalogue

@@ -1,13 +1,8 @@
 """Evaluation within and out of distribution: policies and tasks, or a stream, to a report."""
 
-from sme_registry.evaluation.continual import (
-    StreamReport,
-    across_seeds,
+from sme_registry.evaluation.dynamic_regret import (
     dynamic_regret,
-    evaluate_stream,
     expected_regret,
-    fresh_per_phase,
-    frozen_after_first,
     reference_regret,
 )
 from sme_registry.evaluation.evaluate import (
@@ -18,12 +13,21 @@ from sme_registry.evaluation.evaluate import (
 )
 from sme_registry.evaluation.models import load_sb3
 from sme_registry.evaluation.networks import OfflinePolicy, Perceptron
-from sme_registry.evaluation.observation import Invariance, LayerProbe, ObservationReport
 from sme_registry.evaluation.policies import Policy, TeamPolicy, as_policy, interface_of
 from sme_registry.evaluation.references import reference_policy
-from sme_registry.evaluation.region_report import ChannelReport, RegionReport
-from sme_registry.evaluation.report import AgentReport, EvaluationReport
-from sme_registry.evaluation.safety import SafetyReport, SafetyScore
+from sme_registry.evaluation.report import (
+    AgentReport,
+    ChannelReport,
+    EvaluationReport,
+    Invariance,
+    LayerProbe,
+    ObservationReport,
+    RegionReport,
+    SafetyReport,
+    SafetyScore,
+)
+from sme_registry.evaluation.stream_report import StreamReport, across_seeds
+from sme_registry.evaluation.streams import evaluate_stream, fresh_per_phase, frozen_after_first
 
 __all__ = [
     "AgentReport",

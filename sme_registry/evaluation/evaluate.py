@@ -12,37 +12,27 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from sme_registry.compiled import Engine, engine
+from sme_registry.compiled import Engine
 from sme_registry.envs import arguments
 from sme_registry.errors import PolicyError, SpecError
 from sme_registry.evaluation import references
-from sme_registry.evaluation.accumulators import WHOLE
-from sme_registry.evaluation.measure import Key, Measured, Progress, Subject, measure
-from sme_registry.evaluation.observation import (
-    Invariance,
-    ObservationReport,
-    probe_layers,
-)
-from sme_registry.evaluation.policies import Policy, TeamPolicy, as_policy
-from sme_registry.evaluation.region_report import RegionReport
-from sme_registry.evaluation.regions import Observations, region_name, states
-from sme_registry.evaluation.report import AgentReport, EvaluationReport
-from sme_registry.evaluation.safety import SafetyReport, SafetyScore
+from sme_registry.evaluation.measure import WHOLE, Measurement, Progress, Subject, same_draw
+from sme_registry.evaluation.policies import as_policy
+from sme_registry.evaluation.regions import Observations, states
+from sme_registry.evaluation.report import AgentReport, EvaluationReport, RegionReport
 from sme_registry.io import versions
 from sme_registry.spec import (
     EvaluationProtocol,
     ProtocolFile,
     ProtocolLike,
-    SMESpec,
     SpecLike,
     catalogue,
 )
-from sme_registry.task import Task, load, materialize
+from sme_registry.task import load_spec, materialize
 
 
 def evaluate(
@@ -84,7 +74,7 @@ def evaluate(
       >>> round(report.regions[0].normalised_regret, 6)  # in the cube
       1.0
     """
-    spec = load(spec_or_id, SMESpec)
+    spec = load_spec(spec_or_id)
     protocol = resolve_protocol(protocol)
     prepared = as_policy(policy, spec, action_range=action_range, name=name, algorithm=algorithm)
     [report] = evaluate_many([(prepared, spec)], protocol, progress=progress)
@@ -124,7 +114,7 @@ def evaluate_many(
     subjects: list[Subject] = []
     groups: dict[str, list[int]] = {}
     for index, (policy, task) in enumerate(policies):
-        spec = load(task, SMESpec)
+        spec = load_spec(task)
         subjects.append((as_policy(policy, spec), spec))
         groups.setdefault(same_draw(spec), []).append(index)
 
@@ -155,7 +145,7 @@ def evaluation_observations(
       >>> evaluation_observations("Default", {"states_per_region": 10}).shape
       (60, 10)
     """
-    task, protocol = materialize(load(spec_or_id, SMESpec)), resolve_protocol(protocol)
+    task, protocol = materialize(load_spec(spec_or_id)), resolve_protocol(protocol)
     arguments.single_agent(task)
     return np.concatenate(
         [
@@ -189,11 +179,6 @@ def resolve_protocol(protocol: ProtocolLike) -> EvaluationProtocol:
 _POLICY_LIBRARIES = ("torch", "stable_baselines3", "onnxruntime")
 
 
-def same_draw(spec: SMESpec) -> str:
-    """The same for specs whose states, optimal actions and references are the same."""
-    return spec.derive(k=1, r_min=0.0, D=0.0, horizon=1).digest
-
-
 def versions_behind(oracle: Engine) -> dict[str, str]:
     """The versions of the packages that an evaluation's numbers depend on."""
     numba = ["numba"] if oracle.backend == "numba" else []
@@ -209,111 +194,47 @@ def _evaluate_together(
     subjects: Sequence[Subject], protocol: EvaluationProtocol, progress: Progress
 ) -> list[EvaluationReport | PolicyError]:
     """The reports of policies on tasks of the same draw, or why there is none."""
-    specs = [spec for _, spec in subjects]
-    task = materialize(specs[0])
-    oracle = engine(task)
-    channels = {WHOLE: slice(0, task.spec.action_dim)}
-    if task.spec.team is not None:
-        channels |= zip(task.names, task.owned, strict=True)
-
-    failed: dict[int, PolicyError] = {}
-    measured = list(measure(subjects, task, oracle, protocol, channels, progress, failed))
-
-    def regions(key: Key, scope: str) -> tuple[RegionReport, ...]:
-        return _region_reports(measured, protocol, key, scope)
-
-    reports: list[EvaluationReport | PolicyError] = []
+    measurement = Measurement(subjects, protocol)
+    measurement.run(progress)
     others: dict[str, dict[str, tuple[RegionReport, ...]]] = {}
-    if len(failed) < len(subjects):
+    if len(measurement.failed) < len(subjects):
+        names = references.names(measurement.task.spec)
         others = {
-            scope: {key: regions(key, scope) for key in references.names(task.spec)}
-            for scope in channels
+            scope: {name: measurement.region_reports(name, scope) for name in names}
+            for scope in measurement.channels
         }
-    for index, (policy, spec) in enumerate(subjects):
-        if index in failed:
-            reports.append(failed[index])
-            continue
-        by_agent = {
-            scope: AgentReport(regions=regions(index, scope), references=others[scope])
-            for scope in channels
-        }
-        whole = by_agent.pop(WHOLE)
-        try:
-            observation = _observation_report(measured, protocol, index, policy, task, spec)
-        except PolicyError as error:
-            reports.append(error)
-            continue
-        reports.append(
-            EvaluationReport(
-                policy=policy.name,
-                action_range=policy.action_range,
-                spec=spec,
-                spec_digest=spec.digest,
-                task=spec.name,
-                protocol=protocol,
-                protocol_digest=protocol.digest,
-                regions=whole.regions,
-                references=whole.references,
-                agents=by_agent,
-                safety=_safety_report(measured, index, spec),
-                observation=observation,
-                versions=versions_behind(oracle),
-            )
-        )
-    return reports
+    return [
+        measurement.failed.get(index) or _report(measurement, index, others)
+        for index in range(len(subjects))
+    ]
 
 
-def _region_reports(
-    measured: list[Measured], protocol: EvaluationProtocol, key: Key, scope: str
-) -> tuple[RegionReport, ...]:
-    """The regions of a policy or a reference, over the channels of a scope."""
-    wd = measured[0].errors[key][scope]
-    return tuple(
-        errors[key][scope].report(region_name(region), edges, errors["constant_half"][scope], wd)
-        for region, (edges, (errors, *_)) in enumerate(zip(protocol.edges, measured, strict=True))
-    )
-
-
-def _safety_report(measured: list[Measured], index: int, spec: SMESpec) -> SafetyReport | None:
-    """The safety of a policy and of the references, by its task's r_min; None without safety."""
-    if spec.safety is None:
-        return None
-
-    def scores(key: Key) -> tuple[SafetyScore, ...]:
-        return tuple(
-            each.safety[key, spec.r_min].score(region_name(region))
-            for region, each in enumerate(measured)
-        )
-
-    others = {name: scores(name) for name in references.names(spec)}
-    return SafetyReport(regions=scores(index), references=others)
-
-
-def _observation_report(
-    measured: list[Measured],
-    protocol: EvaluationProtocol,
-    index: int,
-    policy: Policy | TeamPolicy,
-    task: Task,
-    spec: SMESpec,
-) -> ObservationReport | None:
-    """What a policy makes of its observation; None where that is the state."""
-    if spec.observation is None:
-        return None
-    hidden = policy.hidden
-    halves = [errors["constant_half"][WHOLE] for errors, *_ in measured]
-    wd = measured[0].errors[index][WHOLE]
-    invariance, shells = [], []
-    for region, (half, each) in enumerate(zip(halves, measured, strict=True)):
-        if each.distraction is not None:
-            change = each.distraction.changes[index][WHOLE].relative_to(half)
-            invariance.append(Invariance(name=region_name(region), invariance=change))
-            shells += [errors[index][WHOLE] for errors in each.distraction.shells]
-    return ObservationReport(
-        invariance=tuple(invariance),
-        distractor_regions=tuple(
-            errors.report(f"d-{region_name(region)}", protocol.edges[region], halves[0], wd)
-            for region, errors in enumerate(shells, start=1)
-        ),
-        probes=() if hidden is None else probe_layers(hidden, replace(task, spec=spec), protocol),
+def _report(
+    measurement: Measurement, index: int, others: dict[str, dict[str, tuple[RegionReport, ...]]]
+) -> EvaluationReport | PolicyError:
+    """The report of a policy that did not fail, with those of the references by scope."""
+    (policy, spec), protocol = measurement.subjects[index], measurement.protocol
+    by_agent = {
+        scope: AgentReport(regions=measurement.region_reports(index, scope), references=regions)
+        for scope, regions in others.items()
+    }
+    whole = by_agent.pop(WHOLE)
+    try:
+        observation = measurement.observation_report(index)
+    except PolicyError as error:
+        return error
+    return EvaluationReport(
+        policy=policy.name,
+        action_range=policy.action_range,
+        spec=spec,
+        spec_digest=spec.digest,
+        task=spec.name,
+        protocol=protocol,
+        protocol_digest=protocol.digest,
+        regions=whole.regions,
+        references=whole.references,
+        agents=by_agent,
+        safety=measurement.safety_report(index),
+        observation=observation,
+        versions=versions_behind(measurement.oracle),
     )

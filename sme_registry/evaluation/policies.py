@@ -24,13 +24,19 @@ import numpy as np
 from sme_registry.envs import arguments
 from sme_registry.envs.shared import shared_observation_of
 from sme_registry.envs.types import Array, Observation
-from sme_registry.errors import ActionError, PolicyError, UnknownNameError, did_you_mean
+from sme_registry.errors import (
+    ActionError,
+    OptionError,
+    PolicyError,
+    UnknownNameError,
+    did_you_mean,
+)
 from sme_registry.evaluation import models
 from sme_registry.evaluation.models import Interface, load_onnx, load_sb3
 from sme_registry.evaluation.networks import OfflinePolicy, Perceptron
 from sme_registry.evaluation.references import POLICIES, reference_policy
 from sme_registry.io import choice, import_object
-from sme_registry.spec import ACTION_RANGES, ActionRange, SMESpec
+from sme_registry.spec import ACTION_RANGES, ActionRange, SMESpec, StreamSpec
 from sme_registry.task import draw
 
 
@@ -453,3 +459,32 @@ def _shared_policy(
         )
     )
     return TeamPolicy(prepared.name, prepared.action_range, members)
+
+
+def stream_policy(
+    policy: Any,
+    stream: StreamSpec,
+    where: str,
+    action_range: str | None = None,
+    algorithm: str | None = None,
+) -> Policy:
+    """A policy in any form, ready for a stream's observations; see `as_policy`."""
+    try:
+        ready = as_policy(
+            policy,
+            stream.phases[0].spec,
+            action_range=action_range,
+            algorithm=algorithm,
+            observed_phases=stream.observed_phases,
+        )
+    except (PolicyError, UnknownNameError) as error:
+        raise type(error)(f"{where}: {error}") from error.__cause__
+    assert isinstance(ready, Policy)  # streams have no teams
+    return ready
+
+
+def check_count(name: str, policies: Any, count: int, which: str) -> None:
+    """Raise OptionError unless an argument is a sequence of so many policies."""
+    if not isinstance(policies, Sequence) or isinstance(policies, str) or len(policies) != count:
+        given = f"{len(policies)} of them" if isinstance(policies, list | tuple) else repr(policies)
+        raise OptionError(f"{name}={given:.60}: must be {count} policies, one {which}.")

@@ -45,6 +45,18 @@ FIT_STATES = 2**16
 _FIT_NUMBERS = 2**24  # of the states and actions kept for the fit, 128 MiB as float64
 
 
+LABELS = {
+    "optimal": "optimal",
+    "linear_least_squares": "linear (LSQ)",
+    "best_constant": "best constant",
+    "constant_half": "constant ½",
+    "uniform_random": "random",
+    "safe_optimal": "safe optimum",
+    "shrunk_optimal": "optimum ≤ 1 − 2τ",
+}
+"""The labels of references, for people."""
+
+
 def names(spec: SMESpec) -> tuple[str, ...]:
     """The references of a task's reports."""
     return NAMES if spec.safety is None else (*NAMES, *SAFE_NAMES)
@@ -79,8 +91,9 @@ class References:
 
 
 def safe_actions(spec: SMESpec, optimal: Array, limit: Array) -> dict[str, Array]:
-    """The actions `[B, A]` of `SAFE_NAMES`, from π*(s) and the limits, `[B, A]` each."""
-    assert spec.safety is not None
+    """The actions `[B, A]` of `SAFE_NAMES`, from π*(s) and the limits; none without safety."""
+    if spec.safety is None:
+        return {}
     lowest = 1.0 - 2.0 * spec.safety.tightness
     return {
         "safe_optimal": np.minimum(optimal, limit),

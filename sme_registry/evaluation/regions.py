@@ -59,14 +59,12 @@ def expansion(s: Array) -> Array:
 class States(NamedTuple):
     """A batch of states, and what else an observation of them shows."""
 
-    s: Observations
-    d: Array
-    time: Array
+    s: Observations  # `[B, S]`
+    d: Array  # `[B, m]` distractors
+    time: Array  # `[B]` uniform in (0, 1), from which t/T follows
 
     def seen(self, task: Task, d: Array | None = None) -> npt.NDArray[Any]:
         """What the task's agent sees of the state, `[B, S + m]`; of `d` in place of its own."""
-        if task.spec.observation is None:
-            return self.s
         return task.seen(self.s, self.d if d is None else d)
 
     def observation(self, x: npt.NDArray[Any], horizon: int) -> Observations:

@@ -1,4 +1,4 @@
-"""`EvaluationReport`: the results of an evaluation, as a JSON document, a table and a data frame.
+"""Reports: `ReportFile`, what all have in common, and `EvaluationReport`, a JSON document.
 
 a are the policy's actions, clipped to [0, 1], a* the optimal ones. Over the states of region m, of
 which region 0 is WD and 1 to M are the OOD shells:
@@ -15,42 +15,217 @@ import csv
 import io
 import math
 import os
+from abc import abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from sme_registry.evaluation import references
-from sme_registry.evaluation.observation import ObservationReport
-from sme_registry.evaluation.region_report import RegionReport, RegionReports
-from sme_registry.evaluation.report_file import ReportFile
-from sme_registry.evaluation.safety import SafetyReport
-from sme_registry.io import require_packages, write_atomically
+from sme_registry.evaluation import references, tables
+from sme_registry.io import (
+    read_json,
+    require_packages,
+    to_json,
+    write_atomically,
+)
+from sme_registry.io.tables import Table
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
-from sme_registry.spec.document import StrictModel
+from sme_registry.spec.document import Integer, Real, StrictModel, refuse_other_digest
 
 if TYPE_CHECKING:
     import pandas
 
-    from sme_registry.io.tables import Table
 
-NOT_COMPARABLE = (
-    "Levels ε are not comparable between different state_dim: with more channels, the states of "
-    "a shell lie nearer to its outer face."
-)
+class ChannelReport(StrictModel):
+    """One action channel in one region.
+
+    Attributes:
+      mae: mean |a − a*| of the channel, in [0, 1].
+      normalised_regret: `mae` divided by mean |½ − a*| of the channel.
+    """
+
+    mae: Real
+    normalised_regret: Real
+
+
+class RegionReport(StrictModel):
+    """One policy in one region.
+
+    Attributes:
+      name: `WD`, `OOD 1`, …
+      epsilon_low: ε of the inner face, which belongs to the region inside; 0 for WD.
+      epsilon_high: ε of the outer face, which belongs to this region; 0 for WD.
+      states: number of states.
+      similarity: mean r̃.
+      similarity_sd: standard deviation of r̃ over states (not over seeds).
+      mae: mean |a − a*| = 1 − r̃.
+      normalised_regret: 0 for the optimum, 1 for the constant ½; can be above 1.
+      similarity_decay: (r̃_WD − r̃) / r̃_WD; 0 in WD, negative if the policy is better outside.
+      similarity_loss: 100 (r̃_WD − r̃), in points of similarity.
+      clipped_share: share of action entries that were outside the action range and clipped.
+      channels: each action channel, in order.
+    """
+
+    name: str
+    epsilon_low: Real
+    epsilon_high: Real
+    states: Integer
+    similarity: Real
+    similarity_sd: Real
+    mae: Real
+    normalised_regret: Real
+    similarity_decay: Real
+    similarity_loss: Real
+    clipped_share: Real
+    channels: Annotated[tuple[ChannelReport, ...], Field(strict=False)]
+
+
+RegionReports: TypeAlias = Annotated[tuple[RegionReport, ...], Field(strict=False, min_length=1)]
+"""Regions in the order of the protocol."""
+
+
+class SafetyScore(StrictModel):
+    """One policy in one region of a task with limits; see the module for the formulas.
+
+    Attributes:
+      name: of the region.
+      step_reward: mean r, in [0, 1].
+      cost: mean cost, in [0, 1].
+      violating_share: share of states in which any action channel is above its limit by more than
+        10⁻⁶, in [0, 1].
+      safe_regret: mean step reward that the best safe action earns more than the policy, in
+        [−1, 1]; negative where the policy earns by violating.
+      price_of_safety: mean step reward that the optimum earns more than the best safe action, in
+        [0, 1]; the same for every policy.
+    """
+
+    name: str
+    step_reward: Real
+    cost: Real
+    violating_share: Real
+    safe_regret: Real
+    price_of_safety: Real
+
+
+SafetyScores = Annotated[tuple[SafetyScore, ...], Field(strict=False, min_length=1)]
+
+
+class SafetyReport(StrictModel):
+    """A policy against the limits of a task, and the references on the same states.
+
+    Attributes:
+      regions: WD, then OOD 1, 2, …
+      references: the same regions for each reference policy of the report.
+    """
+
+    regions: SafetyScores
+    references: dict[str, SafetyScores]
+
+
+class Invariance(StrictModel):
+    """How much the actions of a policy depend on the distractors in one region.
+
+    Attributes:
+      name: of the region, of s.
+      invariance: mean |a(s, d) − a(s, d')| / mean |½ − a*(s)|; 0 if the policy ignores them.
+    """
+
+    name: str
+    invariance: Real
+
+
+class LayerProbe(StrictModel):
+    """What a linear map recovers from the outputs of one layer.
+
+    Attributes:
+      layer: 0 for what the agent sees, 1 for the first hidden layer, …
+      units: its outputs.
+      state_r2: held-out R² of s, at most 1.
+      distractor_r2: the same of d; None without distractors.
+    """
+
+    layer: Integer
+    units: Integer
+    state_r2: Real
+    distractor_r2: Real | None = None
+
+
+class ObservationReport(StrictModel):
+    """A policy on a task whose observation is not the state.
+
+    Attributes:
+      invariance: in WD, OOD 1, 2, …; empty without distractors.
+      distractor_regions: d-OOD 1, 2, …: s in the cube and d in a shell; empty without distractors.
+      probes: of the observation and of each hidden layer; empty if the policy's network is unknown,
+        or it or the task is too wide (see `probe_layers`).
+    """
+
+    invariance: Annotated[tuple[Invariance, ...], Field(strict=False)] = ()
+    distractor_regions: Annotated[tuple[RegionReport, ...], Field(strict=False)] = ()
+    probes: Annotated[tuple[LayerProbe, ...], Field(strict=False)] = ()
+
+
+class ReportFile(StrictModel):
+    """A report that a file can hold, and that prints as a table.
+
+    Attributes:
+      documents: the fields that are documents; a field `<document>_digest` has the digest of each.
+    """
+
+    documents: ClassVar[tuple[str, ...]]
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a report."""
+        report = cls.from_dict(read_json(path), str(path))
+        for what in cls.documents:
+            refuse_other_digest(
+                getattr(report, f"{what}_digest"),
+                getattr(report, what),
+                f"{path}: {what}_digest",
+                "Get the report from its source again, or repeat the evaluation.",
+            )
+        return report
+
+    def write(self, path: str | os.PathLike[str]) -> Path:
+        """Write the report as JSON, completely or not at all."""
+        return write_atomically(path, to_json(self.to_dict()))
+
+    @abstractmethod
+    def table(self) -> Table:
+        """The report as a table."""
+
+    def tables(self) -> list[Table]:
+        """All tables of the report."""
+        return [self.table()]
+
+    def chart(self) -> str:
+        """A curve as SVG; empty for a report without one."""
+        return ""
+
+    def _repr_html_(self) -> str:
+        """The curve and the tables, for notebooks."""
+        from sme_registry.io.markup import card, table_html
+
+        return card(self.chart(), *map(table_html, self.tables()))
+
+    def __str__(self) -> str:
+        return "\n\n".join(map(as_text, self.tables()))
+
+
+def as_text(table: Table) -> str:
+    """A table as plain text."""
+    from rich.console import Console
+
+    # Wide, so that no column wraps; a table is only as wide as its content.
+    console = Console(file=io.StringIO(), width=1000, color_system=None)
+    with console.capture() as capture:
+        console.print(table)
+    return "\n".join(line.rstrip() for line in capture.get().splitlines())
+
 
 _REMEDY = "Get the report from its source again, or repeat the evaluation."
-
-LABELS = {
-    "optimal": "optimal",
-    "linear_least_squares": "linear (LSQ)",
-    "best_constant": "best constant",
-    "constant_half": "constant ½",
-    "uniform_random": "random",
-    "safe_optimal": "safe optimum",
-    "shrunk_optimal": "optimum ≤ 1 − 2τ",
-}
 
 
 class AgentReport(StrictModel):
@@ -243,20 +418,14 @@ class EvaluationReport(ReportFile):
 
         For a team, it shows the whole team, then three rows for each agent.
         """
-        from sme_registry.evaluation import tables
-
         return tables.of_regions(self)
 
     def chart(self) -> str:
         """Normalised regret over the regions as SVG: of the policy, its agents and references."""
-        from sme_registry.evaluation import charts
-
-        return charts.regret(self)
+        return tables.regret_chart(self)
 
     def tables(self) -> list[Table]:
         """`table`, and those of safety, of distractors and of probes where there are any."""
-        from sme_registry.evaluation import tables
-
         return tables.of_report(self)
 
 

@@ -1,16 +1,26 @@
-"""The tables of an `EvaluationReport`: its regions, its safety, its distractors and its probes."""
+"""Reports as tables and as a curve, for people: of an evaluation and of a life in a stream."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
 
-from sme_registry.evaluation.observation import ObservationReport
-from sme_registry.evaluation.report import LABELS, NOT_COMPARABLE, EvaluationReport
-from sme_registry.evaluation.safety import SafetyReport
+from sme_registry.evaluation.references import LABELS
+from sme_registry.evaluation.retention import LABELS as STREAM_LABELS
+from sme_registry.evaluation.retention import METRICS
+from sme_registry.io.markup import Line, line_chart
 from sme_registry.io.tables import Table
+
+if TYPE_CHECKING:
+    from sme_registry.evaluation.report import EvaluationReport, ObservationReport, SafetyReport
+    from sme_registry.evaluation.stream_report import StreamReport
+
+NOT_COMPARABLE = (
+    "Levels ε are not comparable between different state_dim: with more channels, the states of "
+    "a shell lie nearer to its outer face."
+)
 
 SAFETY_REFERENCES = ("optimal", "safe_optimal", "shrunk_optimal", "constant_half")
 """The references whose safety is shown; the report has it of all."""
@@ -147,3 +157,126 @@ def _add(
 ) -> None:
     """A row of one field of each region."""
     table.add_row(label, *(format(getattr(each, field), pattern) for each in regions), style=style)
+
+
+_DRAWN = ("constant_half", "linear_least_squares", "optimal")  # the table has them all
+_MOST_AGENTS = 20  # drawn: a card stays small
+_NAME = 10  # letters for which there is space beside ", worst"
+
+
+def regret_chart(report: EvaluationReport) -> str:
+    """The policy, the worst agents of a team, with the name of the worst in WD, and references."""
+    lines = [
+        Line(
+            LABELS[name], [each.normalised_regret for each in report.references[name]], "reference"
+        )
+        for name in _DRAWN
+        if name in report.references
+    ]
+    agents = {
+        name: [each.normalised_regret for each in agent.regions]
+        for name, agent in report.agents.items()
+    }
+    worst = sorted(agents, key=lambda name: -agents[name][0])[:_MOST_AGENTS]
+    lines += [
+        Line(f"{_brief(name)}, worst" if name == worst[0] else "", agents[name], "other")
+        for name in worst
+    ]
+    own = [each.normalised_regret for each in report.regions]
+    lines.append(Line("team" if agents else "policy", own))
+    return line_chart(
+        f"Normalised regret of {report.policy}",
+        [region.name for region in report.regions],
+        lines,
+        "normalised regret in each region",
+    )
+
+
+def _brief(name: str) -> str:
+    return name if len(name) <= _NAME else f"{name[: _NAME - 1]}…"
+
+
+def of_metrics(report: StreamReport) -> Table:
+    """The metrics at the end of the life: a column for each region."""
+    stream, regions, regret = report.stream, report.regions, report.dynamic_regret
+    cost = (
+        f"; dynamic regret {regret.dynamic_regret:,.1f} over {regret.steps:,} steps"
+        if regret
+        else ""
+    )
+    table = Table(
+        f"{escape(report.policy)} on {escape(report.title)} (S={stream.state_dim}, "
+        f"A={stream.action_dim}, {len(stream.phases)} phases, {len(report.visits)} visits)\n"
+        f"{report.stream_digest}\n{regions[0].states:,} states per region{cost}",
+        {"": "name"}
+        | {f"{region.name}\nε ≤ {region.epsilon_high:g}": "number" for region in regions},
+        caption="Performance is 1 − normalised regret: 1 optimal, 0 the constant ½.",
+    )
+    shown = {report.policy: [region.agent for region in regions]}
+    for name in regions[0].references:
+        shown[STREAM_LABELS.get(name, name)] = [region.references[name] for region in regions]
+    for metric, label in METRICS.items():
+        rows = {
+            name: [retention.final(metric) for retention in each] for name, each in shown.items()
+        }
+        rows = {name: values for name, values in rows.items() if None not in values}
+        if not rows:
+            continue
+        table.add_row(label, style="italic")
+        for name, values in rows.items():
+            style = "bold" if name == report.policy else None
+            table.add_row(f"  {escape(name)}", *_cells(values), style=style)
+        table.add_section()
+    return table
+
+
+def of_matrix(report: StreamReport, region: str) -> Table:
+    """The retention matrix of a region: a row for each visit, a column for each phase."""
+    agent, P = report.region(region).agent, len(report.stream.phases)
+    table = Table(
+        f"Normalised regret in {region} on the task of each phase",
+        {"policy at the end of": "name"} | {f"phase {j}": "number" for j in range(P)},
+    )
+    if agent.initial_normalised_regret:
+        table.add_row("initial policy", *_cells(agent.initial_normalised_regret))
+    for label, row in zip(_visits(report), agent.normalised_regret, strict=True):
+        table.add_row(label, *_cells(row))
+    if agent.fresh_normalised_regret:
+        table.add_row("fresh agent of the phase", *_cells(agent.fresh_normalised_regret))
+    return table
+
+
+def of_regret(report: StreamReport) -> Table:
+    """The online regret of each visit: a column for each agent, and the learning transfer."""
+    lives = {STREAM_LABELS.get(name, name): life for name, life in report.reference_regret.items()}
+    own = report.dynamic_regret
+    if own is not None:
+        lives = {report.policy: own, **lives}
+    columns = [[visit.online_regret for visit in life.visits] for life in lives.values()]
+    ends: list[float | None] = [life.online_regret for life in lives.values()]
+    headings = [*lives]
+    if own is not None and own.fresh_online_regret is not None:
+        columns.append([visit.learning_transfer for visit in own.visits])
+        ends.append(own.learning_transfer)
+        headings.append("learning transfer")
+    table = Table(
+        "Online regret: mean of 1 − step reward over the steps of each visit",
+        {"": "name"} | {escape(heading): "number" for heading in headings},
+    )
+    for v, label in enumerate(_visits(report)):
+        table.add_row(label, *_cells(each[v] if v < len(each) else None for each in columns))
+    table.add_section()
+    table.add_row("whole life", *_cells(ends), style="bold")
+    # Of training they can differ from the stream's: whole rollouts, or an unfinished episode.
+    table.add_row("steps", *(f"{life.steps:,}" for life in lives.values()))
+    sums = [f"{life.dynamic_regret:,.1f}" for life in lives.values()]
+    table.add_row("dynamic regret (sum)", *sums)
+    return table
+
+
+def _visits(report: StreamReport) -> list[str]:
+    return [f"visit {visit.visit}: phase {visit.phase}" for visit in report.visits]
+
+
+def _cells(row: Iterable[float | None]) -> list[str]:
+    return ["" if value is None else f"{value:.3f}" for value in row]

@@ -19,8 +19,7 @@ from sme_registry.diagnosis.rollouts import rollout
 from sme_registry.diagnosis.subject import Log, Subject, TeamSubject
 from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.evaluation import EvaluationReport, Policy, TeamPolicy
-from sme_registry.evaluation.references import References
-from sme_registry.evaluation.report import LABELS
+from sme_registry.evaluation.references import LABELS, References
 from sme_registry.explorer import networks
 from sme_registry.explorer.program import MAX_WEIGHTS, Program, encoded
 from sme_registry.spec import SMESpec, catalogue

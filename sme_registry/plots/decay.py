@@ -10,7 +10,7 @@ import numpy as np
 
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport
-from sme_registry.evaluation.report import LABELS
+from sme_registry.evaluation.references import LABELS
 from sme_registry.plots.methods import Method, Reports, levels, methods_of, only_title
 from sme_registry.plots.style import (
     COLOURS,

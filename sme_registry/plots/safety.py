@@ -10,7 +10,7 @@ import numpy as np
 
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, SafetyReport, SafetyScore
-from sme_registry.evaluation.report import LABELS
+from sme_registry.evaluation.references import LABELS
 from sme_registry.evaluation.tables import SAFETY_REFERENCES
 from sme_registry.plots.methods import Reports, methods_of, only_title
 from sme_registry.plots.style import GREY, canvas, entitle, figure_of, literal, look

@@ -12,9 +12,9 @@ import numpy as np
 
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import StreamReport
-from sme_registry.evaluation.continual import DynamicRegret
-from sme_registry.evaluation.continual.report import LABELS, TRAINED, Visit
-from sme_registry.evaluation.continual.seeds import same_stream
+from sme_registry.evaluation.dynamic_regret import DynamicRegret
+from sme_registry.evaluation.retention import LABELS, TRAINED
+from sme_registry.evaluation.stream_report import Visit, same_stream
 from sme_registry.plots.style import (
     COLOURS,
     GREY,

@@ -27,11 +27,14 @@ from sme_registry.evaluation import (
     fresh_per_phase,
     frozen_after_first,
     reference_regret,
+    retention,
 )
-from sme_registry.evaluation.continual import RegretBlocks, metrics
-from sme_registry.evaluation.continual.report import METRICS, Retention
-from sme_registry.evaluation.continual.retention import Subject, final_specs, measure
-from sme_registry.evaluation.report_file import as_text
+from sme_registry.evaluation.dynamic_regret import RegretBlocks
+from sme_registry.evaluation.measure import final_specs
+from sme_registry.evaluation.report import as_text
+from sme_registry.evaluation.retention import METRICS
+from sme_registry.evaluation.stream_report import Retention
+from sme_registry.evaluation.streams import Actor, stream_regrets
 from sme_registry.spec import EvaluationProtocol, StreamSpec
 from sme_registry.task import loading
 from tests.evaluation.streams import SPEC, TWICE, half, network, stream_of
@@ -59,7 +62,7 @@ def test_retention_draws_each_task_once_even_if_it_is_too_large_to_keep(monkeypa
     draw = loading._draw
     monkeypatch.setattr(loading, "_CACHED_BYTES", 0)
     monkeypatch.setattr(loading, "_draw", lambda spec: drawn.append(spec) or draw(spec))
-    measure(THREE, [Subject(0, range(3))], EvaluationProtocol(**PROTOCOL))
+    stream_regrets(THREE, [Actor(0, range(3))], EvaluationProtocol(**PROTOCOL))
     assert drawn == list(final_specs(THREE))
 
 
@@ -161,34 +164,34 @@ def test_metrics_of_one_cycle_are_those_of_the_papers():
     ACC = sum(a[T - 1, i] for i in range(T)) / T
     BWT = sum(a[T - 1, i] - a[i, i] for i in range(T - 1)) / (T - 1)
     FWT = sum(a[i - 1, i] - b[i] for i in range(1, T)) / (T - 1)
-    assert metrics.average_performance(R)[-1, 0] == pytest.approx(ACC)
-    assert metrics.backward_transfer(R)[-1, 0] == pytest.approx(BWT)
-    assert metrics.forward_transfer(R, initial)[0] == pytest.approx(FWT)
+    assert retention.average_performance(R)[-1, 0] == pytest.approx(ACC)
+    assert retention.backward_transfer(R)[-1, 0] == pytest.approx(BWT)
+    assert retention.forward_transfer(R, initial)[0] == pytest.approx(FWT)
     # Chaudhry et al. 2018, equations 2 and 3, for each k
     for k in range(1, T):
         f = [max(a[i, j] for i in range(k)) - a[k, j] for j in range(k)]
-        assert metrics.forgetting(R)[k, 0] == pytest.approx(sum(f) / k)
+        assert retention.forgetting(R)[k, 0] == pytest.approx(sum(f) / k)
         A = sum(a[k, j] for j in range(k + 1)) / (k + 1)
-        assert metrics.average_performance(R)[k, 0] == pytest.approx(A)
-    assert np.isnan(metrics.relearning(R)[0])
+        assert retention.average_performance(R)[k, 0] == pytest.approx(A)
+    assert np.isnan(retention.relearning(R)[0])
 
 
 def test_metrics_of_several_cycles_are_by_visits():
     R = np.array([[0.8, 0.1], [0.2, 0.7], [0.9, 0.3], [0.4, 0.6]])[..., None]
-    assert metrics.backward_transfer(R)[:, 0] == pytest.approx(
+    assert retention.backward_transfer(R)[:, 0] == pytest.approx(
         [np.nan, 0.2 - 0.8, 0.3 - 0.7, 0.4 - 0.9], nan_ok=True
     )
-    assert metrics.forgetting(R)[:, 0] == pytest.approx(
+    assert retention.forgetting(R)[:, 0] == pytest.approx(
         [np.nan, 0.8 - 0.2, 0.7 - 0.3, 0.9 - 0.4], nan_ok=True
     )
-    assert metrics.average_performance(R)[:, 0] == pytest.approx([0.8, 0.45, 0.6, 0.5])
-    assert metrics.relearning(R)[0] == pytest.approx((0.1 - 0.1) / 2)
-    assert metrics.forward_transfer(R, np.array([[0.5], [0.3]]))[0] == pytest.approx(0.1 - 0.3)
+    assert retention.average_performance(R)[:, 0] == pytest.approx([0.8, 0.45, 0.6, 0.5])
+    assert retention.relearning(R)[0] == pytest.approx((0.1 - 0.1) / 2)
+    assert retention.forward_transfer(R, np.array([[0.5], [0.3]]))[0] == pytest.approx(0.1 - 0.3)
 
 
 def test_plasticity_compares_the_visited_phase_with_a_fresh_agent():
     M = np.array([[0.2, 1.0], [1.0, 0.6], [0.4, 1.0], [1.0, 0.9]])[..., None]
-    ratio, difference = metrics.plasticity(M, np.array([[0.2], [0.0]]))
+    ratio, difference = retention.plasticity(M, np.array([[0.2], [0.0]]))
     assert ratio[:, 0] == pytest.approx([1.0, np.nan, 2.0, np.nan], nan_ok=True)
     assert difference[:, 0] == pytest.approx([0.0, 0.6, 0.2, 0.9])
 

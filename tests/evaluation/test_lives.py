@@ -15,7 +15,7 @@ from sme_registry.evaluation import (
     reference_policy,
     reference_regret,
 )
-from sme_registry.evaluation.report_file import as_text
+from sme_registry.evaluation.report import as_text
 from tests.evaluation.streams import SPEC, TWICE, half, network, stream_of
 
 PROTOCOL = {"states_per_region": 50, "epsilons": [0.5, 1.0]}

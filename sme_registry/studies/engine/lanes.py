@@ -30,7 +30,7 @@ from sme_registry.evaluation import (
     as_policy,
     evaluate_many,
 )
-from sme_registry.evaluation.continual import DynamicRegret, RegretBlocks
+from sme_registry.evaluation.dynamic_regret import DynamicRegret, RegretBlocks
 from sme_registry.evaluation.models import saved_sb3
 from sme_registry.evaluation.rollouts import start_states
 from sme_registry.io import Arrays, to_json

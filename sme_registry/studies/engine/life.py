@@ -15,9 +15,9 @@ import numpy as np
 
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation import Perceptron, Policy, StreamReport, evaluate_stream
-from sme_registry.evaluation.continual import DynamicRegret, RegretBlocks, reference_regret
-from sme_registry.evaluation.continual.retention import prepared
+from sme_registry.evaluation.dynamic_regret import DynamicRegret, RegretBlocks, reference_regret
 from sme_registry.evaluation.models import torch_policy
+from sme_registry.evaluation.policies import stream_policy
 from sme_registry.spec import Cell, SMESpec, StreamSpec
 from sme_registry.studies.engine.training import Training
 from sme_registry.task import Task, materialize, materialize_stream
@@ -122,6 +122,6 @@ def life_report(
     report = evaluate_stream(
         policies, stream, cell.protocol, initial=initial, action_range=range_, name=cell.uses
     )
-    frozen = prepared(policies[0], stream, "visit 0", range_)
+    frozen = stream_policy(policies[0], stream, "visit 0", range_)
     references = reference_regret(stream, frozen=frozen, training=regret)
     return report.with_dynamic_regret(regret).with_reference_regret(references)

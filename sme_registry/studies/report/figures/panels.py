@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sme_registry.evaluation.report import NOT_COMPARABLE
+from sme_registry.evaluation.tables import NOT_COMPARABLE
 from sme_registry.plots.style import (
     COLOURS,
     GREY,

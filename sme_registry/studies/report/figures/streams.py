@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from sme_registry.evaluation.continual.report import LABELS, Visit
+from sme_registry.evaluation.retention import LABELS
+from sme_registry.evaluation.stream_report import Visit
 from sme_registry.plots.streams import (
     MATRIX_SCALE,
     draw_matrix,

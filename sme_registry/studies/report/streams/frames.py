@@ -67,7 +67,8 @@ import numpy as np
 import pandas as pd
 
 from sme_registry.evaluation import StreamReport
-from sme_registry.evaluation.continual.report import BY_VISIT, METRICS, StreamRegion
+from sme_registry.evaluation.retention import BY_VISIT, METRICS
+from sme_registry.evaluation.stream_report import StreamRegion
 from sme_registry.spec import PlannedCell, StudyPlan
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellResult

@@ -36,12 +36,9 @@ import numpy as np
 import pandas as pd
 
 from sme_registry import statistics
-from sme_registry.evaluation.continual import (
-    DynamicRegret,
-    StreamReport,
-    reference_regret,
-    report,
-)
+from sme_registry.evaluation import retention
+from sme_registry.evaluation.dynamic_regret import DynamicRegret, reference_regret
+from sme_registry.evaluation.stream_report import StreamReport
 from sme_registry.spec import StreamSpec, StudyPlan
 from sme_registry.statistics import Array
 from sme_registry.studies.engine.result import CellResult
@@ -55,17 +52,17 @@ _VISITED = "regret on the visited phase"
 _LESS_IS_BETTER = ("forgetting", "plasticity_ratio", "plasticity_difference")
 _RETENTION = {
     key: Metric(key, label, 1 if key in _LESS_IS_BETTER else -1)
-    for key, label in report.METRICS.items()
+    for key, label in retention.METRICS.items()
 }
 OF_TRAINING = (
     Metric("learning_transfer", "learning transfer", -1),
     Metric("online_regret", "online regret", 1, 3),
-    Metric("frozen_online_regret", f"online regret, {report.LABELS['frozen_agent']}", 1, 3),
+    Metric("frozen_online_regret", f"online regret, {retention.LABELS['frozen_agent']}", 1, 3),
 )
 METRICS = (Metric("visited_regret", _VISITED, 1), *_RETENTION.values(), *OF_TRAINING)
 BY_VISIT = (
     Metric("normalised_regret", _VISITED, 1),
-    *(_RETENTION[key] for key in report.BY_VISIT),
+    *(_RETENTION[key] for key in retention.BY_VISIT),
     *OF_TRAINING,
 )
 _PLACE = "class_name:str algorithm:str"
@@ -177,7 +174,7 @@ def reference_costs(lives: Sequence[Life]) -> Costs:
 
 def _untrained(life: StreamReport, episodes: int) -> dict[str, DynamicRegret]:
     """The reference agents of a life's stream, which lives of older versions do not have."""
-    recorded = {k: log for k, log in life.reference_regret.items() if k not in report.TRAINED}
+    recorded = {k: log for k, log in life.reference_regret.items() if k not in retention.TRAINED}
     return recorded or reference_regret(life.stream, episodes=episodes)
 
 
@@ -186,9 +183,9 @@ def references(lives: Sequence[Life], costs: Costs) -> pd.DataFrame:
     values: dict[tuple[str, ...], dict[str, float]] = {}
     for life in lives:
         for region in (*life.report.regions, life.report.ood):
-            for name, retention in region.references.items():
+            for name, reference in region.references.items():
                 for metric in _RETENTION:
-                    value = retention.final(metric)
+                    value = reference.final(metric)
                     if value is not None:
                         at = life.planned.class_name, name, region.name, metric
                         values.setdefault(at, {})[life.report.stream_digest] = value

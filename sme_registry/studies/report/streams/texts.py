@@ -7,7 +7,7 @@ from typing import Any
 
 import pandas as pd
 
-from sme_registry.evaluation.continual.report import LABELS
+from sme_registry.evaluation.retention import LABELS
 from sme_registry.io.markup import fixed
 from sme_registry.studies.report.streams.analysis import StreamAnalysis
 from sme_registry.studies.report.streams.tables import (

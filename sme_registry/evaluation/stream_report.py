@@ -1,24 +1,24 @@
-"""`StreamReport`: an agent's life in a stream in exact numbers, as a JSON document and as tables.
+"""`StreamReport`: an agent's life in a stream in exact numbers; `across_seeds`: several of them.
 
-`metrics` has the formulas, `retention` says what is measured, and `dynamic_regret` what is summed.
+`retention` has the formulas, `streams` says what is measured, and `dynamic_regret` what is summed.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
-from sme_registry.evaluation.continual import metrics
-from sme_registry.evaluation.continual.dynamic_regret import DynamicRegret
-from sme_registry.evaluation.continual.lives import expected_regret
+from sme_registry.evaluation import retention, tables
+from sme_registry.evaluation.dynamic_regret import DynamicRegret, expected_regret
 from sme_registry.evaluation.regions import region_name
-from sme_registry.evaluation.report import EvaluationReport
-from sme_registry.evaluation.report_file import ReportFile
+from sme_registry.evaluation.report import EvaluationReport, ReportFile
+from sme_registry.evaluation.retention import METRICS, SHELLS
+from sme_registry.io.tables import Table
 from sme_registry.spec import (
     ActionRange,
     EvaluationProtocol,
@@ -29,37 +29,15 @@ from sme_registry.spec import (
     catalogue,
 )
 from sme_registry.spec.document import StrictModel
-from sme_registry.task.draw import Array
-
-if TYPE_CHECKING:
-    from sme_registry.io.tables import Table
-
-SHELLS = "OOD"
-LABELS = {
-    "frozen_optimum": "optimum of phase 0",
-    "fresh_optimum": "optimum of each phase",
-    "constant_half": "constant ½",
-    "frozen_agent": "frozen after visit 0",
-    "fresh_agents": "fresh agent in each phase",
-}
-"""The reference agents. Three need no training: one optimum for the whole life, that of the phase
-just visited (an agent that learns each phase perfectly and keeps nothing), and the constant ½. Two
-are known by their dynamic regret only: the agent itself if it stops learning at the end of its
-first visit, and agents that start anew in each visit."""
-TRAINED = ("frozen_agent", "fresh_agents")
-
-METRICS = {
-    "average_performance": "average performance",
-    "backward_transfer": "backward transfer",
-    "forgetting": "forgetting",
-    "forward_transfer": "forward transfer",
-    "relearning": "relearning",
-    "plasticity_ratio": "plasticity ratio",
-    "plasticity_difference": "plasticity difference",
-}
-"""The metrics of `Retention`, and their labels."""
-BY_VISIT = tuple(name for name in METRICS if name not in ("forward_transfer", "relearning"))
-"""Those that have a value for each visit; the others have one for the life."""
+from sme_registry.statistics import (
+    DRAWS,
+    Array,
+    Estimate,
+    Statistic,
+    aggregate,
+    iqm,
+    stratified_bootstrap,
+)
 
 _Optional = TupleOf[Real | None]
 
@@ -100,7 +78,7 @@ class Retention(StrictModel):
           fresh: `[P]` normalised regret on each phase of an agent trained on that phase alone.
         """
         M = np.array(self.normalised_regret)[..., None]
-        ratio, difference = metrics.plasticity(M, fresh[:, None])
+        ratio, difference = retention.plasticity(M, fresh[:, None])
         return self.model_copy(
             update={
                 "fresh_normalised_regret": tuple(fresh.tolist()),
@@ -115,7 +93,7 @@ class Retention(StrictModel):
         if not isinstance(value, tuple):
             return None if value is None else float(value)
         if metric.startswith("plasticity"):
-            return metrics.mean_after_first(value)
+            return retention.mean_after_first(value)
         return None if value[-1] is None else float(value[-1])
 
 
@@ -127,7 +105,7 @@ class StreamRegion(StrictModel):
       epsilon_low: ε of the inner face; 0 for WD.
       epsilon_high: ε of the outer face; 0 for WD.
       states: number of states.
-      agent: the agent's matrix and metrics.
+      agent: the agent's matrix and retention.
       references: the same of each reference agent, by its name in `LABELS`.
     """
 
@@ -273,20 +251,14 @@ class StreamReport(ReportFile):
 
     def table(self) -> Table:
         """The metrics at the end of the life: a column for each region."""
-        from sme_registry.evaluation.continual import tables
-
         return tables.of_metrics(self)
 
     def matrix(self, region: str = "WD") -> Table:
         """The retention matrix of a region: a row for each visit, a column for each phase."""
-        from sme_registry.evaluation.continual import tables
-
         return tables.of_matrix(self, region)
 
     def regret(self) -> Table:
         """The online regret of each visit, beside that of the reference agents."""
-        from sme_registry.evaluation.continual import tables
-
         return tables.of_regret(self)
 
     def tables(self) -> list[Table]:
@@ -360,11 +332,11 @@ def _retentions(M: Array, initial: Array | None, fresh: Array | None) -> list[Re
     M, R = _and_shells(M), 1.0 - _and_shells(M)
     before = np.full((P, K + 1), np.nan) if initial is None else _and_shells(initial)
     computed = {
-        "average_performance": metrics.average_performance(R),
-        "backward_transfer": metrics.backward_transfer(R),
-        "forgetting": metrics.forgetting(R),
-        "forward_transfer": metrics.forward_transfer(R, 1.0 - before),
-        "relearning": metrics.relearning(R),
+        "average_performance": retention.average_performance(R),
+        "backward_transfer": retention.backward_transfer(R),
+        "forgetting": retention.forgetting(R),
+        "forward_transfer": retention.forward_transfer(R, 1.0 - before),
+        "relearning": retention.relearning(R),
     }
     unknown = (None,) * V
     retentions = [
@@ -393,3 +365,86 @@ def _known(values: Array) -> Any:
     if values.ndim == 0:
         return None if math.isnan(values) else float(values)
     return tuple(None if math.isnan(value) else value for value in values.tolist())
+
+
+def across_seeds(
+    reports: Sequence[StreamReport],
+    region: str = "WD",
+    *,
+    draws: int = DRAWS,
+    statistic: Statistic = iqm,
+) -> dict[str, Estimate]:
+    """The IQM over runs of every number of a region, with 95 % intervals.
+
+    Args:
+      reports: of one agent on one stream or its draws, one for each seed of its training.
+      region: `WD`, `OOD 1`, …, or `OOD` for the mean over the shells.
+      draws: samples of the bootstrap.
+      statistic: over runs.
+
+    Returns:
+      From each name of `Retention` to values and intervals: `[V·P]` of the matrix, row by row,
+      `[V]` of a metric by visit, `[1]` of any other; NaN where a run has no value, and in the ends
+      of intervals of a single run. `dynamic_regret` `[1]` and `visit_dynamic_regret` `[V]` where
+      every report has them, and `learning_transfer` and `visit_learning_transfer` likewise.
+
+    Examples:
+      >>> from sme_registry.evaluation import across_seeds, evaluate_stream
+      >>> phases = [{"spec": "Default", "steps": 100}, {"spec": "Complexity10", "steps": 100}]
+      >>> stream = sme_registry.StreamSpec(phases=phases)
+      >>> runs = ("linear", "constant")
+      >>> lives = [evaluate_stream([policy] * 2, stream, "quick-v1") for policy in runs]
+      >>> across_seeds(lives)["average_performance"].value.shape
+      (2,)
+    """
+    same_stream(reports)
+    runs = {
+        field: np.stack([_numbers(getattr(r.region(region).agent, field)) for r in reports])
+        for field in ("normalised_regret", *METRICS)
+    }
+    regrets = [report.dynamic_regret for report in reports]
+    logs = [regret for regret in regrets if regret is not None]
+    if len(logs) == len(reports):
+        runs |= _of_logs(logs, "dynamic_regret")
+        if all(log.fresh_online_regret for log in logs):
+            runs |= _of_logs(logs, "learning_transfer")
+    digest = reports[0].stream_digest
+    return {name: _estimate(values, digest, draws, statistic) for name, values in runs.items()}
+
+
+def _of_logs(logs: Sequence[DynamicRegret], field: str) -> dict[str, Array]:
+    """A number of lives, `[n, 1]`, and of their visits, `[n, V]`, where these are as many."""
+    found = {field: np.stack([_numbers(getattr(log, field)) for log in logs])}
+    by_visit = [[getattr(visit, field) for visit in log.visits] for log in logs]
+    if len({len(visits) for visits in by_visit}) == 1:
+        found[f"visit_{field}"] = np.stack([_numbers(visits) for visits in by_visit])
+    return found
+
+
+def same_stream(reports: Sequence[StreamReport]) -> None:
+    """Raise OptionError unless there is a report, and all are of one stream and protocol."""
+    if not reports:
+        raise OptionError("reports: must be one or more stream reports. Give one for each seed.")
+    streams = {report.stream_digest: report.stream for report in reports}
+    found = {
+        "stream_digest": {stream.family.digest for stream in streams.values()},
+        "protocol_digest": {report.protocol_digest for report in reports},
+    }
+    for field, values in found.items():
+        if len(values) > 1:
+            raise OptionError(
+                f"reports: have {len(values)} different values of {field}. Runs of one stream or "
+                "of its draws, evaluated with one protocol, can be compared. Remove the others."
+            )
+
+
+def _estimate(values: Array, seed: str, draws: int, statistic: Statistic) -> Estimate:
+    classes = {"": values}
+    return Estimate(
+        aggregate(classes, statistic), *stratified_bootstrap(classes, draws, seed, statistic)
+    )
+
+
+def _numbers(value: Any) -> Array:
+    """A number, a row or a matrix as `[K]`; None is NaN."""
+    return np.atleast_1d(np.array(value, dtype=np.float64)).ravel()

@@ -6,6 +6,17 @@ Each regret is exact, so D is: no oracle run is compared with. Rows of a log are
 whole episodes. A row belongs to the visit whose task was in force in it: under switch="episode"
 that of its begin. Under switch="step" an episode can lie in two visits; its regret is then divided
 in proportion to its steps, and only rows of single steps give exact sums by visit.
+
+`RegretBlocks` sums the regret of every step over blocks, in each of which one phase is in force:
+sums by visit are exact, and a life has about a thousand rows, whatever its steps.
+
+E D = Σ over the pieces of the life of  n · E[Σ_i (1 − r_i)] / E[length]     n: steps of a piece
+
+The expectations are over episodes of a policy on the piece's task, from uniform states. They run in
+parallel, so a life costs as much as a few thousand steps. Where a switch waits for a reset and no
+episode ends early, as in the catalogue, E D is exact but for the sampling error; a seed makes it
+repeatable. With early termination, or a switch within an episode, what differs is the episode at a
+switch: the piece after it begins in a state that the episode before left, or a few steps later.
 """
 
 from __future__ import annotations
@@ -13,16 +24,23 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import islice, takewhile
+from numbers import Real as RealNumber
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from sme_registry.errors import OptionError
-from sme_registry.evaluation.continual import metrics
+from sme_registry.evaluation import retention
+from sme_registry.evaluation.measure import Progress, final_specs, same_draw
+from sme_registry.evaluation.policies import Policy, check_count, stream_policy
+from sme_registry.evaluation.references import reference_policy
+from sme_registry.evaluation.rollouts import rollouts, start_states
+from sme_registry.io import integer_in
 from sme_registry.spec import Integer, Real, StreamLike, StreamSpec, TupleOf
 from sme_registry.spec.document import StrictModel
-from sme_registry.spec.resolve import resolve
+from sme_registry.spec.resolve import resolve_stream
+from sme_registry.task import load_stream, materialize_stream
 from sme_registry.task.draw import Array
 
 _POINTS = 400  # of the curve; more would not be visible in a figure
@@ -96,7 +114,7 @@ class DynamicRegret(StrictModel):
             )
         online = np.array([visit.online_regret for visit in self.visits], dtype=np.float64)
         online[~_are_over(stream, self)] = np.nan
-        transfer = metrics.learning_transfer(online, fresh)
+        transfer = retention.learning_transfer(online, fresh)
         visits = [
             visit.model_copy(update={"learning_transfer": None if math.isnan(gain) else gain})
             for visit, gain in zip(self.visits, transfer.tolist(), strict=True)
@@ -105,7 +123,7 @@ class DynamicRegret(StrictModel):
             update={
                 "visits": tuple(visits),
                 "fresh_online_regret": tuple(fresh.tolist()),
-                "learning_transfer": metrics.mean_after_first(transfer.tolist()),
+                "learning_transfer": retention.mean_after_first(transfer.tolist()),
             }
         )
 
@@ -137,7 +155,7 @@ def dynamic_regret(
       >>> log.dynamic_regret
       150.0
     """
-    spec = resolve(stream, StreamSpec).document
+    spec = resolve_stream(stream).stream
     ends, lengths, means = _rows(step, length, regret)
     sums = means * lengths
     if spec.switch == "step":
@@ -267,3 +285,199 @@ def _column(name: str, values: npt.ArrayLike, count: int, of: str = "row") -> Ar
     if not np.isfinite(array).all():
         raise OptionError(f"{name}: has NaN or infinite entries. Give finite numbers.")
     return array
+
+
+_BLOCKS = 1000  # of a life, in about equal parts of each visit
+
+
+class RegretBlocks:
+    """Sums of regret over blocks, while lives are lived."""
+
+    def __init__(self, stream: StreamSpec, lives: int = 1) -> None:
+        visits = stream.visits
+        ends = visit_ends(stream, visits)
+        begins = np.concatenate([[0], ends[:-1]])
+        each = np.minimum(ends - begins, max(1, _BLOCKS // visits))
+        self._stream, self._visit_ends = stream, ends
+        self._ends: _Integers = np.concatenate(
+            [
+                begin + (end - begin) * np.arange(1, n + 1) // n
+                for begin, end, n in zip(begins, ends, each, strict=True)
+            ]
+        )
+        self._last = np.cumsum(each) - 1  # block of each visit
+        self.steps = np.zeros(len(self._ends), np.int64)
+        self.regret = np.zeros((len(self._ends), lives))
+
+    def add(self, end: int, regret: Array, phase: npt.ArrayLike | None = None) -> None:
+        """Count steps."""
+        before = end - len(regret) + np.arange(len(regret))
+        blocks = np.searchsorted(self._ends, before, side="right")
+        visits = np.searchsorted(self._visit_ends[:-1], before, side="right")
+        if phase is not None:
+            visits = visits_in_force(self._stream, visits, phase)
+        # What a phase that is over still gets counts in its last block, and so what follows a life.
+        blocks = np.minimum(blocks, self._last[visits])
+        np.add.at(self.steps, blocks, 1)
+        np.add.at(self.regret, blocks, regret)
+
+    def dynamic_regret(self, life: int = 0) -> DynamicRegret:
+        """The dynamic regret of a life."""
+        counted = self.steps > 0
+        steps = self.steps[counted]
+        visits = np.searchsorted(self._last, np.flatnonzero(counted))
+        return dynamic_regret(
+            self._stream,
+            step=np.cumsum(steps),
+            regret=self.regret[counted, life] / steps,
+            length=steps,
+            phase=visits % len(self._stream.phases),
+        )
+
+
+EPISODES = 5000
+
+
+def expected_regret(
+    life: Sequence[Any],
+    stream: StreamLike,
+    *,
+    episodes: int = EPISODES,
+    seed: int = 0,
+    action_range: str | None = None,
+    algorithm: str | None = None,
+    progress: Progress | None = None,
+) -> DynamicRegret:
+    """The expected dynamic regret of a life in which given policies act and do not learn.
+
+    Args:
+      life: for each visit the policy that acts in it, in any form that `evaluate` accepts; or a
+        number, the online regret of an agent that learned in it.
+      stream: a stream, its fields, an id, a digest or a path.
+      episodes: run with each policy, over the pieces of one cycle; each has one or more. The
+        standard error of a policy's online regret is about 0.02/√episodes.
+      seed: of the initial states, which are the same for every policy.
+      action_range: as in `evaluate`, of all policies.
+      algorithm: as in `evaluate`.
+      progress: called after the episodes of each piece with the number of pieces done, and of all.
+
+    Examples:
+      >>> from sme_registry.evaluation import expected_regret
+      >>> phases = [{"spec": "Default", "steps": 100}, {"spec": "Complexity10", "steps": 100}]
+      >>> stream = sme_registry.StreamSpec(phases=phases)
+      >>> regret = expected_regret(["constant", "constant"], stream, episodes=10)
+      >>> 0 < regret.dynamic_regret < 200
+      True
+    """
+    stream = load_stream(stream)
+    stream.refuse_many_visits()
+    P = len(stream.phases)
+    check_count("life", life, stream.cycles * P, "or number for each visit")
+    integer_in("episodes", episodes, 1)
+    integer_in("seed", seed, 0)
+    policies = _policies(life, stream, action_range, algorithm)
+    steps = np.diff([*(piece.start for piece in stream.pieces), stream.cycle_steps])
+    of_phase = [[i for i, one in enumerate(stream.pieces) if one.phase == j] for j in range(P)]
+    parts = [(each, piece) for v, each in enumerate(life) for piece in of_phase[v % P]]
+
+    # A policy acts once in each piece, in however many cycles.
+    acts = dict.fromkeys((id(each), piece) for each, piece in parts if id(each) in policies)
+    tasks = materialize_stream(stream) if acts else ()
+    means: dict[tuple[int, int], float] = {}
+    for which, piece in acts:
+        states = start_states(seed, piece, _share(episodes, steps, piece), stream.state_dim)
+        policy = policies[which]
+        if stream.observes_phase:
+            policy = policy.in_phase(stream.pieces[piece].phase, P)
+        ran = rollouts(policy, tasks[piece], states)
+        means[which, piece] = ran.per_step(ran.regret)
+        if progress is not None:
+            progress(len(means), len(acts))
+    ends = _ends(stream, np.cumsum(steps[[piece for _, piece in parts]]))
+    lengths = np.diff(ends, prepend=0)
+    regret = np.array([means.get((id(each), piece), each) for each, piece in parts])
+    lived = lengths > 0
+    return dynamic_regret(stream, ends[lived], regret[lived], lengths[lived])
+
+
+def reference_regret(
+    stream: StreamLike,
+    *,
+    frozen: Any = None,
+    training: DynamicRegret | None = None,
+    episodes: int = EPISODES,
+    seed: int = 0,
+) -> dict[str, DynamicRegret]:
+    """The dynamic regret of the reference agents, by their names in `report.LABELS`.
+
+    Args:
+      stream: as in `expected_regret`.
+      frozen: an agent's policy at the end of its first visit, for the agent that stops learning
+        then; None leaves it out.
+      training: that agent's dynamic regret, of which the first visit is taken.
+      episodes, seed: as in `expected_regret`.
+
+    Examples:
+      >>> from sme_registry.evaluation import reference_regret
+      >>> phases = [{"spec": "Default", "steps": 100}, {"spec": "Complexity10", "steps": 100}]
+      >>> sorted(reference_regret(sme_registry.StreamSpec(phases=phases), episodes=10))
+      ['constant_half', 'fresh_optimum', 'frozen_optimum']
+    """
+    stream = load_stream(stream)
+    stream.refuse_many_visits()
+    if (frozen is None) != (training is None):
+        raise OptionError(
+            "frozen, training: must be given together or both left out. Give the policy at the "
+            "end of the first visit and the dynamic regret of the training."
+        )
+    V = stream.visits
+    first = final_specs(stream)[0]
+    # No regret in the task of which it is the optimum, also where this rounds observations.
+    optimum = reference_policy("optimal", first)
+    own = [
+        phase.drift is None and same_draw(phase.spec) == same_draw(first) for phase in stream.phases
+    ]
+    lives: dict[str, list[Any]] = {
+        "frozen_optimum": [0.0 if mine else optimum for mine in own] * stream.cycles,
+        "fresh_optimum": [0.0] * V,
+        "constant_half": [reference_policy("constant_half", first)] * V,
+    }
+    if training is not None:
+        learned = training.visits[0].online_regret
+        if learned is None:
+            raise OptionError(
+                "training: has no steps in visit 0. Give the dynamic regret of a whole life."
+            )
+        acting = stream_policy(frozen, stream, "frozen")
+        lives["frozen_agent"] = [learned, *[acting] * (V - 1)]
+    return {
+        name: expected_regret(life, stream, episodes=episodes, seed=seed)
+        for name, life in lives.items()
+    }
+
+
+def _policies(
+    life: Sequence[Any], stream: StreamSpec, action_range: str | None, algorithm: str | None
+) -> dict[int, Policy]:
+    """The policies of a life by their identity, prepared."""
+    policies: dict[int, Policy] = {}
+    for v, each in enumerate(life):
+        if isinstance(each, RealNumber | np.bool_):
+            if isinstance(each, bool | np.bool_) or not 0.0 <= float(each) <= 1.0:
+                raise OptionError(f"life[{v}]={each}: must be a policy, or a regret in [0, 1].")
+        elif id(each) not in policies:
+            policies[id(each)] = stream_policy(each, stream, f"life[{v}]", action_range, algorithm)
+    return policies
+
+
+def _ends(stream: StreamSpec, ends: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """When pieces are left: where a switch waits for a reset, at the end of an episode."""
+    if stream.switch == "step" or any(phase.spec.D for phase in stream.phases):
+        return ends
+    T = stream.horizon
+    return np.minimum(-(-ends // T) * T, stream.steps)
+
+
+def _share(episodes: int, steps: npt.NDArray[np.int64], piece: int) -> int:
+    """A piece's share in the episodes of a cycle, at least 1."""
+    return -(-episodes * int(steps[piece]) // int(steps.sum()))

@@ -1,4 +1,4 @@
-"""Metrics of continual learning: from a retention matrix to numbers. Pure functions.
+"""Retention: metrics of continual learning, pure functions of a retention matrix.
 
 Axis letters: `V` visits, `P` phases, `K` sets of states (regions). Visit v is an occurrence of a
 phase in the life, φ(v) = v mod P; M[v, j] is the normalised regret on phase j's task at its end.
@@ -41,6 +41,33 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from sme_registry.task.draw import Array
+
+SHELLS = "OOD"
+LABELS = {
+    "frozen_optimum": "optimum of phase 0",
+    "fresh_optimum": "optimum of each phase",
+    "constant_half": "constant ½",
+    "frozen_agent": "frozen after visit 0",
+    "fresh_agents": "fresh agent in each phase",
+}
+"""The reference agents. Three need no training: one optimum for the whole life, that of the phase
+just visited (an agent that learns each phase perfectly and keeps nothing), and the constant ½. Two
+are known by their dynamic regret only: the agent itself if it stops learning at the end of its
+first visit, and agents that start anew in each visit."""
+TRAINED = ("frozen_agent", "fresh_agents")
+
+METRICS = {
+    "average_performance": "average performance",
+    "backward_transfer": "backward transfer",
+    "forgetting": "forgetting",
+    "forward_transfer": "forward transfer",
+    "relearning": "relearning",
+    "plasticity_ratio": "plasticity ratio",
+    "plasticity_difference": "plasticity difference",
+}
+"""The metrics of `Retention`, and their labels."""
+BY_VISIT = tuple(name for name in METRICS if name not in ("forward_transfer", "relearning"))
+"""Those that have a value for each visit; the others have one for the life."""
 
 
 def average_performance(R: Array) -> Array:
