@@ -64,12 +64,7 @@ _MAX_NUMBERS = 2**21  # in memory at once while drawing, 16 MiB
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Values with their 95 % intervals.
-
-    Attributes:
-      value: `[K]`.
-      low: `[K]` lower ends; NaN where each class has a single run.
-      high: `[K]` upper ends; NaN likewise.
+    """Values `[K]` with the ends of their 95 % intervals, NaN where each class has a single run.
 
     Examples:
       >>> from sme_registry.statistics import Estimate
@@ -83,13 +78,7 @@ class Estimate:
 
 
 def iqm(runs: npt.ArrayLike) -> Array:
-    """The interquartile mean over the first axis, as `scipy.stats.trim_mean(runs, 0.25)`.
-
-    Args:
-      runs: `[n, …]`, n ≥ 1.
-
-    Returns:
-      `[…]`, in the runs' units.
+    """The interquartile mean over the first axis, `[n, …]` to `[…]`: SciPy's `trim_mean` of 0.25.
 
     Examples:
       >>> from sme_registry.statistics import iqm
@@ -124,14 +113,7 @@ def median(runs: npt.ArrayLike) -> Array:
 
 
 def optimality_gap(scores: npt.ArrayLike, target: float = 1.0) -> Array:
-    """The mean shortfall from a target; values above the target do not compensate.
-
-    Args:
-      scores: `[n, …]`, higher is better.
-      target: the target, in the scores' units.
-
-    Returns:
-      `[…]`, at least 0, in the scores' units.
+    """The mean shortfall from a target, `[n, …]` to `[…]`; values above it do not compensate.
 
     Examples:
       >>> from sme_registry.statistics import optimality_gap
@@ -153,14 +135,7 @@ def smoothing_window(rows: int) -> int:
 
 
 def running_median(values: Array, window: int) -> Array:
-    """Medians of the last entries.
-
-    Args:
-      values: `[N]`, in order.
-      window: entries in each median, at least 1.
-
-    Returns:
-      `[N]` medians of the last `window` entries up to each, of fewer at the beginning.
+    """Medians `[N]` of the last `window` entries of `[N]` values, of fewer at the beginning.
 
     Examples:
       >>> from sme_registry.statistics import running_median
@@ -178,23 +153,17 @@ def running_median(values: Array, window: int) -> Array:
 
 
 def smoothed(step: Array, values: Array, window: int | None = None) -> tuple[Array, Array, int]:
-    """The line of a training curve.
-
-    Args:
-      step: `[N]` environment steps at which episodes ended, in any order.
-      values: `[N]`.
-      window: entries in each median; None for `smoothing_window`.
+    """The line of a training curve, from `[N]` values and the steps of each, in any order.
 
     Returns:
-      `[P]` increasing steps, `[P]` medians of the last `window` values up to each, and the window.
+      `[P]` increasing steps, `[P]` medians of the last `window` values up to each, and the window,
+      by default that of `smoothing_window`.
 
     Examples:
       >>> from sme_registry.statistics import smoothed
       >>> step, regret, window = smoothed(np.array([100, 200, 300]), np.array([0.9, 0.5, 0.7]), 2)
       >>> step
       array([200, 300])
-      >>> regret.round(2)
-      array([0.7, 0.6])
     """
     order = np.argsort(step, kind="stable")
     x, y = step[order], values[order]
@@ -211,15 +180,12 @@ def aggregate(
     statistic: Statistic | Mapping[str, Statistic] = iqm,
     weights: Mapping[str, float] | None = None,
 ) -> Array:
-    """θ: the mean over classes, which have equal weight regardless of their number of runs.
+    """θ `[K]`: the mean over classes, which have equal weight regardless of their number of runs.
 
     Args:
       classes: by name, `[n, K]` scores of its runs.
       statistic: applied within each class; one for all, or one for each by its name.
       weights: of the classes, positive; None for equal ones.
-
-    Returns:
-      `[K]`, in the scores' units.
 
     Examples:
       >>> from sme_registry.statistics import aggregate
@@ -241,19 +207,9 @@ def stratified_bootstrap(
 ) -> tuple[Array, Array]:
     """95 % intervals of `aggregate`, with the same resampled runs for all columns.
 
-    Beside classes of several runs, a class with a single run adds no spread: its spread is unknown.
-
-    Args:
-      classes: by name, `[n, K]` scores of its runs.
-      draws: number of samples to draw.
-      seed: any text. The intervals depend only on it and the other arguments: each class has its
-        own stream of random bits, the same in every version of NumPy.
-      statistic: applied within each class; one for all, or one for each by its name.
-      weights: of the classes, positive; None for equal ones.
-
-    Returns:
-      The lower and upper ends, `[K]` each, in the scores' units; NaN where each class has a
-      single run.
+    The ends are `[K]` each, NaN where each class has a single run. Beside classes of several runs,
+    a class with a single run adds no spread: its spread is unknown. `seed` is any text: intervals
+    depend only on it and the other arguments, in every version of NumPy.
 
     Examples:
       >>> from sme_registry.statistics import stratified_bootstrap
@@ -291,15 +247,9 @@ def stratified_bootstrap(
 def performance_profile(
     classes: Mapping[str, Array], thresholds: npt.ArrayLike, draws: int, seed: str
 ) -> Estimate:
-    """The share of runs that score above each threshold, with equal weight for each class.
+    """The share `[K]` of runs above each threshold τ, with equal weight for each class.
 
-    Args:
-      classes: by name, `[n]` scores of its runs, higher is better.
-      thresholds: `[K]` τ.
-      draws, seed: see `stratified_bootstrap`.
-
-    Returns:
-      `[K]` shares in [0, 1], which never rise with τ, with pointwise intervals.
+    A class has `[n]` scores. The shares never rise with τ; the intervals are pointwise.
 
     Examples:
       >>> from sme_registry.statistics import performance_profile
@@ -316,20 +266,12 @@ def performance_profile(
 def probability_of_improvement(
     x: Mapping[str, Array], y: Mapping[str, Array], draws: int, seed: str
 ) -> Estimate:
-    """The probability that a run of one method scores above a run of another on a random class.
+    """The probability `[1]` that a run of x scores above one of y on a random class; ½ if equal.
 
-    If all pairs agree, resampled values do not vary, and two runs would already give certainty.
-    The far end is then the exact binomial bound of Clopper and Pearson 1934 for
-    N = Σ min(n_x, n_y) independent pairs that agree, ((1 − LEVEL)/2)^(1/N).
-
-    Args:
-      x: by class, `[n]` scores of its runs, higher is better.
-      y: the same for the other method, with the same classes.
-      draws: number of samples to draw, independently for the two methods.
-      seed: any text.
-
-    Returns:
-      `[1]`, in [0, 1]; ½ if neither is better.
+    `x` and `y` have the same classes, of `[n]` scores each. If all pairs agree, resampled values do
+    not vary, and two runs would already give certainty. The far end is then the exact binomial
+    bound of Clopper and Pearson 1934 for N = Σ min(n_x, n_y) independent pairs that agree, ((1 −
+    LEVEL)/2)^(1/N).
 
     Examples:
       >>> from sme_registry.statistics import probability_of_improvement
@@ -368,14 +310,12 @@ def probability_of_improvement(
 def _statistics(
     classes: Mapping[str, Array], statistic: Statistic | Mapping[str, Statistic]
 ) -> dict[str, Statistic]:
-    """The statistic of each class."""
     if isinstance(statistic, Mapping):
         return {name: statistic[name] for name in classes}
     return dict.fromkeys(classes, statistic)
 
 
 def _weights(classes: Mapping[str, Array], weights: Mapping[str, float] | None) -> dict[str, float]:
-    """The weight of each class."""
     return {name: 1.0 if weights is None else weights[name] for name in classes}
 
 
@@ -407,7 +347,11 @@ def _counts(chosen: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 
 def _weighted_iqm(runs: Array, counts: npt.NDArray[np.int64]) -> Array:
-    """IQM `[K, draws]` of samples of runs `[n, K]` by counts `[n, draws]`, without sorting."""
+    """IQM `[K, draws]` of samples of runs `[n, K]` by counts `[n, draws]`, without sorting.
+
+    The runs in order of their values occupy the ranks of a sample according to their counts; the
+    mean is over the ranks between the cuts.
+    """
     n = len(runs)
     cut = n // 4
     means = np.empty((runs.shape[1], counts.shape[1]))

@@ -100,10 +100,8 @@ class DynamicRegret(StrictModel):
     def with_fresh(self, stream: StreamSpec, online_regret: Sequence[float]) -> Self:
         """This regret with the learning transfer of its visits, against agents that start anew.
 
-        Args:
-          stream: the stream of this life.
-          online_regret: `[P]` mean regret over the training of an agent on each phase alone, for
-            as many steps as the phase has.
+        `online_regret` `[P]` is the mean regret over the training of an agent on each phase alone,
+        for as many steps as the phase has.
         """
         _refuse_other_visits(stream, self)
         fresh = _column("fresh online_regret", online_regret, len(stream.phases), "phase")
@@ -138,12 +136,10 @@ def dynamic_regret(
     """The dynamic regret of one life from its log.
 
     Args:
-      stream: the stream.
       step: `[N]` the lifetime at the end of each row, increasing: `info["lifetime"]`, or the column
         `step` of an episodes.csv.
       regret: `[N]` mean regret over each row's steps, in [0, 1].
-      length: `[N]` steps of each row, or one number for all: 1 where rows are steps, the column
-        `length` where they are episodes.
+      length: `[N]` steps of each row, or one number for all.
       phase: `[N]` `info["phase"]` of each row. Needed only where rows are steps and
         switch="episode": a phase then lasts until the episode has ended.
 
@@ -353,12 +349,9 @@ def expected_regret(
     Args:
       life: for each visit the policy that acts in it, in any form that `evaluate` accepts; or a
         number, the online regret of an agent that learned in it.
-      stream: a stream, its fields, an id, a digest or a path.
       episodes: run with each policy, over the pieces of one cycle; each has one or more. The
         standard error of a policy's online regret is about 0.02/√episodes.
       seed: of the initial states, which are the same for every policy.
-      action_range: as in `evaluate`, of all policies.
-      algorithm: as in `evaluate`.
       progress: called after the episodes of each piece with the number of pieces done, and of all.
 
     Examples:
@@ -408,14 +401,10 @@ def reference_regret(
     episodes: int = EPISODES,
     seed: int = 0,
 ) -> dict[str, DynamicRegret]:
-    """The dynamic regret of the reference agents, by their names in `report.LABELS`.
+    """The dynamic regret of the reference agents, by their names in `retention.LABELS`.
 
-    Args:
-      stream: as in `expected_regret`.
-      frozen: an agent's policy at the end of its first visit, for the agent that stops learning
-        then; None leaves it out.
-      training: that agent's dynamic regret, of which the first visit is taken.
-      episodes, seed: as in `expected_regret`.
+    With `frozen`, an agent's policy at the end of its first visit, and `training`, its dynamic
+    regret, also that of the agent that stops learning then.
 
     Examples:
       >>> from sme_registry.evaluation import reference_regret

@@ -47,25 +47,17 @@ def evaluate(
 ) -> EvaluationReport:
     """Evaluate a policy within and out of distribution, exactly.
 
-    Models act deterministically. Actions are clipped as the environment clips them.
+    Models act deterministically, and actions are clipped as the environment clips them. The report
+    has the reference policies on the same states; for a team also each agent.
 
     Args:
-      policy: a callable from observations `[B, S + 2]` float32 (of a task with m distractors
-        `[B, S + m + 2]`, what its agent sees of both first) to actions `[B, A]`; a
-        Stable-Baselines3 model, or the path of its .zip (loading it can run code of its author);
-        the path of an .onnx file or of an offline policy's .npz; `module:function`; or the name
-        of a reference policy, such as "linear". For a team, one of these that all agents share,
-        or a dict from each agent's name to its own. `as_policy` has the details.
-      spec_or_id: the task: a spec, its fields, an id, a digest or a path.
+      policy: in any form of `as_policy`: a callable from observations `[B, S + 2]` float32 (with
+        m distractors `[B, S + m + 2]`) to actions `[B, A]`, a Stable-Baselines3 model or the path
+        of its .zip (it can run code of its author), an .onnx or .npz file, `module:function`,
+        the name of a reference such as "linear"; for a team one that all share, or a dict by agent.
       protocol: a protocol, its fields, its name in the catalogue, or the path of its file.
-      action_range: the range of the policy's actions, "unit" for [0, 1] or "symmetric" for
-        [−1, 1]; None takes an SB3 model's own action space, and "unit" for any other policy.
-      name: what the report calls the policy.
-      algorithm: the class of a model's .zip that does not tell it, such as "sb3_contrib:TQC".
+      action_range, name, algorithm: as in `as_policy`.
       progress: called after each batch with the number of states done, and of all states.
-
-    Returns:
-      The report, with the reference policies on the same states; for a team also for each agent.
 
     Examples:
       >>> def half(observations):  # [B, 10] to [B, 4]
@@ -91,18 +83,9 @@ def evaluate_many(
 ) -> list[EvaluationReport | PolicyError]:
     """Evaluate many policies, each on its task, faster than one by one.
 
-    Tasks that differ only in k, r_min, D and the horizon are evaluated in one pass.
-
-    Args:
-      policies: each policy with its task, both as in `evaluate`; `as_policy` prepares a policy that
-        needs a name or an action range.
-      protocol: as in `evaluate`.
-      progress: called after each batch with the number of states done, and of all states; states
-        that several policies share count once.
-
-    Returns:
-      For each policy the report that `evaluate` would return, bit for bit; or, where its actions
-      are invalid, the error that `evaluate` would raise.
+    Tasks that differ only in k, r_min, D and the horizon are evaluated in one pass. For each policy
+    it returns the report that `evaluate` would return, bit for bit; or, where its actions are
+    invalid, the error that `evaluate` would raise.
 
     Examples:
       >>> from sme_registry.evaluation import evaluate_many
@@ -130,15 +113,9 @@ def evaluate_many(
 def evaluation_observations(
     spec_or_id: SpecLike, protocol: ProtocolLike = "paper-v1"
 ) -> Observations:
-    """The observations in which `evaluate` asks a policy of a single agent for actions.
+    """The observations `[regions · n, O]` in which `evaluate` asks a single agent for actions.
 
     Of a task with distractors, those of the regions: it is asked about other distractors as well.
-
-    Args:
-      spec_or_id, protocol: as in `evaluate`.
-
-    Returns:
-      `[regions · n, O]` float32, region after region.
 
     Examples:
       >>> from sme_registry.evaluation import evaluation_observations

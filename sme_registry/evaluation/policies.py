@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import operator
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -36,7 +37,7 @@ from sme_registry.evaluation.models import Interface, load_onnx, load_sb3
 from sme_registry.evaluation.networks import OfflinePolicy, Perceptron
 from sme_registry.evaluation.references import POLICIES, reference_policy
 from sme_registry.io import choice, import_object
-from sme_registry.spec import ACTION_RANGES, ActionRange, SMESpec, StreamSpec
+from sme_registry.spec import ACTION_RANGES, ActionRange, AgentSpec, SMESpec, StreamSpec
 from sme_registry.task import draw
 
 
@@ -142,11 +143,7 @@ class TeamPolicy:
         return self.act_in
 
     def act_in(self, joint: Observation) -> Array:
-        """Joint actions `[B, A]` in episodes, where each agent has its own r_cum; see `__call__`.
-
-        Args:
-          joint: `[B, S + 1 + n]`: s, t/T, and each agent's r_cum/k.
-        """
+        """Joint actions `[B, A]` from s, t/T and each agent's r_cum/k, `[B, S + 1 + n]`."""
         shared = joint.shape[1] - len(self.members)
         columns = [[*range(shared), shared + agent] for agent in range(len(self.members))]
         return self._joint_actions([joint[:, own] for own in columns])
@@ -173,12 +170,12 @@ class TeamPolicy:
 
 
 @contextlib.contextmanager
-def prefixed_errors(agent: str) -> Iterator[None]:
-    """Errors of an agent's policy begin with its name."""
+def prefixed_errors(where: str) -> Iterator[None]:
+    """Errors of a policy begin with where it acts, such as its agent's name."""
     try:
         yield
-    except PolicyError as error:
-        raise PolicyError(f"{agent}: {error}") from error.__cause__
+    except (PolicyError, UnknownNameError) as error:
+        raise type(error)(f"{where}: {error}") from error.__cause__
 
 
 _SUFFIXES = (".zip", ".onnx", ".npz")
@@ -196,31 +193,23 @@ def as_policy(
     """Prepare a policy for a task.
 
     Args:
-      policy: one of
-        a callable from observations `[B, S + 2]` float32, with m distractors `[B, S + m + 2]`, to
-        actions `[B, A]`, NumPy arrays or PyTorch tensors;
-        a `torch.nn.Module`, which is called on a tensor, in evaluation mode and without gradients;
-        a model of Stable-Baselines3, or any other with `predict(observations, deterministic=True)`;
-        the path of such a model's .zip (loading it can run code of its author);
-        the path of an .onnx file, or of the .npz of an offline policy;
-        `module:function` (or a module of PyTorch), imported from the working directory or an
-        installed package;
-        the name of a reference policy, one of `references.POLICIES`;
-        for a team, a dict from each agent's name to its own policy (or a folder of such files,
-        `<agent>.zip`), from the agent's observations
-        `[B, |O_i| + 2]` to its actions `[B, a_i]`; or one of the above that all agents share,
-        from shared observations `[B, S + 2 + n]` (`envs.shared`) to `[B, max a_i]`, of which the
-        agent's first a_i entries count.
-        A policy that this function returned is accepted as well; that of a team keeps its range.
-      spec: the task it is for.
+      policy: a callable from observations `[B, S + 2]` float32 (with m distractors
+        `[B, S + m + 2]`) to actions `[B, A]`, NumPy arrays or PyTorch tensors; a
+        `torch.nn.Module`; a model with `predict(observations, deterministic=True)`, as those of
+        Stable-Baselines3, or the path of its .zip (it can run code of its author); the path of an
+        .onnx or .npz file; `module:function`; the name of a reference policy, one of
+        `references.POLICIES`. For a team a dict from each agent's name to its policy,
+        `[B, |O_i| + 2]` to `[B, a_i]`, or a folder of files `<agent>.zip`; or one policy that all
+        agents share, from shared observations `[B, S + 2 + n]` to `[B, max a_i]`. What this
+        function returned is accepted as well.
       action_range: "unit" for actions in [0, 1] or "symmetric" for [−1, 1]; None takes an SB3
         model's own action space, and "unit" for any other policy.
       name: what reports call it; None takes its name, or that of its file, algorithm or function.
       algorithm: the class of a .zip that does not tell it, as in `load_sb3`.
       observed_phases: entries at the end of its observations for the phase of a stream, one-hot.
 
-    A recurrent model is memoryless here: it acts from its initial state in each observation.
-    `Policy.start` makes it keep its state, as `rollouts` does.
+    A recurrent model acts from its initial state in each observation; `Policy.start` makes it keep
+    its state, as `rollouts` does.
 
     Examples:
       >>> from sme_registry.evaluation import as_policy
@@ -242,9 +231,7 @@ def as_policy(
         return policy if name is None else replace(policy, name=name)
     if spec.team is None:
         return _prepare(policy, interface_of(spec, observed_phases), range_, name)
-    if isinstance(policy, Mapping):
-        return _separate_policies(policy, spec, range_, name)
-    return _shared_policy(policy, spec, range_, name)
+    return _team_policy(policy, spec, range_, name)
 
 
 def interface_of(spec: SMESpec, observed_phases: int = 0) -> Interface:
@@ -391,31 +378,26 @@ def _name_of(policy: Any) -> str:
     return "policy" if name in ("<lambda>", "function") else str(name)
 
 
-def _separate_policies(
-    policies: Mapping[str, Any],
-    spec: SMESpec,
-    action_range: ActionRange | None,
-    name: str | None,
+def _team_policy(
+    policy: Any, spec: SMESpec, action_range: ActionRange | None, name: str | None
 ) -> TeamPolicy:
-    """A team policy from a policy for each agent, by name."""
-    agents = draw.agents(spec)
-    _check_names(policies, [agent.name for agent in agents])
+    """A team policy from a policy for each agent, by name, or from one that all agents share."""
+    agents, channels = draw.agents(spec), draw.observed_channels(spec)
+    own = isinstance(policy, Mapping)
+    if own:
+        _check_names(policy, [agent.name for agent in agents])
+    else:
+        policy = _prepare(policy, interface_of(spec), action_range, name)
     members = []
-    for agent, observed in zip(agents, draw.observed_channels(spec), strict=True):
-        interface = Interface(
-            len(observed) + 2,
-            agent.action_dim,
-            f"{len(observed)} observed and {agent.action_dim} owned channels",
-        )
-        with prefixed_errors(agent.name):
-            policy = policies[agent.name]
-            if isinstance(policy, str):
-                policy = _named(policy, spec)
-            if isinstance(policy, Mapping):  # a reference policy, of all agents
-                policy = policy.get(agent.name)
-            prepared = _prepare(policy, interface, action_range)
-        columns = [*observed, spec.state_dim, spec.state_dim + 1]
-        observe = functools.partial(_columns, columns)
+    for index, (agent, observed) in enumerate(zip(agents, channels, strict=True)):
+        observe: Callable[[Observation], Observation]
+        observe = functools.partial(shared_observation_of, index, len(agents), observed)
+        prepared = policy
+        if own:
+            with prefixed_errors(agent.name):
+                prepared = _own_policy(policy[agent.name], agent, len(observed), spec, action_range)
+            columns = [*observed, spec.state_dim, spec.state_dim + 1]
+            observe = operator.itemgetter((slice(None), columns))
         members.append(Member(agent.name, prepared, observe, agent.action_dim))
     names = {member.policy.name for member in members}
     ranges = {member.policy.action_range for member in members}
@@ -426,8 +408,16 @@ def _separate_policies(
     )
 
 
-def _columns(columns: list[int], observations: Observation) -> Observation:
-    return observations[:, columns]
+def _own_policy(
+    policy: Any, agent: AgentSpec, observed: int, spec: SMESpec, action_range: ActionRange | None
+) -> Policy:
+    """An agent's own policy, from the channels that it observes to those that it owns."""
+    if isinstance(policy, str):
+        policy = _named(policy, spec)
+    if isinstance(policy, Mapping):  # a reference policy, of all agents
+        policy = policy.get(agent.name)
+    text = f"{observed} observed and {agent.action_dim} owned channels"
+    return _prepare(policy, Interface(observed + 2, agent.action_dim, text), action_range)
 
 
 def _check_names(policies: Mapping[str, Any], names: list[str]) -> None:
@@ -441,26 +431,6 @@ def _check_names(policies: Mapping[str, Any], names: list[str]) -> None:
         raise PolicyError(f"policy: {' '.join(problems)} Give one for each of {', '.join(names)}.")
 
 
-def _shared_policy(
-    policy: Any, spec: SMESpec, action_range: ActionRange | None, name: str | None
-) -> TeamPolicy:
-    """A team policy from one policy that all agents share."""
-    agents = draw.agents(spec)
-    prepared = _prepare(policy, interface_of(spec), action_range, name)
-    members = tuple(
-        Member(
-            agent.name,
-            prepared,
-            functools.partial(shared_observation_of, index, len(agents), observed),
-            agent.action_dim,
-        )
-        for index, (agent, observed) in enumerate(
-            zip(agents, draw.observed_channels(spec), strict=True)
-        )
-    )
-    return TeamPolicy(prepared.name, prepared.action_range, members)
-
-
 def stream_policy(
     policy: Any,
     stream: StreamSpec,
@@ -469,7 +439,7 @@ def stream_policy(
     algorithm: str | None = None,
 ) -> Policy:
     """A policy in any form, ready for a stream's observations; see `as_policy`."""
-    try:
+    with prefixed_errors(where):
         ready = as_policy(
             policy,
             stream.phases[0].spec,
@@ -477,8 +447,6 @@ def stream_policy(
             algorithm=algorithm,
             observed_phases=stream.observed_phases,
         )
-    except (PolicyError, UnknownNameError) as error:
-        raise type(error)(f"{where}: {error}") from error.__cause__
     assert isinstance(ready, Policy)  # streams have no teams
     return ready
 

@@ -6,20 +6,15 @@ linear_least_squares   the affine map of the state fitted to π*, clipped to [0,
 best_constant          the constant action with the smallest mean |a − a*|: the medians of a*
 constant_half          a = ½: normalised regret 1
 uniform_random         a ~ U([0, 1]^A), a new draw in each state
+safe_optimal           min(π*(s), ℓ(s)), the best action within the limits (METHOD, section 8)
+shrunk_optimal         min(π*(s), 1 − 2τ): the optimum cut off at the lowest limit of any state
 
-and on a task with limits ℓ of tightness τ (METHOD, section 8), both of cost 0:
+The fitted ones are fitted on the states of WD, at most `FIT_STATES` of them, and used unchanged in
+every other region. In WD they are evaluated on the states they were fitted on, which flatters them
+unless there are many times more states than state_dim.
 
-safe_optimal           min(π*(s), ℓ(s)), the best action within the limits
-shrunk_optimal         min(π*(s), 1 − 2τ): the optimum cut off at the lowest limit that any state
-                       can have, a margin below ℓ(s) that needs no knowledge of ℓ
-
-The two fitted ones are fitted on the states of WD, at most `FIT_STATES` of them (all of them under
-paper-v1), and used unchanged in every other region. In WD they are evaluated on the states they
-were fitted on, which flatters them unless there are many times more states than state_dim.
-
-All act on the state, also where the task's agent sees another observation. An agent's reference
-uses only the channels that the agent observes: no agent that observes a part of the state could
-execute a linear map of the whole state.
+All act on the state, also where the agent sees another observation; an agent's only on the channels
+that it observes.
 """
 
 from __future__ import annotations
@@ -128,17 +123,11 @@ POLICIES = (*NAMES, *SAFE_NAMES, *SHORT_NAMES)
 
 
 def reference_policy(name: str, spec: SMESpec) -> Act | dict[str, Act]:
-    """A reference policy, as `evaluate` accepts it.
+    """A reference policy, as `evaluate` accepts it, by one of the names of `POLICIES`.
 
-    Unlike the references of a report, the fitted ones are fitted on states of their own.
-
-    Args:
-      name: one of `POLICIES`.
-      spec: the task.
-
-    Returns:
-      A function from observations `[B, O]` to actions `[B, A]` of the unit range; for a team, one
-      for each agent. Where the agent sees a mixing, it inverts the mixing first.
+    It maps observations `[B, O]` to actions `[B, A]` in [0, 1]; for a team, one function for each
+    agent. Unlike the references of a report, the fitted ones are fitted on states of their own.
+    Where the agent sees a mixing, it inverts the mixing first.
 
     Examples:
       >>> from sme_registry.evaluation import reference_policy

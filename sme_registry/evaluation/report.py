@@ -357,14 +357,12 @@ class EvaluationReport(ReportFile):
         return sum(regrets) / len(regrets) if regrets else math.nan
 
     def to_frame(self) -> pandas.DataFrame:
-        """The numbers as a tidy pandas frame.
+        """The numbers as a tidy pandas frame, one row for each policy and region.
 
-        Returns:
-          One row for each policy and region: `policy`; `reference`, whether it is a reference
-          policy; `agent`, empty for the whole team or the single agent; `region`; then the columns
-          `epsilon_low` to `clipped_share` of `RegionReport`. Of a task with limits also those of
-          `SafetyScore`; of one with distractors `invariance`, which is 0 for the references, and
-          the policy's regions d-OOD 1, 2, …
+        Columns: `policy`; `reference`, whether it is a reference policy; `agent`, empty for the
+        whole team or the single agent; `region`; then `epsilon_low` to `clipped_share` of
+        `RegionReport`. Of a task with limits also those of `SafetyScore`; of one with distractors
+        `invariance`, which is 0 for the references, and the policy's regions d-OOD 1, 2, ….
         """
         require_packages("EvaluationReport.to_frame", {"pandas": "pandas"}, "studies")
         import pandas
@@ -382,12 +380,7 @@ class EvaluationReport(ReportFile):
             yield {"policy": self.policy, "reference": False, "agent": ""} | _columns(region)
 
     def extensions(self, index: int, reference: str = "") -> dict[str, float]:
-        """The numbers of safety and distractors in a region, by name; none of a plain task.
-
-        Args:
-          index: of the region.
-          reference: the name of a reference; empty for the policy.
-        """
+        """Numbers of safety and distractors in a region, by name, of the policy or a reference."""
         columns: dict[str, float] = {}
         if self.safety is not None:
             safety = self.safety

@@ -72,11 +72,7 @@ class Retention(StrictModel):
     plasticity_difference: _Optional
 
     def with_fresh(self, fresh: Array) -> Self:
-        """The same with the plasticity against fresh agents.
-
-        Args:
-          fresh: `[P]` normalised regret on each phase of an agent trained on that phase alone.
-        """
+        """The same with the plasticity against fresh agents of normalised regret `[P]`."""
         M = np.array(self.normalised_regret)[..., None]
         ratio, difference = retention.plasticity(M, fresh[:, None])
         return self.model_copy(
@@ -210,11 +206,10 @@ class StreamReport(ReportFile):
     ) -> Self:
         """This report with the plasticity, which fresh agents are needed for.
 
-        Args:
-          fresh: for each phase the report of an agent trained for as many steps on that phase
-            alone: on its task, or, where the phase drifts, on the stream of that phase.
-          online_regret: the mean regret over the training of each of them, for the learning
-            transfer of the visits; None adds none.
+        `fresh` has for each phase the report of an agent trained for as many steps on that phase
+        alone: on its task, or, where the phase drifts, on the stream of that phase.
+        `online_regret`, the mean regret over the training of each of them, adds the learning
+        transfer of the visits.
         """
         tasks = [visit.spec_digest for visit in self.visits[: len(self.stream.phases)]]
         alone = _fresh_regrets(fresh, tasks, self.protocol_digest)
@@ -270,9 +265,7 @@ class StreamReport(ReportFile):
 def _fresh_regrets(
     fresh: Sequence[EvaluationReport | StreamReport], tasks: Sequence[str], protocol_digest: str
 ) -> Array:
-    """`[P, K + 1]` normalised regret of fresh agents, each on its phase's task, and the mean over
-    the shells.
-    """
+    """`[P, K + 1]` regret of fresh agents on their phases, with the mean over the shells."""
     if not _are_reports(fresh) or len(fresh) != len(tasks):
         given = f"{len(fresh)} reports" if _are_reports(fresh) else f"{fresh!r:.60}"
         raise OptionError(f"fresh={given}: must be {len(tasks)} reports, one for each phase.")
@@ -376,17 +369,14 @@ def across_seeds(
 ) -> dict[str, Estimate]:
     """The IQM over runs of every number of a region, with 95 % intervals.
 
+    From each name of `Retention` to values and intervals: `[V·P]` of the matrix, row by row, `[V]`
+    of a metric by visit, `[1]` of any other; NaN where a run has no value, and in the ends of
+    intervals of a single run. `dynamic_regret` `[1]` and `visit_dynamic_regret` `[V]` where every
+    report has them, and `learning_transfer` and `visit_learning_transfer` likewise.
+
     Args:
       reports: of one agent on one stream or its draws, one for each seed of its training.
       region: `WD`, `OOD 1`, …, or `OOD` for the mean over the shells.
-      draws: samples of the bootstrap.
-      statistic: over runs.
-
-    Returns:
-      From each name of `Retention` to values and intervals: `[V·P]` of the matrix, row by row,
-      `[V]` of a metric by visit, `[1]` of any other; NaN where a run has no value, and in the ends
-      of intervals of a single run. `dynamic_regret` `[1]` and `visit_dynamic_regret` `[V]` where
-      every report has them, and `learning_transfer` and `visit_learning_transfer` likewise.
 
     Examples:
       >>> from sme_registry.evaluation import across_seeds, evaluate_stream

@@ -23,10 +23,9 @@ import numpy as np
 
 from sme_registry.compiled import Engine, engine
 from sme_registry.envs.types import Observation
-from sme_registry.errors import PolicyError
 from sme_registry.evaluation.evaluate import resolve_protocol, versions_behind
 from sme_registry.evaluation.measure import Progress, final_specs, same_draw
-from sme_registry.evaluation.policies import Policy, check_count, stream_policy
+from sme_registry.evaluation.policies import Policy, check_count, prefixed_errors, stream_policy
 from sme_registry.evaluation.regions import BATCH_NUMBERS, batch_rows, states
 from sme_registry.evaluation.stream_report import StreamReport, Visit, stream_regions
 from sme_registry.spec import EvaluationProtocol, ProtocolLike, StreamLike, StreamSpec
@@ -50,22 +49,15 @@ def evaluate_stream(
 ) -> StreamReport:
     """Evaluate an agent's life in a stream, exactly and without a rollout.
 
+    The report has the reference agents on the same states.
+
     Args:
-      policies: the agent's policy at the end of each visit, in any form that `evaluate` accepts;
-        of a stream with P phases and C cycles C·P of them. A policy that observes the phase is
-        given the phase on whose task it is evaluated.
-      stream: a stream, its fields, an id, a digest or a path.
-      protocol: as in `evaluate`.
-      initial: the agent's policy before training, for the forward transfer.
+      policies: the agent's policy at the end of each visit, in any form that `evaluate` accepts.
+      initial: the policy before the first visit, for the forward transfer.
       fresh: for each phase the policy of an agent trained for as many steps on that phase alone,
         for the plasticity.
-      action_range: as in `evaluate`, of all policies.
+      action_range, algorithm: as in `evaluate`, of all policies.
       name: what the report calls the agent; None takes the name of its policies, if they share it.
-      algorithm: as in `evaluate`.
-      progress: called after each batch with the number of states done, and of all states.
-
-    Returns:
-      The report, with the reference agents on the same states.
 
     Examples:
       >>> from sme_registry.evaluation import evaluate_stream
@@ -237,10 +229,8 @@ def _actions(
 
 
 def _acted(policy: Policy, observations: Observation, where: str) -> Array:
-    try:
+    with prefixed_errors(where):
         return np.clip(policy(observations), 0.0, 1.0)
-    except PolicyError as error:
-        raise PolicyError(f"{where}: {error}") from error.__cause__
 
 
 def _distance(a: Array, optimal: Array) -> float:
