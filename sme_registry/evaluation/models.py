@@ -193,17 +193,11 @@ def predictor(model: Any) -> Callable[[Observation], Any]:
     if network is None:
         return lambda observations: _predicted(model, observations)[0]
 
-    import torch
-
     def act(observations: Observation) -> Any:
-        was_training = network.training
-        network.set_training_mode(False)
-        try:
-            with torch.no_grad():
-                batch = torch.as_tensor(observations, device=network.device)
-                chosen = network._predict(batch, deterministic=True).cpu().numpy()
-        finally:
-            network.set_training_mode(was_training)
+        torch = _torch()
+        with evaluating(network), torch.no_grad():
+            batch = torch.as_tensor(observations, device=network.device)
+            chosen = network._predict(batch, deterministic=True).cpu().numpy()
         return network.unscale_action(chosen) if network.squash_output else chosen
 
     return act

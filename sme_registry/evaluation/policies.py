@@ -160,8 +160,7 @@ class TeamPolicy:
     def check_team(self, spec: SMESpec) -> None:
         """Raise `PolicyError` if a task has other agents than this policy was prepared for."""
         prepared = [(member.agent, member.action_dim) for member in self.members]
-        agents = [] if spec.team is None else draw.agents(spec)
-        if prepared != [(agent.name, agent.action_dim) for agent in agents]:
+        if prepared != [(agent.name, agent.action_dim) for agent in draw.agents(spec)]:
             raise PolicyError(
                 f"policy {self.name!r}: it acts for the agents "
                 f"{', '.join(f'{agent} ({dim} channels)' for agent, dim in prepared)}, and this "

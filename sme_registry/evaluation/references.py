@@ -149,10 +149,9 @@ def reference_policy(name: str, spec: SMESpec) -> Act | dict[str, Act]:
         act.__name__ = name
         return act
 
-    if spec.team is None:
-        return of_agent(range(S), slice(spec.action_dim))
     agents = zip(task.names, task.observed, task.owned, strict=True)
-    return {agent: of_agent(observed, owned) for agent, observed, owned in agents}
+    policies = {agent: of_agent(observed, owned) for agent, observed, owned in agents}
+    return policies if spec.team is not None else policies.popitem()[1]
 
 
 def _joint_policy(name: str, spec: SMESpec) -> Callable[[Array], Array]:

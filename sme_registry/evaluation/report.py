@@ -16,7 +16,7 @@ import io
 import math
 import os
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
@@ -313,12 +313,11 @@ class EvaluationReport(ReportFile):
                 yield f"references.{name}", own, regions
                 own = [score.name for score in scores]
                 yield f"safety.references.{name}", own, regions
-        if self.observation is not None:
-            seen = regions if self.spec.distractors else []
-            own = [each.name for each in self.observation.invariance]
-            yield "observation.invariance", own, seen
-            own = [region.name for region in self.observation.distractor_regions]
-            yield "observation.distractor_regions", own, [f"d-{name}" for name in seen[1:]]
+        distracted = regions if self.spec.distractors else []
+        own = [change.name for change in self.observed.invariance]
+        yield "observation.invariance", own, distracted
+        own = [region.name for region in self.observed.distractor_regions]
+        yield "observation.distractor_regions", own, [f"d-{name}" for name in distracted[1:]]
 
     @model_serializer(mode="wrap")
     def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -334,6 +333,11 @@ class EvaluationReport(ReportFile):
         return catalogue.title(self.spec.named(self.task))
 
     @property
+    def observed(self) -> ObservationReport:
+        """What the policy makes of its observation; empty where that is the state."""
+        return self.observation or ObservationReport()
+
+    @property
     def wd_regret(self) -> float:
         """N₀, normalised regret in WD: 0 for the optimal policy, 1 for the constant ½."""
         return self.regions[0].normalised_regret
@@ -341,8 +345,7 @@ class EvaluationReport(ReportFile):
     @property
     def ood_regret(self) -> float:
         """N̄, the mean of normalised regret over the OOD shells; NaN if there are none."""
-        shells = [region.normalised_regret for region in self.regions[1:]]
-        return sum(shells) / len(shells) if shells else math.nan
+        return _mean_regret(self.regions[1:])
 
     @property
     def ood_decay(self) -> float:
@@ -352,9 +355,7 @@ class EvaluationReport(ReportFile):
     @property
     def distractor_regret(self) -> float:
         """The mean of normalised regret over the shells of distractors; NaN without distractors."""
-        shells = [] if self.observation is None else self.observation.distractor_regions
-        regrets = [region.normalised_regret for region in shells]
-        return sum(regrets) / len(regrets) if regrets else math.nan
+        return _mean_regret(self.observed.distractor_regions)
 
     def to_frame(self) -> pandas.DataFrame:
         """The numbers as a tidy pandas frame, one row for each policy and region.
@@ -376,7 +377,7 @@ class EvaluationReport(ReportFile):
                 who = {"policy": policy or self.policy, "reference": bool(policy), "agent": agent}
                 for index, region in enumerate(regions):
                     yield who | _columns(region) | self.extensions(index, policy)
-        for region in () if self.observation is None else self.observation.distractor_regions:
+        for region in self.observed.distractor_regions:
             yield {"policy": self.policy, "reference": False, "agent": ""} | _columns(region)
 
     def extensions(self, index: int, reference: str = "") -> dict[str, float]:
@@ -386,9 +387,8 @@ class EvaluationReport(ReportFile):
             safety = self.safety
             scores = safety.references[reference] if reference else safety.regions
             columns |= scores[index].model_dump(exclude={"name"})
-        if self.observation is not None and self.observation.invariance:
-            own = 0.0 if reference else self.observation.invariance[index].invariance
-            columns["invariance"] = own
+        for change in self.observed.invariance[index : index + 1]:
+            columns["invariance"] = 0.0 if reference else change.invariance
         return columns
 
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
@@ -420,6 +420,11 @@ class EvaluationReport(ReportFile):
     def tables(self) -> list[Table]:
         """`table`, and those of safety, of distractors and of probes where there are any."""
         return tables.of_report(self)
+
+
+def _mean_regret(regions: Sequence[RegionReport]) -> float:
+    regrets = [region.normalised_regret for region in regions]
+    return sum(regrets) / len(regrets) if regrets else math.nan
 
 
 def _columns(region: RegionReport) -> dict[str, Any]:

@@ -38,10 +38,10 @@ def of_report(report: EvaluationReport) -> list[Table]:
     tables = [of_regions(report)]
     if report.safety is not None:
         tables.append(of_safety(report, report.safety))
-    if report.observation is not None and report.observation.invariance:
-        tables.append(of_distractors(report, report.observation))
-    if report.observation is not None and report.observation.probes:
-        tables.append(of_probes(report, report.observation))
+    if report.observed.invariance:
+        tables.append(of_distractors(report, report.observed))
+    if report.observed.probes:
+        tables.append(of_probes(report, report.observed))
     return tables
 
 
