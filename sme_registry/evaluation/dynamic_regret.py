@@ -39,8 +39,8 @@ from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import integer_in
 from sme_registry.spec import Integer, Real, StreamLike, StreamSpec, TupleOf
 from sme_registry.spec.document import StrictModel
-from sme_registry.spec.resolve import resolve_stream
-from sme_registry.task import load_stream, materialize_stream
+from sme_registry.spec.resolve import resolve
+from sme_registry.task import load, materialize_stream
 from sme_registry.task.draw import Array
 
 _POINTS = 400  # of the curve; more would not be visible in a figure
@@ -151,7 +151,7 @@ def dynamic_regret(
       >>> log.dynamic_regret
       150.0
     """
-    spec = resolve_stream(stream).stream
+    spec = resolve(stream, StreamSpec).document
     ends, lengths, means = _rows(step, length, regret)
     sums = means * lengths
     if spec.switch == "step":
@@ -362,7 +362,7 @@ def expected_regret(
       >>> 0 < regret.dynamic_regret < 200
       True
     """
-    stream = load_stream(stream)
+    stream = load(stream, StreamSpec)
     stream.refuse_many_visits()
     P = len(stream.phases)
     check_count("life", life, stream.cycles * P, "or number for each visit")
@@ -412,7 +412,7 @@ def reference_regret(
       >>> sorted(reference_regret(sme_registry.StreamSpec(phases=phases), episodes=10))
       ['constant_half', 'fresh_optimum', 'frozen_optimum']
     """
-    stream = load_stream(stream)
+    stream = load(stream, StreamSpec)
     stream.refuse_many_visits()
     if (frozen is None) != (training is None):
         raise OptionError(

@@ -29,10 +29,11 @@ from sme_registry.spec import (
     EvaluationProtocol,
     ProtocolFile,
     ProtocolLike,
+    SMESpec,
     SpecLike,
     catalogue,
 )
-from sme_registry.task import load_spec, materialize
+from sme_registry.task import load, materialize
 
 
 def evaluate(
@@ -66,7 +67,7 @@ def evaluate(
       >>> round(report.regions[0].normalised_regret, 6)  # in the cube
       1.0
     """
-    spec = load_spec(spec_or_id)
+    spec = load(spec_or_id, SMESpec)
     protocol = resolve_protocol(protocol)
     prepared = as_policy(policy, spec, action_range=action_range, name=name, algorithm=algorithm)
     [report] = evaluate_many([(prepared, spec)], protocol, progress=progress)
@@ -97,7 +98,7 @@ def evaluate_many(
     subjects: list[Subject] = []
     groups: dict[str, list[int]] = {}
     for index, (policy, task) in enumerate(policies):
-        spec = load_spec(task)
+        spec = load(task, SMESpec)
         subjects.append((as_policy(policy, spec), spec))
         groups.setdefault(same_draw(spec), []).append(index)
 
@@ -122,7 +123,7 @@ def evaluation_observations(
       >>> evaluation_observations("Default", {"states_per_region": 10}).shape
       (60, 10)
     """
-    task, protocol = materialize(load_spec(spec_or_id)), resolve_protocol(protocol)
+    task, protocol = materialize(load(spec_or_id, SMESpec)), resolve_protocol(protocol)
     arguments.single_agent(task)
     return np.concatenate(
         [

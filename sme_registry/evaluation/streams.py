@@ -29,7 +29,7 @@ from sme_registry.evaluation.policies import Policy, check_count, prefixed_error
 from sme_registry.evaluation.regions import BATCH_NUMBERS, batch_rows, states
 from sme_registry.evaluation.stream_report import StreamReport, Visit, stream_regions
 from sme_registry.spec import EvaluationProtocol, ProtocolLike, StreamLike, StreamSpec
-from sme_registry.task import load_stream, materialize_together
+from sme_registry.task import load, materialize_together
 from sme_registry.task.draw import Array
 
 _Any = TypeVar("_Any")
@@ -67,7 +67,7 @@ def evaluate_stream(
       >>> len(report.visits)
       2
     """
-    stream = load_stream(stream)
+    stream = load(stream, StreamSpec)
     stream.refuse_many_visits()
     protocol = resolve_protocol(protocol)
     P = len(stream.phases)
