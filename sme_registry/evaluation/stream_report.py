@@ -43,7 +43,7 @@ _Optional = TupleOf[Real | None]
 
 
 class Retention(StrictModel):
-    """A retention matrix and its metrics; `metrics` has the formulas.
+    """A retention matrix and its metrics; `retention` has the formulas.
 
     A metric by visit is None where nothing can be compared; its last entry is that of the life.
 
@@ -101,7 +101,7 @@ class StreamRegion(StrictModel):
       epsilon_low: ε of the inner face; 0 for WD.
       epsilon_high: ε of the outer face; 0 for WD.
       states: number of states.
-      agent: the agent's matrix and retention.
+      agent: the agent's matrix and metrics.
       references: the same of each reference agent, by its name in `LABELS`.
     """
 
@@ -185,7 +185,7 @@ class StreamReport(ReportFile):
 
     def region(self, name: str = "WD") -> StreamRegion:
         """A region by its name; `OOD` is the mean over the shells."""
-        known = {each.name: each for each in (*self.regions, self.ood)}
+        known = {region.name: region for region in (*self.regions, self.ood)}
         if name not in known:
             hint = did_you_mean(name, known)
             raise UnknownNameError(f"region={name!r:.40}: must be one of {', '.join(known)}.{hint}")
@@ -312,7 +312,7 @@ def stream_regions(
             epsilon_high=high,
             states=count,
             agent=of_agent[k],
-            references={name: each[k] for name, each in of_references.items()},
+            references={name: retentions[k] for name, retentions in of_references.items()},
         )
         for k, (name, low, high, count) in enumerate(names)
     ]

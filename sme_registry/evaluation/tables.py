@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
@@ -14,8 +14,15 @@ from sme_registry.io.markup import Line, line_chart
 from sme_registry.io.tables import Table
 
 if TYPE_CHECKING:
-    from sme_registry.evaluation.report import EvaluationReport, ObservationReport, SafetyReport
+    from sme_registry.evaluation.report import (
+        EvaluationReport,
+        ObservationReport,
+        RegionReport,
+        SafetyReport,
+    )
     from sme_registry.evaluation.stream_report import StreamReport
+
+_ERRORS = {"similarity": "similarity r̃", "normalised_regret": "normalised regret"}
 
 NOT_COMPARABLE = (
     "Levels ε are not comparable between different state_dim: with more channels, the states of "
@@ -57,24 +64,19 @@ def of_regions(report: EvaluationReport) -> Table:
         report,
         NOT_COMPARABLE,
     )
-    for heading, field in (
-        ("similarity r̃", "similarity"),
-        ("normalised regret", "normalised_regret"),
-    ):
-        table.add_row(heading, style="italic")
-        _add(table, f"  {escape(report.policy)}", report.regions, field, style="bold")
-        for name, regions in report.references.items():
-            _add(table, f"  {LABELS.get(name, escape(name))}", regions, field)
-        table.add_section()
+    policies = [(escape(report.policy), report.regions)]
+    policies += [(LABELS.get(name, escape(name)), of) for name, of in report.references.items()]
+    for field, heading in _ERRORS.items():
+        _add_group(table, heading, policies, field)
     _add(table, "SD of r̃ over states", report.regions, "similarity_sd", style="bold")
     _add(table, "similarity decay", report.regions, "similarity_decay", ".1%", style="bold")
     _add(table, "similarity loss, pts", report.regions, "similarity_loss", ".1f", style="bold")
     _add(table, "actions clipped", report.regions, "clipped_share", ".1%", style="bold")
-    for agent, own in report.agents.items():
+    for name, agent in report.agents.items():
         table.add_section()
-        _add(table, f"{escape(agent)}  r̃", own.regions, "similarity")
-        _add(table, "  normalised regret", own.regions, "normalised_regret")
-        if linear := own.references.get("linear_least_squares"):
+        _add(table, f"{escape(name)}  r̃", agent.regions, "similarity")
+        _add(table, "  normalised regret", agent.regions, "normalised_regret")
+        if linear := agent.references.get("linear_least_squares"):
             label = f"  of {LABELS['linear_least_squares']}"
             _add(table, label, linear, "normalised_regret")
     return table
@@ -89,13 +91,11 @@ def of_safety(report: EvaluationReport, safety: SafetyReport) -> Table:
         "A state is violating if any action channel is above its limit by more than 1e-6. "
         "Negative safe regret is earned by violating: read it beside the cost.",
     )
+    policies = [(escape(report.policy), safety.regions)]
+    policies += [(LABELS[name], safety.references[name]) for name in SAFETY_REFERENCES]
     for field, heading in SAFETY_LABELS.items():
-        table.add_row(heading, style="italic")
         pattern = ".1%" if field == "violating_share" else ".3f"
-        _add(table, f"  {escape(report.policy)}", safety.regions, field, pattern, style="bold")
-        for name in SAFETY_REFERENCES:
-            _add(table, f"  {LABELS[name]}", safety.references[name], field, pattern)
-        table.add_section()
+        _add_group(table, heading, policies, field, pattern)
     _add(table, "price of safety", safety.regions, "price_of_safety")
     return table
 
@@ -109,14 +109,9 @@ def of_distractors(report: EvaluationReport, observation: ObservationReport) -> 
         "one as of the other. Invariance is 0 for a policy that ignores the distractors.",
     )
     outside = (report.regions[0], *observation.distractor_regions)
-    for heading, field in (
-        ("similarity r̃", "similarity"),
-        ("normalised regret", "normalised_regret"),
-    ):
-        table.add_row(heading, style="italic")
-        _add(table, "  states in the region", report.regions, field)
-        _add(table, "  distractors in it", outside, field)
-        table.add_section()
+    kinds = [("states in the region", report.regions), ("distractors in it", outside)]
+    for field, heading in _ERRORS.items():
+        _add_group(table, heading, kinds, field, bold=False)
     _add(table, "invariance", observation.invariance, "invariance")
     return table
 
@@ -142,8 +137,25 @@ def _title(report: EvaluationReport) -> str:
 
 
 def _by_region(title: str, report: EvaluationReport, caption: str) -> Table:
-    columns = {f"{each.name}\nε ≤ {each.epsilon_high:g}": "number" for each in report.regions}
+    columns = {f"{region.name}\nε ≤ {region.epsilon_high:g}": "number" for region in report.regions}
     return Table(title, {"": "name"} | columns, caption=caption)
+
+
+def _add_group(
+    table: Table,
+    heading: str,
+    rows: Sequence[tuple[str, Iterable[Any]]],
+    field: str,
+    pattern: str = ".3f",
+    *,
+    bold: bool = True,
+) -> None:
+    """A section of rows of one field; the first one is bold."""
+    table.add_row(heading, style="italic")
+    for index, (label, regions) in enumerate(rows):
+        style = "bold" if bold and not index else None
+        _add(table, f"  {label}", regions, field, pattern, style=style)
+    table.add_section()
 
 
 def _add(
@@ -156,7 +168,8 @@ def _add(
     style: str | None = None,
 ) -> None:
     """A row of one field of each region."""
-    table.add_row(label, *(format(getattr(each, field), pattern) for each in regions), style=style)
+    numbers = (format(getattr(region, field), pattern) for region in regions)
+    table.add_row(label, *numbers, style=style)
 
 
 _DRAWN = ("constant_half", "linear_least_squares", "optimal")  # the table has them all
@@ -166,30 +179,25 @@ _NAME = 10  # letters for which there is space beside ", worst"
 
 def regret_chart(report: EvaluationReport) -> str:
     """The policy, the worst agents of a team, with the name of the worst in WD, and references."""
-    lines = [
-        Line(
-            LABELS[name], [each.normalised_regret for each in report.references[name]], "reference"
-        )
-        for name in _DRAWN
-        if name in report.references
-    ]
-    agents = {
-        name: [each.normalised_regret for each in agent.regions]
-        for name, agent in report.agents.items()
-    }
+    drawn = [name for name in _DRAWN if name in report.references]
+    lines = [Line(LABELS[name], _regret(report.references[name]), "reference") for name in drawn]
+    agents = {name: _regret(agent.regions) for name, agent in report.agents.items()}
     worst = sorted(agents, key=lambda name: -agents[name][0])[:_MOST_AGENTS]
     lines += [
         Line(f"{_brief(name)}, worst" if name == worst[0] else "", agents[name], "other")
         for name in worst
     ]
-    own = [each.normalised_regret for each in report.regions]
-    lines.append(Line("team" if agents else "policy", own))
+    lines.append(Line("team" if agents else "policy", _regret(report.regions)))
     return line_chart(
         f"Normalised regret of {report.policy}",
         [region.name for region in report.regions],
         lines,
         "normalised regret in each region",
     )
+
+
+def _regret(regions: Sequence[RegionReport]) -> list[float]:
+    return [region.normalised_regret for region in regions]
 
 
 def _brief(name: str) -> str:
@@ -264,7 +272,7 @@ def of_regret(report: StreamReport) -> Table:
         {"": "name"} | {escape(heading): "number" for heading in headings},
     )
     for v, label in enumerate(_visits(report)):
-        table.add_row(label, *_cells(each[v] if v < len(each) else None for each in columns))
+        table.add_row(label, *_cells(column[v] if v < len(column) else None for column in columns))
     table.add_section()
     table.add_row("whole life", *_cells(ends), style="bold")
     # Of training they can differ from the stream's: whole rollouts, or an unfinished episode.
