@@ -24,27 +24,27 @@ with warnings.catch_warnings():
 from sme_registry import SMESpec, materialize
 from sme_registry.datasets import DatasetRecipe, to_d3rlpy
 from sme_registry.datasets.collect import collect
+from sme_registry.datasets.learners import BC, IQL, Minibatch
 from sme_registry.datasets.recipe import parse_behaviour
-from sme_registry.offline.bc import BC
-from sme_registry.offline.hyperparameters import (
+from sme_registry.datasets.record import (
     BCHyperparameters,
     IQLHyperparameters,
 )
-from sme_registry.offline.iql import IQL
-from sme_registry.offline.networks import Batch
 
 SEEN, ACTED, ROWS = 10, 4, 256
 
 
 @pytest.fixture
-def batch() -> Batch:
+def batch() -> Minibatch:
     torch.manual_seed(1)
     u = torch.rand(ROWS, ACTED) * 2 - 1
     continues = (torch.rand(ROWS, 1) < 0.9).float()
-    return Batch(torch.rand(ROWS, SEEN), u, torch.rand(ROWS, SEEN), torch.rand(ROWS, 1), continues)
+    return Minibatch(
+        torch.rand(ROWS, SEEN), u, torch.rand(ROWS, SEEN), torch.rand(ROWS, 1), continues
+    )
 
 
-def as_theirs(batch: Batch) -> Any:
+def as_theirs(batch: Minibatch) -> Any:
     from d3rlpy.torch_utility import TorchMiniBatch
 
     return TorchMiniBatch(
@@ -87,7 +87,7 @@ def close(ours: torch.nn.Module, to: torch.nn.Module) -> None:
         torch.testing.assert_close(mine, other, rtol=1e-5, atol=1e-7)
 
 
-def test_a_step_of_bc_is_the_same(batch: Batch) -> None:
+def test_a_step_of_bc_is_the_same(batch: Minibatch) -> None:
     ours = BC(SEEN, ACTED, BCHyperparameters())
     impl = theirs(d3rlpy.algos.BCConfig(batch_size=ROWS))
     give(ours.actor, impl.policy)
@@ -98,7 +98,7 @@ def test_a_step_of_bc_is_the_same(batch: Batch) -> None:
 
 
 def test_the_losses_of_iql_are_the_same_and_so_are_critics_and_value_after_a_step(
-    batch: Batch,
+    batch: Minibatch,
 ) -> None:
     ours = IQL(SEEN, ACTED, IQLHyperparameters())
     impl = theirs(d3rlpy.algos.IQLConfig())
@@ -133,9 +133,9 @@ def test_the_losses_of_iql_are_the_same_and_so_are_critics_and_value_after_a_ste
         close(mine, other)
 
 
-def test_the_policy_acts_the_same(batch: Batch) -> None:
-    from sme_registry.offline import OfflinePolicy
-    from sme_registry.offline.networks import weights
+def test_the_policy_acts_the_same(batch: Minibatch) -> None:
+    from sme_registry.datasets import OfflinePolicy
+    from sme_registry.datasets.learners import weights
 
     ours = BC(SEEN, ACTED, BCHyperparameters())
     unit = d3rlpy.preprocessing.MinMaxActionScaler(

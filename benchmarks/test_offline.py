@@ -18,10 +18,8 @@ import torch
 from sme_registry import SMESpec, materialize
 from sme_registry.datasets import DatasetRecipe, Transitions, to_d3rlpy
 from sme_registry.datasets.collect import collect
-from sme_registry.offline.bc import BC
-from sme_registry.offline.hyperparameters import BCHyperparameters, IQLHyperparameters
-from sme_registry.offline.iql import IQL
-from sme_registry.offline.networks import Batches
+from sme_registry.datasets.learners import BC, IQL, Batches
+from sme_registry.datasets.record import BCHyperparameters, IQLHyperparameters
 
 SPEC, BATCH = SMESpec(), 256
 STEPS = 20

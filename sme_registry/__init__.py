@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from sme_registry import errors as errors
     from sme_registry import evaluation as evaluation
     from sme_registry import export as export
-    from sme_registry import offline as offline
     from sme_registry import plots as plots
     from sme_registry import sb3 as sb3
     from sme_registry import sealed as sealed
@@ -89,7 +88,6 @@ _SUBMODULES = (
     "errors",
     "evaluation",
     "export",
-    "offline",
     "plots",
     "sb3",
     "sealed",

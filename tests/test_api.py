@@ -40,8 +40,8 @@ def test_star_import_gives_the_public_names():
 
 
 SUBMODULES = [
-    "datasets", "diagnosis", "envs", "errors", "evaluation", "offline", "plots", "sb3", "sealed",
-    "spec", "statistics", "studies", "task", "teams", "testing", "training",
+    "datasets", "diagnosis", "envs", "errors", "evaluation", "plots", "sb3", "sealed", "spec",
+    "statistics", "studies", "task", "teams", "testing", "training",
 ]  # fmt: skip
 
 

@@ -30,7 +30,7 @@ from sme_registry.spec import catalogue
 
 if TYPE_CHECKING:
     from sme_registry.datasets import Dataset
-    from sme_registry.datasets.scores import PolicyScore
+    from sme_registry.datasets.record import PolicyScore
 
 
 _DEFAULT = "MINARI_DATASETS_PATH, or ~/.minari/datasets"
@@ -154,7 +154,8 @@ def list_(folder: DatasetsFolder = None, json: Json = False) -> None:
 
       sme dataset list --datasets data --json
     """
-    from sme_registry.datasets import datasets_folder, list_datasets
+    from sme_registry.datasets import list_datasets
+    from sme_registry.datasets.storage import datasets_folder
 
     datasets, broken = list_datasets(folder)
     if json:
@@ -200,7 +201,8 @@ def validate(
 
       sme dataset validate data/sme/inner-v0
     """
-    from sme_registry.datasets import check_location, open_dataset, replay
+    from sme_registry.datasets import open_dataset, replay
+    from sme_registry.datasets.storage import check_location
     from sme_registry.task import materialize
 
     results: list[dict[str, Any]] = []
@@ -349,16 +351,15 @@ def train(
 
       sme evaluate runs/Default-v1-nu50-seed7-v0-iql-seed0/policy.npz Default
     """
-    from sme_registry import offline
-    from sme_registry.datasets import open_dataset
-    from sme_registry.training import known_algorithm
+    from sme_registry.datasets import open_dataset, train_offline
+    from sme_registry.datasets.offline import check_algorithm
 
-    algorithm = known_algorithm(algorithm, offline.ALGORITHMS)
+    algorithm, _ = check_algorithm(algorithm)
     opened = open_dataset(dataset, folder)
     if out_folder is None:
         out_folder = Path("runs") / f"{opened.id.rsplit('/', 1)[-1]}-{algorithm}-seed{seed}"
     with Progress(f"training {algorithm.upper()}", max(1, steps), console=err()) as progress:
-        result = offline.train_offline(
+        result = train_offline(
             opened,
             algorithm=algorithm,
             steps=steps,
@@ -398,8 +399,8 @@ def sealed(
 
       sme offline sealed autumn/datasets/sealed/autumn/deep-0-v0 -o deep-0.npz
     """
+    from sme_registry.datasets import train_sealed
     from sme_registry.io import refuse_existing
-    from sme_registry.offline import train_sealed
 
     refuse_existing(out_file, force=force)
     title = f"training {algorithm.upper()}"

@@ -1,75 +1,58 @@
-"""Reference scores of a data set: of its behaviour, of the constant ½, and of the optimum.
+"""What is known exactly about policies: reference scores of a data set, and returns by rollout.
 
-On the data set's own states they are exact, because π* is known there. By rollouts they are means
-over whole episodes with their own starts, with standard errors; the optimum's return is T by
-construction. For a team every number is the mean over its agents.
+Reference scores are of its behaviour, of the constant ½, and of the optimum. On the data set's own
+states they are exact, because π* is known there. By rollouts they are means over whole episodes
+with their own starts, with standard errors; the optimum's return is T by construction. For a team
+every number is the mean over its agents.
+
+Off-policy evaluation estimates from data what a policy would earn. Here the task is known and its
+transitions are deterministic, so `exact_return` computes it:
+
+    G(s, t, r_cum) = Σ_i γ^i R_{t+1+i}     from the step after t to the end of the episode; γ = 1
+                                           for the undiscounted return
+
+R is the reward as paid, so r_cum, k, r_min, D and the horizon all matter. `M` states, `S`
+state_dim, `A` action_dim, T horizon. Exact means up to rounding: the transition doubles
+differences at each step, so two policies whose actions differ in the last bit of float32 are in
+different states after some 25 steps, and a network rounds differently in batches of another size.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import Field
+import numpy.typing as npt
+from scipy.special import stdtrit
 
 from sme_registry.compiled.values import REWARD, SIMILARITY
-from sme_registry.datasets.arrays import Transitions
-from sme_registry.datasets.behaviour import (
+from sme_registry.datasets.collect import (
+    BehaviourEpisodes,
     BehaviourPolicy,
     EpisodeStream,
     behaviour_policy,
     constant_policy,
 )
-from sme_registry.datasets.collect import BehaviourEpisodes
 from sme_registry.datasets.recipe import DatasetRecipe
-from sme_registry.evaluation.rollouts import play
-from sme_registry.spec import Integer, Real, StrictModel, TupleOf
-from sme_registry.task import Task
-from sme_registry.task.draw import Array
+from sme_registry.datasets.record import PolicyScore, ReferenceScores, Rollouts
+from sme_registry.datasets.transitions import Transitions
+from sme_registry.envs.arguments import initial_states
+from sme_registry.envs.batch import Batch
+from sme_registry.envs.types import Array, Observation
+from sme_registry.errors import OptionError, SpecError, StateError
+from sme_registry.evaluation import as_policy
+from sme_registry.evaluation.rollouts import LANES, play
+from sme_registry.evaluation.rollouts import rollouts as run_rollouts
+from sme_registry.io import integer_in
+from sme_registry.spec import SMESpec, SpecLike
+from sme_registry.spec.document import plain_number
+from sme_registry.task import Task, load_task
 
 EPISODES = 100
 _MAX_STEPS = 10**5  # of the rollouts of one policy, over all episodes
-
-Share = Annotated[Real, Field(ge=0, le=1)]
-
-
-class Rollouts(StrictModel):
-    """Whole episodes of a policy; 0 of them if the values are exact without rollouts.
-
-    Attributes:
-      mean_return: mean sum of rewards, in [0, T].
-      standard_error: of that mean, over episodes.
-      similarity: mean r̃ over all steps.
-    """
-
-    episodes: Integer
-    mean_return: Real
-    standard_error: Real
-    similarity: Share
-
-
-class PolicyScore(StrictModel):
-    """The scores of one policy.
-
-    Attributes:
-      similarity: mean r̃ over the data set's states.
-      step_reward: mean r over them.
-      rollouts: null if the horizon is too long for whole episodes.
-    """
-
-    similarity: Share
-    step_reward: Share
-    rollouts: Rollouts | None
-
-
-class ReferenceScores(StrictModel):
-    """The scores of a = ½, of the behaviour, of each of its policies on its rows, and of π*."""
-
-    constant: PolicyScore
-    behaviour: PolicyScore
-    behaviours: TupleOf[PolicyScore]
-    optimum: PolicyScore
 
 
 def reference_scores(
@@ -168,3 +151,207 @@ def _weighted(weights: list[float], scores: list[Rollouts | None]) -> Rollouts |
         standard_error=math.sqrt(math.fsum((w * s.standard_error) ** 2 for w, s in pairs)),
         similarity=min(1.0, math.fsum(w * score.similarity for w, score in pairs)),
     )
+
+
+CONFIDENCE = 0.95
+_ROUNDED = 1e-6  # of r_cum, which an observation stores as float32
+
+Steps = npt.NDArray[np.int64]
+
+
+class Estimate(NamedTuple):
+    """A mean and its 95 % interval, each a number or `[M]`; an exact value has zero width."""
+
+    mean: Any
+    low: Any
+    high: Any
+
+
+@dataclass(frozen=True, eq=False)
+class ExactReturn:
+    """The returns of a policy from `M` states.
+
+    `undiscounted` and, with γ, `discounted` have a mean, low and high of `[M]` each; `lengths`
+    `[M]` are the mean steps to the end of the episode, `similarity` `[M]` the mean r̃ over them,
+    and `rollouts` the episodes from each state.
+    """
+
+    undiscounted: Estimate
+    discounted: Estimate
+    lengths: Array
+    similarity: Array
+    gamma: float
+    rollouts: int
+
+    def over_states(self) -> tuple[Estimate, Estimate]:
+        """The mean over all states, undiscounted and discounted, with its interval.
+
+        The interval assumes that the states are independent draws from a distribution. For rows of
+        the same trajectories it is too narrow.
+        """
+        if len(self.lengths) < 2:
+            raise OptionError("states: an interval over states requires at least 2 of them.")
+        return _interval(self.undiscounted.mean), _interval(self.discounted.mean)
+
+
+def exact_return(
+    policy: Any,
+    spec: SpecLike,
+    *,
+    states: npt.ArrayLike,
+    t: npt.ArrayLike = 0,
+    r_cum: npt.ArrayLike = 0.0,
+    actions: npt.ArrayLike | None = None,
+    gamma: float = 0.99,
+    rollouts: int = 1,
+    action_range: str | None = None,
+) -> ExactReturn:
+    """Run a policy from `M` states of a single-agent task to the end of the episode.
+
+    Args:
+      policy: anything that `evaluate` accepts: a callable `[B, O] → [B, A]`, a model, or the
+        path of one.
+      spec: a spec, its fields, an id, a digest or a path.
+      states: `[M, S]` in [0, 1]; `Transitions.states` are exact, its observations are rounded.
+      t: `[M]` or one number, steps completed before, in [0, T).
+      r_cum: `[M]` or one number, the rewards since the last payout, in [0, t mod k].
+      actions: `[M, A]` in [0, 1], executed in the first step instead of the policy's. The return
+        is then Q(s, a) instead of V(s).
+      gamma: γ in [0, 1] of the discounted return.
+      rollouts: episodes from each state: 1 for a deterministic policy, whose return is exact; more
+        for a stochastic one, whose mean gets a 95 % interval (Student's t). On a task with
+        distractors also more than 1: each episode draws them anew, at its start too.
+      action_range: of the policy's actions; None takes its own, and "unit" for a callable.
+
+    Examples:
+      >>> from sme_registry.datasets import exact_return, open_dataset, positions
+      >>> data = open_dataset("sme/Default-v1-nu50-seed0-v0", "data")
+      >>> where = positions(data.transitions(), data.recipe.spec, [0, 90])
+      >>> result = exact_return("optimal", data.recipe.spec, **where)
+      >>> result.undiscounted.mean.round(3).tolist()
+      [100.0, 10.0]
+    """
+    task = load_task(spec)
+    if task.spec.team is not None:
+        raise SpecError("team: must be null here. Give a single-agent task.")
+    if type(plain_number(gamma)) not in (int, float) or not 0.0 <= gamma <= 1.0:
+        raise OptionError(f"gamma={gamma!r:.60}: must be a number in [0, 1].")
+    gamma = float(gamma)
+    rollouts = integer_in("rollouts", rollouts, 1, 10**6)
+    checked_policy = as_policy(policy, task.spec, action_range=action_range)
+    states, t, r_cum = _starts(task.spec, states, t, r_cum)
+    if actions is not None:
+        actions = _first_actions(actions, len(states), task.spec.action_dim)
+    if rollouts == 1:
+        _check_deterministic(checked_policy, task, states, t, r_cum)
+    results = [
+        run_rollouts(
+            checked_policy, task, states, t=t, r_cum=r_cum, actions=actions, gamma=gamma, seed=seed
+        )
+        for seed in range(rollouts)
+    ]
+    lengths = np.stack([each.length for each in results])
+    return ExactReturn(
+        _interval(np.stack([each.episode_return for each in results])),
+        _interval(np.stack([each.discounted_return for each in results])),
+        lengths.mean(axis=0),
+        np.average([each.similarity for each in results], axis=0, weights=lengths),
+        gamma,
+        rollouts,
+    )
+
+
+def positions(
+    transitions: Transitions, spec: SMESpec, rows: npt.ArrayLike | None = None
+) -> dict[str, Any]:
+    """The states, times and accumulated rewards of rows of a data set, for `exact_return`.
+
+    `rows` are indices or a mask; None for all. `states` `[M, S]` and `t` `[M]` are exact, `r_cum`
+    `[M]` is as an observation stores it, to a relative precision of 6e-8.
+
+    Examples:
+      >>> from sme_registry.datasets import open_dataset, positions
+      >>> data = open_dataset("sme/Default-v1-nu50-seed0-v0", "data")
+      >>> positions(data.transitions(), data.recipe.spec, [0, 10])["t"].tolist()
+      [0, 10]
+    """
+    chosen = slice(None) if rows is None else np.asarray(rows)
+    seen = transitions.observations[chosen].astype(np.float64)
+    t = np.rint(seen[:, -2] * spec.horizon).astype(np.int64)
+    r_cum = np.minimum(seen[:, -1] * spec.k, t % spec.k)
+    return {"states": transitions.states[chosen], "t": t, "r_cum": r_cum}
+
+
+def _starts(
+    spec: SMESpec, states: npt.ArrayLike, t: npt.ArrayLike, r_cum: npt.ArrayLike
+) -> tuple[Array, Steps, Array]:
+    S, T, k = spec.state_dim, spec.horizon, spec.k
+    M = len(states) if isinstance(states, np.ndarray | list | tuple) else 0
+    if M == 0:
+        raise StateError(f"states={states!r:.60}: must be [M, {S}], one row for each start.")
+    s = initial_states(states, (M, S))
+    steps, accumulated = _column("t", t, M), _column("r_cum", r_cum, M)
+    wrong = (steps != np.rint(steps)) | (steps < 0) | (steps >= T)
+    if wrong.any():
+        raise StateError(f"t={steps[wrong][0]:g}: must be an integer in [0, {T}).")
+    since = steps % k
+    wrong = (accumulated < 0) | (accumulated > since + _ROUNDED)
+    if wrong.any():
+        raise StateError(
+            f"r_cum={accumulated[wrong][0]:g}: must be in [0, {since[wrong][0]:g}] at "
+            f"t={steps[wrong][0]:g}, the number of steps since the last payout (k={k})."
+        )
+    return s, steps.astype(np.int64), accumulated
+
+
+def _first_actions(actions: npt.ArrayLike, rows: int, action_dim: int) -> Array:
+    try:
+        array = np.asarray(actions, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    if array.shape != (rows, action_dim) or not ((array >= 0) & (array <= 1)).all():
+        raise OptionError(
+            f"actions of shape {array.shape}: must be ({rows}, {action_dim}), each in [0, 1]."
+        )
+    return array
+
+
+def _column(name: str, value: npt.ArrayLike, rows: int) -> Array:
+    try:
+        column = np.broadcast_to(np.asarray(value, np.float64), (rows,))
+    except (TypeError, ValueError):
+        raise StateError(
+            f"{name}={value!r:.60}: must be one number, or an array of shape ({rows},)."
+        ) from None
+    if not np.isfinite(column).all():
+        raise StateError(f"{name}: contains NaN or infinity. Give finite numbers.")
+    return column.copy()
+
+
+def _check_deterministic(
+    policy: Callable[[Observation], npt.ArrayLike], task: Task, s: Array, t: Steps, r_cum: Array
+) -> None:
+    """Raise if the return of one episode from a state is not the only one that it can have."""
+    if task.spec.distractors:
+        raise OptionError(
+            f"rollouts=1: the task has {task.spec.distractors} distractors, which are drawn at "
+            "random, so the return of one episode is not exact. Give rollouts=30 or more for a "
+            "mean with its interval."
+        )
+    batch = Batch(task, min(len(s), LANES))
+    batch.place(s[:LANES], t[:LANES], r_cum[:LANES, None])
+    if not np.array_equal(policy(batch.observe()), policy(batch.observe())):
+        raise OptionError(
+            "rollouts=1: the policy is stochastic, so the return of one episode is not exact. Give "
+            "rollouts=30 or more for a mean with its interval."
+        )
+
+
+def _interval(samples: Array) -> Estimate:
+    """Mean over the first axis and its Student's t interval; of one sample, the sample."""
+    count, mean = len(samples), samples.mean(axis=0)
+    if count == 1:
+        return Estimate(mean, mean, mean)
+    error = samples.std(axis=0, ddof=1) / np.sqrt(count)
+    half = stdtrit(count - 1, 0.5 + CONFIDENCE / 2) * error
+    return Estimate(mean, mean - half, mean + half)

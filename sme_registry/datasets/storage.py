@@ -3,31 +3,38 @@
     <folder>/<namespace>/<name>-v<N>/data/main_data.hdf5   the arrays, see `minari_format`
                                           metadata.json    Minari's, with `DatasetRecord` as "sme"
 
-The folder is MINARI_DATASETS_PATH, else ~/.minari/datasets, unless another one is passed.
+The folder is MINARI_DATASETS_PATH, else ~/.minari/datasets, unless another one is passed. A sealed
+data set has the columns that an agent sees, and no record.
 """
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-from sme_registry.datasets.arrays import Transitions
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.datasets.collect import ReportProgress, collect
 from sme_registry.datasets.minari_format import (
     DATA,
     METADATA,
     NAMESPACE_METADATA,
+    metadata_of,
     minari_dataset,
-    minari_metadata,
     read_hdf5,
     require_minari,
     to_hdf5,
 )
-from sme_registry.datasets.recipe import DatasetRecipe
-from sme_registry.datasets.record import KEY, DatasetRecord
+from sme_registry.datasets.recipe import DatasetRecipe, parse_behaviour
+from sme_registry.datasets.record import KEY, DatasetRecord, Seeds
+from sme_registry.datasets.scores import reference_scores
+from sme_registry.datasets.transitions import Columns, Transitions
+from sme_registry.envs.types import Array, Mask, Observation
 from sme_registry.errors import (
     DigestMismatchError,
     MalformedDocumentError,
@@ -38,10 +45,23 @@ from sme_registry.errors import (
     UnknownNameError,
     did_you_mean,
 )
-from sme_registry.io import build_folder, read_json, refuse_unwritable, to_json, write_atomically
+from sme_registry.evaluation import resolve_protocol
+from sme_registry.io import (
+    build_folder,
+    choice,
+    read_json,
+    refuse_unwritable,
+    to_json,
+    versions,
+    write_atomically,
+)
+from sme_registry.spec import ACTION_RANGES, ProtocolLike, SMESpec, SpecLike, catalogue
+from sme_registry.task import load, materialize
 
 NAMESPACE = "sme"
 _ID = re.compile(r"([A-Za-z0-9_-]+/)*[A-Za-z0-9_-]+-v[0-9]+")
+_PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "h5py", "minari")
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -73,18 +93,14 @@ class Dataset:
 
     def transitions(self) -> Transitions:
         """All transitions as aligned arrays, bit for bit as they were written."""
-        require_minari()
-        path = self.path / "data" / DATA
-        try:
-            transitions = read_hdf5(path, self.record)
-        except (OSError, KeyError, ValueError, RuntimeError) as error:
-            raise MalformedDocumentError(
-                f"{path}: cannot be read: {str(error).strip(chr(39))}. Download the data set "
-                "again, or generate it again (--force)."
-            ) from None
+        columns = _read_columns(
+            self.path, "Download the data set again, or generate it again (--force)."
+        )
+        timeouts = columns.pop("truncations") & ~columns["terminations"]
+        transitions = Transitions(**columns, timeouts=timeouts)
         if transitions.digest != self.record.arrays_digest:
             raise DigestMismatchError(
-                f"{path}: its arrays have {transitions.digest[:19]}…: must be "
+                f"{self.path / 'data' / DATA}: its arrays have {transitions.digest[:19]}…: must be "
                 f"{self.record.arrays_digest[:19]}…, as generated. They were changed or extended. "
                 "Download the data set again, generate it again (--force), or read it with Minari, "
                 "which does not check digests."
@@ -92,16 +108,183 @@ class Dataset:
         return transitions
 
 
-def datasets_folder(folder: str | os.PathLike[str] | None = None) -> Path:
-    """The folder passed, else Minari's: MINARI_DATASETS_PATH, else ~/.minari/datasets.
+@dataclass(frozen=True, eq=False)
+class SealedDataset(Columns):
+    """What entrants of a season get of a data set: aligned arrays, and nothing that tells its task.
+
+    Row i is one of `N` transitions; rows of an episode are contiguous and in order.
+
+    Attributes:
+      observations: `[N, O]` float32 in [0, 1], before the step; `O` = S + 2.
+      actions: `[N, A]` float32 in [0, 1].
+      rewards: `[N]` float64 in [0, k].
+      next_observations: `[N, O]` float32, after the step; also at the end of an episode.
+      terminations: `[N]` bool: the episode ended by D. Do not bootstrap.
+      truncations: `[N]` bool: the episode ended at the horizon, or the data set does. Bootstrap,
+        unless the same row terminates.
+    """
+
+    observations: Observation
+    actions: npt.NDArray[np.float32]
+    rewards: Array
+    next_observations: Observation
+    terminations: Mask
+    truncations: Mask
+
+    @classmethod
+    def collect(cls, recipe: DatasetRecipe, progress: ReportProgress | None = None) -> Self:
+        """Generate the transitions of a recipe of mixtures."""
+        rows = collect(recipe, materialize(recipe.spec), progress=progress)
+        return cls(
+            observations=rows.observations,
+            actions=rows.actions,
+            rewards=rows.rewards,
+            next_observations=rows.next_observations,
+            terminations=rows.terminations,
+            truncations=rows.truncations,
+        )
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a data set's folder, which contains `data/`."""
+        return cls(**_read_columns(Path(path), "Download the data set again.", visible=True))
+
+    def agrees_with(self, other: Self) -> bool:
+        """Whether the other has the same transitions, up to what machines round differently.
+
+        The same recipe gives rewards that differ by some 1e-14 where NumPy's linear algebra, or
+        the back-end, is another one. Numbers may differ by 1e-6, the rounding of float32; the ends
+        of episodes must be the same.
+        """
+        columns = other.columns()
+        return all(
+            mine.shape == columns[name].shape and np.allclose(mine, columns[name], 0, _ROUNDING)
+            for name, mine in self.columns().items()
+        )
+
+    def write(self, dataset_id: str, folder: str | os.PathLike[str]) -> Path:
+        """Write the data set in Minari's format, completely or not at all; returns its folder.
+
+        `dataset_id` is Minari's, `[namespace/]name-v<number>`; `folder` the root of all data sets.
+        """
+        require_minari()
+        target = Path(folder) / check_id(dataset_id)
+        if os.path.lexists(target):
+            raise NameTakenError(
+                f"{target} already exists and is not replaced. Remove it yourself."
+            )
+        return _write(dataset_id, Path(folder), self.columns())
+
+
+def make_dataset(
+    spec_or_id: SpecLike,
+    nu: float | None = None,
+    *,
+    mix: Sequence[tuple[Any, float]] | None = None,
+    transitions: int = 50_000,
+    seed: int | str = 0,
+    coverage: float | None = None,
+    protocol: ProtocolLike = "paper-v1",
+    action_range: str | None = None,
+    name: str | None = None,
+    folder: str | os.PathLike[str] | None = None,
+    force: bool = False,
+    progress: ReportProgress | None = None,
+) -> Dataset:
+    """Generate a data set of a chosen quality and write it in Minari's HDF5 format.
+
+    It is written completely or not at all. The same arguments give the same bits of every array and
+    the same bytes of the file.
+
+    Args:
+      spec_or_id: the task: a spec, its fields, an id, a digest or a path.
+      nu: ν in [0, 1] of the mixture that acts: 0 is the optimum, 1 the worst. The default is 0.5
+        unless `mix` is given.
+      mix: several behaviour policies instead of `nu`: pairs of a policy (ν as a number; "random"; a
+        callable, a Stable-Baselines3 model, or the path of its .zip or of an .onnx) and its share
+        of the transitions. The shares must add up to 1.
+      transitions: N, the exact number; the last episode of each behaviour is truncated.
+      seed: of the starts, each α, ã and random actions; independent of the task's. An integer in
+        [0, 2⁵³), or hexadecimal text such as '0x9f86'.
+      coverage: ε in (−1, 0]: keeps only transitions from {s : ‖s − ½‖_∞ ≤ (1 + ε)/2}, so that
+        E(s) − ε of a state is its distance from the data.
+      protocol: for the evaluation of policies that learn from the data set; stored in its record.
+      action_range: of the policies' actions in `mix`; None takes their own.
+      name: Minari's id, `[namespace/]name-v<number>`; None generates a descriptive one. A name that
+        is taken is a NameTakenError, which compares the two recipes.
+      folder: the root of all data sets; None for Minari's folder.
+      force: replace an existing data set of this package.
+      progress: called after each step with the transitions collected and their total.
 
     Examples:
-      >>> from sme_registry.datasets import datasets_folder
-      >>> datasets_folder("data").name
-      'data'
+      >>> from sme_registry.datasets import make_dataset
+      >>> data = make_dataset("Default", 0.3, transitions=200, folder="mine", protocol="quick-v1")
+      >>> len(data.transitions())
+      200
     """
-    default = os.environ.get("MINARI_DATASETS_PATH", Path.home() / ".minari" / "datasets")
-    return Path(default if folder is None else folder)
+    require_minari()
+    if nu is not None and mix is not None:
+        raise OptionError("nu, mix: give only one of them. `mix` accepts ν as a policy.")
+    if action_range is not None:
+        choice("action_range", action_range, ACTION_RANGES)
+    pairs = [(0.5 if nu is None else nu, 1.0)] if mix is None else list(mix)
+    recipe = DatasetRecipe.from_dict(
+        {
+            "spec": load(spec_or_id, SMESpec),
+            "behaviours": [
+                parse_behaviour(policy, weight, action_range) for policy, weight in pairs
+            ],
+            "transitions": transitions,
+            "seed": seed,
+            "coverage": coverage,
+            "protocol": resolve_protocol(protocol),
+        },
+        "data set",
+    )
+    policies = dict(enumerate(policy for policy, _ in pairs))
+    dataset_id = check_id(_default_id(recipe) if name is None else name)
+    root = datasets_folder(folder)
+    _check_target(root / dataset_id, root, recipe, force)
+
+    task = materialize(recipe.spec)
+    arrays = collect(recipe, task, policies, progress=progress)
+    record = DatasetRecord(
+        recipe=recipe,
+        recipe_digest=recipe.digest,
+        spec_digest=recipe.spec.digest,
+        task=recipe.spec.name,
+        protocol_digest=recipe.protocol.digest,
+        seeds=Seeds(task=recipe.spec.seed, data=recipe.seed),
+        nu=recipe.behaviours[0].nu if len(pairs) == 1 else None,
+        trajectories=len(arrays.ends),
+        scores=reference_scores(recipe, task, arrays, policies),
+        arrays_digest=arrays.digest,
+        versions=versions(_PACKAGES),
+    )
+    _check_target(root / dataset_id, root, recipe, force)  # written by others in the meantime
+    columns = {**arrays.columns(), "truncations": arrays.truncations}
+    return Dataset(dataset_id, _write(dataset_id, root, columns, record, force=force), record)
+
+
+def _default_id(recipe: DatasetRecipe) -> str:
+    """`sme/Default-v1-nu50-side80-seed7-v0`: task, behaviour, the sub-cube's side, data seed."""
+    title = catalogue.unique_name(recipe.spec)
+    behaviour = recipe.behaviours[0]
+    if len(recipe.behaviours) > 1:
+        acting = f"mix-{recipe.digest.removeprefix('sha256:')[:8]}"
+    elif behaviour.nu is not None:
+        acting = f"nu{_hundredths(behaviour.nu)}"
+    elif behaviour.kind == "random":
+        acting = "random"
+    else:
+        acting = "policy-" + re.sub("[^A-Za-z0-9]", "_", behaviour.label)
+    side = "" if not recipe.coverage else f"-side{_hundredths(1.0 + recipe.coverage)}"
+    return f"{NAMESPACE}/{title}-{acting}{side}-seed{recipe.seed}-v0"
+
+
+def _hundredths(value: float) -> str:
+    """0.5 as `50`, 0.125 as `12_5`."""
+    return f"{100 * value:.10g}".replace(".", "_").replace("-", "m").replace("+", "")
 
 
 def check_id(dataset_id: str) -> str:
@@ -117,7 +300,7 @@ def check_id(dataset_id: str) -> str:
     return dataset_id
 
 
-def check_target(target: Path, folder: Path, recipe: DatasetRecipe, force: bool) -> None:
+def _check_target(target: Path, folder: Path, recipe: DatasetRecipe, force: bool) -> None:
     """Check that a data set may be written to a path in the root of all data sets."""
     for parent in target.relative_to(folder).parents:
         if parent != Path() and (folder / parent / "data").exists():
@@ -159,40 +342,52 @@ def _comparison(target: Path, recipe: DatasetRecipe) -> str:
     return " and is the same data set"
 
 
-def write_dataset(
+def _write(
     dataset_id: str,
-    record: DatasetRecord,
-    transitions: Transitions,
     folder: Path,
+    columns: dict[str, npt.NDArray[Any]],
+    record: DatasetRecord | None = None,
     *,
     force: bool = False,
-) -> Dataset:
-    """Write a data set completely or not at all; with `force` an old one remains until then."""
+) -> Path:
+    """Write the files of a data set; with `force` an old one remains until then."""
     target = folder / dataset_id
-    check_target(target, folder, record.recipe, force)
-    content = to_hdf5(transitions, record)
-    metadata = minari_metadata(dataset_id, record, len(content))
-    write_minari(target, folder, content, metadata, force=force)
-    return Dataset(dataset_id, target, record)
-
-
-def write_minari(
-    target: Path, folder: Path, content: bytes, metadata: dict[str, Any], *, force: bool
-) -> None:
+    content = to_hdf5(columns)
+    metadata = metadata_of(dataset_id, columns, len(content), record)
     with build_folder(target, force=force) as building:
-        _write_namespaces(target.parent, folder)
+        for namespace in target.relative_to(folder).parents[:-1]:
+            path = folder / namespace / NAMESPACE_METADATA  # by which Minari recognises it
+            if not path.exists():
+                write_atomically(path, "{}")
         (building / "data").mkdir()
         (building / "data" / DATA).write_bytes(content)
         (building / "data" / METADATA).write_bytes(to_json(metadata).encode())
+    return target
 
 
-def _write_namespaces(namespace: Path, folder: Path) -> None:
-    """Write the empty metadata by which Minari recognises a namespace, and those above it."""
-    while namespace != folder:
-        path = namespace / NAMESPACE_METADATA
-        if not path.exists():
-            write_atomically(path, "{}")
-        namespace = namespace.parent
+def _read_columns(
+    folder: Path, remedy: str, *, visible: bool = False
+) -> dict[str, npt.NDArray[Any]]:
+    require_minari()
+    path = folder / "data" / DATA
+    try:
+        return read_hdf5(path, visible=visible)
+    except (OSError, KeyError, ValueError, RuntimeError, MemoryError) as error:
+        raise MalformedDocumentError(
+            f"{path}: cannot be read: {str(error).strip(chr(39))}. {remedy}"
+        ) from None
+
+
+def datasets_folder(folder: str | os.PathLike[str] | None = None) -> Path:
+    """The folder passed, else Minari's: MINARI_DATASETS_PATH, else ~/.minari/datasets.
+
+    Examples:
+      >>> from sme_registry.datasets import datasets_folder
+      >>> datasets_folder("data").name
+      'data'
+    """
+    default = os.environ.get("MINARI_DATASETS_PATH", Path.home() / ".minari" / "datasets")
+    return Path(default if folder is None else folder)
 
 
 def open_dataset(

@@ -7,8 +7,7 @@ import pytest
 
 import sme_registry
 from sme_registry.datasets import DatasetRecipe, to_d3rlpy
-from sme_registry.datasets.behaviour import EpisodeStream, constant_policy
-from sme_registry.datasets.collect import collect
+from sme_registry.datasets.collect import EpisodeStream, collect, constant_policy
 from sme_registry.datasets.recipe import parse_behaviour
 from sme_registry.datasets.scores import reference_scores, whole_episodes
 from sme_registry.spec import SMESpec

@@ -8,8 +8,7 @@ from scipy.stats import kstest
 
 import sme_registry
 from sme_registry.datasets import DatasetRecipe, replay
-from sme_registry.datasets.behaviour import noise_task
-from sme_registry.datasets.collect import collect
+from sme_registry.datasets.collect import collect, noise_task
 from sme_registry.datasets.recipe import parse_behaviour
 from sme_registry.errors import (
     FingerprintMismatchError,

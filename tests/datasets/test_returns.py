@@ -11,7 +11,7 @@ from sme_registry import SMESpec, make, materialize
 from sme_registry.datasets import DatasetRecipe
 from sme_registry.datasets.collect import collect
 from sme_registry.datasets.recipe import parse_behaviour
-from sme_registry.datasets.returns import exact_return, positions
+from sme_registry.datasets.scores import exact_return, positions
 from sme_registry.errors import OptionError, PolicyError, SpecError, StateError
 
 SPEC = SMESpec(state_dim=3, action_dim=2, horizon=30, seed=4)

@@ -26,7 +26,7 @@ def policy():
 
 def test_it_answers_as_the_network_it_was_taken_from():
     torch = pytest.importorskip("torch")
-    from sme_registry.offline.networks import mlp, weights
+    from sme_registry.datasets.learners import mlp, weights
 
     torch.manual_seed(0)
     network = mlp(4, (16, 8), 2)

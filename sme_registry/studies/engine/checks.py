@@ -11,8 +11,8 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
 
+from sme_registry.datasets.offline import check_algorithm
 from sme_registry.errors import OptionError, SMEError, SpecError
-from sme_registry.offline.hyperparameters import resolve_hyperparameters
 from sme_registry.spec import Cell, StudyAlgorithm, StudyPlan
 from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.algorithms import find_algorithm, independent_name, reference_name
@@ -57,7 +57,7 @@ def check_hyperparameters(algorithm: StudyAlgorithm) -> None:
         settings_of(uses, chosen, field)
     elif learner is not None:
         own = {name: value for name, value in chosen.items() if name not in DATA_SETTINGS}
-        resolve_hyperparameters(learner, own)
+        check_algorithm(learner, own)
     else:
         refuse_unknown(find_algorithm(uses), uses, chosen, field)
 

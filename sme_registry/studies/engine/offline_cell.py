@@ -15,10 +15,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from sme_registry.datasets import DatasetRecipe
-from sme_registry.datasets.collect import collect
+from sme_registry.datasets import DatasetRecipe, collect, train_offline
+from sme_registry.datasets.record import ALGORITHMS
 from sme_registry.errors import OptionError, SpecError
-from sme_registry.offline import ALGORITHMS, train_offline
 from sme_registry.spec.study import OFFLINE, Cell
 from sme_registry.studies.engine.algorithms import named_after
 from sme_registry.studies.engine.result import CellResult, LearningCurve, OfflineResult, Timing

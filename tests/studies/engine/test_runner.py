@@ -58,7 +58,7 @@ del signal.pthread_sigmask, os.sched_getaffinity
 """
 RUN = """
 from sme_registry.cli import main
-from sme_registry import datasets, diagnosis, offline, training
+from sme_registry import datasets, diagnosis, training
 for name in ("SIGHUP", "SIGALRM", "SIGCHLD"):
     delattr(signal, name)
 if __name__ == "__main__":

@@ -8,7 +8,17 @@ import pytest
 import torch
 
 from sme_registry import EvaluationReport, SMESpec, materialize, save
-from sme_registry.datasets import Transitions, make_dataset
+from sme_registry.datasets import (
+    DatasetRecipe,
+    OfflinePolicy,
+    OfflineRecord,
+    SealedDataset,
+    Transitions,
+    collect,
+    make_dataset,
+    train_offline,
+    train_sealed,
+)
 from sme_registry.errors import (
     DigestMismatchError,
     MissingDependencyError,
@@ -17,9 +27,8 @@ from sme_registry.errors import (
     SpecError,
     UnknownNameError,
 )
-from sme_registry.offline import OfflinePolicy, OfflineRecord, train_offline
 from tests.commands import good, refused
-from tests.offline.sets import TINY, transitions_of
+from tests.datasets.sets import TINY, transitions_of
 
 PROTOCOL = {"states_per_region": 50}
 
@@ -273,3 +282,55 @@ def test_invalid_input_is_refused_and_writes_nothing(folder, tmp_path, arguments
     out = tmp_path / "run"
     assert message in refused("offline", "train", *arguments, "--datasets", folder, "--out", out)
     assert not out.exists()
+
+
+SEALED = DatasetRecipe.from_dict(
+    {
+        "spec": TINY.to_dict(),
+        "behaviours": [{"kind": "mixture", "nu": 0.5}],
+        "transitions": 200,
+    }
+)
+BRIEF = {"steps": 20, "batch_size": 32, "hyperparameters": {"hidden": [16]}}
+
+
+@pytest.fixture(scope="module")
+def sealed():
+    return SealedDataset.collect(SEALED)
+
+
+@pytest.mark.parametrize("algorithm", ["bc", "iql"])
+def test_the_policy_is_that_of_the_same_rows_with_their_task(sealed, algorithm):
+    rows = collect(SEALED, materialize(TINY))
+    protocol = {"states_per_region": 50}
+    known = train_offline(
+        rows, algorithm=algorithm, spec=TINY, protocol=protocol, evaluations=1, episodes=1, **BRIEF
+    ).policy
+    hidden = train_sealed(sealed, algorithm=algorithm, **BRIEF)
+    for mine, theirs in zip(hidden.layers, known.layers, strict=True):
+        for one, other in zip(mine, theirs, strict=True):
+            np.testing.assert_array_equal(one, other)
+    about = {"algorithm": algorithm, "seed": 0, "steps": 20, "dataset_digest": sealed.digest}
+    assert hidden.about == about  # and no digest of a spec
+
+
+def test_the_progress_is_reported_of_all_steps_and_faults_are_named(sealed):
+    calls = []
+    longer = {**BRIEF, "steps": 60}
+    train_sealed(sealed, algorithm="bc", progress=lambda *done: calls.append(done), **longer)
+    assert calls == [(50, 60), (60, 60)]
+    with pytest.raises(UnknownNameError):
+        train_sealed(sealed, algorithm="ppo")
+    with pytest.raises(OptionError, match="batch_size"):
+        train_sealed(sealed, batch_size=201)
+
+
+def test_the_command_writes_a_policy(sealed, tmp_path):
+    folder, target = sealed.write("sealed/autumn/deep-0-v0", tmp_path), tmp_path / "deep-0.npz"
+    command = ["offline", "sealed", folder, "-o", target, "-n", "20", "--batch-size", "32"]
+    good(*command, "--set", "hidden=[16]")
+    policy, expected = OfflinePolicy.load(target), train_sealed(sealed, **BRIEF)
+    np.testing.assert_array_equal(
+        policy(sealed.observations[:8]), expected(sealed.observations[:8])
+    )
+    assert str(target) in refused(*command).replace("\n", "")

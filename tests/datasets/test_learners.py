@@ -5,16 +5,20 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from sme_registry.offline.bc import BC  # noqa: E402
-from sme_registry.offline.hyperparameters import (  # noqa: E402
-    BCHyperparameters,
-    IQLHyperparameters,
-)
-from sme_registry.offline.iql import IQL  # noqa: E402
-from sme_registry.offline.networks import Batch, Batches, mlp  # noqa: E402
-from tests.offline.sets import transitions_of  # noqa: E402
+from sme_registry.datasets import BCHyperparameters, IQLHyperparameters  # noqa: E402
+from sme_registry.datasets.learners import BC, IQL, Batches, Minibatch, mlp  # noqa: E402
+from tests.datasets.sets import transitions_of  # noqa: E402
 
 SEEN, A, B = 4, 2, 32
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """Networks this small are slower on more threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture
@@ -23,7 +27,7 @@ def batch():
     u = torch.rand(B, A) * 2 - 1
     u[0], u[1] = 1.0, -1.0  # actions at the faces of the cube, where a tanh density ends
     continues = (torch.arange(B) % 4 != 0).float()[:, None]
-    return Batch(torch.rand(B, SEEN), u, torch.rand(B, SEEN), torch.rand(B, 1), continues)
+    return Minibatch(torch.rand(B, SEEN), u, torch.rand(B, SEEN), torch.rand(B, 1), continues)
 
 
 def asked(network, *inputs):
@@ -108,7 +112,7 @@ def test_bc_learns_a_function_that_it_can_represent():
     observations = torch.rand(256, SEEN)
     with torch.no_grad():
         u = torch.tanh(truth(observations))
-    batch = Batch(observations, u, observations, torch.zeros(256, 1), torch.ones(256, 1))
+    batch = Minibatch(observations, u, observations, torch.zeros(256, 1), torch.ones(256, 1))
     first = float(learner.step(batch)["actor"].detach())
     for _ in range(200):
         last = float(learner.step(batch)["actor"].detach())
@@ -121,7 +125,7 @@ def test_iql_prefers_the_rewarded_action():
     learner = IQL(SEEN, 1, IQLHyperparameters(hidden=(32,), learning_rate=0.01))
     u = torch.where(torch.arange(64) % 2 == 0, 0.5, -0.5)[:, None]
     observations = torch.rand(32, SEEN).repeat_interleave(2, dim=0)
-    batch = Batch(observations, u, observations, (u > 0).float(), torch.zeros(64, 1))
+    batch = Minibatch(observations, u, observations, (u > 0).float(), torch.zeros(64, 1))
     for _ in range(400):
         learner.step(batch)
     with torch.no_grad():
@@ -133,7 +137,7 @@ def test_iql_prefers_the_rewarded_action():
 def test_batches_have_matching_rows_of_all_columns_and_every_row_once_before_any_repeats():
     transitions = transitions_of(count=50)
     batches = iter(Batches(transitions, 20, torch.Generator().manual_seed(0)))
-    batch = Batch(*map(torch.cat, zip(*(next(batches) for _ in range(5)), strict=True)))
+    batch = Minibatch(*map(torch.cat, zip(*(next(batches) for _ in range(5)), strict=True)))
     rows = {row.tobytes(): index for index, row in enumerate(transitions.observations)}
     at = [rows[row.numpy().tobytes()] for row in batch.observations]
     assert sorted(at[:50]) == sorted(at[50:]) == list(range(50))

@@ -1,0 +1,342 @@
+"""`train_offline`: train BC or IQL on a data set, and evaluate the policy in the data set's task.
+
+During training, episodes of the policy are played in the task; their mean r̃ is compared with the
+exact mean r̃ of the data set. The final policy is evaluated in and out of distribution.
+
+The folder of an offline training:
+    offline.json      the record, with all evaluations
+    policy.npz        the policy, for `OfflinePolicy.load` and `sme evaluate`
+    evaluation.json   its final evaluation; decay_curve.png, .pdf if matplotlib is installed
+
+`train_sealed` learns alike from a sealed data set. Importing this module does not import PyTorch.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from sme_registry.datasets.record import (
+    ALGORITHMS,
+    BehaviourQuality,
+    Evaluation,
+    Hyperparameters,
+    OfflineRecord,
+)
+from sme_registry.datasets.storage import Dataset, SealedDataset, open_dataset
+from sme_registry.datasets.transitions import Transitions
+from sme_registry.errors import OptionError, SpecError, UnknownNameError
+from sme_registry.evaluation import EvaluationReport, evaluate, resolve_protocol
+from sme_registry.evaluation.networks import OfflinePolicy
+from sme_registry.evaluation.rollouts import rollouts, start_states
+from sme_registry.io import (
+    choice,
+    claim_folder,
+    integer_in,
+    is_installed,
+    require_packages,
+    to_json,
+    versions,
+    write_atomically,
+)
+from sme_registry.plots import files as plot_files
+from sme_registry.spec import ProtocolLike, SMESpec, SpecLike
+from sme_registry.task import Task, load, materialize
+
+if TYPE_CHECKING:
+    from sme_registry.datasets.learners import OfflineLearner
+
+RECORD, POLICY, EVALUATION = "offline.json", "policy.npz", "evaluation.json"
+_FILES = (RECORD, POLICY, EVALUATION, *plot_files.FILES)
+_ABOUT = ("algorithm", "seed", "steps", "dataset_digest", "spec_digest")  # in the policy's file
+_PACKAGES = ("gymnasium", "numpy", "scipy", "numba", "stable_baselines3", "torch")
+
+EPISODES = 10  # METHOD, section 4
+MAX_STEPS = 10**9
+_CHECKED_ROWS = 64
+_TOLERANCE = 1e-6  # of π* between machines, as for fingerprints
+
+ReportProgress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class OfflineResult:
+    """A finished offline training."""
+
+    policy: OfflinePolicy  # from observations `[B, O]` to actions `[B, A]`, for `evaluate`
+    record: OfflineRecord  # the content of `offline.json`
+    report: EvaluationReport  # of the policy
+    folder: Path | None  # None if nothing was written
+
+
+def train_offline(
+    data: Dataset | Transitions | str | os.PathLike[str],
+    *,
+    algorithm: str = "iql",
+    steps: int = 20_000,
+    batch_size: int = 256,
+    seed: int = 0,
+    evaluations: int = 20,
+    episodes: int = EPISODES,
+    hyperparameters: Mapping[str, Any] | None = None,
+    spec: SpecLike | None = None,
+    protocol: ProtocolLike | None = None,
+    folder: str | os.PathLike[str] | None = None,
+    force: bool = False,
+    progress: ReportProgress | None = None,
+) -> OfflineResult:
+    """Train BC or IQL on a data set, on the CPU and one thread.
+
+    The same arguments give the same bits on one machine; other processors and builds of PyTorch
+    round differently.
+
+    Args:
+      data: a data set, its id or its path; or its arrays, with `spec`.
+      algorithm: "bc" or "iql", in any case.
+      steps: gradient steps, at least 1.
+      batch_size: transitions in each, in [1, N]. Every transition is used once before any repeats.
+      seed: in [0, 2**53): of initial weights, shuffles, and the starts of evaluation episodes,
+        which depend on nothing else, so they are the same for both algorithms.
+      evaluations: number of evaluations during training, evenly spaced, in [1, steps]; the last one
+        is at the end.
+      episodes: of each evaluation, in [1, 4096].
+      hyperparameters: changes to the defaults, see `BCHyperparameters` and `IQLHyperparameters`.
+      spec: the task of arrays: a spec, its fields, an id, a digest or a path.
+      protocol: of the final evaluation; None takes the data set's, and "paper-v1" for arrays.
+      folder: output folder, created if it is missing. None writes nothing.
+      force: replace an earlier training in the folder.
+      progress: called with the steps done, their total, and a note.
+
+    Examples:
+      >>> from sme_registry.datasets import train_offline
+      >>> result = train_offline(
+      ...     "data/sme/Default-v1-nu50-seed0-v0",
+      ...     algorithm="bc",
+      ...     steps=10,
+      ...     batch_size=32,
+      ...     evaluations=1,
+      ...     episodes=2,
+      ...     protocol="quick-v1",
+      ... )
+      >>> result.record.steps
+      10
+    """
+    settings = _check_settings(algorithm, hyperparameters, steps, seed)
+    evaluations = integer_in("evaluations", evaluations, 1, settings.steps)
+    episodes = integer_in("episodes", episodes, 1, 4096)
+    transitions, spec, dataset = _load(data, spec)
+    if protocol is None:
+        protocol = "paper-v1" if dataset is None else dataset.recipe.protocol
+    protocol = resolve_protocol(protocol)
+    task = materialize(spec)
+    _check_task(transitions, task)
+    learner = settings.learner(transitions, batch_size)
+    target = None if folder is None else claim_folder(folder, _FILES, force=force)
+
+    similarities = transitions.similarities
+    fields: dict[str, Any] = {
+        "algorithm": settings.algorithm,
+        "hyperparameters": settings.hyperparameters.to_dict(),
+        "seed": settings.seed,
+        "steps": settings.steps,
+        "batch_size": int(batch_size),
+        "episodes": episodes,
+        "dataset": None if dataset is None else dataset.id,
+        "recipe_digest": None if dataset is None else dataset.record.recipe_digest,
+        "dataset_digest": transitions.digest,
+        "transitions": len(transitions),
+        "spec": task.spec,
+        "spec_digest": task.spec.digest,
+        "behaviour": BehaviourQuality(
+            similarity=similarities.mean(),
+            similarity_sd=similarities.std(),
+            step_reward=transitions.step_rewards.mean(),
+        ),
+    }
+    about = {name: fields[name] for name in _ABOUT}
+    start, start_cpu = time.perf_counter(), time.process_time()
+    played: list[Evaluation] = []
+
+    def report(step: int) -> None:
+        if progress is not None:
+            note = f"r̃ {played[-1].similarity:.3f}" if played else ""
+            progress(step, settings.steps, note)
+
+    for index in range(evaluations):
+        learner.advance(round(settings.steps * (index + 1) / evaluations), report)
+        policy = OfflinePolicy(learner.layers, about)
+        states = start_states(settings.seed, index, episodes, task.spec.state_dim)
+        result = rollouts(policy, task, states)
+        played.append(
+            Evaluation(
+                step=learner.steps,
+                similarity=result.per_step(result.similarity),
+                similarity_sd=result.similarity_sd,
+                episode_return=result.episode_return.mean(),
+                losses=learner.losses,
+            )
+        )
+        report(learner.steps)
+    record = OfflineRecord(
+        **fields,
+        evaluations=tuple(played),
+        wall_seconds=round(time.perf_counter() - start, 3),
+        cpu_seconds=round(time.process_time() - start_cpu, 3),
+        cpu_ms_per_step=round(1e3 * learner.cpu_seconds / settings.steps, 4),
+        versions=versions(_PACKAGES),
+    )
+    evaluated = evaluate(policy, spec, protocol, name=settings.algorithm.upper())
+    if target is not None:
+        (target / RECORD).unlink(missing_ok=True)
+        policy.save(target / POLICY)
+        evaluated.write(target / EVALUATION)
+        if is_installed("matplotlib"):
+            plot_files.write_evaluation(evaluated, target)
+        # Last, so that a folder with a record is complete.
+        write_atomically(target / RECORD, to_json(record.to_dict()))
+    return OfflineResult(policy, record, evaluated, target)
+
+
+def train_sealed(
+    data: SealedDataset | str | os.PathLike[str],
+    *,
+    algorithm: str = "iql",
+    steps: int = 20_000,
+    batch_size: int = 256,
+    seed: int = 0,
+    hyperparameters: Mapping[str, Any] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> OfflinePolicy:
+    """Train BC or IQL on a sealed data set, on the CPU and one thread.
+
+    The learners and arguments are those of `train_offline`. Nothing is evaluated: only the season's
+    board can. `data` may be the path of its folder; the policy's `save` writes an .npz file.
+
+    Examples:
+      >>> from sme_registry.datasets import DatasetRecipe, SealedDataset, train_sealed
+      >>> recipe = DatasetRecipe(
+      ...     spec=sme_registry.load("Default"),
+      ...     behaviours=[{"kind": "mixture", "nu": 0.5}],
+      ...     transitions=100,
+      ... )
+      >>> data = SealedDataset.collect(recipe)
+      >>> policy = train_sealed(data, algorithm="bc", steps=10, batch_size=32)
+      >>> policy(data.observations[:2]).shape
+      (2, 4)
+    """
+    settings = _check_settings(algorithm, hyperparameters, steps, seed)
+    rows = data if isinstance(data, SealedDataset) else SealedDataset.read(data)
+    learner = settings.learner(rows, batch_size)
+
+    def report(step: int) -> None:
+        if progress is not None:
+            progress(step, settings.steps)
+
+    learner.advance(settings.steps, report)
+    report(settings.steps)
+    about = {
+        "algorithm": settings.algorithm,
+        "seed": settings.seed,
+        "steps": settings.steps,
+        "dataset_digest": rows.digest,
+    }
+    return OfflinePolicy(learner.layers, about)
+
+
+class _Settings(NamedTuple):
+    """What a training needs to know besides its data."""
+
+    algorithm: str
+    hyperparameters: Hyperparameters
+    steps: int
+    seed: int
+
+    def learner(self, rows: Transitions | SealedDataset, batch_size: int) -> OfflineLearner:
+        batch_size = integer_in(
+            "batch_size", batch_size, 1, len(rows), advice="The data set has no more rows."
+        )
+        from sme_registry.datasets.learners import OfflineLearner
+
+        return OfflineLearner(self.hyperparameters, rows, batch_size, self.seed)
+
+
+def _check_settings(
+    algorithm: str, hyperparameters: Mapping[str, Any] | None, steps: int, seed: int
+) -> _Settings:
+    settings = _Settings(
+        *check_algorithm(algorithm, hyperparameters),
+        steps=integer_in("steps", steps, 1, MAX_STEPS),
+        seed=integer_in("seed", seed, 0, 2**53 - 1),
+    )
+    require_packages("offline training", {"torch": "PyTorch"}, "offline")
+    return settings
+
+
+def check_algorithm(
+    name: str, changes: Mapping[str, Any] | None = None
+) -> tuple[str, Hyperparameters]:
+    """An algorithm, whose case does not matter, and its hyperparameters with some changes."""
+    name = choice("algorithm", str(name).lower(), ALGORITHMS, error=UnknownNameError)
+    plain = dict(changes) if isinstance(changes, Mapping) else changes or {}
+    return name, ALGORITHMS[name].from_dict(plain, "hyperparameters")
+
+
+def _load(data: Any, spec: SpecLike | None) -> tuple[Transitions, SMESpec, Dataset | None]:
+    """The rows of a training, the spec of their task, and their data set unless they are arrays."""
+    dataset = None
+    if isinstance(data, Transitions):
+        if spec is None:
+            raise OptionError("spec=None: is required with arrays. Give the spec of their task.")
+        spec = load(spec, SMESpec)
+    elif isinstance(data, Dataset | str | os.PathLike):
+        dataset = data if isinstance(data, Dataset) else open_dataset(data)
+        record = dataset.record
+        if spec is not None and (digest := load(spec, SMESpec).digest) != record.spec_digest:
+            raise OptionError(
+                f"spec={digest[:19]}…: the data set's task is {record.spec_digest[:19]}…. Leave it "
+                "out."
+            )
+        spec = record.recipe.spec.named(record.task)
+    else:
+        raise OptionError(
+            f"data={data!r:.60}: must be a data set, its id, its path, or its Transitions."
+        )
+    if spec.team is not None:
+        raise SpecError(
+            f"team: the data set has {len(spec.team.agents)} agents, and a policy that sees all "
+            "observations cannot be executed by the individual agents. Train on a single-agent "
+            "data set."
+        )
+    return data if dataset is None else dataset.transitions(), spec, dataset
+
+
+def _check_task(transitions: Transitions, task: Task) -> None:
+    """Raise OptionError unless arrays are finite and of this task."""
+    S, A, m = task.spec.state_dim, task.spec.action_dim, task.spec.distractors
+    seen, with_distractors = task.spec.observation_dim, f", {m} distractors" if m else ""
+    if len(transitions) == 0:
+        raise OptionError("transitions=0: must be at least 1. Give a data set with rows.")
+    for name, width in (("observations", seen), ("actions", A), ("next_observations", seen)):
+        shape = getattr(transitions, name).shape
+        if shape != (len(transitions), width):
+            raise OptionError(
+                f"{name} of shape {shape}: must be ({len(transitions)}, {width}) for state_dim={S},"
+                f" action_dim={A}{with_distractors}. Give the spec of the data set."
+            )
+    for name in ("observations", "actions", "next_observations", "rewards", "states"):
+        if not np.isfinite(getattr(transitions, name)).all():
+            raise OptionError(f"{name}: contains NaN or infinity. Give finite numbers.")
+    rows = np.linspace(0, len(transitions) - 1, min(_CHECKED_ROWS, len(transitions))).astype(int)
+    optimal = task.optimal_action(transitions.states[rows])
+    difference = np.abs(optimal - transitions.optimal_actions[rows]).max()
+    if not difference <= _TOLERANCE:
+        raise OptionError(
+            f"spec={task.spec.digest[:19]}…: is not the task of the data set: the optimal actions "
+            f"differ by up to {difference:.2g}. Give the spec of the data set."
+        )
