@@ -32,7 +32,7 @@ import numpy.typing as npt
 
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import retention
-from sme_registry.evaluation.measure import Progress, final_specs, same_draw
+from sme_registry.evaluation.measure import OnBatch, final_specs, same_draw
 from sme_registry.evaluation.policies import Policy, check_count, stream_policy
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
@@ -342,7 +342,7 @@ def expected_regret(
     seed: int = 0,
     action_range: str | None = None,
     algorithm: str | None = None,
-    progress: Progress | None = None,
+    progress: OnBatch | None = None,
 ) -> DynamicRegret:
     """The expected dynamic regret of a life in which given policies act and do not learn.
 

@@ -20,7 +20,7 @@ from sme_registry.compiled import Engine
 from sme_registry.envs import arguments
 from sme_registry.errors import PolicyError, SpecError
 from sme_registry.evaluation import references
-from sme_registry.evaluation.measure import WHOLE, Measurement, Progress, Subject, same_draw
+from sme_registry.evaluation.measure import WHOLE, Measurement, OnBatch, Subject, same_draw
 from sme_registry.evaluation.policies import as_policy
 from sme_registry.evaluation.regions import Observations, states
 from sme_registry.evaluation.report import AgentReport, EvaluationReport, RegionReport
@@ -44,7 +44,7 @@ def evaluate(
     action_range: str | None = None,
     name: str | None = None,
     algorithm: str | None = None,
-    progress: Progress | None = None,
+    progress: OnBatch | None = None,
 ) -> EvaluationReport:
     """Evaluate a policy within and out of distribution, exactly.
 
@@ -80,7 +80,7 @@ def evaluate_many(
     policies: Sequence[tuple[Any, SpecLike]],
     protocol: ProtocolLike = "paper-v1",
     *,
-    progress: Progress | None = None,
+    progress: OnBatch | None = None,
 ) -> list[EvaluationReport | PolicyError]:
     """Evaluate many policies, each on its task, faster than one by one.
 
@@ -163,13 +163,13 @@ def versions_behind(oracle: Engine) -> dict[str, str]:
     return versions(["numpy", "scipy", "gymnasium", *numba], if_imported=_POLICY_LIBRARIES)
 
 
-def _offset(progress: Progress | None, before: int, total: int) -> Progress:
+def _offset(progress: OnBatch | None, before: int, total: int) -> OnBatch:
     """`progress` of a part, which `before` states precede."""
     return lambda done, _: None if progress is None else progress(before + done, total)
 
 
 def _evaluate_together(
-    subjects: Sequence[Subject], protocol: EvaluationProtocol, progress: Progress
+    subjects: Sequence[Subject], protocol: EvaluationProtocol, progress: OnBatch
 ) -> list[EvaluationReport | PolicyError]:
     """The reports of policies on tasks of the same draw, or why there is none."""
     measurement = Measurement(subjects, protocol)

@@ -73,7 +73,7 @@ PROBE_STATES = 2**14  # of which half are held out
 _PROBED_CHANNELS = 512  # of s and d; above it the least squares take minutes and much memory
 _STATES_PER_UNKNOWN = 4  # of the fit; with fewer, R² would tell how few they are
 
-Progress = Callable[[int, int], None]
+OnBatch = Callable[[int, int], None]
 """Called with the number of states done, and of all states."""
 
 Subject = tuple[Policy | TeamPolicy, SMESpec]
@@ -311,7 +311,7 @@ class Measurement:
             spec.r_min: replace(task, spec=spec) for _, spec in subjects if spec.safety is not None
         }
 
-    def run(self, progress: Progress) -> None:
+    def run(self, progress: OnBatch) -> None:
         """Measure region after region, or until all policies have failed."""
         fitted, known = self._fit_references()
         total, done = self.protocol.states_per_region * len(self.protocol.edges), 0

@@ -174,6 +174,15 @@ class ReportFile(StrictModel):
     """
 
     documents: ClassVar[tuple[str, ...]]
+    left_out_if_empty: ClassVar[tuple[str, ...]]
+
+    @model_serializer(mode="wrap")
+    def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        plain: dict[str, Any] = handler(self)
+        for field in self.left_out_if_empty:
+            if not plain[field]:
+                del plain[field]
+        return plain
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Self:
@@ -265,6 +274,7 @@ class EvaluationReport(ReportFile):
     """
 
     documents = ("spec", "protocol")
+    left_out_if_empty = ("agents", "task", "safety", "observation")
 
     schema_version: Literal[1] = 1
     policy: str
@@ -318,14 +328,6 @@ class EvaluationReport(ReportFile):
         yield "observation.invariance", own, distracted
         own = [region.name for region in self.observed.distractor_regions]
         yield "observation.distractor_regions", own, [f"d-{name}" for name in distracted[1:]]
-
-    @model_serializer(mode="wrap")
-    def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        plain: dict[str, Any] = handler(self)
-        for field in ("agents", "task", "safety", "observation"):
-            if not plain[field]:
-                del plain[field]
-        return plain
 
     @property
     def title(self) -> str:

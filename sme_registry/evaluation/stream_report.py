@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import Field
 
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
 from sme_registry.evaluation import retention, tables
@@ -154,6 +154,7 @@ class StreamReport(ReportFile):
     """
 
     documents = ("stream", "protocol")
+    left_out_if_empty = ("name", "reference_regret")
 
     schema_version: Literal[1] = 1
     policy: str
@@ -169,14 +170,6 @@ class StreamReport(ReportFile):
     dynamic_regret: DynamicRegret | None = None
     reference_regret: dict[str, DynamicRegret] = Field(default_factory=dict)
     versions: dict[str, str]
-
-    @model_serializer(mode="wrap")
-    def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        plain: dict[str, Any] = handler(self)
-        for field in ("name", "reference_regret"):
-            if not plain[field]:
-                del plain[field]
-        return plain
 
     @property
     def title(self) -> str:

@@ -24,7 +24,7 @@ import numpy as np
 from sme_registry.compiled import Engine, engine
 from sme_registry.envs.types import Observation
 from sme_registry.evaluation.evaluate import resolve_protocol, versions_behind
-from sme_registry.evaluation.measure import Progress, final_specs, same_draw
+from sme_registry.evaluation.measure import OnBatch, final_specs, same_draw
 from sme_registry.evaluation.policies import Policy, check_count, prefixed_errors, stream_policy
 from sme_registry.evaluation.regions import BATCH_NUMBERS, batch_rows, states
 from sme_registry.evaluation.stream_report import StreamReport, Visit, stream_regions
@@ -45,7 +45,7 @@ def evaluate_stream(
     action_range: str | None = None,
     name: str | None = None,
     algorithm: str | None = None,
-    progress: Progress | None = None,
+    progress: OnBatch | None = None,
 ) -> StreamReport:
     """Evaluate an agent's life in a stream, exactly and without a rollout.
 
@@ -180,7 +180,7 @@ def stream_regrets(
     stream: StreamSpec,
     actors: Sequence[Actor],
     protocol: EvaluationProtocol,
-    progress: Progress | None = None,
+    progress: OnBatch | None = None,
 ) -> tuple[Array, Engine]:
     """The normalised regret of each actor on each of its phases, in every region."""
     specs = final_specs(stream)

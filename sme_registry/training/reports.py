@@ -20,7 +20,7 @@ from sme_registry.evaluation import (
     evaluate_stream,
     reference_regret,
 )
-from sme_registry.evaluation.measure import Progress as OnBatch
+from sme_registry.evaluation.measure import OnBatch
 from sme_registry.io import is_installed
 from sme_registry.io.terminal import Progress
 from sme_registry.plots import files as plot_files
