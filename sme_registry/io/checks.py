@@ -112,6 +112,6 @@ def server_address(url: str, *, insecure: bool = False) -> Address:
     return address
 
 
-def printable(text: object) -> str:
-    """A server's text for a terminal: at most 2,000 characters, without control characters."""
-    return "".join(each if each.isprintable() else " " for each in str(text)[:2000])
+def printable(text: object, longest: int | None = 2000) -> str:
+    """A text from elsewhere on one line of limited length, without control characters."""
+    return "".join(each if each.isprintable() else " " for each in str(text)[:longest])

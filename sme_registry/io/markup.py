@@ -5,6 +5,7 @@ Cards have no scripts; their colours and fonts are those of the page, light or d
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,29 +15,18 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from rich.console import Console
 from rich.text import Text
 
-from sme_registry.io.tables import Row, Table
+from sme_registry.io.tables import Table
 
-# Notebooks have rules for tables, such as `.jp-RenderedHTMLCommon td`: these are more specific.
+# Notebooks have rules of their own for tables.
 _STYLE = (
-    "<style>"
-    ".sme-card.sme-card{overflow-x:auto;font-variant-numeric:tabular-nums}"
-    ".sme-card table.sme-table{border-collapse:collapse;margin:.5em 0;color:inherit;width:auto}"
-    ".sme-card table.sme-table caption{caption-side:top;text-align:left;padding:.2em .6em;"
-    "color:inherit;font-size:1em;font-weight:normal;font-style:normal}"
-    ".sme-card table.sme-table tr>*{padding:.15em .6em;text-align:left;vertical-align:top;"
-    "white-space:normal;max-width:30em}"
-    ".sme-card table.sme-table tr>.text:last-child{min-width:12em}"
-    ".sme-card table.sme-table tr>.num{text-align:right;white-space:nowrap}"
-    ".sme-card table.sme-table tr>.name{white-space:nowrap}"
-    ".sme-card table.sme-table tr.bold>*{font-weight:bold}"
-    ".sme-card table.sme-table tbody+tbody{border-top:1px solid rgba(128,128,128,.5)}"
-    ".sme-card small,.sme-card summary{overflow-wrap:anywhere}"
-    "</style>"
+    "<style>.sme-card :is(caption,td,th){text-align:left!important;white-space:pre-wrap!important}"
+    ".sme-card .number{text-align:right!important}.sme-card small{overflow-wrap:anywhere}</style>"
 )
 _MOST_ROWS = 60  # of a table: a card stays below 20 kB
-_CLASSES = {"number": "num", "name": "name", "text": "text"}
+_CONSOLE = Console(file=io.StringIO())
 
 
 def card(*parts: str) -> str:
@@ -50,61 +40,40 @@ def folded(summary: str, *parts: str) -> str:
 
 
 def table_html(table: Table) -> str:
-    """A table of the terminal as HTML: title, headings, rows, sections and caption."""
+    """A table of the terminal; of Rich's styles it keeps bold text."""
     kinds = [column.kind for column in table.columns]
-    sections = [[_row("th", [column.heading for column in table.columns], kinds)]]
-    for row in table.rows[:_MOST_ROWS]:
-        if row is None:
-            sections.append([])
-        else:
-            sections[-1].append(_row("td", row.cells, kinds, row))
-    if more := sum(row is not None for row in table.rows[_MOST_ROWS:]):
-        rest = f"<tr><td colspan={len(kinds)}>… {more:,} more</td></tr>"
-        sections.append([rest])
-    bodies = "".join(f"<tbody>{''.join(rows)}</tbody>" for rows in sections if rows)
-    title = _caption(_text(table.title)) if table.title else ""
-    caption = f"<small>{_text(table.caption)}</small>" if table.caption else ""
-    return f'<table class="sme-table">{title}{bodies}</table>{caption}'
+    heading = "".join(f"<th>{escape(column.heading)}</th>" for column in table.columns)
+    rows = [row for row in table.rows if row is not None]
+    lines = [heading]
+    for row in rows[:_MOST_ROWS]:
+        bold = "bold" in row.style
+        cells = zip(kinds, row.cells, strict=True)
+        lines.append("".join(f"<td class={kind}>{_html(cell, bold)}</td>" for kind, cell in cells))
+    if len(rows) > _MOST_ROWS:
+        lines.append(f"<td>… {len(rows) - _MOST_ROWS:,} more</td>")
+    title, caption = (
+        _html(Text.from_markup(text, emoji=False)) for text in (table.title, table.caption)
+    )
+    body = "".join(f"<tr>{line}</tr>" for line in lines)
+    return f"<table><caption>{title}</caption>{body}</table><small>{caption}</small>"
 
 
 def pairs_html(title: str, pairs: Mapping[str, Any]) -> str:
     """Names and values, one per row, under a title."""
     rows = "".join(
-        f'<tr><th class="name">{escape(name)}</th><td>{escape(str(value))}</td></tr>'
+        f"<tr><th>{escape(name)}</th><td>{escape(str(value))}</td></tr>"
         for name, value in pairs.items()
     )
-    return f'<table class="sme-table">{_caption(escape(title))}{rows}</table>'
+    return f"<table><caption>{escape(title)}</caption>{rows}</table>"
 
 
-def _caption(html: str) -> str:
-    """The title of a table, its first line in bold."""
-    if not html:
-        return ""
-    first, *rest = html.split("<br>", 1)
-    return f"<caption>{'<br>'.join([f'<b>{first}</b>', *rest])}</caption>"
-
-
-def _row(tag: str, cells: Any, kinds: list[str], row: Row | None = None) -> str:
-    styled = (
-        f'<{tag} class="{_CLASSES[kind]}">{_text(cell)}</{tag}>'
-        for cell, kind in zip(cells, kinds, strict=True)
+def _html(text: Text, bold: bool = False) -> str:
+    return "".join(
+        f"<b>{escape(part.text)}</b>"
+        if bold or (part.style is not None and part.style.bold)
+        else escape(part.text)
+        for part in text.render(_CONSOLE)
     )
-    bold = row is not None and "bold" in row.style.split()
-    return f"<tr{' class=bold' * bold}>{''.join(styled)}</tr>"
-
-
-def _text(cell: Text | str) -> str:
-    """A cell, heading or title: spaces at its start, line breaks and text in bold are kept."""
-    text = cell if isinstance(cell, Text) else Text.from_markup(cell, emoji=False)
-    lead = len(text.plain) - len(text.plain.lstrip(" "))
-    bold = [span for span in text.spans if "bold" in str(span.style).split()]
-    parts, at = [], lead
-    for span in bold:
-        start, end = max(span.start, at), max(span.end, at)
-        parts += [escape(text.plain[at:start]), f"<b>{escape(text.plain[start:end])}</b>"]
-        at = end
-    html = "".join([*parts, escape(text.plain[at:])])
-    return "&nbsp;" * lead + html.replace("\n", "<br>")
 
 
 _STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)

@@ -5,13 +5,10 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import importlib.util
-import json
 import multiprocessing
 import os
 import platform
 import re
-import shlex
-import shutil
 import signal
 import sys
 import threading
@@ -19,14 +16,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
-from urllib.request import url2pathname
 
 from sme_registry.errors import MissingDependencyError, SMEError, did_you_mean
 from sme_registry.version import __version__
 
 _NAME = "sme-registry"
-_SOURCE = Path(__file__).parents[2]  # the clone, if the package runs from one
 _EXTRA = re.compile(r"""([\w.-]+).*\bextra\s*==\s*['"]([\w-]+)['"]""")
 
 
@@ -69,19 +63,8 @@ def missing_dependency(
 
 
 def install_command(extra: str) -> str:
-    """The command that installs an extra in the way in which this package was installed."""
-    options, requirement = [], f"{_NAME}[{extra}]"
-    origin = _origin()
-    if (_SOURCE / "pyproject.toml").is_file():
-        options, requirement = ["-e"], _in_folder(_SOURCE, extra)
-    elif "dir_info" in origin:
-        folder = Path(url2pathname(urlsplit(origin["url"]).path))
-        if folder.is_dir():
-            requirement = _in_folder(folder, extra)
-    elif "url" in origin:
-        revision = origin.get("vcs_info", {}).get("vcs")
-        requirement += f" @ {revision + '+' if revision else ''}{origin['url']}"
-    return shlex.join([*_pip(), "install", *options, requirement])
+    """The command that adds an extra to the package, wherever it was installed from."""
+    return f"pip install '{_NAME}[{extra}]'"
 
 
 def _missing(
@@ -92,26 +75,6 @@ def _missing(
         f"{purpose}{' and '.join(packages)} {verb} not installed. "
         f"Run `{install_command(extra)}`{', or ' + otherwise if otherwise else ''}."
     )
-
-
-def _in_folder(folder: Path, extra: str) -> str:
-    return f"{'.' if folder == Path.cwd() else folder}[{extra}]"
-
-
-def _pip() -> list[str]:
-    """This environment's pip, also where the `pip` of the shell belongs to another one."""
-    found = shutil.which("pip")
-    here = found is not None and Path(found).parent == Path(sys.executable).parent
-    return ["pip"] if here else [sys.executable, "-m", "pip"]
-
-
-def _origin() -> dict[str, Any]:
-    """Where the package was installed from, as PEP 610 records it; empty for an index."""
-    try:
-        text = metadata.distribution(_NAME).read_text("direct_url.json")
-    except metadata.PackageNotFoundError:
-        return {}
-    return dict(json.loads(text)) if text else {}
 
 
 def _extras() -> dict[str, set[str]]:

@@ -14,14 +14,31 @@ from typing import NamedTuple
 
 from rich import box
 from rich.cells import cell_len
-from rich.console import Console, ConsoleOptions, RenderResult
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.padding import Padding
+from rich.segment import Segment
 from rich.table import Table as RichTable
 from rich.text import Text
+
+from sme_registry.io.checks import printable
 
 _LEAST_TEXT, _MOST_LINES = 16, 4  # of a cell of text in a table
 _STYLES = ((box.HEAVY_HEAD, 1), (None, 2), (None, 1))
 """From wide to narrow: lines, and spaces after each column (with lines, also before it)."""
+
+
+class CleanConsole(Console):
+    """Prints no control characters of a text, such as escape sequences in a name from elsewhere."""
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterator[Segment]:
+        for segment in super().render(renderable, options):
+            if segment.control or segment.text.replace("\n", "").isprintable():
+                yield segment
+            else:
+                lines = (printable(line, longest=None) for line in segment.text.split("\n"))
+                yield segment._replace(text="\n".join(lines))
 
 
 class Column(NamedTuple):

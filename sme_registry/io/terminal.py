@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 import io
+import json
 import os
 import re
 import sys
@@ -27,6 +28,7 @@ from typer.core import TyperGroup
 from sme_registry.errors import SMEError
 from sme_registry.io.files import to_json
 from sme_registry.io.system import missing_dependency
+from sme_registry.io.tables import CleanConsole
 
 _SECONDS_PER_DAY = 86_400
 
@@ -57,7 +59,7 @@ def duration_range(low: float, high: float) -> str:
 _UNLIMITED = 100_000  # columns: lines of a file or a pipe are never wrapped
 
 
-class _Console(Console):
+class _Console(CleanConsole):
     """Wraps no lines of output that is no terminal, and leaves broken pipes to `CommandGroup`.
 
     With FORCE_COLOR, which Jupyter sets for shell cells, Rich would draw bars into a pipe: colours
@@ -93,8 +95,11 @@ def failure(message: str) -> None:
 
 
 def print_json(value: Any) -> None:
-    """Plain JSON, and nothing else, on standard output."""
-    sys.stdout.write(to_json(value))
+    """Plain JSON, and nothing else, on standard output; unprintable characters are escaped."""
+    text = to_json(value)
+    unprintable = {each for each in text if not each.isprintable()} - {"\n"}
+    escapes = {ord(each): json.dumps(each)[1:-1] for each in unprintable}
+    sys.stdout.write(text.translate(escapes))
 
 
 def print_pairs(title: str, pairs: dict[str, object]) -> None:
@@ -136,7 +141,7 @@ class Progress:
         self._title, self._unit = title, unit
         self._total, self._done_before, self._done = total, done, done
         self._rate_from: tuple[int, float] | None = None  # steps and time; None while it prepares
-        self._console = console or Console(stderr=True)
+        self._console = console or err()
         self._seconds_left, self._enabled = seconds_left, enabled
         self._note = ""
         self._parts: dict[str, str] = {}  # how far they are

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import re
 from itertools import pairwise
 from xml.etree import ElementTree
@@ -15,7 +16,7 @@ from typer.testing import CliRunner
 from sme_registry.cli import app
 from sme_registry.io.markup import Line, Scale, card, folded, line_chart, pairs_html, table_html
 from sme_registry.io.tables import Table
-from sme_registry.io.terminal import out
+from sme_registry.io.terminal import failure, out, print_json, print_pairs
 
 WIDTHS = (60, 80, 200)
 COLUMNS = {"id": "name", "n": "number", "of all": "number", "about it": "text"}
@@ -159,3 +160,16 @@ def test_labels_and_titles_are_escaped_and_read_out():
     root = ElementTree.fromstring(svg)
     assert root.attrib["aria-label"] == '<b>. "&<script>: 0.25'
     assert {'"&<script>', "<i>"} <= texts(svg).keys()
+
+
+def test_no_text_reaches_a_terminal_with_control_characters(capsys):
+    evil = "\x1b[2J\x9b1m\u202ename\x07"
+    out().print(Table(evil, {"a": "name", "b": "text"}, [(evil, f"{evil} half ½")], caption=evil))
+    print_pairs(evil, {evil: evil})
+    failure(f"{evil}\n{evil}")
+    print_json({"name": evil, "space": "\u00a0", "tag": "\U000e0001"})
+    printed = capsys.readouterr()
+    assert all(line.isprintable() for line in (printed.out + printed.err).split("\n"))
+    assert "half ½" in printed.out
+    text = printed.out[printed.out.index("{") :]
+    assert json.loads(text) == {"name": evil, "space": "\u00a0", "tag": "\U000e0001"}

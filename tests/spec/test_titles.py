@@ -70,13 +70,13 @@ def test_no_document_fills_a_screen():
 def test_a_notebook_shows_a_tasks_fields_name_and_digest():
     spec = SMESpec(complexity=5, k=3).named("<Mine>")
     html = spec._repr_html_()
-    for text in ("complexity", "<b>5</b><br>default 1", spec.digest, "&lt;Mine&gt;"):
+    for text in ("complexity", "<b>5</b>\ndefault 1", spec.digest, "&lt;Mine&gt;"):
         assert text in html
     assert "<Mine>" not in html
     assert "Not the default: k=3, complexity=5" in html
     assert ">L</b>" in html  # its symbol
     assert "layers of the optimal policy" in html  # its meaning
-    assert html.count("<br>default ") == 2
+    assert html.count("\ndefault ") == 2
     assert "safety" not in html  # not set
     stream = sme_registry.load("Switch5")._repr_html_()
     assert stream.count(">seed=") == 4
