@@ -1,25 +1,13 @@
 """The errors that `sme_registry` raises on invalid input.
 
     SMEError
-    ├── SpecError                 an invalid or missing field of a document (also a ValueError)
-    │   ├── StreamError               a stream where a single task is needed
-    │   ├── UnexpectedKeywordError    an environment has no such argument (also a TypeError)
-    │   ├── MalformedDocumentError    not JSON, or not the JSON of this kind of document
-    │   ├── DigestMismatchError       a file's digest is not the digest of its spec
-    │   └── FingerprintMismatchError  the drawn numbers differ from the published ones
-    ├── UnknownNameError          no environment, suite, … has this name (also a LookupError)
-    ├── NameTakenError            a name already stands for another spec (also a ValueError)
-    ├── ResourceLimitError        the task would not fit in memory (also a MemoryError)
-    ├── ActionError               an action of the wrong shape or not finite (also a ValueError)
-    ├── StateError                a state of the wrong shape or out of bounds (also a ValueError)
-    ├── EpisodeError              a step before `reset`, or after the end of an episode
-    ├── WrapperError              an outer wrapper that would change the task
-    ├── PolicyError               a policy that cannot be loaded, or whose actions cannot be used
-    ├── OptionError               an argument or option outside its range (also a ValueError)
-    ├── WireError                 a malformed message of a sealed season (also a ValueError)
-    ├── SealedError               a sealed season's server refused a request, or gives no answer
-    │   └── BudgetSpentError          no steps are left on the instance
-    └── MissingDependencyError    an optional package is not installed (also an ImportError)
+    ├── SpecError (ValueError): StreamError, UnexpectedKeywordError (TypeError),
+    │   MalformedDocumentError, DigestMismatchError, FingerprintMismatchError
+    ├── ActionError, StateError, OptionError, NameTakenError, WireError (all ValueError)
+    ├── UnknownNameError (LookupError), ResourceLimitError (MemoryError),
+    │   MissingDependencyError (ImportError), EpisodeError (RuntimeError)
+    ├── WrapperError, PolicyError
+    └── SealedError: BudgetSpentError
 
 A message gives the field, its value, the allowed range and the fix:
 `hidden_width=0: must be in [1, 4096]. Correct it, or leave it out for the default, 64.`

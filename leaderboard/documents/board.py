@@ -80,7 +80,7 @@ def refuse_unscored(suite: Suite) -> None:
 
     A rank by distance from the optimum alone would favour agents that break limits.
     """
-    suite.refuse_streams("a leaderboard")
+    suite.check_no_streams("a leaderboard")
     extended = ", ".join(member.name for member in suite.classes if member.setting.extended)
     if extended:
         raise SpecError(

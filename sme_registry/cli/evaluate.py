@@ -164,7 +164,7 @@ class _Policies(NamedTuple):
 def _check_number(given: _Policies, task: str, document: SMESpec | StreamSpec) -> None:
     number = len(given.policies)
     if isinstance(document, StreamSpec):
-        document.refuse_many_visits()
+        document.check_visits()
         if number not in (1, document.visits):
             raise OptionError(
                 f"{number} policies: must be one for the whole life, or {document.visits}, one at "

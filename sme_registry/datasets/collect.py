@@ -43,7 +43,7 @@ from sme_registry.evaluation.regions import expansion
 from sme_registry.evaluation.rollouts import play
 from sme_registry.spec import SMESpec
 from sme_registry.task import Task, draw
-from sme_registry.task.memory import refuse_above_limit
+from sme_registry.task.memory import check_limit
 from sme_registry.task.streams import bit_generator, to_uniform
 
 ReportProgress = Callable[[int, int], None]
@@ -241,7 +241,7 @@ def collect(
     if spec.safety is not None:
         row += 16 * A + 16
     with_distractors = f", {m} distractors" if m else ""
-    refuse_above_limit(
+    check_limit(
         3 * recipe.transitions * row,
         f"transitions={recipe.transitions}: a data set of state_dim={S}, action_dim={A}"
         f"{with_distractors}",

@@ -26,7 +26,7 @@ from sme_registry.datasets.recipe import DatasetRecipe
 from sme_registry.errors import SpecError
 from sme_registry.io import read_json
 from sme_registry.spec import Digest, Integer, Real, SMESpec, StrictModel, TupleOf
-from sme_registry.spec.document import refuse_other_digest
+from sme_registry.spec.document import check_digest
 from sme_registry.spec.sme_spec import Seed
 
 Share = Annotated[Real, Field(ge=0, le=1)]
@@ -126,7 +126,7 @@ class DatasetRecord(StrictModel):
             ("spec_digest", record.recipe.spec),
             ("protocol_digest", record.recipe.protocol),
         ):
-            refuse_other_digest(
+            check_digest(
                 getattr(record, field),
                 document,
                 f"{source}: {KEY}.{field}",
@@ -264,7 +264,7 @@ class OfflineRecord(StrictModel):
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> OfflineRecord:
         record = cls.from_dict(read_json(path), str(path))
-        refuse_other_digest(
+        check_digest(
             record.spec_digest, record.spec, f"{os.fspath(path)}: spec_digest", "Train again."
         )
         return record

@@ -21,7 +21,7 @@ from sme_registry.diagnosis.measurements import Measurements
 from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.io import read_json
 from sme_registry.spec import Digest, Integer, Real, SchemaVersion, SMESpec, StrictModel, TupleOf
-from sme_registry.spec.document import refuse_other_digest
+from sme_registry.spec.document import check_digest
 
 __all__ = [
     "Answer",
@@ -143,7 +143,7 @@ class Diagnosis(StrictModel):
     def read(cls, path: str | os.PathLike[str]) -> Self:
         """Read a diagnosis.json."""
         diagnosis = cls.from_dict(read_json(path), str(path))
-        refuse_other_digest(
+        check_digest(
             diagnosis.spec_digest,
             diagnosis.spec,
             f"{path}: spec_digest",

@@ -26,7 +26,7 @@ from sme_registry.envs.types import Array, Lanes, Mask, Observation
 from sme_registry.errors import ActionError
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.task import Task, observe
-from sme_registry.task.memory import refuse_above_limit
+from sme_registry.task.memory import check_limit
 
 _FLOAT64 = np.dtype(np.float64)
 _AHEAD = 16  # states drawn at once for a lane
@@ -124,9 +124,7 @@ _ALONE = _references(_Results(1, 1, 1, 1, safety=True)._allocate())
 
 def refuse_large_batch(lanes: int, lane_bytes: int) -> None:
     """Raise ResourceLimitError where lanes of so many bytes each would not fit in memory."""
-    refuse_above_limit(
-        lanes * lane_bytes, f"num_envs={lanes}: a batch this large", "Use fewer lanes."
-    )
+    check_limit(lanes * lane_bytes, f"num_envs={lanes}: a batch this large", "Use fewer lanes.")
 
 
 class InitialStates:

@@ -363,7 +363,7 @@ def expected_regret(
       True
     """
     stream = load(stream, StreamSpec)
-    stream.refuse_many_visits()
+    stream.check_visits()
     P = len(stream.phases)
     check_count("life", life, stream.cycles * P, "or number for each visit")
     integer_in("episodes", episodes, 1)
@@ -413,7 +413,7 @@ def reference_regret(
       ['constant_half', 'fresh_optimum', 'frozen_optimum']
     """
     stream = load(stream, StreamSpec)
-    stream.refuse_many_visits()
+    stream.check_visits()
     if (frozen is None) != (training is None):
         raise OptionError(
             "frozen, training: must be given together or both left out. Give the policy at the "

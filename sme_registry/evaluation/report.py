@@ -31,7 +31,7 @@ from sme_registry.io import (
 )
 from sme_registry.io.tables import Table
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
-from sme_registry.spec.document import Integer, Real, StrictModel, refuse_other_digest
+from sme_registry.spec.document import Integer, Real, StrictModel, check_digest
 
 if TYPE_CHECKING:
     import pandas
@@ -189,7 +189,7 @@ class ReportFile(StrictModel):
         """Read a report."""
         report = cls.from_dict(read_json(path), str(path))
         for what in cls.documents:
-            refuse_other_digest(
+            check_digest(
                 getattr(report, f"{what}_digest"),
                 getattr(report, what),
                 f"{path}: {what}_digest",

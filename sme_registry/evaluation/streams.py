@@ -68,7 +68,7 @@ def evaluate_stream(
       2
     """
     stream = load(stream, StreamSpec)
-    stream.refuse_many_visits()
+    stream.check_visits()
     protocol = resolve_protocol(protocol)
     P = len(stream.phases)
     V = stream.cycles * P

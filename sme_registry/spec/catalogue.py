@@ -92,7 +92,7 @@ class Envelope(StrictModel):
                     f"{name}: digest: missing: must be the digest of the {cls.content}. To add "
                     f"it, {remedy}."
                 )
-        _refuse_another_kind(cls, data, name)
+        _check_kind(cls, data, name)
         envelope = super().from_dict(data, source)
         expected = getattr(envelope, cls.content).digest
         if envelope.digest != expected:
@@ -197,7 +197,7 @@ class ProtocolFile(Envelope):
     protocol: EvaluationProtocol
 
 
-def _refuse_another_kind(kind: type[Envelope], data: Any, source: str) -> None:
+def _check_kind(kind: type[Envelope], data: Any, source: str) -> None:
     """Say that a file is a suite, say, and not a task, rather than which fields it lacks."""
     words = {"spec": "task", "plan": "study plan"}
     if isinstance(data, dict) and kind.content not in data:

@@ -319,7 +319,7 @@ class StrictModel(BaseModel):
         return self.model_dump(mode="json")
 
 
-def refuse_other_digest(stated: str, document: Document, where: str, remedy: str) -> None:
+def check_digest(stated: str, document: Document, where: str, remedy: str) -> None:
     """Raise `DigestMismatchError` if a document has another digest than a file states."""
     if stated != document.digest:
         raise DigestMismatchError(
@@ -387,7 +387,7 @@ class _Named(Protocol):
     def name(self) -> str: ...
 
 
-def refuse_repeated_names(field: str, members: Sequence[_Named]) -> None:
+def check_names(field: str, members: Sequence[_Named]) -> None:
     """Raise ValueError, which Pydantic reports, where two members have the same name."""
     names = [member.name for member in members]
     for name in names:

@@ -29,9 +29,9 @@ from sme_registry.spec.document import (
     NamedDocument,
     Real,
     SchemaVersion,
+    check_names,
     matching,
     plain_number,
-    refuse_repeated_names,
     short_repr,
 )
 
@@ -162,7 +162,7 @@ class TeamSpec(Document):
 
     @model_validator(mode="after")
     def _unique_names(self) -> Self:
-        refuse_repeated_names("agents", self.agents)
+        check_names("agents", self.agents)
         return self
 
 

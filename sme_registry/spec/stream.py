@@ -308,7 +308,7 @@ class StreamSpec(NamedDocument):
         """The tasks of the phases, but for their seeds and rotations."""
         return {phase.spec.derive(rotation=0.0, seed=0) for phase in self.phases}
 
-    def refuse_many_visits(self) -> None:
+    def check_visits(self) -> None:
         """Raise SpecError if a life has more visits than are evaluated."""
         if self.visits > MAX_VISITS:
             raise SpecError(

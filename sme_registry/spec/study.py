@@ -24,7 +24,7 @@ from sme_registry.spec.document import (
     Name,
     SchemaVersion,
     StrictModel,
-    refuse_repeated_names,
+    check_names,
     short_repr,
 )
 from sme_registry.spec.sme_spec import ActionRange, Setting, SMESpec
@@ -34,7 +34,7 @@ from sme_registry.spec.suite import (
     EvaluationProtocol,
     StreamClasses,
     SuiteClass,
-    refuse_no_class,
+    check_classes,
 )
 
 FRESH_EVALUATIONS = 10  # at most, of a fresh agent
@@ -245,8 +245,8 @@ class StudyPlan(Document):
 
     @model_validator(mode="after")
     def _can_be_run(self) -> Self:
-        refuse_no_class(self.classes, self.streams)
-        refuse_repeated_names("algorithms", self.algorithms)
+        check_classes(self.classes, self.streams)
+        check_names("algorithms", self.algorithms)
         for i, algorithm in enumerate(self.algorithms):
             for member in self.classes:
                 _check_task(algorithm.uses, member.setting, f"algorithms.{i}.uses")
@@ -260,7 +260,7 @@ class StudyPlan(Document):
                 )
         for i, lived in enumerate(self.streams):
             try:
-                lived.stream.refuse_many_visits()
+                lived.stream.check_visits()
             except SpecError as error:
                 raise ValueError(f"streams.{i}.stream: {error}") from None
         return self

@@ -23,7 +23,7 @@ from sme_registry.spec.document import (
     Name,
     Real,
     SchemaVersion,
-    refuse_repeated_names,
+    check_names,
     short_repr,
 )
 from sme_registry.spec.sme_spec import Seed, Setting, SMESpec
@@ -126,7 +126,7 @@ class Suite(Document):
 
     @model_validator(mode="after")
     def _can_be_told_apart(self) -> Self:
-        refuse_no_class(self.classes, self.streams)
+        check_classes(self.classes, self.streams)
         return self
 
     @property
@@ -145,7 +145,7 @@ class Suite(Document):
         tasks = {member.name: len(member.seeds) for member in self.classes}
         return tasks | {member.name: len(member.draws) for member in self.streams}
 
-    def refuse_streams(self, what: str) -> None:
+    def check_no_streams(self, what: str) -> None:
         """Raise SpecError if the suite has streams."""
         if self.streams:
             names = ", ".join(member.name for member in self.streams)
@@ -155,15 +155,15 @@ class Suite(Document):
             )
 
 
-def refuse_no_class(classes: tuple[SuiteClass, ...], streams: tuple[StreamClass, ...]) -> None:
+def check_classes(classes: tuple[SuiteClass, ...], streams: tuple[StreamClass, ...]) -> None:
     """Raise ValueError, which Pydantic reports, without a class, or where names are equal."""
     if not classes and not streams:
         raise ValueError(
             "classes: must have at least 1 entry, unless there are streams. Add a class, or a "
             "stream."
         )
-    refuse_repeated_names("classes", classes)
-    refuse_repeated_names("streams", (*classes, *streams))
+    check_names("classes", classes)
+    check_names("streams", (*classes, *streams))
 
 
 class EvaluationProtocol(Document):

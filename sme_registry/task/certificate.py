@@ -211,7 +211,7 @@ def certify(task: Task | SpecLike, *, seed: int = 0) -> Certificate:
     lanes = max(256, min(_LANES, 2**24 // (S * A)))
     states = max(2_000, min(_STATES, 2**26 // (S + m + task.spec.hidden_width)))
     distractors = f", distractors={m}" if m else ""
-    memory.refuse_above_limit(
+    memory.check_limit(
         48 * max(lanes, states) * (S + A + m + task.spec.hidden_width),
         f"Certifying a task of state_dim={S}, action_dim={A}{distractors}",
         "Certify a task of the same kind with fewer channels.",

@@ -38,7 +38,7 @@ def materialize(spec: SMESpec, fingerprint: Fingerprint | None = None) -> Task:
     spec = as_spec(spec)
     sizes = ("state_dim", "action_dim", "complexity", "hidden_width")
     named = [*sizes, "distractors"] if spec.distractors else sizes
-    memory.refuse_above_limit(
+    memory.check_limit(
         memory.peak_bytes(spec),
         f"A task of {', '.join(f'{size}={getattr(spec, size)}' for size in named)}",
         "Make one of these smaller.",
@@ -129,7 +129,7 @@ def materialize_together(stream: StreamSpec, specs: Sequence[SMESpec]) -> tuple[
     """
     different = dict.fromkeys(specs)
     held = sum(map(memory.parameter_bytes, different))
-    memory.refuse_above_limit(
+    memory.check_limit(
         held + max(map(memory.peak_bytes, different)),
         f"A stream of {len(stream.phases)} phases with {len(different)} different tasks",
         "Use fewer phases or increments, or smaller tasks.",

@@ -41,7 +41,7 @@ def limit_bytes() -> int:
     raise OptionError(f"{LIMIT_VARIABLE}={text!r}: must be a positive number of GiB, such as 16.")
 
 
-def refuse_above_limit(needed: int, what: str, remedy: str) -> None:
+def check_limit(needed: int, what: str, remedy: str) -> None:
     """Raise ResourceLimitError, with both sizes, if `needed` bytes exceed the limit."""
     limit = limit_bytes()
     if needed > limit:

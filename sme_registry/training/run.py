@@ -272,7 +272,7 @@ def _steps(document: SMESpec | StreamSpec, steps: int | None) -> int:
             f"stream {catalogue.title(document)}. Leave it out, or make another stream, whose "
             "phases have other steps."
         )
-    document.refuse_many_visits()
+    document.check_visits()
     advice = "Make a stream with fewer cycles or phases, or with shorter ones."
     return integer_in("steps", document.steps, 1, MAX_STEPS, advice=advice)
 
