@@ -70,16 +70,14 @@ BAD_AGENTS = [
 ]
 BAD_SAFETY = [
     *[
-        (
-            {"tightness": tightness},
-            f"safety.tightness={tightness}: {words} in (0, 0.5]. Correct it.",
+        ({"tightness": tightness}, f"safety.tightness={tightness!r}: must be{kind} in (0, 0.5]. C")
+        for tightness, kind in (
+            (0, ""),
+            (0.51, ""),
+            (float("nan"), " a finite number"),
+            ("0.2", " a valid number"),
+            (True, " a valid number"),
         )
-        for tightness, words in {
-            0: "must be",
-            0.51: "must be",
-            float("nan"): "must be a finite number",
-            "0.2": "must be a valid number",
-        }.items()
     ],
     ({}, "safety.tightness: missing. Add it."),
     ({"tightness": 0.2, "tau": 0.2}, "safety.tau=0.2: unknown field."),
@@ -163,7 +161,7 @@ def test_all_errors_are_listed_at_once_by_the_constructor_too():
 
 def test_deriving_refuses_as_parsing_does_and_a_source_begins_its_error():
     for document in ([], None):
-        with pytest.raises(SpecError, match=r"^here\.json: must be an object of named fields"):
+        with pytest.raises(SpecError, match=r"^here\.json: \[\]: must be a valid dictionary"):
             SMESpec.from_dict(document, "here.json")
     with pytest.raises(SpecError, match=r"complexiti=3: unknown field\. Did you mean 'complexity'"):
         SMESpec().derive(complexiti=3)
@@ -186,7 +184,7 @@ def test_deriving_refuses_as_parsing_does_and_a_source_begins_its_error():
             "classes: the name 'a' appears twice.",
         ),
         (EvaluationProtocol, {"epsilons": [0.0]}, "epsilons=[0.0]: must increase, from above 0."),
-        (EvaluationProtocol, {"states_per_region": 1}, "states_per_region=1: must be an integer"),
+        (EvaluationProtocol, {"states_per_region": 1}, "states_per_region=1: must be in [2, "),
         (EnvFile, SMESpec().to_dict(), "digest: missing: must be the digest of the spec."),
         (
             EnvFile,
@@ -195,8 +193,8 @@ def test_deriving_refuses_as_parsing_does_and_a_source_begins_its_error():
         ),
         (EnvFile, {"name": "a b"}, "name='a b': must be a string of 1 to 64 letters, digits"),
         (EnvFile, {"digest": "sha256:AB"}, "digest='sha256:AB': must be 'sha256:' and 64"),
-        (EnvFile, {"description": "x" * 2001}, "must be a string of 0 to 2000 characters."),
-        (EnvFile, {"description": "\ud800"}, "description='\\ud800': must be a string"),
+        (EnvFile, {"description": "x" * 2001}, "must have at most 2000 characters."),
+        (EnvFile, {"description": "\ud800"}, "description='\\ud800': must be a valid string"),
         (EnvFile, {"tags": ["a b"]}, "tags.0='a b': "),
         (EnvFile, {"fingerprint": {"optimal_action": [["x"]]}}, "optimal_action.0.0='x': "),
     ],
