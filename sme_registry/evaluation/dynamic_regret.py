@@ -197,7 +197,6 @@ def _are_over(stream: StreamSpec, regret: DynamicRegret) -> npt.NDArray[np.bool_
 
 
 def _refuse_other_visits(stream: StreamSpec, regret: DynamicRegret) -> None:
-    """Raise OptionError if a life in this stream has other visits after as many steps."""
     P, end = len(stream.phases), regret.lifetime[-1]
     earliest, latest = visit_at(stream, np.array([max(0, end - stream.horizon), end - 1])) + 1
     reached = len(regret.visits)
@@ -248,7 +247,6 @@ def _divided(
 def _rows(
     step: npt.ArrayLike, length: npt.ArrayLike, regret: npt.ArrayLike
 ) -> tuple[_Integers, _Integers, Array]:
-    """The checked columns of a log, `[N]` each."""
     count = np.size(step)
     if count == 0:
         raise OptionError("step: has no rows. Give one or more finished episodes or steps.")
@@ -287,7 +285,7 @@ _BLOCKS = 1000  # of a life, in about equal parts of each visit
 
 
 class RegretBlocks:
-    """Sums of regret over blocks, while lives are lived."""
+    """Sums of regret over blocks, while lives are lived: `[blocks]` and `[blocks, lives]`."""
 
     def __init__(self, stream: StreamSpec, lives: int = 1) -> None:
         visits = stream.visits
@@ -306,7 +304,7 @@ class RegretBlocks:
         self.regret = np.zeros((len(self._ends), lives))
 
     def add(self, end: int, regret: Array, phase: npt.ArrayLike | None = None) -> None:
-        """Count steps."""
+        """Count the steps before a lifetime: `[n, lives]`, and `info['phase']` `[n]`."""
         before = end - len(regret) + np.arange(len(regret))
         blocks = np.searchsorted(self._ends, before, side="right")
         visits = np.searchsorted(self._visit_ends[:-1], before, side="right")
@@ -318,7 +316,6 @@ class RegretBlocks:
         np.add.at(self.regret, blocks, regret)
 
     def dynamic_regret(self, life: int = 0) -> DynamicRegret:
-        """The dynamic regret of a life."""
         counted = self.steps > 0
         steps = self.steps[counted]
         visits = np.searchsorted(self._last, np.flatnonzero(counted))
@@ -448,7 +445,6 @@ def reference_regret(
 def _policies(
     life: Sequence[Any], stream: StreamSpec, action_range: str | None, algorithm: str | None
 ) -> dict[int, Policy]:
-    """The policies of a life by their identity, prepared."""
     policies: dict[int, Policy] = {}
     for v, each in enumerate(life):
         if isinstance(each, RealNumber | np.bool_):

@@ -158,7 +158,6 @@ _POLICY_LIBRARIES = ("torch", "stable_baselines3", "onnxruntime")
 
 
 def versions_behind(oracle: Engine) -> dict[str, str]:
-    """The versions of the packages that an evaluation's numbers depend on."""
     numba = ["numba"] if oracle.backend == "numba" else []
     return versions(["numpy", "scipy", "gymnasium", *numba], if_imported=_POLICY_LIBRARIES)
 

@@ -116,7 +116,6 @@ class ErrorStats:
         self._clipped += clipped
 
     def relative_to(self, other: ErrorStats) -> float:
-        """The mean divided by that of another policy."""
         return self._mean / other._mean
 
     def report(
@@ -169,15 +168,12 @@ class ScopedErrors(dict[str, ErrorStats]):
 
 
 class SafetyStats:
-    """The sums behind a `SafetyScore`, over a region's states."""
-
     def __init__(self, task: Task) -> None:
         self._task = task
         self._states = self._violating = 0
         self._reward = self._safe_reward = self._cost = 0.0
 
     def add(self, a: Array, optimal: Array, limit: Array, safe_reward: Array) -> None:
-        """Add a batch."""
         task = self._task
         self._states += len(optimal)
         self._reward += float(task.reward_of(task.similarity_of(a, optimal)).sum())
@@ -186,7 +182,6 @@ class SafetyStats:
         self._violating += int((a - limit > TOLERANCE).any(axis=1).sum())
 
     def score(self, region: str) -> SafetyScore:
-        """The score in the region of this name."""
         return SafetyScore(
             name=region,
             step_reward=self._reward / self._states,
@@ -280,8 +275,6 @@ class _Batch(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What was measured in one region."""
-
     errors: dict[Key, ScopedErrors]
     safety: dict[tuple[Key, float], SafetyStats]  # by r_min; empty without safety
     distraction: Distraction

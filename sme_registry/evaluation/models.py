@@ -36,9 +36,9 @@ class Interface(NamedTuple):
 
     observation_dim: int
     action_dim: int
-    description: str
-    alternatives: str = ""
-    hint: str = ""
+    description: str  # what has these widths, such as "state_dim=3, action_dim=2"
+    alternatives: str = ""  # other forms that are allowed, for the error message
+    hint: str = ""  # see `Policy`
 
     def check(self, policy: str, **shapes: tuple[int, ...] | None) -> None:
         """Raise `PolicyError` if a known shape of `observations` or `actions` is another."""
@@ -53,7 +53,6 @@ class Interface(NamedTuple):
 
 
 def is_module(policy: Any) -> bool:
-    """Whether a policy is a `torch.nn.Module`."""
     nn = sys.modules.get("torch.nn")
     return nn is not None and isinstance(policy, nn.Module)
 
@@ -146,7 +145,6 @@ def advice_on(error: Exception) -> str:
 
 
 def device_of(module: Any) -> Any:
-    """The device of a module's parameters."""
     parameter = next(module.parameters(), None)
     return "cpu" if parameter is None else parameter.device
 
@@ -227,7 +225,6 @@ def _predicted(model: Any, observations: Observation, state: Any = None) -> tupl
 
 
 def check_not_normalised(model: Any) -> None:
-    """Raise `PolicyError` if a model was trained on observations normalised by VecNormalize."""
     normaliser = getattr(model, "get_vec_normalize_env", lambda: None)()
     if getattr(normaliser, "norm_obs", False):
         raise PolicyError(
@@ -341,7 +338,6 @@ def _algorithm_of(path: Path, fields: dict[str, Any]) -> str:
 
 
 def _full_name(algorithm: str) -> str:
-    """`module:class` of an algorithm that the user named."""
     if ":" in algorithm:
         return algorithm
     if algorithm.upper() not in _NAMES:
@@ -415,8 +411,6 @@ def load_onnx(path: str | os.PathLike[str], interface: Interface) -> OnnxNetwork
 
 
 class OnnxNetwork:
-    """An ONNX network: a function of observations."""
-
     def __init__(self, session: Any, path: Path) -> None:
         self._session, self._input = session, session.get_inputs()[0].name
         self.path = path
@@ -424,7 +418,6 @@ class OnnxNetwork:
         self.action_range = recorded if recorded in ACTION_RANGES else None
 
     def __call__(self, observations: Observation) -> Any:
-        """Actions `[B, A]` for observations `[B, O]`."""
         return self._session.run(None, {self._input: observations})[0]
 
 

@@ -90,12 +90,10 @@ class Perceptron:
 
     @property
     def observation_dim(self) -> int:
-        """O, entries of an observation."""
         return len(self.layers[0][0])
 
     @property
     def action_dim(self) -> int:
-        """A, entries of an action."""
         return len(self.layers[-1][1])
 
     def outputs(self, observations: Observation) -> Iterator[Weights]:
@@ -108,7 +106,6 @@ class Perceptron:
             yield x
 
     def hidden(self, observations: Observation) -> list[Weights]:
-        """The outputs `[B, out]` of each layer but the last."""
         return list(self.outputs(observations))[:-1]
 
     def __call__(self, observations: Observation) -> Weights:
@@ -171,21 +168,17 @@ class OfflinePolicy:
 
     @property
     def __name__(self) -> str:
-        """The algorithm, as reports call it."""
         return str(self.about.get("algorithm", "policy"))
 
     @property
     def observation_dim(self) -> int:
-        """O, entries of an observation."""
         return int(self.layers[0][0].shape[1])
 
     @property
     def action_dim(self) -> int:
-        """A, entries of an action."""
         return int(self.layers[-1][0].shape[0])
 
     def __call__(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Actions `[B, A]` float32 in [0, 1] for observations `[B, O]`."""
         x = np.asarray(observations, dtype=np.float32)
         if x.ndim != 2 or x.shape[1] != self.observation_dim:
             raise PolicyError(
@@ -200,7 +193,6 @@ class OfflinePolicy:
         return u
 
     def hidden(self, observations: npt.NDArray[np.float32]) -> Iterator[npt.NDArray[np.float32]]:
-        """The outputs `[B, H]` of each hidden layer."""
         x = observations
         for W, b in self.layers[:-1]:
             x = x @ W.T

@@ -111,12 +111,10 @@ class Policy:
 
 
 class Member(NamedTuple):
-    """One agent of a team policy."""
-
     agent: str
-    policy: Policy
-    observe: Callable[[Observation], Observation]
-    action_dim: int
+    policy: Policy  # its own, or the one that all agents share
+    observe: Callable[[Observation], Observation]  # `[B, S + 2]` to the policy's input, fresh
+    action_dim: int  # a_i, entries of the policy's action that belong to this agent
 
 
 @dataclass(frozen=True)
@@ -158,7 +156,6 @@ class TeamPolicy:
         return np.concatenate(joint, axis=1)
 
     def check_team(self, spec: SMESpec) -> None:
-        """Raise `PolicyError` if a task has other agents than this policy was prepared for."""
         prepared = [(member.agent, member.action_dim) for member in self.members]
         if prepared != [(agent.name, agent.action_dim) for agent in draw.agents(spec)]:
             raise PolicyError(
@@ -451,7 +448,6 @@ def stream_policy(
 
 
 def check_count(name: str, policies: Any, count: int, which: str) -> None:
-    """Raise OptionError unless an argument is a sequence of so many policies."""
     if not isinstance(policies, Sequence) or isinstance(policies, str) or len(policies) != count:
         given = f"{len(policies)} of them" if isinstance(policies, list | tuple) else repr(policies)
         raise OptionError(f"{name}={given:.60}: must be {count} policies, one {which}.")

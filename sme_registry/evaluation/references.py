@@ -53,7 +53,6 @@ LABELS = {
 
 
 def names(spec: SMESpec) -> tuple[str, ...]:
-    """The references of a task's reports."""
     return NAMES if spec.safety is None else (*NAMES, *SAFE_NAMES)
 
 
@@ -64,11 +63,9 @@ def fit_states(spec: SMESpec) -> int:
 
 @dataclass(frozen=True, eq=False)
 class References:
-    """The fitted references."""
-
-    constant: Array
-    slope: Array
-    intercept: Array
+    constant: Array  # `[A]` the best constant action
+    slope: Array  # `[S, A]` about the centre; 0 of channels that an agent does not observe
+    intercept: Array  # `[A]` the linear policy's action at the centre
 
     def linear(self, s: Array) -> Array:
         """The linear policy's actions `[B, A]` in states `[B, S]`, not clipped."""
@@ -99,7 +96,6 @@ def safe_actions(spec: SMESpec, optimal: Array, limit: Array) -> dict[str, Array
 def fit(
     s: Array, optimal: Array, agents: Iterable[tuple[Sequence[int], slice]] | None = None
 ) -> References:
-    """Fit the references to the optimal actions in states of WD."""
     S, A = s.shape[1], optimal.shape[1]
     slope, intercept = np.zeros((S, A)), np.empty(A)
     owned_by_observed: dict[tuple[int, ...], list[int]] = {}

@@ -40,7 +40,6 @@ BATCH_ROWS = 8192
 
 
 def region_name(region: int) -> str:
-    """The name of a region: `WD`, `OOD 1`, `OOD 2`, …"""
     return "WD" if region == 0 else f"OOD {region}"
 
 
@@ -96,7 +95,6 @@ class Uniform:
         self._bits = bit_generator(seed, name)
 
     def __call__(self, *shape: int) -> Array:
-        """The stream's next numbers, of this shape."""
         return to_uniform(self._bits.random_raw(int(np.prod(shape)))).reshape(shape)
 
 
@@ -109,7 +107,6 @@ class Points:
         self._shell = _Shell(protocol, region, dim, stream) if region > 0 else None
 
     def __call__(self, count: int) -> Observations:
-        """The next points, `[count, dim]` float32."""
         u = self._coordinates(count, self._dim)
         return u.astype(np.float32) if self._shell is None else self._shell.points(u)
 

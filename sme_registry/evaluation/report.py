@@ -224,7 +224,6 @@ class ReportFile(StrictModel):
 
 
 def as_text(table: Table) -> str:
-    """A table as plain text."""
     from rich.console import Console
 
     # Wide, so that no column wraps; a table is only as wide as its content.

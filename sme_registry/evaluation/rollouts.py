@@ -136,7 +136,6 @@ def rollouts(
 def _sums(
     batch: Batch, act: Callable[[Array, Observation], npt.NDArray[Any]], gamma: float
 ) -> Array:
-    """`[6 + agents, B]` sums over each lane's episode, in the order of `Rollouts`."""
     sums, weight = np.zeros((6 + len(batch.task.policies), batch.lanes)), 1.0
     for step in play(batch, act):
         values = step.result.values

@@ -185,7 +185,6 @@ class StreamReport(ReportFile):
         return known[name]
 
     def with_dynamic_regret(self, regret: DynamicRegret) -> Self:
-        """This report with the dynamic regret of the agent's training."""
         return self.model_copy(update={"dynamic_regret": regret})
 
     def with_reference_regret(self, references: Mapping[str, DynamicRegret]) -> Self:
@@ -292,7 +291,6 @@ def stream_regions(
     fresh: Array | None,
     references: Mapping[str, Array],
 ) -> tuple[tuple[StreamRegion, ...], StreamRegion]:
-    """The regions of a report, and the mean over the shells."""
     edges, states = protocol.edges, protocol.states_per_region
     names = [(region_name(k), *edge, states) for k, edge in enumerate(edges)]
     names.append((SHELLS, edges[1][0], edges[-1][1], states * (len(edges) - 1)))
@@ -405,7 +403,6 @@ def _of_logs(logs: Sequence[DynamicRegret], field: str) -> dict[str, Array]:
 
 
 def same_stream(reports: Sequence[StreamReport]) -> None:
-    """Raise OptionError unless there is a report, and all are of one stream and protocol."""
     if not reports:
         raise OptionError("reports: must be one or more stream reports. Give one for each seed.")
     streams = {report.stream_digest: report.stream for report in reports}

@@ -169,11 +169,9 @@ def _references(optima: Array, visits: int) -> dict[str, Array]:
 
 
 class Actor(NamedTuple):
-    """What is measured."""
-
-    acts: Policy | int
-    phases: Sequence[int]
-    where: str = ""
+    acts: Policy | int  # the index of a phase whose optimum acts
+    phases: Sequence[int]  # on whose tasks it is measured
+    where: str = ""  # what an error calls it, such as "policies[2]"
 
 
 def stream_regrets(

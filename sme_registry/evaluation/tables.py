@@ -41,7 +41,6 @@ SAFETY_LABELS = {
 
 
 def of_report(report: EvaluationReport) -> list[Table]:
-    """Every table that the report has numbers for."""
     tables = [of_regions(report)]
     if report.safety is not None:
         tables.append(of_safety(report, report.safety))
@@ -167,7 +166,6 @@ def _add(
     *,
     style: str | None = None,
 ) -> None:
-    """A row of one field of each region."""
     numbers = (format(getattr(region, field), pattern) for region in regions)
     table.add_row(label, *numbers, style=style)
 
