@@ -14,7 +14,7 @@ from __future__ import annotations
 import io
 import os
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -54,6 +54,16 @@ ACTIVATIONS: dict[str, Callable[..., Any]] = {
     "silu": _silu,
     "elu": _elu,
 }
+
+
+def _outputs(layers: Iterable[Layer], observations: Observation) -> Iterator[Weights]:
+    """The outputs `[B, out]` of each layer, in order."""
+    x: Weights = np.asarray(observations, np.float32)
+    for W, b, activation in layers:
+        x = x @ W
+        x += b
+        ACTIVATIONS[activation](x, out=x)
+        yield x
 
 
 class Perceptron:
@@ -98,12 +108,7 @@ class Perceptron:
 
     def outputs(self, observations: Observation) -> Iterator[Weights]:
         """The outputs `[B, out]` of each layer, in order; the last are not scaled to actions."""
-        x: Weights = np.asarray(observations, np.float32)
-        for W, b, activation in self.layers:
-            x = x @ W
-            x += b
-            ACTIVATIONS[activation](x, out=x)
-            yield x
+        return _outputs(self.layers, observations)
 
     def hidden(self, observations: Observation) -> list[Weights]:
         return list(self.outputs(observations))[:-1]
@@ -142,7 +147,7 @@ def _checked(index: int, layer: Any, width: int | None) -> Layer:
     return W, b, activation
 
 
-OfflineLayer = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
+OfflineLayer = tuple[Weights, Weights]
 
 KIND = "sme-offline-policy"
 _MAX_LAYERS = 64
@@ -178,27 +183,27 @@ class OfflinePolicy:
     def action_dim(self) -> int:
         return int(self.layers[-1][0].shape[0])
 
-    def __call__(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    def __call__(self, observations: Observation) -> Weights:
         x = np.asarray(observations, dtype=np.float32)
         if x.ndim != 2 or x.shape[1] != self.observation_dim:
             raise PolicyError(
                 f"observations of shape {x.shape}: must be [B, {self.observation_dim}]. Evaluate "
                 "the policy on the task it was trained for."
             )
-        *_, x = x, *self.hidden(x)
-        W, b = self.layers[-1]
-        u: npt.NDArray[np.float32] = np.tanh(x @ W.T + b)
+        *_, u = self._outputs(x)
         u += 1.0
         u *= 0.5
         return u
 
-    def hidden(self, observations: npt.NDArray[np.float32]) -> Iterator[npt.NDArray[np.float32]]:
-        x = observations
-        for W, b in self.layers[:-1]:
-            x = x @ W.T
-            x += b
-            np.maximum(x, 0.0, out=x)
-            yield x
+    def hidden(self, observations: Observation) -> list[Weights]:
+        return list(self._outputs(observations))[:-1]
+
+    def _outputs(self, observations: Observation) -> Iterator[Weights]:
+        last = len(self.layers) - 1
+        activations = ["tanh" if index == last else "relu" for index in range(last + 1)]
+        # Transposed views: copies would multiply in another order.
+        layers = [(W.T, b, f) for (W, b), f in zip(self.layers, activations, strict=True)]
+        return _outputs(layers, observations)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the file completely or not at all; equal policies give equal bytes."""
