@@ -20,7 +20,7 @@ from tests.leaderboard.sealed.playing import online_board
 def main(tickets: int = 50, requests: int = 400, kills: int = 20) -> None:
     member = {"name": "deep", "setting": {"state_dim": 2, "action_dim": 1, "complexity": 5}}
     member |= {"instances": 1, "budget": requests * LANES}
-    logging.getLogger("sme_registry.sealed").setLevel(logging.ERROR)  # each lost connection
+    logging.getLogger("sme_registry.seasons").setLevel(logging.ERROR)  # each lost connection
     with tempfile.TemporaryDirectory() as folder:
         board = online_board(Path(folder), classes=[member])
         seconds = step_through_kills(board, tickets, requests, kills)

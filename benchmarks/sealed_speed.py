@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from leaderboard.documents.keys import SigningKey
-from sme_registry import sealed
+from sme_registry import seasons
 from tests.leaderboard.sealed.killing import killable
 from tests.leaderboard.sealed.playing import online_board
 
@@ -83,14 +83,14 @@ class Taken(NamedTuple):
 def step(
     url: str,
     server: int,
-    ticket: sealed.Ticket,
+    ticket: seasons.Ticket,
     place: int,
     lanes: int,
     seconds: float,
     queue: multiprocessing.Queue[Taken],
 ) -> None:
     """Take steps for some seconds; puts what it has done."""
-    instance = sealed.Instance(url, ticket, place, lanes=lanes)
+    instance = seasons.Instance(url, ticket, place, lanes=lanes)
     instance.begin()
     actions = np.full((lanes, instance.setting.action_dim), 0.3, np.float32)
     windows, begun, used = [], time.perf_counter(), time.process_time()

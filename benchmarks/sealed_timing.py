@@ -28,7 +28,7 @@ from leaderboard.documents.season import SeasonClass
 from leaderboard.sealed.instance import SteppedInstance
 from leaderboard.sealed.stepping import Lanes, Start
 from sme_registry import EvaluationProtocol, SMESpec, materialize
-from sme_registry.sealed import StepFormat
+from sme_registry.seasons.wire import StepFormat
 
 SPEC = SMESpec(complexity=5, seed=20)
 START = Start(SPEC, 1)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from sme_registry import export as export
     from sme_registry import plots as plots
     from sme_registry import sb3 as sb3
-    from sme_registry import sealed as sealed
+    from sme_registry import seasons as seasons
     from sme_registry import spec as spec
     from sme_registry import statistics as statistics
     from sme_registry import studies as studies
@@ -90,7 +90,7 @@ _SUBMODULES = (
     "export",
     "plots",
     "sb3",
-    "sealed",
+    "seasons",
     "spec",
     "statistics",
     "studies",

@@ -40,7 +40,7 @@ def test_star_import_gives_the_public_names():
 
 
 SUBMODULES = [
-    "datasets", "diagnosis", "envs", "errors", "evaluation", "plots", "sb3", "sealed", "spec",
+    "datasets", "diagnosis", "envs", "errors", "evaluation", "plots", "sb3", "seasons", "spec",
     "statistics", "studies", "task", "teams", "testing", "training",
 ]  # fmt: skip
 

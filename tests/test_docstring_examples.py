@@ -18,7 +18,8 @@ from pydantic import BaseModel
 import sme_registry
 from sme_registry.datasets import make_dataset
 from sme_registry.evaluation import resolve_protocol
-from sme_registry.sealed import Ticket, TicketClass
+from sme_registry.seasons import Ticket
+from sme_registry.seasons.wire import TicketClass
 from sme_registry.spec import Setting, StreamSpec, StudyAlgorithm, StudyFile, StudyPlan, SuiteClass
 from sme_registry.studies import run_study
 from sme_registry.training import train

@@ -34,10 +34,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from sme_registry import sealed
+from sme_registry import seasons
 from sme_registry.datasets import SealedDataset
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.io import read_json
+from sme_registry.seasons import wire
 from sme_registry.spec import Setting
 
 Float32 = npt.NDArray[np.float32]
@@ -143,7 +144,7 @@ def fit(net: nn.Module, rows: Rows, steps: int, loss: Loss, *, anneal: bool) -> 
         adam.step()
 
 
-def explore(url: str, ticket: sealed.Ticket, number: int, file: Path, effort: int = 1) -> Optimum:
+def explore(url: str, ticket: seasons.Ticket, number: int, file: Path, effort: int = 1) -> Optimum:
     """Spend an instance's budget on measurements around the present guess, which they refine.
 
     With offsets ±δ that are larger than the guess's error, the distance is linear in the optimum:
@@ -157,7 +158,7 @@ def explore(url: str, ticket: sealed.Ticket, number: int, file: Path, effort: in
     Returns:
       The last guess.
     """
-    with sealed.Instance(url, ticket, number, lanes=LANES) as instance:
+    with seasons.Instance(url, ticket, number, lanes=LANES) as instance:
         setting, random = instance.setting, np.random.default_rng(number)
         _refuse_long_intervals(setting)
         net, offset = Optimum(setting, number), FIRST_OFFSET
@@ -230,14 +231,14 @@ def save(rows: Rows, file: Path) -> None:
 
 def play_online(url: str, file: Path, folder: Path, effort: int) -> None:
     """Play and answer all instances of a ticket."""
-    ticket = sealed.Ticket.read(file)
-    with sealed.Instance(url, ticket) as first:
+    ticket = seasons.Ticket.read(file)
+    with seasons.Instance(url, ticket) as first:
         phases = [each.phase for each in first.status().instances]
     for number, place in enumerate(ticket.places):
         if phases[number] != "answered":
             begun = time.process_time()
             net = explore(url, ticket, number, folder / f"{place.name}.rows.pt", effort)
-            sealed.answer(url, ticket, net.act, number)
+            seasons.answer(url, ticket, net.act, number)
             report(place.name, begun)
 
 
@@ -247,7 +248,7 @@ def play_offline(published: Path, folder: Path, effort: int) -> None:
     for member in season["classes"]:
         setting = Setting.from_dict(member["setting"])
         for number in range(member["instances"]):
-            begun, name = time.process_time(), sealed.instance_name(member["name"], number)
+            begun, name = time.process_time(), wire.instance_name(member["name"], number)
             data = SealedDataset.read(published / f"datasets/sealed/{season['id']}/{name}-v0")
             net = learn(data, setting, number, effort)
             np.save(folder / f"{name}.npy", net.act(np.load(published / f"challenges/{name}.npy")))

@@ -25,10 +25,11 @@ from typing import Any
 
 import numpy as np
 
-from sme_registry import sealed
+from sme_registry import seasons
 from sme_registry.datasets import SealedDataset
 from sme_registry.errors import BudgetSpentError, SMEError
 from sme_registry.io import read_json
+from sme_registry.seasons import wire
 
 SAVE_EVERY = 500  # steps, which are all that a killed player forgets
 BEST, NEIGHBOURS = 4, 8  # of the table: a quarter of the rows, by reward
@@ -56,7 +57,7 @@ def learn(algorithm: str, url: str, ticket: Path, number: int, file: Path) -> No
     import stable_baselines3
     from stable_baselines3.common.callbacks import BaseCallback
 
-    from sme_registry.sealed.sb3 import SealedVecEnv
+    from sme_registry.seasons.sb3 import SealedVecEnv
 
     env = SealedVecEnv(url, ticket, number, num_envs=LANES[algorithm])
     kind = getattr(stable_baselines3, algorithm.upper())
@@ -136,7 +137,7 @@ def main() -> int:
             season = read_json(arguments.published / "season.json")
             for member in season["classes"]:
                 for number in range(member["instances"]):
-                    name = sealed.instance_name(member["name"], number)
+                    name = wire.instance_name(member["name"], number)
                     file = arguments.out / f"{name}.npy"
                     answer_from_table(arguments.published, name, season["id"], file)
         else:
@@ -152,7 +153,7 @@ def play(arguments: argparse.Namespace) -> None:
     import torch
 
     torch.set_num_threads(1)  # networks this small are slower on several threads
-    for number, place in enumerate(sealed.Ticket.read(arguments.ticket).places):
+    for number, place in enumerate(seasons.Ticket.read(arguments.ticket).places):
         if place.name not in (arguments.instance or [place.name]):
             continue
         begun = time.process_time()

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from leaderboard.errors import Rejection
 from sme_registry.errors import ActionError, WireError
-from sme_registry.sealed import unpack_table
+from sme_registry.seasons.wire import unpack_table
 from sme_registry.spec import EvaluationProtocol, Setting
 
 Float32 = npt.NDArray[np.float32]

@@ -125,7 +125,8 @@ def enter(
 
 def _answers(policy: str, states: Path, setting: Any, action_range: str | None) -> bytes:
     """The file of answers: the given one, or a policy's actions in the challenge states."""
-    from sme_registry.sealed import actions_in, pack_table, prepare_policy, unpack_table
+    from sme_registry.seasons import actions_in, prepare_policy
+    from sme_registry.seasons.wire import pack_table, unpack_table
 
     given = answers_in(policy)
     if given is not None:

@@ -32,7 +32,8 @@ from sme_registry.io.tables import Table
 from sme_registry.io.terminal import Progress, err, out
 
 if TYPE_CHECKING:
-    from sme_registry.sealed import Place, Ticket
+    from sme_registry.seasons import Ticket
+    from sme_registry.seasons.wire import TicketPlace
 
 ServedBoard = Annotated[
     str, typer.Argument(metavar="URL", help="The URL of the board that serves the season.")
@@ -174,7 +175,7 @@ def answer(
     """
     import numpy as np
 
-    from sme_registry.sealed import Instance, Ticket, actions_in
+    from sme_registry.seasons import Instance, Ticket, actions_in
 
     if (policy is None) == (challenges is None):
         raise OptionError("POLICY, --challenges: one of the two must be given.")
@@ -218,9 +219,12 @@ def answer(
     out().print(f"{left} instances without answers" if left else "The ticket has ended.")
 
 
-def _prepared(policy: str, place: Place, action_range: str | None, algorithm: str | None) -> Any:
+def _prepared(
+    policy: str, place: TicketPlace, action_range: str | None, algorithm: str | None
+) -> Any:
     """A policy, or the array of actions in a file."""
-    from sme_registry.sealed import prepare_policy, unpack_table
+    from sme_registry.seasons import prepare_policy
+    from sme_registry.seasons.wire import unpack_table
 
     setting, given = place.member.setting, answers_in(policy)
     if given is not None:
@@ -229,7 +233,8 @@ def _prepared(policy: str, place: Place, action_range: str | None, algorithm: st
 
 
 def _write_challenges(url: str, ticket: Ticket, places: dict[str, int], folder: Path) -> None:
-    from sme_registry.sealed import Instance, pack_table
+    from sme_registry.seasons import Instance
+    from sme_registry.seasons.wire import pack_table
 
     refuse_unwritable(folder / "challenge.npy")
     with Progress("writing", len(places), console=err(), unit="challenges") as progress:

@@ -22,7 +22,7 @@ from leaderboard.documents.submission import (
     SignedDocument,
     SignedManifest,
 )
-from sme_registry.sealed import Signer, Statement
+from sme_registry.seasons.wire import Signer, Statement
 from sme_registry.spec import Digest, matching
 
 

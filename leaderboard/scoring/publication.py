@@ -24,7 +24,7 @@ from sme_registry.compiled import chosen_backend
 from sme_registry.datasets import DatasetRecipe, SealedDataset
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.io import build_folder, read_json, sha256_of, to_json, versions
-from sme_registry.sealed import instance_name, pack_table, table_bytes
+from sme_registry.seasons.wire import instance_name, pack_table, table_bytes
 
 Progress = Callable[[int, int], None]
 

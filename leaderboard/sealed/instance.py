@@ -25,7 +25,7 @@ from leaderboard.sealed.signatory import Signatory
 from leaderboard.sealed.stepping import Lanes, Start
 from sme_registry import EvaluationProtocol, io
 from sme_registry.errors import ActionError, SMEError, WireError
-from sme_registry.sealed import Begun, InstanceStatus, StepFormat, table_bytes
+from sme_registry.seasons.wire import InstanceStatus, StepFormat, table_bytes
 
 Phase = Literal["waiting", "stepping", "answering", "answered"]
 _MAX_SIGNED = 4096
@@ -210,7 +210,7 @@ class SteppedInstance:
             self._refuse_answered()
             observation = self._present(journal).observation
             assert self._format is not None  # with the lanes
-            return self._format.pack_begun(Begun(journal.requests, observation))
+            return self._format.pack_start(journal.requests, observation)
 
     def step(self, body: bytes) -> bytes:
         """Take the steps of a request, or answer the last one again.

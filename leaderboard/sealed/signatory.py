@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from leaderboard.documents.entry import SignedAnswers, SignedTicketRequest
 from leaderboard.errors import Rejection
 from sme_registry.errors import SpecError
-from sme_registry.sealed import Statement
+from sme_registry.seasons.wire import Statement
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.envs import SMEVectorEnv
-from sme_registry.sealed import Steps
+from sme_registry.seasons.wire import StepsAnswer
 from sme_registry.spec import SMESpec
 
 Floats = npt.NDArray[np.float32]
@@ -59,11 +59,11 @@ class Lanes:
         self._env = SMEVectorEnv(start.spec, lanes, autoreset_mode="SameStep")
         self.observation: Floats = self._env.reset(seed=start.seed)[0]
 
-    def step(self, actions: Floats) -> Steps:
+    def step(self, actions: Floats) -> StepsAnswer:
         """One step of every lane, of actions `[L, A]`, finite, which are clipped to [0, 1]."""
         return self._step(actions)[0]
 
-    def step_with_regret(self, actions: Floats) -> tuple[Steps, Regret]:
+    def step_with_regret(self, actions: Floats) -> tuple[StepsAnswer, Regret]:
         """`step`, and the regret of the steps, which no entrant is told."""
         steps, info = self._step(actions)
         ended = steps.terminated | steps.truncated
@@ -74,11 +74,13 @@ class Lanes:
         half = 1.0 - task.reward_of(task.similarity_of(np.array(0.5), info["optimal_action"]))
         return steps, Regret(float(info["regret"].sum()), float(half.sum()))
 
-    def _step(self, actions: Floats) -> tuple[Steps, dict[str, Any]]:
+    def _step(self, actions: Floats) -> tuple[StepsAnswer, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self._env.step(actions)
         self.observation = observation
         last = np.zeros_like(observation)
         if "final_obs" in info:
             ended = terminated | truncated
             last[ended] = np.stack(info["final_obs"][ended])
-        return Steps(observation, reward.astype(np.float32), terminated, truncated, last), info
+        return StepsAnswer(
+            observation, reward.astype(np.float32), terminated, truncated, last
+        ), info

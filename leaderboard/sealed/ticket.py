@@ -16,7 +16,8 @@ from leaderboard.sealed.instance import SteppedInstance
 from leaderboard.sealed.signatory import Signatory
 from leaderboard.sealed.stepping import Start
 from leaderboard.store import SealedRow, Store
-from sme_registry import sealed
+from sme_registry import seasons
+from sme_registry.seasons import wire
 
 
 def deadline(season: Season, row: SealedRow) -> datetime.datetime:
@@ -59,9 +60,9 @@ class RunningTicket:
         )
 
     @property
-    def document(self) -> sealed.Ticket:
+    def document(self) -> seasons.Ticket:
         """What the entrant gets; it holds the password."""
-        return sealed.Ticket.from_dict(
+        return seasons.Ticket.from_dict(
             {
                 "season": self._season.id,
                 "ticket": self.number,
@@ -99,9 +100,9 @@ class RunningTicket:
                 "had counts.",
             )
 
-    def status(self, now: float) -> sealed.TicketStatus:
+    def status(self, now: float) -> wire.TicketStatus:
         """How far the entrant is."""
-        return sealed.TicketStatus(
+        return wire.TicketStatus(
             ticket=self.number,
             phase="ended" if self.is_over(now) else "running",
             deadline=utc(self._deadline),
@@ -129,7 +130,7 @@ class RunningTicket:
         """
         self.instance(number).refuse_challenge()
         hidden = self.hidden(number)
-        return sealed.pack_table(challenge(hidden.spec, hidden.protocol))
+        return wire.pack_table(challenge(hidden.spec, hidden.protocol))
 
     def hidden(self, number: int) -> Instance:
         """What is hidden of instance i."""

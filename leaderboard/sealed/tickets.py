@@ -20,7 +20,7 @@ from leaderboard.sealed.scores import unplayed_result
 from leaderboard.sealed.ticket import RunningTicket
 from leaderboard.store import Store
 from sme_registry.io import file_lock
-from sme_registry.sealed import StepFormat, TicketStatus
+from sme_registry.seasons.wire import StepFormat, TicketStatus
 
 MOST_HELD_LANES, _FIXED_LANES, _WEIGHTS_OF_A_LANE = 2**17, 128, 100
 """In memory, of all instances together; what each takes besides its lanes, and its network.

@@ -22,7 +22,7 @@ from leaderboard.errors import TamperedError
 from leaderboard.store.files import read_document
 from leaderboard.store.log import LogEntry
 from leaderboard.store.rows import EntryRow, name_object, scores_of, scores_text
-from sme_registry.sealed import table_bytes
+from sme_registry.seasons.wire import table_bytes
 
 DERIVED = {"season": "digest", "sealed": "id", "answer": "digest || entry"}
 """Tables and their keys."""

@@ -25,7 +25,8 @@ from leaderboard.errors import CODES, BoardError, Rejection
 from leaderboard.intake import upload_header
 from sme_registry.errors import MalformedDocumentError, OptionError, SpecError
 from sme_registry.io import parse_json, printable, require_packages, server_address
-from sme_registry.sealed import Ticket, tickets_path
+from sme_registry.seasons import Ticket
+from sme_registry.seasons.wire import tickets_path
 
 if TYPE_CHECKING:
     import httpx

@@ -1,4 +1,4 @@
-"""`SeasonRoutes`: sealed seasons over HTTP; `sme_registry.sealed` defines the online messages.
+"""`SeasonRoutes`: sealed seasons over HTTP; `sme_registry.seasons` defines the online messages.
 
     GET  /api/seasons                                           the board's seasons
     GET  /api/seasons/{id}                                      one season, its state and its reveal
@@ -43,8 +43,9 @@ from leaderboard.store import SeasonRow, Store
 from leaderboard.web import limits
 from leaderboard.web.errors import HTTP_CODES, RequestError
 from leaderboard.web.quick import StepRequest
-from sme_registry import sealed
+from sme_registry import seasons
 from sme_registry.io import to_json
+from sme_registry.seasons import wire
 
 _SEASON = "/api/seasons/{season}"
 _TICKET = _SEASON + "/tickets/{ticket}"
@@ -163,7 +164,7 @@ class SeasonRoutes:
         text = await limits.read_document(request, "ticket")
         header = request.headers.get("Authorization")
 
-        def start() -> tuple[sealed.Ticket, bool]:
+        def start() -> tuple[seasons.Ticket, bool]:
             envelope = Envelope.read(text, SignedTicketRequest)
             intake.refuse_other_sender(self._store, envelope, header)
             number, new = intake.start_ticket(self._store, envelope, tickets.digest)
@@ -221,7 +222,7 @@ class SeasonRoutes:
         tickets, where = self.place(request.scope)
         owner = f"{tickets.season.id}/{where.ticket}"
         digest = await self._challenges.run(lambda: tickets.journal_digest(*where), owner)
-        return JSONResponse(sealed.JournalDigest(journal=digest).to_dict())
+        return JSONResponse(wire.JournalDigest(journal=digest).to_dict())
 
     async def answer(self, request: Request) -> Response:
         """Store the answers to a challenge."""
@@ -303,7 +304,7 @@ def _token(scope: Scope) -> str:
 
 
 def _without_scheme(authorization: str) -> str:
-    return authorization.removeprefix(sealed.bearer(""))
+    return authorization.removeprefix(wire.bearer(""))
 
 
 def _octets(data: bytes) -> Response:

@@ -17,7 +17,7 @@ from leaderboard.intake import entries
 from leaderboard.scoring.verify import verify
 from sme_registry.errors import SpecError
 from sme_registry.io import sha256_of
-from sme_registry.sealed import pack_table
+from sme_registry.seasons.wire import pack_table
 from tests.leaderboard.conftest import tiny_board
 from tests.leaderboard.sealing import NOTHING, manifest, moment, signed_entry, tiny_season
 from tests.leaderboard.serving import authorization, serving

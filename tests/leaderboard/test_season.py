@@ -34,7 +34,7 @@ from sme_registry.datasets import SealedDataset
 from sme_registry.errors import SMEError
 from sme_registry.evaluation import evaluate_many
 from sme_registry.io import sha256_of
-from sme_registry.sealed import pack_table, unpack_table
+from sme_registry.seasons.wire import pack_table, unpack_table
 from tests.leaderboard.conftest import tiny_board
 from tests.leaderboard.sealing import (
     MASTER,

@@ -12,7 +12,7 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.master import Master
 from leaderboard.scoring.publication import read_season
 from leaderboard.store import Store
-from sme_registry.sealed import pack_table, unpack_table
+from sme_registry.seasons.wire import pack_table, unpack_table
 from tests.leaderboard.conftest import linear_onnx, tiny_board
 from tests.leaderboard.sealing import tiny_terms
 from tests.leaderboard.serving import serving

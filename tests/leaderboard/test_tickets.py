@@ -12,7 +12,7 @@ from leaderboard.errors import BoardError
 from leaderboard.sealed.attendant import Attendant
 from leaderboard.store import Store
 from leaderboard.web import client
-from sme_registry.sealed import Instance, Ticket
+from sme_registry.seasons import Instance, Ticket
 from tests.leaderboard.sealed.playing import online_board
 from tests.leaderboard.serving import serving
 from tests.leaderboard.test_cli import board_command, fails

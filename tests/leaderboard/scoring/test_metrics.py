@@ -19,7 +19,7 @@ from leaderboard.scoring.sealed import (
 )
 from leaderboard.scoring.tables import EASY, table_regret
 from sme_registry import evaluate
-from sme_registry.sealed import pack_table
+from sme_registry.seasons.wire import pack_table
 from sme_registry.spec import Setting
 from tests.leaderboard.sealing import MASTER, tiny_season
 

@@ -22,7 +22,7 @@ from leaderboard.sealed.stepping import Lanes
 from leaderboard.sealed.ticket import RunningTicket
 from leaderboard.store import Store
 from leaderboard.web.serve import listen, url_of
-from sme_registry import sealed
+from sme_registry import seasons
 from tests.leaderboard.sealed.playing import LANES
 
 _SERVE = """
@@ -38,7 +38,7 @@ serve(board, port=int(port), workers=0, announce=lambda url: print(url, flush=Tr
 class Entrant:
     """One entrant's ticket, and what its server answered."""
 
-    ticket: sealed.Ticket
+    ticket: seasons.Ticket
     requests: int = 0
     seen: hashlib._Hash = field(default_factory=hashlib.sha256)
     error: BaseException | None = None
@@ -46,7 +46,7 @@ class Entrant:
     def play(self, url, requests, together):
         """Begin, and when all others have begun take random steps until so many are answered."""
         try:
-            instance = sealed.Instance(url, self.ticket, 0, lanes=LANES)
+            instance = seasons.Instance(url, self.ticket, 0, lanes=LANES)
             self.seen.update(instance.begin().tobytes())
             together.wait()
             for actions in actions_of(self.ticket.ticket, requests):

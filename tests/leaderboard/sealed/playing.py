@@ -19,8 +19,8 @@ from leaderboard.sealed import Tickets
 from leaderboard.sealed.scores import score_ticket
 from leaderboard.store import Store
 from leaderboard.web import client
-from sme_registry import sealed
 from sme_registry.io import sha256_of
+from sme_registry.seasons import wire
 from tests.leaderboard.conftest import tiny_board
 from tests.leaderboard.sealing import MASTER, NOTHING, signed_request, tiny_season
 
@@ -43,7 +43,7 @@ class Board(NamedTuple):
 
     def send(self, url, request, key):
         """What a served board answers to a request for a ticket that a key sends."""
-        path = url + sealed.tickets_path(self.season.id)
+        path = url + wire.tickets_path(self.season.id)
         headers = {"Authorization": upload_header(key, request.id, board=request.board)}
         return httpx.post(path, content=request.to_bytes(), headers=headers, trust_env=False)
 
@@ -114,7 +114,7 @@ class Played:
         self.tickets.finish(self.number, self.token, instance)
 
     def answer(self, table, instance=0):
-        data = table if isinstance(table, bytes) else sealed.pack_table(table)
+        data = table if isinstance(table, bytes) else wire.pack_table(table)
         journal = NOTHING
         with contextlib.suppress(Rejection):  # as long as steps may follow
             journal = self.tickets.journal_digest(self.number, self.token, instance)
@@ -125,7 +125,7 @@ class Played:
         """The entrant's, of these answers and this digest of the steps."""
         signer = self.request.signer(self.key)
         assert signer is not None
-        statement = sealed.Statement(
+        statement = wire.Statement(
             request=self.request.id,
             ticket=self.number,
             instance=instance,
@@ -143,5 +143,5 @@ class Played:
 
 def request(number, value=0.3, lanes=LANES):
     """The body of a request for steps whose actions are all the same."""
-    form = sealed.StepFormat(lanes, 2, 1)
+    form = wire.StepFormat(lanes, 2, 1)
     return form.pack_request(number, np.full((lanes, 1), value, np.float32))

@@ -14,8 +14,9 @@ from leaderboard.sealed.attendant import Attendant
 from leaderboard.sealed.scores import score_ticket
 from leaderboard.sealed.ticket import RunningTicket
 from leaderboard.store import Store
-from sme_registry import SMEError, materialize, sealed
+from sme_registry import SMEError, materialize, seasons
 from sme_registry.io import sha256_of
+from sme_registry.seasons import wire
 from tests.leaderboard.sealed.playing import LANES, online_board, playing, request
 from tests.leaderboard.sealing import MASTER
 from tests.leaderboard.serving import serving
@@ -47,13 +48,13 @@ def everything(url, board, client):
     signed = board.request(KEY)
     started = board.send(url, signed, KEY)
     yield started
-    ticket = sealed.Ticket.from_dict(started.json())
+    ticket = seasons.Ticket.from_dict(started.json())
     signer = signed.signer(KEY)
     assert signer is not None
-    token = {"Authorization": sealed.bearer(ticket.token)}
+    token = {"Authorization": wire.bearer(ticket.token)}
 
     def at(action):
-        return url + sealed.instance_path(board.season.id, 1, 0, action)
+        return url + wire.instance_path(board.season.id, 1, 0, action)
 
     def step(number, value=0.5):
         return client.post(at("steps"), content=request(number, value), headers=token)
@@ -61,7 +62,7 @@ def everything(url, board, client):
     yield client.get(f"{url}/api/seasons")
     yield client.get(f"{url}/api/seasons/{board.season.id}")
     yield client.get(f"{url}/api/log")
-    yield client.get(url + sealed.ticket_path(board.season.id, 1))
+    yield client.get(url + wire.ticket_path(board.season.id, 1))
     yield client.post(at("start?lanes=4"), headers=token)
     for number in range(1, 17):
         yield step(number)
@@ -71,11 +72,11 @@ def everything(url, board, client):
     yield client.post(at("start?lanes=x"), headers=token)
     yield client.get(at("challenge"), headers=token)
     yield client.put(at("answers"), content=b"x", headers=token)
-    answers = sealed.pack_table(np.full((300, 1), 0.5))
+    answers = wire.pack_table(np.full((300, 1), 0.5))
     yield client.put(at("answers"), content=answers, headers=token)
     journal = client.get(at("journal"), headers=token)
     yield journal
-    statement = sealed.Statement(
+    statement = wire.Statement(
         request=signer.request,
         ticket=1,
         instance=0,
@@ -84,7 +85,7 @@ def everything(url, board, client):
     )
     last = f"answers?signature={signer.sign(statement)}"
     yield client.put(at(last), content=answers, headers=token)
-    yield client.get(url + sealed.ticket_path(board.season.id, 1), headers=token)
+    yield client.get(url + wire.ticket_path(board.season.id, 1), headers=token)
 
 
 def test_no_answer_file_or_log_holds_a_secret(tmp_path, caplog):
@@ -119,12 +120,12 @@ def test_no_answer_file_or_log_holds_a_secret(tmp_path, caplog):
 def test_answers_to_steps_have_one_form(tmp_path):
     """The same head and size, whether episodes end or not, in any task."""
     board = online_board(tmp_path)
-    size, heads = sealed.StepFormat(LANES, 2, 1).answer_bytes, set()
+    size, heads = wire.StepFormat(LANES, 2, 1).answer_bytes, set()
     with serving(board.path, season_secrets=[board.secret]) as url, httpx.Client() as client:
         for nonce in range(2):
             ticket = board.ticket(url, KEY, nonce)
-            token = {"Authorization": sealed.bearer(ticket.token)}
-            at = url + sealed.instance_path(board.season.id, ticket.ticket, 0, "")
+            token = {"Authorization": wire.bearer(ticket.token)}
+            at = url + wire.instance_path(board.season.id, ticket.ticket, 0, "")
             client.post(at + "start?lanes=4", headers=token)
             for number in range(1, 17):
                 body = request(number, number / 16)

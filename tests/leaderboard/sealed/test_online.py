@@ -13,7 +13,8 @@ from leaderboard.errors import Rejection
 from leaderboard.intake import start_ticket, upload_header
 from leaderboard.sealed.scores import score_ticket
 from leaderboard.store import Store
-from sme_registry import sealed
+from sme_registry import seasons
+from sme_registry.seasons import wire
 from tests.leaderboard.sealed.killing import step_through_kills
 from tests.leaderboard.sealed.playing import LANES, online_board, request
 from tests.leaderboard.sealing import MASTER, SETTING, manifest, moment, tiny_season
@@ -54,7 +55,7 @@ def outcome(answer):
 
 def played(url, ticket, number, steps):
     """Random steps on an instance, then the constant ½ as answers."""
-    with sealed.Instance(url, ticket, number, lanes=LANES) as instance:
+    with seasons.Instance(url, ticket, number, lanes=LANES) as instance:
         instance.begin()
         random = np.random.default_rng(number)
         for _ in range(steps):
@@ -68,7 +69,7 @@ def test_a_ticket_of_any_season_is_played_and_then_scored_and_logged(url, board,
     ticket = second.ticket(url, key)
     assert (ticket.season, ticket.ticket) == ("second", 1)
     played(url, ticket, 0, 16)
-    with sealed.Instance(url, ticket, 1) as instance:
+    with seasons.Instance(url, ticket, 1) as instance:
         assert instance.status().phase == "running"
         played(url, ticket, 1, 5)
         assert instance.status().phase == "ended"
@@ -110,7 +111,7 @@ def test_a_request_that_others_read_is_no_password(url, board, key):
     request = board.request(key)
     started = board.send(url, request, key)
     assert started.status_code == 201
-    path = url + sealed.tickets_path(board.season.id)
+    path = url + wire.tickets_path(board.season.id)
     with Store.open(board.path, read_only=True) as store:
         folder = store.season_folder(board.season.digest)
     stored = folder.request(started.json()["ticket"])
@@ -195,7 +196,7 @@ def test_a_request_opens_no_ticket_of_another_season_or_board(board, key):
 
 
 def test_a_server_steps_only_online_seasons_whose_master_it_has(url, board, key):
-    offline = httpx.post(url + sealed.tickets_path("sealed-offline"), content=b"{}")
+    offline = httpx.post(url + wire.tickets_path("sealed-offline"), content=b"{}")
     assert outcome(offline) == (422, "season_track")
     with serving(board.path) as without:
         answer = board.send(without, board.request(key), key)
@@ -216,8 +217,8 @@ def test_a_server_steps_only_online_seasons_whose_master_it_has(url, board, key)
 def test_large_bodies_numbers_and_other_methods_are_refused(url, board, key):
     ticket = board.ticket(url, key)
     number = ticket.ticket
-    at = url + sealed.instance_path(board.season.id, number, 0, "")
-    token = {"Authorization": sealed.bearer(ticket.token)}
+    at = url + wire.instance_path(board.season.id, number, 0, "")
+    token = {"Authorization": wire.bearer(ticket.token)}
     with httpx.Client(trust_env=False, headers=token) as client:
         client.post(at + "start?lanes=4")
         answers = [
@@ -230,7 +231,7 @@ def test_large_bodies_numbers_and_other_methods_are_refused(url, board, key):
             client.post(at.replace(f"/{number}/", "/one/") + "steps"),
         ]
         assert client.put(at + "steps", content=request(1)).status_code == 405
-        status = client.get(url + sealed.ticket_path(board.season.id, number)).json()
+        status = client.get(url + wire.ticket_path(board.season.id, number)).json()
     assert [outcome(each) for each in answers] == [
         (413, "too_large"),
         (413, "too_large"),

@@ -15,8 +15,9 @@ from leaderboard.sealed.scores import score_ticket
 from leaderboard.sealed.stepping import Lanes, Start
 from leaderboard.store import Store
 from leaderboard.store.log import Log
-from sme_registry import SMESpec, sealed
+from sme_registry import SMESpec
 from sme_registry.envs import SMEEnv
+from sme_registry.seasons import wire
 from tests.leaderboard.sealed.playing import LANES, ROWS, online_board, playing
 from tests.leaderboard.sealing import AFTERWARDS, MASTER, moment, move_clock, signed_request
 
@@ -76,7 +77,7 @@ def test_altered_journals_and_answers_are_found(revealed, tmp_path):
 
 
 def replace_answers(folder):
-    (folder / "0.npy").write_bytes(sealed.pack_table(np.full((ROWS, 1), 0.75)))
+    (folder / "0.npy").write_bytes(wire.pack_table(np.full((ROWS, 1), 0.75)))
 
 
 def replace_journal(folder):

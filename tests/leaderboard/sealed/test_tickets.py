@@ -29,7 +29,7 @@ from leaderboard.store import played_bytes
 from leaderboard.store.files import to_bytes
 from sme_registry import materialize
 from sme_registry.io import sha256_of
-from sme_registry.sealed import StepFormat, pack_table, unpack_table
+from sme_registry.seasons.wire import StepFormat, pack_table, unpack_table
 from tests.leaderboard.conftest import tiny_board
 from tests.leaderboard.sealed.playing import LANES, ROWS, online_board, playing, request
 from tests.leaderboard.sealing import MASTER, NOTHING, SETTING, moment, tiny_season
@@ -100,9 +100,9 @@ def test_each_step_is_taken_once_whatever_happens(many, events, lanes):
         elif event == "release":
             many.tickets.ticket(many.number).instance(0).release()
         elif event == "start":
-            begun = form.unpack_begun(many.start(lanes))
-            assert begun.number == taken
-            np.testing.assert_array_equal(begun.observation, here.observation)
+            number, observation = form.unpack_start(many.start(lanes))
+            assert number == taken
+            np.testing.assert_array_equal(observation, here.observation)
         elif event == "again":
             if taken:
                 assert many.step(taken, 0.03 * taken, lanes=lanes) == last

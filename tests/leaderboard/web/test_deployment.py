@@ -18,7 +18,8 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.web import client, limits, serve
 from leaderboard.web.connections import Connections
 from leaderboard.web.seasons import SeasonRoutes
-from sme_registry import sealed
+from sme_registry import seasons
+from sme_registry.seasons import wire
 from tests.leaderboard.sealed.playing import online_board
 from tests.leaderboard.serving import serving
 from tests.leaderboard.web.site import boards
@@ -122,10 +123,10 @@ def test_only_steps_have_a_high_rate_and_no_body_is_larger_than_an_artefact():
     matched = {
         name
         for name in ("steps", "start", "challenge", "answers")
-        if re.search(location, sealed.instance_path("autumn", 12, 3, name))
+        if re.search(location, wire.instance_path("autumn", 12, 3, name))
     }
     assert matched == {"steps"}
-    assert not re.search(location, sealed.tickets_path("autumn"))
+    assert not re.search(location, wire.tickets_path("autumn"))
     assert {int(size) for size in re.findall(r"client_max_body_size (\d+)m;", text)} == {2, 9}
 
 
@@ -134,7 +135,7 @@ def test_steps_pass_through_nginx_without_the_application(tmp_path, monkeypatch)
     with (
         serving(season.path, season_secrets=[season.secret]) as upstream,
         proxied(tmp_path, urlsplit(upstream).netloc) as url,
-        sealed.Instance(url, season.ticket(upstream, SigningKey.generate()), 0, 4) as instance,
+        seasons.Instance(url, season.ticket(upstream, SigningKey.generate()), 0, 4) as instance,
     ):
         instance.begin()
         monkeypatch.delattr(SeasonRoutes, "place")

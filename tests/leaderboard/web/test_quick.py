@@ -11,16 +11,17 @@ import pytest
 from leaderboard.documents.keys import SigningKey
 from leaderboard.web.quick import step_request
 from leaderboard.web.seasons import SeasonRoutes
-from sme_registry import sealed
+from sme_registry import seasons
+from sme_registry.seasons import wire
 from tests.leaderboard.sealed.playing import online_board
 from tests.leaderboard.serving import serving
 
-WIRE = sealed.StepFormat(4, 2, 1)
+WIRE = wire.StepFormat(4, 2, 1)
 BODY = WIRE.pack_request(1, np.full((4, 1), 0.5, np.float32))
 
 
 def head_for(season, ticket, token):
-    path = sealed.instance_path(season, ticket, 0, "steps")
+    path = wire.instance_path(season, ticket, 0, "steps")
     return (
         f"POST {path} HTTP/1.1\r\nHost: board.example\r\nAuthorization: Bearer {token}\r\n"
         f"Content-Length: {len(BODY)}\r\n\r\n"
@@ -69,11 +70,11 @@ def test_steps_need_no_application_and_what_is_refused_is_answered_by_it(tmp_pat
     board = online_board(tmp_path)
     with serving(board.path, season_secrets=[board.secret]) as url:
         ticket = board.ticket(url, SigningKey.generate())
-        with sealed.Instance(url, ticket, 0, 4) as instance:
+        with seasons.Instance(url, ticket, 0, 4) as instance:
             instance.begin()
 
         def used():
-            with sealed.Instance(url, ticket, 0, 4) as instance:
+            with seasons.Instance(url, ticket, 0, 4) as instance:
                 return instance.status().instances[0].used
 
         def request(number, token=ticket.token):

@@ -13,14 +13,14 @@ from typer.testing import CliRunner
 
 from examples import cleanrl_style_ppo as cleanrl
 from leaderboard.cli import app
-from sme_registry import sealed
+from sme_registry import seasons
 from sme_registry.errors import OptionError, SealedError
 from sme_registry.sb3 import SMEVecEnv
-from sme_registry.sealed.sb3 import SealedVecEnv
-from sme_registry.sealed.wire import Steps
+from sme_registry.seasons.sb3 import SealedVecEnv
+from sme_registry.seasons.wire import StepsAnswer
 from sme_registry.training.learners import new_learner
 from tests.leaderboard.sealed.playing import ROWS
-from tests.sealed.server import BUDGET, serving_season
+from tests.seasons.server import BUDGET, serving_season
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -66,7 +66,7 @@ def test_an_episode_that_terminates_at_the_horizon_is_not_cut(server, monkeypatc
     hidden = SealedVecEnv(server.url, server.ticket, 0, 3)
     observation = hidden.reset()
     terminated, truncated = np.array([True, False, True]), np.array([True, True, False])
-    steps = Steps(observation, np.zeros(3, np.float32), terminated, truncated, observation)
+    steps = StepsAnswer(observation, np.zeros(3, np.float32), terminated, truncated, observation)
     monkeypatch.setattr(hidden._stepped, "step", lambda _: steps)
     *_, dones, infos = hidden.step(np.zeros((3, 2)))
     assert dones.all()
@@ -82,14 +82,14 @@ def test_this_project_s_trainers_learn_and_their_models_answer(server, algorithm
     model = new_learner(algorithm, env, seed=0, steps=64, hyperparameters=settings)
     model.learn(64)
     assert env.instance.number == 16
-    sealed.answer(server.url, server.ticket, model, 0)
+    seasons.answer(server.url, server.ticket, model, 0)
     assert server.answers(0).shape == (ROWS, 2)
     with pytest.raises(SealedError, match="instance_phase"):  # no more steps after the answers
         model.learn(64)
 
 
 def test_sb3_takes_the_single_environment(server):
-    env = Monitor(sealed.make(server.url, server.ticket, 1, action_range="symmetric"))
+    env = Monitor(seasons.make(server.url, server.ticket, 1, action_range="symmetric"))
     PPO("MlpPolicy", env, n_steps=16, batch_size=16, n_epochs=1, device="cpu").learn(16)
     assert env.unwrapped.instance.number == 16
 
@@ -98,7 +98,7 @@ def test_a_loop_of_one_file_learns(server, monkeypatch):
     monkeypatch.setattr(cleanrl, "ENVS", 4)
     monkeypatch.setattr(cleanrl, "ROLLOUT", 16)
     torch.manual_seed(0)
-    env = sealed.make_vec(server.url, server.ticket, 0, cleanrl.ENVS, action_range="symmetric")
+    env = seasons.make_vec(server.url, server.ticket, 0, cleanrl.ENVS, action_range="symmetric")
     agent = cleanrl.Agent(env.single_observation_space.shape[0], env.single_action_space.shape[0])
     optimiser = torch.optim.Adam(agent.parameters(), lr=1e-3)
     before = agent.mean_actions(env.reset(seed=0)[0])
@@ -111,7 +111,7 @@ def test_a_loop_of_one_file_learns(server, monkeypatch):
         observations = following
     cleanrl.learn(agent, optimiser, rollout, observations)
     assert not np.array_equal(agent.mean_actions(env.reset()[0]), before)
-    sealed.answer(server.url, server.ticket, agent.mean_actions, 0, action_range="symmetric")
+    seasons.answer(server.url, server.ticket, agent.mean_actions, 0, action_range="symmetric")
 
 
 def test_the_page_on_seasons_leads_from_a_ticket_to_its_end(server, tmp_path, monkeypatch):
@@ -123,7 +123,7 @@ def test_the_page_on_seasons_leads_from_a_ticket_to_its_end(server, tmp_path, mo
     assert "n_steps=256" in block
     block = block.replace("n_steps=256", f"n_steps={BUDGET // 8}, n_epochs=1")
     exec(compile(block.replace("https://board.example", server.url), "page", "exec"), {})
-    with sealed.Instance(server.url, server.ticket) as first:
+    with seasons.Instance(server.url, server.ticket) as first:
         used = [each.used for each in first.status().instances]
         assert used == [BUDGET, BUDGET, 8]
         command = re.search(r"^sme-leaderboard (answer .*)$", page, re.M)[1]

@@ -1,32 +1,71 @@
-"""`Instance`: one hidden task of a ticket, stepped and answered over the network."""
+"""`Instance`: one hidden task of a ticket, stepped and answered over the network.
+
+Its `Connection` repeats requests until they are answered. No request of this protocol has a further
+effect when it is repeated (`wire`), so a lost connection or a server that is being restarted costs
+time and nothing else.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import http.client
+import logging
 import os
+import random
+import ssl
+import time
 from typing import Any, TypeVar
+from urllib.parse import urlsplit
+from urllib.request import getproxies, proxy_bypass
 
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.errors import MalformedDocumentError, PolicyError, SealedError, SpecError
+from sme_registry.errors import (
+    BudgetSpentError,
+    MalformedDocumentError,
+    PolicyError,
+    SealedError,
+    SpecError,
+)
 from sme_registry.evaluation import Policy, as_policy
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.evaluation.regions import batch_rows
-from sme_registry.io import integer_in, parse_json, sha256_of
-from sme_registry.sealed.connection import PATIENCE, Connection
-from sme_registry.sealed.signing import Statement, require_signatures
-from sme_registry.sealed.ticket import JournalDigest, Ticket, TicketStatus
-from sme_registry.sealed.wire import (
+from sme_registry.io import (
+    integer_in,
+    number_in,
+    parse_json,
+    printable,
+    server_address,
+    sha256_of,
+)
+from sme_registry.seasons.wire import (
     Float32,
+    JournalDigest,
+    Statement,
     StepFormat,
-    Steps,
+    StepsAnswer,
+    Ticket,
+    TicketStatus,
+    bearer,
     instance_path,
     pack_table,
+    require_signatures,
     ticket_path,
     unpack_table,
 )
 from sme_registry.spec import Setting, SMESpec, StrictModel
+
+PATIENCE = 900.0
+_FIRST_PATIENCE = 5.0  # a mistyped URL shall not wait for a server that does not exist
+_TIMEOUT = 300.0  # to accept a connection, or send more: a restarted server replays all steps
+_FIRST_WAIT, _LONGEST_WAIT = 0.1, 15.0
+_TRANSIENT = frozenset({408, 502, 503, 504, 507})
+_JSON_BYTES = 2**20
+_TYPE = "application/octet-stream"
+
+_log = logging.getLogger(__name__)
+_now, _sleep = time.monotonic, time.sleep
 
 TicketLike = Ticket | str | os.PathLike[str]
 _Document = TypeVar("_Document", bound=StrictModel)
@@ -36,8 +75,138 @@ WITHOUT_TASK = ("constant", "constant_half", "random", "uniform_random")
 """Reference policies that are the same on each task."""
 
 
-def as_ticket(ticket: TicketLike) -> Ticket:
-    return ticket if isinstance(ticket, Ticket) else Ticket.read(ticket)
+class Connection:
+    """An HTTP connection to a server, kept open between requests. Not for several threads.
+
+    A request is repeated for `patience` seconds after the first answer has shown that the server
+    exists. `insecure` allows plain http to other machines, in a network that you trust.
+    """
+
+    def __init__(
+        self, url: str, token: str, *, insecure: bool = False, patience: float = PATIENCE
+    ) -> None:
+        self._http: http.client.HTTPConnection | None = None
+        self._address = server_address(url, insecure=insecure)
+        self._patience = number_in("patience", patience, 0.0)
+        self._headers = {"Authorization": bearer(token), "Content-Type": _TYPE}
+        self._answered = False
+
+    def request(self, method: str, path: str, body: bytes = b"", *, most: int) -> bytes:
+        """The body of the answer to a request, of at most `most` bytes.
+
+        A refusal, no answer, and a longer one are SealedErrors; BudgetSpentError if it is for
+        steps and the instance has none left.
+        """
+        wait, started = _FIRST_WAIT, _now()
+        while True:
+            reused = self._http is not None
+            try:
+                status, data = self._exchange(method, path, body, most)
+            except ssl.SSLCertVerificationError as error:
+                raise SealedError("unreachable", f"{self._address.url}: {error}.") from None
+            except (OSError, http.client.HTTPException) as error:
+                reason = str(error) or type(error).__name__
+                if reused:  # a server closes connections that have been idle
+                    continue
+            else:
+                self._answered = True
+                if status in (200, 201):
+                    return data
+                code, message = _reason_in(data, status)
+                if status not in _TRANSIENT:
+                    kind = BudgetSpentError if code == "budget_spent" else SealedError
+                    raise kind(code, message)
+                reason = f"{code}: {message}"
+            patience = self._patience if self._answered else min(self._patience, _FIRST_PATIENCE)
+            if _now() + wait > started + patience:
+                raise SealedError(
+                    "unreachable",
+                    f"{self._address.url}: gives no answer: {reason:.500} Check the URL and try "
+                    "again: no step is lost, or taken twice.",
+                )
+            _log.warning("%s: no answer, trying again: %.200s", self._address.url, reason)
+            # Clients that lost the same server do not all come back at the same moment.
+            _sleep(wait * random.uniform(0.5, 1.0))
+            wait = min(2 * wait, _LONGEST_WAIT)
+
+    def close(self) -> None:
+        if self._http is not None:
+            self._http.close()
+            self._http = None
+
+    def __del__(self) -> None:  # few users close their environments
+        self.close()
+
+    def _exchange(self, method: str, path: str, body: bytes, most: int) -> tuple[int, bytes]:
+        if self._http is None:
+            self._http = self._new()
+        try:
+            self._http.request(method, self._address.path + path, body, self._headers)
+            with self._http.getresponse() as answer:
+                data = answer.read(max(most, _JSON_BYTES) + 1)
+                if len(data) > max(most, _JSON_BYTES):
+                    raise SealedError(
+                        "wire", f"{self._address.url}: answered with more than {most:,} bytes."
+                    )
+                if answer.length:  # `read` does not raise where the connection was lost
+                    raise http.client.IncompleteRead(data, answer.length)
+        except BaseException:  # an interrupt, too: the rest of this answer is none to the next
+            self.close()
+            raise
+        if answer.will_close:
+            self.close()
+        return answer.status, data
+
+    def _new(self) -> http.client.HTTPConnection:
+        """A new connection, through the proxy that the environment names, if there is one."""
+        address = self._address
+        if not address.is_https:
+            return _InOnePiece(address.host, address.port, timeout=_TIMEOUT)
+        proxy = urlsplit(getproxies().get("https", ""))
+        if address.is_local or not proxy.hostname or proxy_bypass(address.host):
+            return _SecureInOnePiece(address.host, address.port, timeout=_TIMEOUT)
+        connection = _SecureInOnePiece(proxy.hostname, proxy.port, timeout=_TIMEOUT)
+        connection.set_tunnel(address.host, address.port)
+        return connection
+
+
+class _InOnePiece(http.client.HTTPConnection):
+    """Sends a request's head and body together: the head alone wakes the server for nothing."""
+
+    _pieces: list[bytes] | None = None
+
+    def request(self, *args: Any, **kwargs: Any) -> None:
+        if self.sock is None:
+            self.connect()
+        self._pieces = []
+        try:
+            super().request(*args, **kwargs)
+            data = b"".join(self._pieces)
+        finally:
+            self._pieces = None
+        self.send(data)
+
+    def send(self, data: Any) -> None:
+        if self._pieces is None:
+            super().send(data)
+        else:
+            self._pieces.append(data)
+
+
+class _SecureInOnePiece(_InOnePiece, http.client.HTTPSConnection):
+    """The same over TLS."""
+
+
+def _reason_in(data: bytes, status: int) -> tuple[str, str]:
+    """The code and the message in a refusal."""
+    try:
+        plain: Any = parse_json(data, "answer")
+    except MalformedDocumentError:
+        plain = None
+    match plain:
+        case {"code": str(code), "message": str(message)}:
+            return printable(code), printable(message)
+    return "http", f"answered with HTTP status {status}. Check the URL."
 
 
 class Instance:
@@ -53,7 +222,7 @@ class Instance:
       number: of the last steps that were taken; 0 before the first.
 
     Examples:
-      >>> from sme_registry.sealed import Instance
+      >>> from sme_registry.seasons import Instance
       >>> Instance("https://board.example", "ticket.json", lanes=4).setting.complexity
       10
     """
@@ -68,7 +237,7 @@ class Instance:
         insecure: bool = False,
         patience: float = PATIENCE,
     ) -> None:
-        ticket = as_ticket(ticket)
+        ticket = ticket if isinstance(ticket, Ticket) else Ticket.read(ticket)
         member = ticket.place(instance).member
         self.setting: Setting = member.setting
         self.budget = member.budget
@@ -86,7 +255,7 @@ class Instance:
 
     @property
     def steps_left(self) -> int:
-        """Steps of the budget that are left, over all lanes."""
+        """StepsAnswer of the budget that are left, over all lanes."""
         return self.budget - self.number * self.lanes
 
     def begin(self) -> Float32:
@@ -96,7 +265,7 @@ class Instance:
         this instance, whichever process asked for them.
         """
         data = self._request("POST", f"start?lanes={self.lanes}", most=self._format.answer_bytes)
-        number, observation = self._format.unpack_begun(data)
+        number, observation = self._format.unpack_start(data)
         if number == 0:
             self._taken = hashlib.sha256()
         elif number != self.number:
@@ -104,7 +273,7 @@ class Instance:
         self.number = number
         return observation
 
-    def step(self, actions: npt.NDArray[np.floating]) -> Steps:
+    def step(self, actions: npt.NDArray[np.floating]) -> StepsAnswer:
         """One step of every lane by finite actions `[L, A]` in [0, 1]; call `begin` first."""
         body = self._format.pack_request(self.number + 1, actions)
         try:
@@ -153,7 +322,7 @@ class Instance:
         """The status of the whole ticket."""
         path = ticket_path(self._ticket.season, self._ticket.ticket)
         data = self._connection.request("GET", path, most=_MAX_STATUS)
-        return parse_answer(TicketStatus, data)
+        return _parse_answer(TicketStatus, data)
 
     def __enter__(self) -> Instance:
         return self
@@ -166,7 +335,7 @@ class Instance:
 
     def _journal_digest(self) -> str:
         """That of the server's journal, compared with the steps as far as they are known here."""
-        found = parse_answer(JournalDigest, self._request("GET", "journal")).journal
+        found = _parse_answer(JournalDigest, self._request("GET", "journal")).journal
         if self._taken is not None and found != f"sha256:{self._taken.hexdigest()}":
             raise SealedError(
                 "journal",
@@ -198,7 +367,7 @@ def answer(
     The other arguments are those of `make` and `prepare_policy`.
 
     Examples:
-      >>> from sme_registry.sealed import answer
+      >>> from sme_registry.seasons import answer
       >>> answer("https://board.example", "ticket.json", "constant", instance=2)
       Traceback (most recent call last):
       ...
@@ -223,7 +392,7 @@ def prepare_policy(
     A reference policy that depends on the hidden task is refused.
 
     Examples:
-      >>> from sme_registry.sealed import prepare_policy
+      >>> from sme_registry.seasons import prepare_policy
       >>> from sme_registry.spec import Setting
       >>> prepare_policy("constant", Setting())(np.zeros((1, 10), np.float32))
       array([[0.5, 0.5, 0.5, 0.5]])
@@ -243,7 +412,7 @@ def actions_in(states: Float32, policy: Any, setting: Setting) -> Float32:
     """A policy's actions `[rows, A]` in challenge states `[rows, S + 2]`: finite, not clipped.
 
     Examples:
-      >>> from sme_registry.sealed import actions_in
+      >>> from sme_registry.seasons import actions_in
       >>> from sme_registry.spec import Setting
       >>> actions_in(np.zeros((3, 10), np.float32), "constant", Setting()).shape
       (3, 4)
@@ -258,7 +427,7 @@ def _any_spec(setting: Setting) -> SMESpec:
     return SMESpec.from_dict({**setting.to_dict(), "seed": 0})
 
 
-def parse_answer(kind: type[_Document], data: bytes) -> _Document:
+def _parse_answer(kind: type[_Document], data: bytes) -> _Document:
     try:
         return kind.from_dict(parse_json(data, "answer"))
     except (MalformedDocumentError, SpecError) as error:

@@ -1,7 +1,7 @@
 """`SealedVecEnv`: a hidden task for Stable-Baselines3's algorithms.
 
 from stable_baselines3 import PPO
-from sme_registry.sealed.sb3 import SealedVecEnv
+from sme_registry.seasons.sb3 import SealedVecEnv
 env = SealedVecEnv("https://board.example", "ticket.json", instance=0, num_envs=8)
 PPO("MlpPolicy", env).learn(env.instance.steps_left)
 """
@@ -16,14 +16,13 @@ import numpy as np
 from sme_registry.envs.types import Observation
 from sme_registry.sb3 import LanesVecEnv
 from sme_registry.sb3.vec_env import StepResult
-from sme_registry.sealed.connection import PATIENCE
-from sme_registry.sealed.envs import Lanes
-from sme_registry.sealed.instance import Instance, TicketLike
+from sme_registry.seasons.client import PATIENCE, Instance, TicketLike
+from sme_registry.seasons.envs import HiddenEnvs
 from sme_registry.spec import ActionRange
 
 
 class SealedVecEnv(LanesVecEnv):
-    """The lanes of a hidden task, as SB3's `VecEnv`; arguments as in `sealed.make_vec`.
+    """The lanes of a hidden task, as SB3's `VecEnv`; arguments as in `seasons.make_vec`.
 
     As in `SMEVecEnv`, a finished lane begins its next episode at once. The server draws the initial
     states: seeds have no effect on them. `reset` within an episode does not end it. The default
@@ -44,7 +43,7 @@ class SealedVecEnv(LanesVecEnv):
         self.instance = Instance(
             url, ticket, instance, num_envs, insecure=insecure, patience=patience
         )
-        self._stepped = Lanes(self.instance, action_range)
+        self._stepped = HiddenEnvs(self.instance, action_range)
         shared = {
             "render_mode": None, "spec": None,
             "action_space": self._stepped.action_space,

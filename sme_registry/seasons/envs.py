@@ -12,13 +12,12 @@ from gymnasium.vector.utils import batch_space
 from sme_registry.envs import arguments
 from sme_registry.envs.types import Action, Array, Mask, Observation
 from sme_registry.errors import EpisodeError, OptionError
-from sme_registry.sealed.connection import PATIENCE
-from sme_registry.sealed.instance import Instance, TicketLike
-from sme_registry.sealed.wire import Float32, Steps
+from sme_registry.seasons.client import PATIENCE, Instance, TicketLike
+from sme_registry.seasons.wire import Float32, StepsAnswer
 from sme_registry.spec import ActionRange
 
 
-class Lanes:
+class HiddenEnvs:
     """The lanes of an instance: actions of an environment's range in, what the server shows out."""
 
     def __init__(self, instance: Instance, action_range: ActionRange) -> None:
@@ -42,7 +41,7 @@ class Lanes:
         self._has_begun = True
         return observation
 
-    def step(self, actions: Any) -> Steps:
+    def step(self, actions: Any) -> StepsAnswer:
         if not self._has_begun:
             raise EpisodeError("step: the episodes have not begun. Call reset() first.")
         unit = arguments.to_unit(actions, self._shape, self._rescaled)
@@ -59,7 +58,7 @@ class SealedEnv(gymnasium.Env[Observation, Action]):
     returns the present observation, also in a new process that goes on where another one stopped.
 
     Examples:
-      >>> from sme_registry.sealed import Instance, SealedEnv
+      >>> from sme_registry.seasons import Instance, SealedEnv
       >>> env = SealedEnv(Instance("https://board.example", "ticket.json"), "symmetric")
       >>> float(env.action_space.low[0])
       -1.0
@@ -68,7 +67,7 @@ class SealedEnv(gymnasium.Env[Observation, Action]):
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
 
     def __init__(self, instance: Instance, action_range: ActionRange = "unit") -> None:
-        self._lanes = Lanes(instance, action_range)
+        self._lanes = HiddenEnvs(instance, action_range)
         self.action_space = cast("gymnasium.Space[Action]", self._lanes.action_space)
         self.observation_space = self._lanes.observation_space
         self._next: Observation | None = None  # the first of the next episode
@@ -112,14 +111,14 @@ class SealedVectorEnv(VectorEnv[Observation, Array, Array]):
     ended one is in `infos["final_obs"]`. Seeds and resets are as in `SealedEnv`.
 
     Examples:
-      >>> from sme_registry.sealed import Instance, SealedVectorEnv
+      >>> from sme_registry.seasons import Instance, SealedVectorEnv
       >>> envs = SealedVectorEnv(Instance("https://board.example", "ticket.json", lanes=4))
       >>> envs.num_envs
       4
     """
 
     def __init__(self, instance: Instance, action_range: ActionRange = "unit") -> None:
-        self._lanes = Lanes(instance, action_range)
+        self._lanes = HiddenEnvs(instance, action_range)
         self.num_envs = instance.lanes
         self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
         self.single_action_space = self._lanes.action_space
@@ -181,8 +180,8 @@ def make(
       patience: seconds for which a request is repeated while the server gives no answer.
 
     Examples:
-      >>> from sme_registry import sealed
-      >>> env = sealed.make("https://board.example", "ticket.json")
+      >>> from sme_registry import seasons
+      >>> env = seasons.make("https://board.example", "ticket.json")
       >>> env.observation_space.shape
       (10,)
     """
@@ -206,8 +205,8 @@ def make_vec(
     arguments are those of `make`.
 
     Examples:
-      >>> from sme_registry import sealed
-      >>> envs = sealed.make_vec("https://board.example", "ticket.json", num_envs=4)
+      >>> from sme_registry import seasons
+      >>> envs = seasons.make_vec("https://board.example", "ticket.json", num_envs=4)
       >>> envs.observation_space.shape
       (4, 10)
     """

@@ -17,7 +17,7 @@ from leaderboard.scoring.sealed import instances
 from leaderboard.sealed.attendant import Attendant
 from leaderboard.store import Store
 from sme_registry.envs import SMEVectorEnv
-from sme_registry.sealed import Ticket
+from sme_registry.seasons import Ticket
 from tests.leaderboard.sealed.playing import Board, online_board
 from tests.leaderboard.sealing import MASTER
 from tests.leaderboard.serving import serving

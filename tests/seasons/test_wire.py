@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from sme_registry.errors import ActionError, OptionError, SpecError, WireError
-from sme_registry.sealed import (
-    Begun,
+from sme_registry.seasons import Ticket
+from sme_registry.seasons.wire import (
     StepFormat,
-    Steps,
-    Ticket,
+    StepsAnswer,
     TicketStatus,
     instance_path,
     pack_table,
@@ -50,13 +49,13 @@ def test_an_address_has_the_season_the_ticket_and_the_instance():
 
 
 def test_the_answer_to_start_arrives_and_has_one_size():
-    data = FORMAT.pack_begun(Begun(2**40, random(LANES, S + 2)))
-    begun = FORMAT.unpack_begun(data)
-    assert begun.number == 2**40
-    assert np.array_equal(begun.observation, random(LANES, S + 2))
+    data = FORMAT.pack_start(2**40, random(LANES, S + 2))
+    number, observation = FORMAT.unpack_start(data)
+    assert number == 2**40
+    assert np.array_equal(observation, random(LANES, S + 2))
     for other in (b"", data[:-4], data + bytes(4 * LANES)):
         with pytest.raises(WireError, match="start: has"):
-            FORMAT.unpack_begun(other)
+            FORMAT.unpack_start(other)
 
 
 def test_numbers_and_actions_arrive_from_double_precision_too():
@@ -76,7 +75,7 @@ def test_the_bytes_of_a_request_are_little_endian():
 
 
 def steps(terminated, truncated):
-    return Steps(
+    return StepsAnswer(
         random(LANES, S + 2), random(LANES), np.array(terminated), np.array(truncated),
         random(LANES, S + 2)[::-1],
     )  # fmt: skip

@@ -12,7 +12,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from leaderboard.scoring.sealed import challenge
-from sme_registry import sealed
+from sme_registry import seasons
 from sme_registry.errors import (
     ActionError,
     BudgetSpentError,
@@ -22,10 +22,10 @@ from sme_registry.errors import (
     SealedError,
 )
 from sme_registry.evaluation.references import NAMES, SHORT_NAMES
-from sme_registry.sealed import Instance, Ticket, actions_in, connection
+from sme_registry.seasons import Instance, Ticket, actions_in, client, wire
 from sme_registry.spec import Setting
 from tests.leaderboard.sealed.playing import ROWS
-from tests.sealed.server import BUDGET, serving_season
+from tests.seasons.server import BUDGET, serving_season
 
 WAYS_TO_FAIL = ["lose request", "lose answer", "cut answer", "503", "507"]
 
@@ -34,7 +34,7 @@ WAYS_TO_FAIL = ["lose request", "lose answer", "cut answer", "503", "507"]
 def waits(monkeypatch):
     """How long the client would have waited between attempts."""
     waited = []
-    monkeypatch.setattr(connection, "_sleep", waited.append)
+    monkeypatch.setattr(client, "_sleep", waited.append)
     return waited
 
 
@@ -57,7 +57,7 @@ def random_actions(lanes, count, low=0.0):
 @pytest.mark.parametrize("action_range", ["unit", "symmetric"])
 def test_a_hidden_task_is_stepped_as_the_same_task_is_here(server, action_range):
     here = server.local(1, 3, action_range)
-    hidden = sealed.make_vec(server.url, server.ticket, 1, 3, action_range=action_range)
+    hidden = seasons.make_vec(server.url, server.ticket, 1, 3, action_range=action_range)
     for name in ("action_space", "observation_space", "single_action_space", "num_envs"):
         assert getattr(hidden, name) == getattr(here, name)
     assert hidden.metadata["autoreset_mode"] == here.metadata["autoreset_mode"]
@@ -82,7 +82,7 @@ def test_a_hidden_task_is_stepped_as_the_same_task_is_here(server, action_range)
 
 
 def test_a_single_environment_has_episodes(server):
-    here, hidden = server.local(0, 1), sealed.make(server.url, server.ticket)
+    here, hidden = server.local(0, 1), seasons.make(server.url, server.ticket)
     assert np.array_equal(hidden.reset()[0], here._batch.observe()[0])
     ended = 0
     for actions in random_actions(1, 20):
@@ -103,7 +103,7 @@ def test_a_single_environment_has_episodes(server):
 
 
 def test_a_single_environment_passes_gymnasium_s_checks(server):
-    hidden = sealed.make(server.url, server.ticket)
+    hidden = seasons.make(server.url, server.ticket)
     # Gymnasium's checker seeds resets and expects the same states, which the server draws.
     with pytest.raises(AssertionError, match="seed"):
         check_env(hidden, skip_render_check=True)
@@ -115,7 +115,7 @@ def test_a_single_environment_passes_gymnasium_s_checks(server):
 
 @pytest.mark.parametrize("fault", WAYS_TO_FAIL)
 def test_no_step_is_lost_or_taken_twice(server, fault):
-    here, hidden = server.local(0, 2), sealed.make_vec(server.url, server.ticket, 0, 2)
+    here, hidden = server.local(0, 2), seasons.make_vec(server.url, server.ticket, 0, 2)
     hidden.reset()
     for actions in random_actions(2, 10):
         server.faults = [fault, fault]
@@ -126,7 +126,7 @@ def test_no_step_is_lost_or_taken_twice(server, fault):
 
 
 def test_a_request_is_sent_in_one_piece(server, monkeypatch):
-    hidden = sealed.make(server.url, server.ticket)
+    hidden = seasons.make(server.url, server.ticket)
     hidden.reset()
     sent, send = [], socket.socket.sendall
 
@@ -161,7 +161,7 @@ def test_another_process_goes_on_where_one_was_killed(server):
 
 
 def test_after_an_interrupted_step_a_reset_goes_on(server, monkeypatch):
-    hidden = sealed.make_vec(server.behind, server.ticket, 0, 2)  # the relay is a client, too
+    hidden = seasons.make_vec(server.behind, server.ticket, 0, 2)  # the relay is a client, too
     hidden.reset()
     first, second, third = random_actions(2, 3)
     read = http.client.HTTPResponse.read
@@ -189,8 +189,8 @@ def test_refusals_have_the_server_s_codes(server):
         Instance(server.url, server.ticket, 0, 257)
     another_s = Ticket.from_dict({**server.ticket.to_dict(), "token": "cd" * 32})
     with pytest.raises(SealedError, match="token_wrong"):
-        sealed.make(server.url, another_s).reset()
-    hidden = sealed.make_vec(server.url, server.ticket, 2, 2)
+        seasons.make(server.url, another_s).reset()
+    hidden = seasons.make_vec(server.url, server.ticket, 2, 2)
     hidden.reset()
     for _ in range(4):
         hidden.step(np.zeros((2, 2)))
@@ -201,7 +201,7 @@ def test_refusals_have_the_server_s_codes(server):
 
 
 def test_invalid_actions_are_not_sent(server):
-    hidden = sealed.make_vec(server.url, server.ticket, 0, 2)
+    hidden = seasons.make_vec(server.url, server.ticket, 0, 2)
     hidden.reset()
     before = len(server.requests)
     for actions in (np.zeros((3, 2)), np.zeros(2), np.full((2, 2), np.nan), [["a", "b"]] * 2):
@@ -211,13 +211,13 @@ def test_invalid_actions_are_not_sent(server):
 
 
 def test_steps_need_a_reset_and_resets_have_no_options(server):
-    hidden = sealed.make(server.url, server.ticket)
+    hidden = seasons.make(server.url, server.ticket)
     with pytest.raises(EpisodeError, match="Call reset"):
         hidden.step(np.zeros(2))
     with pytest.raises(OptionError, match="the server draws the states"):
         hidden.reset(options={"state": np.zeros(3)})
     with pytest.raises(PolicyError):  # nor does a policy that cannot be used end the stepping
-        sealed.answer(server.url, server.ticket, "missing.zip")
+        seasons.answer(server.url, server.ticket, "missing.zip")
     assert server.requests == []
 
 
@@ -235,15 +235,15 @@ def test_a_server_that_cannot_be_reached_is_reported_soon(
         raise error
 
     clock = iter(range(1000))
-    monkeypatch.setattr(connection, "_now", lambda: float(next(clock)))
-    monkeypatch.setattr(connection.http.client.HTTPConnection, "connect", fails)
+    monkeypatch.setattr(client, "_now", lambda: float(next(clock)))
+    monkeypatch.setattr(client.http.client.HTTPConnection, "connect", fails)
     with pytest.raises(SealedError, match=message):
-        sealed.make(server.url, server.ticket).reset()
+        seasons.make(server.url, server.ticket).reset()
     assert least <= len(waits) <= most
 
 
 def test_a_server_that_stops_is_waited_for_until_patience_ends(server, waits, monkeypatch):
-    hidden = sealed.make(server.url, server.ticket)
+    hidden = seasons.make(server.url, server.ticket)
     hidden.reset()
     server.faults = ["lose request"]
     hidden.step(np.zeros(2))
@@ -254,10 +254,10 @@ def test_a_server_that_stops_is_waited_for_until_patience_ends(server, waits, mo
     assert waits[0] <= 0.1
     assert 7.5 <= waits[-1] <= 15.0
     assert len(set(waits[-2:])) == 2  # clients of one server do not come back together
-    hidden = sealed.make(server.url, server.ticket, patience=3.0)
+    hidden = seasons.make(server.url, server.ticket, patience=3.0)
     hidden.reset()
     clock = iter(range(1000))
-    monkeypatch.setattr(connection, "_now", lambda: float(next(clock)))
+    monkeypatch.setattr(client, "_now", lambda: float(next(clock)))
     server.faults = ["503"] * 20
     with pytest.raises(SealedError, match="unreachable"):
         hidden.step(np.zeros(2))
@@ -267,10 +267,10 @@ def test_a_server_that_stops_is_waited_for_until_patience_ends(server, waits, mo
 
 
 def test_an_answer_that_is_too_long_is_not_read_to_its_end(server, monkeypatch):
-    monkeypatch.setattr(connection, "_JSON_BYTES", 10)
-    path = sealed.ticket_path(server.ticket.season, server.ticket.ticket)
+    monkeypatch.setattr(client, "_JSON_BYTES", 10)
+    path = wire.ticket_path(server.ticket.season, server.ticket.ticket)
     with pytest.raises(SealedError, match=r"wire: .* answered with more than 20 bytes"):
-        connection.Connection(server.url, server.ticket.token).request("GET", path, most=20)
+        client.Connection(server.url, server.ticket.token).request("GET", path, most=20)
 
 
 def test_answers_are_the_policy_s_actions_in_the_challenge_states(server, tmp_path):
@@ -281,7 +281,7 @@ def test_answers_are_the_policy_s_actions_in_the_challenge_states(server, tmp_pa
 
     path = server.ticket.write(tmp_path / "ticket.json")
     for ticket in (path, server.ticket):  # answers may be repeated
-        sealed.answer(server.url, ticket, policy, 1, action_range="symmetric")
+        seasons.answer(server.url, ticket, policy, 1, action_range="symmetric")
     assert server.answers(1).shape == (ROWS, 2)
     with Instance(server.url, server.ticket) as first:
         status = first.status()
@@ -350,7 +350,7 @@ def test_a_policy_in_any_form_that_evaluate_takes_answers_unless_it_needs_the_ta
 
 def test_nothing_of_the_token_is_in_an_error_or_a_repr(server):
     server.faults = ["418"]
-    hidden = sealed.make(server.url, server.ticket)
+    hidden = seasons.make(server.url, server.ticket)
     with pytest.raises(SealedError) as caught:
         hidden.reset()
     for text in (str(caught.value), repr(hidden), repr(hidden.instance), repr(server.ticket)):

@@ -1,0 +1,427 @@
+"""What a sealed-online season's server and its clients send each other: documents and raw arrays.
+
+    POST /api/seasons/{id}/tickets                                       a ticket
+    GET  /api/seasons/{id}/tickets/{n}                                   its status
+    POST /api/seasons/{id}/tickets/{n}/instances/{i}/start?lanes=L       begin, or go on
+    POST /api/seasons/{id}/tickets/{n}/instances/{i}/steps               one step of all lanes
+    POST /api/seasons/{id}/tickets/{n}/instances/{i}/finish              take no more steps
+    GET  /api/seasons/{id}/tickets/{n}/instances/{i}/challenge           challenge states, .npy
+    GET  /api/seasons/{id}/tickets/{n}/instances/{i}/journal             digest of all steps, JSON
+    PUT  /api/seasons/{id}/tickets/{n}/instances/{i}/answers?signature=  an action for each, .npy
+
+Each but the first has the ticket's token as `Authorization: Bearer`. Every request may be repeated
+after a lost answer: none has a further effect. Numbers are little-endian; L are the lanes, S and A
+the state and action channels.
+
+    start, answer    uint64 number of the last steps, float32 [L, S + 2] present observations
+    steps, request   uint64 number: 1, 2, …           float32 [L, A] actions in [0, 1]
+    steps, answer                                     float32 [L, 2(S + 2) + 2] in the columns
+
+        S + 2    observation, of the next episode where this step ended one
+        1        reward
+        1        ends: 0 none, 1 terminated, 2 truncated, 3 both
+        S + 2    last observation of the episode that ended; 0 where none did
+
+So no size depends on a state. The same steps with the same number get the same answer; other
+actions with that number, and numbers further ahead, are refused.
+
+Arrays travel as .npy files of version 1.0, type `<f4`, C order and two axes; nothing else is read.
+
+Answers are signed, so that no board can replace them, or the steps, unnoticed:
+
+    signature = Ed25519(key, "sme-leaderboard/answers/" board "/" digest of the `Statement`)
+
+The request for the ticket names the key's public half, and is signed by the entrant's own key. The
+ticket's file has the private half, so that a machine can step and answer without the entrant's.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field
+
+from sme_registry.envs.types import Mask, Observation
+from sme_registry.errors import ActionError, OptionError, WireError
+from sme_registry.io import integer_in, read_json, require_packages, to_json
+from sme_registry.io.files import atomic_file, unwritable
+from sme_registry.spec import (
+    Digest,
+    Document,
+    Integer,
+    Name,
+    Setting,
+    StrictModel,
+    TupleOf,
+    matching,
+)
+
+Float32 = npt.NDArray[np.float32]
+
+TERMINATED, TRUNCATED = 1, 2
+_FLOAT, _NUMBER_BYTES = np.dtype("<f4"), 8
+_MAGIC = b"\x93NUMPY\x01\x00"
+_MAX_HEADER = 1024
+_HEADER = re.compile(
+    rb"\{'descr': '<f4', 'fortran_order': False, 'shape': \((\d{1,9}), (\d{1,9})\), \} *\n"
+)
+_Hex = Annotated[str, matching(r"^[0-9a-f]{64}$", "64 hex digits")]
+_Secret = Annotated[_Hex, Field(repr=False)]
+_Count = Annotated[Integer, Field(ge=0)]
+
+
+class Statement(Document):
+    """What an entrant signs of one instance.
+
+    Attributes:
+      request: id of the request for the ticket, which names the season and the key.
+      ticket, instance: their numbers.
+      answers: SHA-256 of the answers' .npy file.
+      journal: SHA-256 of the bodies of all requests for steps, in order.
+    """
+
+    request: Digest
+    ticket: _Count
+    instance: _Count
+    answers: Digest
+    journal: Digest
+
+
+class Signer(Document):
+    """The key of a ticket's answers; `repr` does not show it.
+
+    Attributes:
+      board: public key of the board.
+      request: id of the request for the ticket.
+      key: Ed25519's 32 private bytes.
+    """
+
+    board: _Hex
+    request: Digest
+    key: _Secret
+
+    def sign(self, statement: Statement) -> str:
+        """The signature of a statement, 128 hex digits; requires PyNaCl."""
+        require_signatures()
+        from nacl.signing import SigningKey
+
+        message = f"sme-leaderboard/answers/{self.board}/{statement.digest}".encode()
+        return SigningKey(bytes.fromhex(self.key)).sign(message).signature.hex()
+
+
+def require_signatures() -> None:
+    require_packages("signatures", {"nacl": "PyNaCl"}, "leaderboard")
+
+
+class TicketClass(StrictModel):
+    """A class of the season, as far as an entrant knows it.
+
+    Attributes:
+      setting: all of a spec but its seed.
+      instances: number of hidden tasks.
+      budget: steps on each instance, over all lanes.
+      name: of the class.
+    """
+
+    name: Name
+    setting: Setting
+    instances: Annotated[Integer, Field(ge=1)]
+    budget: Annotated[Integer, Field(ge=1)]
+
+
+def instance_name(class_name: str, instance: int) -> str:
+    """What files and commands call a hidden instance, such as `deep-0`; it counts from 0."""
+    return f"{class_name}-{instance}"
+
+
+class TicketPlace(NamedTuple):
+    """An instance of a ticket: its class, and its number in it, from 0."""
+
+    member: TicketClass
+    instance: int
+
+    @property
+    def name(self) -> str:
+        return instance_name(self.member.name, self.instance)
+
+
+class Ticket(StrictModel):
+    """The answer to a request for a ticket, and the file that an entrant keeps of it.
+
+    Attributes:
+      season: the season's id.
+      ticket: its number in the season.
+      token: the password for its instances; whoever has it can take the steps.
+      deadline: until when answers count, in UTC.
+      lanes: the most copies of an instance that are stepped together.
+      classes: instance i of the ticket counts over all of them, class by class.
+      signer: signs the answers; null in a server's answer, which does not know the key.
+
+    Examples:
+      >>> from sme_registry.seasons import Ticket
+      >>> [place.name for place in Ticket.read("ticket.json").places]
+      ['deep-0', 'deep-1']
+    """
+
+    season: Name
+    ticket: _Count
+    token: _Secret
+    deadline: Annotated[str, Field(max_length=40)]
+    lanes: Annotated[Integer, Field(ge=1)]
+    classes: Annotated[TupleOf[TicketClass], Field(min_length=1)]
+    signer: Signer | None = None
+
+    @property
+    def places(self) -> Iterator[TicketPlace]:
+        for member in self.classes:
+            for instance in range(member.instances):
+                yield TicketPlace(member, instance)
+
+    def place(self, instance: int) -> TicketPlace:
+        """Instance i of the ticket."""
+        places = list(self.places)
+        return places[integer_in("instance", instance, 0, len(places) - 1)]
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Ticket:
+        return cls.from_dict(read_json(path), os.fspath(path))
+
+    def write(self, path: str | os.PathLike[str]) -> Path:
+        """Write the ticket into a new file that only its owner can read."""
+        path = Path(path)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_file(path, new=True) as stream:
+                with contextlib.suppress(OSError, AttributeError):  # no modes on this system
+                    os.fchmod(stream.fileno(), 0o600)
+                stream.write(to_json(self.to_dict()).encode())
+        except FileExistsError:
+            raise OptionError(
+                f"{path} already exists and is not replaced: its token is in no other file. Give "
+                "another path."
+            ) from None
+        except OSError as error:
+            raise unwritable(path, error) from None
+        return path
+
+
+class InstanceStatus(StrictModel):
+    """How far a ticket is on one of its instances.
+
+    Attributes:
+      phase: no step taken; steps are taken; no more are, and answers are expected; answered.
+      lanes: copies that are stepped together; null before `start`.
+      requests: number of the last steps that were taken.
+      used: steps of the budget that were taken, over all lanes.
+    """
+
+    phase: Literal["waiting", "stepping", "answering", "answered"]
+    lanes: Annotated[Integer, Field(ge=1)] | None
+    requests: _Count
+    used: _Count
+
+
+class JournalDigest(StrictModel):
+    """The answer to a request for the digest of an instance's steps, once no more can follow.
+
+    Attributes:
+      journal: SHA-256 of the bodies of all requests for steps, in order.
+    """
+
+    journal: Digest
+
+
+class TicketStatus(StrictModel):
+    """The answer to a request for a ticket's status.
+
+    Attributes:
+      ticket: its number in the season.
+      phase: "ended" once every instance is answered, or the deadline has passed.
+      deadline: until when answers count, in UTC.
+      instances: in the ticket's order.
+    """
+
+    ticket: _Count
+    phase: Literal["running", "ended"]
+    deadline: Annotated[str, Field(max_length=40)]
+    instances: TupleOf[InstanceStatus]
+
+
+def tickets_path(season: str) -> str:
+    """Where tickets of a season are requested."""
+    return f"/api/seasons/{season}/tickets"
+
+
+def ticket_path(season: str, ticket: int) -> str:
+    return f"{tickets_path(season)}/{ticket}"
+
+
+def instance_path(season: str, ticket: int, instance: int, action: str) -> str:
+    """The address of an action on an instance, such as `start` or `steps`."""
+    return f"{ticket_path(season, ticket)}/instances/{instance}/{action}"
+
+
+def bearer(token: str) -> str:
+    """The value of the header `Authorization`."""
+    return f"Bearer {token}"
+
+
+class StepsAnswer(NamedTuple):
+    """The answer to `steps`.
+
+    Attributes:
+      observation: `[L, S + 2]`, of the next episode in lanes whose episode ended.
+      reward: `[L]` float32.
+      terminated, truncated: `[L]`.
+      last_observation: `[L, S + 2]` of the episode that ended; 0 in the other lanes.
+    """
+
+    observation: Observation
+    reward: Float32
+    terminated: Mask
+    truncated: Mask
+    last_observation: Observation
+
+
+@dataclass(frozen=True)
+class StepFormat:
+    """The messages of an instance that is stepped in some number of lanes."""
+
+    lanes: int
+    state_dim: int
+    action_dim: int
+
+    @property
+    def request_bytes(self) -> int:
+        return _NUMBER_BYTES + _FLOAT.itemsize * self.lanes * self.action_dim
+
+    @property
+    def answer_bytes(self) -> int:
+        return _FLOAT.itemsize * self.lanes * (2 * self._width + 2)
+
+    @property
+    def _width(self) -> int:
+        return self.state_dim + 2
+
+    def pack_start(self, number: int, observation: Observation) -> bytes:
+        return _packed_number(number) + _packed(observation)
+
+    def unpack_start(self, data: bytes) -> tuple[int, Observation]:
+        """The number of the last steps, and the present observations `[L, S + 2]`."""
+        expected = _NUMBER_BYTES + _FLOAT.itemsize * self.lanes * self._width
+        _check_size("start", data, expected)
+        observation = np.frombuffer(data, _FLOAT, offset=_NUMBER_BYTES)
+        return _number_in(data), _native(observation.reshape(self.lanes, -1))
+
+    def pack_request(self, number: int, actions: npt.NDArray[np.floating]) -> bytes:
+        return _packed_number(number) + _packed(actions)
+
+    def unpack_request(self, data: bytes) -> tuple[int, Float32]:
+        """The number and the actions `[L, A]` in the body of `steps`; finite, not clipped."""
+        _check_size("steps", data, self.request_bytes)
+        actions = np.frombuffer(data, _FLOAT, offset=_NUMBER_BYTES)
+        _refuse_not_finite(actions)
+        return _number_in(data), _native(actions.reshape(self.lanes, -1))
+
+    def pack_steps(self, steps: StepsAnswer) -> bytes:
+        width = self._width
+        table = np.empty((self.lanes, 2 * width + 2), _FLOAT)
+        table[:, :width] = steps.observation
+        table[:, width] = steps.reward
+        table[:, width + 1] = TERMINATED * steps.terminated + TRUNCATED * steps.truncated
+        table[:, width + 2 :] = steps.last_observation
+        return table.tobytes()
+
+    def unpack_steps(self, data: bytes) -> StepsAnswer:
+        """The answer to `steps` in these bytes, as fresh arrays."""
+        _check_size("steps", data, self.answer_bytes)
+        width = self._width
+        table = _native(np.frombuffer(data, _FLOAT).reshape(self.lanes, -1))
+        ends = table[:, width + 1]
+        flags = np.zeros(self.lanes, np.int8)
+        for flag in (TERMINATED, TRUNCATED, TERMINATED | TRUNCATED):
+            flags[ends == flag] = flag
+        if not np.array_equal(flags, ends):
+            raise WireError(
+                "steps: the ends of episodes must be 0, 1, 2 or 3. Check the server's version."
+            )
+        return StepsAnswer(
+            observation=table[:, :width].copy(),
+            reward=table[:, width].copy(),
+            terminated=(flags & TERMINATED).astype(bool),
+            truncated=(flags & TRUNCATED).astype(bool),
+            last_observation=table[:, width + 2 :].copy(),
+        )
+
+
+def pack_table(table: npt.NDArray[np.floating]) -> bytes:
+    """A table `[rows, columns]` as the bytes of an .npy file of float32."""
+    rows, columns = table.shape
+    text = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({rows}, {columns}), }}"
+    # The data begin at a multiple of 64 bytes, as the format asks.
+    padding = -(len(_MAGIC) + 2 + len(text) + 1) % 64
+    header = text.encode() + b" " * padding + b"\n"
+    return _MAGIC + len(header).to_bytes(2, "little") + header + _packed(table)
+
+
+def table_bytes(rows: int, columns: int) -> int:
+    """The most bytes that the .npy file of a table of this shape has."""
+    return len(_MAGIC) + 2 + _MAX_HEADER + _FLOAT.itemsize * rows * columns
+
+
+def unpack_table(data: bytes, columns: int, rows: int | None = None) -> Float32:
+    """The table `[rows, columns]` in the bytes of an .npy file, whose reading runs no code.
+
+    A fresh array of float32, every entry finite; `rows` None accepts any number of them.
+    """
+    start = len(_MAGIC) + 2
+    size = int.from_bytes(data[len(_MAGIC) : start], "little")
+    header = _HEADER.fullmatch(data, start, start + size) if size <= _MAX_HEADER else None
+    if not data.startswith(_MAGIC) or header is None:
+        raise WireError(
+            "array: must be an .npy file of version 1.0 with an array of type '<f4', in C order "
+            "and with two axes. Write it with numpy.save(file, array.astype('<f4'))."
+        )
+    shape = int(header[1]), int(header[2])
+    wanted = shape[0] if rows is None else rows, columns
+    if shape != wanted:
+        raise WireError(f"array of shape {shape}: must be of shape {wanted}.")
+    _check_size("array", data, start + size + _FLOAT.itemsize * shape[0] * shape[1])
+    entries = np.frombuffer(data, _FLOAT, offset=start + size)
+    _refuse_not_finite(entries)
+    return _native(entries.reshape(shape))
+
+
+def _packed(array: npt.NDArray[np.floating]) -> bytes:
+    return array.astype(_FLOAT, copy=False).tobytes()
+
+
+def _packed_number(number: int) -> bytes:
+    return number.to_bytes(_NUMBER_BYTES, "little")
+
+
+def _number_in(data: bytes) -> int:
+    return int.from_bytes(data[:_NUMBER_BYTES], "little")
+
+
+def _native(array: npt.NDArray[np.floating]) -> Float32:
+    """A copy that can be written to, in this machine's byte order."""
+    return np.array(array, np.float32)
+
+
+def _check_size(what: str, data: bytes, expected: int) -> None:
+    if len(data) != expected:
+        raise WireError(f"{what}: has {len(data):,} bytes: must have {expected:,}.")
+
+
+def _refuse_not_finite(numbers: Float32) -> None:
+    if not np.isfinite(numbers).all():
+        raise ActionError("array: has NaN or infinite entries. Give finite numbers.")
