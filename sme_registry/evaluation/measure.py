@@ -36,7 +36,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled import Engine, engine
+from sme_registry.compiled import engine
 from sme_registry.compiled.network import network
 from sme_registry.envs.types import Observation
 from sme_registry.errors import PolicyError
@@ -369,13 +369,23 @@ class Measurement:
 
     def _batches(self, region: int, known: Iterator[Array]) -> Iterator[_Batch]:
         """The states of a region. `known` are the π* of the first ones, where these are known."""
-        limit_of = _limits(self.task, self.oracle)
+        limit_of = self._limit_of()
         for drawn in states(self.protocol, region, self.task.spec):
             s = drawn.s.astype(np.float64)
             optimal = next(known, None)
             if optimal is None:
                 optimal = self.oracle.optimal_action(s)
             yield _Batch(drawn, s, optimal, limit_of(s))
+
+    def _limit_of(self) -> Callable[[Array], Array]:
+        """ℓ of states `[B, S]`, by machine code where the oracle is; `[B, 0]` without safety."""
+        task = self.task
+        if not self._limited:
+            return lambda s: np.empty((len(s), 0))
+        if self.oracle.backend == "numpy":
+            return task.limit
+        v = network(task.limiting)
+        return lambda s: task.limit_of(v(np.ascontiguousarray(s.T)).T)
 
     def _fit_references(self) -> tuple[references.References, Iterator[Array]]:
         """The references fitted on the first states of WD, and the π* `[B, A]` of their batches.
@@ -449,16 +459,6 @@ class Measurement:
 
     def _with_edges(self) -> Iterable[tuple[tuple[float, float], Measured]]:
         return zip(self.protocol.edges, self.regions, strict=True)
-
-
-def _limits(task: Task, oracle: Engine) -> Callable[[Array], Array]:
-    """ℓ of states `[B, S]`, by machine code where the oracle is; `[B, 0]` without safety."""
-    if task.spec.safety is None:
-        return lambda s: np.empty((len(s), 0))
-    if oracle.backend == "numpy":
-        return task.limit
-    v = network(task.limiting)
-    return lambda s: task.limit_of(v(np.ascontiguousarray(s.T)).T)
 
 
 def same_draw(spec: SMESpec) -> str:

@@ -152,6 +152,11 @@ def reference_policy(name: str, spec: SMESpec) -> Act | dict[str, Act]:
 
 def _joint_policy(name: str, spec: SMESpec) -> Callable[[Array], Array]:
     """A reference policy from states `[B, S]` to joint actions `[B, A]`, which are not clipped."""
+    if name not in names(spec):
+        raise SpecError(
+            f"policy={name!r}: needs a task with safety, and this one has no limits. Give "
+            "'optimal', or add safety to the task."
+        )
     if name == "optimal":
         return engine(materialize(spec)).optimal_action
     if name == "constant_half":
@@ -161,11 +166,6 @@ def _joint_policy(name: str, spec: SMESpec) -> Callable[[Array], Array]:
         return lambda s: generator.random((len(s), spec.action_dim))
     task = materialize(spec)
     if name in SAFE_NAMES:
-        if spec.safety is None:
-            raise SpecError(
-                f"policy={name!r}: needs a task with safety, and this one has no limits. Give "
-                "'optimal', or add safety to the task."
-            )
         optimal_action = engine(task).optimal_action
         return lambda s: safe_actions(spec, optimal_action(s), task.limit(s))[name]
     s = np.random.default_rng(0).random((fit_states(spec), spec.state_dim))

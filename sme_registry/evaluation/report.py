@@ -385,8 +385,7 @@ class EvaluationReport(ReportFile):
         """Numbers of safety and distractors in a region, by name, of the policy or a reference."""
         columns: dict[str, float] = {}
         if self.safety is not None:
-            safety = self.safety
-            scores = safety.references[reference] if reference else safety.regions
+            scores = {"": self.safety.regions, **self.safety.references}[reference]
             columns |= scores[index].model_dump(exclude={"name"})
         for change in self.observed.invariance[index : index + 1]:
             columns["invariance"] = 0.0 if reference else change.invariance
