@@ -287,15 +287,21 @@ def _are_reports(fresh: Any) -> bool:
 def stream_regions(
     protocol: EvaluationProtocol,
     agent: Array,
-    initial: Array | None,
-    fresh: Array | None,
+    initial: Array,
+    fresh: Array,
     references: Mapping[str, Array],
 ) -> tuple[tuple[StreamRegion, ...], StreamRegion]:
+    """The regions of a report, and the mean over the shells.
+
+    `agent` is `[V, P, K]` normalised regret, as are `references`; `initial` and `fresh` are
+    `[P, K]`, NaN where there is no such policy.
+    """
     edges, states = protocol.edges, protocol.states_per_region
     names = [(region_name(k), *edge, states) for k, edge in enumerate(edges)]
     names.append((SHELLS, edges[1][0], edges[-1][1], states * (len(edges) - 1)))
     of_agent = _retentions(agent, initial, fresh)
-    of_references = {name: _retentions(M, None, None) for name, M in references.items()}
+    unknown = np.full_like(initial, np.nan)
+    of_references = {name: _retentions(M, unknown, unknown) for name, M in references.items()}
     regions = [
         StreamRegion(
             name=name,
@@ -310,33 +316,34 @@ def stream_regions(
     return tuple(regions[:-1]), regions[-1]
 
 
-def _retentions(M: Array, initial: Array | None, fresh: Array | None) -> list[Retention]:
+def _retentions(M: Array, initial: Array, fresh: Array) -> list[Retention]:
     """The matrix and the metrics in each region, then of the mean over the shells."""
-    V, P, K = M.shape
-    M, R = _and_shells(M), 1.0 - _and_shells(M)
-    before = np.full((P, K + 1), np.nan) if initial is None else _and_shells(initial)
+    M, before, alone = map(_and_shells, (M, initial, fresh))
+    R = 1.0 - M
+    ratio, difference = retention.plasticity(M, alone)
     computed = {
         "average_performance": retention.average_performance(R),
         "backward_transfer": retention.backward_transfer(R),
         "forgetting": retention.forgetting(R),
         "forward_transfer": retention.forward_transfer(R, 1.0 - before),
         "relearning": retention.relearning(R),
+        "plasticity_ratio": ratio,
+        "plasticity_difference": difference,
     }
-    unknown = (None,) * V
-    retentions = [
+    return [
         Retention(
             normalised_regret=tuple(map(tuple, M[..., k].tolist())),
-            initial_normalised_regret=None if initial is None else tuple(before[:, k].tolist()),
-            plasticity_ratio=unknown,
-            plasticity_difference=unknown,
+            initial_normalised_regret=_complete(before[:, k]),
+            fresh_normalised_regret=_complete(alone[:, k]),
             **{name: _known(values[..., k]) for name, values in computed.items()},
         )
-        for k in range(K + 1)
+        for k in range(M.shape[-1])
     ]
-    if fresh is None:
-        return retentions
-    alone = _and_shells(fresh)
-    return [each.with_fresh(alone[:, k]) for k, each in enumerate(retentions)]
+
+
+def _complete(row: Array) -> tuple[float, ...] | None:
+    """A row of known numbers; None for one of NaN."""
+    return None if np.isnan(row).any() else tuple(row.tolist())
 
 
 def _and_shells(values: Array) -> Array:

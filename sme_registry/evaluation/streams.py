@@ -79,35 +79,30 @@ def evaluate_stream(
     def actor(policy: Any, phases: Sequence[int], where: str) -> Actor:
         return Actor(stream_policy(policy, stream, where, action_range, algorithm), phases, where)
 
-    everywhere = range(P)
+    everywhere, nowhere = range(P), Actor(0, ())
     actors = [Actor(j, everywhere) for j in range(P)]
-    rows: dict[int, int] = {}
-    life = []
+    rows: dict[int, int] = {}  # a policy of several visits acts once
     for v, policy in enumerate(policies):
         if id(policy) not in rows:
             rows[id(policy)] = len(actors)
             actors.append(actor(policy, everywhere, f"policies[{v}]"))
-        life.append(rows[id(policy)])
-    start = len(actors)
-    if initial is not None:
-        actors.append(actor(initial, everywhere, "initial"))
-    alone = len(actors)
-    for j, policy in enumerate(fresh or ()):
-        actors.append(actor(policy, [j], f"fresh[{j}]"))
+    life = [rows[id(policy)] for policy in policies]
+    actors.append(nowhere if initial is None else actor(initial, everywhere, "initial"))
+    if fresh is None:
+        actors += [nowhere] * P
+    else:
+        actors += [actor(policy, [j], f"fresh[{j}]") for j, policy in enumerate(fresh)]
 
     measured, oracle = stream_regrets(stream, actors, protocol, progress)
-    regions, ood = stream_regions(
-        protocol,
-        measured[life],
-        measured[start] if initial is not None else None,
-        measured[alone + np.arange(P), np.arange(P)] if fresh is not None else None,
-        _references(measured[:P], V),
-    )
+    *_, before = measured[:-P]
+    alone = measured[np.arange(-P, 0), np.arange(P)]
+    references = _references(measured[:P], V)
+    regions, ood = stream_regions(protocol, measured[life], before, alone, references)
     acting = [actors[row].acts for row in life]
     names = {policy.name for policy in acting if isinstance(policy, Policy)}
     last = acting[-1]
     assert isinstance(last, Policy)
-    digests = [each.digest for each in final_specs(stream)]
+    digests = [spec.digest for spec in final_specs(stream)]
     return StreamReport(
         policy=name or (last.name if len(names) == 1 else f"{V} policies"),
         action_range=last.action_range,
