@@ -1,5 +1,6 @@
 """Documents: specs, suites, protocols and plans, frozen and hashed, and their files."""
 
+from sme_registry.spec import resolve as resolve  # what finds documents by name
 from sme_registry.spec.catalogue import (
     EnvFile,
     Fingerprint,

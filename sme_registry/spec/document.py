@@ -12,8 +12,8 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
-from collections.abc import Iterator, Sequence, Sized
-from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, TypeVar, get_args
+from collections.abc import Callable, Iterator, Sequence, Sized
+from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, TypeVar, cast, get_args
 
 import rfc8785
 from pydantic import (
@@ -31,7 +31,7 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails
 
-from sme_registry.errors import DigestMismatchError, SpecError, did_you_mean
+from sme_registry.errors import DigestMismatchError, SpecError, UnknownNameError, did_you_mean
 from sme_registry.io import sha256_of
 
 _MAX_REPR, _MAX_PATH, _MAX_FAULTS, _MAX_TEXT = 60, 120, 5, 2000  # of errors
@@ -175,6 +175,7 @@ def _integer_only(value: Any) -> Any:
 
 
 _Part = TypeVar("_Part")
+_D = TypeVar("_D", bound="NamedDocument")
 
 Integer = int
 Real = Annotated[float, Field(allow_inf_nan=False)]
@@ -380,6 +381,18 @@ class NamedDocument(Document):
         if type(other) is not type(self):
             return NotImplemented
         return self.__dict__ == other.__dict__
+
+
+finders: dict[type[NamedDocument], Callable[[Any], NamedDocument]] = {}
+"""Kind → what finds a document by its name. `resolve` fills it, which imports every kind."""
+
+
+def find_named(name: Any, kind: type[_D]) -> _D:
+    """The document of a name, without the name; ValueError, which Pydantic reports, if none."""
+    try:
+        return cast(_D, finders[kind](name).named(""))
+    except (UnknownNameError, SpecError) as error:
+        raise ValueError(str(error)) from None
 
 
 class _Named(Protocol):

@@ -14,7 +14,7 @@ from sme_registry.errors import MalformedDocumentError, StreamError, UnknownName
 from sme_registry.io import read_json
 from sme_registry.spec import catalogue
 from sme_registry.spec.catalogue import EnvFile, Fingerprint, StreamFile, SuiteFile
-from sme_registry.spec.document import NamedDocument, short_repr
+from sme_registry.spec.document import NamedDocument, finders, short_repr
 from sme_registry.spec.sme_spec import SMESpec, as_spec
 from sme_registry.spec.stream import StreamSpec, as_stream
 
@@ -117,6 +117,8 @@ def check_not_symmetric(name: str) -> None:
 
 
 _FILES: dict[type[NamedDocument], Any] = {SMESpec: EnvFile, StreamSpec: StreamFile}
+finders[SMESpec] = lambda name: resolve(name, SMESpec).document
+finders[StreamSpec] = lambda name: resolve(name, StreamSpec).document
 
 
 def _as_document(value: Any, kind: Any) -> SMESpec | StreamSpec:

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
-from sme_registry.errors import SpecError, UnknownNameError
+from sme_registry.errors import SpecError
 from sme_registry.io import integer_in
 from sme_registry.spec.document import (
     Digest,
@@ -24,6 +24,7 @@ from sme_registry.spec.document import (
     Real,
     SchemaVersion,
     StrictModel,
+    find_named,
     short_repr,
 )
 from sme_registry.spec.sme_spec import FULL_TURN, MAX_SEED, SMESpec
@@ -70,11 +71,9 @@ class Phase(StrictModel):
         named = data.get("spec", data.get("digest"))
         if not isinstance(named, str | os.PathLike):
             return data
-        from sme_registry.spec.resolve import resolve
-
         try:
-            return {**data, "spec": resolve(named, SMESpec).document.named("")}
-        except (UnknownNameError, SpecError) as error:
+            return {**data, "spec": find_named(named, SMESpec)}
+        except ValueError as error:
             raise ValueError(f"spec: {error}") from None
 
     @model_validator(mode="after")

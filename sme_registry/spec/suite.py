@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
 from pydantic import Field, field_validator, model_validator
 
-from sme_registry.errors import SpecError, UnknownNameError
+from sme_registry.errors import SpecError
 from sme_registry.spec.document import (
     Document,
     Integer,
@@ -24,6 +24,7 @@ from sme_registry.spec.document import (
     Real,
     SchemaVersion,
     check_names,
+    find_named,
     short_repr,
 )
 from sme_registry.spec.sme_spec import Seed, Setting, SMESpec
@@ -79,14 +80,7 @@ class StreamClass(Document):
     @field_validator("stream", mode="before")
     @classmethod
     def _name_to_stream(cls, value: Any) -> Any:
-        if not isinstance(value, str | os.PathLike):
-            return value
-        from sme_registry.spec.resolve import resolve
-
-        try:
-            return resolve(value, StreamSpec).document.named("")
-        except (UnknownNameError, SpecError) as error:
-            raise ValueError(str(error)) from None
+        return find_named(value, StreamSpec) if isinstance(value, str | os.PathLike) else value
 
     @model_validator(mode="after")
     def _draws_differ(self) -> Self:
