@@ -291,15 +291,15 @@ class RegretBlocks:
         visits = stream.visits
         ends = visit_ends(stream, visits)
         begins = np.concatenate([[0], ends[:-1]])
-        each = np.minimum(ends - begins, max(1, _BLOCKS // visits))
+        blocks = np.minimum(ends - begins, max(1, _BLOCKS // visits))
         self._stream, self._visit_ends = stream, ends
         self._ends: _Integers = np.concatenate(
             [
                 begin + (end - begin) * np.arange(1, n + 1) // n
-                for begin, end, n in zip(begins, ends, each, strict=True)
+                for begin, end, n in zip(begins, ends, blocks, strict=True)
             ]
         )
-        self._last = np.cumsum(each) - 1  # block of each visit
+        self._last = np.cumsum(blocks) - 1  # block of each visit
         self.steps = np.zeros(len(self._ends), np.int64)
         self.regret = np.zeros((len(self._ends), lives))
 
@@ -368,10 +368,10 @@ def expected_regret(
     policies = _policies(life, stream, action_range, algorithm)
     steps = np.diff([*(piece.start for piece in stream.pieces), stream.cycle_steps])
     of_phase = [[i for i, one in enumerate(stream.pieces) if one.phase == j] for j in range(P)]
-    parts = [(each, piece) for v, each in enumerate(life) for piece in of_phase[v % P]]
+    parts = [(entry, piece) for v, entry in enumerate(life) for piece in of_phase[v % P]]
 
     # A policy acts once in each piece, in however many cycles.
-    acts = dict.fromkeys((id(each), piece) for each, piece in parts if id(each) in policies)
+    acts = dict.fromkeys((id(entry), piece) for entry, piece in parts if id(entry) in policies)
     tasks = materialize_stream(stream) if acts else ()
     means: dict[tuple[int, int], float] = {}
     for which, piece in acts:
@@ -385,7 +385,7 @@ def expected_regret(
             progress(len(means), len(acts))
     ends = _ends(stream, np.cumsum(steps[[piece for _, piece in parts]]))
     lengths = np.diff(ends, prepend=0)
-    regret = np.array([means.get((id(each), piece), each) for each, piece in parts])
+    regret = np.array([means.get((id(entry), piece), entry) for entry, piece in parts])
     lived = lengths > 0
     return dynamic_regret(stream, ends[lived], regret[lived], lengths[lived])
 
@@ -420,11 +420,11 @@ def reference_regret(
     first = final_specs(stream)[0]
     # No regret in the task of which it is the optimum, also where this rounds observations.
     optimum = reference_policy("optimal", first)
-    own = [
+    same_task = [
         phase.drift is None and same_draw(phase.spec) == same_draw(first) for phase in stream.phases
     ]
     lives: dict[str, list[Any]] = {
-        "frozen_optimum": [0.0 if mine else optimum for mine in own] * stream.cycles,
+        "frozen_optimum": [0.0 if mine else optimum for mine in same_task] * stream.cycles,
         "fresh_optimum": [0.0] * V,
         "constant_half": [reference_policy("constant_half", first)] * V,
     }
@@ -446,12 +446,14 @@ def _policies(
     life: Sequence[Any], stream: StreamSpec, action_range: str | None, algorithm: str | None
 ) -> dict[int, Policy]:
     policies: dict[int, Policy] = {}
-    for v, each in enumerate(life):
-        if isinstance(each, RealNumber | np.bool_):
-            if isinstance(each, bool | np.bool_) or not 0.0 <= float(each) <= 1.0:
-                raise OptionError(f"life[{v}]={each}: must be a policy, or a regret in [0, 1].")
-        elif id(each) not in policies:
-            policies[id(each)] = stream_policy(each, stream, f"life[{v}]", action_range, algorithm)
+    for v, entry in enumerate(life):
+        if isinstance(entry, RealNumber | np.bool_):
+            if isinstance(entry, bool | np.bool_) or not 0.0 <= float(entry) <= 1.0:
+                raise OptionError(f"life[{v}]={entry}: must be a policy, or a regret in [0, 1].")
+        elif id(entry) not in policies:
+            policies[id(entry)] = stream_policy(
+                entry, stream, f"life[{v}]", action_range, algorithm
+            )
     return policies
 
 

@@ -29,6 +29,7 @@ from sme_registry.io import (
     to_json,
     write_atomically,
 )
+from sme_registry.io.markup import card, table_html
 from sme_registry.io.tables import Table
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
 from sme_registry.spec.document import Integer, Real, StrictModel, check_digest
@@ -215,8 +216,6 @@ class ReportFile(StrictModel):
 
     def _repr_html_(self) -> str:
         """The curve and the tables, for notebooks."""
-        from sme_registry.io.markup import card, table_html
-
         return card(self.chart(), *map(table_html, self.tables()))
 
     def __str__(self) -> str:
