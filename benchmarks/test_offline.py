@@ -18,7 +18,7 @@ import torch
 from sme_registry import SMESpec, materialize
 from sme_registry.datasets import DatasetRecipe, Transitions, to_d3rlpy
 from sme_registry.datasets.collect import collect
-from sme_registry.datasets.learners import BC, IQL, Batches
+from sme_registry.datasets.learners import BC, IQL, minibatches
 from sme_registry.datasets.record import BCHyperparameters, IQLHyperparameters
 
 SPEC, BATCH = SMESpec(), 256
@@ -80,7 +80,7 @@ def test_gradient_steps(compare: Any, transitions: Transitions, algorithm: str) 
     learner = (
         BC(*dims, BCHyperparameters()) if algorithm == "bc" else IQL(*dims, IQLHyperparameters())
     )
-    batches = iter(Batches(transitions, BATCH, torch.Generator().manual_seed(0)))
+    batches = minibatches(transitions, BATCH, torch.Generator().manual_seed(0))
 
     def ours(steps: int) -> None:
         for _ in range(steps):

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from sme_registry import testing as testing
     from sme_registry import training as training
     from sme_registry import wrappers as wrappers
+    from sme_registry.datasets import make_dataset, train_offline
     from sme_registry.evaluation import EvaluationReport, evaluate
     from sme_registry.export import export_onnx
     from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
@@ -62,11 +63,13 @@ __all__ = [
     "load",
     "make",
     "make_aec",
+    "make_dataset",
     "make_parallel",
     "make_vec",
     "materialize",
     "register",
     "save",
+    "train_offline",
 ]
 
 _LAZY = {
@@ -77,7 +80,9 @@ _LAZY = {
     "Task": "sme_registry.task",
     "evaluate": "sme_registry.evaluation",
     "export_onnx": "sme_registry.export",
+    "make_dataset": "sme_registry.datasets",
     "materialize": "sme_registry.task",
+    "train_offline": "sme_registry.datasets",
 }
 
 # Not in `__all__`: a star import would load all of them, and with them optional dependencies.

@@ -91,40 +91,31 @@ def weights(network: nn.Sequential) -> list[OfflineLayer]:
     ]
 
 
-class Batches:
-    """An endless iterator over batches of shuffled rows; every row is used once before any repeats.
+def minibatches(
+    data: Transitions | SealedDataset, batch_size: int, generator: torch.Generator
+) -> Iterator[Minibatch]:
+    """Shuffled rows of a data set without end; every row is used once before any repeats.
 
     The data set is one float32 matrix, so that one gather gets all columns of a batch; one for each
     column would take as long as a network.
     """
-
-    def __init__(
-        self,
-        transitions: Transitions | SealedDataset,
-        batch_size: int,
-        generator: torch.Generator,
-    ) -> None:
-        columns = (
-            transitions.observations,
-            2.0 * transitions.actions - 1.0,
-            transitions.next_observations,
-            transitions.rewards[:, None],
-            1.0 - transitions.terminations[:, None],
-        )
-        self._widths = [column.shape[1] for column in columns]
-        self._rows = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32))
-        self._batch_size, self._generator = batch_size, generator
-
-    def __iter__(self) -> Iterator[Minibatch]:
-        remaining = torch.empty(0, dtype=torch.int64)
-        while True:
-            shuffled = torch.randperm(len(self._rows), generator=self._generator)
-            remaining = torch.cat([remaining, shuffled])
-            whole = len(remaining) // self._batch_size * self._batch_size
-            for indices in torch.split(remaining[:whole], self._batch_size):
-                rows = self._rows.index_select(0, indices)
-                yield Minibatch(*torch.split(rows, self._widths, dim=1))
-            remaining = remaining[whole:]
+    columns = (
+        data.observations,
+        2.0 * data.actions - 1.0,
+        data.next_observations,
+        data.rewards[:, None],
+        1.0 - data.terminations[:, None],
+    )
+    widths = [column.shape[1] for column in columns]
+    matrix = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32))
+    remaining = torch.empty(0, dtype=torch.int64)
+    while True:
+        remaining = torch.cat([remaining, torch.randperm(len(matrix), generator=generator)])
+        whole = len(remaining) // batch_size * batch_size
+        for indices in torch.split(remaining[:whole], batch_size):
+            rows = matrix.index_select(0, indices)
+            yield Minibatch(*torch.split(rows, widths, dim=1))
+        remaining = remaining[whole:]
 
 
 class BC(Networks):
@@ -220,7 +211,7 @@ class OfflineLearner:
                 if isinstance(hyperparameters, BCHyperparameters)
                 else IQL(*dims, hyperparameters)
             )
-        self._batches = iter(Batches(data, batch_size, torch.Generator().manual_seed(shuffles)))
+        self._batches = minibatches(data, batch_size, torch.Generator().manual_seed(shuffles))
         self.steps = 0
         self.cpu_seconds = 0.0
         self.losses: dict[str, float] = {}

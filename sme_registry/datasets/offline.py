@@ -25,8 +25,8 @@ import numpy as np
 from sme_registry.datasets.record import (
     ALGORITHMS,
     BehaviourQuality,
-    Evaluation,
     Hyperparameters,
+    OfflineEvaluation,
     OfflineRecord,
 )
 from sme_registry.datasets.storage import Dataset, SealedDataset, open_dataset
@@ -161,7 +161,7 @@ def train_offline(
     }
     about = {name: fields[name] for name in _ABOUT}
     start, start_cpu = time.perf_counter(), time.process_time()
-    played: list[Evaluation] = []
+    played: list[OfflineEvaluation] = []
 
     def report(step: int) -> None:
         if progress is not None:
@@ -174,7 +174,7 @@ def train_offline(
         states = start_states(settings.seed, index, episodes, task.spec.state_dim)
         result = rollouts(policy, task, states)
         played.append(
-            Evaluation(
+            OfflineEvaluation(
                 step=learner.steps,
                 similarity=result.per_step(result.similarity),
                 similarity_sd=result.similarity_sd,

@@ -32,7 +32,7 @@ from sme_registry.spec.sme_spec import Seed
 Share = Annotated[Real, Field(ge=0, le=1)]
 
 
-class Rollouts(StrictModel):
+class EpisodeScores(StrictModel):
     """Whole episodes of a policy; 0 of them if the values are exact without rollouts.
 
     Attributes:
@@ -58,7 +58,7 @@ class PolicyScore(StrictModel):
 
     similarity: Share
     step_reward: Share
-    rollouts: Rollouts | None
+    rollouts: EpisodeScores | None
 
 
 class ReferenceScores(StrictModel):
@@ -178,7 +178,7 @@ Hyperparameters = BCHyperparameters | IQLHyperparameters
 ALGORITHMS: dict[str, type[Hyperparameters]] = {"bc": BCHyperparameters, "iql": IQLHyperparameters}
 
 
-class Evaluation(StrictModel):
+class OfflineEvaluation(StrictModel):
     """Episodes of the policy in the task, played during training.
 
     Attributes:
@@ -245,7 +245,7 @@ class OfflineRecord(StrictModel):
     spec: SMESpec
     spec_digest: str
     behaviour: BehaviourQuality
-    evaluations: Annotated[TupleOf[Evaluation], Field(min_length=1)]
+    evaluations: Annotated[TupleOf[OfflineEvaluation], Field(min_length=1)]
     wall_seconds: Real
     cpu_seconds: Real
     cpu_ms_per_step: Real

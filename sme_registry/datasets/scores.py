@@ -37,7 +37,7 @@ from sme_registry.datasets.collect import (
     constant_policy,
 )
 from sme_registry.datasets.recipe import DatasetRecipe
-from sme_registry.datasets.record import PolicyScore, ReferenceScores, Rollouts
+from sme_registry.datasets.record import EpisodeScores, PolicyScore, ReferenceScores
 from sme_registry.datasets.transitions import Transitions
 from sme_registry.envs.arguments import initial_states
 from sme_registry.envs.batch import Batch
@@ -46,12 +46,13 @@ from sme_registry.errors import OptionError, SpecError, StateError
 from sme_registry.evaluation import as_policy
 from sme_registry.evaluation.rollouts import LANES, play
 from sme_registry.evaluation.rollouts import rollouts as run_rollouts
-from sme_registry.io import integer_in
+from sme_registry.io import integer_in, number_in
 from sme_registry.spec import SMESpec, SpecLike
-from sme_registry.spec.document import plain_number
 from sme_registry.task import Task, load_task
 
+CONFIDENCE = 0.95
 EPISODES = 100
+_ROUNDED = 1e-6  # of r_cum, which an observation stores as float32
 _MAX_STEPS = 10**5  # of the rollouts of one policy, over all episodes
 
 
@@ -65,7 +66,7 @@ def reference_scores(
     T = recipe.spec.horizon
     episodes = min(EPISODES, _MAX_STEPS // T)
 
-    def rollouts(policy: BehaviourPolicy, index: int) -> Rollouts | None:
+    def rollouts(policy: BehaviourPolicy, index: int) -> EpisodeScores | None:
         if episodes == 0:
             return None
         stream = f"dataset/reference/{index}/start"
@@ -94,12 +95,14 @@ def reference_scores(
         optimum=PolicyScore(
             similarity=1.0,
             step_reward=1.0,
-            rollouts=Rollouts(episodes=0, mean_return=float(T), standard_error=0.0, similarity=1.0),
+            rollouts=EpisodeScores(
+                episodes=0, mean_return=float(T), standard_error=0.0, similarity=1.0
+            ),
         ),
     )
 
 
-def _score(similarity: Array, step_reward: Array, rollouts: Rollouts | None) -> PolicyScore:
+def _score(similarity: Array, step_reward: Array, rollouts: EpisodeScores | None) -> PolicyScore:
     means = {"similarity": similarity.mean(), "step_reward": step_reward.mean()}
     return PolicyScore(**means, rollouts=rollouts)
 
@@ -127,9 +130,9 @@ def whole_episodes(
     return returns, similarities, steps
 
 
-def _rollouts(returns: Array, similarities: Array, steps: Array) -> Rollouts:
+def _rollouts(returns: Array, similarities: Array, steps: Array) -> EpisodeScores:
     count = len(returns)
-    return Rollouts(
+    return EpisodeScores(
         episodes=count,
         mean_return=returns.mean(),
         standard_error=returns.std(ddof=1) / math.sqrt(count) if count > 1 else 0.0,
@@ -137,7 +140,7 @@ def _rollouts(returns: Array, similarities: Array, steps: Array) -> Rollouts:
     )
 
 
-def _weighted(weights: list[float], scores: list[Rollouts | None]) -> Rollouts | None:
+def _weighted(weights: list[float], scores: list[EpisodeScores | None]) -> EpisodeScores | None:
     """The mean over behaviours by their weights; None if one is None."""
     known = [score for score in scores if score is not None]
     if len(known) < len(scores):
@@ -145,7 +148,7 @@ def _weighted(weights: list[float], scores: list[Rollouts | None]) -> Rollouts |
     if len(known) == 1:
         return known[0]
     pairs = list(zip(weights, known, strict=True))
-    return Rollouts(
+    return EpisodeScores(
         episodes=sum(score.episodes for score in known),
         mean_return=math.fsum(w * score.mean_return for w, score in pairs),
         standard_error=math.sqrt(math.fsum((w * s.standard_error) ** 2 for w, s in pairs)),
@@ -153,13 +156,7 @@ def _weighted(weights: list[float], scores: list[Rollouts | None]) -> Rollouts |
     )
 
 
-CONFIDENCE = 0.95
-_ROUNDED = 1e-6  # of r_cum, which an observation stores as float32
-
-Steps = npt.NDArray[np.int64]
-
-
-class Estimate(NamedTuple):
+class ReturnEstimate(NamedTuple):
     """A mean and its 95 % interval, each a number or `[M]`; an exact value has zero width."""
 
     mean: Any
@@ -176,14 +173,14 @@ class ExactReturn:
     and `rollouts` the episodes from each state.
     """
 
-    undiscounted: Estimate
-    discounted: Estimate
+    undiscounted: ReturnEstimate
+    discounted: ReturnEstimate
     lengths: Array
     similarity: Array
     gamma: float
     rollouts: int
 
-    def over_states(self) -> tuple[Estimate, Estimate]:
+    def over_states(self) -> tuple[ReturnEstimate, ReturnEstimate]:
         """The mean over all states, undiscounted and discounted, with its interval.
 
         The interval assumes that the states are independent draws from a distribution. For rows of
@@ -234,9 +231,7 @@ def exact_return(
     task = load_task(spec)
     if task.spec.team is not None:
         raise SpecError("team: must be null here. Give a single-agent task.")
-    if type(plain_number(gamma)) not in (int, float) or not 0.0 <= gamma <= 1.0:
-        raise OptionError(f"gamma={gamma!r:.60}: must be a number in [0, 1].")
-    gamma = float(gamma)
+    gamma = number_in("gamma", gamma, 0.0, 1.0)
     rollouts = integer_in("rollouts", rollouts, 1, 10**6)
     checked_policy = as_policy(policy, task.spec, action_range=action_range)
     states, t, r_cum = _starts(task.spec, states, t, r_cum)
@@ -250,14 +245,15 @@ def exact_return(
         )
         for seed in range(rollouts)
     ]
-    lengths = np.stack([each.length for each in results])
+    lengths = np.stack([result.length for result in results])
+    similarities = [result.similarity for result in results]
     return ExactReturn(
-        _interval(np.stack([each.episode_return for each in results])),
-        _interval(np.stack([each.discounted_return for each in results])),
-        lengths.mean(axis=0),
-        np.average([each.similarity for each in results], axis=0, weights=lengths),
-        gamma,
-        rollouts,
+        undiscounted=_interval(np.stack([result.episode_return for result in results])),
+        discounted=_interval(np.stack([result.discounted_return for result in results])),
+        lengths=lengths.mean(axis=0),
+        similarity=np.average(similarities, axis=0, weights=lengths),
+        gamma=gamma,
+        rollouts=rollouts,
     )
 
 
@@ -284,7 +280,7 @@ def positions(
 
 def _starts(
     spec: SMESpec, states: npt.ArrayLike, t: npt.ArrayLike, r_cum: npt.ArrayLike
-) -> tuple[Array, Steps, Array]:
+) -> tuple[Array, npt.NDArray[np.int64], Array]:
     S, T, k = spec.state_dim, spec.horizon, spec.k
     M = len(states) if isinstance(states, np.ndarray | list | tuple) else 0
     if M == 0:
@@ -329,7 +325,11 @@ def _column(name: str, value: npt.ArrayLike, rows: int) -> Array:
 
 
 def _check_deterministic(
-    policy: Callable[[Observation], npt.ArrayLike], task: Task, s: Array, t: Steps, r_cum: Array
+    policy: Callable[[Observation], npt.ArrayLike],
+    task: Task,
+    s: Array,
+    t: npt.NDArray[np.int64],
+    r_cum: Array,
 ) -> None:
     """Raise if the return of one episode from a state is not the only one that it can have."""
     if task.spec.distractors:
@@ -347,11 +347,11 @@ def _check_deterministic(
         )
 
 
-def _interval(samples: Array) -> Estimate:
+def _interval(samples: Array) -> ReturnEstimate:
     """Mean over the first axis and its Student's t interval; of one sample, the sample."""
     count, mean = len(samples), samples.mean(axis=0)
     if count == 1:
-        return Estimate(mean, mean, mean)
+        return ReturnEstimate(mean, mean, mean)
     error = samples.std(axis=0, ddof=1) / np.sqrt(count)
     half = stdtrit(count - 1, 0.5 + CONFIDENCE / 2) * error
-    return Estimate(mean, mean - half, mean + half)
+    return ReturnEstimate(mean, mean - half, mean + half)

@@ -6,7 +6,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from sme_registry.datasets import BCHyperparameters, IQLHyperparameters  # noqa: E402
-from sme_registry.datasets.learners import BC, IQL, Batches, Minibatch, mlp  # noqa: E402
+from sme_registry.datasets.learners import BC, IQL, Minibatch, minibatches, mlp  # noqa: E402
 from tests.datasets.sets import transitions_of  # noqa: E402
 
 SEEN, A, B = 4, 2, 32
@@ -136,7 +136,7 @@ def test_iql_prefers_the_rewarded_action():
 
 def test_batches_have_matching_rows_of_all_columns_and_every_row_once_before_any_repeats():
     transitions = transitions_of(count=50)
-    batches = iter(Batches(transitions, 20, torch.Generator().manual_seed(0)))
+    batches = minibatches(transitions, 20, torch.Generator().manual_seed(0))
     batch = Minibatch(*map(torch.cat, zip(*(next(batches) for _ in range(5)), strict=True)))
     rows = {row.tobytes(): index for index, row in enumerate(transitions.observations)}
     at = [rows[row.numpy().tobytes()] for row in batch.observations]
