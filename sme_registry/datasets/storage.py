@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Self
 
@@ -135,14 +135,7 @@ class SealedDataset(Columns):
     def collect(cls, recipe: DatasetRecipe, progress: ReportProgress | None = None) -> Self:
         """Generate the transitions of a recipe of mixtures."""
         rows = collect(recipe, materialize(recipe.spec), progress=progress)
-        return cls(
-            observations=rows.observations,
-            actions=rows.actions,
-            rewards=rows.rewards,
-            next_observations=rows.next_observations,
-            terminations=rows.terminations,
-            truncations=rows.truncations,
-        )
+        return cls(**{field.name: getattr(rows, field.name) for field in fields(cls)})
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Self:
