@@ -201,7 +201,7 @@ def policy_of_each(policy: str, names: Collection[str]) -> dict[str, str]:
       OptionError: there are several instances, and all would have the same policy, which is none
         of the references that need no task.
     """
-    from sme_registry.seasons.client import WITHOUT_TASK
+    from sme_registry.seasons import WITHOUT_TASK
 
     if len(names) > 1 and "{name}" not in policy and policy not in WITHOUT_TASK:
         raise OptionError(

@@ -9,11 +9,12 @@
 `seasons.sb3.SealedVecEnv` is for Stable-Baselines3. `wire` says what server and client send.
 """
 
-from sme_registry.seasons.client import Instance, actions_in, answer, prepare_policy
+from sme_registry.seasons.client import WITHOUT_TASK, Instance, actions_in, answer, prepare_policy
 from sme_registry.seasons.envs import SealedEnv, SealedVectorEnv, make, make_vec
 from sme_registry.seasons.wire import Ticket
 
 __all__ = [
+    "WITHOUT_TASK",
     "Instance",
     "SealedEnv",
     "SealedVectorEnv",

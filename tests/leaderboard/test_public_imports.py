@@ -16,6 +16,7 @@ from sme_registry.errors import SpecError
 from tests.leaderboard.web.site import boards
 
 SHARED = "sme_registry.io"  # private to the two packages: its modules are imported by name
+PROTOCOL = "sme_registry.seasons.wire"  # what servers and clients send each other
 
 
 def submodules(module):
@@ -29,7 +30,8 @@ def private_imports(source):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("sme_registry"):
             module = importlib.import_module(node.module)
             public = {*getattr(module, "__all__", dir(module)), *submodules(module)}
-            top_level = node.module.count(".") < 2 or node.module.startswith(f"{SHARED}.")
+            top_level = node.module.count(".") < 2 or node.module == PROTOCOL
+            top_level |= node.module.startswith(f"{SHARED}.")
             private += [
                 f"{node.module}.{alias.name}"
                 for alias in node.names
