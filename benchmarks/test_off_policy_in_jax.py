@@ -72,9 +72,9 @@ def training(algorithm: str, lanes: int = 1, budget: int = BUFFER) -> Callable[[
 
 @pytest.mark.parametrize("algorithm", TARGET)
 def test_training_steps_of_one_agent(compare: Any, algorithm: str) -> None:
-    from sme_registry.training.monitored_env import MonitoredVecEnv
+    from sme_registry.sb3.vec_env import SingleVecEnv
 
-    model = learner(algorithm, MonitoredVecEnv(SPEC, action_range="symmetric"))
+    model = learner(algorithm, SingleVecEnv(SPEC, action_range="symmetric"))
     model.learn(STEPS)
 
     def sb3(steps: int) -> None:

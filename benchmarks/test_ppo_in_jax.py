@@ -45,9 +45,9 @@ def training(specs: Sequence[SMESpec | StreamSpec]) -> Callable[[int], None]:
 
 @pytest.mark.parametrize("agents", TARGET)
 def test_training_steps_of_agents(compare: Any, agents: int) -> None:
-    from sme_registry.training.monitored_env import MonitoredVecEnv
+    from sme_registry.sb3.vec_env import SingleVecEnv
 
-    model = learner("PPO", MonitoredVecEnv(SMESpec(), action_range="symmetric"))
+    model = learner("PPO", SingleVecEnv(SMESpec(), action_range="symmetric"))
 
     def sb3(steps: int) -> None:
         model.learn(steps, reset_num_timesteps=False)

@@ -19,10 +19,12 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sme_registry.export import export_onnx
-from sme_registry.sb3 import EpisodeSums, PPOLagrangian, PPOProjection, SMEVecEnv
+from sme_registry.sb3 import PPOLagrangian, PPOProjection, SMEVecEnv
+from sme_registry.sb3.regret_callback import episodes_of, finished_in
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.checks import check_task
-from sme_registry.training import checkpoint, numpy_policy
+from sme_registry.training import numpy_policy
+from sme_registry.training.models import load_checkpoint
 
 SPEC = SMESpec(state_dim=3, action_dim=2, horizon=20, safety={"tightness": 0.2}, seed=5)
 SMALL = {"n_steps": 64, "n_epochs": 2, "seed": 3}
@@ -235,16 +237,13 @@ def test_studies_train_both_and_record_the_online_cost():
 def test_an_action_at_a_tight_limit_is_no_violation_but_for_rounding():
     spec = SPEC.derive(action_dim=1, safety={"tightness": 0.005})
     venv, counted = lanes(1, spec, "unit"), []
-    sums = EpisodeSums(1, spec=lambda: spec)
+    sums = episodes_of(venv)
     seen = venv.reset()
-    for step in range(spec.horizon):
+    for _ in range(spec.horizon):
         limit = materialize(spec).limit(seen[:, : spec.state_dim])
         seen, *rest = venv.step(limit.astype(np.float32))
-        counted += sums.add(step, *rest)
+        counted += finished_in(sums, *rest)
     assert [episode.safety.violating_share for episode in counted] == [0.0]
-    infos = venv.step(np.ones((1, 1), np.float32))[3]
-    with pytest.raises(OptionError, match="EpisodeSums: the task has safety: give spec"):
-        EpisodeSums(1).add(1, np.ones(1), np.zeros(1, bool), infos)
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -291,7 +290,7 @@ def test_a_stopped_run_resumes_with_its_multiplier(tmp_path, monkeypatch):
     record = RunRecord.read(tmp_path / "run")
     assert record is not None
     assert 192 <= record.steps_done < 1000
-    stored = checkpoint.load(PPOLagrangian, tmp_path / "run" / "checkpoint.zip", lanes())
+    stored = load_checkpoint(PPOLagrangian, tmp_path / "run" / "checkpoint.zip", lanes())
     assert stored.multiplier > 0.1
     result = train(SPEC, steps=record.steps_done + 64, resume=True, **settings)
     # It only rises, since the limit is 0.

@@ -117,7 +117,7 @@ def train(
     ] = None,
     hyperparameters: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Hyperparameters in a JSON file.", dir_okay=False),
+        typer.Option(metavar="CHECKPOINT", help="Hyperparameters in a JSON file.", dir_okay=False),
     ] = None,
     checkpoint_every: Annotated[
         int | None,
@@ -288,9 +288,11 @@ def how_to_continue(folder: Path, command: str = "the same command with --resume
 
     if RunRecord.read(folder) is None:
         return "interrupted before the training began: nothing was written."
-    from sme_registry.training.checkpoint import FILE
+    from sme_registry.training.record import CHECKPOINT
 
-    saved = "up to its last checkpoint" if (folder / FILE).exists() else "without a checkpoint"
+    saved = (
+        "up to its last checkpoint" if (folder / CHECKPOINT).exists() else "without a checkpoint"
+    )
     return (
         f"interrupted: the run is in {folder}, {saved}. Run {command} to continue, or with --force "
         "to start again."

@@ -20,7 +20,7 @@ from sme_registry.io import read_json
 from sme_registry.plots.streams import FILE
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.study import Cell
-from sme_registry.training import RunRecord, snapshots
+from sme_registry.training import RunRecord, lives
 from sme_registry.training.numpy_policy import numpy_policy
 
 __all__ = ["Networks", "StreamSubject", "life_in_cell", "life_of_run"]
@@ -43,7 +43,7 @@ class StreamSubject:
 def life_of_run(folder: Path, name: str, record: RunRecord, plan: dict[str, Any]) -> StreamSubject:
     """The life of a run of `sme train`."""
     assert record.stream is not None  # of a life
-    kept = snapshots.Snapshots(folder / snapshots.FOLDER, record.stream)
+    kept = lives.Snapshots(folder / lives.FOLDER, record.stream)
     path = folder / FILE
     if not path.exists():
         raise OptionError(
@@ -53,7 +53,7 @@ def life_of_run(folder: Path, name: str, record: RunRecord, plan: dict[str, Any]
     missing = [file.name for file in (kept.initial, *kept.visits) if not file.exists()]
     if missing:
         raise OptionError(
-            f"run={str(folder)!r}: {snapshots.FOLDER}/ lacks {missing[0]}. Copy the whole folder "
+            f"run={str(folder)!r}: {lives.FOLDER}/ lacks {missing[0]}. Copy the whole folder "
             "of the run, or train it again with --force."
         )
     report = StreamReport.read(path)
@@ -77,11 +77,11 @@ def life_in_cell(
     fresh = [path.with_stem(_stem(each)) for each in cell.fresh]
     if fresh and all(each.exists() for each in fresh):
         report = _with_fresh(report, fresh)
-    kept = snapshots.Snapshots(snapshots.folder_of_cell(study, path.stem), cell.stream)
+    kept = lives.Snapshots(lives.folder_of_cell(study, path.stem), cell.stream)
     networks = _kept(kept.visits, cell.stream, cell.action_range)
     initial = _kept([kept.initial], cell.stream, cell.action_range)
     alone = [
-        _kept([snapshots.model_of_cell(study, each.digest)], each.document, cell.action_range)
+        _kept([lives.model_of_cell(study, each.digest)], each.document, cell.action_range)
         for each in cell.fresh
     ]
     return StreamSubject(

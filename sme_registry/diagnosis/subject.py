@@ -23,10 +23,10 @@ from sme_registry.io import read_json
 from sme_registry.spec import SMESpec
 from sme_registry.spec.study import INDEPENDENT, Cell, in_jax
 from sme_registry.task.draw import Array
-from sme_registry.training import RunRecord, checkpoint, snapshots
+from sme_registry.training import RunRecord, lives
 from sme_registry.training import episodes as episode_files
 from sme_registry.training.numpy_policy import numpy_policy
-from sme_registry.training.record import MODEL
+from sme_registry.training.record import CHECKPOINT, MODEL
 
 __all__ = [
     "AnySubject",
@@ -140,10 +140,10 @@ def load_run(folder: str | Path) -> AnySubject:
             "it with `sme train … --resume`."
         )
     if not path.exists():
-        path, checkpoint_step = folder / checkpoint.FILE, record.steps_done
+        path, checkpoint_step = folder / CHECKPOINT, record.steps_done
     if not path.exists():
         raise OptionError(
-            f"run={str(folder)!r}: has neither {MODEL} nor {checkpoint.FILE} yet. Wait for its "
+            f"run={str(folder)!r}: has neither {MODEL} nor {CHECKPOINT} yet. Wait for its "
             "first checkpoint, or continue it with `sme train … --resume`."
         )
     spec = record.spec.named(record.task)
@@ -240,7 +240,7 @@ def _cell_model(study: Path, stem: str, cell: Cell) -> Any:
         from sme_registry.evaluation.references import reference_policy
 
         return reference_policy(cell.uses.partition(":")[2], cell.spec)
-    path = snapshots.model_of_cell(study, stem)
+    path = lives.model_of_cell(study, stem)
     if not path.exists():
         raise OptionError(
             f"cell={stem[:12]!r}: its model was not kept. Finished cells are not run again, so run "

@@ -21,7 +21,7 @@ from sme_registry.evaluation.models import ModulePredictor, OnnxNetwork
 from sme_registry.evaluation.references import References
 from sme_registry.explorer.graph import read_onnx
 from sme_registry.explorer.program import Program, ProgramBuilder
-from sme_registry.export.perceptron import of_offline_policy
+from sme_registry.export.network import of_offline_policy
 from sme_registry.export.torch_modules import traced
 from sme_registry.spec import SMESpec
 from sme_registry.task import Task, streams

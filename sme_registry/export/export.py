@@ -19,7 +19,8 @@ from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation import OfflinePolicy, Perceptron, load_sb3
 from sme_registry.evaluation.models import ACTION_RANGE, Interface, start_session, torch_policy
 from sme_registry.evaluation.policies import interface_of
-from sme_registry.export import perceptron, torch_modules
+from sme_registry.export import network as arrays
+from sme_registry.export import torch_modules
 from sme_registry.export.network import INPUT, Network
 from sme_registry.export.operators import FEED_FORWARD
 from sme_registry.export.shapes import fold_shapes, read_by
@@ -45,6 +46,9 @@ def export_onnx(
 ) -> Path:
     """Write a policy as an ONNX file, and check the file against the policy.
 
+    The file has opset 17, weights inside, any batch size, and actions in [0, 1]. A `UserWarning`
+    names the operators that boards do not accept, if it has any.
+
     Args:
       policy: a network from the task's observations `[B, O]` to actions `[B, A]`, one of
         a `torch.nn.Module`, or a function of PyTorch tensors such as `lambda o: actor(o).mean`;
@@ -52,19 +56,11 @@ def export_onnx(
         a Stable-Baselines3 model, or the path of its .zip (loading it can run code of its author);
         an offline policy, or the path of its .npz.
         Modules are exported in evaluation mode. For a team, the policy that all agents share.
-      spec: the task: a spec, its fields, an id, a digest or a path.
-      path: the .onnx file. Its folder is created if it is missing, and an existing file is
-        replaced.
       action_range: of the policy's actions, "unit" for [0, 1] or "symmetric" for [−1, 1]; None
-        takes an SB3 model's own action space, and "unit" for any other policy. The file's actions
-        are always in [0, 1], which its metadata records.
+        takes an SB3 model's own action space, and "unit" for any other policy.
       vec_normalize: of an SB3 model, the `VecNormalize` of its training, or the path of its saved
         file (which can run code too). None takes that of the model's environment, if any. A
         model's .zip does not contain it.
-
-    Returns:
-      The path: opset 17, weights inside, any batch size. A `UserWarning` names the operators
-      that boards do not accept, if the file has any.
 
     Examples:
       >>> from sme_registry.evaluation import Perceptron
@@ -133,20 +129,18 @@ def _network(
     """The policy as a network that writes itself."""
     policy = _loaded(policy)
     if hasattr(policy, "predict"):
-        from sme_registry.export.sb3 import sb3_network
-
         if torch_policy(policy) is None:
             raise PolicyError(
                 f"policy={policy!r:.80}: predicts by other means than a PyTorch policy of "
                 "Stable-Baselines3, such as JAX or a recurrent state. Give its network as a "
                 "torch.nn.Module or its parameters as a `Perceptron`."
             )
-        return sb3_network(policy, interface, action_range, vec_normalize)
+        return torch_modules.sb3_network(policy, interface, action_range, vec_normalize)
     if vec_normalize is not None:
         raise PolicyError("vec_normalize: is for models of Stable-Baselines3. Leave it out.")
     symmetric = action_range == "symmetric"
     if isinstance(policy, OfflinePolicy):
-        policy = perceptron.of_offline_policy(policy)
+        policy = arrays.of_offline_policy(policy)
     if isinstance(policy, Perceptron):
         if interface is not None:
             widths = {
@@ -154,7 +148,7 @@ def _network(
                 "actions": (policy.action_dim,),
             }
             interface.check("policy", **widths)
-        return perceptron.network(policy, symmetric)
+        return arrays.network(policy, symmetric)
     if interface is None or not callable(policy):
         raise PolicyError(
             f"policy={policy!r:.80}: must be a torch.nn.Module, a function of PyTorch tensors, a "

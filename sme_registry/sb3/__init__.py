@@ -16,15 +16,13 @@ from sme_registry.io import require_packages
 try:
     from sme_registry.sb3.ppo_lagrangian import PPOLagrangian
     from sme_registry.sb3.ppo_projection import PPOProjection
-    from sme_registry.sb3.regret_callback import EpisodeRegret, EpisodeSums, RegretCallback
+    from sme_registry.sb3.regret_callback import RegretCallback
     from sme_registry.sb3.vec_env import LanesVecEnv, SMETeamVecEnv, SMEVecEnv
 except ImportError:
     require_packages("sme_registry.sb3", {"stable_baselines3": "Stable-Baselines3"}, "train")
     raise
 
 __all__ = [
-    "EpisodeRegret",
-    "EpisodeSums",
     "LanesVecEnv",
     "PPOLagrangian",
     "PPOProjection",

@@ -17,6 +17,7 @@ near 8τ where the limit is neither 0 nor above the optimum's cost, which is nea
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -26,22 +27,42 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.utils import obs_as_tensor
 
+from sme_registry.envs.arguments import refuse_without_limits
+from sme_registry.errors import OptionError
 from sme_registry.io import number_in
-from sme_registry.sb3.limits import costs_in, spec_with_limits
+from sme_registry.spec import SMESpec
 
 _Array = npt.NDArray[np.float32]
+
+
+def spec_with_limits(algorithm: str, env: Any) -> SMESpec:
+    """The spec of an environment's task, which must have `safety`."""
+    try:
+        spec: SMESpec = env.get_attr("sme_spec")[0]
+    except AttributeError:
+        raise OptionError(
+            f"{algorithm}: the environment has no `sme_spec`. Use an environment of sme_registry."
+        ) from None
+    refuse_without_limits(algorithm, spec)
+    return spec
+
+
+def _costs_in(infos: Sequence[dict[str, Any]]) -> _Array:
+    """The cost of a step in each lane, `[lanes]`, from its infos."""
+    try:
+        return np.array([info["cost"] for info in infos], np.float32)
+    except KeyError:
+        raise OptionError(
+            "the environment's infos have no 'cost'. Use an environment of sme_registry whose "
+            "task has safety, with wrappers that keep its infos."
+        ) from None
 
 
 class PPOLagrangian(PPO):  # type: ignore[misc, unused-ignore]  # an untyped class without SB3
     """PPO with a limit on the mean cost of a step, for tasks with `safety`; see the module.
 
-    Args:
-      policy: as in PPO, such as "MlpPolicy".
-      env: environments of this package.
-      cost_limit: d, the mean cost of a step that is allowed while exploring, in [0, 1].
-      multiplier: λ at the start, at least 0.
-      multiplier_learning_rate: η, at least 0; 0 keeps the multiplier.
-      **settings: those of PPO.
+    `cost_limit` is d, the mean cost of a step that is allowed while exploring, in [0, 1];
+    `multiplier` λ at the start; `multiplier_learning_rate` η, where 0 keeps λ.
 
     Attributes:
       multiplier: the present λ.
@@ -110,7 +131,7 @@ class PPOLagrangian(PPO):  # type: ignore[misc, unused-ignore]  # an untyped cla
             for lane, info in enumerate(infos)
             if info.get("TimeLimit.truncated") and "terminal_observation" in info
         ]
-        self._costs.append(costs_in(infos))
+        self._costs.append(_costs_in(infos))
 
     def train(self) -> None:
         """Update the multiplier, the critic of costs, and then the policy as PPO does."""

@@ -22,7 +22,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnvWrapper, unwrap_vec_normalize
 
 from sme_registry.errors import OptionError
-from sme_registry.sb3.limits import spec_with_limits
+from sme_registry.sb3.ppo_lagrangian import spec_with_limits
 from sme_registry.spec import SMESpec
 from sme_registry.task import materialize
 
@@ -87,7 +87,7 @@ class ProjectedVecEnv(VecEnvWrapper):  # type: ignore[misc, unused-ignore]  # un
 class PPOProjection(PPO):  # type: ignore[misc, unused-ignore]  # an untyped class without SB3
     """PPO with actions projected onto the limits, for tasks with `safety`; see the module.
 
-    Arguments are those of PPO.
+    Observations must begin with the state as it is: no mixing, no wrapper that changes them.
 
     Examples:
       >>> from sme_registry.sb3 import PPOProjection, SMEVecEnv

@@ -19,7 +19,7 @@ from sme_registry.compiled.values import (
     ROWS,
     ROWS_WITH_SAFETY,
 )
-from sme_registry.envs import arguments, infos
+from sme_registry.envs import SMEEnv, SMEStreamEnv, arguments, infos
 from sme_registry.envs.base import renamed_by_content
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.batch_rendering import METADATA, batch_renderer
@@ -314,16 +314,10 @@ class SMEVecEnv(_BatchVecEnv):
     As in SB3's `VecEnv`s, a finished lane begins its next episode at once, its last observation is
     `terminal_observation` in its info, `TimeLimit.truncated` is True where it was truncated and
     not terminated, and `seed(n)` seeds lane i with n + i at the next reset. Observations are
-    `[B, S + m + 2]`, as those of `SMEEnv`. A stream's lives go on at each `reset()` without a seed;
-    observations and infos are those of `SMEStreamEnv`.
+    `[B, S + m + 2]`, as those of `SMEEnv`. A stream's lives go on at each `reset()` without a seed.
 
-    Args:
-      spec_or_id: the task or stream: a document, its fields, an id, a digest or a path.
-      num_envs: B, the lanes, at least 1.
-      action_range: "symmetric", [−1, 1], which suits SB3's Gaussian policies; or "unit".
-      render_mode: None or "rgb_array", for `VecVideoRecorder`.
-      render_lanes: the lanes to draw, such as `[0, 1]`; None draws each of them.
-      **overrides: spec fields to change.
+    `action_range` "symmetric", [−1, 1], suits SB3's Gaussian policies; `render_mode` "rgb_array" is
+    for `VecVideoRecorder`, with `render_lanes` the lanes to draw; `**overrides` change the spec.
 
     Examples:
       >>> from sme_registry.sb3 import SMEVecEnv
@@ -366,16 +360,7 @@ class SMETeamVecEnv(_BatchVecEnv):
     Its action is `[max a_i]`, of which its first a_i are used. Reward and info are that agent's,
     with the keys of `SMEEnv`. All agents of a team end together, and the team begins its next
     episode at once. `seed(n)` seeds team e with n + e at the next reset. All lanes of a team
-    take the same options.
-
-    Args:
-      spec_or_id: the task: a spec, its fields, an id, a digest or a path. One without a team is a
-        team of one.
-      num_envs: the teams, at least 1; `num_envs` of the VecEnv is the lanes, teams times agents.
-      action_range: "symmetric", [−1, 1], or "unit", [0, 1].
-      render_mode: None or "rgb_array", for `VecVideoRecorder`.
-      render_lanes: the teams to draw, such as `[0, 1]`; None draws each of them.
-      **overrides: spec fields to change.
+    take the same options. The other arguments are as in `SMEVecEnv`.
 
     Examples:
       >>> from sme_registry.sb3 import SMETeamVecEnv
@@ -414,3 +399,29 @@ class SMETeamVecEnv(_BatchVecEnv):
             raise arguments.not_finite_error()
         by_agent = unit.reshape(self.num_teams, len(self.agents), -1)
         return np.ascontiguousarray(by_agent[:, self._owner, self._entry])
+
+
+class SingleVecEnv(LanesVecEnv):
+    """One environment, bit for bit `SMEVecEnv` with one, without the overhead of a batch."""
+
+    def __init__(self, document: SMESpec | StreamSpec, *, action_range: ActionRange) -> None:
+        single: type[SMEEnv] = SMEStreamEnv if isinstance(document, StreamSpec) else SMEEnv
+        self._env = single(document, action_range=action_range)  # type: ignore[arg-type]
+        super().__init__([self._env])
+
+    def reset(self) -> Observation:
+        """Begin an episode with the seed and options set before; observations `[1, …]`."""
+        observation, info = self._env.reset(seed=self._seeds[0], options=self._options[0] or None)
+        self.reset_infos = [info]
+        self._clear_reset_arguments()
+        return observation[None]
+
+    def step_wait(self) -> StepResult:
+        """One step; see `SMEVecEnv.step_wait`."""
+        observation, reward, terminated, truncated, info = self._env.step(self._take_actions()[0])
+        ended = terminated or truncated
+        info["TimeLimit.truncated"] = truncated and not terminated
+        if ended:
+            info["terminal_observation"] = observation
+            observation, self.reset_infos[0] = self._env.reset()
+        return observation[None], np.array([reward], np.float32), np.array([ended]), [info]

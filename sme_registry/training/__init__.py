@@ -7,24 +7,24 @@
 Importing this module imports neither PyTorch nor JAX.
 """
 
+from sme_registry.envs.episodes import Episode
 from sme_registry.training.algorithms import (
     ALGORITHMS,
     default_algorithm,
     folder_name,
     full_name,
-    known_algorithm,
     short_name,
 )
-from sme_registry.training.episodes import Episode, read_episodes
+from sme_registry.training.episodes import read_episodes
 from sme_registry.training.hyperparameters import (
     check_hyperparameters,
     nested_hyperparameters,
     read_hyperparameters,
 )
+from sme_registry.training.lives import model_of_cell
 from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.record import RunRecord
 from sme_registry.training.run import DEFAULT_STEPS, EXPLORER, TrainingResult, train
-from sme_registry.training.snapshots import model_of_cell
 
 __all__ = [
     "ALGORITHMS",
@@ -37,7 +37,6 @@ __all__ = [
     "default_algorithm",
     "folder_name",
     "full_name",
-    "known_algorithm",
     "model_of_cell",
     "nested_hyperparameters",
     "numpy_policy",

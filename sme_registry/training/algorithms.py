@@ -1,15 +1,16 @@
-"""`uses`: the name of what `sme train` and the cells of a study train. Imported only when needed.
+"""`LEARNERS`: what the names in `uses` stand for, in `sme train` and in the cells of a study.
 
-    PPO, TD3, …        an algorithm of Stable-Baselines3, in any case
-    PPOLagrangian, …   one of ours for tasks with `safety` (`WITH_LIMITS`), in any case
-    jax:PPO, …         the same in JAX, with its environment in one program (`sme_registry.jax`)
-    an entry point     of the group `sme_registry.algorithms`, in an installed package
-    module:name        imported, from this folder or installed
+    PPO, TD3, …            an algorithm of Stable-Baselines3, in any case, or one of ours for tasks
+                           with `safety`; the agents of a team share one model
+    independent:PPO        the same with one model for each agent of a team
+    jax:PPO, …             the same in JAX, with its environment in one program
+    offline:bc, …          learns from a data set
+    reference:linear, …    a reference policy, which learns nothing
+    an entry point         of the group `sme_registry.algorithms`, in an installed package
+    module:name            imported, from this folder or installed
 
 An entry point or `module:name` is either a class like those of Stable-Baselines3
-(`sb3_contrib:TQC`), or a function that returns a learner; see `learners`.
-
-Also the settings they share here: one thread, no messages, a replay buffer of the size needed.
+(`sb3_contrib:TQC`), or a function that returns a model; see `learners`.
 """
 
 from __future__ import annotations
@@ -19,29 +20,150 @@ import importlib
 import importlib.metadata
 import io
 import warnings
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
+from sme_registry.datasets import record
 from sme_registry.envs.arguments import refuse_without_limits
-from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
+from sme_registry.errors import OptionError, SpecError, UnknownNameError, did_you_mean
+from sme_registry.evaluation.references import POLICIES
 from sme_registry.io import choice, import_object, require_packages
 from sme_registry.spec import SMESpec, StreamSpec
-from sme_registry.spec.study import INDEPENDENT, JAX, in_jax
+from sme_registry.spec.study import INDEPENDENT, JAX, OFFLINE, REFERENCE, in_jax
 
-# Names of classes in `stable_baselines3` and, for tasks with `safety`, in `sme_registry.sb3`.
-ALGORITHMS = {
+ENTRY_POINTS = "sme_registry.algorithms"
+AGENTS = ("sb3", "jax")  # whose implementation of an algorithm is trained
+_TEAMS = 8
+_MAX_REPLAY = 1_000_000  # SB3's default
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What a name in `uses` stands for; `place` is the module of a class that is ours or SB3's."""
+
+    kind: str  # "sb3", also what others wrote for its environments; or a prefix without its colon
+    name: str  # without the prefix
+    about: str = ""
+    place: str = ""
+    needs_limits: bool = False
+
+    @property
+    def prefix(self) -> str:
+        """Of the name in `uses`."""
+        return "" if self.kind == "sb3" else f"{self.kind}:"
+
+    def load(self, field: str = "uses") -> Any:
+        """The class or function that makes a model."""
+        if self.kind not in ("sb3", "independent"):
+            raise OptionError(
+                f"{field}='{self.prefix}{self.name}': is no algorithm of Stable-Baselines3's kind. "
+                "Use it in a study."
+            )
+        require_sb3()  # every model gets its `VecEnv`
+        if self.place:
+            # It imports the deprecated `gym` if that is installed, which prints a long notice.
+            with contextlib.redirect_stderr(io.StringIO()), quiet():
+                return getattr(importlib.import_module(self.place), self.name)
+        if ":" in self.name:
+            with quiet():
+                algorithm = import_object(self.name, field, OptionError)
+        else:
+            algorithm = _entry_point(self.name, field)
+        if not callable(algorithm):
+            raise OptionError(
+                f"{field}={self.name!r}: is of type {type(algorithm).__name__}: must be a class "
+                "like those of Stable-Baselines3, or a function from an environment to a learner."
+            )
+        return algorithm
+
+    def check_installed(self) -> None:
+        """Check that what learns is installed here, where that can be told in little time."""
+        if self.kind == "jax":
+            importlib.import_module("sme_registry.jax")  # raises where JAX is missing
+        elif self.kind in ("sb3", "independent"):
+            require_sb3()
+            if not self.place or self.kind == "independent":
+                self._check_kind(self.load())
+
+    def _check_kind(self, algorithm: Any) -> None:
+        if self.kind == "independent" and not is_on_policy(algorithm):
+            raise OptionError(
+                f"uses='{self.prefix}{self.name}': must be an on-policy algorithm, such as "
+                "independent:PPO, because the models of a team learn from the same rollouts. Use "
+                f"one model for all agents instead: {self.name}."
+            )
+
+    def check_task(self, document: SMESpec | StreamSpec) -> None:
+        """Check that it can learn a task or live in a stream, beyond what a plan itself says."""
+        if self.needs_limits:
+            spec = document if isinstance(document, SMESpec) else document.phases[0].spec
+            refuse_without_limits(self.name, spec)
+        if self.kind == "jax":
+            _check_in_jax(document)
+
+
+_OF_SB3 = {
     "TD3": "off-policy, deterministic; the fastest learner on the default task",
     "SAC": "off-policy, entropy-regularised",
     "DDPG": "off-policy, deterministic; the predecessor of TD3",
     "PPO": "on-policy; steps ten times faster, but learns from many more",
     "A2C": "on-policy",
+}
+_OF_OURS = {
     "PPOLagrangian": "PPO with a limit on the mean cost of a step, for tasks with safety",
     "PPOProjection": "PPO whose actions are cut at the limits, which it knows, for the same tasks",
 }
-WITH_LIMITS = ("PPOLagrangian", "PPOProjection")
-ENTRY_POINTS = "sme_registry.algorithms"
-_TEAMS = 8
-_MAX_REPLAY = 1_000_000  # SB3's default
+ALGORITHMS = _OF_SB3 | _OF_OURS
+"""Names and descriptions of the algorithms that `sme train` knows by name."""
+
+LEARNERS: dict[str, Entry] = {
+    entry.prefix + entry.name: entry
+    for entry in (
+        *(Entry("sb3", name, text, "stable_baselines3") for name, text in _OF_SB3.items()),
+        *(Entry("sb3", name, text, "sme_registry.sb3", True) for name, text in _OF_OURS.items()),
+        *(Entry("jax", name) for name in ("PPO", "TD3", "SAC")),
+        *(Entry("offline", name) for name in record.ALGORITHMS),
+        *(Entry("reference", name) for name in POLICIES),
+    )
+}
+_PREFIXES = (REFERENCE, OFFLINE, INDEPENDENT, JAX)
+
+
+def find(uses: str, field: str = "uses") -> Entry:
+    """The entry of a name, in any case. A name of no table may be an entry point: see `load`."""
+    prefix = next((prefix for prefix in _PREFIXES if uses.startswith(prefix)), "")
+    name = uses.removeprefix(prefix)
+    if prefix == INDEPENDENT:
+        entry = find(name, field)
+        return Entry("independent", entry.name, entry.about, entry.place, entry.needs_limits)
+    same_kind = {known: entry for known, entry in LEARNERS.items() if entry.prefix == prefix}
+    for known, entry in same_kind.items():
+        if known.casefold() == uses.casefold():
+            return entry
+    if prefix:
+        hint = " Other algorithms run without JAX." if prefix == JAX else ""
+        raise UnknownNameError(
+            f"{field}={uses!r}: must be one of {', '.join(same_kind)}.{hint}"
+            f"{did_you_mean(name, [entry.name for entry in same_kind.values()])}"
+        )
+    return Entry("sb3", name)
+
+
+def _check_in_jax(document: SMESpec | StreamSpec) -> None:
+    """Raise SpecError where JAX does not have a field, or agents in it cannot live in a stream."""
+    from sme_registry.jax.lives import check_switches
+    from sme_registry.jax.task import check_supported
+
+    if isinstance(document, SMESpec):
+        check_supported(document)
+        return
+    for index, phase in enumerate(document.phases):
+        try:
+            check_supported(phase.spec)
+        except SpecError as error:
+            raise SpecError(f"phases.{index}.spec: {error}") from None
+    check_switches(document)
 
 
 def default_algorithm(document: SMESpec | StreamSpec) -> str:
@@ -61,31 +183,10 @@ def default_num_envs(spec: SMESpec, algorithm: Any) -> int:
     return _TEAMS if spec.team is not None and is_on_policy(algorithm) else 1
 
 
-def is_on_policy(algorithm: Any) -> bool:
-    """Whether this is an on-policy class of Stable-Baselines3, such as PPO."""
-    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-
-    return isinstance(algorithm, type) and issubclass(algorithm, OnPolicyAlgorithm)
-
-
-def check_limits(uses: str, document: SMESpec | StreamSpec) -> None:
-    """Raise OptionError if an algorithm of `WITH_LIMITS` is to train on a task without `safety`."""
-    spec = document if isinstance(document, SMESpec) else document.phases[0].spec
-    for name in WITH_LIMITS:
-        if uses.removeprefix(INDEPENDENT).casefold() == name.casefold():
-            refuse_without_limits(name, spec)
-
-
-AGENTS = ("sb3", "jax")
-"""Whose implementation of an algorithm is trained: Stable-Baselines3's, or ours in JAX."""
-
-
 def full_name(uses: str, agents: str | None = None) -> str:
     """The exact name of an algorithm in any case, also of `jax:…`; others' names unchanged.
 
-    Args:
-      uses: the name.
-      agents: whose implementation, one of `AGENTS`; None for the one that the name says.
+    `agents` is whose implementation, "sb3" or "jax"; None for the one that the name says.
 
     Examples:
       >>> from sme_registry.training import full_name
@@ -127,23 +228,6 @@ def folder_name(uses: str) -> str:
     return f"{'jax-' * in_jax(uses)}{short_name(uses)}"
 
 
-def known_algorithm(name: str, algorithms: Collection[str] = tuple(ALGORITHMS)) -> str:
-    """The exact name of an algorithm, whose case does not matter.
-
-    Examples:
-      >>> from sme_registry.training import known_algorithm
-      >>> known_algorithm("td3")
-      'TD3'
-    """
-    for known in algorithms:
-        if known.casefold() == str(name).casefold():
-            return known
-    raise UnknownNameError(
-        f"algorithm={name!r}: must be one of {', '.join(algorithms)}."
-        f"{did_you_mean(str(name), algorithms)}"
-    )
-
-
 def require_sb3() -> None:
     """Check that Stable-Baselines3 and PyTorch are installed; imports neither."""
     require_packages(
@@ -151,36 +235,10 @@ def require_sb3() -> None:
     )
 
 
-def load_algorithm(name: str) -> Any:
-    """The class of an algorithm of `ALGORITHMS`; see `require_sb3`."""
-    # It imports the deprecated `gym` if that is installed, which prints a long notice.
-    with contextlib.redirect_stderr(io.StringIO()), quiet():
-        name = known_algorithm(name)
-        module = "sme_registry.sb3" if name in WITH_LIMITS else "stable_baselines3"
-        return getattr(importlib.import_module(module), name)
-
-
-def find_algorithm(uses: str, field: str = "uses", others: Iterable[str] = ()) -> Any:
-    """The class or function that `uses` names."""
-    require_sb3()  # every learner gets their `VecEnv`
-    if ":" in uses:
-        with quiet():
-            algorithm = import_object(uses, field, OptionError)
-    elif uses.casefold() in (known.casefold() for known in ALGORITHMS):
-        return load_algorithm(uses)
-    else:
-        algorithm = _entry_point(uses, field, others)
-    if not callable(algorithm):
-        raise OptionError(
-            f"{field}={uses!r}: is of type {type(algorithm).__name__}: must be a class like those "
-            "of Stable-Baselines3, or a function from an environment to a learner."
-        )
-    return algorithm
-
-
-def _entry_point(name: str, field: str, others: Iterable[str]) -> Any:
+def _entry_point(name: str, field: str) -> Any:
     installed = {point.name: point for point in importlib.metadata.entry_points(group=ENTRY_POINTS)}
     if name not in installed:
+        others = [known for known in LEARNERS if known not in ALGORITHMS]
         known = [*ALGORITHMS, *sorted(installed), *others]
         raise UnknownNameError(
             f"{field}={name!r}: must be one of {', '.join(known)}; or module:Class or "
@@ -194,6 +252,13 @@ def _entry_point(name: str, field: str, others: Iterable[str]) -> Any:
             f"{field}={name!r}: the entry point {point.value!r} cannot be imported: "
             f"{type(error).__name__}: {error}. Repair or remove the package that provides it."
         ) from error
+
+
+def is_on_policy(algorithm: Any) -> bool:
+    """Whether this is an on-policy class of Stable-Baselines3, such as PPO."""
+    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+    return isinstance(algorithm, type) and issubclass(algorithm, OnPolicyAlgorithm)
 
 
 def is_sb3(algorithm: Any) -> bool:

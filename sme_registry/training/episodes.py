@@ -10,44 +10,13 @@ import csv
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
-from sme_registry.envs.episodes import EpisodeSafety
+from sme_registry.envs.episodes import Episode, EpisodeSafety
 from sme_registry.errors import OptionError
 from sme_registry.io import write_atomically
 
 FILE = "episodes.csv"
 _AGENT_PREFIX = "regret/"
-
-
-class Episode(NamedTuple):
-    """A finished episode; of a team, one episode of the whole team.
-
-    Attributes:
-      episode: its number, from 1.
-      step: environment steps of the run over all environments when it ended; a step of a team is
-        one step of all its agents.
-      episode_return: sum of its rewards, in [0, T]. For a team, this, `regret` and `similarity`
-        are means over its agents.
-      length: number of steps.
-      regret: mean of 1 − r over its steps, in [0, 1]; exact.
-      similarity: mean r̃ over its steps, in [0, 1]; exact.
-      terminated: 1 if it ended by D, 0 if it reached the horizon.
-      wall_seconds: of training over all sessions when it ended.
-      agents_regret: mean regret of each agent, in the team's order; empty for a single agent.
-      safety: what it cost; None for a task without `safety`.
-    """
-
-    episode: int
-    step: int
-    episode_return: float
-    length: int
-    regret: float
-    similarity: float
-    terminated: int
-    wall_seconds: float
-    agents_regret: tuple[float, ...] = ()
-    safety: EpisodeSafety | None = None
 
 
 COLUMNS = Episode._fields[:-2]

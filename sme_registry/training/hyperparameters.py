@@ -13,15 +13,16 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from sme_registry.datasets.offline import check_algorithm
 from sme_registry.errors import OptionError, did_you_mean
 from sme_registry.io import import_object, read_json
-from sme_registry.spec.study import JAX, in_jax
-from sme_registry.training.algorithms import find_algorithm, is_sb3
+from sme_registry.training.algorithms import find, is_sb3
 
 # Arguments of an algorithm's constructor that are not hyperparameters.
 _RESERVED = ("self", "policy", "env", "seed", "device", "verbose", "tensorboard_log")
 # Arguments of a policy's constructor that the algorithm passes.
 _PASSED = ("self", "observation_space", "action_space", "lr_schedule")
+OF_DATA_SET = ("nu", "transitions", "batch_size")  # of `offline:…`, and not the learner's
 _ROLLOUT, _MIN_ROLLOUT = 2048, 16  # SB3's default for PPO in one environment; ours at least
 
 
@@ -73,16 +74,12 @@ def check_hyperparameters(
     field: str = "hyperparameters",
     others: Iterable[str] = (),
 ) -> None:
-    """Check that an algorithm has hyperparameters of these names. It checks no values, but in JAX.
+    """Check that an algorithm has hyperparameters of these names; values only in JAX and offline.
 
     The names are those of the constructor, or of the function, and in `policy_kwargs` those of the
     policy's constructor.
 
-    Args:
-      uses: the algorithm; see `find_algorithm`.
-      hyperparameters: names and values.
-      field: what error messages call them.
-      others: names that the caller accepts beside them, which the message may suggest.
+    Error messages call them `field`, and may suggest one of `others`, which the caller accepts.
 
     Examples:
       >>> from sme_registry.training import check_hyperparameters
@@ -92,14 +89,25 @@ def check_hyperparameters(
       ...
       sme_registry.errors.OptionError: hyperparameters.learning_rat: PPO has no such ...
     """
-    if in_jax(uses):
-        from sme_registry.jax.run import full_name, settings_of
+    if not hyperparameters:
+        return
+    entry = find(uses)
+    if entry.kind == "reference":
+        raise OptionError(
+            f"hyperparameters={sorted(hyperparameters)}: {uses} has no hyperparameters. Leave them "
+            "out."
+        )
+    if entry.kind == "offline":
+        own = {name: hyperparameters[name] for name in hyperparameters if name not in OF_DATA_SET}
+        check_algorithm(entry.name, own)
+    elif entry.kind == "jax":
+        from sme_registry.jax.run import settings_of
 
-        plain = full_name(uses).removeprefix(JAX)
-        refuse_unknown(find_algorithm(plain), plain, hyperparameters, field, others)
+        if others:  # where Stable-Baselines3 is needed anyway
+            refuse_unknown(find(entry.name).load(), entry.name, hyperparameters, field, others)
         settings_of(uses, hyperparameters, field)
-    elif hyperparameters:
-        refuse_unknown(find_algorithm(uses), uses, hyperparameters, field, others)
+    else:
+        refuse_unknown(entry.load(), uses, hyperparameters, field, others)
 
 
 def refuse_unknown(

@@ -7,30 +7,27 @@ Imports JAX and Stable-Baselines3; import it inside functions only.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 from stable_baselines3.common.logger import configure
 
-from sme_registry.envs.episodes import EpisodeSafety, safety_of_step
+from sme_registry.envs.episodes import Episode
 from sme_registry.errors import OptionError
 from sme_registry.evaluation.models import saved_sb3
 from sme_registry.io import is_installed, read_arrays, write_arrays, write_atomically
 from sme_registry.io.system import defer_interrupts
 from sme_registry.jax import run as jax_run
 from sme_registry.jax.program import Program, StepLog
-from sme_registry.sb3 import EpisodeRegret
-from sme_registry.spec import SMESpec
-from sme_registry.training import checkpoint
-from sme_registry.training.episodes import Episode
+from sme_registry.sb3.regret_callback import log_episode
 from sme_registry.training.learn import RunLog, not_finite
-from sme_registry.training.record import MODEL, TENSORBOARD, RunRecord
-from sme_registry.training.sb3_models import new_sb3_model, set_weights
-from sme_registry.training.snapshots import FOLDER as SNAPSHOTS
-from sme_registry.training.snapshots import Snapshots
+from sme_registry.training.lives import FOLDER as SNAPSHOTS
+from sme_registry.training.lives import Snapshots
+from sme_registry.training.models import new_sb3_model, set_weights, unloadable
+from sme_registry.training.record import CHECKPOINT, MODEL, TENSORBOARD, RunRecord
 
 _PIECE = 100  # steps between two reports of progress, and the longest wait for Ctrl-C
 _EPISODE = "episode"  # of the checkpoint: the sums of the present episode
@@ -70,32 +67,31 @@ def learn(
 ) -> tuple[RunRecord, list[Episode], Any]:
     """Train and write a model; see `training.learn.learn`."""
     program, model = agent
-    present = _PresentEpisode(record.spec)
-    path = folder / checkpoint.FILE
+    present = np.zeros(4 if record.spec.safety is None else 7)
+    path = folder / CHECKPOINT
     if record.sessions > 1 and path.exists():
         try:
             arrays = read_arrays(path)
-            present.sums = arrays.pop(_EPISODE)
+            present = arrays.pop(_EPISODE)
             program.restore(arrays)
         except (KeyError, OptionError) as error:
-            raise checkpoint.unloadable(path, error.__cause__ or error) from None
+            raise unloadable(path, error.__cause__ or error) from None
     total = -(-max(record.steps, program.steps) // program.rollout) * program.rollout
     board = _Board(folder / TENSORBOARD)
     begin, piece = program.steps, min(_PIECE, record.checkpoint_every)
     with RunLog(record, folder, begin, total, progress, console) as log:
         log.prepare("compiling …")
+        sums = log.sums.sums[: len(present), 0, 0]
+        sums[:] = present
 
         def save() -> None:
-            log.save_checkpoint(
-                lambda path: write_arrays(path, {**program.save(), _EPISODE: present.sums})
-            )
+            log.save_checkpoint(lambda path: write_arrays(path, {**program.save(), _EPISODE: sums}))
 
         def on_log(steps: StepLog) -> None:
             _check_finite(program, folder)
-            finished = present.add(program.steps, steps)
-            for episode in finished:
-                log.add(episode.step, [episode])
-            log.add(program.steps, [])
+            ended = np.logical_or(steps.terminated, steps.truncated)
+            info = {name: value for name, value in steps._asdict().items() if value is not None}
+            finished = log.add(log.sums.add(steps.reward, info, steps.terminated, ended))
             if program.steps - begin > max(piece, program.rollout):
                 log.prepared()  # PPO's updates are compiled in the second piece
             board.add(program.steps, finished)
@@ -137,48 +133,6 @@ def _check_finite(program: Program, folder: Path) -> None:
         raise not_finite(program.steps, folder)
 
 
-class _PresentEpisode:
-    """The sums of the episode that goes on from one piece of a run to the next."""
-
-    def __init__(self, spec: SMESpec) -> None:
-        self._spec = spec
-        self._zeros = np.zeros(4 if spec.safety is None else 4 + len(EpisodeSafety._fields))
-        self.sums: npt.NDArray[np.float64] = self._zeros
-
-    def add(self, last_step: int, log: StepLog) -> list[EpisodeRegret]:
-        """The episodes that ended in a piece."""
-        lengths = np.ones_like(log.regret)
-        values = np.stack([log.reward, lengths, log.regret, log.similarity])[:, :, 0]
-        if log.cost is not None and log.safe_regret is not None:
-            infos = {"cost": log.cost[:, 0], "safe_regret": log.safe_regret[:, 0]}
-            summands = safety_of_step(infos, lambda: self._spec)
-            assert summands is not None
-            values = np.concatenate([values, summands])
-        ends = np.flatnonzero(np.logical_or(log.terminated, log.truncated)[:, 0]) + 1
-        begin, finished = 0, []
-        for end in ends.tolist():
-            returned, length, regret, similarity, *safety = self._added(values[:, begin:end])
-            finished.append(
-                EpisodeRegret(
-                    step=last_step - values.shape[1] + end,
-                    regret=regret / length,
-                    similarity=similarity / length,
-                    episode_return=returned,
-                    length=int(length),
-                    terminated=bool(log.terminated[end - 1, 0]),
-                    safety=EpisodeSafety(*(each / length for each in safety)) if safety else None,
-                )
-            )
-            self.sums, begin = self._zeros, end
-        self.sums = np.array(self._added(values[:, begin:]))
-        return finished
-
-    def _added(self, values: npt.NDArray[np.float64]) -> list[float]:
-        """The sums with those of `[4 or 7, n]` steps, in order: the same bits for any pieces."""
-        sums: list[float] = np.cumsum(np.column_stack([self.sums, values]), axis=1)[:, -1].tolist()
-        return sums
-
-
 class _Board:
     """TensorBoard's log of finished episodes, if it is installed."""
 
@@ -186,17 +140,14 @@ class _Board:
         installed = is_installed("tensorboard")
         self._logger = configure(str(folder), ["tensorboard"]) if installed else None
 
-    def add(self, step: int, episodes: list[EpisodeRegret]) -> None:
+    def add(self, step: int, episodes: Sequence[Episode]) -> None:
         """Log the means of the episodes that ended in a piece."""
         if self._logger is None or not episodes:
             return
         for episode in episodes:
             self._logger.record_mean("rollout/ep_rew_mean", episode.episode_return)
             self._logger.record_mean("rollout/ep_len_mean", episode.length)
-            self._logger.record_mean("rollout/regret", episode.regret)
-            self._logger.record_mean("rollout/similarity", episode.similarity)
-            for name, value in episode.safety._asdict().items() if episode.safety else ():
-                self._logger.record_mean(f"rollout/{name}", value)
+            log_episode(self._logger, episode)
         self._logger.dump(step)
 
     def close(self) -> None:

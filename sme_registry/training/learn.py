@@ -15,42 +15,43 @@ from typing import Any
 import numpy as np
 import torch
 from rich.console import Console
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecMonitor
 
+from sme_registry.envs.episodes import Episode, Episodes
 from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation.models import saved_sb3
 from sme_registry.io import is_installed, write_atomically
 from sme_registry.io.system import defer_interrupts
 from sme_registry.io.terminal import Progress
-from sme_registry.sb3 import EpisodeRegret, EpisodeSums, RegretCallback, SMETeamVecEnv, SMEVecEnv
-from sme_registry.training import checkpoint
+from sme_registry.sb3 import SMETeamVecEnv, SMEVecEnv
+from sme_registry.sb3.regret_callback import finished_in, log_episode
 from sme_registry.training import episodes as episode_files
 from sme_registry.training.algorithms import is_sb3, short_name, silence
-from sme_registry.training.episodes import Episode, EpisodeLog
-from sme_registry.training.independent import IndependentLearners
-from sme_registry.training.learners import new_learner
-from sme_registry.training.record import MODEL, MODELS, TENSORBOARD, RunRecord
-from sme_registry.training.snapshots import FOLDER as SNAPSHOTS
-from sme_registry.training.snapshots import Snapshots
-from sme_registry.training.visits import VisitEnds
+from sme_registry.training.episodes import EpisodeLog
+from sme_registry.training.learners import CountedVecEnv, IndependentModels
+from sme_registry.training.lives import FOLDER as SNAPSHOTS
+from sme_registry.training.lives import Snapshots, VisitEnds
+from sme_registry.training.models import load_checkpoint, save_checkpoint
+from sme_registry.training.models import new_model as new_sb3_model
+from sme_registry.training.record import CHECKPOINT, MODEL, MODELS, TENSORBOARD, RunRecord
 
 _RECENT = 20  # episodes in the running mean that the progress shows
 
 
 def new_model(record: RunRecord) -> Any:
-    """The untrained model of a run, with its environment; `IndependentLearners` for such a team."""
+    """The untrained model of a run, with its environment; `IndependentModels` for such a team."""
+    options: dict[str, Any] = {"seed": record.seed, "hyperparameters": record.hyperparameters}
     if record.independent:
-        return IndependentLearners(record)
+        team = SMETeamVecEnv(record.spec, record.num_envs, action_range=record.action_range)
+        counted = CountedVecEnv(team)
+        return IndependentModels(record.algorithm, counted, steps=record.steps, **options)
     env_class = SMEVecEnv if record.spec.team is None else SMETeamVecEnv
     env = VecMonitor(env_class(record.document, record.num_envs, action_range=record.action_range))  # type: ignore[arg-type, unused-ignore]
-    model: Any = new_learner(
-        record.algorithm,
-        env,
-        seed=record.seed,
-        steps=record.steps * record.agents,
-        hyperparameters=record.hyperparameters,
-        field="algorithm",
+    transitions = record.steps * record.agents
+    model: Any = new_sb3_model(
+        record.algorithm, env, steps=transitions, field="algorithm", **options
     )
     if not is_sb3(model):
         raise OptionError(
@@ -105,14 +106,10 @@ def _train(
 
 
 def _train_independent(
-    learners: IndependentLearners, record: RunRecord, first_step: int, log: RunLog
+    learners: IndependentModels, record: RunRecord, first_step: int, log: RunLog
 ) -> None:
-    sums = EpisodeSums(learners.env.num_envs, record.agents)
-
-    def on_step(rewards: Any, dones: Any, infos: list[dict[str, Any]]) -> None:
-        finished = sums.add(learners.num_timesteps, rewards, dones, infos)
-        log.add(learners.num_timesteps, finished)
-        for episode in finished:
+    def after_step(steps: int) -> None:
+        for episode in log.add(finished_in(log.sums, *learners.env.last)):
             by_agent = episode.agents_regret or (episode.regret,)
             for model, regret in zip(learners.models.values(), by_agent, strict=True):
                 model.logger.record_mean("rollout/regret", regret)
@@ -121,7 +118,8 @@ def _train_independent(
         if log.is_checkpoint_due():
             _save_checkpoint(learners, log)
 
-    learners.learn(record.steps, on_step, on_rollout)
+    learners.env.after_step = after_step
+    learners.learn(record.steps, on_rollout)
 
 
 def _visits(model: Any, record: RunRecord, folder: Path, first_step: int) -> VisitEnds | None:
@@ -136,9 +134,9 @@ def _visits(model: Any, record: RunRecord, folder: Path, first_step: int) -> Vis
 
 def _save_checkpoint(model: Any, log: RunLog) -> None:
     _check_finite(model, log)
-    independent = isinstance(model, IndependentLearners)
+    independent = isinstance(model, IndependentModels)
     log.save_checkpoint(
-        model.save_checkpoint if independent else lambda path: checkpoint.save(model, path)
+        model.save_checkpoint if independent else lambda path: save_checkpoint(model, path)
     )
 
 
@@ -155,7 +153,7 @@ def not_finite(steps: int, folder: Path) -> PolicyError:
     record = RunRecord.read(folder)  # of its last checkpoint
     if record is not None:
         record.updated(status="failed", failure=failure).write(folder)
-    path = folder / checkpoint.FILE
+    path = folder / CHECKPOINT
     kept = f"{path} is its last checkpoint" if path.exists() else "it has no checkpoint"
     return PolicyError(
         f"training: {failure}. The run stays in {folder}; {kept}. Train into another folder with "
@@ -164,7 +162,7 @@ def not_finite(steps: int, folder: Path) -> PolicyError:
 
 
 def _write_model(model: Any, folder: Path) -> None:
-    if isinstance(model, IndependentLearners):
+    if isinstance(model, IndependentModels):
         model.save(folder / MODELS)
         return
     write_atomically(folder / MODEL, saved_sb3(model))
@@ -187,7 +185,14 @@ class RunLog:
         self._record, self._folder = record, folder
         self._log = EpisodeLog(folder / episode_files.FILE, first_step, names)
         self._wall_before = self.episodes[-1].wall_seconds if self.episodes else 0.0
-        self._steps = self._last_checkpoint = first_step
+        self._last_checkpoint = first_step
+        self.sums = Episodes(
+            record.num_envs,
+            record.agents,
+            lambda: record.spec,
+            steps=first_step,
+            clock=lambda: self._wall_seconds,
+        )
         name = short_name(record.algorithm)
         if progress and total > max(first_step, record.steps):
             (console or Console(stderr=True)).print(
@@ -210,6 +215,11 @@ class RunLog:
         self._log.close()
 
     @property
+    def agents(self) -> Sequence[str]:
+        """Names of a team's agents; none for a single agent."""
+        return self._log.agents
+
+    @property
     def episodes(self) -> list[Episode]:
         """All finished episodes, also those of earlier sessions."""
         return self._log.episodes
@@ -222,53 +232,46 @@ class RunLog:
         """Measure the displayed rate from here on, if it is not measured yet."""
         self._progress.prepared()
 
-    def add(self, steps: int, finished: Sequence[EpisodeRegret]) -> None:
-        """Log the episodes that finished after so many environment steps of the whole run."""
-        self._steps = steps
+    @property
+    def steps(self) -> int:
+        """Environment steps of the whole run so far."""
+        return self.sums.steps
+
+    def add(self, finished: Sequence[Episode]) -> Sequence[Episode]:
+        """Log the episodes that ended in the last steps, and return them."""
         for episode in finished:
-            by_agent = episode.agents_regret or (episode.regret,)
-            self._log.add(
-                Episode(
-                    episode=len(self.episodes) + 1,
-                    step=steps,
-                    episode_return=episode.episode_return,
-                    length=episode.length,
-                    regret=episode.regret,
-                    similarity=episode.similarity,
-                    terminated=int(episode.terminated),
-                    wall_seconds=round(self._wall_seconds, 3),
-                    agents_regret=by_agent if self._log.agents else (),
-                    safety=episode.safety,
-                )
-            )
+            by_agent = (episode.agents_regret or (episode.regret,)) if self._log.agents else ()
+            number = len(self.episodes) + 1
+            self._log.add(episode._replace(episode=number, agents_regret=by_agent))
         if finished:
             self._note = self._progress_note()
-        self._progress.update(steps, self._note)
+        self._progress.update(self.steps, self._note)
+        return finished
 
     def record(self) -> RunRecord:
         """The record with its present progress."""
         seconds = self._wall_seconds
         return self._record.updated(
-            steps_done=self._steps,
+            steps_done=self.steps,
             episodes=len(self.episodes),
             wall_seconds=round(seconds, 3),
-            steps_per_second=round(self._steps / max(seconds, 1e-9), 3),
+            steps_per_second=round(self.steps / max(seconds, 1e-9), 3),
         )
 
     def is_checkpoint_due(self) -> bool:
         """Whether enough steps have passed since the last checkpoint."""
-        return self._steps - self._last_checkpoint >= self._record.checkpoint_every
+        return self.steps - self._last_checkpoint >= self._record.checkpoint_every
 
     def save_checkpoint(self, save: Callable[[Path], None]) -> None:
         """Write the checkpoint with `save`, and the record."""
         with defer_interrupts():
-            save(self._folder / checkpoint.FILE)
+            save(self._folder / CHECKPOINT)
             self.record().write(self._folder)
-        self._last_checkpoint = self._steps
+        self._last_checkpoint = self.steps
 
     def not_finite(self) -> PolicyError:
         """The error for weights that are not finite; see the function."""
-        return not_finite(self._steps, self._folder)
+        return not_finite(self.steps, self._folder)
 
     @property
     def _wall_seconds(self) -> float:
@@ -279,7 +282,7 @@ class RunLog:
         """The phase of a stream, and the mean regret of the last episodes."""
         notes, stream, recent = [], self._record.stream, self.episodes[-_RECENT:]
         if stream is not None:
-            notes.append(f"phase {stream.pieces[stream.piece_at(self._steps)].phase}")
+            notes.append(f"phase {stream.pieces[stream.piece_at(self.steps)].phase}")
         if recent:
             regret = np.mean([episode.regret for episode in recent])
             whose = "team's mean regret" if self._log.agents else "mean regret"
@@ -289,12 +292,12 @@ class RunLog:
         return ", ".join(notes)
 
 
-class _Callback(RegretCallback):
+class _Callback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped without SB3
     """Logs finished episodes, saves checkpoints and updates the progress during SB3's training."""
 
     def __init__(self, model: Any, log: RunLog, visits: VisitEnds | None) -> None:
         super().__init__()
-        self.model, self._log, self._logged, self._visits = model, log, 0, visits
+        self.model, self._log, self._visits = model, log, visits
 
     def _on_rollout_start(self) -> None:
         # Between rollouts the model is consistent: it has learnt from all transitions, and they are
@@ -303,26 +306,28 @@ class _Callback(RegretCallback):
             _save_checkpoint(self.model, self._log)
 
     def _on_step(self) -> bool:
-        super()._on_step()
+        step = (self.locals[name] for name in ("rewards", "dones", "infos"))
+        finished = finished_in(self._log.sums, *step)
         if self._visits is not None:
-            self._visits.after_step(self.steps)
-        self._log.add(self.steps, self.episodes[self._logged :])
-        self._logged = len(self.episodes)
+            self._visits.after_step(self._log.steps)
+        agents = self._log.agents
+        for episode in self._log.add(finished):
+            log_episode(self.logger, episode, agents if len(agents) > 1 else ())
         return True
 
 
 def _continued(model: Any, record: RunRecord, folder: Path) -> Any:
     """The model of the checkpoint if the run is resumed, or the new one."""
-    path = folder / checkpoint.FILE
+    path = folder / CHECKPOINT
     if record.sessions == 1 or not path.exists():
         return model
-    if isinstance(model, IndependentLearners):
+    if isinstance(model, IndependentModels):
         model.load_checkpoint(path)
         return model
     changes: dict[str, Any] = {}
     if hasattr(model, "buffer_size"):
         changes["buffer_size"] = model.buffer_size
-    model = checkpoint.load(type(model), path, model.env, **changes)
+    model = load_checkpoint(type(model), path, model.env, **changes)
     # Another stream than the first session's, but the same whenever this session is repeated.
     sequence = np.random.SeedSequence([record.seed, model.num_timesteps])
     model.set_random_seed(int(sequence.generate_state(1)[0] >> 1))
@@ -332,7 +337,7 @@ def _continued(model: Any, record: RunRecord, folder: Path) -> Any:
 
 
 def _models(model: Any) -> list[Any]:
-    return list(model.models.values()) if isinstance(model, IndependentLearners) else [model]
+    return list(model.models.values()) if isinstance(model, IndependentModels) else [model]
 
 
 def _set_loggers(model: Any, folder: Path) -> None:
@@ -342,7 +347,7 @@ def _set_loggers(model: Any, folder: Path) -> None:
     if is_installed("tensorboard"):
         folders = (
             {folder / name: each for name, each in model.models.items()}
-            if isinstance(model, IndependentLearners)
+            if isinstance(model, IndependentModels)
             else {folder: model}
         )
         for own_folder, each in folders.items():

@@ -32,18 +32,12 @@ _TOLERANCE = 1e-5  # of an action; another order of the same sums moves it by 1e
 def numpy_policy(
     model: Any, document: SMESpec | StreamSpec, *, action_range: str | None = None
 ) -> Policy:
-    """The deterministic policy of a model with its current weights.
+    """The deterministic policy of a model with its current weights, as a callable for `evaluate`.
 
-    Args:
-      model: a Stable-Baselines3 model, or anything else that `evaluate` accepts. Only the network
-        of a model is copied, so later training does not change it; other policies are called
-        directly.
-      document: a single-agent task, or a stream.
-      action_range: of the policy's actions; None takes the model's own action space.
-
-    Returns:
-      A callable from observations `[B, O]` (of a stream that shows the phase, with its
-      one-hot) to actions `[B, A]` in units of the unit range, which the environment clips.
+    Maps observations `[B, O]` (of a stream that shows the phase, with its one-hot) to actions
+    `[B, A]` of the unit range, which the environment clips. The network of a model is copied, so
+    later training does not change it; what is no such model is called directly.
+    `action_range` is that of its actions; None takes the model's own action space.
 
     Examples:
       >>> from sme_registry.evaluation import load_sb3

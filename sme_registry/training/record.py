@@ -24,6 +24,7 @@ from sme_registry.spec.study import INDEPENDENT, in_jax
 RECORD = "run.json"
 MODEL, MODELS = "model.zip", "model"  # a folder of one model for each independent agent
 TENSORBOARD = "tensorboard"
+CHECKPOINT = "checkpoint.zip"
 PACKAGES = ("gymnasium", "numpy", "scipy", "numba", "stable_baselines3", "torch")
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from rich.console import Console
 
+from sme_registry.envs.episodes import Episode
 from sme_registry.evaluation import (
     EvaluationReport,
     StreamReport,
@@ -27,9 +28,9 @@ from sme_registry.plots import files as plot_files
 from sme_registry.plots.streams import FILE as STREAM
 from sme_registry.spec import StreamSpec
 from sme_registry.training import episodes as episode_files
-from sme_registry.training import snapshots
+from sme_registry.training import lives
 from sme_registry.training.algorithms import short_name
-from sme_registry.training.episodes import Episode, read_episodes
+from sme_registry.training.episodes import read_episodes
 from sme_registry.training.record import RunRecord
 
 EVALUATION = "evaluation.json"
@@ -70,7 +71,7 @@ def write_report(
 def _evaluate_life(
     record: RunRecord, stream: StreamSpec, folder: Path, on_batch: OnBatch
 ) -> StreamReport:
-    files = snapshots.Snapshots(folder / snapshots.FOLDER, stream)
+    files = lives.Snapshots(folder / lives.FOLDER, stream)
     report = evaluate_stream(
         files.visits,
         stream,

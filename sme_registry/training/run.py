@@ -25,6 +25,7 @@ from typing import Any, Literal
 
 from rich.console import Console
 
+from sme_registry.envs.episodes import Episode
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, StreamReport, resolve_protocol
 from sme_registry.io import (
@@ -47,27 +48,33 @@ from sme_registry.spec import (
 )
 from sme_registry.spec.study import in_jax
 from sme_registry.task import load, materialize, materialize_stream
-from sme_registry.training import checkpoint, reports
 from sme_registry.training import episodes as episode_files
+from sme_registry.training import reports
 from sme_registry.training.algorithms import (
-    check_limits,
     default_algorithm,
     default_num_envs,
-    find_algorithm,
+    find,
     full_name,
     one_thread,
     quiet,
     require_sb3,
 )
-from sme_registry.training.episodes import Episode
 from sme_registry.training.hyperparameters import for_lanes, nested_hyperparameters, refuse_unknown
-from sme_registry.training.record import MODEL, MODELS, RECORD, TENSORBOARD, RunRecord, versions_for
-from sme_registry.training.snapshots import FOLDER as SNAPSHOTS
+from sme_registry.training.lives import FOLDER as SNAPSHOTS
+from sme_registry.training.record import (
+    CHECKPOINT,
+    MODEL,
+    MODELS,
+    RECORD,
+    TENSORBOARD,
+    RunRecord,
+    versions_for,
+)
 
 REPORT = "report.md"  # written by `sme demo`
 EXPLORER = "explorer.html"  # written by `sme train` and `sme explore`
 _FILES = (
-    RECORD, episode_files.FILE, checkpoint.FILE, MODEL, MODELS, SNAPSHOTS, *reports.FILES,
+    RECORD, episode_files.FILE, CHECKPOINT, MODEL, MODELS, SNAPSHOTS, *reports.FILES,
     REPORT, EXPLORER, TENSORBOARD,
 )  # fmt: skip
 
@@ -118,54 +125,39 @@ def train(
     agents: Literal["sb3", "jax"] | None = None,
     device: str | None = None,
 ) -> TrainingResult:
-    """Train one algorithm of Stable-Baselines3's kind: with it on the CPU, or in JAX.
+    """Train one algorithm on one task or stream: with Stable-Baselines3 on the CPU, or in JAX.
 
     Hyperparameters that are not given have the algorithm's defaults, except in several environments
     or for a team, where `n_steps` or `gradient_steps` keep the algorithm what it is in one; see
     `hyperparameters.for_lanes`. `run.json` records all that differ from the defaults.
 
     A resumed run continues from its last checkpoint, with the same networks, optimisers, replay
-    buffer and step count. It does not reproduce the uninterrupted run bit for bit: random streams
-    are seeded again, and the current episodes (for PPO and A2C the current rollout) restart.
-    Episodes logged after the checkpoint are dropped. In JAX the checkpoint holds everything, and
-    the resumed run is the uninterrupted one, bit for bit on the same device and versions.
+    buffer and step count, but not bit for bit: random streams are seeded again, and the current
+    episodes (for PPO and A2C the current rollout) restart. In JAX it is the uninterrupted run, bit
+    for bit on the same device and versions.
 
     On a stream the agent lives through all phases, and `folder/snapshots` keeps its model at the
     end of each visit. A resumed life goes on at the step of its checkpoint.
 
     Args:
-      spec: the task or the stream: a document, its fields, an id, a digest or a path.
-      algorithm: "TD3", "SAC", "DDPG", "PPO" or "A2C", in any case; for a task with `safety` also
-        "PPOLagrangian" or "PPOProjection"; "module:Class", such as
-        "sb3_contrib:TQC", "module:function" or an entry point (`algorithms`); "jax:PPO", "jax:TD3"
-        or "jax:SAC" in JAX; None takes TD3, and PPO for a team.
-      steps: environment steps over all environments, at least 1; None takes 20,000, and those of
-        a stream, which must not be others. One step of a team is a step of all its n agents and
-        gives n transitions. PPO and A2C finish their last rollout.
-      seed: of the algorithm and of the environment's starts, in [0, 2**32 - num_envs].
-      folder: output folder, created if it is missing.
-      hyperparameters: those that differ from the algorithm's defaults, as JSON values, such as
+      algorithm: a name of `algorithms.LEARNERS` that trains in an environment, in any case, an
+        entry point, or "module:Class"; None takes TD3, and PPO for a team.
+      steps: environment steps over all environments; None takes 20,000, and those of a stream. One
+        step of a team is a step of all its agents. PPO and A2C finish their last rollout.
+      hyperparameters: as JSON values, such as
         {"learning_rate": 1e-4, "policy_kwargs": {"net_arch": [64, 64]}}. Dotted names are nested.
       independent: whether each agent of a team has a model of its own, which learns from its
         observations and rewards; otherwise they share one. For on-policy algorithms.
       action_range: of the policy's actions, "symmetric" [−1, 1] or "unit" [0, 1].
       num_envs: environments (or teams) stepped in parallel, in [1, 4096]; None takes 1, and 8 for a
-        team and an on-policy algorithm. 1 on a stream.
+        team and an on-policy algorithm. 1 on a stream and in JAX.
       checkpoint_every: steps between checkpoints; None takes a twentieth of `steps`, at least
         1,000.
-      protocol: of the final evaluation.
-      progress: whether to show progress: a bar, or lines if there is no terminal.
-      console: where to show it; None for standard error.
-      resume: continue the unfinished run in the folder; `steps` may be larger than before, and not
-        smaller than what is done.
+      resume: continue the unfinished run in the folder; `steps` may be larger than before.
       force: remove the run in the folder and start again.
-      agents: "jax" for our implementation of "PPO", "TD3" or "SAC" in JAX, with its environment in
-        one program, for a task without a team; "sb3" for Stable-Baselines3's; None for the one that
-        `algorithm` names.
+      agents: "jax" or "sb3", whose implementation is trained; None for the one that `algorithm`
+        names.
       device: of agents in JAX, "cpu", "gpu" or "tpu"; None for JAX's default.
-
-    Returns:
-      The finished run.
 
     Examples:
       >>> from sme_registry.training import train
@@ -295,8 +287,14 @@ def _with_algorithm(
             f"device={device!r}: is for agents in JAX; those of Stable-Baselines3 train on the "
             'CPU. Leave it out, or use --agents jax (in Python, agents="jax").'
         )
-    check_limits(uses, plan.document)
-    algorithm = find_algorithm(uses, "algorithm")
+    entry = find(uses, "algorithm")
+    if entry.kind == "independent":
+        raise OptionError(
+            f"algorithm={uses!r}: is a name for studies. Train {entry.name!r} with "
+            "independent=True (in the terminal, --independent)."
+        )
+    entry.check_task(plan.document)
+    algorithm = entry.load("algorithm")
     refuse_unknown(algorithm, uses, settings)
     if num_envs is None:
         num_envs = default_num_envs(plan.spec, algorithm)
@@ -325,10 +323,9 @@ def _with_jax_algorithm(
     """The same for an agent in JAX."""
     require_sb3()  # `model.zip` is a model of it
     from sme_registry.jax.device import find_device
-    from sme_registry.jax.run import full_name as known_name
     from sme_registry.jax.run import settings_of
 
-    known_name(uses, "algorithm")
+    find(uses, "algorithm")
     settings_of(uses, settings)
     if num_envs not in (None, 1):
         raise OptionError(
@@ -368,7 +365,7 @@ def _new_or_continued(folder: Path, plan: RunRecord, *, resume: bool, force: boo
         return plan
     if previous is None:
         lanes = plan.num_envs * (1 if plan.independent else plan.agents)
-        settings = for_lanes(find_algorithm(plan.algorithm), lanes, plan.hyperparameters)
+        settings = for_lanes(find(plan.algorithm).load(), lanes, plan.hyperparameters)
         return plan.updated(hyperparameters={**settings, **plan.hyperparameters})
     if previous.status != "running":
         reason = f" ({previous.failure})" if previous.failure else ""

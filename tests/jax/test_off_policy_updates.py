@@ -19,7 +19,7 @@ from sme_registry.jax.replay import Transitions
 from sme_registry.jax.sac import SAC, SACProgram
 from sme_registry.jax.td3 import TD3, TD3Program
 from sme_registry.sb3 import SMEVecEnv
-from sme_registry.training.algorithms import load_algorithm, one_thread, quiet
+from sme_registry.training.algorithms import find, one_thread, quiet
 
 NET_ARCH = (96, 64)
 BATCH = 64
@@ -33,7 +33,7 @@ def model_in_mid_run(algorithm, dimensions):
     spec = {"state_dim": dimensions.state_dim, "action_dim": dimensions.action_dim, "seed": 5}
     env = SMEVecEnv({**spec, "horizon": 20, "D": 0.1 if dimensions.action_dim < 9 else 0.0}, 1)
     with quiet(), one_thread():
-        model = load_algorithm(algorithm)(
+        model = find(algorithm).load()(
             "MlpPolicy", env, seed=3, batch_size=BATCH, buffer_size=1000, device="cpu",
             policy_kwargs={"net_arch": list(NET_ARCH)},
         )  # fmt: skip

@@ -22,8 +22,8 @@ from sme_registry.jax.networks import Adam
 from sme_registry.jax.padding import Dimensions, Padding
 from sme_registry.jax.run import settings_of
 from sme_registry.jax.task import task_params
+from sme_registry.sb3.vec_env import SingleVecEnv
 from sme_registry.training.algorithms import silence
-from sme_registry.training.monitored_env import MonitoredVecEnv
 
 Weights = dict[str, npt.NDArray[np.float32]]
 
@@ -48,7 +48,7 @@ class Recording(NamedTuple):
     weights: list[Weights]
 
 
-class RecordingEnv(MonitoredVecEnv):
+class RecordingEnv(SingleVecEnv):
     """An environment that keeps the answers to its steps."""
 
     def step_wait(self):

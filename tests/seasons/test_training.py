@@ -18,7 +18,7 @@ from sme_registry.errors import OptionError, SealedError
 from sme_registry.sb3 import SMEVecEnv
 from sme_registry.seasons.sb3 import SealedVecEnv
 from sme_registry.seasons.wire import StepsAnswer
-from sme_registry.training.learners import new_learner
+from sme_registry.training.models import new_model
 from tests.leaderboard.sealed.playing import ROWS
 from tests.seasons.server import BUDGET, serving_season
 
@@ -79,7 +79,7 @@ def test_an_episode_that_terminates_at_the_horizon_is_not_cut(server, monkeypatc
 )
 def test_this_project_s_trainers_learn_and_their_models_answer(server, algorithm, settings):
     env = SealedVecEnv(server.url, server.ticket, 0, 4)
-    model = new_learner(algorithm, env, seed=0, steps=64, hyperparameters=settings)
+    model = new_model(algorithm, env, seed=0, steps=64, hyperparameters=settings)
     model.learn(64)
     assert env.instance.number == 16
     seasons.answer(server.url, server.ticket, model, 0)

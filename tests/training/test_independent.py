@@ -40,14 +40,15 @@ def test_a_team_of_one_learns_exactly_what_sb3s_ppo_learns(team_run):
     from stable_baselines3 import PPO
     from stable_baselines3.common.utils import set_random_seed
 
-    from sme_registry.sb3 import SMEVecEnv
+    from sme_registry.sb3 import SMETeamVecEnv, SMEVecEnv
     from sme_registry.training.algorithms import silence
-    from sme_registry.training.independent import IndependentLearners
+    from sme_registry.training.learners import IndependentModels
 
     spec = TINY.derive(team={"agents": [{"action_dim": 2}]})
-    record = team_run.record.updated(spec=spec, agents=1, num_envs=2, seed=4)
-    learners = IndependentLearners(record)
-    learners.learn(192, lambda *step: None, lambda: None)
+    settings = team_run.record.hyperparameters
+    env = SMETeamVecEnv(spec, 2)
+    learners = IndependentModels("PPO", env, seed=4, steps=192, hyperparameters=settings)
+    learners.learn(192)
     (ours,) = learners.models.values()
 
     env = SMEVecEnv(TINY, 2)

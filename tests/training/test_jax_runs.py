@@ -25,9 +25,10 @@ from sme_registry.evaluation.models import saved_sb3
 from sme_registry.export import export_onnx
 from sme_registry.io import read_arrays, write_arrays
 from sme_registry.jax.run import new_program
-from sme_registry.training import RunRecord, checkpoint, jax_learn, train
+from sme_registry.training import RunRecord, jax_learn, train
 from sme_registry.training.episodes import read_episodes
-from sme_registry.training.sb3_models import new_sb3_model, set_weights
+from sme_registry.training.models import new_sb3_model, set_weights
+from sme_registry.training.record import CHECKPOINT
 from tests.training.runs import NARROW, PROTOCOL, TINY
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
@@ -92,7 +93,7 @@ def test_the_model_is_one_of_stable_baselines3(run, tmp_path):
     assert evaluate(run.model_path, TINY, PROTOCOL, name="PPO").regions == run.report.regions
     # The last checkpoint precedes the last update.
     program = new_program("jax:PPO", [TINY], [0], hyperparameters=PPO, steps=120)
-    arrays = read_arrays(run.folder / checkpoint.FILE)
+    arrays = read_arrays(run.folder / CHECKPOINT)
     program.restore({name: array for name, array in arrays.items() if name != "episode"})
     program.finish()
     for name, weight in model.policy.state_dict().items():
@@ -158,7 +159,7 @@ def without_times(result):
 def same_bits(one, other):
     assert without_times(one) == without_times(other)
     assert one.report.regions == other.report.regions
-    with np.load(one.folder / checkpoint.FILE) as a, np.load(other.folder / checkpoint.FILE) as b:
+    with np.load(one.folder / CHECKPOINT) as a, np.load(other.folder / CHECKPOINT) as b:
         assert a.files == b.files
         assert all(np.array_equal(a[name], b[name]) for name in a.files)
     weights, others = (load_sb3(each.model_path).policy.state_dict() for each in (one, other))
@@ -188,7 +189,7 @@ def test_a_damaged_checkpoint_is_refused_and_one_with_weights_that_are_not_finit
 ):
     folder = tmp_path / "run"
     interrupted(folder, monkeypatch)
-    path = folder / checkpoint.FILE
+    path = folder / CHECKPOINT
     whole = read_arrays(path)
 
     def refused():

@@ -102,10 +102,10 @@ def test_the_checkpoint_holds_the_model_its_optimisers_and_its_replay_buffer(kil
     from stable_baselines3 import TD3
 
     from sme_registry.sb3 import SMEVecEnv
-    from sme_registry.training import checkpoint
+    from sme_registry.training.models import load_checkpoint
 
     path = killed / "checkpoint.zip"
-    model = checkpoint.load(TD3, path, SMEVecEnv(TINY, 1), buffer_size=5_000)
+    model = load_checkpoint(TD3, path, SMEVecEnv(TINY, 1), buffer_size=5_000)
     steps = model.num_timesteps
     assert steps % 50 == 0
     assert steps >= 150

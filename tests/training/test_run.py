@@ -252,6 +252,8 @@ def test_a_folder_with_other_files_is_never_touched(tmp_path):
         ({"task": "Defalt"}, "Did you mean 'Default"),
         ({"task": {"state_dim": 2**20, "action_dim": 2**20}}, "state_dim"),
         ({"algorithm": "TD4"}, "Did you mean 'TD3'"),
+        ({"algorithm": "independent:PPO"}, "Train 'PPO' with independent=True"),
+        ({"algorithm": "reference:linear"}, "Use it in a study"),
         ({"resume": True}, "contains no run to resume. Leave out --resume"),
         ({"hyperparameters": {"buffer_size": 10**15}}, "rejects the task or .*buffer_size"),
         ({"hyperparameters": {"gama": 0.9}}, "Did you mean 'gamma'"),
@@ -325,10 +327,11 @@ STREAM = StreamSpec(
 )
 def test_steps_equal_those_of_a_batch_of_one(document, action_range):
     from sme_registry.sb3 import SMEVecEnv
-    from sme_registry.training.monitored_env import MonitoredVecEnv
+    from sme_registry.sb3.vec_env import SingleVecEnv
+    from sme_registry.training.learners import CountedVecEnv
 
     batch = SMEVecEnv(document, 1, action_range=action_range)
-    monitored = MonitoredVecEnv(document, action_range=action_range)
+    monitored = CountedVecEnv(SingleVecEnv(document, action_range=action_range))
     assert monitored.action_space == batch.action_space
     assert monitored.observation_space == batch.observation_space
     for env in (batch, monitored):

@@ -1,13 +1,16 @@
 """`run_cell`: one run of a study, from its document to its result. It writes no files of the study.
 
-A single agent learns in one environment, as its algorithm is defined (teams: `training`). Only the
-evaluations run as a batch. The same cell gives the same result on the same machine, except for
-`timing`.
+    reference:…    a policy that learns nothing, evaluated as often as a learner
+    offline:…      collects a data set, which it does not keep, and learns from it alone
+    jax:…          the only lane of a program (`lanes`)
+    any other      a `Learner` in its environments
+
+Only the evaluations run as a batch. The same cell gives the same result on the same machine, except
+for `timing`.
 """
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from sme_registry.errors import PolicyError
+from sme_registry.datasets import DatasetRecipe, collect, train_offline
+from sme_registry.errors import OptionError, PolicyError, SpecError
 from sme_registry.evaluation import (
     EvaluationReport,
     Policy,
@@ -27,19 +31,22 @@ from sme_registry.evaluation import (
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import write_atomically
-from sme_registry.spec.study import Cell, in_jax
-from sme_registry.studies.engine.algorithms import find_algorithm, reference_name
-from sme_registry.studies.engine.checks import refuse_of_reference
+from sme_registry.spec import SMESpec, StreamSpec
+from sme_registry.spec.study import Cell
 from sme_registry.studies.engine.jobs import Lanes
 from sme_registry.studies.engine.lanes import run_lanes
-from sme_registry.studies.engine.life import Life, TasksInForce
-from sme_registry.studies.engine.offline_cell import offline_name, run_offline
-from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing, report_field
-from sme_registry.studies.engine.training import Training, training
-from sme_registry.training.algorithms import one_thread, quiet
-from sme_registry.training.record import versions_for
+from sme_registry.studies.engine.record import EVALUATION, TRAINING, Record, life_report
+from sme_registry.studies.engine.result import CellResult, LearningCurve, OfflineResult, Timing
+from sme_registry.task import Task, materialize, materialize_stream
+from sme_registry.training.algorithms import find, one_thread, quiet
+from sme_registry.training.hyperparameters import check_hyperparameters
+from sme_registry.training.lives import Snapshots, VisitEnds
 
 ReportSteps = Callable[[int, int], None]
+
+TRANSITIONS = 50_000
+BATCH_SIZE = 256
+_COUNTED_AT_ONCE = 500  # steps of a life; one by one they would cost a twentieth of PPO's
 
 
 def run_cell(
@@ -47,9 +54,8 @@ def run_cell(
 ) -> CellResult:
     """Train, evaluate during training, and evaluate in and out of distribution at the end.
 
-    The k-th evaluation follows round(steps · k / evaluations) steps, the last one the end of
-    training: on-policy algorithms finish their last rollout, so it can be later. Its episodes are
-    deterministic and start in states that depend only on the seed and on k.
+    The evaluations' episodes are deterministic and start in states that depend only on the seed and
+    on the evaluation's number.
 
     Args:
       cell: the cell to run.
@@ -70,38 +76,18 @@ def run_cell(
       >>> run_cell(cell).report.policy
       'reference:linear'
     """
-    start = time.thread_time()
     progress = progress or (lambda done, total: None)
-    if in_jax(cell.uses):
+    entry = find(cell.uses)
+    if entry.kind == "jax":
         return _run_alone(cell, progress, model_path)
-    learner = offline_name(cell.uses)
-    if learner is not None:
-        return run_offline(cell, learner, progress)
-    reference = reference_name(cell.uses)
-    if reference is None:
-        find_algorithm(cell.uses)  # refuse an unknown one before anything is loaded
-    recorder = _Recorder(cell, progress)
-    with quiet(), contextlib.nullcontext() if reference else one_thread():
-        learned: Policy | TeamPolicy | Life
-        if reference:
-            learned = _evaluate_reference(cell, reference, recorder)
-        else:
-            learned = _train(cell, recorder, model_path)
-        evaluation_start = time.thread_time()
-        if isinstance(learned, Life):
-            report: EvaluationReport | StreamReport = learned.report()
-        else:
-            report = evaluate(learned, cell.spec, cell.protocol, name=cell.uses)
-        recorder.evaluation_seconds += time.thread_time() - evaluation_start
-    return CellResult(
-        key=cell.digest,
-        cell=cell,
-        curve=recorder.curve(),
-        **report_field(report),
-        **recorder.online_regret(),
-        timing=recorder.timing(time.thread_time() - start),
-        versions=versions_for(cell.uses),
-    )
+    if entry.kind == "offline":
+        return _run_offline(cell, entry.name, progress)
+    if entry.kind == "reference":
+        check_hyperparameters(cell.uses, cell.hyperparameters)
+        return _run_reference(cell, entry.name, progress)
+    entry.load()  # refuse a missing one before anything is made
+    with quiet(), one_thread():
+        return _run_learner(cell, progress, model_path)
 
 
 def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> CellResult:
@@ -120,139 +106,254 @@ def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> Ce
     return lane.ended
 
 
-class _Recorder:
-    """Records the evaluations, regret and times of a run, and when the next evaluation is due."""
-
-    def __init__(self, cell: Cell, progress: ReportSteps) -> None:
-        self._cell, self._progress = cell, progress
-        self._tasks = TasksInForce(cell.document)
-        n = cell.evaluations
-        self.due = [round(cell.steps * k / n) for k in range(1, n + 1)]
-        self.rows: list[tuple[float, ...]] = []  # the fields of a `LearningCurve`, in its order
-        self._agents = () if cell.spec.team is None else self._tasks.after(0).names
-        self.steps, self.regret = 0, 0.0
-        self.cost: float | None = None
-        self.agents_regret = np.zeros(len(self._agents))
-        self.agents_rows: list[list[float]] = []  # the regret of each agent in an evaluation
-        self.training_seconds = self.environment_seconds = self.evaluation_seconds = 0.0
-
-    def report(self, steps: int) -> None:
-        """Report the steps done; an algorithm may take more than those of the plan."""
-        if steps <= self._cell.steps:
-            self._progress(steps, self._cell.steps)
-
-    def is_due(self, steps: int) -> bool:
-        """Whether an evaluation is due during training; the last one waits for its end."""
-        done = len(self.rows)
-        return done + 1 < len(self.due) and self.due[done] <= steps
-
-    def evaluate(self, steps: int, policy: Policy | TeamPolicy) -> None:
-        """Run the next evaluation, after `steps` steps of training."""
-        start = time.thread_time()
-        cell = self._cell
-        states = start_states(
-            cell.seed, len(self.rows), cell.evaluation_episodes, cell.spec.state_dim
-        )
-        done = rollouts(self._tasks.shown_to(policy, steps), self._tasks.after(steps), states)
-        self.rows.append(
-            (
-                steps,
-                float(done.episode_return.mean()),
-                done.per_step(done.regret),
-                done.per_step(done.similarity),
-                float(done.length.mean()),
-            )
-        )
-        if self._agents:
-            self.agents_rows.append([done.per_step(regret) for regret in done.agents_regret])
-        self.evaluation_seconds += time.thread_time() - start
-
-    def curve(self) -> LearningCurve:
-        """The learning curve."""
-        if not self.rows:
-            return LearningCurve()
-        columns = zip(*self.rows, strict=True)
-        fields: dict[str, Any] = dict(zip(LearningCurve.model_fields, columns, strict=False))
-        by_agent = zip(*self.agents_rows, strict=True)
-        fields["agents_regret"] = dict(zip(self._agents, by_agent, strict=False))
-        return LearningCurve(**fields)
-
-    def online_regret(self) -> dict[str, Any]:
-        """The online regret, the online cost, and the regret of each agent."""
-        if not self.steps:
-            return {}
-        means = (self.agents_regret / self.steps).tolist()
-        return {
-            "online_regret": self.regret / self.steps,
-            "online_cost": None if self.cost is None else self.cost / self.steps,
-            "agents_online_regret": dict(zip(self._agents, means, strict=True)),
-        }
-
-    def timing(self, total: float) -> Timing:
-        """Where the time went; `total` is the whole run's."""
-        learning = self.training_seconds + self.environment_seconds
-        return Timing(
-            total=total,
-            training=self.training_seconds,
-            environment=self.environment_seconds,
-            evaluation=self.evaluation_seconds,
-            steps_per_second=self.steps / learning if self.steps else 0.0,
-        )
-
-
-def _evaluate_reference(cell: Cell, reference: str, recorder: _Recorder) -> Policy | TeamPolicy:
+def _run_reference(cell: Cell, name: str, progress: ReportSteps) -> CellResult:
     """Evaluate a policy that learns nothing as often as a learner."""
-    refuse_of_reference(cell.uses, cell.hyperparameters)
-    policy = as_policy(reference_policy(reference, cell.spec), cell.spec)
-    for steps in recorder.due:
-        recorder.evaluate(steps, policy)
-        recorder.report(steps)
-    return policy
+    evaluations = _Evaluations(cell, progress)
+    with quiet():
+        policy = as_policy(reference_policy(name, cell.spec), cell.spec)
+        for steps in evaluations.record.due:
+            evaluations.evaluate(steps, policy)
+            evaluations.report(steps)
+        return evaluations.result(policy, 0)
 
 
-def _train(cell: Cell, recorder: _Recorder, model_path: Path | None) -> Policy | TeamPolicy | Life:
+def _run_learner(cell: Cell, progress: ReportSteps, model_path: Path | None) -> CellResult:
     """Train the cell's learner, and evaluate it whenever an evaluation is due."""
-    run = training(cell)
-    life = None
+    from sme_registry.training.learners import Learner
+
+    evaluations = _Evaluations(cell, progress)
+    learner = Learner(
+        cell.uses,
+        cell.document,
+        seed=cell.seed,
+        steps=cell.steps,
+        hyperparameters=cell.hyperparameters,
+        action_range=cell.action_range,
+    )
+    env, life = learner.env, None
     if cell.stream is not None:
-        life = Life(cell, run, model_path and model_path.with_suffix(""))
-    _learn(cell, run, recorder, life)
-    while len(recorder.rows) < cell.evaluations:
-        recorder.evaluate(run.env.steps, run.policy())
-    if model_path is not None:
-        run.save(model_path)
-    if life is None:
-        return run.policy()
-    life.finish(run.env.steps)
-    return life
-
-
-def _learn(cell: Cell, run: Training, recorder: _Recorder, life: Life | None) -> None:
-    env = run.env
-
-    def evaluate_due(steps: int) -> None:
-        while recorder.is_due(steps):
-            recorder.evaluate(steps, run.policy())
-        recorder.report(steps)
+        life = _Life(evaluations, learner, model_path and model_path.with_suffix(""))
 
     def after_step(steps: int) -> None:
         if life is not None:
             life.after_step(steps)
-        evaluate_due(steps)
+        evaluations.evaluate_due(steps, learner)
+        evaluations.report(steps)
 
     env.after_step = after_step
-    evaluate_due(0)
-    start, evaluating = time.thread_time(), recorder.evaluation_seconds
+    evaluations.record.start()
+    evaluations.evaluate_due(0, learner)
+    evaluations.report(0)
     if cell.steps:
-        run.learn()
-    learning = time.thread_time() - start - (recorder.evaluation_seconds - evaluating)
+        learner.learn()
     if env.steps < cell.steps:
         raise PolicyError(
             f"uses={cell.uses!r}: learn({cell.steps}) returned after {env.steps} steps of its "
             "environment. It must take all of them, in that environment."
         )
-    recorder.steps, recorder.regret = env.steps, env.regret
-    recorder.cost = getattr(env, "cost", None)
-    recorder.agents_regret = getattr(env, "agents_regret", recorder.agents_regret)
-    recorder.environment_seconds = env.seconds
-    recorder.training_seconds = learning - env.seconds
+    evaluations.record.add(env.regret, env.cost)
+    evaluations.record.spend(TRAINING)
+    while evaluations.record.evaluated < cell.evaluations:
+        evaluations.evaluate(env.steps, learner.policy())
+    if model_path is not None:
+        learner.save(model_path)
+    if life is None:
+        return evaluations.result(learner.policy(), env.steps, env.seconds)
+    return evaluations.result(life.report(env.steps), env.steps, env.seconds)
+
+
+class _Evaluations:
+    """The evaluations of a cell whose policy runs outside JAX, and their record."""
+
+    def __init__(self, cell: Cell, progress: ReportSteps) -> None:
+        self.cell, self._progress = cell, progress
+        self._tasks = _TasksInForce(cell.document)
+        agents = () if cell.spec.team is None else self._tasks.after(0).names
+        self.record = Record((cell,), 1, time.thread_time, agents)
+        self._begun = time.thread_time()
+
+    def report(self, steps: int) -> None:
+        """Report the steps done; an algorithm may take more than those of the plan."""
+        if steps <= self.cell.steps:
+            self._progress(steps, self.cell.steps)
+
+    def evaluate_due(self, steps: int, learner: Any) -> None:
+        """Run the evaluations that are due during training; the last one waits for its end."""
+        record = self.record
+        while record.evaluated + 1 < len(record.due) and record.due[record.evaluated] <= steps:
+            record.spend(TRAINING)
+            self.evaluate(steps, learner.policy())
+
+    def evaluate(self, steps: int, policy: Policy | TeamPolicy) -> None:
+        """Run the next evaluation, after `steps` steps of training."""
+        cell, k = self.cell, self.record.evaluated
+        states = start_states(cell.seed, k, cell.evaluation_episodes, cell.spec.state_dim)
+        done = rollouts(self._tasks.shown_to(policy, steps), self._tasks.after(steps), states)
+        row = (
+            steps,
+            float(done.episode_return.mean()),
+            done.per_step(done.regret),
+            done.per_step(done.similarity),
+            float(done.length.mean()),
+        )
+        by_agent = None
+        if cell.spec.team is not None:
+            by_agent = [done.per_step(regret) for regret in done.agents_regret]
+        self.record.evaluation(k, np.array(row)[:, None], by_agent)
+        self.record.spend(EVALUATION)
+
+    def result(
+        self, ended: Policy | TeamPolicy | StreamReport, steps: int, seconds: float = 0.0
+    ) -> CellResult:
+        """The result with the report of the trained policy, or of a life."""
+        cell, record = self.cell, self.record
+        report: EvaluationReport | StreamReport
+        if isinstance(ended, StreamReport):
+            report = ended
+        else:
+            report = evaluate(ended, cell.spec, cell.protocol, name=cell.uses)
+        record.spend(EVALUATION)
+        total = time.thread_time() - self._begun
+        timing = record.timing(steps, 0.0, environment=seconds, total=total)
+        return record.result(0, steps, report, timing)
+
+
+class _TasksInForce:
+    """The task of a cell, or those of its stream, by the steps that were taken."""
+
+    def __init__(self, document: SMESpec | StreamSpec) -> None:
+        self._stream: StreamSpec | None = None
+        if isinstance(document, StreamSpec):
+            self._stream, self._tasks = document, materialize_stream(document)
+        else:
+            self._tasks = (materialize(document),)
+
+    def after(self, steps: int) -> Task:
+        """The task on which the last of so many steps was taken, or the first will be."""
+        return self._tasks[self._piece(steps)]
+
+    def shown_to(self, policy: Any, steps: int) -> Any:
+        """The policy of that task's observations, with the phase if the agent observes it."""
+        stream = self._stream
+        if stream is None or not stream.observes_phase:
+            return policy
+        return policy.in_phase(stream.pieces[self._piece(steps)].phase, stream.observed_phases)
+
+    def _piece(self, steps: int) -> int:
+        return 0 if self._stream is None else self._stream.piece_at(max(steps - 1, 0))
+
+
+class _Life:
+    """A learner's life while it trains: its policies at the ends of visits, and its regret."""
+
+    def __init__(self, evaluations: _Evaluations, learner: Any, models: Path | None) -> None:
+        cell, blocks = evaluations.cell, evaluations.record.blocks
+        assert cell.stream is not None
+        assert blocks is not None
+        self._cell, self._learner, self._blocks = cell, learner, blocks
+        self._uncounted: list[tuple[float, int]] = []  # regret and phase of steps
+        self._ends = VisitEnds(cell.stream, self._end_visit)
+        self._files = None if models is None else Snapshots(models, cell.stream)
+        self._initial, self._policies = learner.lasting_policy(), list[Policy]()
+        if self._files is not None:
+            learner.save(self._files.initial)
+
+    def after_step(self, steps: int) -> None:
+        """Count a step, before the learner learns from it."""
+        info = self._learner.env.last[2][0]
+        self._uncounted.append((info["regret"], info["phase"]))
+        if len(self._uncounted) >= _COUNTED_AT_ONCE:
+            self._count(steps)
+        self._ends.after_step(steps)
+
+    def report(self, steps: int) -> StreamReport:
+        """End the life after its training: what the agent retains, and its dynamic regret."""
+        self._count(steps)
+        self._ends.finish(steps)
+        regret = self._blocks.dynamic_regret()
+        return life_report(self._cell, self._policies, self._initial, regret)
+
+    def _count(self, steps: int) -> None:
+        if self._uncounted:
+            regret, phase = zip(*self._uncounted, strict=True)
+            self._blocks.add(steps, np.array(regret)[:, None], phase)
+            self._uncounted.clear()
+
+    def _end_visit(self, visit: int) -> None:
+        self._policies.append(self._learner.lasting_policy())
+        if self._files is not None:
+            self._learner.save(self._files.visits[visit])
+
+
+def _run_offline(cell: Cell, name: str, progress: ReportSteps) -> CellResult:
+    """Collect the data, learn from it, and evaluate the policy as in every cell."""
+    start = time.thread_time()
+    settings: dict[str, Any] = dict(cell.hyperparameters)
+    nu: Any = settings.get("nu")
+    recipe = _recipe(cell, settings)
+    data = collect(recipe, materialize(cell.spec), {})
+    collected = time.thread_time()
+    result = train_offline(
+        data,
+        algorithm=name,
+        steps=cell.steps,
+        batch_size=settings.pop("batch_size", BATCH_SIZE),
+        seed=cell.seed,
+        evaluations=max(1, cell.evaluations),
+        episodes=cell.evaluation_episodes,
+        hyperparameters=settings,
+        spec=cell.spec,
+        protocol=cell.protocol,
+        progress=lambda done, total, _: progress(done, total),
+    )
+    end = time.thread_time()
+    record, T = result.record, cell.spec.horizon
+    evaluations = record.evaluations
+    training = record.cpu_ms_per_step * cell.steps / 1e3
+    return CellResult(
+        key=cell.digest,
+        cell=cell,
+        curve=LearningCurve(
+            steps=tuple(each.step for each in evaluations),
+            episode_return=tuple(each.episode_return for each in evaluations),
+            regret=tuple(1.0 - each.episode_return / T for each in evaluations),
+            similarity=tuple(each.similarity for each in evaluations),
+            length=(float(T),) * len(evaluations),
+        ),
+        report=result.report,
+        offline=OfflineResult(
+            nu=nu,
+            transitions=recipe.transitions,
+            dataset_digest=record.dataset_digest,
+            behaviour_similarity=record.behaviour.similarity,
+            behaviour_similarity_sd=record.behaviour.similarity_sd,
+            similarity=record.similarity,
+            similarity_sd=evaluations[-1].similarity_sd,
+        ),
+        timing=Timing(
+            total=end - start,
+            training=training,
+            environment=collected - start,
+            evaluation=max(0.0, end - collected - training),
+            steps_per_second=cell.steps / max(training, 1e-9),
+        ),
+        versions=record.versions,
+    )
+
+
+def _recipe(cell: Cell, settings: dict[str, Any]) -> DatasetRecipe:
+    """The recipe of a cell's data set; takes its `nu` and `transitions` out of `settings`."""
+    if cell.spec.D > 0:
+        raise SpecError(f"D={cell.spec.D:g}: must be 0 for an offline cell. Leave it out.")
+    if "nu" not in settings:
+        raise OptionError("hyperparameters.nu: is required. Give a number in [0, 1], such as 0.5.")
+    return DatasetRecipe.from_dict(
+        {
+            "spec": cell.spec,
+            "behaviours": [{"kind": "mixture", "nu": settings.pop("nu"), "weight": 1.0}],
+            "transitions": settings.pop("transitions", TRANSITIONS),
+            "seed": cell.seed,
+            "protocol": cell.protocol,
+        },
+        "data set",
+    )

@@ -8,78 +8,30 @@ plan runs, so its algorithms cannot be checked here: `MissingDependencyError`, o
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
 
-from sme_registry.datasets.offline import check_algorithm
-from sme_registry.errors import OptionError, SMEError, SpecError
+from sme_registry.errors import SMEError
 from sme_registry.spec import Cell, StudyAlgorithm, StudyPlan
 from sme_registry.spec.study import in_jax
-from sme_registry.studies.engine.algorithms import find_algorithm, independent_name, reference_name
-from sme_registry.studies.engine.offline_cell import DATA_SETTINGS, offline_name
-from sme_registry.training import ALGORITHMS
-from sme_registry.training.algorithms import check_limits, is_on_policy, require_sb3
-from sme_registry.training.hyperparameters import parameters_of, refuse_unknown
+from sme_registry.training import algorithms, hyperparameters
 
 __all__ = ["check_hyperparameters", "check_task", "find", "uneven_rollouts"]
 
 
 def find(uses: str) -> None:
     """Check that an algorithm of any kind can be found."""
-    if reference_name(uses) is not None or offline_name(uses) is not None:
-        return
-    if in_jax(uses):
-        from sme_registry.jax.run import full_name
-
-        full_name(uses)
-        return
-    independent = independent_name(uses)
-    if (independent or uses).casefold() in (name.casefold() for name in ALGORITHMS):
-        require_sb3()  # importing them takes seconds
-    else:
-        find_algorithm(uses)
-    if independent is not None:
-        _check_independent(uses)
+    algorithms.find(uses).check_installed()
 
 
 def check_hyperparameters(algorithm: StudyAlgorithm) -> None:
     """Check that an algorithm of a plan has hyperparameters of these names."""
-    uses, chosen = algorithm.uses, algorithm.hyperparameters
-    if not chosen:
-        return
     field = f"algorithm {algorithm.name!r}: hyperparameters"
-    learner = offline_name(uses)
-    if reference_name(uses) is not None:
-        refuse_of_reference(uses, chosen)
-    elif in_jax(uses):
-        from sme_registry.jax.run import settings_of
-
-        settings_of(uses, chosen, field)
-    elif learner is not None:
-        own = {name: value for name, value in chosen.items() if name not in DATA_SETTINGS}
-        check_algorithm(learner, own)
-    else:
-        refuse_unknown(find_algorithm(uses), uses, chosen, field)
+    hyperparameters.check_hyperparameters(algorithm.uses, algorithm.hyperparameters, field)
 
 
 def check_task(cell: Cell) -> None:
     """Check that the algorithm of a cell has such tasks, where that depends on more than a team."""
-    check_limits(cell.uses, cell.document)
-    if not in_jax(cell.uses):
-        return
-    from sme_registry.jax.task import check_supported
-
-    if cell.stream is None:
-        check_supported(cell.spec)
-        return
-    from sme_registry.jax.lives import check_switches
-
-    for index, phase in enumerate(cell.stream.phases):
-        try:
-            check_supported(phase.spec)
-        except SpecError as error:
-            raise SpecError(f"phases.{index}.spec: {error}") from None
-    check_switches(cell.stream)
+    algorithms.find(cell.uses).check_task(cell.document)
 
 
 class UnevenRollouts(NamedTuple):
@@ -122,26 +74,8 @@ def _rollout_steps(algorithm: StudyAlgorithm) -> int:
         from sme_registry.jax.run import settings_of
 
         return int(getattr(settings_of(uses, chosen), "n_steps", 1))
-    learner = find_algorithm(uses)
-    if not is_on_policy(learner):
+    learner = algorithms.find(uses).load()
+    if not algorithms.is_on_policy(learner):
         return 1
-    parameter = parameters_of(learner).get("n_steps")
+    parameter = hyperparameters.parameters_of(learner).get("n_steps")
     return 1 if parameter is None else int(cast(Any, chosen.get("n_steps", parameter.default)))
-
-
-def refuse_of_reference(uses: str, hyperparameters: Mapping[str, Any]) -> None:
-    """Raise OptionError if a reference policy is given hyperparameters."""
-    if hyperparameters:
-        raise OptionError(
-            f"hyperparameters={sorted(hyperparameters)}: {uses} has no hyperparameters. Leave them "
-            "out."
-        )
-
-
-def _check_independent(uses: str) -> None:
-    if not is_on_policy(find_algorithm(uses)):
-        raise OptionError(
-            f"uses={uses!r}: must be an on-policy algorithm, such as independent:PPO, because the "
-            "models of a team learn from the same rollouts. Use one model for all agents instead: "
-            f"{independent_name(uses)}."
-        )

@@ -22,8 +22,7 @@ from collections.abc import Hashable, Iterable, Sequence
 from typing import NamedTuple
 
 from sme_registry.spec import Cell, SMESpec
-from sme_registry.spec.study import REFERENCE, in_jax
-from sme_registry.studies.engine.algorithms import independent_name
+from sme_registry.spec.study import INDEPENDENT, REFERENCE, in_jax
 from sme_registry.studies.engine.result import CellResult
 
 # Seconds of one training step with default hyperparameters: on a fast core, and the slowest
@@ -99,7 +98,7 @@ def makespan(seconds: Sequence[float], workers: int) -> float:
 
 def _work(cell: Cell) -> Span:
     """A cell's seconds by the table, without its start."""
-    uses = independent_name(cell.uses) or cell.uses
+    uses = cell.uses.removeprefix(INDEPENDENT)
     transitions = 0 if uses.startswith(REFERENCE) else cell.steps * _agents(cell.spec)
     states = cell.protocol.states_per_region * len(cell.protocol.edges)
     step = SECONDS_PER_STEP.get(uses, _UNKNOWN)

@@ -30,7 +30,7 @@ from sme_registry.evaluation import (
     as_policy,
     evaluate_many,
 )
-from sme_registry.evaluation.dynamic_regret import DynamicRegret, RegretBlocks
+from sme_registry.evaluation.dynamic_regret import DynamicRegret
 from sme_registry.evaluation.models import saved_sb3
 from sme_registry.evaluation.rollouts import start_states
 from sme_registry.io import Arrays, to_json
@@ -44,17 +44,19 @@ from sme_registry.studies.engine.jobs import (
     new_program,
     shape_of,
 )
-from sme_registry.studies.engine.life import life_report
 from sme_registry.studies.engine.program_state import read_header, read_state, write_state
+from sme_registry.studies.engine.record import (
+    EVALUATION,
+    TRAINING,
+    Record,
+    check_forms,
+    life_report,
+)
 from sme_registry.studies.engine.result import (
     CellResult,
-    LearningCurve,
     ProgramResult,
-    Timing,
-    report_field,
 )
-from sme_registry.training.record import versions_for
-from sme_registry.training.snapshots import Snapshots
+from sme_registry.training.lives import Snapshots
 
 if TYPE_CHECKING:
     from sme_registry.jax.program import Evaluation, StepLog
@@ -73,7 +75,6 @@ class Ended(NamedTuple):
 
 
 SECONDS_BETWEEN_STATES = 180.0
-_TRAINING, _EVALUATION = 0, 1  # what a program's time is for
 
 
 def run_lanes(
@@ -107,20 +108,9 @@ class _Run:
             lanes=lanes.count,
             shape=lanes.shape or shape_of(cell),
         )
-        n = cell.evaluations
-        self._due = [round(cell.steps * k / n) for k in range(1, n + 1)]
-        self._clock = time.process_time if self._program.device.platform == CPU else time.monotonic
-        self._mark = self._clock()
-        # Saved with the program's state. `failed_at`: the step at which a lane was seen to have
-        # failed, or −1.
-        self._records: Arrays = {
-            "rows": np.zeros((n, 5, lanes.count)),  # the fields of a `LearningCurve`
-            "regret": np.zeros(lanes.count),  # over all steps of training
-            "failed_at": np.full(lanes.count, -1),
-            "seconds": np.zeros(2),
-        }
-        if cell.spec.safety is not None:
-            self._records["cost"] = np.zeros(lanes.count)  # as the regret
+        clock = time.process_time if self._program.device.platform == CPU else time.monotonic
+        self._record = Record(self._cells, lanes.count, clock)
+        self._weights: Arrays = {}  # of lives, saved with the records
         self._begin_lives()
         self._restore()
         self._last_state = time.monotonic()
@@ -131,11 +121,11 @@ class _Run:
 
         run(
             self._program,
-            due=self._due,
+            due=self._record.due,
             start_states=self._start_states,
             on_log=self._on_log,
             on_evaluation=self._on_evaluation,
-            on_visit=self._on_visit if self._blocks else None,
+            on_visit=self._on_visit if self._cell.stream else None,
             after_piece=self._after_piece,
         )
         self._note_failures()
@@ -145,7 +135,7 @@ class _Run:
         draws: dict[Hashable, list[int]] = defaultdict(list)  # lanes that are evaluated together
         for lane, key in enumerate(self._keys):
             if key in self._own:
-                cell, step = self._cells[lane], int(self._records["failed_at"][lane])
+                cell, step = self._cells[lane], int(self._record.arrays["failed_at"][lane])
                 if step >= 0:
                     yield Ended(cell, _not_finite(step))
                 else:
@@ -161,51 +151,41 @@ class _Run:
         cell = self._cells[lane]
         if isinstance(report, PolicyError):
             return Ended(cell, report)
-        result = CellResult(
-            key=cell.digest,
-            cell=cell,
-            curve=self._curve(lane),
-            **report_field(report),
-            online_regret=self._online("regret", lane),
-            online_cost=self._online("cost", lane),
-            program=self._made,
-            timing=self._timing(seconds),
-            versions=versions_for(cell.uses),
-        )
+        record, steps = self._record, self._program.steps
+        timing = record.timing(steps, seconds, cells=len(self._own))
+        result = record.result(lane, steps, report, timing, program=self._made)
         if not self._keep_models:
             return Ended(cell, result)
         return Ended(cell, result, self._model(lane), self._snapshots(lane))
 
     def _trained(self, lane: int) -> _Trained:
         cell = self._cells[lane]
-        if self._blocks is None:
+        if self._record.blocks is None:
             return _Trained(cell, [self._program.weights(lane)])
-        return _Trained(cell, self._weights_of_life(lane), self._blocks.dynamic_regret(lane))
+        regret = self._record.blocks.dynamic_regret(lane)
+        return _Trained(cell, self._weights_of_life(lane), regret)
 
     def _begin_lives(self) -> None:
-        """Records of lives, which hold the weights of visits for as long as the program runs."""
-        stream = self._cell.stream
-        self._blocks = None if stream is None else RegretBlocks(stream, self._lanes.count)
-        if stream is None or self._blocks is None:
+        """Begin to keep the weights of visits: the actor's, and of a model that is kept all."""
+        if self._cell.stream is None:
             return
-        self._records |= {"block_steps": self._blocks.steps, "block_regret": self._blocks.regret}
-        snapshots = stream.visits + 1
+        snapshots = self._cell.stream.visits + 1
         for lane in range(len(self._cells)):
             for name, weight in self._program.weights(lane).items():
                 if not (self._keep_models or name.startswith(self._program.actor)):
                     continue
                 kept = np.zeros((snapshots, *weight.shape), weight.dtype)
                 kept[0] = weight
-                self._records[f"{_SNAPSHOT}{lane}/{name}"] = kept
+                self._weights[f"{_SNAPSHOT}{lane}/{name}"] = kept
 
     def _on_visit(self, visit: int, weights: list[Arrays]) -> None:
         for lane, own in enumerate(weights):
-            for name, kept in _named(self._records, f"{_SNAPSHOT}{lane}/").items():
+            for name, kept in _named(self._weights, f"{_SNAPSHOT}{lane}/").items():
                 kept[visit + 1] = own[name]
 
     def _weights_of_life(self, lane: int) -> list[Arrays]:
         """A lane's weights before training, and at the end of each visit."""
-        kept = _named(self._records, f"{_SNAPSHOT}{lane}/")
+        kept = _named(self._weights, f"{_SNAPSHOT}{lane}/")
         return [dict(zip(kept, each, strict=True)) for each in zip(*kept.values(), strict=True)]
 
     def _start_states(self, k: int) -> list[Any]:
@@ -215,23 +195,23 @@ class _Run:
         ]
 
     def _on_log(self, log: StepLog) -> None:
-        self._records["regret"] += log.regret.sum(axis=0)
-        if log.cost is not None:
-            self._records["cost"] += log.cost.sum(axis=0)
-        if self._blocks is not None:
-            self._blocks.add(self._program.steps, log.regret)
-        self._spend(_TRAINING)
+        record, cost = self._record, log.cost
+        record.add(log.regret.sum(axis=0), None if cost is None else cost.sum(axis=0))
+        if record.blocks is not None:
+            record.blocks.add(self._program.steps, log.regret)
+        record.spend(TRAINING)
 
     def _on_evaluation(self, k: int, step: int, done: Evaluation) -> None:
         steps = done.length.sum(axis=1)
-        self._records["rows"][k] = (
+        row = (
             np.full(len(steps), step),
             done.episode_return.mean(axis=1),
             done.regret.sum(axis=1) / steps,
             done.similarity.sum(axis=1) / steps,
             done.length.mean(axis=1),
         )
-        self._spend(_EVALUATION)
+        self._record.evaluation(k, row)
+        self._record.spend(EVALUATION)
 
     def _after_piece(self) -> None:
         from sme_registry.jax.device import compilations
@@ -244,27 +224,12 @@ class _Run:
         self._progress(min(self._program.steps, steps), steps, compilations())
 
     def _note_failures(self) -> None:
-        failed_at = self._records["failed_at"]
+        failed_at = self._record.arrays["failed_at"]
         failed_at[self._program.failed() & (failed_at < 0)] = self._program.steps
-
-    def _spend(self, purpose: int) -> None:
-        """Count the time since the last call."""
-        now = self._clock()
-        self._records["seconds"][purpose] += now - self._mark
-        self._mark = now
-
-    def _curve(self, lane: int) -> LearningCurve:
-        if not self._due:
-            return LearningCurve()
-        steps, *others = self._records["rows"][:, :, lane].T.tolist()
-        columns: dict[str, Any] = dict(
-            zip(list(LearningCurve.model_fields)[1:], others, strict=False)
-        )
-        return LearningCurve(steps=tuple(int(step) for step in steps), **columns)
 
     def _model(self, lane: int) -> bytes:
         """A lane's model as Stable-Baselines3 saves it."""
-        from sme_registry.training.sb3_models import set_weights
+        from sme_registry.training.models import set_weights
 
         model = _new_model(self._cells[lane])
         set_weights(model, self._program.weights(lane), self._program.steps)
@@ -272,7 +237,7 @@ class _Run:
 
     def _snapshots(self, lane: int) -> dict[str, bytes]:
         """The models of a life before training and at the ends of its visits."""
-        from sme_registry.training.sb3_models import set_weights
+        from sme_registry.training.models import set_weights
 
         cell = self._cells[lane]
         if cell.stream is None:
@@ -287,24 +252,6 @@ class _Run:
             snapshots[path.name] = saved_sb3(model)
         return snapshots
 
-    def _online(self, record: str, lane: int) -> float | None:
-        """The mean of a record over all steps of training; None without steps or record."""
-        steps = self._program.steps
-        if not steps or record not in self._records:
-            return None
-        return float(self._records[record][lane]) / steps
-
-    def _timing(self, at_the_end: float) -> Timing:
-        """A cell's share of the program's time, and that of its evaluation at the end."""
-        training, evaluation = (self._records["seconds"] / len(self._own)).tolist()
-        return Timing(
-            total=training + evaluation + at_the_end,
-            training=training,
-            environment=0.0,
-            evaluation=evaluation + at_the_end,
-            steps_per_second=self._program.steps / training if training else 0.0,
-        )
-
     def _header(self) -> dict[str, Any]:
         """What a state must have been made with to be gone on from."""
         return {"cells": self._keys, "device": self._made.device, **self._lanes.made_with}
@@ -313,7 +260,8 @@ class _Run:
         if self._lanes.state is None:
             return
         arrays = {_PROGRAM + name: array for name, array in self._program.save().items()}
-        arrays |= {_RECORDS + name: array for name, array in self._records.items()}
+        records = {**self._record.arrays, **self._weights}
+        arrays |= {_RECORDS + name: array for name, array in records.items()}
         with contextlib.suppress(OptionError):  # a full disk costs only what a kill would lose
             write_state(self._lanes.state, self._header(), arrays)
 
@@ -324,20 +272,17 @@ class _Run:
             return
         arrays = read_state(state)
         # A program that kept models has more weights of visits than one that keeps none.
-        records = {n: a for n, a in _named(arrays, _RECORDS).items() if n in self._records}
+        own = {**self._record.arrays, **self._weights}
+        records = {n: a for n, a in _named(arrays, _RECORDS).items() if n in own}
+        weights = {name: array for name, array in records.items() if name in self._weights}
         try:
-            if _forms(records) != _forms(self._records):
-                raise OptionError(
-                    "its records of the lanes are missing or others, or of lives without models."
-                )
+            check_forms(records, own)
             self._program.restore(_named(arrays, _PROGRAM))
         except OptionError as error:
             self._progress(0, self._cell.steps, 0, f"starts again, without {state}: {error}")
             return
-        self._records = records
-        if self._blocks is not None:
-            self._blocks.steps = records["block_steps"]
-            self._blocks.regret = records["block_regret"]
+        self._weights = weights
+        self._record.restore({n: a for n, a in records.items() if n not in weights})
 
 
 def _named(arrays: Arrays, prefix: str) -> Arrays:
@@ -345,13 +290,9 @@ def _named(arrays: Arrays, prefix: str) -> Arrays:
     return {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)}
 
 
-def _forms(arrays: Arrays) -> Any:
-    return {name: (array.dtype, array.shape) for name, array in arrays.items()}
-
-
 def _new_model(cell: Cell) -> Any:
     """The untrained model of Stable-Baselines3 of a cell."""
-    from sme_registry.training.sb3_models import new_sb3_model
+    from sme_registry.training.models import new_sb3_model
 
     return new_sb3_model(
         cell.uses,

@@ -22,7 +22,7 @@ from sme_registry.io import Lock, file_lock, is_locked, read_json, to_json, writ
 from sme_registry.spec import StudyFile
 from sme_registry.studies.engine.program_state import read_header
 from sme_registry.studies.engine.result import CellFailure, CellResult
-from sme_registry.training.snapshots import MODELS, folder_of_cell, model_of_cell
+from sme_registry.training.lives import MODELS, folder_of_cell, model_of_cell
 
 PLAN = "plan.json"
 CELLS, FAILED, LOCKS, REPORT = "cells", "failed", "locks", "report"

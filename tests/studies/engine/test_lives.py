@@ -20,7 +20,7 @@ from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.engine.runner import run_study
 from sme_registry.studies.engine.status import label, study_status
-from sme_registry.training.snapshots import Snapshots
+from sme_registry.training.lives import Snapshots
 from tests.studies.cells import numbers
 
 pytest.importorskip("stable_baselines3")
