@@ -208,14 +208,3 @@ def _violations(cost: Array, spec: SMESpec) -> Array:
     assert spec.safety is not None  # the infos have costs
     excess = cost * (2.0 * spec.safety.tightness * spec.action_dim)
     return (excess > max(_TOLERANCE, _ROUNDING * spec.action_dim)).astype(np.float64)
-
-
-def safety_of_step(
-    infos: Mapping[str, Any] | Sequence[Mapping[str, Any]], spec: Callable[[], SMESpec]
-) -> Array | None:
-    """The summands of `EpisodeSafety`, `[3, B]`, of a step of each lane; None without `safety`."""
-    info = infos if isinstance(infos, Mapping) else info_of_lanes(infos)
-    if "cost" not in info:
-        return None
-    cost, safe_regret = (_numbers(info[key], (-1,)) for key in _SAFETY)
-    return np.array([cost, _violations(cost, spec()), safe_regret])
