@@ -349,10 +349,9 @@ def plan(
 
       sme study plan smoke --folder runs/smoke --json
     """
-    from sme_registry.studies.engine.estimate import Estimator, Span, makespan
+    from sme_registry.studies.engine.budget import Estimator, Span, makespan, selected
     from sme_registry.studies.engine.jobs import available_cores
     from sme_registry.studies.engine.ledger import Ledger
-    from sme_registry.studies.engine.scaling import selected
 
     if plan is None:
         _list_plans(json)
@@ -452,7 +451,7 @@ def scaled_plan(
     agents: str | None = None,
 ) -> StudyFile:
     """A plan with the budgets of `--steps`, `--seeds` and `--evaluations`, and `--agents`."""
-    from sme_registry.studies.engine.scaling import scaled, with_agents
+    from sme_registry.studies.engine.budget import scaled, with_agents
 
     budgets: dict[str, int] = {}
     for text in steps or ():

@@ -333,7 +333,7 @@ def compare(
       sme study compare runs/smoke PPO TD3 --json
     """
     from sme_registry.studies.report import compare as comparison
-    from sme_registry.studies.report.exports import difference_caveats
+    from sme_registry.studies.report.texts import difference_caveats
 
     metrics = tuple(metric or comparison.DEFAULT_METRICS)
     differences = comparison.compare(folder, first, second, metrics)

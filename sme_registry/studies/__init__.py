@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from sme_registry.studies.engine.runner import run_study
     from sme_registry.studies.engine.status import CellStatus, StudyStatus, study_status
     from sme_registry.studies.report.compare import compare, write_comparison
-    from sme_registry.studies.report.frames import StudyFrames, load
-    from sme_registry.studies.report.streams.frames import StreamFrames, load_streams
+    from sme_registry.studies.report.frames import StreamFrames, StudyFrames, load, load_streams
     from sme_registry.studies.report.write import write_report
 
 __all__ = [
@@ -44,12 +43,12 @@ __all__ = [
 _LAZY = {
     "CellResult": "studies.engine.result",
     "CellStatus": "studies.engine.status",
-    "StreamFrames": "studies.report.streams.frames",
+    "StreamFrames": "studies.report.frames",
     "StudyFrames": "studies.report.frames",
     "StudyStatus": "studies.engine.status",
     "compare": "studies.report.compare",
     "load": "studies.report.frames",
-    "load_streams": "studies.report.streams.frames",
+    "load_streams": "studies.report.frames",
     "run_cell": "studies.engine.cell",
     "run_study": "studies.engine.runner",
     "study_status": "studies.engine.status",

@@ -67,8 +67,7 @@ def test_every_number_in_a_document_has_the_name_of_its_quantity():
 def columns():
     """The columns of numbers in episodes.csv and in a study's data frames."""
     pytest.importorskip("pandas")
-    from sme_registry.studies.report.frames import study_frames
-    from sme_registry.studies.report.streams.frames import stream_frames
+    from sme_registry.studies.report.frames import stream_frames, study_frames
     from sme_registry.training import episodes
 
     frames = [*study_frames(catalogue.entries(StudyFile)[0].plan, {}), *stream_frames([])]

@@ -1,11 +1,12 @@
 """Studies that have been run: folders with real results of learners that learn in milliseconds."""
 
+import dataclasses
+
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellFailure
-from sme_registry.studies.report.analysis import analyse
-from sme_registry.studies.report.frames import plan_file
+from sme_registry.studies.report.tables import analyse
 
 LEARNERS = {
     "Alpha": {"half_life": 10.0, "r_min": 0.7, "k": 0.02},
@@ -67,8 +68,13 @@ def finish(folder):
 def analysed(folder, leave_out=lambda planned: False, draws=300):
     """The tables of a folder's runs, except for those left out."""
     ledger = Ledger(folder)
-    file = plan_file(ledger)
+    file = ledger.study_file()
     gone = {planned.cell.digest for planned in file.plan.cells if leave_out(planned)}
     results = {key: result for key, result in ledger.results().items() if key not in gone}
     errors = {key: failure.error for key, failure in ledger.failures().items()}
     return analyse(file, results, errors, draws=draws)
+
+
+def with_tables(analysis, **tables):
+    """The analysis with other tables."""
+    return dataclasses.replace(analysis, tables=analysis.tables | tables)

@@ -8,10 +8,9 @@ import pytest
 
 from sme_registry.errors import OptionError, SpecError, UnknownNameError
 from sme_registry.spec import SMESpec, StudyAlgorithm, StudyFile, StudyPlan, SuiteFile, catalogue
+from sme_registry.studies.engine.budget import Estimator, makespan, scaled, selected, with_agents
 from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.estimate import Estimator, makespan
 from sme_registry.studies.engine.runner import run_study
-from sme_registry.studies.engine.scaling import scaled, selected, with_agents
 from tests import commands
 from tests.studies.cells import raising, small_file
 
@@ -266,7 +265,7 @@ class TestCommands:
             ("run smoke -f s --jobs 0", "--jobs"),
             ("run smoke", "--folder"),
             ("run smoke -f s --agents jax --device abacus", "'abacus'"),
-            ("status nowhere", "contains no study"),
+            ("status nowhere", "holds no study"),
             ("new x -t Default -a PPO", "must end in .json"),
             ("new x.json -t Default", "--algorithm"),
             ("new x.json -t Default -a PPO -a PPO", "appears twice"),

@@ -7,20 +7,31 @@ driver touches the study's folder, except for the states of programs, which may 
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import logging
+import multiprocessing
+import os
+import signal
+import socket
 import tempfile
 import time
 import traceback
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from multiprocessing import connection
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
+from sme_registry.errors import OptionError
+from sme_registry.io import require_packages
+from sme_registry.io.system import block_interrupts, defer_interrupts, end_with_parent
 from sme_registry.spec import Cell
 from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.jobs import Job, Report
+from sme_registry.studies.engine.jobs import CPU, Job, Report, available_cores, child_environment
 from sme_registry.studies.engine.lanes import run_lanes
 from sme_registry.studies.engine.result import CellFailure, CellResult
 from sme_registry.training.record import versions_for
@@ -32,6 +43,20 @@ Jobs = Iterator[Job | None]
 POLL_SECONDS = 0.2
 TRACEBACK_CHARACTERS = 4000  # kept of a failed cell's traceback or output
 _SECONDS_BETWEEN_REPORTS = 0.5
+_SECONDS_TO_END = 10.0
+# One thread for each library that would take every core: the jobs share the cores, one each.
+_ONE_THREAD = {
+    f"{library}_NUM_THREADS": "1"
+    for library in ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM", "NUMEXPR", "NUMBA")
+} | {"NPROC": "1"}  # of XLA on a CPU
+_RETRIES = 3  # of a cell whose worker or node is lost
+_SECONDS_TO_ANSWER = 10.0
+_SETTINGS = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_task_oom_retries": str(_RETRIES),  # without it a cell too large is retried for ever
+    "RAY_DEDUP_LOGS_SKIP_REGEX": ".",  # its notices of a lost node, dozens of lines each
+}
+_ADDRESSES = "Give 'local', or the host:port of a running cluster of this Ray version."
 
 
 class Outcome(NamedTuple):
@@ -175,3 +200,260 @@ class ConcurrentExecutor(ABC):
 
 
 _END = object()
+
+
+class Processes(ConcurrentExecutor):
+    """A new process (`spawn`) with one thread for each job.
+
+    Not a pool of workers. With `concurrent.futures`, one dead worker fails every cell that is
+    running. The workers of `pebble` survive a killed driver and would go on with cells whose locks
+    are free again. Here each process has its own pipe, so its death fails only its cells, and it
+    ends with this one, however that ends. It ignores Ctrl-C, which this process handles.
+    """
+
+    @property
+    def workers(self) -> int:
+        """Processes at once."""
+        return available_cores() if self._jobs is None else self._jobs
+
+    @contextlib.contextmanager
+    def _session(self) -> Iterator[None]:
+        with tempfile.TemporaryDirectory(prefix="sme-study-") as scratch:
+            self._scratch = Path(scratch)
+            try:
+                yield
+            finally:
+                with defer_interrupts():
+                    for process in self._running.values():
+                        process.kill()
+                    self._running.clear()
+
+    def _start(self, job: Job) -> None:
+        with defer_interrupts():  # or a process that has just started would have no owner
+            process = _JobProcess.start(self._run, job, self._keep_models, self._scratch)
+            self._running[process.pipe] = process
+
+    def _ended(self, progress: ReportProgress) -> Iterator[Outcome]:
+        for pipe in connection.wait(list(self._running), POLL_SECONDS):
+            process = self._running[pipe]
+            received = process.receive()
+            if isinstance(received, _Steps):
+                progress(process.job, *received)
+                continue
+            if not process.unfinished:
+                del self._running[pipe]
+            yield from received
+
+
+class _Steps(NamedTuple):
+    """What a process reports; see `Report`."""
+
+    done: int
+    total: int
+    compilations: int
+    note: str
+
+
+@dataclass(frozen=True)
+class _JobProcess:
+    """A job in a process of its own."""
+
+    job: Job
+    process: Any
+    pipe: Any  # a Connection, on Windows a PipeConnection
+    log: Path
+    unfinished: dict[str, Cell]
+
+    @classmethod
+    def start(cls, run: RunCell, job: Job, keep_models: bool, scratch: Path) -> _JobProcess:
+        spawn = multiprocessing.get_context("spawn")
+        pipe, child_end = spawn.Pipe(duplex=False)
+        unfinished = {cell.digest: cell for cell in job.cells}
+        log = scratch / f"{next(iter(unfinished)).removeprefix('sha256:')}.log"
+        process = spawn.Process(target=_child, args=(child_end, run, job, keep_models, log))
+        on_cpu = job.lanes is not None and job.lanes.device == CPU
+        # Or JAX would look for a GPU, and take most of its memory.
+        variables = _ONE_THREAD | ({"JAX_PLATFORMS": CPU} if on_cpu else {})
+        with child_environment(variables), block_interrupts():
+            process.start()
+        child_end.close()  # so that the pipe ends when the process does
+        return cls(job, process, pipe, log, unfinished)
+
+    def receive(self) -> list[Outcome] | _Steps:
+        """How far it is, or the outcomes of cells that have ended since."""
+        try:
+            received = self.pipe.recv()
+        except (EOFError, OSError):
+            self.kill()
+            deaths = [self._death(cell) for cell in self.unfinished.values()]
+            self.unfinished.clear()
+            return deaths
+        if isinstance(received, _Steps):
+            return received
+        del self.unfinished[received.entry.key]
+        if not self.unfinished:
+            self.process.join(_SECONDS_TO_END)
+            self.kill()
+        return [received]
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+
+    def _death(self, cell: Cell) -> Outcome:
+        code = self.process.exitcode
+        killed_by = next((each.name for each in signal.Signals if each == -code), None)
+        how = f"was killed by {killed_by}" if killed_by else f"ended with exit code {code}"
+        hint = " Memory may have run out: try fewer --jobs." if killed_by == "SIGKILL" else ""
+        output = self.log.read_text(errors="replace") if self.log.exists() else ""
+        error = f"the cell's process {how}.{hint} Run it again with --retry."
+        return failed(cell, error, output)
+
+
+def _child(pipe: Any, run: RunCell, job: Job, keep_models: bool, log: Path) -> None:
+    """Run one job: the main function of its process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
+    # Studies run for days, and many machines remove old files from the temporary folder.
+    log.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    with contextlib.suppress(OSError):  # what libraries print is for the failure, not the terminal
+        handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+        os.dup2(handle, 1)
+        os.dup2(handle, 2)
+    tempfile.tempdir = str(log.parent)  # which the driver removes, also after a kill
+    for outcome in run_job(run, job, keep_models, lambda *steps: pipe.send(_Steps(*steps))):
+        pipe.send(outcome)
+
+
+class OnRay(ConcurrentExecutor):
+    """A task on one core of a Ray cluster for each job; one whose node is lost runs again."""
+
+    def __init__(
+        self,
+        address: str = "local",
+        jobs: int | None = None,
+        run: RunCell = run_cell,
+        keep_models: bool = False,
+    ) -> None:
+        super().__init__(jobs, run, keep_models)
+        self._address, self._ray = address, _import_ray()
+        self._connected_here = False  # then `map` disconnects
+        if address != "local":  # now, so that a wrong one is refused before anything is written
+            self._connect()
+
+    @property
+    def workers(self) -> int:
+        """Jobs that can run at once: `jobs`, else the cluster's cores as of now."""
+        if self._jobs is not None:
+            return self._jobs
+        if not self._ray.is_initialized():
+            return available_cores()
+        return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+
+    @contextlib.contextmanager
+    def _session(self) -> Iterator[None]:
+        self._connect()
+        try:
+            self._steps = _start_step_counts(self._ray)
+            self._task = self._ray.remote(num_cpus=1, max_retries=_RETRIES)(_task)
+            yield
+        finally:
+            for reference in self._running:
+                self._ray.cancel(reference, force=True)
+            self._running.clear()
+            if self._connected_here:
+                self._ray.shutdown()
+                self._connected_here = False
+
+    def _start(self, job: Job) -> None:
+        if job.lanes is not None:
+            job = replace(job, lanes=replace(job.lanes, state=None))
+        task = self._task.remote(self._steps, self._run, job, self._keep_models)
+        self._running[task] = job
+
+    def _ended(self, progress: ReportProgress) -> Iterator[Outcome]:
+        ready, _ = self._ray.wait(list(self._running), timeout=POLL_SECONDS)
+        for reference in ready:
+            yield from self._outcomes(reference, self._running.pop(reference))
+        by_key = {job.cells[0].digest: job for job in self._running.values()}
+        for key, reported in self._ray.get(self._steps.take.remote()).items():
+            if key in by_key:
+                progress(by_key[key], *reported)
+
+    def _connect(self) -> None:
+        """Connect, unless this process is connected already."""
+        if self._ray.is_initialized():
+            return
+        options: dict[str, Any] = {"address": self._address}
+        if self._address == "local":
+            options |= {"num_cpus": self.workers, "include_dashboard": False}
+        else:
+            _refuse_unreachable(self._address)
+        try:
+            self._ray.init(**options, log_to_driver=False, logging_level=logging.ERROR)
+        except Exception as error:  # of many kinds, by what is wrong with the address
+            raise OptionError(
+                f"ray={self._address!r}: cannot be used: {str(error).splitlines()[0]} {_ADDRESSES}"
+            ) from None
+        self._connected_here = True
+
+    def _outcomes(self, reference: Any, job: Job) -> list[Outcome]:
+        try:
+            return [Outcome(*ended) for ended in self._ray.get(reference)]
+        except self._ray.exceptions.RayError as error:
+            text = str(error).strip()
+            message = (
+                f"{type(error).__name__}: lost {_RETRIES + 1} times: {text.splitlines()[0]} "
+                "Run it again with --retry."
+            )
+            return [failed(cell, message, text) for cell in job.cells]
+
+
+def _task(steps: Any, run: RunCell, job: Job, keep_models: bool) -> list[tuple[Any, ...]]:
+    """Run one job on a Ray worker."""
+    report = functools.partial(steps.put.remote, job.cells[0].digest)
+    return [tuple(outcome) for outcome in run_job(run, job, keep_models, report)]
+
+
+class _StepCounts:
+    """A Ray actor to which workers report the steps they have done."""
+
+    def __init__(self) -> None:
+        self._steps: dict[str, tuple[Any, ...]] = {}
+
+    def put(self, key: str, *reported: Any) -> None:
+        self._steps[key] = reported
+
+    def take(self) -> dict[str, tuple[Any, ...]]:
+        steps, self._steps = self._steps, {}
+        return steps
+
+
+def _start_step_counts(ray: Any) -> Any:
+    """The actor, on the driver's own node: if that is lost, so is the driver."""
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    here = ray.get_runtime_context().get_node_id()
+    strategy = NodeAffinitySchedulingStrategy(node_id=here, soft=False)
+    return ray.remote(num_cpus=0, scheduling_strategy=strategy)(_StepCounts).remote()
+
+
+def _refuse_unreachable(address: str) -> None:
+    """Raise if nothing answers at an address: Ray itself would try for many minutes."""
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host, int(port)), _SECONDS_TO_ANSWER).close()
+    except (OSError, ValueError, OverflowError) as error:
+        raise OptionError(f"ray={address!r}: cannot be reached: {error}. {_ADDRESSES}") from None
+
+
+def _import_ray() -> Any:
+    for name, value in _SETTINGS.items():
+        os.environ.setdefault(name, value)
+    instead = "leave out --ray to use processes on this machine"
+    require_packages("a study on a cluster", {"ray": "Ray"}, "ray", otherwise=instead)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import ray
+    return ray

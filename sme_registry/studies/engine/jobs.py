@@ -34,8 +34,6 @@ _Returned = TypeVar("_Returned")
 CPU = "cpu"
 _MOST_LANES = 10  # on a CPU: more save little time, and the last of a study would run alone longer
 _MOST_LANES_ELSEWHERE = 256
-# Elsewhere a step costs about as much for few lanes as for many, so shapes are padded to these.
-_BUCKETS = {"state_dim": (8, 64), "action_dim": (4, 16)}
 
 
 @dataclass(frozen=True)
@@ -171,7 +169,7 @@ class Programs:
             cell.evaluation_episodes,
             # Rewards that change no observation and end no episode are computed in another way.
             all(spec.k == 1 and spec.D == 0 for spec in cell.specs),
-            tuple(_shape(spec) if self.platform == CPU else _bucket(spec) for spec in cell.specs),
+            tuple(map(_shape, cell.specs)),
             tuple(map(_form, cell.specs)),
             cell.stream and cell.stream.switches,
         )
@@ -245,11 +243,3 @@ def _form(spec: SMESpec) -> Hashable:
     from sme_registry.jax.task import Form
 
     return Form.of(spec)
-
-
-def _bucket(spec: SMESpec) -> Hashable:
-    widths = (
-        next((width for width in widths if getattr(spec, name) <= width), getattr(spec, name))
-        for name, widths in _BUCKETS.items()
-    )
-    return *widths, spec.complexity > 1, _shape(spec).hidden_width

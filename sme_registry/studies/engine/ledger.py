@@ -76,6 +76,15 @@ class Ledger:
             )
         return None
 
+    def study_file(self) -> StudyFile:
+        """The plan in the folder of a study; OptionError if it holds none."""
+        file = self.plan_file()
+        if file is None:
+            raise OptionError(
+                f"folder={str(self.folder)!r}: holds no study. Give the folder of `sme study run`."
+            )
+        return file
+
     def write_plan(self, file: StudyFile) -> None:
         """Write the plan; results of earlier plans stay."""
         file.write(self.folder / PLAN)

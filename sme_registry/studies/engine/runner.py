@@ -1,41 +1,38 @@
-"""`run_study`: run the cells of a plan that have no result yet.
-
-Any number of runs may share a folder at once, on one machine or on several that share it: the lock
-of a cell decides who runs it, and its result file says that it is done. Cells are claimed when a
-worker is free: one, or as many as a program has lanes, so that the others are left to other runs.
-"""
+"""`run_study`: run the cells of a plan that have no result yet."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
 import os
-import time
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 from rich.console import Console
 
 from sme_registry.errors import OptionError, ResourceLimitError, UnknownNameError
-from sme_registry.io import Lock, integer_in
+from sme_registry.io import integer_in
 from sme_registry.io.terminal import Progress, duration
-from sme_registry.spec import Cell, PlannedCell, StudyFile, StudyPlan
+from sme_registry.spec import PlannedCell, StudyFile, StudyPlan
 from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine import checks
+from sme_registry.studies.engine.budget import Paces, first_places, selected
 from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.estimate import Estimator, makespan
-from sme_registry.studies.engine.executors import Executor, InProcess, Outcome, RunCell
+from sme_registry.studies.engine.executors import (
+    Executor,
+    InProcess,
+    OnRay,
+    Outcome,
+    Processes,
+    RunCell,
+)
 from sme_registry.studies.engine.jobs import CPU, Job, Programs, platform_of
-from sme_registry.studies.engine.ledger import Ledger, SavedState
-from sme_registry.studies.engine.processes import Processes
-from sme_registry.studies.engine.ray_executor import OnRay
+from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.engine.queue import Ended, Queue
 from sme_registry.studies.engine.result import CellFailure, CellResult
-from sme_registry.studies.engine.scaling import first_places, selected
 from sme_registry.studies.engine.status import StudyStatus, label, plan_status
 from sme_registry.training.record import versions_for
 
-_SHARE_FOR_A_PACE = 0.02  # of a job, before its pace is measured
 EXECUTORS = ("processes", "in-process", "ray")
 
 
@@ -89,41 +86,33 @@ def run_study(
     if lanes is not None:
         lanes = integer_in("lanes", lanes, 1, 100_000)
     planned = first_places(selected(plan_file.plan.cells, only))
-    programs = None
     if run is run_cell:
         _check(plan_file.plan, planned.values())
-    if run is run_cell and any(in_jax(cell.cell.uses) for cell in planned.values()):
-        if executor == "ray" or isinstance(executor, OnRay):
-            device = _device_on_ray(device)
-        every = (cell.cell for cell in plan_file.plan.cells)
-        programs = Programs(every, platform_of(device), device, lanes)
-    else:
+    on_ray = executor == "ray" or isinstance(executor, OnRay)
+    with_jax = run is run_cell and any(in_jax(cell.cell.uses) for cell in planned.values())
+    programs = _programs(plan_file.plan, device, lanes, on_ray=on_ray) if with_jax else None
+    if not with_jax:
         _refuse_without_jax(device=device, lanes=lanes)
     runs_on = _executor(executor, jobs, ray, run, keep_models)
     ledger = Ledger(folder)
     earlier_plan = ledger.plan_file()
-    study = _StudyRun(
-        plan_file,
-        ledger,
-        planned,
-        runs_on,
-        programs,
-        console or Console(stderr=True),
-        retry_failed,
-        progress,
-    )
-    if not isinstance(runs_on, OnRay):  # whose nodes have a memory of their own
-        study.refuse_without_room()
+    queue = Queue(ledger, planned, programs, retry_failed=retry_failed)
+    if programs is not None and not on_ray:  # whose nodes have a memory of their own
+        _check_room(programs, queue, runs_on.workers)
     if earlier_plan is None or earlier_plan != plan_file:
         ledger.write_plan(plan_file)
-    if study.finished < len(planned):
+    if queue.finished < len(planned):
         ledger.write_request(plan_file, only)
-    study.announce(earlier_plan, keep_models)
+    study = _StudyRun(plan_file, planned, queue, runs_on, console or Console(stderr=True), progress)
+    ledger.warn = study.say
+    study.announce(earlier_plan)
+    if keep_models:
+        study.announce_missing_models(ledger)
     try:
         study.run()
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"interrupted: {study.finished} of {len(planned)} cells have finished and are in "
+            f"interrupted: {queue.finished} of {len(planned)} cells have finished and are in "
             f"{ledger.folder}. Run the same command to continue."
         ) from None
     return plan_status(ledger, plan_file, only)
@@ -150,14 +139,15 @@ def _refuse_without_jax(**options: Any) -> None:
             )
 
 
-def _device_on_ray(device: str | None) -> str:
-    """The device of programs on Ray: each task has one core of its node, and no GPU."""
-    if device not in (None, CPU):
+def _programs(plan: StudyPlan, device: str | None, lanes: int | None, *, on_ray: bool) -> Programs:
+    """The programs of a plan; on Ray each has one core of its node, and no GPU."""
+    if on_ray and device not in (None, CPU):
         raise OptionError(
             f"device={device!r}: must be cpu on Ray, where a program has one core. Leave out "
             "--device, or leave out --ray on a machine that has such a device."
         )
-    return CPU
+    device = CPU if on_ray else device
+    return Programs((cell.cell for cell in plan.cells), platform_of(device), device, lanes)
 
 
 def _executor(
@@ -174,127 +164,47 @@ def _executor(
     raise UnknownNameError(f"executor={executor!r}: must be one of {', '.join(EXECUTORS)}.")
 
 
-class _Running(NamedTuple):
-    """A cell that runs: its lock, when its job started, and the job."""
-
-    lock: Lock
-    started: float
-    job: Job
+def _check_room(programs: Programs, queue: Queue, workers: int) -> None:
+    """Raise ResourceLimitError if programs that run at once would not fit in memory."""
+    cells = [planned.cell for planned in queue.waiting.values()]
+    reasons = programs.without_room(cells, workers)
+    if reasons:
+        named = ((queue.waiting[key], reason) for key, reason in reasons.items())
+        raise ResourceLimitError(
+            "\n".join(f"{cell.algorithm} on {cell.class_name}: {why}" for cell, why in named)
+            + "\nSee --lanes and --jobs."
+        )
 
 
 class _StudyRun:
-    """The cells of one `run_study`: waiting, running, or ended and not yet written."""
+    """One `run_study`: it hands jobs to the executor, writes outcomes, and shows progress."""
 
     def __init__(
         self,
         file: StudyFile,
-        ledger: Ledger,
         planned: dict[str, PlannedCell],
+        queue: Queue,
         executor: Executor,
-        programs: Programs | None,
         console: Console,
-        retry_failed: bool,
         progress: bool,
     ) -> None:
-        self._file, self._ledger, self._executor = file, ledger, executor
-        self._planned, self._programs = planned, programs
-        self._results = ledger.results(planned)
-        self._failures = ledger.failures(planned.keys() - self._results.keys())
-        self.finished, self._failed = len(self._results), 0
-        self._estimator = Estimator(self._results.values())
-        self._waiting = {
-            key: cell
-            for key, cell in planned.items()
-            if key not in self._results and (retry_failed or key not in self._failures)
-        }
-        self._running: dict[str, _Running] = {}
-        self._shares: dict[str, float] = {}  # of a running cell's steps, done
-        # Of each job, the first report after it last compiled: time, share, compilations.
-        self._first_reports: dict[str, tuple[float, float, int]] = {}
-        self._paces: dict[str, float] = {}  # measured by estimated seconds, of each algorithm
-        self._unwritten: list[Outcome] = []
+        self._file, self._planned, self._queue, self._executor = file, planned, queue, executor
+        self._paces = Paces(queue.results.values(), queue.one_at_a_time)
         self._progress = Progress(
             f"study {file.versioned_name}",
             len(planned),
-            done=self.finished,
+            done=queue.finished,
             console=console,
             unit="cells",
-            seconds_left=self.seconds_left,
+            seconds_left=self._seconds_left,
             enabled=progress,
         )
-        ledger.warn = self._progress.message
-
-    def refuse_without_room(self) -> None:
-        """Raise ResourceLimitError if programs that run at once would not fit in memory."""
-        if self._programs is None:
-            return
-        cells = [planned.cell for planned in self._waiting.values()]
-        reasons = self._programs.without_room(cells, self._executor.workers)
-        if reasons:
-            named = ((self._planned[key], reason) for key, reason in reasons.items())
-            raise ResourceLimitError(
-                "\n".join(f"{cell.algorithm} on {cell.class_name}: {why}" for cell, why in named)
-                + "\nSee --lanes and --jobs."
-            )
-
-    def announce(self, earlier_plan: StudyFile | None, keep_models: bool) -> None:
-        """Print what is done, what is reused, and what will run."""
-        say = self._progress.message
-        if earlier_plan is not None and earlier_plan.digest != self._file.digest:
-            say(
-                f"The folder's plan was {earlier_plan.versioned_name} "
-                f"({earlier_plan.digest[:19]}…) and is now {self._file.versioned_name} "
-                f"({self._file.digest[:19]}…). Results of cells in both plans are reused; the "
-                "others stay in the folder."
-            )
-        parts = [f"{len(self._planned):,} cells"]
-        if self.finished:
-            parts.append(f"{self.finished:,} finished before and reused")
-        skipped = len(self._planned) - self.finished - len(self._waiting)
-        if skipped:
-            parts.append(f"{skipped:,} failed before (--retry runs them again)")
-        parts.append(f"{len(self._waiting):,} to run")
-        if self._waiting:
-            parts.append(f"{self._executor.workers} at once")
-            parts.append(f"about {duration(self.seconds_left())}")
-        say(f"study {self._file.versioned_name}: {' · '.join(parts)}")
-        self._announce_other_versions()
-        if keep_models:
-            self._announce_missing_models()
-
-    def _announce_other_versions(self) -> None:
-        installed = functools.cache(versions_for)
-        count, differences = 0, set[str]()
-        for result in self._results.values():
-            now = installed(result.cell.uses)
-            different = {
-                f"{package} {version} (installed: {now[package]})"
-                for package, version in result.versions.items()
-                if now.get(package, version) != version
-            }
-            count, differences = count + bool(different), differences | different
-        if count:
-            self._progress.message(
-                f"{count:,} of the reused results come from other package versions: "
-                f"{', '.join(sorted(differences))}. For results of one set of versions, run the "
-                "plan in a new folder."
-            )
-
-    def _announce_missing_models(self) -> None:
-        missing = sum(
-            # Only a cell that learnt by acting leaves a model.
-            result.online_regret is not None and not self._ledger.model_path(result.key).exists()
-            for result in self._results.values()
-        )
-        if missing:
-            self._progress.message(
-                f"{missing:,} of the finished cells have no model and are not run again. To get "
-                "their models, run the plan in a new folder."
-            )
+        self.say = self._progress.message
+        self._shown = queue.finished, queue.failed
 
     def run(self) -> None:
         """Run every waiting cell."""
-        if not self._waiting:
+        if not self._queue.waiting:
             return
         outcomes = self._executor.map(self._jobs(), self._report)
         with self._progress:
@@ -303,192 +213,109 @@ class _StudyRun:
                     for outcome in outcomes:
                         self._handle(outcome)
             finally:
-                for running in self._running.values():
-                    running.lock.release()
-
-    def seconds_left(self) -> float:
-        """Seconds to the end, as estimated now."""
-        seconds: dict[bool, list[float]] = {True: [], False: []}  # one at a time; others
-        jobs = {id(running.job): running.job.cells for running in self._running.values()}
-        waiting = ((self._planned[key].cell,) for key in self._waiting)
-        for cells in (*jobs.values(), *waiting):
-            rests = (self._seconds(c) * (1 - self._shares.get(c.digest, 0.0)) for c in cells)
-            seconds[self._one_at_a_time(cells[0])].append(sum(rests))
-        return max(sum(seconds[True]), makespan(seconds[False], self._executor.workers))
-
-    def _seconds(self, cell: Cell) -> float:
-        """A whole cell's seconds; before one of its algorithm has finished, by the pace of those
-        that run.
-        """
-        low, high = self._estimator.seconds(cell)
-        pace = 1.0 if self._estimator.knows(cell) else self._paces.get(cell.uses, 1.0)
-        return pace * (low + high) / 2
-
-    def _one_at_a_time(self, cell: Cell) -> bool:
-        """Whether a cell's program has the device to itself."""
-        programs = self._programs
-        return programs is not None and programs.one_at_a_time and in_jax(cell.uses)
+                self._queue.release()
 
     def _jobs(self) -> Iterator[Job | None]:
-        """Jobs of locked cells for the executor; None while no cell is available."""
-        while self._waiting or self._unwritten:
-            try:
-                for outcome in list(self._unwritten):
-                    self._write(outcome)
-                    self._unwritten.remove(outcome)
-                job = self._next_job()
-            except OptionError:
-                # The folder cannot be written to. Running cells are left to finish: there may be
-                # space again by then, and their outcomes are kept in memory until they are written.
-                if len(self._running) == len(self._unwritten):
-                    raise
-                job = None
-            yield job
-
-    def _next_job(self) -> Job | None:
-        """Claim the next cells that still have to run; None if there are none to claim now."""
-        occupied = any(self._one_at_a_time(c) for r in self._running.values() for c in r.job.cells)
-        for key, planned in list(self._waiting.items()):
-            if occupied and self._one_at_a_time(planned.cell):
+        for item in self._queue.jobs():
+            if isinstance(item, Ended):
+                self._show(item)
                 continue
-            if self._programs is not None and in_jax(planned.cell.uses):
-                job = self._claim_program(self._programs, key)
-            elif (lock := self._claim(key)) is not None:
-                job = self._started(Job((planned.cell,)), [lock])
-            else:
-                job = None
-            if job is not None:
-                return job
-        return None
+            if item is not None:
+                self._progress.start_part(self._name(item), "compiling" if item.lanes else "")
+            if self._shown != (self._queue.finished, self._queue.failed):  # by another run
+                self._show()
+            yield item
 
-    def _claim_program(self, programs: Programs, first: str) -> Job | None:
-        """Claim a cell and the others of its program: those of a saved state, or the next ones."""
-        if self._ledger.is_running(first):
-            return None
-        alone = self._ledger.claim_lock()
-        if alone is None:
-            return None
-        with alone, contextlib.ExitStack() as stack:  # releases all of them if one raises
-            cells, locks = list[Cell](), list[Lock]()
-            program = programs.program(self._planned[first].cell)
-            saved = self._ledger.state_of(first, program.made_with)
-            in_state = programs.cells(saved.keys) if saved else None
-            if in_state is None:
-                saved, in_state = None, ()
-            for key in self._candidates(programs, first, saved):
-                if len(cells) < program.count:
-                    lock = self._claim(key)
-                    if lock is not None:
-                        locks.append(stack.enter_context(lock))
-                        cells.append(self._planned[key].cell)
-                if not cells:
-                    return None
-            new = self._ledger.state_path([cell.digest for cell in cells], program.made_with)
-            program = replace(program, state=saved.path if saved else new, cells=in_state)
-            stack.pop_all()
-        return self._started(Job(tuple(cells), program), locks)
-
-    def _candidates(self, programs: Programs, first: str, saved: SavedState | None) -> list[str]:
-        """The waiting cells that may be lanes of the program of the first one, which leads."""
-        group = programs.group(self._planned[first].cell)
-        others = self._waiting if saved is None else saved.keys
-        return [first] + [
-            key
-            for key in others
-            if key != first
-            and key in self._waiting
-            and programs.group(self._planned[key].cell) == group
-        ]
-
-    def _claim(self, key: str) -> Lock | None:
-        """Lock a waiting cell; None if another process holds it, or has run it."""
-        lock = self._ledger.lock(key)
-        if lock is None:
-            return None
+    def _handle(self, outcome: Outcome) -> None:
+        entry = outcome.entry
+        if isinstance(entry, CellFailure):
+            self.say(f"failed: {label(self._planned[entry.key])}: {entry.error}")
         try:
-            self._ledger.set_aside(key)
-            result, failure = self._ledger.result(key), self._ledger.failure(key)
-        except BaseException:
-            lock.release()
-            raise
-        earlier = self._failures.get(key)
-        attempts = earlier.attempts if earlier else 0
-        failed_since = failure is not None and failure.attempts > attempts
-        if result is None and not failed_since:
-            return lock
-        lock.release()
-        del self._waiting[key]
-        self.finished += result is not None
-        self._show(failed=result is None)
-        return None
+            self._show(self._queue.write(outcome))
+        except OptionError as error:
+            self._queue.keep(outcome)
+            self.say(
+                f"{error} No new cell starts until there is space. Finished cells are kept in "
+                "memory, and are lost only if this process ends before it can write them."
+            )
 
-    def _started(self, job: Job, locks: Sequence[Lock]) -> Job:
-        now = time.monotonic()
-        for cell, lock in zip(job.cells, locks, strict=True):
-            del self._waiting[cell.digest]
-            self._running[cell.digest] = _Running(lock, now, job)
-        self._progress.start_part(self._name(job), "compiling" if job.lanes else "")
-        return job
+    def _report(
+        self, job: Job, done: int, total: int, compilations: int = 0, note: str = ""
+    ) -> None:
+        if note:
+            self.say(f"{self._name(job)}: {note}")
+            return
+        share = done / total if total else 1.0
+        self._paces.report(job, share, compilations)
+        state = f"{done:,} of {total:,} steps" if done < total else "evaluating"
+        self._progress.update_part(self._name(job), share, state)
+
+    def _show(self, ended: Ended | None = None) -> None:
+        if ended is not None and isinstance(ended.entry, CellResult):
+            self._paces.observe(ended.entry, ended.seconds)
+        if ended is not None and ended.last:
+            self._progress.end_part(self._name(ended.job))
+        self._shown = finished, failed = self._queue.finished, self._queue.failed
+        self._progress.update(finished, f"{failed} failed" if failed else "")
+
+    def _seconds_left(self) -> float:
+        return self._paces.seconds_left(self._queue.unfinished(), self._executor.workers)
 
     def _name(self, job: Job) -> str:
         """What people call a job: `PPO on k-25, run 3`, or `…, and 9 more`."""
         first, *others = (label(self._planned[cell.digest]) for cell in job.cells)
         return f"{first}, and {len(others)} more" if others else first
 
-    def _report(
-        self, job: Job, done: int, total: int, compilations: int = 0, note: str = ""
-    ) -> None:
-        if note:
-            self._progress.message(f"{self._name(job)}: {note}")
-            return
-        share, now = done / total if total else 1.0, time.monotonic()
-        first = job.cells[0]
-        then, before, compiled = self._first_reports.get(first.digest, (now, share, -1))
-        if compilations != compiled:
-            then, before = now, share
-            self._first_reports[first.digest] = (now, share, compilations)
-        if share - before >= _SHARE_FOR_A_PACE:  # a program may go on from far beyond its start
-            measured = (now - then) / (share - before) / len(job.cells)
-            self._paces[first.uses] = 2 * measured / sum(self._estimator.seconds(first))
-        self._shares |= {cell.digest: share for cell in job.cells}
-        state = f"{done:,} of {total:,} steps" if done < total else "evaluating"
-        self._progress.update_part(self._name(job), share, state)
+    def announce(self, earlier_plan: StudyFile | None) -> None:
+        """Print what is done, what is reused, and what will run."""
+        queue, say = self._queue, self.say
+        if earlier_plan is not None and earlier_plan.digest != self._file.digest:
+            say(
+                f"The folder's plan was {earlier_plan.versioned_name} "
+                f"({earlier_plan.digest[:19]}…) and is now {self._file.versioned_name} "
+                f"({self._file.digest[:19]}…). Results of cells in both plans are reused; the "
+                "others stay in the folder."
+            )
+        parts = [f"{len(self._planned):,} cells"]
+        if queue.finished:
+            parts.append(f"{queue.finished:,} finished before and reused")
+        skipped = len(self._planned) - queue.finished - len(queue.waiting)
+        if skipped:
+            parts.append(f"{skipped:,} failed before (--retry runs them again)")
+        parts.append(f"{len(queue.waiting):,} to run")
+        if queue.waiting:
+            parts.append(f"{self._executor.workers} at once")
+            parts.append(f"about {duration(self._seconds_left())}")
+        say(f"study {self._file.versioned_name}: {' · '.join(parts)}")
+        self._announce_other_versions()
 
-    def _handle(self, outcome: Outcome) -> None:
-        entry = outcome.entry
-        if isinstance(entry, CellFailure):
-            name = label(self._planned[entry.key])
-            self._progress.message(f"failed: {name}: {entry.error}")
-        try:
-            self._write(outcome)
-        except OptionError as error:
-            self._unwritten.append(outcome)
-            self._progress.message(
-                f"{error} No new cell starts until there is space. Finished cells are kept in "
-                "memory, and are lost only if this process ends before it can write them."
+    def _announce_other_versions(self) -> None:
+        installed = functools.cache(versions_for)
+        count, differences = 0, set[str]()
+        for result in self._queue.results.values():
+            now = installed(result.cell.uses)
+            different = {
+                f"{package} {version} (installed: {now[package]})"
+                for package, version in result.versions.items()
+                if now.get(package, version) != version
+            }
+            count, differences = count + bool(different), differences | different
+        if count:
+            self.say(
+                f"{count:,} of the reused results come from other package versions: "
+                f"{', '.join(sorted(differences))}. For results of one set of versions, run the "
+                "plan in a new folder."
             )
 
-    def _write(self, outcome: Outcome) -> None:
-        entry, key = outcome.entry, outcome.entry.key
-        if isinstance(entry, CellFailure) and key in self._failures:
-            attempts = self._failures[key].attempts + 1
-            entry = entry.model_copy(update={"attempts": attempts})
-        self._ledger.write(entry, outcome.model, outcome.snapshots)
-        lock, started, job = self._running.pop(key)
-        lock.release()
-        if isinstance(entry, CellResult):
-            self.finished += 1
-            self._estimator.observe(entry, (time.monotonic() - started) / len(job.cells))
-        if not any(cell.digest in self._running for cell in job.cells):
-            self._end(job)
-        self._show(failed=isinstance(entry, CellFailure))
-
-    def _end(self, job: Job) -> None:
-        """Remove a job of which every cell has been written, and its state if it is of no use."""
-        self._progress.end_part(self._name(job))
-        if job.lanes is not None and job.lanes.state is not None:
-            self._ledger.remove_states(job.lanes.state)
-
-    def _show(self, *, failed: bool) -> None:
-        self._failed += failed
-        self._progress.update(self.finished, f"{self._failed} failed" if self._failed else "")
+    def announce_missing_models(self, ledger: Ledger) -> None:
+        """Say how many finished cells will stay without a model."""
+        missing = sum(
+            # Only a cell that learnt by acting leaves a model.
+            result.online_regret is not None and not ledger.model_path(result.key).exists()
+            for result in self._queue.results.values()
+        )
+        if missing:
+            self.say(
+                f"{missing:,} of the finished cells have no model and are not run again. To get "
+                "their models, run the plan in a new folder."
+            )

@@ -12,10 +12,9 @@ from typing import Any, Literal
 
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.spec import PlannedCell, StudyFile
-from sme_registry.studies.engine.estimate import Estimator, Span
+from sme_registry.studies.engine.budget import Estimator, Span, selected
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellFailure
-from sme_registry.studies.engine.scaling import selected
 
 State = Literal["done", "running", "failed", "waiting"]
 STATES: tuple[State, ...] = ("done", "running", "failed", "waiting")
@@ -149,12 +148,7 @@ def study_status(
       6
     """
     ledger = Ledger(folder)
-    file = ledger.plan_file()
-    if file is None:
-        raise OptionError(
-            f"folder={str(folder)!r}: contains no study. `sme study run` with --folder starts one."
-        )
-    return plan_status(ledger, scale(file), only)
+    return plan_status(ledger, scale(ledger.study_file()), only)
 
 
 def plan_status(ledger: Ledger, file: StudyFile, only: Sequence[str] | None) -> StudyStatus:

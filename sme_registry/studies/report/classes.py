@@ -7,11 +7,12 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sme_registry.spec import ObservationSpec, StudyPlan, SuiteClass
+from sme_registry.spec import ObservationSpec, StreamSpec, StudyPlan, SuiteClass
 from sme_registry.spec.cards import symbol
 
 ALL = "all classes"
 SEVERAL = "several axes"
+TASKS, SCHEDULE = "tasks", "schedule"  # axes of streams
 _AXES = {
     "state_dim": "state dimension",
     "action_dim": "action dimension",
@@ -51,6 +52,24 @@ class ClassInfo:
 
 
 @dataclass(frozen=True)
+class StreamInfo:
+    """A class of streams of the plan, by its first draw.
+
+    Its axis is what differs from the plan's first stream: "" for itself, `TASKS` if nothing else
+    differs, or `SCHEDULE`.
+    """
+
+    name: str
+    stream: StreamSpec
+    axis: str
+
+    @property
+    def related(self) -> bool:
+        """Whether all phases are rotations of one task."""
+        return len({phase.spec.derive(rotation=0.0) for phase in self.stream.phases}) == 1
+
+
+@dataclass(frozen=True)
 class Group:
     """Classes that are compared with each other.
 
@@ -72,6 +91,18 @@ class Group:
 def class_infos(plan: StudyPlan) -> dict[str, ClassInfo]:
     """Every class of the plan by its name."""
     return {member.name: _class_info(member, plan.classes[0]) for member in plan.classes}
+
+
+def stream_infos(plan: StudyPlan) -> dict[str, StreamInfo]:
+    """Every class of streams of the plan by its name."""
+    infos: dict[str, StreamInfo] = {}
+    for member in plan.streams:
+        stream = member.instances[0]
+        base = next(iter(infos.values()), None)
+        alike = base is not None and stream.switches == base.stream.switches
+        axis = "" if base is None else TASKS if alike else SCHEDULE
+        infos[member.name] = StreamInfo(member.name, stream, axis)
+    return infos
 
 
 def groups(

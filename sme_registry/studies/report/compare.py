@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -16,17 +15,24 @@ from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
 from sme_registry.io import refuse_unwritable, to_json, write_atomically
 from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.report.analysis import Analysis, analyse
-from sme_registry.studies.report.exports import difference_table
-from sme_registry.studies.report.frames import StudyFrames, load, plan_file, runs
-from sme_registry.studies.report.tables import (
+from sme_registry.studies.report.analysis import (
+    DIFFERENCES,
     EXTENSION_METRICS,
     METRICS,
+    Analysis,
     Metric,
     differences,
     metrics_of,
 )
-from sme_registry.studies.report.text import TextTable
+from sme_registry.studies.report.frames import (
+    StudyFrames,
+    frame,
+    load,
+    records,
+    runs_of,
+)
+from sme_registry.studies.report.tables import analyse
+from sme_registry.studies.report.texts import TextTable, difference_table
 
 __all__ = ["compare", "comparison_tables", "implementation_caveats", "write_comparison"]
 
@@ -64,10 +70,10 @@ def compare(
     if not isinstance(study, StudyFrames):
         _refuse_streams_alone(study)
         study = load(study)
-    finished = runs(study.results)
+    finished = runs_of(study.results)
     _check_names(first, second, list(dict.fromkeys(finished.algorithm)))
     chosen = [_metric(name, metrics_of(finished)) for name in metrics]
-    table = differences(finished, [(first, second)], chosen)
+    table = frame([*differences(finished, [(first, second)], chosen)], DIFFERENCES)
     if table.empty:
         raise OptionError(
             f"{first!r} and {second!r}: no class has a run of both on the same instance with the "
@@ -86,7 +92,7 @@ def comparison_tables(table: pd.DataFrame) -> list[TextTable]:
 
 def implementation_caveats(folder: str | os.PathLike[str], first: str, second: str) -> list[str]:
     """A sentence if one of two algorithms runs in JAX and the other does not."""
-    uses = {each.name: each.uses for each in plan_file(Ledger(folder)).plan.algorithms}
+    uses = {each.name: each.uses for each in Ledger(folder).study_file().plan.algorithms}
     ours = [name for name in (first, second) if in_jax(uses[name])]
     if len(ours) != 1:
         return []
@@ -115,7 +121,8 @@ def write_comparison(
       ['.csv', '.json', '.pdf', '.png', '.tex']
     """
     from sme_registry.plots.style import WRITTEN
-    from sme_registry.studies.report.figures.differences import draw_class_curves, draw_differences
+    from sme_registry.studies.report.figures.comparisons import draw_differences
+    from sme_registry.studies.report.figures.curves import draw_class_curves
 
     refuse_unwritable(Path(out) / "differences.csv")
     table = compare(folder, first, second, metrics)
@@ -131,16 +138,10 @@ def write_comparison(
     return [write_atomically(Path(out) / name, content) for name, content in contents.items()]
 
 
-def records(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """The rows of a frame as plain data; NaN is None."""
-    plain = table.astype(object).where(table.notna(), None)
-    return [{str(name): value for name, value in row.items()} for row in plain.to_dict("records")]
-
-
 def _analysis(folder: str | os.PathLike[str], first: str, second: str) -> Analysis:
     """The tables of these two algorithms alone, the first one first."""
     ledger = Ledger(folder)
-    file = plan_file(ledger)
+    file = ledger.study_file()
     of = {algorithm.name: algorithm for algorithm in file.plan.algorithms}
     plan = file.plan.model_copy(update={"algorithms": (of[first], of[second])})
     results = ledger.results(cell.cell.digest for cell in plan.cells)
@@ -148,7 +149,7 @@ def _analysis(folder: str | os.PathLike[str], first: str, second: str) -> Analys
 
 
 def _refuse_streams_alone(folder: str | os.PathLike[str]) -> None:
-    if not plan_file(Ledger(folder)).plan.classes:
+    if not Ledger(folder).study_file().plan.classes:
         raise OptionError(
             f"folder={str(folder)!r}: its plan has streams alone, and runs on single tasks are "
             "compared. `sme study report` has the differences between algorithms in streams."

@@ -1,371 +1,373 @@
-"""Findings of a study: which property of the task breaks each algorithm, and how sure that is.
+"""`findings`: what a study found, as a table with a verdict and a sentence in each row.
 
-They follow from the contrasts of normalised regret within distribution. A change counts if its 95 %
-interval excludes 0; it is an indication if it rests on fewer than `ENOUGH_RUNS` pairs. Any other
-change is open, which does not mean that it is none. `templates/findings.jinja` has the words.
+A change or a metric counts if its 95 % interval excludes the neutral value, 0 or for a ratio 1; it
+is an indication if it rests on fewer than `ENOUGH_RUNS` pairs of runs or lives. Any other is open,
+which does not mean that there is no effect.
+
+    section      tasks, comparison, caveats, offline, streams, stream_changes, stream_caveats
+    algorithm, class_name    what it is about; "" where it is about several
+    question, verdict        together they choose the sentence, see `sentences`
+    value, low, high, runs   the number it rests on, its interval, and its runs, pairs or lives
+    sentence     for people
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal
+from typing import Any
 
-from pydantic import SerializerFunctionWrapHandler, model_serializer
+import pandas as pd
 
-from sme_registry.diagnosis.questions import THRESHOLDS as DIAGNOSIS
-from sme_registry.spec import Digest, Integer, Real, SchemaVersion, StrictModel, TupleOf
-from sme_registry.spec.document import without_empty
-from sme_registry.studies.report.analysis import Analysis
-from sme_registry.studies.report.classes import ALL
-from sme_registry.studies.report.offline_findings import THRESHOLDS as OFFLINE
-from sme_registry.studies.report.offline_findings import OfflineFindings, offline_findings
-from sme_registry.studies.report.offline_tables import OFFLINE_INTERVAL
-from sme_registry.studies.report.streams.findings import StreamFindings, stream_findings
-from sme_registry.studies.report.tables import ENOUGH_RUNS, training_data
+from sme_registry.io.markup import conjunction, plural, signed
+from sme_registry.studies.report.analysis import ENOUGH_RUNS, Analysis
+from sme_registry.studies.report.classes import ALL, AXES, SEVERAL
+from sme_registry.studies.report.frames import frame
+from sme_registry.studies.report.life_findings import stream_findings
+from sme_registry.studies.report.sentences import (
+    THRESHOLDS,
+    Found,
+    between,
+    change_text,
+    ends_text,
+    few_runs,
+    finding,
+    missing_runs,
+    numbers_of,
+)
+from sme_registry.studies.report.tables import OFFLINE_INTERVAL, training_data
 
-__all__ = [
-    "THRESHOLDS",
-    "AlgorithmFinding",
-    "Best",
-    "Caveats",
-    "Contrast",
-    "Findings",
-    "OutOfDistribution",
-    "Rival",
-    "findings",
-]
-
-THRESHOLDS = {
-    "unlearnt": DIAGNOSIS["unlearnt"],  # normalised regret, at least: almost nothing was learnt
-    "broken": 0.2,  # change of normalised regret, at least
-    "hurt": 0.05,  # at least; a smaller one hurts slightly
-    "probability": 0.5,  # of improvement, for the better of two algorithms
-    "enough_runs": float(ENOUGH_RUNS),  # with fewer runs or pairs a change is an indication
-    "interval_runs": float(OFFLINE_INTERVAL),  # with fewer an improvement has no interval
-    **OFFLINE,
-}
+COLUMNS = (
+    "section:str algorithm:str class_name:str question:str verdict:str value low high runs:Int64 "
+    "sentence:str"
+)
 _WD, _OOD = "wd_regret", "ood_regret"
 _CHANCE = 0.05  # share of 95 % intervals that exclude 0 without an effect
+_NEAR = THRESHOLDS["near"]
 
-Severity = Literal["broken", "hurt", "slightly_hurt"]
-Certainty = Literal["indication", "rivals", "only_axis", "certain"]
-Position = Literal[
-    "worse_than_constant", "like_constant", "worse_than_linear", "better_than_linear"
-]
+Rows = Sequence[Any]  # of a table, as named tuples
 
 
-class Contrast(StrictModel):
-    """The change of normalised regret from the first class to another; a row of `contrasts`."""
-
-    class_name: str
-    axis: str  # the field in which the classes differ; `SEVERAL`; or ""
-    setting: str  # the class's values of the fields that differ, such as "k = 25"
-    base: Real  # IQM of the normalised regret on the first class
-    level: Real  # and on this one
-    change: Real
-    low: Real | None
-    high: Real | None
-    pairs: Integer  # of runs
-    enough_pairs: bool  # at least `ENOUGH_RUNS`
-    verdict: Literal["worse", "better", "open"]  # "open" unless the interval excludes 0
-
-
-class OutOfDistribution(StrictModel):
-    """The class that costs most regret out of distribution, and larger changes that are open."""
-
-    worst: Contrast
-    larger: TupleOf[Contrast]
-
-
-class AlgorithmFinding(StrictModel):
-    """Which property of the task breaks an algorithm."""
-
-    algorithm: str
-    # By the largest change for the worse; "none_shown" if there is none, and "no_contrasts" if no
-    # run on the first class has a partner on another.
-    verdict: Severity | Literal["none_shown", "no_contrasts"]
-    base_wd_regret: Real | None = None  # on the first class; None if it has no run there
-    base_unlearnt: bool = False  # whether almost nothing was learnt on the first class
-    worst: Contrast | None = None  # the largest change for the worse
-    larger: TupleOf[Contrast] = ()  # larger changes that are open
-    # Whether `worst` is certainly the worst: "indication" with few pairs; "rivals" if the intervals
-    # of other axes allow a larger change; "only_axis" if no other was varied.
-    certainty: Certainty | None = None
-    rivals: TupleOf[Contrast] = ()  # those other axes
-    position: Position | None = None  # of the level on `worst`; None without a linear policy
-    linear_wd_regret: Real | None = None  # WD regret of the linear policy on `worst`
-    base_linear_wd_regret: Real | None = None  # and on the first class
-    harder_to_fit: bool = False  # whether it rises by more than the threshold "hurt"
-    also_worse: TupleOf[Contrast] = ()  # changes for the worse on other axes
-    better: TupleOf[Contrast] = ()  # changes for the better
-    open: TupleOf[Contrast] = ()  # axes without a change for the worse, apart from `larger`
-    out_of_distribution: OutOfDistribution | None = None  # over the shells; None if none is certain
-    highest_change: Real | None = None  # the highest end of an interval
-    largest_single: Contrast | None = None  # the largest change of a single pair of runs
-
-
-class Rival(StrictModel):
-    """An algorithm compared with the best one."""
-
-    algorithm: str
-    probability: Real  # that a run of the best algorithm beats one of this algorithm
-    low: Real | None  # of its 95 % interval; None if a class has a single run
-    high: Real | None
-    # "open" if the interval reaches down to 0.5; "indication" with few runs.
-    verdict: Literal["better", "indication", "open"]
-
-
-class Best(StrictModel):
-    """The best algorithm over all classes, among those with equal data."""
-
-    algorithm: str
-    nu: Real | None  # of the data that all of them learnt from; None for online algorithms
-    transitions: Integer | None
-    classes: Integer  # on which all algorithms have runs
-    iqm: Real  # of 1 − WD regret, mean over classes: 1 is the optimum, 0 the constant ½
-    low: Real | None  # of its 95 % interval; None if a class has a single run
-    high: Real | None
-    rivals: TupleOf[Rival]  # the other algorithms
-
-
-class Caveats(StrictModel):
-    """What limits all findings."""
-
-    planned: Integer  # runs
-    missing: Integer
-    failed: Integer  # of those missing
-    fewest_pairs: Integer | None  # of a contrast; None without contrasts
-    intervals: Integer  # of contrasts within distribution
-    false_findings: Integer  # how many of them exclude 0 by chance if nothing has an effect
-    other_policy_init: TupleOf[str]  # classes whose policy_init also differs from the first's
-
-
-class Findings(StrictModel):
-    """What a study found, as data."""
-
-    schema_version: SchemaVersion = 1
-    study: str  # name and version of the plan
-    digest: Digest  # of the plan
-    base: str  # the plan's first class, with which the others are contrasted; "" without classes
-    thresholds: dict[str, Real]  # see `THRESHOLDS`
-    algorithms: TupleOf[AlgorithmFinding]  # those that learn
-    steps: dict[str, Integer]  # training steps of those compared, if they differ
-    best: TupleOf[Best]  # one for each data set that algorithms share
-    caveats: Caveats
-    offline: OfflineFindings | None  # what learning from data adds; None without such runs
-    streams: StreamFindings | None = None  # None, and left out of the JSON, without streams
-
-    @model_serializer(mode="wrap")
-    def _omit_no_streams(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return without_empty(handler(self), "streams")
-
-
-def findings(analysis: Analysis) -> Findings:
+def findings(analysis: Analysis) -> pd.DataFrame:
     """The findings of a study, from its tables."""
-    rows = analysis.aggregates
-    rows = rows[(rows.group == ALL) & (rows.metric == _WD) & (rows.statistic == "iqm")]
-    compared = list(rows[rows.algorithm.isin(analysis.learners)].itertuples())
-    return Findings(
-        study=analysis.file.versioned_name,
-        digest=analysis.file.digest,
-        base=analysis.base,
-        thresholds=THRESHOLDS,
-        algorithms=tuple(_algorithm(analysis, algorithm) for algorithm in analysis.learners),
-        steps=_steps(analysis, [row.algorithm for row in compared]),
-        best=tuple(_best(analysis, compared)),
-        caveats=_caveats(analysis),
-        offline=offline_findings(analysis) if analysis.has_offline_runs else None,
-        streams=None if analysis.streams is None else stream_findings(analysis.streams),
-    )
+    parts: list[Iterable[dict[str, Any]]] = []
+    if analysis.classes:
+        parts += [_tasks(analysis), _comparison(analysis), _caveats(analysis)]
+    if not analysis.tables["offline"].empty:
+        parts.append(_offline(analysis))
+    if analysis.streams:
+        parts.append(stream_findings(analysis))
+    return frame([row for part in parts for row in part], COLUMNS)
 
 
-def _algorithm(analysis: Analysis, algorithm: str) -> AlgorithmFinding:
-    contrasts = _contrasts(analysis, algorithm, _WD)
-    if not contrasts:
-        return AlgorithmFinding(algorithm=algorithm, verdict="no_contrasts")
-    base_wd_regret, base_linear = _level(analysis, analysis.base, algorithm)
-    fields: dict[str, Any] = {
-        "algorithm": algorithm,
-        "base_wd_regret": base_wd_regret,
-        "base_unlearnt": base_wd_regret is not None and base_wd_regret >= THRESHOLDS["unlearnt"],
-        "better": tuple(c for c in contrasts if c.verdict == "better"),
-        "highest_change": max((c.high for c in contrasts if c.high is not None), default=None),
-        "largest_single": _largest(c for c in contrasts if c.high is None),
-    }
-    worst = _largest(c for c in contrasts if c.verdict == "worse")
-    if worst is None:
-        return AlgorithmFinding(verdict="none_shown", **fields)
-    larger = _larger(contrasts, worst)
-    rivals = _rivals(contrasts, worst)
-    _, linear = _level(analysis, worst.class_name, algorithm)
-    rise = 0.0 if linear is None or base_linear is None else linear - base_linear
-    worse = _largest_of_each_axis(c for c in contrasts if c.verdict == "worse")
-    return AlgorithmFinding(
-        verdict=_severity(worst.change),
-        worst=worst,
-        larger=larger,
-        certainty=_certainty(contrasts, worst, rivals),
-        rivals=rivals,
-        position=_position(worst.level, linear),
-        linear_wd_regret=linear,
-        base_linear_wd_regret=base_linear,
-        harder_to_fit=rise > THRESHOLDS["hurt"],
-        also_worse=tuple(c for c in worse if c.axis != worst.axis),
-        open=tuple(
-            c for c in _largest_of_each_axis(contrasts) if c.verdict != "worse" and c not in larger
-        ),
-        out_of_distribution=_out_of_distribution(analysis, algorithm),
-        **fields,
-    )
+def _tasks(analysis: Analysis) -> Found:
+    """Which property of the task breaks each learner, and how sure that is."""
+    for name in analysis.learners:
+        contrasts = _contrasts(analysis, name, _WD)
+        if not contrasts:
+            yield finding("tasks", "contrasts", "none", algorithm=name, first=analysis.base)
+            continue
+        base = _level(analysis, analysis.base, name)
+        if base is not None and base.iqm >= THRESHOLDS["unlearnt"]:
+            yield finding("tasks", "first class", "unlearnt", algorithm=name, value=base.iqm)
+        worst = _largest(c for c in contrasts if c.verdict == "worse")
+        if worst is None:
+            yield from _no_worst(name, contrasts)
+        else:
+            yield from _worst(analysis, name, contrasts, worst)
 
 
-def _severity(change: float) -> Severity:
+def _no_worst(name: str, contrasts: Rows) -> Found:
+    """What is known of a learner that no class was shown to make worse."""
+    yield finding("tasks", "worst", "none_shown", algorithm=name)
+    yield from _others(name, "better", [c for c in contrasts if c.verdict == "better"])
+    highest = max((c.high for c in contrasts if not math.isnan(c.high)), default=None)
+    if highest is not None:
+        yield finding("tasks", "highest", "open", algorithm=name, value=highest)
+    single = _largest(c for c in contrasts if math.isnan(c.high))
+    if single is not None:
+        at = {"class_name": single.class_name, "value": single.change}
+        yield finding("tasks", "single", "open", algorithm=name, **at)
+
+
+def _worst(analysis: Analysis, name: str, contrasts: Rows, worst: Any) -> Found:
+    """The largest change for the worse, its certainty, and the other changes."""
+    numbers = {"algorithm": name, **numbers_of(worst)}
+    larger = _of_each_axis(c for c in contrasts if c.change > worst.change)
+    severity = _severity(worst.change)
+    yield finding(
+        "tasks", "worst", severity, **numbers, base=worst.base, level=worst.level,
+        most="" if larger else " most", comma="" if larger else ",", property=_property(worst),
+        change=change_text(worst),
+    )  # fmt: skip
+    if larger:
+        yield finding("tasks", "larger", "open", algorithm=name, listed=_listed(larger))
+    rivals = _of_each_axis(c for c in contrasts if c.axis != worst.axis and not c.high < worst.low)
+    axes = {c.axis for c in contrasts}
+    yield finding(
+        "tasks", "certainty", _certainty(worst, rivals, axes), **numbers, listed=_listed(rivals),
+        pairs=plural(worst.pairs, "pair"), enough=ENOUGH_RUNS,
+    )  # fmt: skip
+    yield from _position(analysis, name, worst)
+    worse = _of_each_axis(c for c in contrasts if c.verdict == "worse" and c.axis != worst.axis)
+    yield from _others(name, "worse", [c for c in worse if c.enough_pairs])
+    yield from _others(name, "indication", [c for c in worse if not c.enough_pairs])
+    still_open = [c for c in _of_each_axis(contrasts) if c.verdict != "worse" and c not in larger]
+    yield from _others(name, "open", still_open)
+    outside = _contrasts(analysis, name, _OOD)
+    far = _largest(c for c in outside if c.verdict == "worse")
+    if far is not None:
+        larger = _of_each_axis(c for c in outside if c.change > far.change)
+        yield finding(
+            "tasks", "out of distribution", "worse", algorithm=name, **numbers_of(far),
+            property="the same property" if far.axis == worst.axis else _property(far),
+            costs="costs" if larger else "costs most", listed=_listed([far]),
+        )  # fmt: skip
+        if larger:
+            yield finding("tasks", "larger", "open", algorithm=name, listed=_listed(larger))
+
+
+def _others(name: str, verdict: str, contrasts: Rows) -> Found:
+    if contrasts:
+        yield finding("tasks", "other axes", verdict, algorithm=name, listed=_listed(contrasts))
+
+
+def _severity(change: float) -> str:
     if change >= THRESHOLDS["broken"]:
         return "broken"
     return "hurt" if change >= THRESHOLDS["hurt"] else "slightly_hurt"
 
 
-def _certainty(
-    contrasts: Sequence[Contrast], worst: Contrast, rivals: Sequence[Contrast]
-) -> Certainty:
+def _certainty(worst: Any, rivals: Rows, axes: set[str]) -> str:
+    """Whether the intervals of other axes allow a larger change, if there are others."""
     if not worst.enough_pairs:
         return "indication"
     if rivals:
         return "rivals"
-    return "only_axis" if len({c.axis for c in contrasts}) == 1 else "certain"
+    return "only_axis" if len(axes) == 1 else "certain"
 
 
-def _position(level: float, linear: float | None) -> Position | None:
-    """Where a normalised regret is among the constant's, which is 1, and the linear policy's."""
-    if level > 2.0 - THRESHOLDS["unlearnt"]:
-        return "worse_than_constant"
-    if level >= THRESHOLDS["unlearnt"]:
-        return "like_constant"
-    if linear is None:
-        return None
-    return "worse_than_linear" if level > linear else "better_than_linear"
-
-
-def _out_of_distribution(analysis: Analysis, algorithm: str) -> OutOfDistribution | None:
-    contrasts = _contrasts(analysis, algorithm, _OOD)
-    worst = _largest(c for c in contrasts if c.verdict == "worse")
-    if worst is None:
-        return None
-    return OutOfDistribution(worst=worst, larger=_larger(contrasts, worst))
-
-
-def _contrasts(analysis: Analysis, algorithm: str, metric: str) -> list[Contrast]:
-    rows = analysis.contrasts
-    rows = rows[(rows.algorithm == algorithm) & (rows.metric == metric)]
-    rows = rows.drop(columns=["algorithm", "metric"]).astype(object)
-    return [
-        Contrast(
-            **{**row, "low": _known(row["low"]), "high": _known(row["high"])},
-            setting=analysis.classes[row["class_name"]].label,
+def _position(analysis: Analysis, name: str, worst: Any) -> Found:
+    """Where the worst level is among the constant's, which is 1, and the linear policy's."""
+    at, base = _level(analysis, worst.class_name, name), _level(analysis, analysis.base, name)
+    linear = math.nan if at is None else at.linear
+    about = {"algorithm": name, "class_name": worst.class_name, "value": worst.level}
+    if worst.level > 2.0 - THRESHOLDS["unlearnt"]:
+        yield finding("tasks", "position", "worse_than_constant", **about)
+    elif worst.level >= THRESHOLDS["unlearnt"]:
+        yield finding("tasks", "position", "like_constant", **about)
+    elif not math.isnan(linear):
+        verdict = "worse_than_linear" if worst.level > linear else "better_than_linear"
+        yield finding("tasks", "position", verdict, **about, linear=linear)
+    if base is not None and linear - base.linear > THRESHOLDS["hurt"]:
+        yield finding(
+            "tasks", "linear policy", "harder_to_fit", **about | {"value": linear}, base=base.linear
         )
-        for row in rows.to_dict("records")
-    ]
 
 
-def _level(
-    analysis: Analysis, class_name: str, algorithm: str
-) -> tuple[float | None, float | None]:
-    """WD regret of an algorithm on a class, and that of the linear policy."""
-    rows = analysis.levels
+def _comparison(analysis: Analysis) -> Found:
+    """The best learner over all classes among those with equal data, and its rivals."""
+    rows = analysis.tables["aggregates"]
+    rows = rows[(rows.group == ALL) & (rows.metric == _WD) & (rows.statistic == "iqm")]
+    compared = list(rows[rows.algorithm.isin(analysis.learners)].itertuples())
+    of_all = dict(zip(analysis.runs.algorithm, analysis.runs.steps.tolist(), strict=True))
+    steps = {row.algorithm: of_all[row.algorithm] for row in compared}
+    if len(set(steps.values())) > 1:
+        listed = ", ".join(f"{name} {count:,}" for name, count in steps.items())
+        yield finding("comparison", "training steps", "differ", listed=listed)
+    data = training_data(analysis.runs)
+    for shared in dict.fromkeys(data[row.algorithm] for row in compared):
+        alike = [row for row in compared if data[row.algorithm] == shared]
+        if len(alike) > 1:
+            best = max(alike, key=lambda row: row.value)
+            nu, transitions = shared or (math.nan, 0)
+            of_data = f" of those with {transitions:,} transitions of ν = {nu:g},"
+            yield finding(
+                "comparison", "best", "best", algorithm=best.algorithm, value=best.value,
+                low=best.low, high=best.high, runs=best.fewest_runs, interval=ends_text(best),
+                classes=plural(best.classes, "class", "classes"), data=of_data if shared else "",
+            )  # fmt: skip
+            yield from _rivals(analysis, best.algorithm, {row.algorithm for row in alike})
+
+
+def _rivals(analysis: Analysis, best: str, among: set[str]) -> Found:
+    rows = analysis.tables["improvements"]
+    for row in rows[(rows.group == ALL) & (rows.metric == _WD)].itertuples():
+        if best not in (row.first, row.second) or not {row.first, row.second} <= among:
+            continue
+        numbers = {"value": row.probability, "low": row.low, "high": row.high}
+        if row.second == best:
+            ends = {"low": 1.0 - row.high, "high": 1.0 - row.low}
+            numbers = {"value": 1.0 - row.probability, **ends}
+        verdict = "open"
+        if numbers["low"] > THRESHOLDS["probability"]:
+            verdict = "better" if row.fewest_runs >= ENOUGH_RUNS else "indication"
+        yield finding(
+            "comparison", "rival", verdict, algorithm=best, runs=row.fewest_runs, **numbers,
+            other=row.first if row.second == best else row.second, interval=between(**numbers),
+        )  # fmt: skip
+
+
+def _caveats(analysis: Analysis) -> Found:
+    """What limits all findings on single tasks."""
+    rows, missing = analysis.tables["contrasts"], analysis.tables["missing"]
+    rows = rows[rows.algorithm.isin(analysis.learners)]
+    planned, failed = len(analysis.runs) + len(missing), int((missing.error != "").sum())
+    yield from missing_runs("caveats", len(missing), planned, failed)
+    if not rows.empty and rows.pairs.min() < ENOUGH_RUNS:
+        yield few_runs("caveats", int(rows.pairs.min()), "pair of runs", "pairs of runs")
+    intervals = int(((rows.metric == _WD) & rows.low.notna()).sum())
+    if intervals > 1:
+        value = max(1, round(_CHANCE * intervals))
+        yield finding("caveats", "chance", "expected", value=value, intervals=intervals)
+    init = {name: info.setting["policy_init"] for name, info in analysis.classes.items()}
+    other = [
+        name for name, info in analysis.classes.items()
+        if info.axis != "policy_init" and init[name] != init[analysis.base]
+    ]  # fmt: skip
+    if other:
+        yield finding("caveats", "policy_init", "differs", listed=conjunction(other))
+
+
+def _offline(analysis: Analysis) -> Found:
+    """Whether each learner reaches or surpasses the policy that made its data."""
+    rows = list(analysis.tables["offline"].itertuples())
+    data = training_data(analysis.runs)
+    example, nu = next((name, source[0]) for name, source in data.items() if source)
+    yield finding("offline", "example", "nu", algorithm=example, value=nu)
+    yield _behaviour(rows)
+    for name in dict.fromkeys(row.learner for row in rows):
+        yield from _learner(analysis, name, [row for row in rows if row.learner == name])
+    few, most = min(row.runs for row in rows), max(row.runs for row in rows)
+    yield finding(
+        "offline", "offline runs", "few" if few < ENOUGH_RUNS else "enough", runs=few,
+        count=(f"{few} to " if few < most else "") + plural(most, "run"), near=_NEAR,
+        enough=ENOUGH_RUNS, interval_runs=OFFLINE_INTERVAL,
+    )  # fmt: skip
+
+
+def _behaviour(rows: Rows) -> dict[str, Any]:
+    """The behaviour policies compared with 1 − ν/6, which independent uniform actions give."""
+    places = list({(row.class_name, row.nu): row for row in reversed(rows)}.values())[::-1]
+    off = [row.behaviour_similarity - (1.0 - row.nu / 6.0) for row in places]
+    far = [row for row, difference in zip(places, off, strict=True) if abs(difference) > _NEAR]
+    worst = max(range(len(off)), key=lambda i: abs(off[i]))
+    return finding(
+        "offline", "behaviour", "far" if far else "near", value=off[worst],
+        where=_at(places[worst]), near=len(places) - len(far), count=len(places),
+        places=_places(far),
+    )  # fmt: skip
+
+
+def _learner(analysis: Analysis, name: str, rows: Rows) -> Found:
+    near = [row for row in rows if abs(row.improvement) <= _NEAR]
+    verdict = "near_at_some" if near else "near_at_none"
+    farthest = max(rows, key=lambda row: abs(row.improvement))
+    yield finding(
+        "offline", "imitation", "imitates" if len(near) == len(rows) else verdict, algorithm=name,
+        **numbers_of(farthest), places=_places(near), where=_at(farthest),
+    )  # fmt: skip
+    by_verdict: dict[str, list[Any]] = {}
+    for row in rows:
+        if row.runs > 1:
+            by_verdict.setdefault(row.verdict, []).append(row)
+        elif row.improvement > _NEAR:
+            by_verdict.setdefault("single_above", []).append(row)
+    if not by_verdict.keys() & {"above", "above_few"}:
+        yield finding("offline", "improvement", "none", algorithm=name)
+    for verdict, places in by_verdict.items():
+        low, high = (signed(f(row.improvement for row in places), 3) for f in (min, max))
+        yield finding(
+            "offline", "improvement", verdict, algorithm=name, places=_places(places),
+            by=low if low == high else f"{low} to {high}",
+        )  # fmt: skip
+    yield from _depth(analysis, name, rows)
+
+
+def _depth(analysis: Analysis, name: str, rows: Rows) -> Found:
+    """Whether a learner collapses on the deepest class, if classes differ in depth."""
+    classes = dict.fromkeys(analysis.tables["offline"].class_name)
+    depth = {each: float(analysis.classes[each].setting["complexity"]) for each in classes}
+    if len(set(depth.values())) < 2:
+        return
+    deepest = max(depth, key=lambda each: depth[each])
+    rows = [row for row in rows if row.class_name == deepest]
+    about = {"algorithm": name, "class_name": deepest}
+    if not rows:
+        yield finding("offline", "depth", "no_runs", **about)
+        return
+    constant = [row for row in rows if row.similarity <= row.constant_similarity + _NEAR]
+    below = [
+        row for row in rows
+        if row.improvement <= -THRESHOLDS["collapse"] and row not in constant
+    ]  # fmt: skip
+    lowest = min(rows, key=lambda row: row.improvement)
+    how = [f"at ν = {_nus(constant)} it is at most {_NEAR} better than the constant ½"] * bool(
+        constant
+    ) + [
+        f"at ν = {_nus(below)} it is better than the constant ½, but {THRESHOLDS['collapse']} or "
+        "more below its data"
+    ] * bool(below)
+    few = any(row.runs < ENOUGH_RUNS for row in (*constant, *below))
+    yield finding(
+        "offline", "depth", "collapses" if how else "holds", **about, value=lowest.improvement,
+        runs=sum(row.runs for row in rows), nus=plural(len(rows), "value"),
+        count=plural(sum(row.runs for row in rows), "run"), near=_NEAR, where=_at(lowest),
+        how=", and ".join(how), few=" With so few runs this is an indication." * few,
+    )  # fmt: skip
+
+
+def _contrasts(analysis: Analysis, algorithm: str, metric: str) -> Rows:
+    """Rows of the contrasts, with the setting of their class."""
+    rows = analysis.tables["contrasts"]
+    rows = rows[(rows.algorithm == algorithm) & (rows.metric == metric)]
+    setting = rows.class_name.map({name: c.label for name, c in analysis.classes.items()})
+    return list(rows.assign(setting=setting).itertuples())
+
+
+def _level(analysis: Analysis, class_name: str, algorithm: str) -> Any | None:
+    """The row of an algorithm's WD regret on a class."""
+    rows = analysis.tables["levels"]
     place = (rows.class_name == class_name) & (rows.algorithm == algorithm) & (rows.metric == _WD)
-    row = next(rows[place].itertuples(), None)
-    return (None, None) if row is None else (row.iqm, _known(row.linear))
+    return next(rows[place].itertuples(), None)
 
 
-def _known(value: float) -> float | None:
-    return None if math.isnan(value) else value
-
-
-def _largest(contrasts: Iterable[Contrast]) -> Contrast | None:
+def _largest(contrasts: Iterable[Any]) -> Any | None:
     return max(contrasts, key=lambda c: c.change, default=None)
 
 
-def _largest_of_each_axis(contrasts: Iterable[Contrast]) -> tuple[Contrast, ...]:
+def _of_each_axis(contrasts: Iterable[Any]) -> Rows:
     """For each axis the contrast with the largest change, in falling order."""
-    largest: dict[str, Contrast] = {}
+    largest: dict[str, Any] = {}
     for contrast in sorted(contrasts, key=lambda c: c.change, reverse=True):
         largest.setdefault(contrast.axis or contrast.class_name, contrast)
-    return tuple(largest.values())
+    return list(largest.values())
 
 
-def _larger(contrasts: Iterable[Contrast], worst: Contrast) -> tuple[Contrast, ...]:
-    """Changes that are larger than the largest certain one."""
-    return _largest_of_each_axis(c for c in contrasts if c.change > worst.change)
+def _property(contrast: Any) -> str:
+    """What differs between the classes of a contrast: `reward interval k`."""
+    if contrast.axis in AXES:
+        return AXES[contrast.axis][1]
+    if contrast.axis == SEVERAL:
+        return f"several axes at once ({contrast.setting})"
+    return contrast.axis or f"the class {contrast.class_name}"
 
 
-def _rivals(contrasts: Iterable[Contrast], worst: Contrast) -> tuple[Contrast, ...]:
-    """Changes on other axes that may be larger than the worst one, by their intervals."""
-    low = worst.low or 0.0
-    return _largest_of_each_axis(
-        c for c in contrasts if c.axis != worst.axis and (c.high is None or c.high >= low)
-    )
+def _listed(contrasts: Rows) -> str:
+    """`complexity L (complexity-10: +0.13, 95 % interval +0.12 to +0.15, 5 pairs)`, …"""
+    return ", ".join(f"{_property(c)} ({c.class_name}: {change_text(c)})" for c in contrasts)
 
 
-def _steps(analysis: Analysis, algorithms: Sequence[str]) -> dict[str, int]:
-    steps = dict(zip(analysis.runs.algorithm, analysis.runs.steps.tolist(), strict=True))
-    compared = {algorithm: steps[algorithm] for algorithm in algorithms}
-    return compared if len(set(compared.values())) > 1 else {}
+def _at(row: Any) -> str:
+    return f"{row.class_name}, ν = {row.nu:g}"
 
 
-def _best(analysis: Analysis, rows: Sequence[Any]) -> Iterable[Best]:
-    data = training_data(analysis.runs)
-    for shared in dict.fromkeys(data[row.algorithm] for row in rows):
-        alike = [row for row in rows if data[row.algorithm] == shared]
-        if len(alike) < 2:
-            continue
-        best = max(alike, key=lambda row: row.value)
-        nu, transitions = shared or (None, None)
-        yield Best(
-            algorithm=best.algorithm,
-            nu=nu,
-            transitions=transitions,
-            classes=best.classes,
-            iqm=best.value,
-            low=_known(best.low),
-            high=_known(best.high),
-            rivals=tuple(_improvements(analysis, best.algorithm, {row.algorithm for row in alike})),
-        )
+def _nus(rows: Rows) -> str:
+    return ", ".join(f"{row.nu:g}" for row in rows)
 
 
-def _improvements(analysis: Analysis, best: str, among: set[str]) -> Iterable[Rival]:
-    rows = analysis.improvements
-    for row in rows[(rows.group == ALL) & (rows.metric == _WD)].itertuples():
-        pair = {row.first, row.second}
-        if best not in pair or not pair <= among:
-            continue
-        probability, low, high = row.probability, _known(row.low), _known(row.high)
-        if row.second == best:
-            probability = 1.0 - probability
-            low, high = (None if end is None else 1.0 - end for end in (high, low))
-        verdict: Literal["better", "indication", "open"] = "open"
-        if low is not None and low > THRESHOLDS["probability"]:
-            verdict = "better" if row.fewest_runs >= ENOUGH_RUNS else "indication"
-        (other,) = pair - {best}
-        yield Rival(algorithm=other, probability=probability, low=low, high=high, verdict=verdict)
-
-
-def _caveats(analysis: Analysis) -> Caveats:
-    rows, missing = analysis.contrasts, analysis.missing
-    rows = rows[rows.algorithm.isin(analysis.learners)]
-    base = analysis.classes.get(analysis.base)
-    policy_init = None if base is None else base.setting["policy_init"]
-    intervals = int(((rows.metric == _WD) & rows.low.notna()).sum())
-    return Caveats(
-        planned=len(analysis.runs) + len(missing),
-        missing=len(missing),
-        failed=int((missing.error != "").sum()),
-        fewest_pairs=None if rows.empty else int(rows.pairs.min()),
-        intervals=intervals,
-        false_findings=max(1, round(_CHANCE * intervals)),
-        other_policy_init=tuple(
-            name
-            for name, info in analysis.classes.items()
-            if info.axis != "policy_init" and info.setting["policy_init"] != policy_init
-        ),
-    )
+def _places(rows: Rows) -> str:
+    """`shallow (ν = 0, 0.5), deep (ν = 1)`."""
+    grouped = itertools.groupby(rows, key=lambda row: row.class_name)
+    return ", ".join(f"{name} (ν = {_nus(list(at))})" for name, at in grouped)

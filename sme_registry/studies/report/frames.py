@@ -1,4 +1,4 @@
-"""`load`: a study's finished runs as two tidy pandas frames, which the report also uses.
+"""`load`, `load_streams`: a study's finished runs as tidy pandas frames, as the report uses them.
 
 `results`: one row per run and region, ordered by class, algorithm, run, region.
 
@@ -35,7 +35,6 @@ Columns of the run, repeated in each of its regions; NaN or NA where the run has
 
 `curves`: one row per run and evaluation during training, ordered by class, algorithm, run, step.
 
-    class_name, algorithm, run   as above
     step                         training steps before the evaluation (offline: gradient steps)
     episode_return               mean return of its episodes, in [0, horizon]
     regret                       mean of 1 − step reward over their steps, in [0, 1]
@@ -60,6 +59,55 @@ or NA for the other tasks:
     distractor_regret                                     of the run: mean over the shells of d
     wd_invariance                                         of the run: that of the cube
     invariance                                            of the region
+
+`load_streams` has lives in streams: an agent's training through a whole stream. Fresh agents, which
+train on one phase alone, are joined to it: a life has its plasticity and learning transfer once all
+of them have finished. `evaluation.retention` has the formulas.
+
+`lives`: one row per life and region, with the metrics at the end of the life.
+
+    region                       WD, OOD 1, OOD 2, …, and OOD: the mean over the shells
+    average_performance          mean of 1 − normalised regret over the phases; 1 optimal
+    visited_regret               mean over visits of the normalised regret on the phase just visited
+    backward_transfer            mean change of performance since each phase was last trained
+    forgetting                   mean fall of performance on earlier phases below their best
+    forward_transfer             mean gain on phases before their first visit
+    relearning                   mean gain of the second visit of a phase on its first
+    plasticity_ratio, plasticity_difference   of the visited phase's regret to a fresh agent's,
+                                 mean over visits ≥ 1: in visit 0 a life is a fresh agent itself
+
+Columns of the life, repeated in each of its regions; NaN where it has no such number:
+
+    learning_transfer            1 − online regret / that of the fresh agents, mean over visits ≥ 1
+    online_regret                mean of 1 − step reward over the life, in [0, 1]
+    dynamic_regret               its sum
+    frozen_online_regret         online regret of the same agent if it stops learning after visit 0,
+                                 in expectation
+    uses, action_range, steps    the algorithm, its action range, environment steps of the life
+    state_dim, action_dim, horizon   of every phase
+    stream_digest, seed          the stream's digest; the seed of training
+    fresh_agents                 number of its fresh agents that have finished; a life of one phase
+                                 that drifts is a fresh agent itself, and has none
+    seconds, steps_per_second    CPU time of the life, and training speed
+    key                          digest of the life's cell, which names its file
+
+`visits`: one row per life, visit and region, with the metrics at the end of the visit.
+
+    visit, cycle, phase          indices from 0; phase is that of the stream's document
+    lifetime                     environment steps at the end of the visit
+    normalised_regret            on the phase just visited
+    fresh_normalised_regret      that of the phase's fresh agent
+    average_performance, backward_transfer, forgetting, plasticity_ratio, plasticity_difference
+    online_regret, dynamic_regret, frozen_online_regret, fresh_online_regret, learning_transfer
+                                 of the visit's training, repeated in each region
+
+`retention`: the retention matrices, one row per life, region, visit and phase.
+
+    visit                        NA for the initial policy
+    phase                        on whose task the policy at the end of the visit is evaluated
+    normalised_regret            0 optimal, 1 the constant ½
+
+`curves`: one row per life and evaluation during training, as in `load`: on the task in force.
 """
 
 from __future__ import annotations
@@ -72,9 +120,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sme_registry.errors import OptionError
-from sme_registry.evaluation import EvaluationReport
-from sme_registry.spec import PlannedCell, StudyFile, StudyPlan
+from sme_registry.evaluation import EvaluationReport, StreamReport
+from sme_registry.evaluation.retention import BY_VISIT, METRICS
+from sme_registry.evaluation.stream_report import StreamRegion
+from sme_registry.spec import PlannedCell, StudyPlan
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellResult
 
@@ -101,10 +150,17 @@ _EXTENSIONS = {
     ),
 }
 CURVES = RUN_COLUMNS + "step:int64 episode_return regret similarity length"
-_PROBES = RUN_COLUMNS + "layer:int64 units:int64 state_r2 distractor_r2"
 # Columns of each agent of a team, as in `wd_regret/agent_0`.
 AGENT_COLUMNS = ("normalised_regret", "wd_regret", "ood_regret", "online_regret")
 _RUN_OF_AGENT = tuple(f"{column}/" for column in AGENT_COLUMNS[1:])
+_LIVES = f"""{RUN_COLUMNS} region:str epsilon_low epsilon_high states:int64 visited_regret
+    {" ".join(METRICS)} learning_transfer online_regret dynamic_regret frozen_online_regret
+    uses:str action_range:str steps:int64 state_dim:int64 action_dim:int64 horizon:int64
+    stream_digest:str seed:int64 fresh_agents:int64 seconds steps_per_second key:str"""
+_VISITS = f"""{RUN_COLUMNS} region:str visit:int64 cycle:int64 phase:int64 lifetime:int64
+    normalised_regret fresh_normalised_regret {" ".join(BY_VISIT)} online_regret dynamic_regret
+    frozen_online_regret fresh_online_regret learning_transfer"""
+_RETENTION = f"{RUN_COLUMNS} region:str visit:Int64 phase:int64 normalised_regret"
 _REFERENCES = {
     "linear_normalised_regret": "linear_least_squares",
     "best_constant_normalised_regret": "best_constant",
@@ -123,7 +179,6 @@ class StudyFrames(NamedTuple):
         return f"<StudyFrames: results {self.results.shape}, curves {self.curves.shape}>"
 
     def _repr_html_(self) -> str:
-        """Both frames, for notebooks; pandas abbreviates long ones."""
         frames = self._asdict().items()
         return "".join(f"<h4>{name}</h4>{frame.to_html(max_rows=10)}" for name, frame in frames)
 
@@ -138,18 +193,8 @@ def load(folder: str | os.PathLike[str]) -> StudyFrames:
       ['PPO', 'constant', 'linear']
     """
     ledger = Ledger(folder)
-    file = plan_file(ledger)
+    file = ledger.study_file()
     return study_frames(file.plan, ledger.results(cell.cell.digest for cell in file.plan.cells))
-
-
-def plan_file(ledger: Ledger) -> StudyFile:
-    """The plan in a study's folder; raises the errors of `load`."""
-    file = ledger.plan_file()
-    if file is None:
-        raise OptionError(
-            f"folder={str(ledger.folder)!r}: holds no study. Give the folder of `sme study run`."
-        )
-    return file
 
 
 def study_frames(plan: StudyPlan, results: Mapping[str, CellResult]) -> StudyFrames:
@@ -176,20 +221,7 @@ def study_frames(plan: StudyPlan, results: Mapping[str, CellResult]) -> StudyFra
     )
 
 
-def probes(plan: StudyPlan, results: Mapping[str, CellResult]) -> pd.DataFrame:
-    """One row per run and probed layer; see `evaluation.LayerProbe`. Empty without any."""
-    rows = [
-        place(planned) | probe.model_dump()
-        for planned in ordered(plan)
-        if (result := results.get(planned.cell.digest)) is not None
-        and (report := result.report) is not None
-        and report.observation is not None
-        for probe in report.observation.probes
-    ]
-    return frame(rows, _PROBES)
-
-
-def runs(results: pd.DataFrame) -> pd.DataFrame:
+def runs_of(results: pd.DataFrame) -> pd.DataFrame:
     """One row per run: `results` without the columns of its regions."""
     by_agent = [name for name in results.columns if name.startswith(_RUN_OF_AGENT)]
     extensions = _dtypes(" ".join(of_run for of_run, _ in _EXTENSIONS.values()))
@@ -215,6 +247,12 @@ def frame(rows: Sequence[Any], columns: str) -> pd.DataFrame:
 def _dtypes(columns: str) -> dict[str, str]:
     parts = (column.partition(":") for column in columns.split())
     return {name: dtype or "float64" for name, _, dtype in parts}
+
+
+def records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """The rows of a frame as plain data; NaN is None."""
+    plain = table.astype(object).where(table.notna(), None)
+    return [{str(name): value for name, value in row.items()} for row in plain.to_dict("records")]
 
 
 def window(evaluations: int) -> int:
@@ -315,3 +353,149 @@ def _final_return(result: CellResult) -> float:
     if not returns:
         return math.nan
     return 100.0 * float(np.mean(returns[-window(len(returns)) :])) / result.cell.spec.horizon
+
+
+class StreamFrames(NamedTuple):
+    """A study's finished lives in streams; the module's docstring lists the columns."""
+
+    lives: pd.DataFrame
+    visits: pd.DataFrame
+    retention: pd.DataFrame
+    curves: pd.DataFrame
+
+
+class FinishedLife(NamedTuple):
+    """A finished life."""
+
+    planned: PlannedCell
+    result: CellResult
+    report: StreamReport
+    fresh_agents: int
+
+
+def load_streams(folder: str | os.PathLike[str]) -> StreamFrames:
+    """Load the finished lives of a study with streams; frames without rows if there are none.
+
+    Examples:
+      >>> from sme_registry import studies
+      >>> len(studies.load_streams("study").retention)  # a study without streams
+      0
+    """
+    ledger = Ledger(folder)
+    plan = ledger.study_file().plan
+    return stream_frames(
+        finished_lives(plan, ledger.results(cell.cell.digest for cell in plan.cells))
+    )
+
+
+def finished_lives(plan: StudyPlan, results: Mapping[str, CellResult]) -> list[FinishedLife]:
+    """The finished lives, from results by the digests of their cells."""
+    found = []
+    for planned in ordered(plan):
+        result = results.get(planned.cell.digest)
+        if planned.phase is None and result is not None and result.stream_report is not None:
+            alone = [results.get(cell.digest) for cell in planned.cell.fresh]
+            finished = [one for one in alone if one is not None]
+            report = result.stream_report
+            if alone and len(finished) == len(alone):
+                report = _with_fresh(report, finished)
+            found.append(FinishedLife(planned, result, report, len(finished)))
+    return found
+
+
+def stream_frames(lives: list[FinishedLife]) -> StreamFrames:
+    """The frames of lives."""
+    return StreamFrames(
+        frame([row for life in lives for row in _life_rows(life)], _LIVES),
+        frame([row for life in lives for row in _visit_rows(life)], _VISITS),
+        frame([row for life in lives for row in _retention_rows(life)], _RETENTION),
+        frame([row for life in lives for row in curve_rows(life.planned, life.result)], CURVES),
+    )
+
+
+def _with_fresh(report: StreamReport, fresh: Sequence[CellResult]) -> StreamReport:
+    """The report with its fresh agents, one for each phase."""
+    costs = [result.online_regret for result in fresh if result.online_regret is not None]
+    known = len(costs) == len(fresh) and report.dynamic_regret is not None
+    return report.with_fresh([result.any_report for result in fresh], costs if known else None)
+
+
+def _life_rows(life: FinishedLife) -> Iterator[dict[str, Any]]:
+    cell, result, regret = life.result.cell, life.result, life.report.dynamic_regret
+    frozen = life.report.reference_regret.get("frozen_agent")
+    of_life = {
+        **place(life.planned),
+        **{name: getattr(cell, name) for name in ("uses", "action_range", "steps", "seed")},
+        **{
+            name: None if regret is None else getattr(regret, name)
+            for name in ("learning_transfer", "online_regret", "dynamic_regret")
+        },
+        **{
+            name: getattr(life.report.stream, name)
+            for name in ("state_dim", "action_dim", "horizon")
+        },
+        "frozen_online_regret": None if frozen is None else frozen.online_regret,
+        "stream_digest": life.report.stream_digest,
+        "fresh_agents": life.fresh_agents,
+        "seconds": result.timing.total,
+        "steps_per_second": result.timing.steps_per_second,
+        "key": result.key,
+    }
+    for region in _regions(life.report):
+        M = np.array(region.agent.normalised_regret)
+        yield {
+            **of_life,
+            **region.model_dump(include={"epsilon_low", "epsilon_high", "states"}),
+            **{name: region.agent.final(name) for name in METRICS},
+            "region": region.name,
+            "visited_regret": M[np.arange(len(M)), np.arange(len(M)) % M.shape[1]].mean(),
+        }
+
+
+def _visit_rows(life: FinishedLife) -> Iterator[dict[str, Any]]:
+    report = life.report
+    for visit in report.visits:
+        v, j = visit.visit, visit.phase
+        of_visit = {
+            **place(life.planned),
+            **visit.model_dump(include={"visit", "cycle", "phase", "lifetime"}),
+            **_visit_regret(report, v, j),
+        }
+        for region in _regions(report):
+            agent, alone = region.agent, region.agent.fresh_normalised_regret
+            yield {
+                **of_visit,
+                **{name: getattr(agent, name)[v] for name in BY_VISIT},
+                "region": region.name,
+                "normalised_regret": agent.normalised_regret[v][j],
+                "fresh_normalised_regret": None if alone is None else alone[j],
+            }
+
+
+def _visit_regret(report: StreamReport, visit: int, phase: int) -> dict[str, Any]:
+    """What the training of a visit cost."""
+    regret = report.dynamic_regret
+    if regret is None or visit >= len(regret.visits):
+        return {}
+    alone, frozen = regret.fresh_online_regret, report.reference_regret.get("frozen_agent")
+    names = ("online_regret", "dynamic_regret", "learning_transfer")
+    return {
+        **{name: getattr(regret.visits[visit], name) for name in names},
+        "frozen_online_regret": None if frozen is None else frozen.visits[visit].online_regret,
+        "fresh_online_regret": None if alone is None else alone[phase],
+    }
+
+
+def _retention_rows(life: FinishedLife) -> Iterator[tuple[Any, ...]]:
+    at = place(life.planned).values()
+    for region in _regions(life.report):
+        initial = region.agent.initial_normalised_regret
+        rows = [] if initial is None else [(None, initial)]
+        for visit, row in [*rows, *enumerate(region.agent.normalised_regret)]:
+            for phase, value in enumerate(row):
+                yield (*at, region.name, visit, phase, value)
+
+
+def _regions(report: StreamReport) -> Iterator[StreamRegion]:
+    yield from report.regions
+    yield report.ood

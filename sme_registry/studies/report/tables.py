@@ -1,7 +1,6 @@
-"""Summary tables of a study: functions from its frames (`frames`) to frames.
+"""`analyse`: the tables of a study's runs on single tasks; `lives` has those of its streams.
 
-The run is the unit: its regions and evaluations are no further evidence. Missing runs are counted
-in `counts` and `missing`, and are part of no other number. An unknown interval end is NaN.
+An unknown interval end is NaN.
 
     value            1 − normalised regret, for statistics that expect more to be better
     change           IQM over run numbers i of  x_i(class) − x_i(first class)
@@ -33,339 +32,257 @@ Columns of each table, those that name the row first; class_name and algorithm a
     improvements      group, metric, first, second: classes, fewest_runs; probability; low, high
     learning_curves   measure, step: median, q25, q75 over runs, smoothed; runs; window: evaluations
                       averaged
+    offline           nu, learner (the same for every ν): runs; similarity and similarity_sd, means
+                      over runs of `offline_similarity` and `offline_similarity_sd`; improvement,
+                      the mean of r̃ minus that of the policy that made the data (0 for imitation),
+                      low, high from `OFFLINE_INTERVAL` runs; verdict: above, above_few, below,
+                      below_few, open; behaviour_similarity and behaviour_similarity_sd, means over
+                      the data_sets; constant_similarity: of the constant ½ in WD, over runs
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from sme_registry import statistics
-from sme_registry.spec import StudyPlan
+from sme_registry.spec import StudyAlgorithm, StudyFile
 from sme_registry.statistics import Array, Statistic
-from sme_registry.studies.report.classes import ALL, Group
-from sme_registry.studies.report.frames import frame, ordered, runs, window
+from sme_registry.studies.engine.result import CellResult
+from sme_registry.studies.report.analysis import (
+    AGENT_METRICS,
+    CONTRASTS,
+    DIFFERENCES,
+    ENOUGH_RUNS,
+    INTERVAL,
+    LEARNING_CURVES,
+    PLACE,
+    PLACE_COLUMNS,
+    REGRET_METRICS,
+    Analysis,
+    Bootstrap,
+    Metric,
+    by_place,
+    contrasts,
+    differences,
+    learning_curves,
+    missing_runs,
+    summary,
+    table,
+    with_tables,
+)
+from sme_registry.studies.report.classes import class_infos, groups, stream_infos
+from sme_registry.studies.report.frames import (
+    RUN,
+    frame,
+    ordered,
+    place,
+    runs_of,
+    study_frames,
+    window,
+)
+from sme_registry.studies.report.lives import lives_of, reference_costs
 
-# With fewer runs an interval is an indication only. Of normal, exponential and two-humped runs, a
-# 95 % interval of one class covers the truth in 32–62 % of cases with 2 runs, in 48–86 % with 3, in
-# 94–98 % with 4 to 10.
-ENOUGH_RUNS = 5
 THRESHOLDS = np.linspace(0.0, 1.0, 101)
 STATISTICS: dict[str, Statistic] = {
     "iqm": statistics.iqm,
     "median": statistics.median,
     "optimality_gap": statistics.optimality_gap,
 }
-CURVES = {"episode_return": "return, % of optimum", "regret": "mean regret per step"}
-PLACE = ["class_name", "algorithm"]
-_PLACE = "class_name:str algorithm:str"
+OFFLINE_INTERVAL = 4  # with fewer runs a mean improvement has no interval at all
+_GROUP = "group:str metric:str "
 
 
-@dataclass(frozen=True)
-class Metric:
-    """A column of `results`, and whether more of it is worse (+1) or less (−1)."""
-
-    key: str
-    label: str
-    worse: int
-    digits: int = 2  # of its values in tables
-
-
-METRICS = (
-    Metric("wd_regret", "WD regret", 1),
-    Metric("ood_regret", "OOD regret", 1),
-    Metric("ood_decay", "OOD decay", 1),
-    Metric("final_return", "final return, % of optimum", -1, 1),
-    Metric("online_regret", "online regret", 1),
-)
-# Of tasks with safety, or with distractors: columns that `runs` has where the plan has such tasks.
-EXTENSION_METRICS = (
-    Metric("wd_cost", "WD cost", 1, 3),
-    Metric("wd_safe_regret", "WD safe regret", 1),
-    Metric("online_cost", "online cost", 1, 3),
-    Metric("distractor_regret", "regret with distractors outside their cube", 1),
-    Metric("wd_invariance", "WD invariance", 1),
-)
-REGRET_METRICS = METRICS[:2]
-AGENT_METRICS = (*REGRET_METRICS, METRICS[4])
-
-
-def metrics_of(runs: pd.DataFrame) -> tuple[Metric, ...]:
-    """The metrics that a study's runs have."""
-    return (*METRICS, *(metric for metric in EXTENSION_METRICS if metric.key in runs.columns))
-
-
-@dataclass(frozen=True)
-class Bootstrap:
-    """Intervals as a function of the plan's digest and of their table and row."""
-
-    digest: str
-    draws: int = statistics.DRAWS
-
-    def seed(self, *place: str) -> str:
-        """The seed of the interval at a place."""
-        return " ".join((self.digest, *place))
-
-    def interval(
-        self, values: Array, *place: str, statistic: Statistic = statistics.iqm
-    ) -> tuple[float, float]:
-        """The interval of a statistic of `[n]` runs; NaN for a single run."""
-        column, seed = {"": np.asarray(values)[:, None]}, self.seed(*place)
-        low, high = statistics.stratified_bootstrap(column, self.draws, seed, statistic)
-        return float(low[0]), float(high[0])
-
-
-def missing(
-    plan: StudyPlan,
-    runs: pd.DataFrame,
-    errors: Mapping[str, str],
+def analyse(
+    file: StudyFile,
+    finished: Mapping[str, CellResult],
+    errors: Mapping[str, str] | None = None,
+    *,
     requested: Collection[str] | None = None,
-) -> pd.DataFrame:
-    """The requested runs that have not finished, in the plan's order; None for all runs."""
-    done = set(runs.key)
-    rows = [
-        (cell.class_name, cell.algorithm, cell.run, errors.get(cell.cell.digest, ""))
-        for cell in plan.cells
-        if not cell.in_stream
-        and cell.cell.digest not in done
-        and (requested is None or cell.cell.digest in requested or cell.cell.digest in errors)
-    ]
-    return frame(rows, f"{_PLACE} run:int64 error:str")
+    draws: int = statistics.DRAWS,
+) -> Analysis:
+    """Every table of a study; equal for equal results.
 
-
-def counts(plan: StudyPlan, runs: pd.DataFrame, missing: pd.DataFrame) -> pd.DataFrame:
-    """How many runs of each algorithm on each class have finished and failed."""
-    places = {*runs[[*PLACE, "run"]].itertuples(index=False, name=None)}
-    places |= {*missing[[*PLACE, "run"]].itertuples(index=False, name=None)}
-    cells = [(c.class_name, c.algorithm, c.run) for c in ordered(plan)]
-    planned = frame([cell[:2] for cell in cells if cell in places], _PLACE)
-    table = planned.groupby(PLACE, sort=False).size().rename("planned").to_frame()
-    absent = missing.groupby(PLACE).size().reindex(table.index, fill_value=0)
-    failed = missing[missing.error != ""].groupby(PLACE).size()
-    table.insert(0, "done", table.planned - absent)
-    table.insert(1, "failed", failed.reindex(table.index, fill_value=0))
-    return table.reset_index()
-
-
-def regions(results: pd.DataFrame) -> pd.DataFrame:
-    """Each algorithm on each class in each region, over its runs."""
-    return (
-        results.groupby([*PLACE, "region"], sort=False)
-        .agg(
-            epsilon_high=("epsilon_high", "first"),
-            runs=("run", "size"),
-            similarity=("similarity", _iqm),
-            similarity_q25=("similarity", lambda values: np.quantile(values, 0.25)),
-            similarity_q75=("similarity", lambda values: np.quantile(values, 0.75)),
-            normalised_regret=("normalised_regret", _iqm),
-            linear_normalised_regret=("linear_normalised_regret", "median"),
-        )
-        .reset_index()
+    Args:
+      finished: results by the digests of their cells; cells outside the plan are ignored.
+      errors: of failed runs, by the digests of their cells.
+      requested: digests of the cells that count as missing without a result; None for all.
+      draws: bootstrap samples of each interval.
+    """
+    plan = file.plan
+    results, curves = study_frames(plan, finished)
+    runs, (lives, life_frames) = runs_of(results), lives_of(plan, finished)
+    classes = class_infos(plan)
+    present = [a for a in plan.algorithms if a.name in set(runs.algorithm)]
+    names = tuple(algorithm.name for algorithm in present)
+    keys = [c.cell.digest for c in plan.cells if c.in_stream and c.cell.digest in finished]
+    analysis = Analysis(
+        file=file,
+        cells={key: finished[key] for key in (*runs.key, *keys)},
+        errors=errors or {},
+        requested_cells=requested,
+        bootstrap=Bootstrap(file.digest, draws),
+        classes=classes,
+        streams=stream_infos(plan),
+        algorithms=names,
+        learners=tuple(a.name for a in present if not a.uses.startswith("reference:")),
+        groups=groups(classes, names, set(by_place(runs))),
+        runs=runs,
+        offline_runs=offline_runs(results, plan.algorithms),
+        lives=lives,
+        reference_costs=reference_costs(lives),
+        tables={"results": results, "curves": curves, **life_frames},
     )
+    return with_tables(analysis)
 
 
-def levels(results: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
-    """The IQM of every metric."""
-    linear = {place: _linear_medians(rows) for place, rows in by_place(results).items()}
-    rows = []
-    finished = runs(results)
-    for place, group in by_place(finished).items():
-        for metric in metrics_of(finished):
-            values = group[metric.key].dropna().to_numpy()
-            if len(values):
-                ends = bootstrap.interval(values, "level", *reversed(place), metric.key)
-                reference = linear[place].get(metric.key, math.nan)
-                rows.append((*place, metric.key, len(values), _iqm(values), *ends, reference))
-    return frame(rows, f"{_PLACE} metric:str runs:int64 iqm low high linear")
+@table("missing", f"{PLACE_COLUMNS} run:int64 error:str")
+def _missing(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
+    for class_name, algorithm, run, _, error, _ in missing_runs(analysis, streams=False):
+        yield class_name, algorithm, run, error
 
 
-def layers(probes: pd.DataFrame) -> pd.DataFrame:
-    """What a linear map recovers from each layer, over runs; of what `frames.probes` has."""
-    by = probes.groupby([*PLACE, "layer"], sort=False)
-    kept = by.agg(
+@table("counts", f"{PLACE_COLUMNS} done:int64 failed:int64 planned:int64")
+def _counts(analysis: Analysis) -> pd.DataFrame:
+    """How many runs of each algorithm on each class have finished and failed."""
+    missing = analysis.tables["missing"]
+    places = {*analysis.runs[RUN].itertuples(index=False, name=None)}
+    places |= {*missing[RUN].itertuples(index=False, name=None)}
+    cells = [(c.class_name, c.algorithm, c.run) for c in ordered(analysis.plan)]
+    planned = frame([cell[:2] for cell in cells if cell in places], PLACE_COLUMNS)
+    counts = planned.groupby(PLACE, sort=False).size().rename("planned").to_frame()
+    absent = missing.groupby(PLACE).size().reindex(counts.index, fill_value=0)
+    failed = missing[missing.error != ""].groupby(PLACE).size()
+    counts.insert(0, "done", counts.planned - absent)
+    counts.insert(1, "failed", failed.reindex(counts.index, fill_value=0))
+    return counts.reset_index()
+
+
+@table("regions", "")
+def _regions(analysis: Analysis) -> pd.DataFrame:
+    """Each algorithm on each class in each region, over its runs."""
+    by = analysis.tables["results"].groupby([*PLACE, "region"], sort=False)
+    return by.agg(
+        epsilon_high=("epsilon_high", "first"),
         runs=("run", "size"),
-        state_r2=("state_r2", _iqm),
-        distractor_r2=("distractor_r2", _iqm),
+        similarity=("similarity", _iqm),
+        similarity_q25=("similarity", lambda values: np.quantile(values, 0.25)),
+        similarity_q75=("similarity", lambda values: np.quantile(values, 0.75)),
+        normalised_regret=("normalised_regret", _iqm),
+        linear_normalised_regret=("linear_normalised_regret", "median"),
+    ).reset_index()
+
+
+@table("levels", f"{PLACE_COLUMNS} metric:str {INTERVAL} linear")
+def _levels(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
+    """The IQM of every metric."""
+    results = analysis.tables["results"]
+    linear = {place: _linear_medians(rows) for place, rows in by_place(results).items()}
+    rows = summary(
+        analysis.runs, [], analysis.metrics, analysis.bootstrap,
+        lambda name, algorithm, key: ("level", algorithm, name, key),
+    )  # fmt: skip
+    for row in rows:
+        yield (*row, linear[row[:2]].get(row[2], math.nan))
+
+
+@table("layers", f"{PLACE_COLUMNS} layer:int64 runs:int64 state_r2 distractor_r2", optional=True)
+def _layers(analysis: Analysis) -> pd.DataFrame:
+    rows = [
+        place(planned) | probe.model_dump()
+        for planned in ordered(analysis.plan)
+        if (result := analysis.cells.get(planned.cell.digest)) is not None
+        and (report := result.report) is not None
+        and report.observation is not None
+        for probe in report.observation.probes
+    ]
+    columns = f"{PLACE_COLUMNS} run:int64 layer:int64 units:int64 state_r2 distractor_r2"
+    return layers(frame(rows, columns))
+
+
+def layers(probed: pd.DataFrame) -> pd.DataFrame:
+    """What a linear map recovers from each layer, over runs."""
+    kept = probed.groupby([*PLACE, "layer"], sort=False).agg(
+        runs=("run", "size"), state_r2=("state_r2", _iqm), distractor_r2=("distractor_r2", _iqm)
     )
     return kept.reset_index()
 
 
-def agents(runs: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
-    """The IQM of regret of each agent of a team; empty without teams."""
-    rows = []
-    for place, group in by_place(runs).items():
-        for metric in AGENT_METRICS:
-            for column in [c for c in runs.columns if c.startswith(f"{metric.key}/")]:
-                values = group[column].dropna().to_numpy()
-                if len(values):
-                    ends = bootstrap.interval(values, "agent", *reversed(place), column)
-                    agent = column.partition("/")[2]
-                    rows.append((*place, agent, metric.key, len(values), _iqm(values), *ends))
-    return frame(rows, f"{_PLACE} agent:str metric:str runs:int64 iqm low high")
+@table("agents", f"{PLACE_COLUMNS} agent:str metric:str {INTERVAL}", optional=True)
+def _agents(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
+    """The IQM of regret of each agent of a team."""
+    runs, keys = analysis.runs, [metric.key for metric in AGENT_METRICS]
+    names = [c.partition("/")[2] for c in runs.columns if c.startswith(f"{keys[0]}/")]
+    if names:
+        columns = [
+            runs[RUN].assign(agent=name, **{key: runs[f"{key}/{name}"] for key in keys})
+            for name in names
+        ]
+        yield from summary(
+            pd.concat(columns), ["agent"], AGENT_METRICS, analysis.bootstrap,
+            lambda name, algorithm, key, agent: ("agent", algorithm, name, f"{key}/{agent}"),
+        )  # fmt: skip
 
 
-def contrasts(
-    runs: pd.DataFrame,
-    axes: Mapping[str, str],
-    bootstrap: Bootstrap,
-    metrics: Sequence[Metric] | None = None,
-) -> pd.DataFrame:
-    """What each class changes compared with the plan's first one, between runs of equal number."""
-    metrics = metrics_of(runs) if metrics is None else metrics
-    first = next(iter(axes), "")
-    keys = [metric.key for metric in metrics]
-    base = runs.loc[runs.class_name == first, ["algorithm", "run", *keys]]
-    pairs = runs[runs.class_name != first].merge(base, on=["algorithm", "run"], suffixes=("", "_0"))
-    rows = []
-    for place, group in by_place(pairs).items():
-        for metric in metrics:
-            both = group[[metric.key, f"{metric.key}_0"]].dropna().to_numpy()
-            if not len(both):
-                continue
-            change = both[:, 0] - both[:, 1]
-            low, high = bootstrap.interval(change, "contrast", *reversed(place), metric.key)
-            level, before = statistics.iqm(both)
-            middle = _iqm(change)
-            verdict = contrast_verdict(middle * metric.worse, low, high)
-            rows.append(
-                (*place, metric.key, axes[place[0]], before, level, middle, low, high,
-                 len(both), len(both) >= ENOUGH_RUNS, verdict)
-            )  # fmt: skip
-    columns = "axis:str base level change low high pairs:int64 enough_pairs:bool verdict:str"
-    return frame(rows, f"{_PLACE} metric:str {columns}")
+@table("contrasts", CONTRASTS)
+def _contrasts(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
+    axes = {name: info.axis for name, info in analysis.classes.items()}
+    return contrasts(analysis.runs, axes, analysis.bootstrap, analysis.metrics)
 
 
-def differences(
-    runs: pd.DataFrame,
-    pairs: Iterable[tuple[str, str]],
-    metrics: Sequence[Metric] | None = None,
-    draws: int = statistics.DRAWS,
-    instance: str = "spec_digest",
-) -> pd.DataFrame:
-    """How the first algorithm of each pair differs from the second, on each class and on all."""
-    metrics = metrics_of(runs) if metrics is None else metrics
-    rows = []
-    for (first, second), metric in itertools.product(pairs, metrics):
-        paired = _paired(runs, first, second, metric.key, instance)
-        classes = {name: both for name, (both, _) in paired.items()}
-        bootstrap = Bootstrap(" ".join(("difference", *sorted((first, second)))), draws)
-        instances = {name: count for name, (_, count) in paired.items()}
-        for name, both in classes.items():
-            change = both[:, 0] - both[:, 1]
-            ends = bootstrap.interval(change, name, metric.key)
-            rows.append(_difference(first, second, metric, name, statistics.iqm(both), _iqm(change),
-                                    ends, len(both), instances[name], len(both)))  # fmt: skip
-        if len(classes) > 1:
-            change_of = {n: (both[:, 0] - both[:, 1])[:, None] for n, both in classes.items()}
-            sizes = [len(both) for both in classes.values()]
-            low, high = statistics.stratified_bootstrap(
-                change_of, draws, bootstrap.seed(metric.key)
-            )
-            ends = (low[0], high[0]) if min(sizes) > 1 else (math.nan, math.nan)
-            rows.append(_difference(first, second, metric, ALL, statistics.aggregate(classes),
-                                    float(statistics.aggregate(change_of)[0]), ends,
-                                    sum(sizes), sum(instances.values()), min(sizes)))  # fmt: skip
-    columns = (
-        "first_level second_level difference low high pairs:int64 instances:int64 "
-        "enough_pairs:bool verdict:str"
-    )
-    return frame(rows, f"first:str second:str metric:str class_name:str {columns}")
+@table("differences", DIFFERENCES)
+def _differences(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
+    pairs = itertools.combinations(analysis.algorithms, 2)
+    return differences(analysis.runs, pairs, analysis.metrics, analysis.bootstrap.draws)
 
 
-def _paired(
-    runs: pd.DataFrame, first: str, second: str, metric: str, instance: str
-) -> dict[str, tuple[Array, int]]:
-    """By class, `[n, 2]` values of both algorithms in runs on the same instance with one seed."""
-    on = ["class_name", instance, "seed"]
-    left, right = (runs.loc[runs.algorithm == name, [*on, metric]] for name in (first, second))
-    both = left.merge(right, on=on, suffixes=("_1", "_2")).dropna()
-    return {
-        str(name): (
-            group[[f"{metric}_1", f"{metric}_2"]].to_numpy(),
-            int(group[instance].nunique()),
-        )
-        for name, group in both.groupby("class_name", sort=False)
-    }
-
-
-def _difference(
-    first: str,
-    second: str,
-    metric: Metric,
-    class_name: str,
-    levels: Array,
-    difference: float,
-    ends: tuple[float, float],
-    pairs: int,
-    instances: int,
-    fewest: int,
-) -> tuple[Any, ...]:
-    verdict = contrast_verdict(difference * metric.worse, *ends)
-    enough = fewest >= ENOUGH_RUNS
-    if verdict != "open" and not enough:
-        verdict = "indication"
-    place = (first, second, metric.key, class_name)
-    return (*place, *levels, difference, *ends, pairs, instances, enough, verdict)
-
-
-def contrast_verdict(worsening: float, low: float, high: float) -> str:
-    """`worse` or `better` where the interval of a change excludes 0, else `open`."""
-    if not (low > 0.0 or high < 0.0):
-        return "open"
-    return "worse" if worsening > 0 else "better"
-
-
-def aggregates(
-    runs: pd.DataFrame, groups: Sequence[Group], algorithms: Sequence[str], bootstrap: Bootstrap
-) -> pd.DataFrame:
+@table(
+    "aggregates",
+    f"{_GROUP} algorithm:str statistic:str classes:int64 runs:int64 fewest_runs:int64 value low "
+    "high",
+)
+def _aggregates(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
     """Statistics of 1 − normalised regret over the classes of each group; classes count alike."""
-    rows = []
-    for group, metric, values in _compared(runs, groups, algorithms):
+    for group, metric, values in _compared(analysis):
         for algorithm, (name, statistic) in itertools.product(values, STATISTICS.items()):
             classes = {key: x[:, None] for key, x in values[algorithm].items()}
             sizes = [len(x) for x in classes.values()]
-            seed = bootstrap.seed("aggregate", algorithm, metric)
-            low, high = statistics.stratified_bootstrap(classes, bootstrap.draws, seed, statistic)
-            ends = (low[0], high[0]) if min(sizes) > 1 else (math.nan, math.nan)
+            place = "aggregate", algorithm, metric
+            ends = analysis.bootstrap.interval(classes, *place, statistic=statistic)
             value = statistics.aggregate(classes, statistic)[0]
             counts = len(sizes), sum(sizes), min(sizes)
-            rows.append((group, metric, algorithm, name, *counts, value, *ends))
-    columns = "statistic:str classes:int64 runs:int64 fewest_runs:int64 value low high"
-    return frame(rows, f"group:str metric:str algorithm:str {columns}")
+            yield (group, metric, algorithm, name, *counts, value, *ends)
 
 
-def profiles(
-    runs: pd.DataFrame, groups: Sequence[Group], algorithms: Sequence[str], bootstrap: Bootstrap
-) -> pd.DataFrame:
+@table("profiles", f"{_GROUP} algorithm:str fewest_runs:int64 threshold share low high")
+def _profiles(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
     """Shares of runs whose 1 − normalised regret is above each threshold."""
-    rows: list[Any] = []
-    for group, metric, values in _compared(runs, groups, algorithms):
+    bootstrap = analysis.bootstrap
+    for group, metric, values in _compared(analysis):
         for algorithm, classes in values.items():
             fewest = min(map(len, classes.values()))
             seed = bootstrap.seed("profile", algorithm, metric)
             shares = statistics.performance_profile(classes, THRESHOLDS, bootstrap.draws, seed)
             known = 1.0 if fewest > 1 else math.nan  # whether the spread of each class is known
             ends = known * shares.low, known * shares.high
-            shares_at = zip(THRESHOLDS.round(4), shares.value, *ends, strict=True)
-            rows += [(group, metric, algorithm, fewest, *at) for at in shares_at]
-    columns = "fewest_runs:int64 threshold share low high"
-    return frame(rows, f"group:str metric:str algorithm:str {columns}")
+            for at in zip(THRESHOLDS.round(4), shares.value, *ends, strict=True):
+                yield (group, metric, algorithm, fewest, *at)
 
 
-def improvements(
-    runs: pd.DataFrame, groups: Sequence[Group], algorithms: Sequence[str], bootstrap: Bootstrap
-) -> pd.DataFrame:
+@table(
+    "improvements",
+    f"{_GROUP} first:str second:str classes:int64 fewest_runs:int64 probability low high",
+)
+def _improvements(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
     """Every pair of algorithms, except those that learnt from different data."""
-    data = training_data(runs)
-    rows = []
-    for group, metric, values in _compared(runs, groups, algorithms):
-        for first, second in itertools.combinations(algorithms, 2):
+    data, bootstrap = training_data(analysis.runs), analysis.bootstrap
+    for group, metric, values in _compared(analysis):
+        for first, second in itertools.combinations(analysis.algorithms, 2):
             if len({data[first], data[second]} - {None}) == 2:
                 continue
             x, y = values[first], values[second]
@@ -373,34 +290,90 @@ def improvements(
             seed = bootstrap.seed("improvement", first, second, metric)
             estimate = statistics.probability_of_improvement(x, y, bootstrap.draws, seed)
             ends = (estimate.low[0], estimate.high[0]) if fewest > 1 else (math.nan, math.nan)
-            rows.append((group, metric, first, second, len(x), fewest, estimate.value[0], *ends))
-    columns = "first:str second:str classes:int64 fewest_runs:int64 probability low high"
-    return frame(rows, f"group:str metric:str {columns}")
+            yield (group, metric, first, second, len(x), fewest, estimate.value[0], *ends)
 
 
-def learning_curves(
-    curves: pd.DataFrame, runs: pd.DataFrame, window: Callable[[int], int] = window
-) -> pd.DataFrame:
-    """Median and quartiles over runs, then the running median over a window of evaluations."""
-    horizons = runs.groupby("class_name").horizon.first()
-    columns = f"{_PLACE} measure:str step:int64 median q25 q75 runs:int64 window:int64"
-    tables = [frame([], columns)]
-    for (class_name, algorithm), group in curves.groupby(PLACE, sort=False):
-        each = [run for _, run in group.groupby("run")]
-        P = min(map(len, each))
-        steps = np.median([run.step[:P] for run in each], axis=0).astype(int)
-        for measure in CURVES:
-            values = np.array([run[measure][:P] for run in each])
-            if measure == "episode_return":
-                values *= 100.0 / horizons[class_name]
-            quartiles = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
-            q25, median, q75 = (statistics.running_median(line, window(P)) for line in quartiles)
-            table = {
-                "class_name": class_name, "algorithm": algorithm, "measure": measure, "step": steps,
-                "median": median, "q25": q25, "q75": q75, "runs": len(each), "window": window(P),
+@table("learning_curves", LEARNING_CURVES)
+def _learning_curves(analysis: Analysis) -> pd.DataFrame:
+    return learning_curves(analysis.tables["curves"], analysis.runs, window)
+
+
+@table(
+    "offline",
+    "class_name:str nu learner:str runs:int64 similarity similarity_sd improvement low high "
+    "verdict:str behaviour_similarity behaviour_similarity_sd data_sets:int64 constant_similarity",
+    optional=True,
+)
+def _offline(analysis: Analysis) -> Iterator[dict[str, Any]]:
+    """Each offline learner on each class at each ν."""
+    runs = analysis.offline_runs
+    intervals = summary(
+        runs, ["nu"], [Metric("improvement", "improvement", -1)], analysis.bootstrap,
+        lambda name, learner, _, nu: ("offline", learner, name, f"{nu:g}"),
+        place=["class_name", "learner"], statistic=statistics.mean, fewest=OFFLINE_INTERVAL,
+    )  # fmt: skip
+    known = {row[:3]: row[4:] for row in intervals}
+    for (name, nu), same_data in runs.groupby(["class_name", "nu"], sort=False):
+        data_sets = same_data.drop_duplicates("dataset_digest")  # however many runs learnt from one
+        data = {
+            "behaviour_similarity": data_sets.behaviour_similarity.to_numpy().mean(),
+            "behaviour_similarity_sd": data_sets.behaviour_similarity_sd.to_numpy().mean(),
+            "data_sets": len(data_sets),
+            "constant_similarity": same_data.constant_similarity.to_numpy().mean(),
+        }
+        for learner, group in same_data.groupby("learner", sort=False):
+            count, improvement, low, high = known[name, learner, nu]
+            yield {
+                "class_name": name, "nu": nu, "learner": learner, "runs": count,
+                "similarity": group.offline_similarity.to_numpy().mean(),
+                "similarity_sd": group.offline_similarity_sd.to_numpy().mean(),
+                "improvement": improvement, "low": low, "high": high,
+                "verdict": offline_verdict(group.improvement.to_numpy(), low, high), **data,
             }  # fmt: skip
-            tables.append(pd.DataFrame(table))
-    return pd.concat(tables, ignore_index=True)
+
+
+def offline_runs(results: pd.DataFrame, algorithms: Sequence[StudyAlgorithm]) -> pd.DataFrame:
+    """One row per run of an offline learner, ordered by class, ν, learner and run."""
+    names = learner_names(algorithms)
+    rows = results[results.nu.notna()].drop_duplicates(RUN)
+    rows = rows.assign(learner=rows.algorithm.map(names))
+    order = {"class_name": list(dict.fromkeys(rows.class_name)),
+             "learner": list(dict.fromkeys(names.values()))}  # fmt: skip
+
+    def key(column: pd.Series) -> pd.Series:
+        return column.map(order[column.name].index) if column.name in order else column
+
+    return rows.sort_values(["class_name", "nu", "learner", "run"], key=key, ignore_index=True)
+
+
+def offline_verdict(improvements: Array, low: float, high: float) -> str:
+    """Whether a learner surpasses its data, from the improvements of its runs."""
+    if len(improvements) >= ENOUGH_RUNS:
+        return "above" if low > 0.0 else "below" if high < 0.0 else "open"
+    if len(improvements) > 1 and improvements.min() > 0.0:
+        return "above_few"
+    return "below_few" if len(improvements) > 1 and improvements.max() < 0.0 else "open"
+
+
+def learner_names(algorithms: Sequence[StudyAlgorithm]) -> dict[str, str]:
+    """What each algorithm of a plan is apart from its ν: `IQL`, or `IQL (expectile = 0.9)`."""
+    settings = {
+        algorithm.name: {k: v for k, v in algorithm.hyperparameters.items() if k != "nu"}
+        | ({} if algorithm.steps is None else {"steps": algorithm.steps})
+        for algorithm in algorithms
+    }
+    names = {}
+    for algorithm in algorithms:
+        alike = [settings[other.name] for other in algorithms if other.uses == algorithm.uses]
+        options = settings[algorithm.name]
+        differing = [
+            f"{key} = {options[key]}" if key in options else f"default {key}"
+            for key in sorted({key for each in alike for key in each})
+            if any(each.get(key) != alike[0].get(key) for each in alike)
+        ]
+        name = algorithm.uses.removeprefix("offline:").upper()
+        names[algorithm.name] = f"{name} ({', '.join(differing)})" if differing else name
+    return names
 
 
 def training_data(runs: pd.DataFrame) -> dict[str, tuple[float, int] | None]:
@@ -409,11 +382,6 @@ def training_data(runs: pd.DataFrame) -> dict[str, tuple[float, int] | None]:
         row.algorithm: None if math.isnan(row.nu) else (row.nu, int(row.transitions))
         for row in runs.drop_duplicates("algorithm").itertuples()
     }
-
-
-def by_place(rows: pd.DataFrame) -> dict[tuple[str, str], pd.DataFrame]:
-    """The rows of each (class, algorithm), in their order."""
-    return dict(iter(rows.groupby(PLACE, sort=False)))
 
 
 def _linear_medians(results: pd.DataFrame) -> dict[str, float]:
@@ -425,16 +393,14 @@ def _linear_medians(results: pd.DataFrame) -> dict[str, float]:
     return {key: float(np.median(value)) for key, value in values.items()}
 
 
-def _compared(
-    runs: pd.DataFrame, groups: Sequence[Group], algorithms: Sequence[str]
-) -> Iterator[tuple[str, str, dict[str, dict[str, Array]]]]:
+def _compared(analysis: Analysis) -> Iterator[tuple[str, str, dict[str, dict[str, Array]]]]:
     """Each group and regret metric with `[n]` values 1 − regret, by algorithm and class."""
-    at = by_place(runs)
-    comparable = [group for group in groups if group.compared]
+    at = by_place(analysis.runs)
+    comparable = [group for group in analysis.groups if group.compared]
     for group, metric in itertools.product(comparable, REGRET_METRICS):
         values = {
             a: {c: 1.0 - at[c, a][metric.key].to_numpy() for c in group.compared}
-            for a in algorithms
+            for a in analysis.algorithms
         }
         yield group.name, metric.key, values
 

@@ -7,31 +7,71 @@
     REPORT/tables/*.tex         the tables of a paper
     REPORT/explorers/*.html     on request, a page for each model that the study kept
 
-The same results give the same files. Other files of an earlier report are kept.
+The same results give the same files. Other files of an earlier report are kept. The page loads
+nothing: pictures are embedded, and a content security policy forbids it. Figures are drawn on
+white; on a dark page their lightness is inverted, except for maps, whose lightness carries meaning.
 """
 
 from __future__ import annotations
 
+import base64
 import os
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
-from sme_registry.errors import OptionError
+import pandas as pd
+from markupsafe import Markup
+
+from sme_registry.diagnosis import load_cell
+from sme_registry.errors import OptionError, SMEError
+from sme_registry.explorer import explorer_page, run_report
 from sme_registry.io import refuse_unwritable, to_json, write_atomically
+from sme_registry.io.markup import environment, plural
+from sme_registry.io.terminal import duration
+from sme_registry.spec import StudyFile
+from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.ledger import REPORT, Ledger
-from sme_registry.studies.engine.status import requested
-from sme_registry.studies.report.analysis import Analysis, analyse
-from sme_registry.studies.report.explorers import Explorer, explorers_of
-from sme_registry.studies.report.exports import csv_tables, text_tables
-from sme_registry.studies.report.figures import draw_figures
+from sme_registry.studies.engine.status import requested, run_label
+from sme_registry.studies.report.analysis import Analysis
+from sme_registry.studies.report.figures import Picture, draw_figures
 from sme_registry.studies.report.findings import findings
-from sme_registry.studies.report.frames import plan_file
-from sme_registry.studies.report.page import page
-
-__all__ = ["FORMATS", "write_report"]
+from sme_registry.studies.report.frames import records
+from sme_registry.studies.report.sentences import THRESHOLDS
+from sme_registry.studies.report.tables import analyse
+from sme_registry.studies.report.texts import TextTable, csv_tables, text_tables
 
 FORMATS = ("html", "png", "pdf", "csv", "latex")
 _FIGURE_FORMATS = {"html": "svg", "png": "png", "pdf": "pdf"}
+# Headings, and the beginnings of the figures' names. A section without contents is left out.
+_SECTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "offline": ("Learning from data", ("offline",)),
+    "findings": ("Findings", ()),
+    "breaks": ("What breaks it", ("contrasts", "regret", "wd-regret", "ood-regret")),
+    "agents": ("Agents of the teams", ("agents",)),
+    "regions": ("Inside and outside the training cube", ("regions", "decay", "maps")),
+    "algorithms": (
+        "Algorithms compared",
+        ("aggregates", "profiles", "improvements", "differences"),
+    ),
+    "learning": ("Learning", ("learning-curves",)),
+    "streams": ("Lives in streams", ("stream-",)),
+    "explorers": ("Explorers", ()),
+    "absent": ("Figures that could not be drawn", ()),
+    "tables": ("Tables", ()),
+    "origin": ("Origin of the numbers", ()),
+}
+_MAX_MISSING = 40  # missing runs that the page lists; the CSV lists all
+_DIGITS = 16  # of a cell's key, in the name of its explorer
+
+
+class Explorer(NamedTuple):
+    """A page of one run: its label, its path in the report's folder, and its HTML."""
+
+    label: str
+    path: str
+    content: str
 
 
 def write_report(
@@ -60,7 +100,7 @@ def write_report(
     if unknown or not formats:
         raise OptionError(f"format={','.join(unknown)!r}: must be of {', '.join(FORMATS)}.")
     ledger = Ledger(folder)
-    file = plan_file(ledger)
+    file = ledger.study_file()
     keys = list(dict.fromkeys(planned.cell.digest for planned in file.plan.cells))
     results = ledger.results(keys)
     if not results:
@@ -90,9 +130,18 @@ def _contents(
     figures, absent = draw_figures(analysis, figure_formats, models) if figure_formats else ([], [])
     contents: dict[str, str | bytes] = {}
     if "html" in formats:
-        document = findings(analysis)
-        contents["index.html"] = page(analysis, document, figures, absent, tables, explorers)
-        contents["findings.json"] = to_json(document.to_dict())
+        found = findings(analysis)
+        contents["index.html"] = page(analysis, found, figures, absent, tables, explorers)
+        contents["findings.json"] = to_json(
+            {
+                "schema_version": 2,  # 1 had nested documents instead of a table
+                "study": analysis.file.versioned_name,
+                "digest": analysis.file.digest,
+                "base": analysis.base,
+                "thresholds": THRESHOLDS,
+                "findings": records(found),
+            }
+        )
     for ending in ("png", "pdf"):
         if ending in formats:
             contents |= {f"figures/{x.name}.{ending}": x.files[ending] for x in figures}
@@ -101,3 +150,130 @@ def _contents(
     if "latex" in formats:
         contents |= {f"tables/{table.name}.tex": table.latex() for table in tables}
     return contents | {each.path: each.content for each in explorers}
+
+
+def page(
+    analysis: Analysis,
+    found: pd.DataFrame,
+    figures: Sequence[Picture],
+    absent: Sequence[str],
+    tables: Sequence[TextTable],
+    explorers: Sequence[Explorer] = (),
+) -> str:
+    """The whole page; `absent` has a sentence for each figure that could not be drawn."""
+    folder = Path(__file__).parent
+    templates = environment(folder / "templates", autoescape=True)
+    templates.filters["base64"] = lambda data: base64.b64encode(data).decode("ascii")
+    by_section = {
+        key: [figure for figure in figures if figure.name.startswith(prefixes)]
+        for key, (_, prefixes) in _SECTIONS.items()
+    }
+    present = {
+        "tables": True, "origin": True, "findings": analysis.classes, "streams": analysis.streams,
+        "offline": "offline" in set(found.section), "absent": absent, "explorers": explorers,
+    }  # fmt: skip
+    offline = [table for table in tables if table.name.startswith("offline")]
+    return templates.get_template("page.html.jinja").render(
+        analysis=analysis,
+        kinds=_kinds(analysis),
+        style=Markup((folder / "page.css").read_text(encoding="utf-8")),
+        sections={
+            key: heading
+            for key, (heading, _) in _SECTIONS.items()
+            if present.get(key) or by_section[key]
+        },
+        findings=_by_subject(found),
+        in_jax=_in_jax(analysis),
+        figures=by_section,
+        tables={"offline": offline, "tables": [t for t in tables if t not in offline]},
+        absent=absent,
+        explorers=explorers,
+        origin=_origin(analysis),
+        missing=_missing(analysis),
+        max_missing=_MAX_MISSING,
+    )
+
+
+def _by_subject(found: pd.DataFrame) -> dict[str, dict[str, list[str]]]:
+    """The sentences of each section, by algorithm, or by class in the sections of streams."""
+    sections: dict[str, dict[str, list[str]]] = {}
+    for row in found.itertuples():
+        subject = row.class_name if row.section.startswith("stream") else row.algorithm
+        sections.setdefault(row.section, {}).setdefault(subject, []).append(row.sentence)
+    return sections
+
+
+def _kinds(analysis: Analysis) -> list[str]:
+    """`3 classes`, `2 streams`: what the plan has of each."""
+    plan = analysis.plan
+    classes = [plural(len(plan.classes), "class", "classes")] if plan.classes else []
+    return [*classes, plural(len(plan.streams), "stream")] if plan.streams else classes
+
+
+def _missing(analysis: Analysis) -> list[tuple[str, str]]:
+    """What each missing run is, and its error."""
+    in_streams = analysis.tables.get("stream_missing")
+    return [
+        *((run_label(r.class_name, r.algorithm, r.run), r.error)
+          for r in analysis.tables["missing"].itertuples()),
+        *((run_label(r.class_name, r.algorithm, r.run, None if pd.isna(r.phase) else r.phase),
+           r.error) for r in (() if in_streams is None else in_streams.itertuples())),
+    ]  # fmt: skip
+
+
+def _in_jax(analysis: Analysis) -> list[str]:
+    """The algorithms that run in JAX, if others beside them learn without it."""
+    of_plan = {algorithm.name: algorithm.uses for algorithm in analysis.plan.algorithms}
+    learners = {*analysis.learners, *analysis.stream_algorithms}
+    ours = [name for name in of_plan if name in learners and in_jax(of_plan[name])]
+    return ours if len(ours) < len(learners) else []
+
+
+def _origin(analysis: Analysis) -> Iterable[tuple[str, str, str]]:
+    """What the numbers were made from: a name, a digest or other code, and a text."""
+    file, plan = analysis.file, analysis.plan
+    states = f"{plan.protocol.states_per_region:,} states per region"
+    yield "plan", file.digest, file.versioned_name
+    yield "protocol", plan.protocol.digest, states
+    runs = f"{analysis.finished:,} of {plural(analysis.requested, 'run')}"
+    yield "runs", "", f"{runs} finished, in {duration(analysis.seconds)} of CPU time"
+    episodes = plural(plan.evaluation_episodes, "episode")
+    yield "evaluations", "", f"{plan.evaluations:,} during training, {episodes} each"
+    for algorithm in plan.algorithms:
+        steps = plan.steps if algorithm.steps is None else algorithm.steps
+        settings = ", ".join(f"{k} = {v}" for k, v in sorted(algorithm.hyperparameters.items()))
+        budget = f"{steps:,} steps, " if plan.classes else ""
+        text = f"{budget}{algorithm.action_range} actions"
+        yield algorithm.name, algorithm.uses, f"{text}, {settings or 'default hyperparameters'}"
+    programs = (result.program for result in analysis.cells.values())
+    kinds = Counter((each.device, each.lanes) for each in programs if each is not None)
+    for (device, lanes), count in kinds.most_common():
+        text = f"on {device}, in programs of {plural(lanes, 'lane')}"
+        yield f"{plural(count, 'run')} in JAX", "", text
+    versions = Counter(
+        ", ".join(f"{name} {version}" for name, version in sorted(result.versions.items()))
+        for result in analysis.cells.values()
+    )
+    for text, count in versions.most_common():
+        yield f"versions of {plural(count, 'run')}", "", text
+
+
+def explorers_of(ledger: Ledger, file: StudyFile, models: Mapping[str, Path]) -> list[Explorer]:
+    """A page for each run on a single task whose model was kept, in the plan's order."""
+    pages: dict[str, Explorer] = {}
+    for planned in file.plan.cells:
+        key = planned.cell.digest
+        if planned.in_stream or key not in models or key in pages:
+            continue
+        label = run_label(planned.class_name, planned.algorithm, planned.run)
+        name = key.removeprefix("sha256:")[:_DIGITS]
+        try:
+            report = run_report(ledger.folder, key)
+        except SMEError:  # of another version: the page then lacks its regions
+            report = None
+        try:
+            content = explorer_page(load_cell(ledger.folder, key), report=report)
+        except SMEError:
+            continue
+        pages[key] = Explorer(label, f"explorers/{name}.html", content)
+    return list(pages.values())

@@ -23,10 +23,10 @@ from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.program_state import read_header, read_state, write_state
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.engine.runner import run_study
-from sme_registry.studies.report.analysis import analyse
 from sme_registry.studies.report.compare import implementation_caveats
 from sme_registry.studies.report.findings import findings
-from sme_registry.studies.report.page import page
+from sme_registry.studies.report.tables import analyse
+from sme_registry.studies.report.write import page
 from tests.studies.cells import numbers
 
 pytest.importorskip("jax")

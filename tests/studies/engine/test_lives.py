@@ -12,9 +12,9 @@ from sme_registry.errors import PolicyError, SMEError, SpecError
 from sme_registry.evaluation import evaluate_stream, expected_regret
 from sme_registry.spec import Cell, StudyFile, StudyPlan
 from sme_registry.studies.engine import lanes
+from sme_registry.studies.engine.budget import Estimator
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.checks import check_task
-from sme_registry.studies.engine.estimate import Estimator
 from sme_registry.studies.engine.jobs import Programs
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellResult

@@ -10,9 +10,9 @@ from sme_registry import statistics
 from sme_registry.spec import StudyPlan
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.report import tables
-from sme_registry.studies.report.analysis import analyse
 from sme_registry.studies.report.classes import ALL, SEVERAL, class_infos
 from sme_registry.studies.report.frames import window
+from sme_registry.studies.report.tables import analyse
 from tests.studies.finished import analysed
 
 TABLES = (
@@ -44,20 +44,20 @@ def row_of(table, class_name, algorithm, metric):
 
 
 def contrast(analysis, class_name, algorithm, metric):
-    return row_of(analysis.contrasts, class_name, algorithm, metric)
+    return row_of(analysis.tables["contrasts"], class_name, algorithm, metric)
 
 
 def test_missing_runs_are_counted_and_named(study):
     analysis = study[2]
-    assert list(analysis.missing.itertuples(index=False, name=None)) == [
+    assert list(analysis.tables["missing"].itertuples(index=False, name=None)) == [
         ("k-25", "Beta", 3, "ValueError: <b>bad</b>"),
         ("k-25", "Beta", 4, ""),
     ]
-    rows = analysis.counts.itertuples(index=False, name=None)
+    rows = analysis.tables["counts"].itertuples(index=False, name=None)
     counts = {count[:2]: count[2:] for count in rows}
     assert counts["k-25", "Beta"] == (3, 1, 5)
     assert counts["default", "Alpha"] == (5, 0, 5)
-    assert len(analysis.runs) == analysis.counts.done.sum() == 73
+    assert len(analysis.runs) == analysis.tables["counts"].done.sum() == 73
 
 
 def test_a_class_has_the_axis_in_which_it_differs_from_the_first(study):
@@ -114,7 +114,7 @@ def test_contrasts_find_the_axis_that_each_learner_is_sensitive_to(study):
     analysis = study[2]
     for algorithm, class_name in (("Alpha", "r_min-0_5"), ("Beta", "k-25")):
         rows = [
-            row for row in analysis.contrasts.itertuples()
+            row for row in analysis.tables["contrasts"].itertuples()
             if (row.algorithm, row.metric) == (algorithm, "wd_regret")
         ]  # fmt: skip
         assert max(rows, key=lambda row: row.change).class_name == class_name
@@ -128,27 +128,32 @@ def test_contrasts_find_the_axis_that_each_learner_is_sensitive_to(study):
 def test_a_reference_has_no_online_regret(study):
     analysis = study[2]
     assert analysis.learners == ("Alpha", "Beta")
-    assert row_of(analysis.levels, "default", "constant", "online_regret") is None
-    assert row_of(analysis.levels, "default", "Alpha", "online_regret") is not None
+    assert row_of(analysis.tables["levels"], "default", "constant", "online_regret") is None
+    assert row_of(analysis.tables["levels"], "default", "Alpha", "online_regret") is not None
 
 
 def test_one_run_has_no_interval(finished):
     alone = analysed(finished, lambda planned: planned.run > 0, draws=50)
-    for table in (alone.contrasts, alone.levels, alone.aggregates, alone.improvements):
+    for table in (
+        alone.tables["contrasts"],
+        alone.tables["levels"],
+        alone.tables["aggregates"],
+        alone.tables["improvements"],
+    ):
         assert len(table) > 0
         assert table[["low", "high"]].isna().all(axis=None)
-    assert set(alone.contrasts.verdict) == {"open"}
+    assert set(alone.tables["contrasts"].verdict) == {"open"}
 
 
 def test_only_classes_with_runs_of_every_algorithm_are_compared(finished):
     cut = analysed(finished, lambda p: (p.class_name, p.algorithm) == ("plane", "Beta"), draws=50)
     assert (cut.groups[0].name, cut.groups[0].left_out) == (ALL, ("plane",))
-    assert set(cut.aggregates[cut.aggregates.group == ALL].classes) == {4}
+    assert set(cut.tables["aggregates"][cut.tables["aggregates"].group == ALL].classes) == {4}
 
 
 def test_curves_are_the_median_over_runs_then_smoothed(study):
     file, results, analysis = study
-    curves = analysis.learning_curves
+    curves = analysis.tables["learning_curves"]
     curve = curves[
         (curves.class_name == "default")
         & (curves.algorithm == "Alpha")
@@ -172,23 +177,23 @@ def test_the_same_results_give_the_same_tables(study, finished):
     errors = {key: failure.error for key, failure in Ledger(finished).failures().items()}
     again = analyse(file, dict(reversed(results.items())), errors)
     for table in TABLES:
-        pd.testing.assert_frame_equal(getattr(again, table), getattr(analysis, table), rtol=0)
+        pd.testing.assert_frame_equal(again.tables[table], analysis.tables[table], rtol=0)
 
 
 def test_without_results_the_tables_are_empty_and_without_the_first_class_the_contrasts(
     study, finished
 ):
     cut = analysed(finished, lambda planned: planned.class_name == "default", draws=50)
-    assert cut.contrasts.empty
+    assert cut.tables["contrasts"].empty
     assert len(cut.runs) == 73 - 15
     empty = analyse(study[0], {}, draws=50)
-    assert len(empty.missing) == 75
-    assert empty.results.empty
+    assert len(empty.tables["missing"]) == 75
+    assert empty.tables["results"].empty
     for name in TABLES:
-        assert getattr(empty, name).empty
+        assert empty.tables[name].empty
 
 
 def test_the_documentation_names_every_column_of_the_tables(study):
     documented = set(re.findall(r"\w+", str(tables.__doc__)))
     for name in (*TABLES, "counts", "missing"):
-        assert not {*getattr(study[2], name)} - documented
+        assert not {*study[2].tables[name]} - documented

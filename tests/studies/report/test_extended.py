@@ -9,11 +9,11 @@ from sme_registry.errors import UnknownNameError
 from sme_registry.evaluation.report import LayerProbe
 from sme_registry.spec import StudyPlan
 from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.report import exports, frames
-from sme_registry.studies.report.analysis import analyse
+from sme_registry.studies.report import frames, texts
+from sme_registry.studies.report.analysis import METRICS
 from sme_registry.studies.report.compare import compare
 from sme_registry.studies.report.frames import study_frames
-from sme_registry.studies.report.tables import METRICS, layers
+from sme_registry.studies.report.tables import analyse, layers
 from tests.studies.cells import small_file
 
 FIELDS = {
@@ -70,7 +70,7 @@ def test_rows_have_the_numbers_of_their_reports(study):
     rows = study_frames(file.plan, results).results
     documented = set(re.findall(r"\w+", str(frames.__doc__)))
     assert not set(rows) - documented
-    runs = frames.runs(rows).set_index("key")
+    runs = frames.runs_of(rows).set_index("key")
     for key, of_run in rows.groupby("key"):
         result, run = results[key], runs.loc[key]
         safety, observation = result.report.safety, result.report.observation
@@ -117,7 +117,8 @@ def test_plans_without_limits_and_observations_have_no_such_columns(study):
 def test_the_metrics_of_a_class_are_those_that_its_tasks_have(study, analysis):
     of_regret = {"wd_regret", "ood_regret", "ood_decay"}
     metrics = {
-        name: set(rows.metric) - of_regret for name, rows in analysis.levels.groupby("class_name")
+        name: set(rows.metric) - of_regret
+        for name, rows in analysis.tables["levels"].groupby("class_name")
     }
     assert metrics == {
         "plain": set(),
@@ -125,7 +126,7 @@ def test_the_metrics_of_a_class_are_those_that_its_tasks_have(study, analysis):
         "driven": {"distractor_regret", "wd_invariance"},
         "mixed": set(),
     }
-    assert set(analysis.contrasts.metric) == of_regret  # the first class has no others
+    assert set(analysis.tables["contrasts"].metric) == of_regret  # the first class has no others
     costs = [
         result.report.safety.regions[0].cost
         for result in study[1].values()
@@ -133,9 +134,13 @@ def test_the_metrics_of_a_class_are_those_that_its_tasks_have(study, analysis):
         and result.report.safety is not None
         and result.cell.uses == "reference:linear_least_squares"
     ]
-    (row,) = analysis.levels.query(
-        "class_name == 'safe' and algorithm == 'linear_least_squares' and metric == 'wd_cost'"
-    ).itertuples()
+    (row,) = (
+        analysis.tables["levels"]
+        .query(
+            "class_name == 'safe' and algorithm == 'linear_least_squares' and metric == 'wd_cost'"
+        )
+        .itertuples()
+    )
     assert row.iqm == pytest.approx(sum(costs) / 2)
     assert row.iqm > 0
 
@@ -153,17 +158,17 @@ def test_comparisons_have_the_metrics_too(study):
 
 
 def test_tables_for_people_show_them_and_what_the_layers_keep(study, analysis):
-    tables = {table.name: table.frame for table in exports.text_tables(analysis)}
+    tables = {table.name: table.frame for table in texts.text_tables(analysis)}
     assert list(tables["levels-wd-cost"]["class"]) == ["safe"]
     assert tables["layers"].to_numpy().tolist() == [
         ["driven", "observation", "−1.50, 0.25", "−1.50, 0.25"],
         ["driven", "1", "−0.50, 0.25", "−0.50, 0.25"],
     ]
-    assert "layers" in exports.csv_tables(analysis)
+    assert "layers" in texts.csv_tables(analysis)
     plain = analyse(*only(study, "plain"), draws=200)
     assert plain.metrics == METRICS
-    assert "layers" not in exports.csv_tables(plain)
-    assert "layers" not in {table.name for table in exports.text_tables(plain)}
+    assert "layers" not in texts.csv_tables(plain)
+    assert "layers" not in {table.name for table in texts.text_tables(plain)}
 
 
 def test_what_layers_keep_is_the_iqm_over_runs():

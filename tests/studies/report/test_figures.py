@@ -6,13 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.studies.finished import analysed
+from tests.studies.finished import analysed, with_tables
 
 pytest.importorskip("matplotlib")
 
-from sme_registry.studies.report.figures import curves, differences, draw_figures, panels
+from sme_registry.studies.report.figures import curves, draw_figures, panels
 from sme_registry.studies.report.figures.maps import draw_regions
-from sme_registry.studies.report.figures.scale import Scale, spacing
+from sme_registry.studies.report.figures.panels import Scale, spacing
 from tests.geometry import assert_readable
 from tests.studies.report.test_report import FIGURES
 
@@ -24,23 +24,28 @@ def with_algorithms(analysis, names):
         alpha = table[table.algorithm == "Alpha"]
         return pd.concat([alpha.assign(algorithm=name) for name in names], ignore_index=True)
 
-    tables = ("results", "runs", "regions", "levels", "contrasts", "aggregates", "profiles",
+    tables = ("results", "regions", "levels", "contrasts", "aggregates", "profiles",
               "learning_curves")  # fmt: skip
     pair = {"first": names[0], "second": names[1]}
-    return dataclasses.replace(
-        analysis, algorithms=tuple(names), learners=tuple(names),
-        improvements=analysis.improvements[:1].assign(**pair),
-        differences=analysis.differences.assign(**pair),
-        **{table: renamed(getattr(analysis, table)) for table in tables},
-    )  # fmt: skip
+    many = dataclasses.replace(
+        analysis, algorithms=tuple(names), learners=tuple(names), runs=renamed(analysis.runs)
+    )
+    return with_tables(
+        many,
+        improvements=analysis.tables["improvements"][:1].assign(**pair),
+        differences=analysis.tables["differences"].assign(**pair),
+        **{table: renamed(analysis.tables[table]) for table in tables},
+    )
 
 
 def test_figures_of_eight_algorithms_with_long_names_are_readable_and_whole(analysis, drawn):
-    levels = analysis.levels.copy()  # the worst is in the last panel, and far above the others
+    levels = analysis.tables[
+        "levels"
+    ].copy()  # the worst is in the last panel, and far above the others
     worst = (levels.class_name == "plane") & (levels.algorithm == "Alpha")
     levels.loc[worst, ["iqm", "low", "high"]] = 1.7, 1.5, 1.9
     names = [f"PPO (learning_rate = 0.000{i}, n_steps = 256)" for i in range(1, 9)]
-    many = with_algorithms(dataclasses.replace(analysis, levels=levels), names)
+    many = with_algorithms(with_tables(analysis, levels=levels), names)
     pictures, _ = draw_figures(many, ("png",), {})
     assert {picture.name for picture in pictures} == FIGURES
     figures = dict(zip([picture.name for picture in pictures], drawn, strict=True))
@@ -57,8 +62,10 @@ def test_figures_of_eight_algorithms_with_long_names_are_readable_and_whole(anal
 
 
 def test_a_heat_map_has_one_scale_that_covers_its_values_and_prints_them(analysis, drawn):
-    regions = analysis.regions.assign(similarity=np.linspace(0.91, 0.96, len(analysis.regions)))
-    draw_regions(dataclasses.replace(analysis, regions=regions), ("png",))
+    regions = analysis.tables["regions"].assign(
+        similarity=np.linspace(0.91, 0.96, len(analysis.tables["regions"]))
+    )
+    draw_regions(with_tables(analysis, regions=regions), ("png",))
     (figure,) = drawn
     maps = [axes for axes in figure.axes if axes.images]
     assert len(maps) == len(analysis.algorithms)
@@ -69,13 +76,13 @@ def test_a_heat_map_has_one_scale_that_covers_its_values_and_prints_them(analysi
 
 
 def test_curves_and_levels_near_1_have_headroom(analysis, drawn):
-    rows = analysis.learning_curves
+    rows = analysis.tables["learning_curves"]
     names = ["q25", "median", "q75"]
     squeezed = rows.assign(**{name: 0.98 + 0.02 * (rows[name] % 1.0) for name in names})
     squeezed.loc[squeezed.index[::3], "q75"] = 1.0
-    levels = analysis.levels.assign(iqm=0.999, linear=0.999, low=0.99, high=1.0)
-    unlearnt = dataclasses.replace(analysis, learning_curves=squeezed, levels=levels)
-    (picture,) = differences.draw_class_curves(unlearnt, ["png"])
+    levels = analysis.tables["levels"].assign(iqm=0.999, linear=0.999, low=0.99, high=1.0)
+    unlearnt = with_tables(analysis, learning_curves=squeezed, levels=levels)
+    (picture,) = curves.draw_class_curves(unlearnt, ["png"])
     assert "each a running median over 2 evaluations" in picture.caption
     ((low, high),) = {axes.get_ylim() for axes in drawn[0].axes if axes.get_visible()}
     assert 0.9 < low < 0.98
@@ -89,7 +96,9 @@ def test_curves_and_levels_near_1_have_headroom(analysis, drawn):
 
 def test_levels_of_one_state_dimension_are_comparable(analysis):
     assert "not comparable" in panels.epsilon_remark(analysis)
-    alike = dataclasses.replace(analysis, results=analysis.results[analysis.results.state_dim == 8])
+    alike = with_tables(
+        analysis, results=analysis.tables["results"][analysis.tables["results"].state_dim == 8]
+    )
     assert panels.epsilon_remark(alike) == ""
 
 

@@ -1,200 +1,184 @@
-"""Findings of a study: verdicts that the tables support, each with words on the page."""
+"""Findings of a study: verdicts that the tables support, each with a sentence on the page."""
 
 import dataclasses
 import html
-import itertools
 import math
 import re
-from typing import get_args
 
 import pytest
 
-from sme_registry.studies.report.findings import (
-    AlgorithmFinding,
-    Contrast,
-    OutOfDistribution,
-    Rival,
-    findings,
-)
-from sme_registry.studies.report.tables import ENOUGH_RUNS, contrast_verdict
-from tests.studies.finished import analysed
+from sme_registry.studies.report.analysis import ENOUGH_RUNS, change_verdict
+from sme_registry.studies.report.findings import findings
+from sme_registry.studies.report.sentences import SENTENCES, sentence
+from tests.studies.finished import analysed, with_tables
 
 pytest.importorskip("matplotlib")
 
-from sme_registry.studies.report.page import page
+from sme_registry.studies.report.write import page
 
-CHANGE = Contrast(
-    class_name="c", axis="k", setting="k = 25", base=0.1, level=0.9, change=0.8, low=0.7,
-    high=0.9, pairs=5, enough_pairs=True, verdict="worse",
-)  # fmt: skip
 SINGLE = {"low": math.nan, "high": math.nan, "pairs": 1}
 
 
 def contrasted(analysis, class_name, fields):
     """With another contrast of Alpha's regret within the distribution."""
-    rows = analysis.contrasts.copy()
+    rows = analysis.tables["contrasts"].copy()
     at = rows[["class_name", "algorithm", "metric"]] == [class_name, "Alpha", "wd_regret"]
     for name, value in fields.items():
         rows.loc[at.all(axis=1), name] = value
     rows["enough_pairs"] = rows.pairs >= ENOUGH_RUNS
-    rows["verdict"] = [contrast_verdict(r.change, r.low, r.high) for r in rows.itertuples()]
-    return dataclasses.replace(analysis, contrasts=rows)
+    rows["verdict"] = [change_verdict(r.change, r.low, r.high) for r in rows.itertuples()]
+    return with_tables(analysis, contrasts=rows)
+
+
+def found(analysis, **at):
+    """The rows of findings with these values, by question."""
+    rows = findings(analysis)
+    for name, value in at.items():
+        rows = rows[rows[name] == value]
+    return {row.question: row for row in rows.itertuples()}
 
 
 def of_alpha(analysis):
-    return findings(analysis).algorithms[0]
-
-
-def classes(contrasts):
-    return [contrast.class_name for contrast in contrasts]
-
-
-def worst_class(finding):
-    return finding.worst.class_name
+    return found(analysis, section="tasks", algorithm="Alpha")
 
 
 def test_findings_name_the_property_that_each_learner_was_built_to_fail_at(analysis):
-    alpha, beta = findings(analysis).algorithms
-    assert (alpha.algorithm, alpha.verdict, worst_class(alpha)) == ("Alpha", "broken", "r_min-0_5")
-    assert alpha.worst.pairs == 5
-    assert (alpha.certainty, alpha.larger) == ("certain", ())
-    assert (beta.algorithm, beta.verdict, worst_class(beta)) == ("Beta", "broken", "k-25")
+    alpha, beta = of_alpha(analysis), found(analysis, section="tasks", algorithm="Beta")
+    assert (alpha["worst"].verdict, alpha["worst"].class_name) == ("broken", "r_min-0_5")
+    assert alpha["worst"].sentence.startswith("Alpha is broken most by minimum reward r_min: on")
+    assert alpha["worst"].runs == 5
+    assert alpha["certainty"].verdict == "certain"
+    assert "larger" not in alpha
+    assert (beta["worst"].verdict, beta["worst"].class_name) == ("broken", "k-25")
 
 
 def test_larger_changes_that_are_open_are_listed_next_to_the_worst(analysis):
     alpha = of_alpha(contrasted(analysis, "complexity-10", {"change": 1.06, **SINGLE}))
-    assert (alpha.verdict, worst_class(alpha)) == ("broken", "r_min-0_5")
-    assert classes(alpha.larger) == ["complexity-10"]
-    assert (alpha.larger[0].change, alpha.larger[0].low) == (1.06, None)
-    assert alpha.certainty == "rivals"
-    assert "complexity-10" not in classes(alpha.open)
+    assert (alpha["worst"].verdict, alpha["worst"].class_name) == ("broken", "r_min-0_5")
+    assert "most" not in alpha["worst"].sentence
+    assert "(complexity-10: +1.06, a single pair, no interval)" in alpha["larger"].sentence
+    assert alpha["certainty"].verdict == "rivals"
+    assert "complexity-10" not in alpha["other axes"].sentence
     # Nothing is certainly the worst next to a change without an interval, however small.
     alpha = of_alpha(contrasted(analysis, "complexity-10", {"change": 0.01, **SINGLE}))
-    assert (alpha.certainty, classes(alpha.rivals)) == ("rivals", ["complexity-10"])
+    assert alpha["certainty"].verdict == "rivals"
+    assert "complexity-10" in alpha["certainty"].sentence
 
 
 def test_few_pairs_make_an_indication_and_a_caveat(analysis):
-    found = findings(analysis)
-    assert found.algorithms[1].certainty == "indication"
-    assert found.caveats.fewest_pairs == 3
-    assert (found.caveats.missing, found.caveats.planned) == (2, 75)
-    assert found.caveats.other_policy_init == ("complexity-10",)
+    beta = found(analysis, section="tasks", algorithm="Beta")
+    assert beta["certainty"].verdict == "indication"
+    caveats = found(analysis, section="caveats")
+    assert caveats["few runs"].runs == 3
+    assert caveats["missing runs"].sentence.startswith("2 of 75 runs are missing, 1 of them")
+    assert "complexity-10" in caveats["policy_init"].sentence
 
 
 def test_single_runs_show_nothing(finished):
     cut = analysed(finished, lambda p: p.run > 0)
-    for finding in findings(cut).algorithms:
-        assert finding.verdict == "none_shown"
-        rows = cut.contrasts
-        rows = rows[(rows.algorithm == finding.algorithm) & (rows.metric == "wd_regret")]
-        assert finding.largest_single.change == rows.change.max()
-        assert finding.highest_change is None
+    rows = cut.tables["contrasts"]
+    for name in cut.learners:
+        own = found(cut, section="tasks", algorithm=name)
+        assert own["worst"].verdict == "none_shown"
+        changes = rows[(rows.algorithm == name) & (rows.metric == "wd_regret")].change
+        assert own["single"].value == changes.max()
+        assert "highest" not in own
     ends = {"change": 0.01, "low": -0.02, "high": 0.04, "pairs": 2}
     alpha = of_alpha(contrasted(cut, "k-25", ends))
-    assert (alpha.verdict, alpha.highest_change) == ("none_shown", 0.04)
-    assert alpha.largest_single.class_name != "k-25"
+    assert (alpha["worst"].verdict, alpha["highest"].value) == ("none_shown", 0.04)
+    assert alpha["single"].class_name != "k-25"
 
 
 def test_a_first_class_that_was_not_learnt_is_marked(analysis):
-    assert not any(finding.base_unlearnt for finding in findings(analysis).algorithms)
-    levels = analysis.levels.copy()
+    assert "first class" not in of_alpha(analysis)
+    levels = analysis.tables["levels"].copy()
     levels.loc[(levels.class_name == "default") & (levels.metric == "wd_regret"), "iqm"] = 0.97
-    for finding in findings(dataclasses.replace(analysis, levels=levels)).algorithms:
-        assert finding.base_unlearnt
-        assert finding.base_wd_regret == 0.97
+    unlearnt = of_alpha(with_tables(analysis, levels=levels))["first class"]
+    assert (unlearnt.verdict, unlearnt.value) == ("unlearnt", 0.97)
+
+
+@pytest.mark.parametrize(
+    ("level", "linear", "verdict"),
+    [
+        (1.2, 0.5, "worse_than_constant"),
+        (0.95, 0.5, "like_constant"),
+        (0.6, 0.5, "worse_than_linear"),
+        (0.4, 0.5, "better_than_linear"),
+        (0.4, math.nan, None),
+    ],
+)
+def test_the_worst_level_is_compared_with_the_constant_and_the_linear_policy(
+    analysis, level, linear, verdict
+):
+    levels = analysis.tables["levels"].copy()
+    at = (levels.class_name == "r_min-0_5") & (levels.algorithm == "Alpha")
+    levels.loc[at, "linear"] = linear
+    changed = contrasted(with_tables(analysis, levels=levels), "r_min-0_5", {"level": level})
+    position = of_alpha(changed).get("position")
+    assert (position and position.verdict) == verdict
+
+
+@pytest.mark.parametrize(
+    ("change", "verdict"), [(0.3, "broken"), (0.1, "hurt"), (0.01, "slightly_hurt")]
+)
+def test_severity_is_the_size_of_the_largest_change(analysis, change, verdict):
+    rows = analysis.tables["contrasts"]
+    rows = rows.assign(change=change, low=change / 2, high=2 * change, verdict="worse")
+    assert of_alpha(with_tables(analysis, contrasts=rows))["worst"].verdict == verdict
 
 
 def test_an_improvement_whose_interval_includes_a_half_is_open(analysis):
-    (best,) = findings(analysis).best
-    assert best.algorithm in analysis.learners
-    blurred = analysis.improvements.assign(low=0.1, high=0.9)
-    (best,) = findings(dataclasses.replace(analysis, improvements=blurred)).best
-    assert [rival.verdict for rival in best.rivals] == ["open"]
-    certain = analysis.improvements.assign(probability=0.99, low=0.98, high=1.0)
+    best = found(analysis, section="comparison")["best"].algorithm
+    assert best in analysis.learners
+    rows = analysis.tables["improvements"]
+    blurred = with_tables(analysis, improvements=rows.assign(low=0.1, high=0.9))
+    assert found(blurred, section="comparison")["rival"].verdict == "open"
+    certain = rows.assign(probability=0.99, low=0.98, high=1.0, fewest_runs=5)
     certain[["first", "second"]] = [
-        (best.algorithm, row.second if row.first == best.algorithm else row.first)
-        for row in certain.itertuples()
+        (best, row.second if row.first == best else row.first) for row in certain.itertuples()
     ]
-    (best,) = findings(dataclasses.replace(analysis, improvements=certain)).best
-    assert "open" not in [rival.verdict for rival in best.rivals]
+    rival = found(with_tables(analysis, improvements=certain), section="comparison")["rival"]
+    assert (rival.verdict, rival.value) == ("better", 0.99)
 
 
 def test_different_training_steps_are_reported(analysis):
-    assert findings(analysis).steps == {}
+    assert "training steps" not in found(analysis)
     runs = analysis.runs.copy()
     runs.loc[runs.algorithm == "Alpha", "steps"] = 4000
-    steps = findings(dataclasses.replace(analysis, runs=runs)).steps
-    assert steps == {"Alpha": 4000, "Beta": 40}
+    steps = found(dataclasses.replace(analysis, runs=runs))["training steps"]
+    assert steps.sentence == "Training steps differ: Alpha 4,000, Beta 40."
 
 
-def choices(model, field):
-    """The values of a field that is an enumeration, and None where it may be that."""
-    annotation = model.model_fields[field].annotation
-    values = itertools.chain(*(get_args(part) or (part,) for part in get_args(annotation)))
-    return tuple(None if value is type(None) else value for value in values)
+def test_every_verdict_has_a_whole_sentence():
+    numbers = dict.fromkeys(("value", "low", "high", "base", "level", "linear"), 0.5)
+    for question, verdicts in SENTENCES.items():
+        for verdict, template in verdicts.items():
+            words = dict.fromkeys(re.findall(r"\{(\w+)", template), "") | numbers
+            text = sentence({"question": question, "verdict": verdict, **words})
+            assert text.endswith(".")
+            assert "{" not in text
 
 
-def every_algorithm_finding():
-    """Every verdict with every certainty and position, and lists with and without entries."""
-    worst = CHANGE
-    single = {"axis": "", "low": None, "high": None, "pairs": 1, "enough_pairs": False}
-    few = {"axis": "several axes", "pairs": 3, "enough_pairs": False}
-    listed = (worst, worst.model_copy(update=single), worst.model_copy(update=few))
-    found = [AlgorithmFinding(algorithm="A", verdict="no_contrasts")]
-    for better, highest, largest in itertools.product(((), listed), (None, 0.1), (None, worst)):
-        nothing = {"better": better, "highest_change": highest, "largest_single": largest}
-        found.append(AlgorithmFinding(algorithm="A", verdict="none_shown", **nothing))
-    for verdict, certainty, position, contrasts in itertools.product(
-        ("broken", "hurt", "slightly_hurt"),
-        [value for value in choices(AlgorithmFinding, "certainty") if value],
-        choices(AlgorithmFinding, "position"),
-        ((), listed),
-    ):
-        found.append(
-            AlgorithmFinding(
-                algorithm="A", verdict=verdict, base_wd_regret=0.95, base_unlearnt=bool(contrasts),
-                worst=worst, larger=contrasts, certainty=certainty, rivals=listed,
-                position=position, linear_wd_regret=0.5, base_linear_wd_regret=0.2,
-                harder_to_fit=bool(contrasts), also_worse=contrasts, open=contrasts,
-                out_of_distribution=OutOfDistribution(worst=worst, larger=contrasts)
-                if contrasts or certainty == "rivals" else None,
-            )
-        )  # fmt: skip
-    return found
-
-
-def text_of(analysis, found, *reasons):
+def text_of(analysis, *reasons):
     """What a reader sees of the page."""
-    text = page(analysis, found, [], reasons, [])
+    text = page(analysis, findings(analysis), [], reasons, [])
     body = re.sub("</?(code|strong)>", "", text[text.index("<main>") :])
     return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", body)).split())
 
 
-def assert_worded(analysis, found):
+def assert_worded(analysis):
     """The text of a page without values that are missing and without gaps between words."""
-    text = text_of(analysis, found, "No maps.")
-    assert "None" not in text
+    text = text_of(analysis, "No maps.")
+    assert not re.search(r"None|nan\b", text)
     assert not re.search(r"\(\s|\s[,.;:)]|\.\.|,,", text)
     assert not re.search(r"\d[a-z]{3}|[a-z½)](?=[0-9A-Z½])", text[: text.index("Tables")])
     return text
 
 
-def test_every_verdict_has_words_on_the_page(analysis):
-    found = findings(analysis)
-    rivals = tuple(
-        Rival(algorithm="B", probability=0.6, low=low, high=low, verdict=verdict)
-        for verdict in choices(Rival, "verdict")
-        for low in (None, 0.4)
-    )
-    (best,) = found.best
-    many = best.model_copy(update={"rivals": rivals, "nu": 0.5, "transitions": 50_000})
-    none = {"missing": 0, "fewest_pairs": None, "intervals": 0, "other_policy_init": ()}
-    everything = {
-        "algorithms": tuple(every_algorithm_finding()),
-        "best": (best, many),
-        "steps": {"A": 40, "B": 4000},
-        "caveats": found.caveats.model_copy(update={"failed": 1}),
-    }
-    assert_worded(analysis, found.model_copy(update=everything))
-    nothing = {"algorithms": (), "caveats": found.caveats.model_copy(update=none)}
-    assert "No algorithm" in assert_worded(analysis, found.model_copy(update=nothing))
+def test_the_page_has_the_sentences(analysis, finished):
+    text = assert_worded(analysis)
+    for row in findings(analysis).itertuples():
+        assert " ".join(row.sentence.split()) in text
+    assert "No algorithm" not in text
+    nothing = analysed(finished, lambda planned: planned.algorithm != "constant")
+    assert "No algorithm that learns has a finished run yet" in assert_worded(nothing)

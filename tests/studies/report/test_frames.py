@@ -55,7 +55,7 @@ def test_every_row_has_the_numbers_of_its_report(finished, loaded):
 
 def test_curves_have_one_row_per_evaluation(finished, loaded):
     results = Ledger(finished).results()
-    runs = frames.runs(loaded.results).set_index(frames.RUN).key
+    runs = frames.runs_of(loaded.results).set_index(frames.RUN).key
     assert len(loaded.curves) == 73 * 20
     for place, rows in loaded.curves.groupby(frames.RUN):
         curve = results[runs[place]].curve
@@ -66,7 +66,7 @@ def test_curves_have_one_row_per_evaluation(finished, loaded):
 
 def test_final_return_is_in_percent_of_the_optimum(loaded):
     last = loaded.curves.groupby(frames.RUN).episode_return.apply(lambda x: x.iloc[-2:].mean())
-    expected = frames.runs(loaded.results).set_index(frames.RUN).final_return
+    expected = frames.runs_of(loaded.results).set_index(frames.RUN).final_return
     assert np.allclose(last / 20 * 100, expected.reindex(last.index))
 
 

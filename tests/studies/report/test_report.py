@@ -15,9 +15,9 @@ from sme_registry.io import read_json
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.report.findings import Findings, findings
-from sme_registry.studies.report.frames import plan_file
-from sme_registry.studies.report.latex import latex_table
+from sme_registry.studies.report.findings import findings
+from sme_registry.studies.report.frames import records
+from sme_registry.studies.report.texts import TextTable
 from tests.commands import good, refused
 
 pytest.importorskip("matplotlib")
@@ -150,16 +150,17 @@ def test_the_page_is_whole_loads_nothing_and_says_where_its_numbers_come_from(wr
     ):
         assert fact in page.text
     assert "table-levels-wd-regret" in page.ids
-    levels = analysis.levels[analysis.levels.metric == "wd_regret"]
+    levels = analysis.tables["levels"][analysis.tables["levels"].metric == "wd_regret"]
     assert all(f"<td>{row.iqm:.2f} [" in html for row in levels.itertuples())
 
 
 def test_findings_and_every_number_of_the_tables_are_written_as_data(written, analysis):
-    read = Findings.from_dict(read_json(written / "findings.json"), "findings.json")
-    assert read == findings(analysis)
-    assert len(analysis.results) == 73 * 3
+    document = read_json(written / "findings.json")
+    assert (document["schema_version"], document["base"]) == (2, "default")
+    assert document["findings"] == records(findings(analysis))
+    assert len(analysis.tables["results"]) == 73 * 3
     for path in (written / "tables").glob("*.csv"):
-        table = getattr(analysis, path.stem)
+        table = analysis.tables[path.stem]
         numbers = table.select_dtypes("float64")
         with path.open(newline="", encoding="utf-8") as stream:
             rows = list(csv.DictReader(stream))
@@ -168,19 +169,19 @@ def test_findings_and_every_number_of_the_tables_are_written_as_data(written, an
         assert np.array_equal(values, numbers.to_numpy(), equal_nan=True)
 
 
-def test_latex_tables_are_ascii_and_as_wide_as_they_say(written):
+def test_latex_tables_are_ascii_and_scaled_to_the_column(written):
     files = list((written / "tables").glob("*.tex"))
     assert len(files) == 21
     for path in files:
         text = path.read_text()
         assert text.isascii(), path
-        columns = re.search(r"X(r*)@\{\}\}$", text, re.MULTILINE)
+        assert "\\resizebox{\\ifdim\\width>\\linewidth" in text
+        columns = re.search(r"begin\{tabular\}\{(l+r*)\}", text)
         assert columns is not None
         rows = [line for line in text.splitlines() if line.endswith(r" \\")]
         assert len(rows) > 1
         for row in rows:
-            if not row.startswith(r"\multicolumn{2}"):
-                assert len(re.findall(r"(?<!\\)&", row)) == len(columns[1])
+            assert len(re.findall(r"(?<!\\)&", row)) == len(columns[1]) - 1
             assert not re.search(r"(?<!\\)[_%#]", row)
 
 
@@ -236,7 +237,7 @@ def test_cells_that_no_run_asked_for_are_not_missing(finished, tmp_path, drawn):
     study = tmp_path / "study"
     shutil.copytree(finished, study)
     ledger = Ledger(study)
-    file = plan_file(ledger)
+    file = ledger.study_file()
     ledger.write_request(file, ["class=default"])
     for planned in file.plan.cells:
         if planned.class_name != "default":
@@ -260,13 +261,14 @@ def latex(algorithms, classes=3):
     for name in NAMES[:algorithms]:
         frame[name] = ENTRY
     caption = "Difference of WD regret. IQM over pairs, 95 % interval. *: worse, †: better."
-    return latex_table(frame, names=1, caption=caption, label=f"t{algorithms}-{classes}")
+    title, _, note = caption.partition(". ")
+    return TextTable(f"t{algorithms}-{classes}", title, note, frame).latex()
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="needs pdflatex")
 def test_pdflatex_finds_no_overfull_box(tmp_path):
     tables = "\n".join(latex(n, 6) + "\\clearpage" for n in (1, 2, 3, 8))
-    packages = "\\usepackage{booktabs,tabularx,array}"
+    packages = "\\usepackage{booktabs,graphicx}"
     document = f"\\documentclass[twocolumn]{{article}}{packages}\\begin{{document}}\n{tables}"
     (tmp_path / "paper.tex").write_text(document + "\n\\end{document}\n", encoding="ascii")
     command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]

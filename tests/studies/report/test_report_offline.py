@@ -7,15 +7,14 @@ from sme_registry.io.markup import fixed
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import OfflineResult
-from sme_registry.studies.report.analysis import analyse
 from sme_registry.studies.report.classes import ALL
-from sme_registry.studies.report.exports import offline_tables
+from sme_registry.studies.report.tables import analyse
+from sme_registry.studies.report.texts import offline_tables
 from tests.studies.finished import study_file
 
 pytest.importorskip("matplotlib")
 
 from sme_registry.studies.report.findings import findings
-from sme_registry.studies.report.offline_findings import offline_findings
 from sme_registry.studies.report.write import write_report
 from tests.studies.report.test_findings import assert_worded
 
@@ -83,11 +82,11 @@ def analysis(file, done):
 
 
 def test_learners_are_named_without_their_nu_and_data_sets_count_once(analysis):
-    rows = analysis.offline[["class_name", "nu", "learner", "data_sets"]]
+    rows = analysis.tables["offline"][["class_name", "nu", "learner", "data_sets"]]
     assert list(rows.itertuples(index=False, name=None)) == [
         (name, nu, learner, 5) for name in CLASSES for nu in NUS for learner in ("BC", "IQL")
     ]
-    for row in analysis.offline.itertuples():
+    for row in analysis.tables["offline"].itertuples():
         assert row.runs == 5
         assert row.behaviour_similarity == pytest.approx(1.002 - row.nu / 6.0)
         assert row.similarity_sd == pytest.approx(0.03)
@@ -102,68 +101,68 @@ def test_learners_of_one_kind_are_named_by_their_settings_other_than_nu():
     ]
     file = planned(algorithms=algorithms, seeds=1)
     analysis = analyse(file, results(file), draws=300)
-    assert list(analysis.offline.learner) == [
+    assert list(analysis.tables["offline"].learner) == [
         "IQL (expectile = 0.9)", "IQL (default expectile)",
     ] * 2  # fmt: skip
 
 
 def of_learner(analysis, name):
-    return next(each for each in offline_findings(analysis).learners if each.name == name)
-
-
-def places(differences):
-    return [(place.class_name, place.nu) for place in differences]
+    """The rows on a learner, by question; those of its improvement by verdict."""
+    rows = findings(analysis)
+    rows = rows[(rows.section == "offline") & (rows.algorithm == name)]
+    return {
+        row.verdict if row.question == "improvement" else row.question: row
+        for row in rows.itertuples()
+    }
 
 
 def test_findings_name_who_imitates_who_surpasses_and_who_collapses(analysis):
-    offline = offline_findings(analysis)
-    behaviour = offline.behaviour
-    assert (offline.example, offline.nu) == ("BC (0)", 0.0)
-    assert (offline.fewest_runs, offline.most_runs) == (5, 5)
-    assert behaviour.far == ()
-    assert behaviour.farthest.difference == pytest.approx(0.002)
-    assert_worded(analysis, findings(analysis))
-    shallow, deep = (([(name, nu) for nu in NUS]) for name in CLASSES)
+    rows = findings(analysis)
+    offline = rows[rows.section == "offline"].set_index("question")
+    assert tuple(offline.loc["example", ["algorithm", "value"]]) == ("BC (0)", 0.0)
+    assert "Each learner has 5 runs per class" in offline.loc["offline runs"].sentence
+    assert offline.loc["behaviour"].verdict == "near"
+    assert offline.loc["behaviour"].value == pytest.approx(0.002)
+    assert_worded(analysis)
     bc, iql = (of_learner(analysis, name) for name in ("BC", "IQL"))
-    assert (bc.verdict, iql.verdict) == ("near_at_some", "near_at_none")
-    assert places(bc.near) == shallow
-    assert iql.surpasses
-    assert places(iql.places["above"]) == shallow
-    assert [place.difference for place in iql.places["above"]] == pytest.approx([0.05, 0.05])
-    assert places(iql.places["below"]) == deep
-    assert [place.difference for place in iql.places["below"]] == pytest.approx([-0.4, -0.4])
+    assert (bc["imitation"].verdict, iql["imitation"].verdict) == ("near_at_some", "near_at_none")
+    assert "at shallow (ν = 0, 0.5)." in bc["imitation"].sentence
+    above, below = (iql[verdict].sentence for verdict in ("above", "below"))
+    assert above == "It surpasses its data at shallow (ν = 0, 0.5), by +0.050."
+    assert below == "It falls behind its data at deep (ν = 0, 0.5), by −0.400."
     for learner in (bc, iql):
-        assert (learner.depth.verdict, learner.depth.class_name) == ("collapses", "deep")
-        assert (len(learner.depth.places), learner.depth.runs) == (2, 10)
-        assert not learner.depth.few_runs
-        assert not {"above_few", "below_few", "single_above"} & set(learner.places)
-    assert places(iql.depth.at_constant) == deep
+        depth = learner["depth"]
+        assert (depth.verdict, depth.class_name, depth.runs) == ("collapses", "deep", 10)
+        assert "few runs" not in depth.sentence
+        assert not {"above_few", "below_few", "single_above"} & set(learner)
+    assert "at ν = 0, 0.5 it is at most 0.02 better than the constant" in iql["depth"].sentence
 
 
 @pytest.mark.parametrize("runs", [1, 4])
 def test_few_runs_give_indications_at_most(file, done, runs):
     keys = {place.cell.digest for place in file.plan.cells if place.run < runs}
     few = analyse(file, {key: done[key] for key in keys}, draws=300)
-    assert set(few.offline.low.isna()) == {runs < 4}
+    assert set(few.tables["offline"].low.isna()) == {runs < 4}
     iql = of_learner(few, "IQL")
-    assert not {"above", "below"} & set(iql.places)
-    assert ("above_few" in iql.places) == (runs > 1)
-    assert ("single_above" in iql.places) == (runs == 1)
-    assert iql.surpasses == (runs > 1)
-    assert iql.depth.few_runs
-    assert_worded(few, findings(few))
+    assert not {"above", "below"} & set(iql)
+    assert ("above_few" in iql) == (runs > 1)
+    assert ("single_above" in iql) == (runs == 1)
+    assert ("none" in iql) == (runs == 1)
+    assert "With so few runs this is an indication." in iql["depth"].sentence
+    assert_worded(few)
 
 
 def test_only_learners_with_equal_data_are_compared(analysis):
-    rows = analysis.improvements[analysis.improvements.group == ALL]
+    rows = analysis.tables["improvements"][analysis.tables["improvements"].group == ALL]
     pairs = set(zip(rows["first"], rows["second"], strict=True))
     learners = {("BC (0)", "IQL (0)"), ("BC (0.5)", "IQL (0.5)")}
     assert pairs == learners
-    best = findings(analysis).best
-    assert [(b.algorithm, b.nu, b.transitions) for b in best] == [
-        ("BC (0)", 0.0, 1000), ("BC (0.5)", 0.5, 1000),
-    ]  # fmt: skip
-    assert [[rival.algorithm for rival in b.rivals] for b in best] == [["IQL (0)"], ["IQL (0.5)"]]
+    found = findings(analysis)
+    best, rivals = (found[found.question == each] for each in ("best", "rival"))
+    assert list(best.algorithm) == list(rivals.algorithm) == ["BC (0)", "BC (0.5)"]
+    assert "with 1,000 transitions of ν = 0.5, BC (0.5) is best" in best.sentence.iloc[1]
+    beaten = ["beats one of IQL (0) ", "beats one of IQL (0.5) "]
+    assert all(name in text for name, text in zip(beaten, rivals.sentence, strict=True))
 
 
 def test_learning_from_data_comes_first_in_the_report_and_has_every_format(
@@ -196,7 +195,7 @@ def test_learning_from_data_comes_first_in_the_report_and_has_every_format(
 
 def test_the_table_has_the_behaviour_policy_next_to_the_learners(analysis):
     similarities, improvements = (table.frame for table in offline_tables(analysis))
-    constant = fixed(analysis.offline.constant_similarity[0], 3)
+    constant = fixed(analysis.tables["offline"].constant_similarity[0], 3)
     assert similarities.iloc[0].to_dict() == {
         "class": "shallow",
         "ν": "0",

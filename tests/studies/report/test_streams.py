@@ -1,6 +1,5 @@
 """The streams of a study in its report: frames, tables, findings, figures and the page."""
 
-import dataclasses
 import functools
 import re
 import shutil
@@ -16,15 +15,14 @@ from sme_registry.io import read_json
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellFailure
-from sme_registry.studies.report.findings import Findings, findings
-from sme_registry.studies.report.streams import frames, tables
+from sme_registry.studies.report import frames, lives
+from sme_registry.studies.report.findings import findings
 from tests.studies import finished
 from tests.studies.lives import AGENTS, STREAMS, TASK, live, stream_study
 
 pytest.importorskip("matplotlib")
 
-from sme_registry.studies.report.page import page
-from sme_registry.studies.report.write import write_report
+from sme_registry.studies.report.write import page, write_report
 from tests.geometry import assert_readable
 from tests.studies.report.test_report import Page
 
@@ -63,13 +61,7 @@ analysed = functools.cache(finished.analysed)
 @pytest.fixture(scope="module")
 def streams(study):
     """The tables of `study`."""
-    streams = analysed(study).streams
-    assert streams is not None
-    return streams
-
-
-def found_in(folder):
-    return worded(analysed(folder))[0]
+    return analysed(study)
 
 
 def text_of(analysis):
@@ -77,8 +69,12 @@ def text_of(analysis):
     return Page(page(analysis, findings(analysis), [], [], [])).text
 
 
-def of_stream(found, name):
-    return next(each for each in found.streams if each.class_name == name)
+def found(analysis, **at):
+    """The rows of findings with these values, by question."""
+    rows = findings(analysis)
+    for name, value in at.items():
+        rows = rows[rows[name] == value]
+    return {row.question: row for row in rows.itertuples()}
 
 
 def within(rows, **at):
@@ -169,15 +165,19 @@ def test_results_and_curves_hold_single_tasks_alone(study, tmp_path):
 
 
 def test_a_table_has_the_iqm_over_lives_with_its_interval(streams):
-    lives = streams.frames.lives
-    for row in streams.metrics.itertuples():
+    lives = streams.tables["stream_lives"]
+    for row in streams.tables["stream_metrics"].itertuples():
         place = {"class_name": row.class_name, "algorithm": row.algorithm, "region": row.region}
         values = within(lives, **place)[row.metric].to_numpy()
         assert row.runs == 5
         assert row.iqm == pytest.approx(trim_mean(values, 0.25), abs=1e-12)
         assert row.low <= row.iqm <= row.high
-    M = within(streams.matrices, class_name="Related", algorithm="Forgetful", phase=1)
-    retention = within(streams.frames.retention, class_name="Related", algorithm="Forgetful")
+    M = within(
+        streams.tables["stream_matrices"], class_name="Related", algorithm="Forgetful", phase=1
+    )
+    retention = within(
+        streams.tables["stream_retention"], class_name="Related", algorithm="Forgetful"
+    )
     assert np.isnan(M.visit.astype(float)[:1]).all()
     for row in M[1:].itertuples():
         values = retention[(retention.visit == row.visit) & (retention.phase == 1)]
@@ -185,23 +185,27 @@ def test_a_table_has_the_iqm_over_lives_with_its_interval(streams):
 
 
 def test_streams_are_compared_by_runs_of_equal_number(streams):
-    rows = streams.contrasts[streams.contrasts.algorithm == "Forgetful"]
+    rows = streams.tables["stream_contrasts"][
+        streams.tables["stream_contrasts"].algorithm == "Forgetful"
+    ]
     axes = {"Related": "tasks", "Cycle": "schedule"}
     assert dict(zip(rows.class_name, rows.axis, strict=True)) == axes
     (row,) = rows[(rows.class_name == "Related") & (rows.metric == "forgetting")].itertuples()
-    lives = within(streams.frames.lives, algorithm="Forgetful").set_index(["class_name", "run"])
+    lives = within(streams.tables["stream_lives"], algorithm="Forgetful").set_index(
+        ["class_name", "run"]
+    )
     change = lives.forgetting["Related"] - lives.forgetting["Switch"]
     assert row.change == pytest.approx(trim_mean(change, 0.25))
     assert (row.verdict, row.pairs) == ("better", 5)
 
 
 def test_a_regret_curve_is_beside_fresh_agents_and_the_agent_frozen_after_visit_0(streams):
-    lives = within(streams.frames.lives).groupby(["class_name", "algorithm"])
-    for place, curve in streams.regret.groupby(["class_name", "algorithm"]):
+    lives = within(streams.tables["stream_lives"]).groupby(["class_name", "algorithm"])
+    for place, curve in streams.tables["stream_regret"].groupby(["class_name", "algorithm"]):
         name, algorithm = place
         own = lives.get_group(place)
         assert curve["median"].iloc[-1] == pytest.approx(own.dynamic_regret.median())
-        visits = within(streams.frames.visits, class_name=name, algorithm=algorithm)
+        visits = within(streams.tables["stream_visits"], class_name=name, algorithm=algorithm)
         alone = (100 * visits.fresh_online_regret).groupby(visits.run).sum()
         assert curve.fresh.iloc[-1] == pytest.approx(alone.median())
         at_switch = curve.fresh[np.isclose(curve.lifetime, 100.0)]
@@ -215,16 +219,16 @@ def test_a_regret_curve_is_beside_fresh_agents_and_the_agent_frozen_after_visit_
         last = np.median([log.dynamic_regret for log in frozen])
         assert curve.frozen.iloc[-1] == pytest.approx(last)
         of_place = {"class_name": name, "algorithm": algorithm, "metric": "frozen_online_regret"}
-        (row,) = within(streams.metrics, **of_place).itertuples()
+        (row,) = within(streams.tables["stream_metrics"], **of_place).itertuples()
         assert row.iqm == pytest.approx(trim_mean([log.online_regret for log in frozen], 0.25))
         assert row.low <= row.iqm <= row.high
-        (row,) = within(streams.visit_metrics, visit=1, **of_place).itertuples()
+        (row,) = within(streams.tables["stream_visit_metrics"], visit=1, **of_place).itertuples()
         second = [log.visits[1].online_regret for log in frozen]
         assert row.iqm == pytest.approx(trim_mean(second, 0.25))
 
 
 def test_reference_agents_are_those_that_lives_recorded_and_else_computed(streams):
-    costs = tables.reference_costs(streams.lives)
+    costs = lives.reference_costs(streams.lives)
     for (name, reference), logs in costs.items():
         own = [life.report for life in streams.lives if life.planned.class_name == name]
         recorded = {each.stream_digest: each.reference_regret[reference] for each in own}
@@ -233,34 +237,40 @@ def test_reference_agents_are_those_that_lives_recorded_and_else_computed(stream
         life._replace(report=life.report.model_copy(update={"reference_regret": {}}))
         for life in streams.lives
     ]
-    computed = tables.reference_costs(old)
+    computed = lives.reference_costs(old)
     assert computed.keys() == costs.keys()
     for place, logs in computed.items():
         for mine, theirs in zip(logs, costs[place], strict=True):
             assert mine.online_regret == pytest.approx(theirs.online_regret, abs=0.1)
-    assert tables.regret(old).frozen.isna().all()
+    assert lives.regret(old).frozen.isna().all()
 
 
 def test_what_is_missing_is_counted_and_leaves_plasticity_unknown(gaps):
-    streams = analysed(gaps).streams
-    counts = streams.counts.set_index(["class_name", "algorithm"])
+    streams = analysed(gaps)
+    counts = streams.tables["stream_counts"].set_index(["class_name", "algorithm"])
     assert tuple(counts.loc[("Switch", "Stubborn")]) == (3, 15, 5, 15, 1)
     assert tuple(counts.loc[("Cycle", "Tired")]) == (5, 5, 5, 10, 0)
     # The three streams have the same phase 0, and so the same fresh agents of it.
-    missing = streams.missing
+    missing = streams.tables["stream_missing"]
     assert (len(missing), missing.key.nunique()) == (2 + 3 * 5, 2 + 5)
     assert (streams.finished, streams.requested, streams.planned) == (113, 120, 120)
-    tired = streams.metrics[streams.metrics.algorithm == "Tired"].metric
+    tired = streams.tables["stream_metrics"][
+        streams.tables["stream_metrics"].algorithm == "Tired"
+    ].metric
     assert not {"plasticity_ratio", "plasticity_difference", "learning_transfer"} & set(tired)
     assert {"forgetting", "online_regret"} < set(tired)
-    assert streams.regret[streams.regret.algorithm == "Tired"].fresh.isna().all()
-    switch = of_stream(found_in(gaps), "Switch")
-    life = next(life for life in switch.lives if life.algorithm == "Tired")
-    assert life.plasticity_ratio is life.learning_transfer is life.last_plasticity_ratio is None
-    assert switch.without_fresh == 5
+    assert (
+        streams.tables["stream_regret"][streams.tables["stream_regret"].algorithm == "Tired"]
+        .fresh.isna()
+        .all()
+    )
+    tired = found(streams, section="streams", class_name="Switch", algorithm="Tired")
+    assert tired["plasticity"].verdict == "unknown"
+    fresh = found(streams, section="streams", class_name="Switch")["fresh agents"]
+    assert fresh.value == 5
     text = text_of(analysed(gaps))
     for words in (
-        "its plasticity is unknown, since no life has all of its fresh agents",
+        "that of Tired is unknown, since no life has all of its fresh agents",
         "113 of 120 runs have finished",
         "Tired on phase 0 of Switch alone, run 0",
         "Stubborn on Switch, run 3: failed: ValueError: <b>bad</b>",
@@ -271,72 +281,65 @@ def test_what_is_missing_is_counted_and_leaves_plasticity_unknown(gaps):
 # Findings
 
 
-def test_findings_name_what_each_agent_was_made_to_do(study):
-    found = found_in(study)
-    related = of_stream(found, "Related")
-    assert (related.lives[0].algorithm, related.forgetting) == ("Tired", "forgets")
-    assert [rival.verdict for rival in related.rivals] == ["more", "more"]
-    for rival in related.rivals:
-        assert rival.low is not None
-        assert rival.high is not None
-        assert 0.0 < rival.low <= rival.change <= rival.high
-    switch = of_stream(found, "Switch")
-    assert (switch.lives[0].algorithm, switch.forgetting) == ("Forgetful", "forgets")
-    rivals = {rival.algorithm: rival.verdict for rival in switch.rivals}
-    assert rivals == {"Tired": "open", "Stubborn": "more"}
-    verdicts = {
-        life.algorithm: life.plasticity_ratio and life.plasticity_ratio.verdict
-        for life in switch.lives
-    }
-    assert verdicts == {"Forgetful": "open", "Tired": "above", "Stubborn": "above"}
-    tired = related.lives[0]  # more in each visit
-    assert tired.last_plasticity_ratio.value > tired.plasticity_ratio.value
-    changes = {(c.algorithm, c.metric): c for c in found.changes}
-    assert {change.class_name for change in found.changes} == {"Related"}  # not Cycle
-    assert all(change.related for change in found.changes)
-    assert changes["Forgetful", "forgetting"].verdict == "better"
-    assert changes["Forgetful", "plasticity_ratio"].verdict == "open"
+def test_findings_name_what_each_agent_was_made_to_do(streams):
+    rows = findings(streams)
+    related, switch = (
+        rows[(rows.section == "streams") & (rows.class_name == name)]
+        for name in ("Related", "Switch")
+    )
+    first, *_ = related.itertuples()
+    assert (first.algorithm, first.verdict) == ("Tired", "forgets")
+    assert first.sentence.startswith("In Related, Tired forgets most")
+    rivals = related[related.question == "forgets more"]
+    assert list(rivals.verdict) == ["more", "more"]
+    assert ((rivals.low > 0.0) & (rivals.low <= rivals.value) & (rivals.value <= rivals.high)).all()
+    first, *_ = switch.itertuples()
+    assert (first.algorithm, first.verdict) == ("Forgetful", "forgets")
+    rivals = switch[switch.question == "forgets more"]
+    assert list(rivals.verdict) == ["open", "more"]
+    assert ["Tired" in rivals.sentence.iloc[0], "Stubborn" in rivals.sentence.iloc[1]] == [True] * 2
+    plasticity = switch[switch.question == "plasticity"].set_index("algorithm")
+    verdicts = {"Forgetful": "open", "Tired": "above", "Stubborn": "above"}
+    assert plasticity.verdict.to_dict() == verdicts
+    changes = rows[rows.question == "change"]
+    assert set(changes.class_name) == {"Related"}  # not Cycle
+    assert "relatedness makes" in rows[rows.question == "relatedness"].sentence.iloc[0]
+    of_forgetful = changes[changes.algorithm == "Forgetful"]
+    for metric, verdict in (("forgetting", "better"), ("the plasticity ratio", "open")):
+        of_metric = of_forgetful.sentence.str.startswith(f"Forgetful: {metric} is ")
+        assert list(of_forgetful[of_metric].verdict) == [verdict]
 
 
 def changed(analysis, metric, ends, runs=5):
     """Tables with another IQM and interval of a metric, for all algorithms or by algorithm."""
-    rows = analysis.streams.metrics.copy()
+    rows = analysis.tables["stream_metrics"].copy()
     for name, each in (ends if isinstance(ends, dict) else dict.fromkeys(AGENTS, ends)).items():
         at = (rows.metric == metric) & (rows.algorithm == name)
         rows.loc[at, ["runs", "iqm", "low", "high"]] = runs, *each
-    streams = dataclasses.replace(analysis.streams, metrics=rows)
-    return dataclasses.replace(analysis, streams=streams)
-
-
-def worded(analysis):
-    """The findings, and their words on the page."""
-    found = findings(analysis).streams
-    assert found is not None
-    return found, text_of(analysis)
+    return finished.with_tables(analysis, stream_metrics=rows)
 
 
 def forgetting_of(analysis):
     """The verdict on forgetting, which is that on each of the streams, and the words."""
-    found, text = worded(analysis)
-    (verdict,) = {stream.forgetting for stream in found.streams}
-    return verdict, text
+    rows = findings(analysis)
+    (verdict,) = set(rows[rows.question == "forgets"].verdict)
+    return verdict, text_of(analysis)
 
 
 @pytest.mark.parametrize(
     ("interval", "verdict", "words"),
     [
         ((0.9, 0.8, 1.2), "open", "no loss of plasticity was shown"),
-        ((1.3, 1.1, 1.5), "above", "it loses plasticity"),
-        ((0.7, 0.5, 0.9), "below", "it learns more than a fresh agent"),
+        ((1.3, 1.1, 1.5), "above", "loses plasticity"),
+        ((0.7, 0.5, 0.9), "below", "learns more than a fresh agent"),
     ],
 )
 def test_plasticity_is_judged_by_the_interval_of_the_ratio_against_1(
-    study, interval, verdict, words
+    streams, interval, verdict, words
 ):
-    found, text = worded(changed(analysed(study), "plasticity_ratio", interval))
-    life = of_stream(found, "Switch").lives[0]
-    assert life.plasticity_ratio.verdict == verdict
-    assert f"Plasticity: {words}" in text
+    row = found(changed(streams, "plasticity_ratio", interval), class_name="Switch")["plasticity"]
+    assert row.verdict == verdict
+    assert words in row.sentence
 
 
 BELOW = (-0.2, -0.3, -0.1)
@@ -356,19 +359,19 @@ BELOW = (-0.2, -0.3, -0.1)
         ),
     ],
 )
-def test_forgetting_is_judged_by_its_interval_against_0(study, ends, verdict, words):
-    found, text = forgetting_of(changed(analysed(study), "forgetting", ends))
-    assert found == verdict
+def test_forgetting_is_judged_by_its_interval_against_0(streams, ends, verdict, words):
+    judged, text = forgetting_of(changed(streams, "forgetting", ends))
+    assert judged == verdict
     assert words in text
     if verdict == "forgets":
         assert "no algorithm" not in text
 
 
-def test_that_none_forgets_needs_enough_lives_of_agents_that_learnt(study):
-    verdict, text = forgetting_of(changed(analysed(study), "forgetting", BELOW, runs=2))
+def test_that_none_forgets_needs_enough_lives_of_agents_that_learnt(streams):
+    verdict, text = forgetting_of(changed(streams, "forgetting", BELOW, runs=2))
     assert verdict == "open"
     assert "no algorithm forgets" not in text
-    unlearnt = changed(analysed(study), "visited_regret", (0.97, 0.95, 0.99))
+    unlearnt = changed(streams, "visited_regret", (0.97, 0.95, 0.99))
     assert forgetting_of(changed(unlearnt, "forgetting", BELOW))[0] == "unlearnt"
     assert forgetting_of(changed(unlearnt, "forgetting", (0.2, 0.1, 0.3)))[0] == "forgets"
 
@@ -387,8 +390,8 @@ def test_the_report_of_streams_alone_is_whole_readable_and_the_same_each_time(
     assert "findings" not in page.ids
     for words in ("120 of 120 runs have finished", "In Related, Tired forgets most"):
         assert words in page.text
-    read = Findings.from_dict(read_json(tmp_path / "one" / "findings.json"), "findings.json")
-    assert [stream.class_name for stream in read.streams.streams] == [*STREAMS]
+    rows = read_json(tmp_path / "one" / "findings.json")["findings"]
+    assert [row["class_name"] for row in rows if row["question"] == "forgets"] == [*STREAMS]
     written = {path.stem for path in files if path.suffix == ".csv"}
     assert "stream_lives" in written
     assert "results" not in written
@@ -412,7 +415,7 @@ def assert_shown(streams, figures):
         titles = [axes.get_title() for axes in figures[name].axes if axes.get_title()]
         assert titles == [*AGENTS]
     first = figures["stream-retention-Switch"].axes[0].images[0].get_array()
-    rows = within(streams.matrices, class_name="Switch", algorithm="Forgetful")
+    rows = within(streams.tables["stream_matrices"], class_name="Switch", algorithm="Forgetful")
     np.testing.assert_allclose(np.ravel(first), rows.iqm)
 
 
@@ -425,8 +428,8 @@ def test_a_life_of_one_visit_is_compared_with_no_fresh_agent(tmp_path):
     lives = studies.load_streams(tmp_path).lives
     assert set(lives[lives.class_name == "drift"].fresh_agents) == {0}
     assert lives.plasticity_ratio.isna().all()
-    found, text = worded(analysed(tmp_path))
-    assert {stream.without_fresh for stream in found.streams} == {0}
+    text = text_of(analysed(tmp_path))
+    assert "fresh agents" not in found(analysed(tmp_path))
     assert "Plasticity: a life of one visit is a fresh agent itself" in text
     assert "no life has all of its fresh agents" not in text
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sme_registry.studies.report.analysis import Analysis
-from sme_registry.studies.report.figures import comparisons, curves, differences, maps, streams
+from sme_registry.studies.report.figures import comparisons, curves, maps, streams
 from sme_registry.studies.report.figures.panels import Picture
 
 __all__ = ["Picture", "draw_figures"]
@@ -50,15 +50,15 @@ def _draw_tasks(
         *comparisons.draw_aggregates(analysis, formats),
         *curves.draw_profiles(analysis, formats),
         *comparisons.draw_improvements(analysis, formats),
-        *differences.draw_differences(analysis, formats),
-        *differences.draw_class_curves(analysis, formats),
+        *comparisons.draw_differences(analysis, formats),
+        *curves.draw_class_curves(analysis, formats),
         *curves.draw_learning_curves(analysis, formats),
         *([plane] if isinstance(plane, Picture) else ()),
         *curves.draw_offline(analysis, formats),
     ]
-    if not analysis.levels.empty and analysis.levels.runs.min() == 1:
+    if not analysis.tables["levels"].empty and analysis.tables["levels"].runs.min() == 1:
         pictures = [_with_single_runs(picture) for picture in pictures]
-    reasons = [reason for table, reason in _REASONS.items() if getattr(analysis, table).empty]
+    reasons = [reason for table, reason in _REASONS.items() if analysis.tables[table].empty]
     return pictures, reasons if isinstance(plane, Picture) else [*reasons, plane]
 
 

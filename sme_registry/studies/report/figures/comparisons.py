@@ -1,42 +1,36 @@
-"""Figures that compare classes or algorithms: contrasts, aggregates, improvements, decay."""
+"""Figures that compare classes or algorithms: contrasts, aggregates, improvements, differences."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
-from sme_registry.plots.style import GREY, drawing, legend_below, literal, wrapped
-from sme_registry.studies.report.analysis import Analysis
+from sme_registry.plots.style import GREY, drawing, legend_below, literal
+from sme_registry.studies.report.analysis import ENOUGH_RUNS, METRICS, Analysis
 from sme_registry.studies.report.classes import ALL
 from sme_registry.studies.report.figures import panels
-from sme_registry.studies.report.figures.panels import Grid, Look, Picture
+from sme_registry.studies.report.figures.panels import Column, Look, Picture, mark_rows
 from sme_registry.studies.report.frames import RUN
-from sme_registry.studies.report.tables import ENOUGH_RUNS, METRICS
-
-_LABELS = 2.4  # inches of the names of rows
 
 
 def draw_contrasts(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
     """The change that each class makes: of regret, and of metrics of training."""
+    sides = {1: "right", -1: "left"}
     for name, metrics in (("regret", METRICS[:3]), ("training", METRICS[3:])):
-        rows = analysis.contrasts[analysis.contrasts.metric.isin([m.key for m in metrics])]
+        rows = analysis.tables["contrasts"]
+        rows = rows[rows.metric.isin([m.key for m in metrics])]
         if rows.empty:
             continue
+        rows = rows.assign(place=rows.class_name, enough=rows.enough_pairs)
         looks = {a: look for a, look in panels.looks(analysis).items() if a in set(rows.algorithm)}
-        place = class_places(analysis, set(rows.class_name))
-        height = 1.15 + (0.07 * len(looks) + 0.09) * max(5.0, max(place.values()) + 1)
-        with panels.panel_grid(len(metrics), formats, (0.0, height)) as grid:
-            if name == "regret":  # WD and OOD, of one unit and size
-                grid.panels[1].sharex(grid.panels[0])
-            for axes, metric in zip(grid.panels, metrics, strict=True):
-                selected = rows[rows.metric == metric.key]
-                at, enough = selected.class_name.map(place), selected.enough_pairs
-                panels.marks_by_algorithm(axes, selected, "change", at, enough, looks)
-                axes.axvline(0.0, color="black", linewidth=0.9, zorder=1.5)
-                side = "right" if metric.worse > 0 else "left"
-                axes.set_xlabel(f"change of\n{metric.label}\n(worse to the {side})")
-                axes.locator_params(axis="x", nbins=15 // len(metrics))
-            name_rows(grid, place)
-            panels.legend(grid.figure, looks)
+        columns = [
+            Column(
+                rows[rows.metric == metric.key],
+                f"change of\n{metric.label}\n(worse to the {sides[metric.worse]})",
+                neutral=0.0,
+                ticks=15 // len(metrics),
+            )
+            for metric in metrics
+        ]
         labels = [metric.label.partition(",")[0] for metric in metrics]
         yield Picture(
             f"contrasts-{name}",
@@ -45,96 +39,123 @@ def draw_contrasts(analysis: Analysis, formats: Sequence[str]) -> Iterator[Pictu
             "class, each run compared with the run of the same number, with its 95 % bootstrap "
             f"interval. Hollow: fewer than {ENOUGH_RUNS} pairs, so that the interval is an "
             "indication only.",
-            grid.files,
-        )
+            mark_rows(
+                columns, "change", _class_places(analysis, set(rows.class_name)), looks, formats,
+                alike=2 if name == "regret" else 0,  # WD and OOD, of one unit and size
+            ),
+        )  # fmt: skip
 
 
 def draw_agents(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
     """Normalised regret of each agent of a team, WD and OOD side by side, one row an agent."""
-    if not analysis.has_teams:
+    rows = analysis.tables["agents"]
+    if rows.empty:
         return
-    rows = analysis.agents
-    names = rows.class_name + ", " + rows.agent
-    place: dict[str, float] = {}
-    for _, group in names.groupby(rows.class_name, sort=False):
-        begin = max(place.values(), default=-1.4) + 1.4
-        place |= {name: begin + i for i, name in enumerate(dict.fromkeys(group))}
-    looks = panels.looks(analysis)
-    height = 1.1 + (0.07 * len(looks) + 0.12) * max(4.0, max(place.values()) + 1)
-    with panels.panel_grid(2, formats, (0.0, height)) as grid:
-        for axes, (metric, heading) in zip(grid.panels, panels.HEADINGS.items(), strict=True):
-            selected = rows[rows.metric == metric]
-            at, enough = names[selected.index].map(place), selected.runs >= ENOUGH_RUNS
-            panels.marks_by_algorithm(axes, selected, "iqm", at, enough, looks)
-            axes.set_title(heading, fontsize=9)
-            axes.set_xlabel("normalised regret")
-        name_rows(grid, place)
-        panels.legend(grid.figure, looks)
+    rows = rows.assign(place=rows.class_name + ", " + rows.agent, enough=rows.runs >= ENOUGH_RUNS)
+    places: dict[str, float] = {}
+    for _, group in rows.groupby("class_name", sort=False):
+        begin = max(places.values(), default=-1.4) + 1.4
+        places |= {name: begin + i for i, name in enumerate(dict.fromkeys(group.place))}
+    columns = [
+        Column(rows[rows.metric == metric], "normalised regret", heading)
+        for metric, heading in panels.HEADINGS.items()
+    ]
     yield Picture(
         "agents",
         "Normalised regret of each agent",
         "IQM over runs with its 95 % bootstrap interval, over the action channels that the agent "
         f"owns: 0 is the optimum, 1 the constant ½. Hollow: fewer than {ENOUGH_RUNS} runs.",
-        grid.files,
+        mark_rows(columns, "iqm", places, panels.looks(analysis), formats),
     )
 
 
 def draw_aggregates(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
     """The IQM of 1 − normalised regret, WD and OOD side by side, one row a group of classes."""
-    rows = analysis.aggregates[analysis.aggregates.statistic == "iqm"]
+    rows = analysis.tables["aggregates"]
+    rows = rows[rows.statistic == "iqm"]
     if rows.empty:
         return
-    place = _places(rows.group)
-    looks = panels.looks(analysis)
-    height = 1.1 + (0.09 * len(looks) + 0.1) * max(2, len(place))
-    with panels.panel_grid(2, formats, (0.0, height), share_x=True) as grid:
-        for axes, (metric, heading) in zip(grid.panels, panels.HEADINGS.items(), strict=True):
-            selected = rows[rows.metric == metric]
-            at, enough = selected.group.map(place), selected.fewest_runs >= ENOUGH_RUNS
-            panels.marks_by_algorithm(axes, selected, "value", at, enough, looks)
-            axes.set_title(heading, fontsize=9)
-            axes.set_xlabel("IQM of 1 − normalised regret")
-        name_rows(grid, place)
-        panels.legend(grid.figure, looks)
+    rows = rows.assign(place=rows.group, enough=rows.fewest_runs >= ENOUGH_RUNS)
+    columns = [
+        Column(rows[rows.metric == metric], "IQM of 1 − normalised regret", heading)
+        for metric, heading in panels.HEADINGS.items()
+    ]
     yield Picture(
         "aggregates",
         "Aggregates over kinds of tasks",
         "Mean over classes of the IQM over runs, with its 95 % stratified bootstrap interval: "
         "1 is the optimum, 0 the constant ½. The classes of an axis include the first class.",
-        grid.files,
-    )
+        mark_rows(
+            columns, "value", _places(rows.place), panels.looks(analysis), formats, alike=2
+        ),
+    )  # fmt: skip
 
 
 def draw_improvements(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
     """How probably one algorithm beats another, WD and OOD side by side, one row a pair."""
-    rows = analysis.improvements[analysis.improvements.group == ALL]
+    rows = analysis.tables["improvements"]
+    rows = rows[rows.group == ALL]
     if rows.empty:
         return
-    pairs = rows["first"] + " over " + rows["second"]
-    place = _places(pairs)
-    with panels.panel_grid(2, formats, (1.0, 0.26 * max(3, len(place)))) as grid:
-        for axes, (metric, heading) in zip(grid.panels, panels.HEADINGS.items(), strict=True):
-            selected = rows[rows.metric == metric]
-            at, enough = pairs[selected.index].map(place), selected.fewest_runs >= ENOUGH_RUNS
-            panels.marks(axes, selected, "probability", at, enough, Look("black", "o", "-"))
-            axes.axvline(0.5, color=GREY, linewidth=1.0, zorder=1.5)
-            axes.set_xlim(-0.02, 1.02)
-            axes.set_title(heading, fontsize=9)
-            axes.set_xlabel("P(a run of X beats a run of Y)")
-        name_rows(grid, place, shaded=False)
+    rows = rows.assign(
+        place=rows["first"] + " over " + rows["second"],
+        enough=rows.fewest_runs >= ENOUGH_RUNS,
+        algorithm="",
+    )
+    columns = [
+        Column(
+            rows[rows.metric == metric], "P(a run of X beats a run of Y)", heading, neutral=0.5,
+            limits=(-0.02, 1.02),
+        )
+        for metric, heading in panels.HEADINGS.items()
+    ]  # fmt: skip
     caption = (
         "How probably a run of the first algorithm beats a run of the second on a class drawn at "
         "random, with its 95 % interval: ½ where neither is better."
     )
-    if analysis.has_offline_runs:
+    if not analysis.tables["offline"].empty:
         caption += " Algorithms that learnt from different data are not compared."
-    yield Picture("improvements", "Probability of improvement", caption, grid.files)
+    looks = {"": Look("black", "o", "-")}
+    files = mark_rows(
+        columns, "probability", _places(rows.place), looks, formats, shaded=False
+    )  # fmt: skip
+    yield Picture("improvements", "Probability of improvement", caption, files)
+
+
+def draw_differences(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
+    """The paired difference of each algorithm from the first one, one row a class."""
+    drawn, first = METRICS[:2], analysis.algorithms[0]
+    rows = analysis.tables["differences"]
+    rows = rows[(rows["first"] == first) & rows.metric.isin([metric.key for metric in drawn])]
+    rows = rows.assign(algorithm=rows.second, place=rows.class_name, enough=rows.enough_pairs)
+    looks = {a: look for a, look in panels.looks(analysis).items() if a in set(rows.second)}
+    if not looks:
+        return
+    places = _class_places(analysis, set(rows.class_name))
+    if ALL in set(rows.class_name):
+        places[ALL] = max(places.values()) + 1.4
+    alone = next(iter(looks)) if len(looks) == 1 else ""
+    label = (
+        f"{literal(first)} − {literal(alone) or 'the other'}\n(left: {literal(first)} is better)"
+    )
+    columns = [
+        Column(rows[rows.metric == metric.key], label, metric.label, neutral=0.0, ticks=6)
+        for metric in drawn
+    ]
+    yield Picture(
+        "differences",
+        f"Paired differences from {first}",
+        f"IQM over pairs of runs of the difference {first} minus {alone or 'the other algorithm'}, "
+        "with its 95 % bootstrap interval. The runs of a pair have the same instance and seed. "
+        f"Hollow: fewer than {ENOUGH_RUNS} pairs, so that the interval is an indication only.",
+        mark_rows(columns, "difference", places, looks, formats, alike=2),
+    )
 
 
 def draw_decay(analysis: Analysis, formats: Sequence[str]) -> Picture:
     """What each run loses out of distribution, against its similarity within; one mark a run."""
-    inside = analysis.results.drop_duplicates(RUN, keep="first")
-    outside = analysis.results.drop_duplicates(RUN, keep="last")
+    inside = analysis.tables["results"].drop_duplicates(RUN, keep="first")
+    outside = analysis.tables["results"].drop_duplicates(RUN, keep="last")
     loss = outside.similarity_loss.to_numpy()
     with drawing((4.8, 3.5), formats) as (figure, files):
         axes = figure.add_subplot()
@@ -166,7 +187,7 @@ def _places(names: Iterable[str]) -> dict[str, float]:
     return {name: float(i) for i, name in enumerate(dict.fromkeys(names))}
 
 
-def class_places(analysis: Analysis, present: set[str]) -> dict[str, float]:
+def _class_places(analysis: Analysis, present: set[str]) -> dict[str, float]:
     """The height of each class's row, with a gap between axes."""
     places: dict[str, float] = {}
     y, last = -1.0, None
@@ -175,18 +196,3 @@ def class_places(analysis: Analysis, present: set[str]) -> dict[str, float]:
             y += 1.0 if last in (None, info.axis) else 1.4
             places[info.name], last = y, info.axis
     return places
-
-
-def name_rows(grid: Grid, places: Mapping[str, float], *, shaded: bool = True) -> None:
-    """Rows of marks from top to bottom, on light bands instead of grid lines."""
-    for axes in grid.panels:
-        axes.grid(visible=False, axis="y")
-        axes.tick_params(axis="y", length=0)
-        for y in places.values() if shaded else ():
-            axes.axhspan(y - 0.42, y + 0.42, color="#f4f4f4", zorder=0.5, linewidth=0)
-    first = grid.panels[0]
-    labels = [wrapped(literal(name), _LABELS) for name in places]
-    first.set_yticks([*places.values()], labels, fontsize=8)
-    more = max(label.count("\n") for label in labels)
-    grid.figure.set_figheight(grid.figure.get_figheight() + 0.13 * more * len(labels))
-    first.set_ylim(max(places.values()) + 0.6, -0.6)

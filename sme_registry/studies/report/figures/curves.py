@@ -10,13 +10,11 @@ from typing import Any
 import pandas as pd
 
 from sme_registry.plots.style import GREY, literal, shades
-from sme_registry.studies.report.analysis import Analysis
+from sme_registry.studies.report.analysis import CURVES, ENOUGH_RUNS, Analysis
 from sme_registry.studies.report.classes import SEVERAL, Group, axis_values, setting_label
 from sme_registry.studies.report.figures import panels
-from sme_registry.studies.report.figures.panels import CONSTANT, LINEAR, Look, Picture
-from sme_registry.studies.report.figures.scale import Scale
-from sme_registry.studies.report.offline_tables import OFFLINE_INTERVAL
-from sme_registry.studies.report.tables import CURVES, ENOUGH_RUNS, training_data
+from sme_registry.studies.report.figures.panels import CONSTANT, LINEAR, Look, Picture, Scale
+from sme_registry.studies.report.tables import OFFLINE_INTERVAL, training_data
 
 _OFFLINE_DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1, 1, 1)), (0, (8, 2)))
 _BEHAVIOUR = Look("black", "", "-")
@@ -84,7 +82,7 @@ def _draw_axis(
     values = axis_values(group.axis, [analysis.classes[name] for name in group.classes])
     scale = Scale.of(values, len(group.classes))
     x = dict(zip(group.classes, scale.at, strict=True))
-    levels = analysis.levels[analysis.levels.metric == metric]
+    levels = analysis.tables["levels"][analysis.tables["levels"].metric == metric]
     levels = levels[levels.class_name.isin(x)]
     levels = levels.sort_values("class_name", key=lambda names: names.map(x), kind="stable")
     at = levels.class_name.map(x)
@@ -107,7 +105,7 @@ def _draw_axis(
 def draw_profiles(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
     """The share of runs above each value of 1 − normalised regret, one panel a group of classes."""
     looks = panels.looks(analysis)
-    for metric, rows in analysis.profiles.groupby("metric", sort=False):
+    for metric, rows in analysis.tables["profiles"].groupby("metric", sort=False):
         groups = list(dict.fromkeys(rows.group))
         with panels.panel_grid(len(groups), formats, (0.7, 2.1), share_x=True) as grid:
             for axes, group in zip(grid.panels, groups, strict=True):
@@ -134,7 +132,7 @@ def draw_learning_curves(analysis: Analysis, formats: Sequence[str]) -> Iterator
     """One figure an axis: algorithms as panels, the values of the axis as lines."""
     data = training_data(analysis.runs)
     for group in _axis_groups(analysis):
-        rows = analysis.learning_curves
+        rows = analysis.tables["learning_curves"]
         rows = rows[rows.class_name.isin(group.classes)]
         names = [name for name in analysis.learners if name in set(rows.algorithm)]
         if not names:
@@ -147,7 +145,7 @@ def draw_learning_curves(analysis: Analysis, formats: Sequence[str]) -> Iterator
             for stack, name in zip(grid.stacks, names, strict=True):
                 for axes, measure in zip(stack, CURVES, strict=True):
                     selected = rows[(rows.algorithm == name) & (rows.measure == measure)]
-                    _draw_classes(axes, selected, looks)
+                    draw_lines(axes, selected, "class_name", looks)
                 stack[0].set_title(literal(name))
                 stack[-1].set_xlabel(f"{'gradient' if data[name] else 'environment'} steps")
                 stack[-1].set_xlim(left=0)
@@ -173,22 +171,53 @@ def curves_caption(rows: pd.DataFrame) -> str:
     return f"Median over runs, with the interquartile range as a band{smoothed}."
 
 
-def _draw_classes(axes: Any, rows: pd.DataFrame, looks: Mapping[str, Look]) -> None:
-    """The curves of one algorithm and measure, one a class; markers do not coincide."""
-    curves = dict(iter(rows.groupby("class_name")))
+def draw_class_curves(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
+    """Learning curves with a panel for each class and all algorithms in it."""
+    rows = analysis.tables["learning_curves"]
+    rows = rows[(rows.measure == "regret") & rows.algorithm.isin(analysis.learners)]
+    classes = list(dict.fromkeys(rows.class_name))
+    looks = {a: look for a, look in panels.looks(analysis).items() if a in set(rows.algorithm)}
+    if len(looks) < 2:
+        return
+    with panels.panel_grid(len(classes), formats, (0.8, 1.9)) as grid:
+        for axes, class_name in zip(grid.panels, classes, strict=True):
+            draw_lines(axes, rows[rows.class_name == class_name], "algorithm", looks)
+            info = analysis.classes[class_name]
+            axes.set_title(literal(f"{class_name} ({info.label})" if info.label else class_name))
+            axes.title.set_fontsize(9)
+            axes.set_xlim(left=0)
+            axes.locator_params(axis="x", nbins=4)
+            axes.xaxis.set_major_formatter(step_text)
+            axes.set_xlabel("steps")
+        grid.label_rows(CURVES["regret"])
+        panels.legend(grid.figure, looks)
+    yield Picture(
+        "learning-curves-by-class",
+        "Learning curves of all algorithms by class",
+        f"{curves_caption(rows)} Mean exact regret per step, 0 for the optimum.",
+        grid.files,
+    )
+
+
+def draw_lines(
+    axes: Any, rows: pd.DataFrame, by: str, looks: Mapping[str, Look], x: str = "step"
+) -> None:
+    """The median and quartiles of each algorithm or class along x; markers do not coincide."""
     for index, (name, look) in enumerate(looks.items()):
-        if name in curves:
-            curve = curves[name][["step", "q25", "median", "q75"]]
+        curve = rows[rows[by] == name][[x, "q25", "median", "q75"]]
+        if not curve.empty:
             every = max(1, len(curve) // 6)
             line_with_band(axes, curve, look, (index * every // len(looks), every))
 
 
 def draw_offline(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
     """The improvement of offline learners over the behaviour policy, one panel a class."""
-    if not analysis.has_offline_runs:
+    if analysis.tables["offline"].empty:
         return
-    classes = list(dict.fromkeys(analysis.offline.class_name))
-    looks = panels.numbered_looks(dict.fromkeys(analysis.offline.learner), dashes=_OFFLINE_DASHES)
+    classes = list(dict.fromkeys(analysis.tables["offline"].class_name))
+    looks = panels.numbered_looks(
+        dict.fromkeys(analysis.tables["offline"].learner), dashes=_OFFLINE_DASHES
+    )
     across = min(3, len(classes))
     width = max(3.6, min(panels.WIDTH, 1.0 + 2.4 * across))
     with panels.panel_grid(len(classes), formats, (0.9, 2.4), width=width, share_x=True) as grid:
@@ -207,14 +236,14 @@ def draw_offline(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture
 def _draw_improvements(
     axes: Any, analysis: Analysis, class_name: str, looks: Mapping[str, Look]
 ) -> None:
-    rows = analysis.offline[analysis.offline.class_name == class_name]
+    rows = analysis.tables["offline"][analysis.tables["offline"].class_name == class_name]
     runs = analysis.offline_runs[analysis.offline_runs.class_name == class_name]
     data = rows.drop_duplicates("nu")
     axes.axhline(0.0, color="black", linewidth=0.9, zorder=1.5)
     for look, similarity in ((_OPTIMUM, 1.0), (CONSTANT, data.constant_similarity)):
         height = similarity - data.behaviour_similarity
         axes.plot(data.nu, height, **look.line, linewidth=1.1, zorder=1.6)
-    nus = sorted(set(analysis.offline.nu))
+    nus = sorted(set(analysis.tables["offline"].nu))
     apart = min((b - a for a, b in itertools.pairwise(nus)), default=1.0)
     for name, look, shift in panels.side_by_side(looks, 0.25 * apart):
         selected, each = rows[rows.learner == name], runs[runs.learner == name]
@@ -228,12 +257,12 @@ def _draw_improvements(
 
 
 def _offline_caption(analysis: Analysis) -> str:
-    few = analysis.offline.runs.min()
+    few = analysis.tables["offline"].runs.min()
     caption = (
         "A small mark is a run, a large one the mean over runs: similarity of the learner minus "
         "that of the policy that made its data."
     )
-    if not analysis.offline.low.isna().all():
+    if not analysis.tables["offline"].low.isna().all():
         caption += " Bars are 95 % bootstrap intervals of the mean."
     if few < OFFLINE_INTERVAL:
         caption += f" With fewer than {OFFLINE_INTERVAL} runs there is no interval."

@@ -19,10 +19,9 @@ from sme_registry.plots.maps import (
     similarity_on_grid,
 )
 from sme_registry.plots.style import drawing, literal, wrapped
-from sme_registry.studies.report.analysis import Analysis
+from sme_registry.studies.report.analysis import Analysis, by_place
 from sme_registry.studies.report.figures import panels
 from sme_registry.studies.report.figures.panels import WIDTH, Picture, panel_grid
-from sme_registry.studies.report.tables import by_place
 
 _EPSILON, _RESOLUTION, _TIME = 1.0, 120, 0.5
 _BOX = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
@@ -31,7 +30,7 @@ _LUMINANCE = (0.299, 0.587, 0.114)  # of red, green and blue
 
 def draw_regions(analysis: Analysis, formats: Sequence[str]) -> Picture:
     """Similarity of every algorithm on every class in every region: one heat map an algorithm."""
-    rows = analysis.regions
+    rows = analysis.tables["regions"]
     regions = list(dict.fromkeys(rows.region))
     classes = [name for name in analysis.classes if name in set(rows.class_name)]
     heights = 0.75, 0.62 + 0.2 * len(classes)
@@ -81,7 +80,7 @@ def draw_maps(
     analysis: Analysis, formats: Sequence[str], models: Mapping[str, Path]
 ) -> Picture | str:
     """One map a class and algorithm whose models were kept, or the reason why there is none."""
-    inside = analysis.results[analysis.results.region == "WD"]
+    inside = analysis.tables["results"][analysis.tables["results"].region == "WD"]
     single = [name for name, info in analysis.classes.items() if info.setting["team"] == "none"]
     plane = inside[(inside.state_dim == 2) & inside.class_name.isin(single)]
     if plane.empty:

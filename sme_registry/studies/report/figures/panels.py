@@ -1,4 +1,9 @@
-"""What the figures share: a grid of panels, the look of each algorithm, marks, and the legend."""
+"""What the figures share: a grid of panels, the look of each algorithm, marks, and the scale.
+
+Values v₁ < … < vₙ are drawn on a logarithmic scale if all are above 0, n ≥ 3, and their logarithms
+are spaced more evenly than they are themselves: cv(log vᵢ₊₁ − log vᵢ) < cv(vᵢ₊₁ − vᵢ), with cv the
+standard deviation over the mean. So 1, 2, 5, 10 and 2, 4, 8 are, and 0.25, 0.5, 0.75 are not.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +11,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -23,11 +28,13 @@ from sme_registry.plots.style import (
     wrapped,
 )
 from sme_registry.studies.report.analysis import Analysis
+from sme_registry.studies.report.classes import is_numeric
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_LABELS = 2.4  # inches of the names of rows
 WIDTH = 7.2  # inches: of a page, so that 9 points stay 9 points
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (8, 2)))
 HEADINGS = {"wd_regret": "within distribution (WD)", "ood_regret": "out of distribution (OOD)"}
@@ -223,3 +230,119 @@ def legend(figure: Figure, looks: Mapping[str, Look], across: int = 6) -> None:
         for name, look in looks.items()
     ]  # fmt: skip
     legend_below(figure, handles, across)
+
+
+class Column(NamedTuple):
+    """A panel of a figure whose rows of marks have names.
+
+    `rows` has, beside the marks, the columns `place` (the row's name) and `enough` (filled marks).
+    """
+
+    rows: pd.DataFrame
+    label: str
+    title: str = ""
+    neutral: float | None = None
+    ticks: int | None = None
+    limits: tuple[float, float] | None = None
+
+
+def mark_rows(
+    columns: Sequence[Column],
+    value: str,
+    places: Mapping[str, float],
+    looks: Mapping[str, Look],
+    formats: Sequence[str],
+    *,
+    alike: int = 0,
+    most_across: int = 3,
+    shaded: bool = True,
+) -> Mapping[str, bytes]:
+    """A figure with a named row of marks at the height of each place; its first panels share x.
+
+    `alike` is how many do. There is a legend if algorithms have names.
+    """
+    height = 1.3 + (0.09 * len(looks) + 0.12) * max(4.0, max(places.values()) + 1)
+    with panel_grid(len(columns), formats, (0.0, height), most_across=most_across) as grid:
+        for axes in grid.panels[1:alike]:
+            axes.sharex(grid.panels[0])
+        for axes, column in zip(grid.panels, columns, strict=True):
+            at, filled = column.rows.place.map(places), column.rows.enough
+            marks_by_algorithm(axes, column.rows, value, at, filled, looks)
+            if column.neutral is not None:
+                axes.axvline(column.neutral, color="black", linewidth=0.9, zorder=1.5)
+            if column.limits is not None:
+                axes.set_xlim(*column.limits)
+            axes.set_title(column.title, fontsize=9)
+            axes.set_xlabel(column.label)
+            if column.ticks is not None:
+                axes.locator_params(axis="x", nbins=column.ticks)
+        _name_rows(grid, places, shaded=shaded)
+        if [*looks] != [""]:
+            legend(grid.figure, looks)
+    return grid.files
+
+
+def _name_rows(grid: Grid, places: Mapping[str, float], *, shaded: bool) -> None:
+    """Rows of marks from top to bottom, on light bands instead of grid lines."""
+    for axes in grid.panels:
+        axes.grid(visible=False, axis="y")
+        axes.tick_params(axis="y", length=0)
+        for y in places.values() if shaded else ():
+            axes.axhspan(y - 0.42, y + 0.42, color="#f4f4f4", zorder=0.5, linewidth=0)
+    first = grid.panels[0]
+    labels = [wrapped(literal(name), _LABELS) for name in places]
+    first.set_yticks([*places.values()], labels, fontsize=8)
+    more = max(label.count("\n") for label in labels)
+    grid.figure.set_figheight(grid.figure.get_figheight() + 0.13 * more * len(labels))
+    first.set_ylim(max(places.values()) + 0.6, -0.6)
+
+
+Spacing = Literal["linear", "log", "nominal"]
+
+
+def spacing(values: Sequence[Any]) -> Spacing:
+    """How values are spaced; nominal if they are no numbers in increasing order."""
+    if len(values) < 2 or not is_numeric(values) or min(np.diff(values)) <= 0:
+        return "nominal"
+    if len(values) < 3 or values[0] <= 0:
+        return "linear"
+    return "log" if _variation(np.log(values)) < _variation(np.asarray(values)) else "linear"
+
+
+@dataclass(frozen=True)
+class Scale:
+    """The places of classes along x."""
+
+    spacing: Spacing
+    at: tuple[float, ...]
+
+    @classmethod
+    def of(cls, values: Sequence[Any], classes: int) -> Scale:
+        """The scale of an axis' values; `classes` in all, which may have no values."""
+        kind = spacing(values)
+        places = range(classes) if kind == "nominal" else values
+        return cls(kind, tuple(float(place) for place in places))
+
+    def shifted(self, x: Any, shift: float) -> Any:
+        """Places moved by a share of the smallest distance between two classes."""
+        if self.spacing == "log":
+            return x * np.exp(shift * np.diff(np.log(self.at)).min())
+        distance = np.diff(self.at).min() if len(self.at) > 1 else 1.0
+        return x + shift * distance
+
+    def apply(self, axes: Any, labels: Sequence[str]) -> None:
+        """Give an axes this scale, with a tick at each class."""
+        if self.spacing == "log":
+            axes.set_xscale("log")
+            axes.minorticks_off()
+        crowded = len(labels) > 7 or max(map(len, labels)) > 12 or self.spacing == "nominal"
+        long = crowded and max(map(len, labels)) > 4
+        turned = {"rotation": 30, "ha": "right", "fontsize": 8} if long else {}
+        axes.set_xticks(self.at, labels, **turned)
+        axes.set_xlim(self.shifted(self.at[0], -0.5), self.shifted(self.at[-1], 0.5))
+
+
+def _variation(values: Any) -> float:
+    """The coefficient of variation of the distances between values; dimensionless."""
+    distances = np.diff(values)
+    return float(distances.std() / distances.mean())

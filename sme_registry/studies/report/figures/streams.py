@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-import pandas as pd
-
 from sme_registry.evaluation.retention import LABELS
 from sme_registry.evaluation.stream_report import Visit
 from sme_registry.plots.streams import (
@@ -17,15 +15,12 @@ from sme_registry.plots.streams import (
     tick_visits,
 )
 from sme_registry.plots.style import GREY, legend_below, literal
-from sme_registry.studies.report.analysis import Analysis
+from sme_registry.studies.report.analysis import CURVES, ENOUGH_RUNS, Analysis
 from sme_registry.studies.report.figures import panels
-from sme_registry.studies.report.figures.comparisons import name_rows
-from sme_registry.studies.report.figures.curves import curves_caption, line_with_band, step_text
+from sme_registry.studies.report.figures.curves import curves_caption, draw_lines, step_text
 from sme_registry.studies.report.figures.panels import CONSTANT, Look, Picture
-from sme_registry.studies.report.streams.analysis import StreamAnalysis
-from sme_registry.studies.report.streams.tables import METRICS, WITHIN
-from sme_registry.studies.report.tables import CURVES, ENOUGH_RUNS
-from sme_registry.studies.report.text import slug
+from sme_registry.studies.report.lives import METRICS, WITHIN
+from sme_registry.studies.report.texts import slug
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,68 +46,64 @@ _QUARTILES = "Median over lives, with the interquartile range as a band."
 
 def draw_streams(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
     """Every figure of the finished lives; none without one."""
-    streams = analysis.streams
-    if streams is None or not streams.lives:
+    if not analysis.lives:
         return
-    names = dict.fromkeys((*analysis.learners, *streams.algorithms))
-    looks = {a: look for a, look in panels.numbered_looks(names).items() if a in streams.algorithms}
-    yield _draw_metrics(streams, formats, looks)
-    yield _draw_regret(streams, formats, looks)
-    yield from _draw_plasticity(streams, formats, looks)
-    for name in _lived(streams):
-        yield _draw_retention(streams, formats, name)
-        yield _draw_performance(streams, formats, name)
-    yield from _draw_learning_curves(streams, formats, looks)
+    names = dict.fromkeys((*analysis.learners, *analysis.stream_algorithms))
+    present = analysis.stream_algorithms
+    looks = {a: look for a, look in panels.numbered_looks(names).items() if a in present}
+    yield _draw_metrics(analysis, formats, looks)
+    yield _draw_regret(analysis, formats, looks)
+    yield from _draw_plasticity(analysis, formats, looks)
+    for name in _lived(analysis):
+        yield _draw_retention(analysis, formats, name)
+        yield _draw_performance(analysis, formats, name)
+    yield from _draw_learning_curves(analysis, formats, looks)
 
 
-def _draw_metrics(
-    streams: StreamAnalysis, formats: Sequence[str], looks: Mapping[str, Look]
-) -> Picture:
+def _draw_metrics(analysis: Analysis, formats: Sequence[str], looks: Mapping[str, Look]) -> Picture:
     """The metrics of whole lives, one panel a metric and one row a stream."""
-    rows = streams.metrics[streams.metrics.region == WITHIN]
-    metrics = [m for m in METRICS if m.key in _SHOWN and m.key in set(rows.metric)]
-    place = {name: float(i) for i, name in enumerate(_lived(streams))}
-    height = 1.3 + (0.09 * len(looks) + 0.12) * max(3, len(place))
-    with panels.panel_grid(len(metrics), formats, (0.0, height), most_across=4) as grid:
-        for axes, metric in zip(grid.panels, metrics, strict=True):
-            selected = rows[rows.metric == metric.key]
-            at, enough = selected.class_name.map(place), selected.runs >= ENOUGH_RUNS
-            panels.marks_by_algorithm(axes, selected, "iqm", at, enough, looks)
-            axes.axvline(_NEUTRAL.get(metric.key, 0.0), color="black", linewidth=0.9, zorder=1.5)
-            axes.set_xlabel(f"{metric.label}\n({'less' if metric.worse > 0 else 'more'} is better)")
-            axes.locator_params(axis="x", nbins=4)
-        name_rows(grid, place)
-        panels.legend(grid.figure, looks)
+    rows = analysis.tables["stream_metrics"]
+    rows = rows[rows.region == WITHIN]
+    rows = rows.assign(place=rows.class_name, enough=rows.runs >= ENOUGH_RUNS)
+    columns = [
+        panels.Column(
+            rows[rows.metric == metric.key],
+            f"{metric.label}\n({'less' if metric.worse > 0 else 'more'} is better)",
+            neutral=_NEUTRAL.get(metric.key, 0.0),
+            ticks=4,
+        )
+        for metric in METRICS
+        if metric.key in _SHOWN and metric.key in set(rows.metric)
+    ]
+    places = {name: float(i) for i, name in enumerate(_lived(analysis))}
     return Picture(
         "stream-metrics",
         "Performance, forgetting and plasticity of whole lives",
         f"{_INTERVAL} Black lines: the constant ½, no forgetting, and as good as a fresh agent.",
-        grid.files,
+        panels.mark_rows(columns, "iqm", places, looks, formats, most_across=4),
     )
 
 
-def _draw_regret(
-    streams: StreamAnalysis, formats: Sequence[str], looks: Mapping[str, Look]
-) -> Picture:
+def _draw_regret(analysis: Analysis, formats: Sequence[str], looks: Mapping[str, Look]) -> Picture:
     """The dynamic regret over the lifetime, one panel a stream."""
     looks = {algorithm: look._replace(dash="-") for algorithm, look in looks.items()}
-    references = streams.reference_regret
-    with panels.panel_grid(len(_lived(streams)), formats, _HEIGHTS) as grid:
-        for axes, name in zip(grid.panels, _lived(streams), strict=True):
-            rows = streams.regret[streams.regret.class_name == name]
+    regret, references = (analysis.tables[f"stream_{n}"] for n in ("regret", "reference_regret"))
+    with panels.panel_grid(len(_lived(analysis)), formats, _HEIGHTS) as grid:
+        for axes, name in zip(grid.panels, _lived(analysis), strict=True):
+            rows = regret[regret.class_name == name]
             for algorithm, look in looks.items():
                 curve = rows[rows.algorithm == algorithm]
                 for column, (_, beside) in _BESIDE.items():
                     line = look._replace(marker="", dash=beside.dash).line
                     axes.plot(curve.lifetime, curve[column], **line, linewidth=1.1, zorder=2.5)
-            _draw_lines(axes, rows, "lifetime", looks)
+            draw_lines(axes, rows, "algorithm", looks, "lifetime")
             for reference, curve in references[references.class_name == name].groupby("reference"):
                 look = _REFERENCES[str(reference)]
                 axes.plot(curve.lifetime, curve["median"], **look.line, linewidth=1.1, zorder=1.5)
-            _finish_lifetime(axes, streams, name)
+            _finish_lifetime(axes, analysis, name)
             axes.yaxis.set_major_formatter(step_text)
         grid.label_rows("dynamic regret  (Σ of 1 − r)")
-        known = {column for column in _BESIDE if streams.regret[column].notna().any()}
+        known = {column for column in _BESIDE if regret[column].notna().any()}
         beside_looks = dict(_BESIDE[column] for column in _BESIDE if column in known)
         drawn = {LABELS[name]: look for name, look in _REFERENCES.items()
                  if name in set(references.reference)}  # fmt: skip
@@ -135,12 +126,12 @@ def _draw_regret(
 
 
 def _draw_plasticity(
-    streams: StreamAnalysis, formats: Sequence[str], looks: Mapping[str, Look]
+    analysis: Analysis, formats: Sequence[str], looks: Mapping[str, Look]
 ) -> Iterator[Picture]:
     """The plasticity ratio by visit, one panel a stream."""
-    rows = streams.visit_metrics
+    rows = analysis.tables["stream_visit_metrics"]
     rows = rows[(rows.region == WITHIN) & (rows.metric == "plasticity_ratio")]
-    names = [name for name in _lived(streams) if name in set(rows.class_name)]
+    names = [name for name in _lived(analysis) if name in set(rows.class_name)]
     if not names:
         return
     with panels.panel_grid(len(names), formats, _HEIGHTS) as grid:
@@ -153,7 +144,7 @@ def _draw_plasticity(
                     axes, own, "iqm", own.visit + shift, enough, look, upright=True, joined=True
                 )
             axes.axhline(1.0, color="black", linewidth=0.9, zorder=1.5)
-            tick_visits(axes, _visits(streams, name))
+            tick_visits(axes, _visits(analysis, name))
             axes.set_xlabel("visit of phase")
             axes.set_title(literal(name))
         grid.label_rows("plasticity ratio")
@@ -168,12 +159,14 @@ def _draw_plasticity(
     )
 
 
-def _draw_retention(streams: StreamAnalysis, formats: Sequence[str], name: str) -> Picture:
+def _draw_retention(analysis: Analysis, formats: Sequence[str], name: str) -> Picture:
     """The retention matrices of one stream, one panel an algorithm."""
-    rows = streams.matrices
+    rows = analysis.tables["stream_matrices"]
     rows = rows[(rows.region == WITHIN) & (rows.class_name == name)]
-    names = [algorithm for algorithm in streams.algorithms if algorithm in set(rows.algorithm)]
-    visits, top = _visits(streams, name), max(1.0, rows.iqm.max())
+    names = [
+        algorithm for algorithm in analysis.stream_algorithms if algorithm in set(rows.algorithm)
+    ]
+    visits, top = _visits(analysis, name), max(1.0, rows.iqm.max())
     initial = int(rows.visit.isna().any())
     labels = [*["initial"] * initial, *(f"visit {visit.visit}" for visit in visits)]
     visited = [(visit.visit + initial, visit.phase) for visit in visits]
@@ -202,12 +195,12 @@ def _draw_retention(streams: StreamAnalysis, formats: Sequence[str], name: str) 
     )
 
 
-def _draw_performance(streams: StreamAnalysis, formats: Sequence[str], name: str) -> Picture:
+def _draw_performance(analysis: Analysis, formats: Sequence[str], name: str) -> Picture:
     """Performance on each phase over the visits of one stream, one panel an algorithm."""
     reports = {
-        algorithm: [life.report for life in streams.lives
+        algorithm: [life.report for life in analysis.lives
                     if (life.planned.class_name, life.planned.algorithm) == (name, algorithm)]
-        for algorithm in streams.algorithms
+        for algorithm in analysis.stream_algorithms
     }  # fmt: skip
     reports = {algorithm: each for algorithm, each in reports.items() if each}
     with panels.panel_grid(len(reports), formats, (0.9, 2.4), share_x=True) as grid:
@@ -229,17 +222,18 @@ def _draw_performance(streams: StreamAnalysis, formats: Sequence[str], name: str
 
 
 def _draw_learning_curves(
-    streams: StreamAnalysis, formats: Sequence[str], looks: Mapping[str, Look]
+    analysis: Analysis, formats: Sequence[str], looks: Mapping[str, Look]
 ) -> Iterator[Picture]:
     """Regret per step over the lifetime, evaluated on the task in force, one panel a stream."""
-    rows = streams.learning_curves[streams.learning_curves.measure == _MEASURE]
-    names = [name for name in _lived(streams) if name in set(rows.class_name)]
+    rows = analysis.tables["stream_learning_curves"]
+    rows = rows[rows.measure == _MEASURE]
+    names = [name for name in _lived(analysis) if name in set(rows.class_name)]
     if not names:
         return
     with panels.panel_grid(len(names), formats, _HEIGHTS) as grid:
         for axes, name in zip(grid.panels, names, strict=True):
-            _draw_lines(axes, rows[rows.class_name == name], "step", looks)
-            _finish_lifetime(axes, streams, name)
+            draw_lines(axes, rows[rows.class_name == name], "algorithm", looks)
+            _finish_lifetime(axes, analysis, name)
         grid.label_rows(CURVES[_MEASURE])
         panels.legend(grid.figure, looks)
     yield Picture(
@@ -251,18 +245,9 @@ def _draw_learning_curves(
     )
 
 
-def _draw_lines(axes: Axes, rows: pd.DataFrame, x: str, looks: Mapping[str, Look]) -> None:
-    """The median and quartiles of each algorithm along x."""
-    for index, (algorithm, look) in enumerate(looks.items()):
-        curve = rows[rows.algorithm == algorithm][[x, "q25", "median", "q75"]]
-        if not curve.empty:
-            every = max(1, len(curve) // 6)
-            line_with_band(axes, curve, look, (index * every // len(looks), every))
-
-
-def _finish_lifetime(axes: Axes, streams: StreamAnalysis, name: str) -> None:
+def _finish_lifetime(axes: Axes, analysis: Analysis, name: str) -> None:
     """Visits as bands, the name of the stream above them, and ticks of steps."""
-    visits = _visits(streams, name)
+    visits = _visits(analysis, name)
     axes.set_xlim(0.0, visits[-1].lifetime)
     shade_visits(axes, visits)
     axes.set_title(literal(name), pad=14.0)
@@ -271,12 +256,12 @@ def _finish_lifetime(axes: Axes, streams: StreamAnalysis, name: str) -> None:
     axes.xaxis.set_major_formatter(step_text)
 
 
-def _lived(streams: StreamAnalysis) -> list[str]:
+def _lived(analysis: Analysis) -> list[str]:
     """The streams with a finished life, in the plan's order."""
-    present = {life.planned.class_name for life in streams.lives}
-    return [name for name in streams.classes if name in present]
+    present = {life.planned.class_name for life in analysis.lives}
+    return [name for name in analysis.streams if name in present]
 
 
-def _visits(streams: StreamAnalysis, name: str) -> Sequence[Visit]:
+def _visits(analysis: Analysis, name: str) -> Sequence[Visit]:
     """The visits of a stream's lives."""
-    return next(life.report.visits for life in streams.lives if life.planned.class_name == name)
+    return next(life.report.visits for life in analysis.lives if life.planned.class_name == name)

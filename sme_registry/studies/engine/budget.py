@@ -1,0 +1,279 @@
+"""How long a study will take, and plans that fit the time available.
+
+A cell takes, in seconds of one core, with P its steps (times the agents of a team), E its
+evaluations, T the horizon, N the states of its evaluation in and out of distribution, L the layers
+of the optimal policy:
+
+    start + P · step + E · T · batch step + N · (state + layer · (L − 1))
+
+A life in a stream takes the last term for each of its tasks at the end. In JAX it is a lane of a
+program of ten on a CPU, and a batch step takes more for each layer, too. Once cells have finished,
+the sum after `start` is multiplied by the median ratio of their measured to their estimated
+seconds, over cells of the same algorithm and setting, or else of the same algorithm.
+
+Budgets and algorithms are part of a cell's content, so a plan with others is another plan with its
+own digest and name. The selection of the cells to run now is not: `selected` works on any plan.
+"""
+
+from __future__ import annotations
+
+import heapq
+import statistics
+import time
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from fnmatch import fnmatchcase
+from typing import NamedTuple
+
+from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
+from sme_registry.io import choice
+from sme_registry.spec import Cell, PlannedCell, SMESpec, StudyFile, StudyPlan
+from sme_registry.spec.study import INDEPENDENT, JAX, OFFLINE, REFERENCE, in_jax
+from sme_registry.studies.engine.jobs import Job
+from sme_registry.studies.engine.result import CellResult
+from sme_registry.training.algorithms import AGENTS
+
+# Seconds of one training step with default hyperparameters: on a fast core, and the slowest
+# measured. Other algorithms may be as fast as PPO or as slow as SAC.
+SECONDS_PER_STEP = {
+    "PPO": (0.0006, 0.0013),
+    "A2C": (0.0006, 0.0013),
+    "TD3": (0.012, 0.021),
+    "DDPG": (0.012, 0.021),
+    "SAC": (0.013, 0.024),
+    "jax:PPO": (0.00002, 0.00006),
+    "jax:TD3": (0.006, 0.014),
+    "jax:SAC": (0.005, 0.013),
+    "offline:bc": (0.0015, 0.0030),
+    "offline:iql": (0.006, 0.0110),
+}
+_UNKNOWN = (SECONDS_PER_STEP["PPO"][0], SECONDS_PER_STEP["SAC"][1])
+_BATCH_STEP = (0.00006, 0.0005)  # one step of all episodes of an evaluation, which run as a batch
+_STATE = (1.5e-6, 3e-6)
+_LAYER = (1e-6, 3e-6)  # of π*, which is evaluated in every state
+_START = (1.5, 4.0)  # a process and its imports
+_START_IN_JAX = (0.4, 2.0)  # a tenth of them, and of compiling
+_BATCH_STEP_IN_JAX = (5e-7, 2e-6)
+_BATCH_LAYER_IN_JAX = (3.6e-6, 1.2e-5)
+_SHARE_FOR_A_PACE = 0.02  # of a job, before its pace is measured
+_LONGEST_NAME = 64
+_KINDS: dict[str, Callable[[PlannedCell], str]] = {
+    "class": lambda planned: planned.class_name,
+    "algorithm": lambda planned: planned.algorithm,
+}
+
+
+class Span(NamedTuple):
+    """Bounds in seconds; equal if they come from finished cells."""
+
+    low: float
+    high: float
+
+
+class Estimator:
+    """Estimates the seconds of cells; improves as cells finish."""
+
+    def __init__(self, finished: Iterable[CellResult] = ()) -> None:
+        self._ratios: dict[Hashable, list[float]] = defaultdict(list)
+        for result in finished:
+            self.observe(result)
+
+    def observe(self, result: CellResult, seconds: float | None = None) -> None:
+        """Learn from a finished cell, and from its wall time in seconds if that was measured."""
+        expected = _work(result.cell).low
+        if expected > 0 and result.timing.total > 0:
+            took = max(result.timing.total, (seconds or 0.0) - _start(result.cell).low)
+            ratio = took / expected
+            self._ratios[result.cell.uses].append(ratio)
+            self._ratios[result.cell.uses, _setting(result.cell)].append(ratio)
+
+    def knows(self, cell: Cell) -> bool:
+        """Whether a cell of the same algorithm has finished."""
+        return bool(self._ratios.get(cell.uses))
+
+    def seconds(self, cell: Cell) -> Span:
+        """Estimate the cell on one core."""
+        work = _work(cell)
+        ratios = self._ratios.get((cell.uses, _setting(cell))) or self._ratios.get(cell.uses)
+        start = _start(cell)
+        if ratios:
+            seconds = start.low + work.low * statistics.median(ratios)
+            return Span(seconds, seconds)
+        return Span(start.low + work.low, start.high + work.high)
+
+
+def makespan(seconds: Sequence[float], workers: int) -> float:
+    """Seconds to the end of jobs that are started in order, each by the first free worker."""
+    free = [0.0] * min(workers, len(seconds))
+    for job in seconds:
+        heapq.heapreplace(free, free[0] + job)
+    return max(free, default=0.0)
+
+
+class Paces:
+    """How far the running jobs of a study are, and how long all of it takes."""
+
+    def __init__(
+        self, finished: Iterable[CellResult], one_at_a_time: Callable[[Cell], bool]
+    ) -> None:
+        self._estimator, self._one_at_a_time = Estimator(finished), one_at_a_time
+        self._shares: dict[str, float] = {}  # of a running cell's steps, done
+        # Of each job, the first report after it last compiled: time, share, compilations.
+        self._first_reports: dict[str, tuple[float, float, int]] = {}
+        self._paces: dict[str, float] = {}  # measured by estimated seconds, of each algorithm
+
+    def observe(self, result: CellResult, seconds: float) -> None:
+        """Learn from a finished cell and its share of its job's wall time."""
+        self._estimator.observe(result, seconds)
+
+    def report(self, job: Job, share: float, compilations: int) -> None:
+        """A job has done this share of its steps."""
+        first, now = job.cells[0], time.monotonic()
+        then, before, compiled = self._first_reports.get(first.digest, (now, share, -1))
+        if compilations != compiled:
+            then, before = now, share
+            self._first_reports[first.digest] = (now, share, compilations)
+        if share - before >= _SHARE_FOR_A_PACE:  # a program may go on from far beyond its start
+            measured = (now - then) / (share - before) / len(job.cells)
+            self._paces[first.uses] = 2 * measured / sum(self._estimator.seconds(first))
+        self._shares |= {cell.digest: share for cell in job.cells}
+
+    def seconds_left(self, jobs: Iterable[Sequence[Cell]], workers: int) -> float:
+        """Seconds to the end of the cells of running jobs and of those that wait."""
+        seconds: dict[bool, list[float]] = {True: [], False: []}  # one at a time; others
+        for cells in jobs:
+            rests = (self._seconds(c) * (1 - self._shares.get(c.digest, 0.0)) for c in cells)
+            seconds[self._one_at_a_time(cells[0])].append(sum(rests))
+        return max(sum(seconds[True]), makespan(seconds[False], workers))
+
+    def _seconds(self, cell: Cell) -> float:
+        """A whole cell's; before one of its algorithm has finished, by the pace of running ones."""
+        low, high = self._estimator.seconds(cell)
+        pace = 1.0 if self._estimator.knows(cell) else self._paces.get(cell.uses, 1.0)
+        return pace * (low + high) / 2
+
+
+def _work(cell: Cell) -> Span:
+    """A cell's seconds by the table, without its start."""
+    uses = cell.uses.removeprefix(INDEPENDENT)
+    transitions = 0 if uses.startswith(REFERENCE) else cell.steps * _agents(cell.spec)
+    states = cell.protocol.states_per_region * len(cell.protocol.edges)
+    step = SECONDS_PER_STEP.get(uses, _UNKNOWN)
+
+    inner = [spec.complexity - 1 for spec in cell.specs]
+    layers = sum(inner) / len(inner)
+
+    def bound(i: int) -> float:
+        training = transitions * step[i]
+        batch_step = _BATCH_STEP[i]
+        if in_jax(cell.uses):
+            batch_step = _BATCH_STEP_IN_JAX[i] + _BATCH_LAYER_IN_JAX[i] * layers
+        curve = cell.evaluations * cell.spec.horizon * batch_step
+        return training + curve + states * len(inner) * (_STATE[i] + _LAYER[i] * layers)
+
+    return Span(bound(0), bound(1))
+
+
+def _start(cell: Cell) -> Span:
+    return Span(*(_START_IN_JAX if in_jax(cell.uses) else _START))
+
+
+def _agents(spec: SMESpec) -> int:
+    """How many transitions a step gives."""
+    return 1 if spec.team is None else len(spec.team.agents)
+
+
+def _setting(cell: Cell) -> Hashable:
+    return tuple(spec.model_copy(update={"seed": 0}) for spec in cell.specs)
+
+
+def scaled(
+    file: StudyFile,
+    *,
+    steps: int | None = None,
+    steps_of: Mapping[str, int] | None = None,
+    seeds: int | None = None,
+    evaluations: int | None = None,
+) -> StudyFile:
+    """The plan with other budgets; None keeps the plan's."""
+    steps_of = dict(steps_of or {})
+    known = [algorithm.name for algorithm in file.plan.algorithms]
+    for name in steps_of:
+        if name not in known:
+            raise UnknownNameError(
+                f"steps={name}={steps_of[name]}: the plan has no such algorithm."
+                f"{did_you_mean(name, known)} Its algorithms: {', '.join(known)}."
+            )
+    if (steps is not None or steps_of) and not file.plan.classes:
+        raise OptionError(
+            f"steps={steps or dict(steps_of)}: lives have the steps of their streams, and the plan "
+            "has no single tasks. Make streams with other steps, or leave it out."
+        )
+    budgets = {"steps": steps, "seeds": seeds, "evaluations": evaluations}
+    fields = file.plan.to_dict() | {k: v for k, v in budgets.items() if v is not None}
+    for algorithm in fields["algorithms"]:
+        budget, name = algorithm["steps"], algorithm["name"]
+        if name in steps_of:
+            algorithm["steps"] = steps_of[name]
+        elif steps is not None and budget != 0:  # 0: a reference, which does not train
+            algorithm["steps"] = None
+    plan = StudyPlan.from_dict(fields, "the scaled plan")
+    return _renamed(file, plan, "-scaled")
+
+
+def with_agents(file: StudyFile, agents: str) -> StudyFile:
+    """The plan with other implementations of its algorithms."""
+    choice("agents", agents, AGENTS)
+    fields = file.plan.to_dict()
+    for algorithm in fields["algorithms"]:
+        uses = algorithm["uses"]
+        if agents == "sb3":
+            algorithm["uses"] = uses.removeprefix(JAX)
+        elif not uses.startswith((REFERENCE, OFFLINE)):
+            from sme_registry.jax.run import full_name
+
+            algorithm["uses"] = full_name(uses, f"algorithm {algorithm['name']!r}: uses")
+    plan = StudyPlan.from_dict(fields, f"the plan with agents={agents}")
+    return _renamed(file, plan, f"-{agents}")
+
+
+def _renamed(file: StudyFile, plan: StudyPlan, suffix: str) -> StudyFile:
+    """The file with another plan, and a name that says so; the same file for the same plan."""
+    if plan == file.plan:
+        return file
+    name = file.name.removesuffix(suffix)[: _LONGEST_NAME - len(suffix)] + suffix
+    return file.model_copy(update={"name": name, "plan": plan, "digest": plan.digest})
+
+
+def first_places(cells: Iterable[PlannedCell]) -> dict[str, PlannedCell]:
+    """Each cell once, by its digest, in its first place in the plan."""
+    places: dict[str, PlannedCell] = {}
+    for planned in cells:
+        places.setdefault(planned.cell.digest, planned)
+    return places
+
+
+def selected(cells: Iterable[PlannedCell], only: Sequence[str] = ()) -> tuple[PlannedCell, ...]:
+    """The cells that match."""
+    cells = tuple(cells)
+    matching: dict[str, set[str]] = {}  # the names that the patterns of each kind match
+    for text in only:
+        kind, equals, glob = text.partition("=")
+        if not equals or kind not in _KINDS:
+            raise OptionError(
+                f"only={text!r}: must be class=GLOB or algorithm=GLOB, such as class='k-*'."
+            )
+        names = sorted({_KINDS[kind](cell) for cell in cells})
+        matches = [name for name in names if fnmatchcase(name, glob)]
+        if not matches:
+            listed = ", ".join(names[:12]) + (", …" if len(names) > 12 else "")
+            raise UnknownNameError(
+                f"only={text!r}: matches no {kind} of the plan.{did_you_mean(glob, names)} "
+                f"Available: {listed}."
+            )
+        matching.setdefault(kind, set()).update(matches)
+    return tuple(
+        cell
+        for cell in cells
+        if all(_KINDS[kind](cell) in names for kind, names in matching.items())
+    )
