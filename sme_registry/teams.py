@@ -28,16 +28,9 @@ __all__ = ["SMETeamEnv", "env", "parallel_env"]
 def parallel_env(
     spec: SpecLike = "Team2-v1", *, max_cycles: int | None = None, **kwargs: Any
 ) -> SMETeamEnv:
-    """A team's task as a PettingZoo parallel environment.
+    """A team's task as a PettingZoo parallel environment; see `make_parallel`.
 
-    Args:
-      spec: the task; one without a team is a team of one, `agent_0`.
-      max_cycles: PettingZoo's name of the spec's `horizon`.
-      **kwargs: spec fields to override, `action_range`, `render_mode`.
-
-    Raises:
-      UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMETeamEnv`.
-      OptionError: `max_cycles` and `horizon` differ.
+    `max_cycles` is PettingZoo's name of the spec's `horizon`.
 
     Examples:
       >>> from sme_registry import teams
@@ -73,13 +66,10 @@ def env(
 
 
 class TurnBasedTeam(OrderEnforcingWrapper):  # type: ignore[misc]
-    """A team whose agents act in turn.
+    """A team, from its parallel environment, whose agents act in turn.
 
     It rejects an invalid action in its agent's own turn, when it can still be corrected. Until the
     first step its infos are empty: PettingZoo's `seed_test` compares them, and NaN equals nothing.
-
-    Args:
-      parallel: the team's parallel environment, an `SMETeamEnv`.
     """
 
     def __init__(self, parallel: Any) -> None:

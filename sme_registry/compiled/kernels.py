@@ -46,7 +46,6 @@ _NARROW = 16  # below it a matrix product over rows beats the vectorised one ove
 
 
 def pack(task: Task) -> npt.NDArray[np.float64]:
-    """A task as one flat array, in the order of this module's head."""
     spec = task.spec
     widest = max(spec.state_dim, *(max(W.shape) for layers in task.policies for W, _ in layers))
     parts = [
@@ -70,7 +69,6 @@ def pack_layers(layers: Sequence[Layer]) -> npt.NDArray[np.float64]:
 
 
 def layer_parts(layers: Sequence[Layer]) -> list[npt.ArrayLike]:
-    """The parts of each layer in a packed task."""
     return [part for W, b in layers for part in (W.shape[::-1], W.T.ravel(), b)]
 
 
@@ -88,27 +86,22 @@ _PACKED = types.Array(float64, 1, "C", readonly=True)
 
 @njit(inline="always", error_model="numpy")
 def clipped(a):  # type: ignore[no-untyped-def]
-    """a, clipped to [0, 1]."""
     a = a if a > 0.0 else 0.0
     return a if a < 1.0 else 1.0
 
 
 @njit(inline="always", error_model="numpy")
 def reward_of(similarity, r_min):  # type: ignore[no-untyped-def]
-    """The step reward of a similarity."""
     graded = 4.0 * (similarity - 0.75)
     return graded if graded > 0.0 and graded > r_min else 0.0
 
 
 @njit(error_model="numpy")
 def lane_layers(p, at, layers, room, x, y, uniform):  # type: ignore[no-untyped-def]
-    """Packed layers for one lane, Φ(W x + b) each, or W x + b where not `uniform`.
+    """Packed layers for one lane, the first at `p[at]`: Φ(W x + b), or W x + b where not `uniform`.
 
-    The first layer begins at `p[at]`. `room[x]` and `room[y]` begin room for two layers, of which
-    the first has the inputs.
-
-    Returns:
-      `(x, at)`: where the outputs begin in `room`, and what follows the layers in `p`.
+    `room[x]` and `room[y]` begin room for two layers, of which the first has the inputs. Returns
+    `(x, at)`: where the outputs begin in `room`, and what follows the layers in `p`.
     """
     for _ in range(layers):
         inputs, outputs = np.uint64(p[at]), np.uint64(p[at + _U1])
@@ -314,8 +307,7 @@ def _one_sum(W, b, x, y, o, count):  # type: ignore[no-untyped-def]
 def _block_layer(W, b, x, y, cells, count, uniform):  # type: ignore[no-untyped-def]
     """y = Φ(W x + b) for `count` lanes: x `[in, count]`, y `[out, count]`, W transposed.
 
-    `cells` `[count]` is room for those of Φ's table. Not `uniform`: y = W x + b. Each sum runs over
-    its inputs in ascending order.
+    `cells` `[count]` is room for those of Φ's table. Not `uniform`: y = W x + b.
     """
     outputs = W.shape[1]
     in_fours = outputs - outputs % 4
@@ -336,9 +328,8 @@ def _block_layer(W, b, x, y, cells, count, uniform):  # type: ignore[no-untyped-
 def block_layers(p, at, layers, x, y, cells, count, uniform):  # type: ignore[no-untyped-def]
     """Packed layers, the first at `p[at]`, for `count` lanes; x has the inputs, see `_block_layer`.
 
-    Returns:
-      `(x, y, at, outputs)`: the outputs, the other room, what follows the layers in `p`, and how
-      many outputs there are, 0 without layers.
+    Returns `(x, y, at, outputs)`: the outputs, the other room, what follows the layers in `p`, and
+    how many outputs there are, 0 without layers.
     """
     outputs = 0
     for _ in range(layers):
@@ -356,11 +347,10 @@ def block_layers(p, at, layers, x, y, cells, count, uniform):  # type: ignore[no
 # block overlap no other array.
 @njit(inline="always", error_model="numpy")
 def _block_policy(p, s, first, count, x, y, cells, optimal, owner, owned):  # type: ignore[no-untyped-def]
-    """π* of a block of lanes, agent by agent.
+    """π* of a block of lanes, agent by agent; `x` and `y` are room for two layers.
 
-    `x` and `y` are room for two layers, `cells` for a row of one. Writes `optimal` `[A, lanes]`,
-    the agent of each action channel (`owner` `[A]`), and how many channels each agent owns
-    (`owned` `[n]`).
+    Writes `optimal` `[A, lanes]`, the agent of each action channel (`owner` `[A]`), and how many
+    channels each agent owns (`owned` `[n]`).
     """
     at = _HEADER + int(p[1]) * int(p[0]) + int(p[0])  # behind the header, W and b
     channel = 0
@@ -385,8 +375,8 @@ def _block_policy(p, s, first, count, x, y, cells, optimal, owner, owned):  # ty
 def _block_distance(action, first, count, best, owner, distance, acted, optimal):  # type: ignore[no-untyped-def]
     """‖a − π*‖₁ of each agent, `distance` `[n, lanes]`, NaN where its action is not finite.
 
-    Also writes the actions that the transition takes, clipped and rounded to float32 (`acted`
-    `[A, lanes]`), and π* of the block's lanes into `optimal` `[B, A]`.
+    Also writes the actions that the transition takes, clipped and rounded to float32 (`acted`), and
+    π* of the block's lanes into `optimal` `[B, A]`.
     """
     distance[:] = 0.0
     for i in range(owner.size):
@@ -435,11 +425,7 @@ def _block_transition(W, b, s, first, count, acted, column, moved, observation):
 
 @njit(inline="always", error_model="numpy")
 def _block_rewards(p, first, count, distance, owned, team_distance, values, ends):  # type: ignore[no-untyped-def]
-    """Similarity, step reward and regret of each agent, and whether a lane is terminated.
-
-    Returns:
-      False where a similarity is NaN: an action was not finite.
-    """
+    """Similarity, step reward, regret, and whether a lane is terminated; False where NaN is."""
     A, r_min, D, pays_the_team = p[1], p[4], p[5], p[9] == 1.0
     finite = True
     for lane in range(count):
@@ -570,14 +556,7 @@ NETWORK = void(_PACKED, float64[:, ::1], boolean, float64[:, ::1])
 
 @njit(NETWORK, error_model="numpy", cache=True)
 def network(p, s, uniform, out):  # type: ignore[no-untyped-def]
-    """The output of packed layers for `B` lanes.
-
-    Args:
-      p: the packed layers; see `pack_layers`.
-      s: `[in, B]`.
-      uniform: whether each layer ends with Φ.
-      out: `[out, B]`, written.
-    """
+    """The output `[out, B]` of packed layers of inputs `[in, B]`; see `pack_layers`."""
     layers, widest = int(p[0]), int(p[1])
     lanes = min(max(32, min(128, BLOCK_NUMBERS // widest)), s.shape[1])
     x, y, cells = np.empty((widest, lanes)), np.empty((widest, lanes)), np.empty(lanes, np.int32)

@@ -34,8 +34,8 @@ def transition_matrix(spec: SMESpec) -> Array:
 def _mixing_weights(seed: int | str, name: str, rows: int, columns: int) -> Array:
     """U(0,1) entries `[rows, columns]`, each row divided by its sum, on the grid 2⁻²⁹.
 
-    In exact integer arithmetic: each entry is rounded down to the grid, and a row's
-    difference from exactly 1 is added, one grid step each, to the entries that lost most.
+    In exact integers: each entry is rounded down to the grid, and a row's difference from exactly 1
+    is added, one grid step each, to the entries that lost most.
     """
     bits = raw_bits(seed, name, rows * columns).reshape(rows, columns)
     # Odd 32-bit numbers, the mid-points of 2³¹ bins. With at most 2²⁰ of them in a row, every
@@ -70,10 +70,7 @@ def optimal_policies(spec: SMESpec, stream: str = "policy") -> tuple[tuple[Layer
 
 
 def limiting_network(spec: SMESpec) -> tuple[Layer, ...]:
-    """The layers of v, of which the action limits are 1 − 2τ v(s); none without `safety`.
-
-    Of the optimal policy's shape, and independent of it. A rotation does not move them.
-    """
+    """The layers of v, of which the action limits are 1 − 2τ v(s); none without `safety`."""
     if spec.safety is None:
         return ()
     everything = tuple(range(spec.state_dim))
@@ -92,8 +89,8 @@ def distractor_transition(spec: SMESpec) -> tuple[Array, Array] | None:
 def mixing_layers(spec: SMESpec) -> tuple[Layer, ...]:
     """The layers of the map from state and distractors `[S + m]` to what the agent sees.
 
-    x ↦ W x + b where the mixing is orthogonal, then W = Q/c and b = ½ − W ½ with the least c that
-    keeps the cube's image in the cube. Uniform layers where it is nonlinear. None without mixing.
+    x ↦ W x + b where the mixing is orthogonal, with W = Q/c, b = ½ − W ½ and the least c that keeps
+    the cube's image in the cube. Uniform layers where it is nonlinear. None without mixing.
     """
     if spec.observation is None or spec.observation.mixing == "none":
         return ()
@@ -117,7 +114,6 @@ def agents(spec: SMESpec) -> tuple[AgentSpec, ...]:
 
 
 def observed_channels(spec: SMESpec) -> tuple[tuple[int, ...], ...]:
-    """The state channels that each agent observes, as indices."""
     everything = tuple(range(spec.state_dim))
     return tuple(
         everything if agent.observes == "all" else tuple(agent.observes) for agent in agents(spec)
@@ -127,7 +123,6 @@ def observed_channels(spec: SMESpec) -> tuple[tuple[int, ...], ...]:
 def _optimal_policy(
     spec: SMESpec, stream: str, observed: tuple[int, ...], action_dim: int
 ) -> tuple[Layer, ...]:
-    """A network whose input the spec's rotation turns."""
     (W, b), *others = _network(spec, stream, observed, action_dim)
     if spec.rotation:
         W = W @ _rotation(spec, f"{stream}/rotation", len(observed))

@@ -1,8 +1,7 @@
 """Fingerprints: a digest fixes the spec, not the numbers; probes of π* and T fix those.
 
-Random streams and LAPACK may differ between machines and versions. A file therefore publishes
-π*(s) and T(s, a) at three fixed probes. A task whose numbers differ from them by more than 1e-6 is
-refused, so that no other task runs under the same name.
+Random streams and LAPACK may differ between machines and versions. So a file publishes π*(s) and
+T(s, a) at three fixed probes, and a task that differs by more than 1e-6 is refused.
 """
 
 from __future__ import annotations
@@ -25,13 +24,7 @@ _GOLDEN = 0.6180339887498949
 
 
 class Probes(NamedTuple):
-    """Where a task is probed.
-
-    Attributes:
-      states: `[3, S]`, the last one scaled out of the cube.
-      actions: `[3, A]`.
-      distractors: `[3, m]`.
-    """
+    """Where a task is probed: `[3, S]` states, the last out of the cube, `[3, A]` and `[3, m]`."""
 
     states: Array
     actions: Array
@@ -39,7 +32,6 @@ class Probes(NamedTuple):
 
 
 def probes(spec: SMESpec) -> Probes:
-    """The fixed probes of a task's shape."""
     p = np.arange(1, PROBES + 1)[:, None]
     states, actions, distractors = (
         np.modf(_GOLDEN * (p + i * PROBES) * np.arange(1, width + 1))[0]
@@ -50,7 +42,6 @@ def probes(spec: SMESpec) -> Probes:
 
 
 def fingerprint_of(task: Task) -> Fingerprint:
-    """The fingerprint of a drawn task."""
     states, actions, distractors = probes(task.spec)
     numbers = {
         "optimal_action": task.optimal_action(states),
@@ -66,11 +57,7 @@ def fingerprint_of(task: Task) -> Fingerprint:
 
 
 def check_fingerprint(published: Fingerprint, task: Task) -> None:
-    """Compare a task with a published fingerprint.
-
-    Raises:
-      FingerprintMismatchError: shapes differ, or a number differs by more than 1e-6.
-    """
+    """Raise FingerprintMismatchError where a task differs from a published fingerprint."""
     drawn = fingerprint_of(task)
     for field in Fingerprint.model_fields:
         here, rows = np.asarray(getattr(drawn, field)), getattr(published, field)

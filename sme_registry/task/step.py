@@ -25,11 +25,11 @@ from sme_registry.task.task import Task
 
 
 class Step(NamedTuple):
-    """The result of one step, for each lane.
+    """The result of one step of `B` environments, of the states acted in.
 
     Attributes:
       state: `[B, S]` next states.
-      optimal_action: `[B, A]` π* of the states acted in.
+      optimal_action: `[B, A]` π*.
       similarity: `[B, n]` r̃ over the agent's own channels.
       step_reward: `[B, n]` r.
       reward: `[B, n]` R, the payout.
@@ -51,17 +51,11 @@ class Step(NamedTuple):
 def step(
     task: Task, s: Array, t: npt.NDArray[np.int64], accumulated_reward: Array, a: Array
 ) -> Step:
-    """One step of every lane.
+    """One step of `B` environments, from states `[B, S]` with finite actions `[B, A]`, clipped.
 
-    Each lane is a matrix of one row to the oracle: a product of all lanes at once would sum in
-    an order that depends on B, and then a batch would not equal its singles bit for bit.
-
-    Args:
-      task: the task.
-      s: `[B, S]` states.
-      t: `[B]` steps completed before this one.
-      accumulated_reward: `[B, n]` r_cum before this step.
-      a: `[B, A]` actions, finite; clipped to [0, 1].
+    `t` `[B]` are the steps completed and `accumulated_reward` `[B, n]` is r_cum before this one.
+    Each environment is a matrix of one row to the oracle: a product of all at once would sum in an
+    order that depends on B, and then a batch would not equal its singles bit for bit.
 
     Examples:
       >>> from sme_registry.task import load_task, step

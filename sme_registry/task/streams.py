@@ -17,14 +17,13 @@ DYNAMICS_VERSION = 1
 
 
 def bit_generator(seed: int | str, name: str) -> np.random.Philox:
-    """The bit generator of a stream, at its beginning."""
     label = f"sme-v{DYNAMICS_VERSION}/{seed}/{name}"
     key = int.from_bytes(hashlib.sha256(label.encode()).digest()[:16], "little")
     return np.random.Philox(key=key)
 
 
 def raw_bits(seed: int | str, name: str, count: int) -> npt.NDArray[np.uint64]:
-    """The first `count` 64-bit words of a stream, `[count]`."""
+    """The first `count` 64-bit words of a stream."""
     return bit_generator(seed, name).random_raw(count)
 
 
@@ -37,7 +36,6 @@ def to_uniform(bits: npt.NDArray[np.uint64]) -> npt.NDArray[np.float64]:
 
 
 def uniform(seed: int | str, name: str, count: int) -> npt.NDArray[np.float64]:
-    """The first `count` uniform numbers of a stream, `[count]`; see `to_uniform`."""
     return to_uniform(raw_bits(seed, name, count))
 
 
@@ -55,19 +53,12 @@ SECOND_MIX = np.uint64(0x94D049BB133111EB)
 def counted(
     key: npt.NDArray[np.uint64], first: npt.NDArray[np.uint64], count: int
 ) -> npt.NDArray[np.float64]:
-    """Uniform numbers of counter-based streams, for environments; see `to_uniform`.
+    """Uniform numbers `[n, count]` in (0, 1) of counter-based streams, for environments.
 
-    The word at place n is SplitMix64's n-th from the seed mix(key). Any place can be computed
-    alone, by machine code as well, so that a lane's only state is the place.
+    Of each stream from place `first` `[n]` on, 1 at the beginning: the word at place n is
+    SplitMix64's n-th from the seed mix(`key`). Any place can be computed alone, by machine code as
+    well, so that an environment's only state is the place.
     Source: Steele, Lea & Flood (2014), Fast splittable pseudorandom number generators.
-
-    Args:
-      key: `[n]` of each stream.
-      first: `[n]` the place of the first number, 1 at the beginning.
-      count: of numbers of each stream.
-
-    Returns:
-      `[n, count]` in (0, 1).
     """
     with np.errstate(over="ignore"):  # arithmetic is modulo 2⁶⁴
         places = first[:, None] + np.arange(count, dtype=np.uint64)

@@ -76,7 +76,6 @@ class Task:
 
     @property
     def arrays(self) -> Iterator[Array]:
-        """Every array of the task."""
         yield from (self.W, self.b, *(self.distractor_transition or ()))
         for layers in (*self.policies, self.limiting, self.mixing):
             for layer in layers:
@@ -91,7 +90,7 @@ class Task:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The agents, in the order of the channels that they own; one where there is no team."""
+        """The agents, in the order of the channels that they own; one without a team."""
         return tuple(agent.name for agent in draw.agents(self.spec))
 
     @property
@@ -107,30 +106,16 @@ class Task:
         return self.spec.team is not None and self.spec.team.reward == "team"
 
     def transition(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
-        """The next state, ψ(s + a W + b).
+        """The next state ψ(s + a W + b), `[B, S]` or `[S]` in [0, 1].
 
         The sum runs in a fixed order (s + b, then W_i a_i for i = 1…A) over actions rounded to
         float32, which makes each product exact: so every back-end gets the same bits.
-
-        Args:
-          s: `[B, S]` or `[S]` states.
-          a: `[B, A]` or `[A]` actions.
-
-        Returns:
-          `[B, S]` or `[S]` next states in [0, 1].
         """
         s, a = self._pairs(s, a)
         return _moved(s, a, self.W, self.b)
 
     def optimal_action(self, s: npt.ArrayLike) -> Array:
-        """π*(s), the unique action of regret 0.
-
-        Args:
-          s: `[B, S]` or `[S]` states, any real numbers.
-
-        Returns:
-          `[B, A]` or `[A]` actions in [0, 1].
-        """
+        """π*(s), the unique action of regret 0: `[B, A]` or `[A]` in [0, 1]."""
         return self.policy(self._states(s))
 
     def similarity(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
@@ -147,11 +132,7 @@ class Task:
         return 1.0 - self.step_reward(s, a)
 
     def limit(self, s: npt.ArrayLike) -> Array:
-        """ℓ, the limit of each action channel, `[B, A]` or `[A]` in [1 − 2τ, 1]; 1 without safety.
-
-        Args:
-          s: `[B, S]` or `[S]` states, any real numbers.
-        """
+        """ℓ, the limits of the action channels, `[B, A]` or `[A]` in [1 − 2τ, 1]; else 1."""
         s = self._states(s)
         if self.spec.safety is None:
             return np.ones((*s.shape[:-1], self.spec.action_dim))
@@ -171,7 +152,7 @@ class Task:
         return self.cost_of(a, self.limit(s))
 
     def limit_of(self, v: Array) -> Array:
-        """ℓ = 1 − 2τ v of the outputs of v, of any shape; SpecError without safety."""
+        """ℓ = 1 − 2τ v of the outputs of v, of any shape."""
         if self.spec.safety is None:
             raise SpecError("limit_of: this task has no safety. Give its spec safety.")
         return 1.0 - 2.0 * self.spec.safety.tightness * v
@@ -188,14 +169,10 @@ class Task:
         return self.reward_of(self.similarity_of(np.minimum(optimal, limit), optimal))
 
     def distractor_step(self, d: npt.ArrayLike, u: npt.ArrayLike) -> Array:
-        """The next distractors `[B, m]` or `[m]`, ψ(d + u W + b), as `transition` computes it.
+        """The next distractors ψ(d + u W + b), `[B, m]` or `[m]`, as `transition` computes it.
 
-        Args:
-          d: `[B, m]` or `[m]` autonomous or driven distractors.
-          u: `[B, A]` or `[A]` what drives them: uniform random numbers, or the agent's actions.
-
-        Raises:
-          SpecError: the task has no distractors, or they are noise, which is drawn anew each step.
+        `u` `[B, A]` or `[A]` drives them: uniform random numbers, or the agent's actions. SpecError
+        where the task has no distractors, or they are noise, drawn anew each step.
         """
         if self.distractor_transition is None:
             found = "has noise, drawn anew each step" if self.spec.distractors else "has none"
@@ -209,10 +186,6 @@ class Task:
 
     def seen(self, s: npt.ArrayLike, d: npt.ArrayLike | None = None) -> Array:
         """M(s, d), what the agent sees of the state: `[B, S + m]` or `[S + m]`.
-
-        Args:
-          s: `[B, S]` or `[S]` states, any real numbers.
-          d: `[B, m]` or `[m]` distractors; None where the task has none.
 
         One state may be given with a batch of distractors, and the other way round.
         """
@@ -230,11 +203,9 @@ class Task:
     def unmixed(self, x: npt.ArrayLike) -> Array:
         """The state and distractors behind what the agent sees, M⁻¹(x): `[B, S + m]` or `[S + m]`.
 
-        Exact up to rounding: of float32 observations to about 1e-7 times the condition number of
-        M. A uniform layer's outputs of 0 or 1, which rounding can give, count as 2⁻²⁵ from them.
-
-        Args:
-          x: `[B, S + m]` or `[S + m]` what the agent sees, without t/T and r_cum/k.
+        `x` is an observation without t/T and r_cum/k. Exact up to rounding: of float32
+        observations to about 1e-7 times the condition number of M. A uniform layer's outputs of 0
+        or 1, which rounding can give, count as 2⁻²⁵ from them.
         """
         y = _checked(x, self.spec.state_dim + self.spec.distractors, "observation", StateError)
         for W, b in reversed(self.mixing):
@@ -262,9 +233,8 @@ class Task:
     def regret_shares(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
         """Each agent's share of the team's regret, `[B, n]` or `[n]`; they add up to it.
 
-        regret · d_i / Σ_j d_j, with d_i the L1 distance of agent i's action from its optimal one.
-        The team's 1 − r̃ is the sum of all d_i / A, so each is charged in proportion to its
-        contribution. All are 0 at the optimum.
+        regret · d_i / Σ_j d_j, with d_i the L1 distance of agent i's action from its optimal one:
+        the team's 1 − r̃ is the sum of all d_i / A. All are 0 at the optimum.
         """
         s, a = self._pairs(s, a)
         optimal = self.policy(s)
@@ -278,8 +248,8 @@ class Task:
     def difference_rewards(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
         """The team's gain if one agent acted optimally, `[B, n]` or `[n]`, in [0, 1].
 
-        The team's step reward with agent i's action replaced by its optimal one and all others as
-        they are, minus the team's step reward as it is.
+        The team's step reward with agent i's action replaced by its optimal one, minus that as it
+        is.
         """
         s, a = self._pairs(s, a)
         optimal = self.policy(s)
@@ -335,7 +305,6 @@ def _moved(s: Array, a: Array, W: Array, b: Array) -> Array:
 def _refuse_unequal(
     name: str, values: Array, others: Array, rule: str, error: type[Exception]
 ) -> None:
-    """Raise `error` if both are batches, and not of one size."""
     if values.ndim == others.ndim == 2 and len(values) != len(others):
         raise error(
             f"{name} of shape {values.shape}: must be [{len(others)}, {values.shape[1]}], "
