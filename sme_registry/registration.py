@@ -21,32 +21,23 @@ if TYPE_CHECKING:
 
 _S = TypeVar("_S")
 
-# By the argument of the environment that takes the document.
-_ENTRY_POINTS: dict[str, dict[str, Any]] = {
-    "spec": {
-        "entry_point": "sme_registry.envs:SMEEnv",
-        "vector_entry_point": "sme_registry.envs:SMEVectorEnv",
-    },
-    "stream": {
-        "entry_point": "sme_registry.envs:SMEStreamEnv",
-        "vector_entry_point": "sme_registry.envs:SMEStreamVectorEnv",
-    },
+_ENTRY_POINTS: dict[str, Any] = {
+    "entry_point": "sme_registry.envs:SMEEnv",
+    "vector_entry_point": "sme_registry.envs:SMEVectorEnv",
 }
 
 
 def _register(env_id: str, argument: str, document: dict[str, Any] | str) -> None:
-    """Register an id with Gymnasium, and its symmetric id."""
     from sme_registry.spec.catalogue import symmetric_name
 
-    kwargs, entry_points = {argument: document}, _ENTRY_POINTS[argument]
-    gymnasium.register(env_id, **entry_points, kwargs=kwargs)
+    kwargs = {argument: document}
+    gymnasium.register(env_id, **_ENTRY_POINTS, kwargs=kwargs)
     if "/sha256-" not in env_id:
         symmetric = {**kwargs, "action_range": "symmetric"}
-        gymnasium.register(symmetric_name(env_id), **entry_points, kwargs=symmetric)
+        gymnasium.register(symmetric_name(env_id), **_ENTRY_POINTS, kwargs=symmetric)
 
 
 def _register_team(env_id: str, spec: dict[str, Any] | str) -> None:
-    """Register the id of a team with PettingZoo."""
     kwargs = {"spec": spec}
     pettingzoo.register("parallel", env_id, "sme_registry.teams:parallel_env", kwargs=kwargs)
     pettingzoo.register("aec", env_id, "sme_registry.teams:env", kwargs=kwargs)
@@ -81,19 +72,11 @@ def register_catalogue() -> None:
 
 
 def register(spec: SMESpec | StreamSpec, name: str) -> str:
-    """Register a spec or a stream under a name, in this process.
+    """Register a spec or a stream, or its fields, under a name, in this process; returns the id.
 
-    Args:
-      spec: the spec or stream, or its fields as a mapping.
-      name: letters, digits, '_' and '-', as in `MyTask` or `MyTask-v1`.
-
-    Returns:
-      The id, such as `SME/MyTask-v1`. A single agent's task and a stream can also be made by
-      `SME/MyTaskSymmetric-v1`, with actions in [−1, 1].
-
-    Raises:
-      OptionError: the name has invalid characters, or ends with "Symmetric".
-      NameTakenError: the id stands for another spec; a released id never changes its numbers.
+    Of letters, digits, '_' and '-'. A single agent's task and a stream can also be made by
+    `SME/MyTaskSymmetric-v1`, with actions in [−1, 1]. NameTakenError where the id stands for
+    another spec: a released id never changes its numbers.
 
     Examples:
       >>> sme_registry.register(sme_registry.SMESpec(k=3), "EveryThird")
@@ -141,7 +124,6 @@ def register(spec: SMESpec | StreamSpec, name: str) -> str:
 
 
 def _document_of(name: str) -> SMESpec | StreamSpec:
-    """The spec or the stream that a name stands for; draws nothing."""
     from sme_registry.spec.resolve import resolve
 
     return resolve(name).document
@@ -154,18 +136,13 @@ def load(id_or_path_or_digest: str | os.PathLike[str], kind: type[_S]) -> _S: ..
 def load(id_or_path_or_digest: str | os.PathLike[str], kind: Any = None) -> Any:
     """The spec or stream of an id, a file's path, or a digest.
 
-    The task of a file is drawn here, to check that this machine draws its published numbers.
+    The task of a file is drawn here, to check that this machine draws its published numbers
+    (FingerprintMismatchError). UnknownNameError suggests the nearest name.
 
     Args:
       id_or_path_or_digest: the name.
       kind: `SMESpec` or `StreamSpec`, to accept no other and to tell a type checker which it is;
         None takes what the name stands for.
-
-    Raises:
-      UnknownNameError: nothing has this name; the message suggests the nearest.
-      MalformedDocumentError, SpecError, DigestMismatchError: the file is invalid.
-      FingerprintMismatchError: this machine draws other numbers than the file publishes.
-      ResourceLimitError: the file's task would not fit in memory.
 
     Examples:
       >>> sme_registry.load("Complexity10").complexity
@@ -195,14 +172,6 @@ def save(
       name: letters, digits, '_' and '-'; by default the file's name without its ending.
       description: one or two sentences.
       tags: keywords, for `sme list --tag`.
-
-    Returns:
-      The path written.
-
-    Raises:
-      SpecError: the name or a tag has invalid characters.
-      ResourceLimitError: the task would not fit in memory.
-      OptionError: the file cannot be written; an existing file is unchanged.
 
     Examples:
       >>> spec = sme_registry.SMESpec(state_dim=16, complexity=10, seed=7)
@@ -237,17 +206,8 @@ def save(
 def env_spec(spec: SpecLike | StreamLike, **kwargs: Any) -> EnvSpec:
     """Gymnasium's `EnvSpec` of any spec or stream, unregistered; its kwargs are plain JSON.
 
-    Args:
-      spec: the spec or stream, or a name, digest or path as for `load`.
-      **kwargs: spec fields to override, which give the derived spec its own id; and arguments of
-        the environment, such as `action_range`.
-
-    Returns:
-      What `gymnasium.make` and `gymnasium.make_vec` take in place of an id.
-
-    Raises:
-      UnknownNameError, SpecError: see `load`. A stream has no fields of a spec to override.
-      FingerprintMismatchError: this machine draws other numbers than the spec's file publishes.
+    `gymnasium.make` and `gymnasium.make_vec` take it in place of an id. Keywords are fields of the
+    spec to override, which give the derived spec its own id, and arguments of the environment.
 
     Examples:
       >>> import gymnasium
@@ -255,7 +215,7 @@ def env_spec(spec: SpecLike | StreamLike, **kwargs: Any) -> EnvSpec:
       >>> gymnasium.make(derived).unwrapped.sme_spec.complexity
       10
     """
-    from sme_registry.envs import SMEStreamEnv, arguments
+    from sme_registry.envs import SMEEnv, arguments
     from sme_registry.envs.base import content_id
     from sme_registry.spec import SMESpec, StreamSpec
     from sme_registry.spec.resolve import names_stream
@@ -263,29 +223,21 @@ def env_spec(spec: SpecLike | StreamLike, **kwargs: Any) -> EnvSpec:
 
     if names_stream(spec):
         for name in SMESpec.model_fields.keys() & kwargs.keys():
-            arguments.refuse_override(SMEStreamEnv, name)
+            arguments.refuse_override(SMEEnv, name)
         stream = load(cast("StreamLike", spec), StreamSpec)
         kwargs = {"stream": stream.to_dict(), **kwargs}
-        return EnvSpec(id=content_id(stream), **_ENTRY_POINTS["stream"], kwargs=kwargs)
+        return EnvSpec(id=content_id(stream), **_ENTRY_POINTS, kwargs=kwargs)
     overrides = {name: kwargs.pop(name) for name in [*kwargs] if name in SMESpec.model_fields}
     derived = load(cast("SpecLike", spec), SMESpec).derive(**overrides)
     kwargs = {"spec": derived.to_dict(), **kwargs}
-    return EnvSpec(id=content_id(derived), **_ENTRY_POINTS["spec"], kwargs=kwargs)
+    return EnvSpec(id=content_id(derived), **_ENTRY_POINTS, kwargs=kwargs)
 
 
 def make(spec_or_id: SpecLike | StreamLike, **kwargs: Any) -> gymnasium.Env[Any, Any]:
     """`gymnasium.make` for an id, a digest, a path, a spec or a stream.
 
-    Args:
-      spec_or_id: the task or stream.
-      **kwargs: spec fields to override (`complexity=10`), `action_range`, `render_mode`, and
-        other arguments of `gymnasium.make`.
-
-    Returns:
-      The environment with Gymnasium's default wrappers.
-
-    Raises:
-      UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMEEnv`.
+    Keywords are fields of the spec to override (`complexity=10`), `action_range`, `render_mode`,
+    and other arguments of `gymnasium.make`. The environment has Gymnasium's default wrappers.
 
     Examples:
       >>> env = sme_registry.make("Default", horizon=20)
@@ -304,14 +256,7 @@ def make_vec(
 ) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
     """`gymnasium.make_vec` for an id, a digest, a path, a spec or a stream; a native batch.
 
-    Args:
-      spec_or_id: the task or stream.
-      num_envs: the lanes.
-      **kwargs: spec fields to override, `action_range`, `autoreset_mode`, and other
-        arguments of `gymnasium.make_vec`.
-
-    Raises:
-      UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMEVectorEnv`.
+    Keywords as for `make`, and `autoreset_mode`.
 
     Examples:
       >>> envs = sme_registry.make_vec("Default", 64)
@@ -335,12 +280,8 @@ def registered_or_new(spec_or_id: SpecLike | StreamLike) -> EnvSpec:
 def make_parallel(spec_or_id: SpecLike, **kwargs: Any) -> SMETeamEnv:
     """The team of an id, a digest, a path or a spec as a PettingZoo parallel environment.
 
-    Args:
-      spec_or_id: the task; one without a team is a team of one, `agent_0`.
-      **kwargs: spec fields to override, `action_range`, `render_mode`.
-
-    Raises:
-      UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMETeamEnv`.
+    A task without a team is a team of one, `agent_0`. Keywords are fields of the spec to override,
+    `action_range` and `render_mode`.
 
     Examples:
       >>> team = sme_registry.make_parallel("Team4")

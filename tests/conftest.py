@@ -44,7 +44,7 @@ settings.load_profile("deterministic")
 def pytest_configure(config):
     """Compile the step once, before the workers and their children would each do it."""
     if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
-        kernels = "sme_registry.compiled.extension_kernels"
+        kernels = "sme_registry.compiled.safety_observation"
         # Numba is an extra: no failure where it is missing.
         subprocess.run([sys.executable, "-c", f"import {kernels}"], check=False)
 

@@ -35,7 +35,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sme_registry.sb3 import RegretCallback, SMETeamVecEnv, SMEVecEnv
-from sme_registry.testing.comparing import expect_same
+from sme_registry.testing import expect_same
 
 # Ends early and late, pays late, and its lanes drift apart.
 HARD = sme_registry.SMESpec(horizon=12, k=5, D=0.2, r_min=0.1, complexity=2, seed=4)

@@ -1,7 +1,6 @@
 """A notice while Numba compiles: without it, the first environment looks like a hanging program.
 
-Numba keeps what it compiled on disk, next to this package or in NUMBA_CACHE_DIR, so this happens
-once for a machine and a version.
+Numba keeps what it compiled next to this package or in NUMBA_CACHE_DIR: once for each version.
 """
 
 from __future__ import annotations

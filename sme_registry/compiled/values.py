@@ -1,8 +1,9 @@
-"""Where a step's numbers are: rows of a batch's `values`, and entries of a single lane.
+"""Where a step's numbers are: rows of a batch's `values`, and entries of a single environment.
 
-`values` `[5, n, B]` is what one step of a batch computes for n agents in B lanes; with `safety`
-there are two more rows. A single lane is t, the five values of its last step, of which it keeps
-r_cum, and the state s `[S]`.
+`values` `[5, n, B]` is what one step of a batch computes for n agents in B environments; with
+`safety` there are two more rows. A single environment is one buffer: t, the five values of its last
+step, of which it keeps r_cum, and the state s `[S]`. With `safety` or `observation` there are more
+numbers behind them: two values of its last step, and its own distractors.
 """
 
 from __future__ import annotations
@@ -13,13 +14,13 @@ COST, SAFE_REGRET = 5, 6
 ROWS_WITH_SAFETY = 7
 
 LANE_T, LANE_VALUES, LANE_STATE = 0, 1, 1 + ROWS
-"""The first entry of each part of a lane."""
+"""The first entry of each part of a single environment."""
 
-EXTENDED = 4.0
-"""Added to the end of a single lane whose info has more to say; see `compiled.extension`."""
+HAS_MORE = 4.0
+"""Added to the end of a single step of a task with `safety` or `observation`."""
 
 OWN_KEY, OWN_DRAWN, OWN_DISTRACTORS = range(3)
-"""An extended lane: the key of its random numbers, how many it has drawn, its distractors `[m]`."""
+"""Of its distractors: the key of their random numbers, how many it has drawn, and d `[m]`."""
 
-EXTRA_COST, EXTRA_SAFE_REGRET, EXTRA_OWN = range(3)
-"""What a single lane has behind its plain numbers: two values of its last step, and its own."""
+MORE_COST, MORE_SAFE_REGRET, MORE_OWN = range(3)
+"""The first entry of each part behind the plain numbers of a single environment."""

@@ -14,7 +14,6 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.envs.stream_tasks import StreamTasks
 from sme_registry.envs.types import Array, Mask
 from sme_registry.errors import (
     ActionError,
@@ -25,26 +24,19 @@ from sme_registry.errors import (
     did_you_mean,
 )
 from sme_registry.io import choice, integer_in
-from sme_registry.spec import ACTION_RANGES, SMESpec, SpecLike, StreamLike, StreamSpec
-from sme_registry.spec.resolve import resolve
+from sme_registry.spec import ACTION_RANGES, SMESpec, SpecLike, StreamSpec
 from sme_registry.task import Task, load_task
-from sme_registry.task.loading import draw_published
 
 MAX_LIFETIME = 2**62  # at which a life may begin: its steps are counted in 64 bits
 
 
 def load_overridden(environment: type, spec: SpecLike, overrides: dict[str, Any]) -> Task:
-    """The task of an environment class that is called with these overrides of spec fields.
-
-    Raises:
-      UnexpectedKeywordError: an override is no field, and no argument of the environment.
-      SpecError, UnknownNameError, ResourceLimitError: see `load_task`.
-    """
+    """The task of an environment class that is called with these overrides of spec fields."""
     fields = list(SMESpec.model_fields)
     for name in overrides:
         if name not in fields:
             parameters = inspect.signature(environment).parameters.values()
-            named = [each.name for each in parameters if each.kind is each.KEYWORD_ONLY]
+            named = [one.name for one in parameters if one.kind is one.KEYWORD_ONLY]
             raise UnexpectedKeywordError(
                 f"{environment.__name__}() got an unexpected keyword argument {name!r}: must be "
                 f"{', '.join(named)} or a field of the spec ({', '.join(fields)})."
@@ -53,25 +45,10 @@ def load_overridden(environment: type, spec: SpecLike, overrides: dict[str, Any]
     return load_task(spec, **overrides)
 
 
-def load_stream_tasks(
-    environment: type, stream: StreamLike, overrides: dict[str, Any]
-) -> StreamTasks:
-    """The tasks of a stream; an environment class of streams was called with these overrides.
-
-    Raises:
-      UnexpectedKeywordError: there is an override: a stream has no fields of a spec to change.
-      SpecError, UnknownNameError, ResourceLimitError: see `load`.
-    """
-    for name in overrides:
-        refuse_override(environment, name)
-    resolved = resolve(stream, StreamSpec)
-    return StreamTasks(resolved.document, draw_published(resolved))
-
-
 def refuse_override(environment: type, name: str) -> NoReturn:
     """Raise UnexpectedKeywordError on a keyword that is no argument of a stream's environment."""
     parameters = inspect.signature(environment).parameters.values()
-    named = [each.name for each in parameters if each.kind is each.KEYWORD_ONLY]
+    named = [one.name for one in parameters if one.kind is one.KEYWORD_ONLY]
     advice = did_you_mean(name, named) or " Remove it."
     if name in {*SMESpec.model_fields, *StreamSpec.model_fields}:
         advice = f" {another_stream(name)}"
@@ -105,18 +82,10 @@ def action_space(action_range: str, action_dim: int) -> tuple[gymnasium.spaces.B
 def to_unit(
     action: Any, shape: tuple[int, ...], rescaled: bool, ignored: Mask | None = None
 ) -> Array:
-    """Actions of an environment as contiguous float64 of the unit range; not clipped.
+    """Actions of an environment `[…]` as contiguous float64 of the unit range; not clipped.
 
-    Whether they are finite is checked by the step, which reads each of them anyway.
-
-    Args:
-      action: the user's argument.
-      shape: the required shape.
-      rescaled: whether the environment's range is [−1, 1].
-      ignored: `[B]` rows to set to zero.
-
-    Raises:
-      ActionError: not numbers, or of another shape.
+    Rows `ignored` `[B]` become zero. Whether actions are finite is checked by the step, which reads
+    each of them anyway.
     """
     try:
         array = np.asarray(action)
@@ -145,7 +114,6 @@ def from_unit(unit: npt.NDArray[Any], rescaled: bool) -> npt.NDArray[Any]:
 
 
 def not_finite_error() -> ActionError:
-    """The error of a step that refused its actions."""
     return ActionError("action: has NaN or infinite entries. Give finite numbers.")
 
 
@@ -156,7 +124,7 @@ def checked_seed(seed: Any) -> int | None:
 
 
 def refuse_unknown_options(options: dict[str, Any] | None, known: tuple[str, ...]) -> None:
-    """Raise OptionError on an option that does not exist, with the nearest known one."""
+    """Raise OptionError on an option that does not exist."""
     for name in options or {}:
         if name not in known:
             raise OptionError(
@@ -174,23 +142,20 @@ def lifetime_in(options: dict[str, Any] | None) -> int | None:
 
 
 def initial_values(
-    name: str, options: dict[str, Any], shape: tuple[int, ...], lanes: int | None = None
+    name: str, options: dict[str, Any], shape: tuple[int, ...], num_envs: int | None = None
 ) -> Array | None:
     """The option `state` or `distractors` of a reset, as float64 of `shape`; None without it.
 
-    With `lanes` B, a value of `shape` is for each of them, and one of `[B, *shape]` has one for
-    each; the result is `[B, *shape]`.
-
-    Raises:
-      StateError: of another shape, or an entry outside [0, 1].
+    With `num_envs` B, a value of `shape` is for each of them, and one of `[B, *shape]` has one for
+    each; the result is `[B, *shape]`. StateError outside [0, 1].
     """
     if name not in options:
         return None
-    if lanes is None:
+    if num_envs is None:
         return initial_states(options[name], shape, name)
     one_for_all = np.asarray(options[name], dtype=object).ndim == len(shape)
-    value = initial_states(options[name], shape if one_for_all else (lanes, *shape), name)
-    return np.broadcast_to(value, (lanes, *shape))
+    value = initial_states(options[name], shape if one_for_all else (num_envs, *shape), name)
+    return np.broadcast_to(value, (num_envs, *shape))
 
 
 def initial_states(state: Any, shape: tuple[int, ...], name: str = "state") -> Array:
@@ -210,8 +175,8 @@ def initial_states(state: Any, shape: tuple[int, ...], name: str = "state") -> A
     return array
 
 
-def without_extension(task: Task) -> Task:
-    """The task; SpecError if it has `safety` or `observation`, which teams do not support."""
+def without_safety_or_observation(task: Task) -> Task:
+    """The task; SpecError if it has what teams do not support."""
     for field in ("safety", "observation"):
         if getattr(task.spec, field) is not None:
             raise SpecError(

@@ -1,4 +1,4 @@
-"""What environments have in common: their task, their names in Gymnasium, and rendering."""
+"""What environments have in common: their task, their names in Gymnasium, and their cards."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
-from sme_registry.errors import EpisodeError, OptionError, WrapperError
-from sme_registry.spec import SMESpec, StreamSpec
+from sme_registry.errors import WrapperError
+from sme_registry.io.markup import card, folded, pairs_html, table_html
+from sme_registry.spec import SMESpec, StreamSpec, cards
 from sme_registry.spec.catalogue import NAMESPACE
 from sme_registry.task import Task
 from sme_registry.task.streams import DYNAMICS_VERSION
 
-RENDER_MODES = ["human", "rgb_array"]
+_STATUS = {"created": "not begun", "running": "running", "ended": "ended"}
 
 
 class TaskMixin:
@@ -53,53 +54,16 @@ class GymnasiumMixin(TaskMixin):
         """
         return self._env_spec
 
+    @property
+    def stream(self) -> StreamSpec:
+        """The stream that is run; an environment of a task has no such attribute."""
+        if not isinstance(self.document, StreamSpec):
+            raise AttributeError(f"stream: {self!r} runs a task. Its spec is sme_spec.")
+        return self.document
+
     @spec.setter
     def spec(self, value: EnvSpec | None) -> None:
         self._env_spec = renamed_by_content(value, self.document)
-
-
-class RenderMixin(TaskMixin):
-    """Frames of an episode; pygame is imported when the first is recorded."""
-
-    metadata: dict[str, Any]
-    render_mode: str | None
-    _renderer: Any = None
-
-    def _set_render_mode(self, render_mode: str | None) -> None:
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise OptionError(f"render_mode={render_mode!r}: must be None, 'human' or 'rgb_array'.")
-        self.render_mode = render_mode
-
-    def _record(self, env: Any, last: tuple[Any, dict[str, Any]] | None) -> None:
-        """Record a reset or a step, in an environment with a render mode; see `Renderer.record`."""
-        if self._renderer is None:
-            from sme_registry.envs.rendering import Renderer
-
-            assert self.render_mode is not None
-            self._renderer = Renderer(self._task, self.render_mode, self.metadata)
-        self._renderer.record(env, last)
-
-    def render(self) -> Any:
-        """The frame of this step: `[H, W, 3]` uint8 for "rgb_array"; None for "human".
-
-        Raises:
-          EpisodeError: before the first reset.
-        """
-        if self.render_mode is None:
-            gymnasium.logger.warn(
-                "render() needs a render_mode, such as "
-                'sme_registry.make(..., render_mode="rgb_array").'
-            )
-            return None
-        if self._renderer is None:
-            raise EpisodeError("render: the episode has not begun. Call reset() first.")
-        return self._renderer.frame()
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
 
 
 def refuse_short_time_limit(horizon: int) -> None:
@@ -135,7 +99,7 @@ def content_id(document: SMESpec | StreamSpec) -> str:
 
 
 def argument_of(document: SMESpec | StreamSpec) -> str:
-    """The argument of an environment that takes the document: "spec" or "stream"."""
+    """The keyword of an environment that takes the document, in its `EnvSpec`."""
     return "stream" if isinstance(document, StreamSpec) else "spec"
 
 
@@ -170,3 +134,49 @@ def renamed_by_content(env_spec: EnvSpec | None, document: SMESpec | StreamSpec)
         plain.name = plain.id.removeprefix(f"{NAMESPACE}/").rsplit("-v", 1)[0]
         plain.version = DYNAMICS_VERSION
     return plain
+
+
+def html_card(
+    env: Any,
+    observation: Any,
+    action: Any,
+    *,
+    status: str | None = None,
+    autoreset: str | None = None,
+) -> str:
+    """A card of an environment for notebooks; a team's has its agents in place of the spaces.
+
+    The spaces are those of a single environment, or of any agent in a team; `status` is "created",
+    "running" or "ended", and None for a batch.
+    """
+    document: SMESpec | StreamSpec = env.document
+    agents = cards.agents(document) if isinstance(document, SMESpec) else []
+    span = f"float32 in [{action.low.flat[0]:g}, {action.high.flat[0]:g}]"
+    facts = {
+        "observation": f"[{observation.shape[0]}] float32 in [0, 1]: {_observed(document)}",
+        "action": f"[{action.shape[0]}] {span}",
+    }
+    if agents:
+        facts = {"actions": span}
+    facts["episode"] = f"at most {document.horizon:,} steps"
+    if status is not None:
+        facts["episode"] += f"; {_STATUS[status]}"
+    if autoreset is not None:
+        facts["autoreset"] = autoreset
+    shown = [pairs_html(repr(env), facts)]
+    if agents:
+        shown.append(table_html(cards.agents_table(agents)))
+    if isinstance(document, SMESpec):
+        summary = cards.difference(document)
+        task = [table_html(cards.task_table(document))]
+    else:
+        summary = f"Stream: {document.visits:,} visits, {document.steps:,} steps"
+        task = cards.parts(document)
+    return card(*shown, folded(summary, *task))
+
+
+def _observed(document: SMESpec | StreamSpec) -> str:
+    if isinstance(document, SMESpec):
+        return cards.observation_text(document)
+    phase = ", one-hot of the phase" if document.observes_phase else ""
+    return cards.observation_text(document.phases[0].spec) + phase

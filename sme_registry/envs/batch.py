@@ -1,8 +1,8 @@
 """`Batch`: parallel episodes of a single agent or a team, the core of all batched environments.
 
-It holds the state, completed steps and r_cum of `B` lanes, and steps them with the compiled engine.
-Each environment decides what its agents observe and what happens at the end of an episode. A team
-of n agents is stepped as one: its joint observation is s, t/T and every agent's r_cum/k.
+It holds the state, completed steps and r_cum of `B` environments, and steps them with the compiled
+engine. The environments on top decide what their agents observe, and what happens at the end of an
+episode. A team of n agents is stepped as one: its joint observation is s, t/T and every r_cum/k.
 """
 
 from __future__ import annotations
@@ -17,25 +17,33 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import seeding
 
-from sme_registry.compiled import engine
-from sme_registry.compiled.engine import StepMany
-from sme_registry.compiled.values import ROWS, ROWS_WITH_SAFETY
+from sme_registry.compiled import Engine, engine
+from sme_registry.compiled.engine import StepMany, draw
+from sme_registry.compiled.values import (
+    OWN_DISTRACTORS,
+    OWN_DRAWN,
+    OWN_KEY,
+    ROWS,
+    ROWS_WITH_SAFETY,
+)
+from sme_registry.envs import infos
 from sme_registry.envs.arguments import not_finite_error
-from sme_registry.envs.extension import Extended, reset_options
-from sme_registry.envs.types import Array, Lanes, Mask, Observation
+from sme_registry.envs.schedule import Schedule
+from sme_registry.envs.types import Array, Indices, Mask, Observation
 from sme_registry.errors import ActionError
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.task import Task, observe
 from sme_registry.task.memory import check_limit
 
 _FLOAT64 = np.dtype(np.float64)
-_AHEAD = 16  # states drawn at once for a lane
-_MAX_NUMBERS = 2**19  # held in advance for all lanes, 4 MiB
+_AHEAD = 16  # states drawn at once for an environment
+_MAX_NUMBERS = 2**19  # held in advance for all environments, 4 MiB
 _KEPT = 3  # a loop holds an observation and the next one while a step writes the third
+_KEY_SHIFT = np.uint64(12)  # keys of 52 bits, which a float64 holds exactly
 
 
 class BatchStep(NamedTuple):
-    """The result of one step of all lanes; no later step writes to an array that is still held.
+    """The result of one step of a batch; no later step writes to an array that is still held.
 
     Attributes:
       observation: `[B, S + 1 + n]` float32: s, t/T, and each agent's r_cum/k. Of a stream that
@@ -71,9 +79,9 @@ class _Results:
     """Arrays for the results of steps, written again once nobody holds them.
 
     They are too large for NumPy's cache of small arrays: fresh ones at each step can make the heap
-    shrink and grow each time, for half as much time again with 1,024 lanes and three times as much
-    with 4,096. So the last few are kept, and used again when their reference counts show that they
-    are alone.
+    shrink and grow each time, for half as much time again with 1,024 environments and three times
+    as much with 4,096. So the last few are kept, and used again when their reference counts show
+    that they are alone.
 
     Views of them are handed out, never they themselves. A view holds its array, as do a view or
     slice of it, its memoryview, and a tensor that shares its memory; and what a user does to a
@@ -81,12 +89,12 @@ class _Results:
     """
 
     def __init__(
-        self, lanes: int, observation_dim: int, action_dim: int, agents: int, *, safety: bool
+        self, num_envs: int, observation_dim: int, action_dim: int, agents: int, *, safety: bool
     ) -> None:
         rows, limited = (ROWS_WITH_SAFETY, action_dim) if safety else (ROWS, 0)
         self._shapes = (
-            (lanes, observation_dim), (lanes, action_dim), (rows, agents, lanes),
-            (2, lanes, limited),
+            (num_envs, observation_dim), (num_envs, action_dim), (rows, agents, num_envs),
+            (2, num_envs, limited),
         )  # fmt: skip
         self._kept: list[_Arrays] = []
 
@@ -122,105 +130,144 @@ def _references(arrays: _Arrays) -> list[int]:
 _ALONE = _references(_Results(1, 1, 1, 1, safety=True)._allocate())
 
 
-def refuse_large_batch(lanes: int, lane_bytes: int) -> None:
-    """Raise ResourceLimitError where lanes of so many bytes each would not fit in memory."""
-    check_limit(lanes * lane_bytes, f"num_envs={lanes}: a batch this large", "Use fewer lanes.")
-
-
 class InitialStates:
-    """The initial states of a batch: uniform in the cube, drawn in advance, a generator per lane.
+    """The initial states of a batch: uniform in the cube, drawn in advance, each by a generator.
 
-    Lane i draws what a single environment with its seed would draw, in the same order. Drawing one
+    Environment i draws what a single one with its seed would draw, in the same order. Drawing one
     state from each of 1,024 generators costs as much as six steps of the whole batch. Drawing
     sixteen states at once costs little more and gives the same numbers.
     """
 
-    def __init__(self, lanes: int, state_dim: int) -> None:
-        self._generators: list[np.random.Generator | None] = [None] * lanes
-        self._ahead = max(1, min(_AHEAD, _MAX_NUMBERS // (lanes * state_dim)))
-        self._drawn = np.empty((lanes, self._ahead, state_dim))
-        self._used = np.full(lanes, self._ahead)
+    def __init__(self, num_envs: int, state_dim: int) -> None:
+        self._generators: list[np.random.Generator | None] = [None] * num_envs
+        self._ahead = max(1, min(_AHEAD, _MAX_NUMBERS // (num_envs * state_dim)))
+        self._drawn = np.empty((num_envs, self._ahead, state_dim))
+        self._used = np.full(num_envs, self._ahead)
 
-    def seed(self, lane: int, seed: int) -> None:
-        """Restart a lane's stream."""
-        self._generators[lane] = seeding.np_random(seed)[0]
-        self._used[lane] = self._ahead
+    def seed(self, env: int, seed: int) -> None:
+        self._generators[env] = seeding.np_random(seed)[0]
+        self._used[env] = self._ahead
 
-    def draw(self, lanes: Lanes) -> Array:
-        """The next state of each of these lanes, `[len(lanes), state_dim]`."""
-        for lane in lanes[self._used[lanes] == self._ahead].tolist():
-            generator = self._generators[lane]
+    def draw(self, envs: Indices) -> Array:
+        """The next state of each of these environments, `[len(envs), state_dim]`."""
+        for env in envs[self._used[envs] == self._ahead].tolist():
+            generator = self._generators[env]
             if generator is None:
-                generator = self._generators[lane] = seeding.np_random(None)[0]
-            generator.random(out=self._drawn[lane])
-            self._used[lane] = 0
-        states: Array = self._drawn[lanes, self._used[lanes]]
-        self._used[lanes] += 1
+                generator = self._generators[env] = seeding.np_random(None)[0]
+            generator.random(out=self._drawn[env])
+            self._used[env] = 0
+        states: Array = self._drawn[envs, self._used[envs]]
+        self._used[envs] += 1
         return states
 
 
+class Distractors:
+    """The distractors of `B` environments, and the random numbers that move them.
+
+    Both come from streams of their own, so that the initial states are those of the task without
+    `observation`. An environment that is never seeded has a random stream. Most tasks have m = 0.
+
+    Attributes:
+      own: `[2 + m, B]` each environment's key, numbers drawn, and distractors; see
+        `compiled.values`.
+    """
+
+    def __init__(self, count: int, num_envs: int) -> None:
+        self._count = count
+        self.own = np.zeros((OWN_DISTRACTORS + count, num_envs))
+        if count:
+            words = np.random.SeedSequence().generate_state(num_envs, np.uint64)
+            self.own[OWN_KEY] = words >> _KEY_SHIFT
+
+    @property
+    def values(self) -> Array:
+        """The distractors, `[B, m]` float64 in [0, 1] (a copy)."""
+        return self.own[OWN_DISTRACTORS:].T.copy()
+
+    def seed(self, env: int, seed: int) -> None:
+        """Restart a stream. It is none of those that the seed gives to initial states."""
+        if self._count:
+            (word,) = np.random.SeedSequence(seed, spawn_key=(1,)).generate_state(1, np.uint64)
+            self.own[OWN_KEY, env] = word >> _KEY_SHIFT
+            self.own[OWN_DRAWN, env] = 0.0
+
+    def begin(self, envs: Indices, distractors: Array | None = None) -> None:
+        """Those of environments that begin an episode, `[len(envs), m]`; None draws them."""
+        if not self._count:
+            return
+        if distractors is None:
+            own = self.own[:, envs]
+            distractors = draw(own, self._count)
+            self.own[OWN_DRAWN, envs] = own[OWN_DRAWN]
+        self.own[OWN_DISTRACTORS:, envs] = distractors.T
+
+    def beside(self, states: Array, envs: Indices) -> Array:
+        """Some environments' states `[len(envs), S]` and distractors, `[S + m, len(envs)]`."""
+        return np.concatenate([states.T, self.own[OWN_DISTRACTORS:, envs]])
+
+
 class Batch:
-    """`lanes` episodes of one task, stepped together.
+    """`num_envs` episodes of one task, or lives of one stream, stepped together.
+
+    Each environment has its own lifetime and segment of a stream. While one task is in force in all
+    of them, as it nearly always is, it steps the batch; else those of each segment are a group.
 
     Args:
-      task: the task.
-      lanes: B, at least 1.
+      schedule: what is run; or a task.
+      num_envs: B, at least 1.
       reuse: write each step into the arrays of the step before the last, for environments that
         copy their results anyway; a small batch spends a third of its time on handing out arrays.
 
-    Raises:
-      ResourceLimitError: a batch this large would not fit in memory.
+    Attributes:
+      lived: what infos say of each life in the last step; nothing, of a task.
     """
 
-    lived: Mapping[str, Lanes] = MappingProxyType({})  # `life()` at the end of the last step
+    lived: Mapping[str, Indices] = MappingProxyType({})
 
-    def __init__(self, task: Task, lanes: int, *, reuse: bool = False) -> None:
-        S, A, n = task.spec.state_dim, task.spec.action_dim, len(task.policies)
-        self._shape = (lanes, A)
-        width = S + task.spec.distractors
-        refuse_large_batch(lanes, 8 * (5 * width + 12 * A + 20 * n + 48))
-        self.task, self.lanes = task, lanes
-        self._extended = Extended(task, lanes) if task.spec.extended else None
-        self.initial_states = InitialStates(lanes, S)
+    def __init__(self, schedule: Schedule | Task, num_envs: int, *, reuse: bool = False) -> None:
+        self.schedule = schedule if isinstance(schedule, Schedule) else Schedule.of(schedule)
+        self.num_envs = num_envs
+        spec, n = self.task.spec, len(self.task.policies)
+        S, A, m = spec.state_dim, spec.action_dim, spec.distractors
+        phases = self.schedule.stream.observed_phases if self.schedule.stream is not None else 0
+        check_limit(
+            num_envs * 8 * (5 * (S + m) + 12 * A + 20 * n + 54 + 3 * phases),
+            f"num_envs={num_envs}: a batch this large",
+            "Use fewer environments.",
+        )
+        self._shape = (num_envs, A)
+        self._envs = np.arange(num_envs)
+        self.initial_states = InitialStates(num_envs, S)
+        self._distractors = Distractors(m, num_envs)
         # Channel by channel, [S, B] and [n, B], as the compiled step reads them.
-        self._s = np.zeros((S, lanes))
-        self._t = np.zeros(lanes, np.int64)
-        self._accumulated = np.zeros((n, lanes))
+        self._s = np.zeros((S, num_envs))
+        self._t = np.zeros(num_envs, np.int64)
+        self._accumulated = np.zeros((n, num_envs))
+        self._segment, self._lifetime = np.zeros((2, num_envs), np.int64)
+        self._next_switch = np.zeros(num_envs, np.int64)  # at the first `begin` each may switch
+        self._soonest = 0  # so many steps at most until a segment is over
         self._reuse = reuse
         self._load_engine()
 
     @property
     def document(self) -> SMESpec | StreamSpec:
-        """What is run: the task's spec."""
-        return self.task.spec
+        """What is run: a spec, or a stream."""
+        return self.schedule.document
+
+    @property
+    def task(self) -> Task:
+        """The task of the first segment, with the shapes of all."""
+        return self.schedule.tasks[0]
+
+    @property
+    def one_task(self) -> Task | None:
+        """The task in force where it is the same in every environment."""
+        return self.task_of(0) if len(self._groups) == 1 else None
 
     @property
     def observation_dim(self) -> int:
-        """Entries of a joint observation: S, the distractors, 1 + n."""
-        return self.task.spec.observation_dim - 1 + len(self._accumulated)
-
-    @property
-    def reset_options(self) -> tuple[str, ...]:
-        """The options of an environment's reset."""
-        return reset_options(self.task.spec)
-
-    def _load_engine(self) -> None:
-        S, A, n = self.task.spec.state_dim, self.task.spec.action_dim, len(self._accumulated)
-        self._step_many: StepMany = engine(self.task).step_many
-        self._moved = np.empty((S, self.lanes))
-        safety = self.task.spec.safety is not None
-        results = _Results(self.lanes, self.observation_dim, A, n, safety=safety)
-        in_turn = itertools.cycle([results.take(), results.take()])
-        self._take = in_turn.__next__ if self._reuse else results.take
-
-    # Machine code cannot be pickled or copied: the copy loads it, and has arrays of its own.
-    def __getstate__(self) -> dict[str, Any]:
-        dropped = ("_step_many", "_moved", "_take")
-        return {name: value for name, value in self.__dict__.items() if name not in dropped}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._load_engine()
+        """Entries of a joint observation: those of a single agent's, and one for each other."""
+        return self.document.observation_dim - 1 + len(self._accumulated)
 
     @property
     def state(self) -> Array:
@@ -230,75 +277,104 @@ class Batch:
     @property
     def distractors(self) -> Array:
         """The distractors, `[B, m]` float64 in [0, 1] (a copy)."""
-        return np.empty((self.lanes, 0)) if self._extended is None else self._extended.distractors
+        return self._distractors.values
 
-    def task_of(self, lane: int) -> Task:
-        """The task of a lane, which is that of every lane."""
-        return self.task
+    def _load_engine(self) -> None:
+        self._engines: dict[int, Engine] = {}
+        first = self._engine_of(0)
+        self._add_many, self._see = first.add_many, first.seen
+        self._moved = np.empty_like(self._s)
+        A, n, safety = self._shape[1], len(self._accumulated), self.task.spec.safety is not None
+        results = _Results(self.num_envs, self.observation_dim, A, n, safety=safety)
+        in_turn = itertools.cycle([results.take(), results.take()])
+        self._take = in_turn.__next__ if self._reuse else results.take
+        self._put_in_force()
 
-    def life(self) -> dict[str, Lanes]:
-        """What infos say of each lane's life, `[B]`, at a reset; nothing, for a task."""
-        return {}
+    # Machine code cannot be pickled or copied: the copy loads it, and has arrays of its own.
+    def __getstate__(self) -> dict[str, Any]:
+        dropped = {"_engines", "_add_many", "_see", "_moved", "_take", "_step_many", "_groups"}
+        return {name: value for name, value in vars(self).items() if name not in dropped}
 
-    def life_of(self, lane: int) -> dict[str, Any]:
-        """The same of one lane, as NumPy's numbers."""
-        return {}
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._load_engine()
 
-    def seed(self, lane: int, seed: int) -> None:
-        """Restart the generators of a lane."""
-        self.initial_states.seed(lane, seed)
-        if self._extended is not None:
-            self._extended.seed(lane, seed)
+    def task_of(self, env: int) -> Task:
+        """The task in force in an environment."""
+        return self.schedule.tasks[int(self._segment[env])]
 
-    def seed_by_states(self, lanes: Lanes, states: Array, seed: int = 0) -> None:
-        """Restart the distractors of lanes from initial states `[len(lanes), S]` and a seed.
+    def life(self) -> dict[str, Indices]:
+        """What infos say of each life, fresh arrays `[B]`: phase and steps lived; or nothing."""
+        if self.schedule.stream is None:
+            return {}
+        return infos.of_life(self._phase.copy(), self._lifetime.copy())
 
-        Equal states and seeds give equal distractors, in any lane: so episodes whose states come
-        from a named stream need no other random numbers to be reproducible.
+    def life_of(self, env: int) -> dict[str, Any]:
+        """The same of one environment, as NumPy's numbers."""
+        if self.schedule.stream is None:
+            return {}
+        return infos.of_life(self._phase[env], self._lifetime[env])
+
+    def seed(self, env: int, seed: int) -> None:
+        """Restart an environment's generators, and its life."""
+        self.initial_states.seed(env, seed)
+        self._distractors.seed(env, seed)
+        self.live(env, 0)
+
+    def seed_by_states(self, envs: Indices, states: Array, seed: int = 0) -> None:
+        """Restart the distractors of environments from initial states `[len(envs), S]` and a seed.
+
+        Equal states and seeds give equal distractors, anywhere: so episodes whose states come from
+        a named stream need no other random numbers to be reproducible.
         """
-        if self._extended is not None:
-            self._extended.seed_by_states(lanes, states, seed)
+        if self.task.spec.distractors:
+            for env, s in zip(envs.tolist(), states, strict=True):
+                word = int.from_bytes(s.astype("<f8").tobytes(), "little")
+                self._distractors.seed(env, seed + word)
 
-    def live(self, lane: int, lifetime: int) -> None:
-        """Let a lane's life, if it lives through a stream, go on after so many steps."""
+    def live(self, env: int, lifetime: int) -> None:
+        """Let a life go on after so many steps, at its next `begin`."""
+        self._lifetime[env] = lifetime
+        self._next_switch[env] = 0
 
     def observe(self) -> Observation:
-        """The present joint observations of all lanes, `[B, observation_dim]`."""
+        """The present joint observations, `[B, observation_dim]`."""
         plain = observe(self.task.spec, self.state, self._t, self._accumulated.T)
-        if self._extended is None:
-            return plain
-        seen = self._extended.seen(self.state, np.arange(self.lanes))
-        return np.concatenate([seen, plain[:, self.task.spec.state_dim :]], axis=1)
+        seen, S = self._seen(self.state, self._envs), len(self._s)
+        parts = [seen, plain[:, S:], self._shown]
+        observation: Observation = np.concatenate(parts, axis=1, dtype=np.float32)
+        self._show(self._envs, observation)
+        return observation
 
     def begin(
         self,
-        lanes: Lanes,
+        envs: Indices,
         observation: Observation,
         states: Array | None = None,
         distractors: Array | None = None,
     ) -> None:
-        """Put lanes at the start of an episode, and write their rows of `observation`.
+        """Put environments at the start of an episode, and write their rows of `observation`.
 
-        `states` are `[len(lanes), S]` and `distractors` `[len(lanes), m]`; None draws them from
-        each lane's generators.
+        `states` are `[len(envs), S]` and `distractors` `[len(envs), m]`; None draws them from
+        each one's generators. Of a stream, in the segment in force after the steps lived.
         """
+        self._switch(envs)
         if states is None:
-            states = self.initial_states.draw(lanes)
-        self._s[:, lanes] = states.T
-        self._t[lanes] = 0
-        self._accumulated[:, lanes] = 0.0
-        shown: npt.NDArray[Any] = states
-        if self._extended is not None:
-            self._extended.begin(lanes, distractors)
-            shown = self._extended.seen(states, lanes)
-        width = shown.shape[1]
-        observation[lanes, :width] = shown
-        observation[lanes, width:] = 0.0
+            states = self.initial_states.draw(envs)
+        self._s[:, envs] = states.T
+        self._t[envs] = 0
+        self._accumulated[:, envs] = 0.0
+        self._distractors.begin(envs, distractors)
+        seen = self._seen(states, envs)
+        width = seen.shape[1]
+        observation[envs, :width] = seen
+        observation[envs, width:] = 0.0
+        self._show(envs, observation)
 
     def place(
-        self, states: Array, t: Lanes, accumulated: Array, distractors: Array | None = None
+        self, states: Array, t: Indices, accumulated: Array, distractors: Array | None = None
     ) -> None:
-        """Put every lane at any point of an episode; `observe` gives the observations there.
+        """Put every environment at any point of an episode; `observe` gives what is seen there.
 
         States are `[B, S]`, completed steps t `[B]` in [0, T), each agent's r_cum `[B, n]`, and
         distractors `[B, m]`; None draws them.
@@ -306,19 +382,15 @@ class Batch:
         self._s[:] = states.T
         self._t[:] = t
         self._accumulated[:] = accumulated.T
-        if self._extended is not None:
-            self._extended.begin(np.arange(self.lanes), distractors)
+        self._distractors.begin(self._envs, distractors)
 
     def advance(self, actions: Array, resting: Mask | None = None) -> BatchStep:
-        """One step of every lane.
+        """One step of every environment; ActionError changes none of them.
 
         Args:
           actions: `[B, A]` float64 of the unit range; clipped.
-          resting: `[B]` lanes whose step is not one of their environment, since their episodes have
-            ended; None: no lane.
-
-        Raises:
-          ActionError: of another shape, or not finite; no lane has changed then.
+          resting: `[B]` those whose episode has ended, and whose step does not count: they neither
+            live nor draw numbers; None: none.
         """
         # Machine code does not check shape, dtype and layout: any other would be misread.
         if actions.shape != self._shape:
@@ -333,8 +405,95 @@ class Batch:
         ):
             raise not_finite_error()
         self._s, self._moved = moved, self._s
-        if self._extended is not None:
-            self._extended.extend(
-                self._moved, moved, actions, optimal, values, observation, limits, resting
-            )
+        if self._add_many is not None:
+            own = self._distractors.own
+            drawn = None if resting is None else own[OWN_DRAWN, resting]
+            self._add_many(own, self._moved, moved, actions, optimal, values, observation, limits)
+            if drawn is not None:
+                own[OWN_DRAWN, resting] = drawn
+        if self.schedule.stream is not None:
+            self._live_on(observation, resting)
         return result
+
+    def _seen(self, states: Array, envs: Indices) -> npt.NDArray[Any]:
+        """What the agents of some environments see of states, `[len(envs), S + m]`."""
+        if self.task.spec.observation is None:
+            return states
+        return self._see(self._distractors.beside(states, envs)).T.astype(np.float32)
+
+    def _live_on(self, observation: Observation, resting: Mask | None) -> None:
+        """Count a step of each life, and switch where a segment ends within an episode."""
+        self._lifetime += 1 if resting is None else ~resting
+        self.lived = self.life()  # before the switch: of the task in which the action was taken
+        if self._shown.shape[1]:
+            observation[:, len(self._s) + 2 :] = self._shown
+        if self.schedule.switches_within:
+            self._soonest -= 1
+            if self._soonest <= 0:
+                envs = np.flatnonzero(self._lifetime >= self._next_switch)
+                self._switch(envs)
+                self._show(envs, observation)
+
+    def _switch(self, envs: Indices) -> None:
+        """Put the next segment in force in those of these environments whose segment is over."""
+        if self.schedule.stream is None:
+            return
+        over = envs[self._lifetime[envs] >= self._next_switch[envs]]
+        if over.size:
+            lifetimes, which = np.unique(self._lifetime[over], return_inverse=True)
+            segments = [self.schedule.segment(lifetime) for lifetime in lifetimes.tolist()]
+            switches = [self.schedule.next_switch(lifetime) for lifetime in lifetimes.tolist()]
+            self._segment[over] = np.array(segments)[which]
+            self._next_switch[over] = np.array(switches)[which]
+            self._put_in_force()
+        self._soonest = int((self._next_switch - self._lifetime).min())
+
+    def _put_in_force(self) -> None:
+        """Prepare what depends on the segments: what steps the batch, and what is shown."""
+        segments = np.unique(self._segment).tolist()
+        steps = [self._engine_of(segment).step_many for segment in segments]
+        envs = [np.flatnonzero(self._segment == segment) for segment in segments]
+        self._groups = [*zip(steps, envs, strict=True)]
+        self._step_many: StepMany = steps[0] if len(steps) == 1 else self._step_groups
+        self._phase = self.schedule.phases[self._segment]
+        self._shown = self.schedule.shown(self._phase)
+        self._k = self.schedule.k[self._segment]
+
+    def _engine_of(self, segment: int) -> Engine:
+        if segment not in self._engines:
+            self._engines[segment] = engine(self.schedule.tasks[segment])
+        return self._engines[segment]
+
+    def _step_groups(
+        self,
+        s: Array,
+        t: Indices,
+        accumulated: Array,
+        action: Array,
+        moved: Array,
+        observation: Observation,
+        optimal: Array,
+        values: Array,
+        ends: Mask,
+    ) -> bool:
+        """One step as `StepMany`, by the step of each environment's segment."""
+        groups = []
+        for step, envs in self._groups:
+            before = s[:, envs], t[envs], accumulated[:, envs], action[envs]
+            after = moved[:, envs], observation[envs], optimal[envs], values[..., envs]
+            arrays = [*map(np.ascontiguousarray, (*before, *after, ends[:, envs]))]
+            if not step(*arrays):
+                return False  # before any environment has moved
+            groups.append((envs, arrays))
+        for envs, arrays in groups:
+            _, t[envs], accumulated[:, envs], _, moved[:, envs] = arrays[:5]
+            observation[envs], optimal[envs], values[..., envs], ends[:, envs] = arrays[5:]
+        return True
+
+    def _show(self, envs: Indices, observation: Observation) -> None:
+        """Write what depends on the segment in force into rows: r_cum/k, and the phase."""
+        if self.schedule.stream is not None:
+            S = len(self._s)
+            waiting = self._accumulated[0, envs] / self._k[envs]
+            observation[envs, S + 1] = np.minimum(waiting, 1.0)
+            observation[envs, S + 2 :] = self._shown[envs]

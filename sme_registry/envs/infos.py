@@ -23,7 +23,7 @@ from sme_registry.compiled.values import (
     STEP_REWARD,
 )
 from sme_registry.envs.arguments import from_unit
-from sme_registry.envs.types import Array, Lanes, Mask
+from sme_registry.envs.types import Array, Indices, Mask
 from sme_registry.spec import SMESpec
 
 if TYPE_CHECKING:
@@ -67,57 +67,57 @@ def at_reset(spec: SMESpec, action_dim: int | None = None) -> dict[str, Any]:
     return {**arrays, **dict.fromkeys(numbers(spec), _NAN)}
 
 
-def batch_at_reset(spec: SMESpec, lanes: int) -> dict[str, Array]:
+def batch_at_reset(spec: SMESpec, num_envs: int) -> dict[str, Array]:
     """The info of `B` resets: fresh arrays of NaN, those of actions `[B, A]`, others `[B]`."""
-    arrays = {key: np.full((lanes, spec.action_dim), np.nan) for key in actions(spec)}
-    return arrays | {key: np.full(lanes, np.nan) for key in numbers(spec)}
+    arrays = {key: np.full((num_envs, spec.action_dim), np.nan) for key in actions(spec)}
+    return arrays | {key: np.full(num_envs, np.nan) for key in numbers(spec)}
 
 
 def write_reset(
-    info: dict[str, npt.NDArray[Any]], lanes: Lanes, life: Mapping[str, npt.NDArray[Any]]
+    info: dict[str, npt.NDArray[Any]], envs: Indices, life: Mapping[str, npt.NDArray[Any]]
 ) -> None:
-    """Overwrite a batched info in the lanes that begin an episode; `life` is `Batch.life`'s."""
+    """Overwrite a batched info where an episode begins; `life` is `Batch.life`'s."""
     for key, value in info.items():
-        value[lanes] = life[key][lanes] if key in life else np.nan
+        value[envs] = life[key][envs] if key in life else np.nan
 
 
 def of_batch(step: BatchStep, rescaled: bool) -> dict[str, npt.NDArray[Any]]:
-    """The info of a step of a single agent's lanes: `[B, A]` and `[B]`; see `_of_step`."""
+    """The info of a step of single agents: `[B, A]` and `[B]`; see `_of_step`."""
     return _of_step(step, step.values[:, 0], ..., rescaled)
 
 
-def of_all_agents(step: BatchStep, lane: int, rescaled: bool) -> dict[str, Any]:
-    """One lane's step as one agent's: the actions of all channels, the means over the agents."""
-    return _of_step(step, step.values[:, :, lane].mean(axis=1), lane, rescaled)
+def of_all_agents(step: BatchStep, env: int, rescaled: bool) -> dict[str, Any]:
+    """A team's step as one agent's: the actions of all channels, the means over the agents."""
+    return _of_step(step, step.values[:, :, env].mean(axis=1), env, rescaled)
 
 
-def _of_step(step: BatchStep, values: Array, lanes: Any, rescaled: bool) -> dict[str, Any]:
-    """The info of a step from its `values` `[5 or 7, …]`, and its actions of some lanes."""
+def _of_step(step: BatchStep, values: Array, envs: Any, rescaled: bool) -> dict[str, Any]:
+    """The info of a step from its `values` `[5 or 7, …]`, and its actions of some environments."""
     info = {
-        "optimal_action": from_unit(step.optimal[lanes], rescaled),
+        "optimal_action": from_unit(step.optimal[envs], rescaled),
         **{key: values[row] for key, row in NUMBERS.items()},
     }
     if step.limits.size:
-        info |= zip(SAFETY_ACTIONS, from_unit(step.limits[:, lanes], rescaled), strict=True)
+        info |= zip(SAFETY_ACTIONS, from_unit(step.limits[:, envs], rescaled), strict=True)
         info |= {key: values[row] for key, row in SAFETY_NUMBERS.items()}
     return info
 
 
 def of_life(phase: Any, lifetime: Any) -> dict[str, Any]:
-    """What the info of a stream has besides: its phase, and the environment steps lived."""
+    """What the info of a stream has besides."""
     return {"phase": phase, "lifetime": lifetime}
 
 
 def masked(info: Mapping[str, npt.NDArray[Any]], mask: Mask | None = None) -> dict[str, Any]:
-    """Gymnasium's form of batched info: each key with its mask `_key`; None is every lane.
+    """Gymnasium's form of batched info: each key with its mask `_key`; None is all.
 
     Copies arrays only where there is a mask, and writes 0 where it is False.
     """
     infos: dict[str, Any] = {}
     if mask is None:
-        every_lane = np.ones(len(info["similarity"]), bool)
+        everywhere = np.ones(len(info["similarity"]), bool)
         for key, value in info.items():
-            infos[key], infos[f"_{key}"] = value, every_lane
+            infos[key], infos[f"_{key}"] = value, everywhere
         return infos
     for key, value in info.items():
         columns = mask.reshape(-1, *[1] * (value.ndim - 1))

@@ -9,14 +9,20 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import gymnasium
 import numpy as np
 import numpy.typing as npt
 
+from sme_registry.envs import arguments, infos
+from sme_registry.envs.base import TaskMixin
+from sme_registry.envs.batch import Batch, BatchStep
+from sme_registry.envs.types import Array
 from sme_registry.errors import EpisodeError, OptionError
-from sme_registry.io import require_packages
+from sme_registry.io import integer_in, require_packages
 from sme_registry.spec import SMESpec
 from sme_registry.spec.catalogue import title
 from sme_registry.task import Task
@@ -24,10 +30,11 @@ from sme_registry.task import Task
 if TYPE_CHECKING:
     import pygame
 
-    from sme_registry.envs.single import SMEEnv
-
 Frame = npt.NDArray[np.uint8]
 _Colour = tuple[int, int, int]
+
+RENDER_MODES = ["human", "rgb_array"]
+METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
 
 WIDTH, HEIGHT = 800, 520
 _MARGIN = 24
@@ -51,13 +58,7 @@ def _import_pygame() -> Any:
 class Renderer:
     """Draws the present episode. Recording is cheap; a frame is drawn on request.
 
-    Args:
-      task: the task.
-      mode: "rgb_array" or "human" (a window, shown as each step is recorded).
-      metadata: the environment's; `render_fps` paces the window.
-
-    Raises:
-      MissingDependencyError: pygame is not installed.
+    In mode "human" each step is shown in a window, paced by `render_fps` of the metadata.
     """
 
     def __init__(self, task: Task, mode: str, metadata: dict[str, Any]) -> None:
@@ -75,16 +76,8 @@ class Renderer:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state, _pygame=_import_pygame(), _window=None)
 
-    def record(self, env: SMEEnv, last: tuple[Any, dict[str, Any]] | None) -> None:
-        """Record a reset or a step.
-
-        Args:
-          env: the environment, after it.
-          last: None at a reset; else the action, in the environment's range, and the step's info.
-
-        Raises:
-          OptionError: no window can be opened in mode "human".
-        """
+    def record(self, env: Any, last: tuple[Any, dict[str, Any]] | None) -> None:
+        """Record a reset (`last` is None), or a step: its action, as it was given, and its info."""
         self._state, self._spec = env.state, env.sme_spec  # a stream's spec may change
         if last is None:
             self._begun = True
@@ -108,11 +101,7 @@ class Renderer:
             self._show()
 
     def frame(self) -> Frame | None:
-        """The present frame: `[H, W, 3]` uint8 for "rgb_array"; None for "human".
-
-        Raises:
-          EpisodeError: before the first reset.
-        """
+        """The present frame: `[H, W, 3]` uint8 for "rgb_array"; None for "human"."""
         if not self._begun:
             raise EpisodeError("render: the episode has not begun. Call reset() first.")
         if self._mode == "human":
@@ -292,3 +281,106 @@ def _columns(values: Sequence[float], left: int, right: int) -> list[tuple[int, 
     pitch = min((right - left) / len(values), 44.0)
     width = max(1, round(pitch - min(8.0, pitch / 4)))
     return [(round(left + i * pitch), width, value) for i, value in enumerate(values)]
+
+
+class RenderMixin(TaskMixin):
+    """Frames of an episode; pygame is imported when the first is recorded."""
+
+    metadata: dict[str, Any]
+    render_mode: str | None
+    _renderer: Any = None
+
+    def _set_render_mode(self, render_mode: str | None) -> None:
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise OptionError(f"render_mode={render_mode!r}: must be None, 'human' or 'rgb_array'.")
+        self.render_mode = render_mode
+
+    def _record(self, env: Any, last: tuple[Any, dict[str, Any]] | None) -> None:
+        """Record in an environment with a render mode; see `Renderer.record`."""
+        if self._renderer is None:
+            assert self.render_mode is not None
+            self._renderer = Renderer(self._task, self.render_mode, self.metadata)
+        self._renderer.record(env, last)
+
+    def render(self) -> Any:
+        """The frame of this step: `[H, W, 3]` uint8 for "rgb_array"; None for "human"."""
+        if self.render_mode is None:
+            gymnasium.logger.warn(
+                "render() needs a render_mode, such as "
+                'sme_registry.make(..., render_mode="rgb_array").'
+            )
+            return None
+        if self._renderer is None:
+            raise EpisodeError("render: the episode has not begun. Call reset() first.")
+        return self._renderer.frame()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+class BatchRenderer:
+    """Draws the present episodes of some environments of a batch, a team's as one; None: of all."""
+
+    def __init__(
+        self, batch: Batch, envs: Sequence[int] | None, space: gymnasium.spaces.Box
+    ) -> None:
+        chosen = range(batch.num_envs) if envs is None else envs
+        if not isinstance(chosen, list | tuple | range | np.ndarray) or len(chosen) == 0:
+            raise OptionError(f"render_lanes={envs!r}: must be a list of lanes, such as [0, 1].")
+        chosen = [integer_in("render_lanes", env, 0, batch.num_envs - 1) for env in chosen]
+        self._batch, self._space = batch, space
+        self._renderers = {
+            env: Renderer(batch.task_of(env), "rgb_array", METADATA) for env in chosen
+        }
+
+    def record(
+        self, began: Iterable[int], unit: Array | None = None, step: BatchStep | None = None
+    ) -> None:
+        """Record a reset in the environments that began an episode, and a step in the others.
+
+        `unit` are the actions `[B, A]` of the unit range; None after a reset, which has no step.
+        """
+        states, reset = self._batch.state, set(began)
+        for env, renderer in self._renderers.items():
+            view: Any = SimpleNamespace(
+                state=states[env],
+                action_space=self._space,
+                sme_spec=self._batch.task_of(env).spec,
+            )
+            if env in reset:
+                renderer.record(view, None)
+            elif unit is not None and step is not None:
+                rescaled = bool(self._space.low[0] < 0.0)
+                action = arguments.from_unit(unit[env], rescaled)
+                renderer.record(view, (action, infos.of_all_agents(step, env, rescaled)))
+
+    def frames(self) -> tuple[Frame, ...]:
+        """The present frames of those drawn, each `[H, W, 3]` uint8."""
+        frames = (renderer.frame() for renderer in self._renderers.values())
+        return tuple(frame for frame in frames if frame is not None)  # None is for windows only
+
+    def frame_of_each(self) -> tuple[Frame, ...]:
+        """A frame of each environment; those not drawn are the same white frame."""
+        blank = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+        drawn = dict(zip(self._renderers, self.frames(), strict=True))
+        return tuple(drawn.get(env, blank) for env in range(self._batch.num_envs))
+
+
+def batch_renderer(
+    render_mode: str | None,
+    envs: Sequence[int] | None,
+    batch: Batch,
+    space: gymnasium.spaces.Box,
+) -> BatchRenderer | None:
+    """The renderer of a batch's `render_mode` and `render_lanes`; None without a mode."""
+    if render_mode not in (None, "rgb_array"):
+        raise OptionError(
+            f"render_mode={render_mode!r}: must be None or 'rgb_array' for a batch. Create a "
+            "single environment to watch an episode in a window."
+        )
+    if render_mode is None and envs is not None:
+        raise OptionError("render_lanes: needs render_mode='rgb_array'. Add it.")
+    return None if render_mode is None else BatchRenderer(batch, envs, space)

@@ -3,34 +3,43 @@
 from __future__ import annotations
 
 import copy
-from typing import Any, cast
+from collections.abc import Callable
+from typing import Any, TypeAlias, cast
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled import Engine, Extension, engine
-from sme_registry.compiled.values import EXTENDED, LANE_STATE, LANE_VALUES
-from sme_registry.envs import arguments, infos
-from sme_registry.envs.base import (
-    RENDER_MODES,
-    GymnasiumMixin,
-    RenderMixin,
-    refuse_short_time_limit,
+from sme_registry.compiled import engine
+from sme_registry.compiled.values import (
+    ACCUMULATED_REWARD,
+    HAS_MORE,
+    LANE_STATE,
+    LANE_VALUES,
+    MORE_COST,
+    MORE_OWN,
+    MORE_SAFE_REGRET,
 )
-from sme_registry.envs.extension import ExtendedLane, reset_options
-from sme_registry.envs.types import Action, Array, Observation
+from sme_registry.envs import arguments, infos
+from sme_registry.envs.base import GymnasiumMixin, html_card, refuse_short_time_limit
+from sme_registry.envs.batch import Distractors
+from sme_registry.envs.rendering import RENDER_MODES, RenderMixin
+from sme_registry.envs.schedule import Schedule
+from sme_registry.envs.types import Action, Array, Indices, Observation
 from sme_registry.errors import EpisodeError
-from sme_registry.spec import ActionRange, SpecLike
+from sme_registry.spec import ActionRange, SMESpec, SpecLike, StreamLike, StreamSpec
 from sme_registry.spec.catalogue import title
-from sme_registry.task import Task
 
 _FLOAT32 = np.dtype(np.float32)
 _POOL_BYTES = 4096
+_AHEAD = 256  # lifetimes made at once: NumPy's numbers one by one cost a quarter of a step
+_ONLY: Indices = np.zeros(1, np.int64)
+
+_Result: TypeAlias = tuple[Observation, float, bool, bool, dict[str, Any]]
 
 
 class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
-    """One episode at a time of a task whose optimal policy is known.
+    """One episode at a time of a task, or of a stream of tasks, whose optimal policy is known.
 
     Observation: `[S + 2]` float32 in [0, 1]: the state, t/T, and r_cum/k. Action: `[A]`, in [0, 1]
     (`action_range="unit"`) or [−1, 1] (`"symmetric"`, rescaled); actions outside are clipped.
@@ -43,11 +52,18 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
     range; `cost` in [0, 1]; and `safe_regret`, the safe action's step reward minus r. With
     `observation` the agent sees M(s, d) `[S + m]` in place of the state.
 
+    Of a stream, `task` and `sme_spec` are those in force, by the steps that were lived. `info` also
+    has `phase`, the index of the phase in force, and `lifetime`, the environment steps of this
+    life up to now; at a step it is all about the task in which the action was taken.
+    `reset(seed=…)` begins a new life at 0, and `reset()` continues it. With `switch="step"` a new
+    phase begins within an episode: state, t and r_cum carry over. The observation has the r_cum/k
+    of the k then in force, at most 1, and with `observes_phase` ends with the phase, one-hot.
+
     Args:
-      spec: the task: a spec, its fields, an id, a digest or a path.
+      spec: the task or stream: a document, its fields, an id, a digest or a path.
       action_range: "unit" or "symmetric".
       render_mode: None, "rgb_array" or "human".
-      **overrides: spec fields to change; the environment then runs the derived spec.
+      **overrides: fields of a task's spec to change; the environment then runs the derived spec.
 
     Raises:
       SpecError, UnknownNameError: no such task, or a field out of range.
@@ -68,96 +84,32 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
 
     def __init__(
         self,
-        spec: SpecLike = "Default-v1",
+        spec: SpecLike | StreamLike = "Default-v1",
         *,
         action_range: ActionRange = "unit",
         render_mode: str | None = None,
         **overrides: Any,
     ) -> None:
         self._set_render_mode(render_mode)
-        self._task = self._load(spec, overrides)
-        A = self.sme_spec.action_dim
-        space, self._rescaled = arguments.action_space(action_range, A)
+        self._schedule = Schedule.load(type(self), spec, overrides)
+        document = self.document
+        self._action_shape = (document.action_dim,)
+        space, self._rescaled = arguments.action_space(action_range, document.action_dim)
         self.action_space = cast("gymnasium.Space[Action]", space)
-        width = self.sme_spec.observation_dim + len(self._phase_shown)
+        width = document.observation_dim
         self.observation_space = gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32)
-        self._action_shape = (A,)
         self._state = "created"
         self._keyed_by: np.random.Generator | None = None  # of which the distractors' stream is
-        self._extended = ExtendedLane(self._task) if self.sme_spec.extended else None
-        self._load_engine()
-
-    # What `SMEStreamEnv` has besides. They stand here because a step of a stream is a step of its
-    # task: one that called this one would cost a sixth more.
-    _phase: Any = None  # in force, NumPy's number
-    _lifetimes: list[Any] | None = None  # those of the next steps, the last one first
-    _phase_shown: Observation = np.empty(0, np.float32)  # what observations end with
+        self._distractors = Distractors(self._schedule.tasks[0].spec.distractors, 1)
+        # Of a stream: the lifetimes of the next steps, the last one first.
+        self._lifetimes: list[Any] | None = None if self._schedule.stream is None else []
+        self._look_ahead(0)
+        self._put_in_force(0)
 
     @property
-    def _reset_options(self) -> tuple[str, ...]:
-        return reset_options(self.sme_spec)
-
-    def _load(self, spec: Any, overrides: dict[str, Any]) -> Task:
-        """The task at the beginning."""
-        return arguments.single_agent(arguments.load_overridden(type(self), spec, overrides))
-
-    def _load_engine(self) -> None:
-        compiled: Engine | Extension
-        if self._extended is None:
-            compiled = engine(self._task)
-            self._buffer, self._lane = compiled.new_lane()  # the second is a view of the first
-        else:
-            compiled = self._extended.compiled
-            self._buffer, self._lane = self._extended.buffer, self._extended.lane
-        self._step_float32, self._step_float64 = compiled.step_float32, compiled.step_float64
-        # Views of no dimension: `view[()]` makes a NumPy number in a third of `np.float64`'s time.
-        self._values = tuple(self._lane[LANE_VALUES + row, ...] for row in infos.NUMBERS.values())
-        self._rows: list[tuple[Array, Observation]] = []
-        self._prepare_step()
-
-    def _prepare_step(self) -> None:
-        """Gather what a step needs in one tuple, so that a step looks up one attribute.
-
-        The first entry is the dtype of actions that need no checks: None while no episode is
-        running, where actions are rescaled, or frames are rendered.
-        """
-        plain = self._state == "running" and not self._rescaled and self.render_mode is None
-        self._fast_step: tuple[Any, ...] = (
-            _FLOAT32 if plain else None,
-            self._step_float32,
-            self._buffer,
-            self._rows.pop,
-            *self._values,
-            None if self._lifetimes is None else (self._phase, self._lifetimes),
-        )
-
-    def _refill(self) -> None:
-        """Allocate what later steps write, each once. Half the cost of two `np.empty` a step."""
-        width, A = self.sme_spec.observation_dim, self.sme_spec.action_dim
-        if self.sme_spec.safety is not None:
-            A *= 3  # the limits and the safe action, which `add_limits` takes from the row
-        count = max(1, _POOL_BYTES // (8 * max(width, A)))
-        optimal = np.empty((count, A))
-        observations = np.empty((count, width + len(self._phase_shown)), np.float32)
-        observations[:, width:] = self._phase_shown
-        self._rows.extend(zip(optimal, observations, strict=True))
-
-    # Machine code cannot be pickled or copied: the copy looks it up again.
-    def __getstate__(self) -> dict[str, Any]:
-        dropped = (
-            "_step_float32",
-            "_step_float64",
-            "_buffer",
-            "_values",
-            "_fast_step",
-            "_rows",
-        )
-        return {name: value for name, value in self.__dict__.items() if name not in dropped}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._load_engine()
-        self._lane[:] = state["_lane"]
+    def document(self) -> SMESpec | StreamSpec:
+        """What the environment runs: its spec, or a stream."""
+        return self._schedule.document
 
     @property
     def state(self) -> Array:
@@ -167,7 +119,38 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
     @property
     def distractors(self) -> Array:
         """The distractors d, `[m]` float64 in [0, 1] (a copy); empty where the task has none."""
-        return np.empty(0) if self._extended is None else self._extended.distractors[0]
+        return self._distractors.values[0]
+
+    def _put_in_force(self, segment: int) -> None:
+        """Run the task of a segment; the episode, if one is running, goes on by `_load_engine`."""
+        self._segment, self._task = segment, self._schedule.tasks[segment]
+        self._phase: Any = self._schedule.phases[segment]  # NumPy's number
+        self._phase_shown = self._schedule.shown(self._phase)
+        self._load_engine()
+
+    def _load_engine(self) -> None:
+        self._engine = engine(self._task)
+        self._buffer, self._lane, more = self._engine.new_buffer()  # both are views of the first
+        if self.sme_spec.distractors:
+            own = more[MORE_OWN:, None]
+            own[:] = self._distractors.own
+            self._distractors.own = own
+        # Views of no dimension: `view[()]` makes a NumPy number in a third of `np.float64`'s time.
+        self._values = tuple(self._lane[LANE_VALUES + row, ...] for row in infos.NUMBERS.values())
+        if self.sme_spec.safety is not None:
+            self._cost, self._safe_regret = more[MORE_COST, ...], more[MORE_SAFE_REGRET, ...]
+        self._rows: list[tuple[Array, Observation]] = []
+        self._step = self._fast_step() if self._state == "running" else _refuse_step
+
+    # Machine code cannot be pickled or copied: the copy looks it up again.
+    def __getstate__(self) -> dict[str, Any]:
+        dropped = {"_engine", "_buffer", "_values", "_cost", "_safe_regret", "_rows", "_step"}
+        return {name: value for name, value in vars(self).items() if name not in dropped}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._load_engine()
+        self._lane[:] = state["_lane"]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -177,20 +160,21 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         Args:
           seed: seeds the environment's generator; None continues its stream. Distractors follow
             from the seed, or from `np_random` where you have set it.
-          options: `{"state": s}` begins at s `[S]`, each entry in [0, 1], and where the task has
-            distractors `{"distractors": d}` at d `[m]`.
+          options: `{"state": s}` begins at s `[S]`, each entry in [0, 1]; where the task has
+            distractors `{"distractors": d}` at d `[m]`; and of a stream `{"lifetime": n}` begins a
+            life after n steps.
 
         Returns:
-          The observation `[S + m + 2]`, and an info of NaN.
+          The observation, and an info of NaN.
 
         Raises:
           StateError: the state or the distractors have the wrong shape or lie outside the cube.
           OptionError: an unknown option, or a seed that is no integer of at least 0.
           WrapperError: an outer TimeLimit would end the episode before the horizon.
         """
-        refuse_short_time_limit(self.sme_spec.horizon)
-        arguments.refuse_unknown_options(options, self._reset_options)
-        S, seed = self.sme_spec.state_dim, arguments.checked_seed(seed)
+        refuse_short_time_limit(self.document.horizon)
+        arguments.refuse_unknown_options(options, self._schedule.reset_options)
+        S, seed = self.document.state_dim, arguments.checked_seed(seed)
         lifetime = arguments.lifetime_in(options)
         start, distractors = (
             arguments.initial_values(name, options or {}, (width,))
@@ -201,19 +185,24 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         s = self.np_random.random(S) if start is None else start
         self._lane[:LANE_STATE] = 0.0
         self._lane[LANE_STATE:] = s
-        shown: npt.NDArray[Any] = s
-        if self._extended is not None:
-            if self._keyed_by is not self.np_random:
-                self._extended.seed(0, self._distractors_seed())
-                self._keyed_by = self.np_random
-            shown = self._extended.begin_lane(distractors)
-        observation = np.zeros(len(shown) + 2 + len(self._phase_shown), np.float32)
-        observation[: len(shown)], observation[len(shown) + 2 :] = shown, self._phase_shown
+        seen = self._begin_seeing(s, distractors)
+        observation = np.zeros(self.document.observation_dim, np.float32)
+        observation[: len(seen)], observation[len(seen) + 2 :] = seen, self._phase_shown
         self._state = "running"
-        self._prepare_step()
+        self._step = self._fast_step()
         if self.render_mode is not None:
             self._record(self, None)
         return observation, {**infos.at_reset(self.sme_spec), **life}
+
+    def _begin_seeing(self, s: Array, distractors: Array | None) -> npt.NDArray[Any]:
+        """Begin an episode of the distractors; what the agent sees of the state, `[S + m]`."""
+        if self.sme_spec.observation is None:
+            return s
+        if self._keyed_by is not self.np_random:
+            self._distractors.seed(0, self._distractors_seed())
+            self._keyed_by = self.np_random
+        self._distractors.begin(_ONLY, None if distractors is None else distractors[None])
+        return self._engine.seen(self._distractors.beside(s[None], _ONLY))[:, 0]
 
     def _distractors_seed(self) -> int:
         """The seed of the generator, or a number that follows from one that the user has set.
@@ -225,14 +214,35 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         return seed if seed >= 0 else int(copy.deepcopy(self.np_random).integers(2**63))
 
     def _live(self, lifetime: int | None) -> dict[str, Any]:
-        """Called by each reset before it draws a state; what it returns is added to the info.
+        """Begin a life of a stream after so many steps; None continues the present one.
 
-        Args:
-          lifetime: of a stream, the steps after which a life begins; None continues the present.
+        Each reset calls it before it draws a state. What it returns is added to the info.
         """
-        return {}
+        if self._lifetimes is None:
+            return {}
+        if lifetime is None:
+            lifetime = int(self._lifetimes[-1]) - 1
+        else:
+            self._look_ahead(lifetime)
+        self._enter(self._schedule.segment(lifetime))
+        return infos.of_life(self._phase, np.int64(lifetime))
 
-    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def _look_ahead(self, lifetime: int) -> None:
+        """Fill the lifetimes of the next steps: those until a switch, or the next few."""
+        if self._lifetimes is not None:
+            stop = lifetime + _AHEAD
+            if self._schedule.switches_within:
+                stop = min(stop, self._schedule.next_switch(lifetime))
+            self._lifetimes[:] = np.arange(stop, lifetime, -1)
+
+    def _enter(self, segment: int) -> None:
+        """Put another segment in force; the episode, if one is running, goes on."""
+        if segment != self._segment:
+            lane = self._lane
+            self._put_in_force(segment)
+            self._lane[:] = lane
+
+    def step(self, action: Action) -> _Result:
         """One step.
 
         Args:
@@ -245,67 +255,94 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
           ActionError: wrong shape, not numbers, or not finite; the state is unchanged then.
           EpisodeError: no episode is running.
         """
-        # Written for speed: each look-up and branch here costs one percent of a step.
-        (
-            plain_dtype, step_float32, buffer, next_rows,
-            similarity, step_reward, regret, accumulated_reward, life,
-        ) = self._fast_step  # fmt: skip
-        try:
-            optimal, observation = next_rows()
-        except IndexError:
-            self._refill()
-            optimal, observation = next_rows()
-        try:
-            plain = action.dtype is plain_dtype and action.ndim == 1
-        except AttributeError:
-            plain = False
-        if plain:
-            reward, end = step_float32(buffer, action, optimal, observation)
-        else:
-            action = self._checked(action)
-            reward, end = self._step_float64(buffer, action, optimal, observation)
-        if life is None:
-            info = {
-                "optimal_action": optimal,
-                "similarity": similarity[()],
-                "step_reward": step_reward[()],
-                "regret": regret[()],
-                "accumulated_reward": accumulated_reward[()],
-            }
-        else:  # written out: a dictionary that grows to seven keys costs twice as much
-            phase, lifetimes = life
-            info = {
-                "optimal_action": optimal,
-                "similarity": similarity[()],
-                "step_reward": step_reward[()],
-                "regret": regret[()],
-                "accumulated_reward": accumulated_reward[()],
-                "phase": phase,
-                "lifetime": lifetimes.pop(),
-            }
-            plain = plain and lifetimes
-        if end or not plain:
-            end = self._after(end, action, info, observation)
-            return observation, reward, end == 1.0 or end == 3.0, end >= 2.0, info
-        return observation, reward, False, False, info
+        return self._step(self, action)
+
+    def _fast_step(self) -> Callable[[Any, Any], _Result]:
+        """A step of the present segment, as a closure over all that it reads.
+
+        Written for speed: each look-up of an attribute and each branch costs a percent of a step.
+        It takes the environment as an argument, as a closure over it would be a circle.
+        """
+        # Actions of this dtype need no checks; none where they are rescaled or frames are drawn.
+        no_checks = None if self._rescaled or self.render_mode is not None else _FLOAT32
+        step_float32, step_float64 = self._engine.step_float32, self._engine.step_float64
+        buffer, next_rows = self._buffer, self._rows.pop
+        similarity, step_reward, regret, accumulated_reward = self._values
+        phase, lifetimes = self._phase, self._lifetimes
+
+        def step(env: SMEEnv, action: Any) -> _Result:
+            try:
+                optimal, observation = next_rows()
+            except IndexError:
+                env._refill()
+                optimal, observation = next_rows()
+            try:
+                plain = action.dtype is no_checks and action.ndim == 1
+            except AttributeError:
+                plain = False
+            if plain:
+                reward, end = step_float32(buffer, action, optimal, observation)
+            else:
+                action = env._checked(action)
+                reward, end = step_float64(buffer, action, optimal, observation)
+            if lifetimes is None:
+                info = {
+                    "optimal_action": optimal,
+                    "similarity": similarity[()],
+                    "step_reward": step_reward[()],
+                    "regret": regret[()],
+                    "accumulated_reward": accumulated_reward[()],
+                }
+            else:  # written out: a dictionary that grows to seven keys costs twice as much
+                info = {
+                    "optimal_action": optimal,
+                    "similarity": similarity[()],
+                    "step_reward": step_reward[()],
+                    "regret": regret[()],
+                    "accumulated_reward": accumulated_reward[()],
+                    "phase": phase,
+                    "lifetime": lifetimes.pop(),
+                }
+                if not lifetimes:
+                    plain = False
+            if end or not plain:
+                end = env._after(end, action, info, observation)
+                return observation, reward, end == 1.0 or end == 3.0, end >= 2.0, info
+            return observation, reward, False, False, info
+
+        return step
+
+    def _refill(self) -> None:
+        """Allocate what later steps write, each once. Half the cost of two `np.empty` a step."""
+        width, A = self.document.observation_dim, self._action_shape[0]
+        if self.sme_spec.safety is not None:
+            A *= 3  # the limits and the safe action as well
+        count = max(1, _POOL_BYTES // (8 * max(width, A)))
+        optimal = np.empty((count, A))
+        observations = np.empty((count, width), np.float32)
+        observations[:, width - len(self._phase_shown) :] = self._phase_shown
+        self._rows.extend(zip(optimal, observations, strict=True))
 
     def _after(
         self, end: float, action: Action, info: dict[str, Any], observation: Observation
     ) -> float:
-        """What the fast path leaves out: refused actions, extensions, the end, ranges, frames.
+        """What the fast path leaves out: refused actions, switches, safety, the end, frames.
 
-        Returns:
-          The end without EXTENDED.
+        Returns the end without HAS_MORE.
         """
         if end < 0.0:
+            if self._lifetimes is not None:
+                self._lifetimes.append(info["lifetime"])  # nothing was lived
             self._checked(action)  # raises where the size is wrong
             raise arguments.not_finite_error()
-        if self._extended is not None:
-            self._extended.add_limits(info)
-            end -= EXTENDED
+        if self._lifetimes is not None and not self._lifetimes:
+            self._go_on(int(info["lifetime"]), observation)
+        if end >= HAS_MORE:
+            end -= HAS_MORE
+            if self.sme_spec.safety is not None:
+                self._add_limits(info)
         if end:
-            self._state = "ended"
-            self._prepare_step()
+            self._state, self._step = "ended", _refuse_step
         if self._rescaled:
             for key in infos.actions(self.sme_spec):
                 info[key] = arguments.from_unit(info[key], True)
@@ -313,18 +350,37 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             self._record(self, (arguments.from_unit(action, self._rescaled), info))
         return end
 
+    def _go_on(self, lifetime: int, observation: Observation) -> None:
+        """Look further ahead; where a segment ends within an episode, put the next in force."""
+        self._look_ahead(lifetime)
+        if self._schedule.switches_within:
+            self._enter(self._schedule.segment(lifetime))
+            S = self.sme_spec.state_dim
+            waiting = self._lane[LANE_VALUES + ACCUMULATED_REWARD] / self.sme_spec.k
+            observation[S + 1], observation[S + 2 :] = min(waiting, 1.0), self._phase_shown
+
+    def _add_limits(self, info: dict[str, Any]) -> None:
+        """Complete the info of a step, whose "optimal_action" is what the step wrote, `[3A]`."""
+        row, (A,) = info["optimal_action"], self._action_shape
+        info["optimal_action"] = row[:A]  # slices: `reshape` takes three times as long
+        info["cost"] = self._cost[()]
+        info["limit"] = row[A : 2 * A]
+        info["safe_action"] = row[2 * A :]
+        info["safe_regret"] = self._safe_regret[()]
+
+    def _checked(self, action: Any) -> Array:
+        """The action as `[A]` float64 in the unit range."""
+        return arguments.to_unit(action, self._action_shape, self._rescaled)
+
     def _repr_html_(self) -> str:
         """A card for notebooks: spaces, episode and task."""
-        from sme_registry.envs import cards
-
-        return cards.html(self, self.observation_space, self.action_space, status=self._state)
+        return html_card(self, self.observation_space, self.action_space, status=self._state)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({title(self.document)})"
 
-    def _checked(self, action: Any) -> Array:
-        """The action as `[A]` float64 in the unit range."""
-        if self._state != "running":
-            phase = "has ended" if self._state == "ended" else "has not begun"
-            raise EpisodeError(f"step: the episode {phase}. Call reset() first.")
-        return arguments.to_unit(action, self._action_shape, self._rescaled)
+
+def _refuse_step(env: SMEEnv, action: Any) -> _Result:
+    """The step of an environment without a running episode."""
+    phase = "has ended" if env._state == "ended" else "has not begun"
+    raise EpisodeError(f"step: the episode {phase}. Call reset() first.")

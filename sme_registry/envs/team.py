@@ -4,10 +4,19 @@ Agent i owns a_i action channels and observes the state channels O_i, t/T, and i
 It is paid for its own channels (`reward="individual"`) or for all (`"team"`). Its optimal policy
 maps what *it* observes to its own channels, so its regret is exact and can reach 0.
 A task without a team is a team of one, `agent_0`. Source: METHOD, section 5.
+
+Where one policy acts for every agent, agents may observe and own different numbers of channels. It
+is called for each agent in turn, with that agent's *shared observation*
+
+    (s with the channels that the agent does not observe set to 0, t/T, its r_cum/k, one-hot of i)
+
+`[B, S + 2 + n]`, so it observes no more of the state than the agent does, and which agent it is.
+It returns `[B, max a_i]`, of which the agent's first a_i are used.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
@@ -17,20 +26,18 @@ import numpy as np
 import numpy.typing as npt
 from pettingzoo import ParallelEnv
 
-from sme_registry.compiled.values import (
-    REWARD,
-    ROWS,
-)
+from sme_registry.compiled.values import REWARD, ROWS
 from sme_registry.envs import arguments, infos
-from sme_registry.envs.base import RENDER_MODES, RenderMixin
+from sme_registry.envs.base import html_card
 from sme_registry.envs.batch import Batch, BatchStep
-from sme_registry.envs.types import Array, Lanes, Observation
+from sme_registry.envs.rendering import RENDER_MODES, RenderMixin
+from sme_registry.envs.types import Array, Indices, Observation
 from sme_registry.errors import ActionError, EpisodeError, OptionError, did_you_mean
 from sme_registry.spec import ActionRange, SpecLike
 from sme_registry.spec.catalogue import title
 from sme_registry.task import Task
 
-_ONLY_LANE: Lanes = np.zeros(1, np.int64)
+_ONLY: Indices = np.zeros(1, np.int64)
 
 
 def observed_columns(task: Task) -> tuple[npt.NDArray[np.int64], ...]:
@@ -85,7 +92,7 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
     ) -> None:
         self._set_render_mode(render_mode)
         task = arguments.load_overridden(type(self), spec, overrides)
-        self._task = arguments.without_extension(task)
+        self._task = arguments.without_safety_or_observation(task)
         self._batch = Batch(self._task, 1, reuse=True)
         columns = observed_columns(self._task)
         self._every_column = np.concatenate(columns)
@@ -155,10 +162,6 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
 
         Returns:
           Each agent's observation, and for each an info of NaN.
-
-        Raises:
-          StateError: the state has the wrong shape or lies outside the cube.
-          OptionError: a bad seed or a mistyped option.
         """
         states = None
         for name in options or {}:
@@ -168,9 +171,9 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
             states = arguments.initial_states(options["state"], (self.sme_spec.state_dim,))[None]
         seed = arguments.checked_seed(seed)
         if seed is not None:
-            self._batch.initial_states.seed(0, seed)
+            self._batch.seed(0, seed)
         observation = self._batch.observe()
-        self._batch.begin(_ONLY_LANE, observation, states)
+        self._batch.begin(_ONLY, observation, states)
         self.agents = self.possible_agents[:]
         self._begun = True
         if self.render_mode is not None:
@@ -204,22 +207,22 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         """
         joint = self._joint(actions)
         try:
-            done = self._batch.advance(joint)
+            result = self._batch.advance(joint)
         except ActionError:
             raise self._not_finite(joint) from None
-        terminated, truncated = done.terminated.item(), done.truncated.item()
-        np.copyto(self._values, done.values)
+        terminated, truncated = result.terminated.item(), result.truncated.item()
+        np.copyto(self._values, result.values)
         if terminated or truncated:
             self.agents = []
         if self.render_mode is not None:
-            self._record_step(joint, done)
+            self._record_step(joint, result)
         names = self.possible_agents
         return (
-            self._by_agent(done.observation),
+            self._by_agent(result.observation),
             dict(zip(names, self._values[REWARD, :, 0].tolist())),  # noqa: B905  # costs a percent
             dict.fromkeys(names, terminated),
             dict.fromkeys(names, truncated),
-            self._infos(done.optimal[0].copy()),
+            self._infos(result.optimal[0].copy()),
         )
 
     def _infos(self, optimal: Array) -> dict[str, dict[str, Any]]:
@@ -272,7 +275,6 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
             raise ActionError(f"{agent}: {arguments.not_finite_error()}")
 
     def _wrong_agents(self, actions: Any) -> ActionError:
-        """The error where there is not exactly one action for each agent."""
         if not isinstance(actions, dict):
             return ActionError(
                 f"actions={actions!r:.60}: must be a dict from each agent's name to its action."
@@ -304,26 +306,62 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         return agent
 
     def _joint_view(self) -> SimpleNamespace:
-        """What a renderer needs of an environment, of all agents together."""
         return SimpleNamespace(
             state=self.state(), action_space=self._joint_space, sme_spec=self.sme_spec
         )
 
-    def _record_step(self, joint: Array, done: BatchStep) -> None:
+    def _record_step(self, joint: Array, result: BatchStep) -> None:
         """Record a step of the team as one: all channels, and the means over the agents."""
-        info = infos.of_all_agents(done, 0, self._rescaled)
+        info = infos.of_all_agents(result, 0, self._rescaled)
         self._record(self._joint_view(), (arguments.from_unit(joint[0], self._rescaled), info))
 
     def _repr_html_(self) -> str:
         """A card for notebooks: agents, episode and task."""
-        from sme_registry.envs import cards
-
         status = "running" if self.agents else "ended" if self._begun else "created"
         first = self.possible_agents[0]
         spaces = self._observation_spaces[first], self._action_spaces[first]
-        return cards.html(self, *spaces, status=status)
+        return html_card(self, *spaces, status=status)
 
     def __repr__(self) -> str:
         return f"SMETeamEnv({title(self.sme_spec)}, {len(self.possible_agents)} agents)"
 
     __str__ = __repr__
+
+
+def shared_observation_dim(task: Task) -> int:
+    """Entries of a shared observation, S + 2 + n."""
+    return task.spec.state_dim + 2 + len(task.observed)
+
+
+def shared_action_dim(task: Task) -> int:
+    """Entries of a shared policy's action: as many as the agent with most channels owns."""
+    return int(max(channels.stop - channels.start for channels in task.owned))
+
+
+def shared_observation(task: Task, joint: Observation) -> Observation:
+    """Each agent's shared observation, `[B, n, S + 2 + n]` float32, a fresh array.
+
+    `joint` is `[B, S + 1 + n]` float32: s, t/T, and each agent's r_cum/k.
+    """
+    S, n = task.spec.state_dim, len(task.observed)
+    shared = np.empty((len(joint), n, shared_observation_dim(task)), np.float32)
+    single = joint[:, : S + 2].copy()
+    for agent, observed in enumerate(task.observed):
+        single[:, S + 1] = joint[:, S + 1 + agent]
+        shared[:, agent] = shared_observation_of(agent, n, observed, single)
+    return shared
+
+
+def shared_observation_of(
+    agent: int, agents: int, observed: Sequence[int], single: Observation
+) -> Observation:
+    """The shared observation of one agent of `agents`, `[B, S + 2 + n]` float32, a fresh array.
+
+    `single` is `[B, S + 2]` float32: s, t/T, and this agent's r_cum/k.
+    """
+    width = single.shape[1]
+    visible = [*observed, width - 2, width - 1]
+    shared = np.zeros((len(single), width + agents), np.float32)
+    shared[:, visible] = single[:, visible]
+    shared[:, width + agent] = 1.0
+    return shared

@@ -1,4 +1,4 @@
-"""Types of the arrays that environments take and return. `B` lanes of a batch."""
+"""Types of the arrays that environments take and return. `B` environments of a batch."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Action: TypeAlias = npt.NDArray[np.floating[Any]]
 """Actions of an agent, in its environment's range."""
 
 Mask: TypeAlias = npt.NDArray[np.bool_]
-"""`[B]` which lanes."""
+"""`[B]` which environments."""
 
-Lanes: TypeAlias = npt.NDArray[np.int64]
-"""Indices of lanes, or a count for each of them."""
+Indices: TypeAlias = npt.NDArray[np.int64]
+"""Indices of environments, or a count for each of them."""

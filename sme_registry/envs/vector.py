@@ -1,4 +1,4 @@
-"""`SMEVectorEnv`: a batch of one task's environments, stepped as one."""
+"""`SMEVectorEnv`: a batch of environments of one task or stream, stepped as one."""
 
 from __future__ import annotations
 
@@ -13,35 +13,75 @@ from gymnasium.vector.utils import batch_space
 
 from sme_registry.compiled.values import REWARD
 from sme_registry.envs import arguments, infos
-from sme_registry.envs.base import GymnasiumMixin, check_time_limit
+from sme_registry.envs.base import GymnasiumMixin, check_time_limit, html_card
 from sme_registry.envs.batch import Batch
-from sme_registry.envs.batch_rendering import METADATA, batch_renderer
-from sme_registry.envs.lanes import Lane
-from sme_registry.envs.rendering import Frame
-from sme_registry.envs.types import Array, Lanes, Mask, Observation
+from sme_registry.envs.rendering import METADATA, Frame, batch_renderer
+from sme_registry.envs.schedule import Schedule
+from sme_registry.envs.types import Array, Indices, Mask, Observation
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.io import choice, integer_in
-from sme_registry.spec import ActionRange, SMESpec, SpecLike, StreamSpec
+from sme_registry.spec import ActionRange, SMESpec, SpecLike, StreamLike, StreamSpec
 from sme_registry.spec.catalogue import title
+from sme_registry.task import Task
 
-_NO_LANE: Lanes = np.empty(0, np.int64)
+_NONE: Indices = np.empty(0, np.int64)
+
+
+class EnvView:
+    """One environment of a batch: attributes that all share, and its own."""
+
+    def __init__(self, owner: Any, index: int, **shared: Any) -> None:
+        self._owner, self._index = owner, index
+        vars(self).update(shared)
+
+    @property
+    def state(self) -> Array:
+        """The state s, `[S]` float64 in [0, 1] (a copy)."""
+        state: Array = self._owner._batch.state[self._index]
+        return state
+
+    @property
+    def distractors(self) -> Array:
+        """The distractors, `[m]` float64 in [0, 1] (a copy)."""
+        distractors: Array = self._owner._batch.distractors[self._index]
+        return distractors
+
+    @property
+    def task(self) -> Task:
+        """The task; of a stream the one in force."""
+        task: Task = self._owner._batch.task_of(self._index)
+        return task
+
+    @property
+    def sme_spec(self) -> SMESpec:
+        """Its spec."""
+        return self.task.spec
+
+    @property
+    def unwrapped(self) -> EnvView:
+        """Itself, as environments without a wrapper have it."""
+        return self
 
 
 class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
-    """`num_envs` lanes of one task, bit-equal to as many `SMEEnv`s with the same seeds.
+    """`num_envs` environments of one task or stream, bit-equal to `SMEEnv`s with the same seeds.
 
     Spaces, rewards and `info` are those of `SMEEnv` with a leading axis `[B]`; as in Gymnasium each
-    info `key` comes with a mask `_key`. A seed n seeds lane i with n + i.
+    info `key` comes with a mask `_key`. A seed n seeds environment i with n + i.
+
+    Lives of a stream go on by themselves: with early termination they are at different steps, and
+    near a switch in different phases. `get_attr("task")` gives the task in force in each
+    environment, and `task` that of all of them, or EpisodeError.
 
     Args:
-      spec: the task: a spec, its fields, an id, a digest or a path.
-      num_envs: B, the lanes, at least 1.
+      spec: the task or stream: a document, its fields, an id, a digest or a path.
+      num_envs: B, at least 1.
       action_range: "unit" or "symmetric".
       autoreset_mode: Gymnasium's: "NextStep" (default), "SameStep" or "Disabled".
       render_mode: None or "rgb_array".
-      render_lanes: the lanes to draw, such as `[0, 1]`; None draws each of them.
+      render_lanes: the environments to draw, such as `[0, 1]`; None draws each of them.
       max_episode_steps: refused below the horizon (Gymnasium passes it on).
-      **overrides: spec fields to change.
+      **overrides: fields of a task's spec to change.
 
     Raises:
       SpecError, UnknownNameError, ResourceLimitError, OptionError: as `SMEEnv`.
@@ -57,7 +97,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
 
     def __init__(
         self,
-        spec: SpecLike = "Default-v1",
+        spec: SpecLike | StreamLike = "Default-v1",
         num_envs: int = 1,
         *,
         action_range: ActionRange = "unit",
@@ -73,8 +113,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**METADATA, "autoreset_mode": self.autoreset_mode}
         self.render_mode = render_mode
-        self._batch = self._load(spec, num_envs, overrides)
-        self._task = self._batch.task
+        self._batch = Batch(Schedule.load(type(self), spec, overrides), num_envs)
         if max_episode_steps is not None:
             check_time_limit(max_episode_steps, self.document.horizon)
         self.num_envs = num_envs
@@ -86,21 +125,31 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         self._renderer = batch_renderer(
             render_mode, render_lanes, self._batch, self.single_action_space
         )
-
         self._begun = np.zeros(num_envs, bool)
         self._ended = np.zeros(num_envs, bool)
         self._all_begun, self._any_ended = False, False
-        self._lanes: list[Lane] = []
-
-    def _load(self, spec: Any, num_envs: int, overrides: dict[str, Any]) -> Batch:
-        """The batch that is stepped."""
-        task = arguments.load_overridden(type(self), spec, overrides)
-        return Batch(arguments.single_agent(task), num_envs)
+        self._views: list[EnvView] = []
 
     @property
     def document(self) -> SMESpec | StreamSpec:
-        """What the environment runs: its spec, or a stream."""
+        """What the environments run: their spec, or a stream."""
         return self._batch.document
+
+    @property
+    def task(self) -> Task:
+        """The task in force; EpisodeError where it is not the same in every environment."""
+        task = self._batch.one_task
+        if task is None:
+            raise EpisodeError(
+                "task: the environments are in different segments of the stream. Ask for that of "
+                "each one, get_attr('task')."
+            )
+        return task
+
+    @property
+    def sme_spec(self) -> SMESpec:
+        """The spec of the task in force; as `task`."""
+        return self.task.spec
 
     @property
     def state(self) -> Array:
@@ -118,52 +167,53 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode in every lane, or in those of `options["reset_mask"]`.
+        """Begin an episode in every environment, or in those of `options["reset_mask"]`.
 
         Args:
-          seed: n seeds lane i with n + i; a list seeds each lane; None continues the streams.
-          options: `{"state": s}` begins at s, `[S]` or `[B, S]`; where the task has distractors,
-            `{"distractors": d}` at d, `[m]` or `[B, m]`; `{"reset_mask": mask}` resets the lanes
-            where `mask` `[B]` is True and leaves the others as they are.
+          seed: n seeds environment i with n + i; a list seeds each; None continues the streams.
+          options: those of `SMEEnv.reset`, where `state` `[S]` or `[B, S]` and `distractors` `[m]`
+            or `[B, m]`; and `{"reset_mask": mask}` resets the environments where `mask` `[B]` is
+            True and leaves the others as they are.
 
         Returns:
-          Observations `[B, S + m + 2]`, and infos of NaN in the lanes that are reset.
+          Observations `[B, S + m + 2]`, and infos of NaN where an episode begins.
 
         Raises:
           StateError, OptionError: as `SMEEnv.reset`.
         """
-        arguments.refuse_unknown_options(options, (*self._batch.reset_options, "reset_mask"))
+        known = (*self._batch.schedule.reset_options, "reset_mask")
+        arguments.refuse_unknown_options(options, known)
         options = options or {}
         lifetime = arguments.lifetime_in(options)
         mask = self._mask(options["reset_mask"]) if "reset_mask" in options else None
-        lanes = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
-        seeds = self._seeds(seed)[lanes]
+        envs = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
+        seeds = self._seeds(seed)[envs]
         widths = {"state": self.document.state_dim, "distractors": self._batch.distractors.shape[1]}
         given = {
             name: arguments.initial_values(name, options, (width,), self.num_envs)
             for name, width in widths.items()
         }
-        states, distractors = (None if value is None else value[lanes] for value in given.values())
+        states, distractors = (None if value is None else value[envs] for value in given.values())
         # Every argument is checked: from here on, the state changes.
-        for lane, lane_seed in zip(lanes, seeds, strict=True):
-            if lane_seed is not None:
-                self._batch.seed(int(lane), lane_seed)
+        for env, env_seed in zip(envs, seeds, strict=True):
+            if env_seed is not None:
+                self._batch.seed(int(env), env_seed)
             if lifetime is not None:
-                self._batch.live(int(lane), lifetime)
+                self._batch.live(int(env), lifetime)
         observation = self._batch.observe()
-        self._batch.begin(lanes, observation, states, distractors)
-        self._ended[lanes] = False
-        self._begun[lanes] = True
+        self._batch.begin(envs, observation, states, distractors)
+        self._ended[envs] = False
+        self._begun[envs] = True
         self._all_begun, self._any_ended = bool(self._begun.all()), bool(self._ended.any())
         if self._renderer is not None:
-            self._renderer.record(lanes.tolist())
+            self._renderer.record(envs.tolist())
         info = infos.batch_at_reset(self._batch.task.spec, self.num_envs)
         return observation, infos.masked({**info, **self._batch.life()}, mask)
 
     def step(  # type: ignore[override]  # Gymnasium types all three arrays alike; ends are bool
         self, actions: Any
     ) -> tuple[Observation, Array, Mask, Mask, dict[str, Any]]:
-        """One step of every lane.
+        """One step of every environment.
 
         Args:
           actions: `[B, A]`, finite; clipped to the action range.
@@ -173,7 +223,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
 
         Raises:
           ActionError: wrong shape, not numbers, or not finite; the states are unchanged then.
-          EpisodeError: before the first reset, or (mode "Disabled") lanes have ended.
+          EpisodeError: before the first reset, or (mode "Disabled") where episodes have ended.
         """
         B, A = self.num_envs, self.document.action_dim
         if not self._all_begun:
@@ -182,18 +232,18 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         if any_ended_before and self.autoreset_mode is AutoresetMode.DISABLED:
             first = np.flatnonzero(ended_before)[0]
             raise EpisodeError(
-                f"step: the episodes of {ended_before.sum()} lanes have ended (the first is lane "
+                f"step: the episodes of {ended_before.sum()} environments have ended (the first is "
                 f"{first}). Call reset(options={{'reset_mask': terminated | truncated}}) first."
             )
-        # In mode NEXT_STEP the actions of lanes that have ended are ignored.
+        # In mode NEXT_STEP the actions of environments that have ended are ignored.
         resting = ended_before if any_ended_before else None
         unit_actions = arguments.to_unit(actions, (B, A), self._rescaled, ignored=resting)
 
-        done = self._batch.advance(unit_actions, resting)
-        observation, reward = done.observation, done.values[REWARD, 0]
-        terminated, truncated = done.terminated, done.truncated
-        info = {**infos.of_batch(done, self._rescaled), **self._batch.lived}
-        began = _NO_LANE
+        result = self._batch.advance(unit_actions, resting)
+        observation, reward = result.observation, result.values[REWARD, 0]
+        terminated, truncated = result.terminated, result.truncated
+        info = {**infos.of_batch(result, self._rescaled), **self._batch.lived}
+        began = _NONE
         if any_ended_before:
             began = np.flatnonzero(ended_before)
             for array in (reward, terminated, truncated):
@@ -209,26 +259,23 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
             returned |= self._last(observation, info, ended)
             self._begin(began, observation, info)
         if self._renderer is not None:
-            self._renderer.record(began.tolist(), unit_actions, done)
+            self._renderer.record(began.tolist(), unit_actions, result)
         return observation, reward, terminated, truncated, returned
 
     def render(self) -> tuple[Frame, ...] | None:
-        """A frame of each lane, `[H, W, 3]` uint8; white for lanes not in `render_lanes`.
+        """A frame of each environment, `[H, W, 3]` uint8; white for those not in `render_lanes`.
 
-        None without a `render_mode`.
-
-        Raises:
-          EpisodeError: before the first reset.
+        None without a `render_mode`; EpisodeError before the first reset.
         """
         return None if self._renderer is None else self._renderer.frame_of_each()
 
     def _last(
         self, observation: Observation, info: dict[str, npt.NDArray[Any]], ended: Mask
     ) -> dict[str, Any]:
-        """Gymnasium's `final_obs` and `final_info` of the lanes `ended` `[B]`."""
+        """Gymnasium's `final_obs` and `final_info` of the environments `ended` `[B]`."""
         final = np.full(self.num_envs, None, dtype=object)
-        for lane in np.flatnonzero(ended):
-            final[lane] = observation[lane].copy()
+        for env in np.flatnonzero(ended):
+            final[env] = observation[env].copy()
         return {
             "final_obs": final,
             "_final_obs": ended.copy(),
@@ -237,75 +284,67 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         }
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Call a method of each lane, or read an attribute; see `get_attr`."""
-        attributes = [getattr(lane, name) for lane in self._all_lanes()]
-        return tuple(each(*args, **kwargs) if callable(each) else each for each in attributes)
+        """Call a method of each environment, or read an attribute; see `get_attr`."""
+        values = [getattr(view, name) for view in self._all_views()]
+        return tuple(value(*args, **kwargs) if callable(value) else value for value in values)
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """An attribute of each lane: `state` `[S]`, `task`, `sme_spec`, `spec`, … or one set."""
+        """An attribute of each environment: `state` `[S]`, `task`, `sme_spec`, … or one set."""
         return self.call(name)
 
     def set_attr(self, name: str, values: list[Any] | tuple[Any, ...] | Any) -> None:
-        """Set an attribute of each lane, from a list or tuple of one for each, or from one for all.
-
-        Raises:
-          OptionError: the number of values is not that of the lanes.
-        """
+        """Set an attribute, from a list or tuple of one for each environment, or one for all."""
         if not isinstance(values, list | tuple):
             values = [values] * self.num_envs
         if len(values) != self.num_envs:
             raise OptionError(
-                f"values: must be one for each of the {self.num_envs} lanes, got {len(values)}."
+                f"values: must be one for each of the {self.num_envs} environments, got "
+                f"{len(values)}."
             )
-        for lane, value in zip(self._all_lanes(), values, strict=True):
-            setattr(lane, name, value)
+        for view, value in zip(self._all_views(), values, strict=True):
+            setattr(view, name, value)
 
-    def _all_lanes(self) -> list[Lane]:
-        """The lanes, created when they are first asked for: most batches never need them."""
-        if not self._lanes:
+    def _all_views(self) -> list[EnvView]:
+        """Created when they are first asked for: most batches never need them."""
+        if not self._views:
             shared = {
                 "spec": self.spec, "render_mode": self.render_mode,
                 "action_space": self.single_action_space,
                 "observation_space": self.single_observation_space,
             }  # fmt: skip
-            self._lanes = [Lane(self, lane, **shared) for lane in range(self.num_envs)]
-        return self._lanes
+            self._views = [EnvView(self, env, **shared) for env in range(self.num_envs)]
+        return self._views
 
     def _repr_html_(self) -> str:
         """A card for notebooks: spaces, episodes and task."""
-        from sme_registry.envs import cards
-
         spaces = self.single_observation_space, self.single_action_space
-        return cards.html(self, *spaces, autoreset=self.autoreset_mode.value)
+        return html_card(self, *spaces, autoreset=self.autoreset_mode.value)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({title(self.document)}, num_envs={self.num_envs})"
 
     def _begin(
-        self,
-        lanes: Lanes,
-        observation: Observation,
-        info: dict[str, npt.NDArray[Any]],
+        self, envs: Indices, observation: Observation, info: dict[str, npt.NDArray[Any]]
     ) -> None:
-        """Put lanes at the start of an episode, and write their observations and infos."""
-        self._batch.begin(lanes, observation)
-        self._ended[lanes] = False
-        infos.write_reset(info, lanes, self._batch.life())
+        """Put environments at the start of an episode; write their observations and infos."""
+        self._batch.begin(envs, observation)
+        self._ended[envs] = False
+        infos.write_reset(info, envs, self._batch.life())
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> npt.NDArray[Any]:
-        """One seed or None for each lane, `[B]`."""
+        """One seed or None for each environment, `[B]`."""
         seeds = np.full(self.num_envs, None, dtype=object)
         if not isinstance(seed, list | tuple | np.ndarray) or np.ndim(seed) == 0:
             first = arguments.checked_seed(seed)
             if first is not None:
-                seeds[:] = [first + lane for lane in range(self.num_envs)]
+                seeds[:] = [first + env for env in range(self.num_envs)]
             return seeds
         if len(seed) != self.num_envs:
             raise OptionError(
                 f"seed={seed!r:.60}: must be an integer, None, or a list of one for each of the "
-                f"{self.num_envs} lanes."
+                f"{self.num_envs} environments."
             )
-        seeds[:] = [arguments.checked_seed(lane_seed) for lane_seed in seed]
+        seeds[:] = [arguments.checked_seed(env_seed) for env_seed in seed]
         return seeds
 
     def _mask(self, mask: Any) -> Mask:
@@ -314,5 +353,5 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         if mask.shape != (self.num_envs,):
             raise OptionError(f"reset_mask of shape {mask.shape}: must be ({self.num_envs},).")
         if not mask.any():
-            raise OptionError("reset_mask: must be True for at least one lane.")
+            raise OptionError("reset_mask: must be True for at least one environment.")
         return mask

@@ -5,7 +5,7 @@ an offline policy · `module:function` · name of a reference policy · for team
 
 In a team, either each agent has its own policy of what it observes and owns,
 `[B, |O_i| + 2] → [B, a_i]`, or all share one, which is called for each agent in turn with its
-shared observation (`envs.shared`), `[B, S + 2 + n] → [B, max a_i]`. A function of the whole state
+shared observation (`envs.team`), `[B, S + 2 + n] → [B, max a_i]`. A function of the whole state
 is no team policy: under partial observation no agent could execute it.
 """
 
@@ -23,7 +23,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, cast
 import numpy as np
 
 from sme_registry.envs import arguments
-from sme_registry.envs.shared import shared_observation_of
+from sme_registry.envs.team import shared_observation_of
 from sme_registry.envs.types import Array, Observation
 from sme_registry.errors import (
     ActionError,

@@ -19,15 +19,14 @@ from sme_registry.compiled.values import (
     ROWS,
     ROWS_WITH_SAFETY,
 )
-from sme_registry.envs import SMEEnv, SMEStreamEnv, arguments, infos
-from sme_registry.envs.base import renamed_by_content
+from sme_registry.envs import SMEEnv, arguments, infos
+from sme_registry.envs.base import html_card, renamed_by_content
 from sme_registry.envs.batch import Batch
-from sme_registry.envs.batch_rendering import METADATA, batch_renderer
-from sme_registry.envs.lanes import Lane
-from sme_registry.envs.rendering import Frame
-from sme_registry.envs.shared import shared_action_dim, shared_observation, shared_observation_dim
-from sme_registry.envs.stream_batch import StreamBatch
+from sme_registry.envs.rendering import METADATA, Frame, batch_renderer
+from sme_registry.envs.schedule import Schedule
+from sme_registry.envs.team import shared_action_dim, shared_observation, shared_observation_dim
 from sme_registry.envs.types import Array, Mask, Observation
+from sme_registry.envs.vector import EnvView
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.io import integer_in
 from sme_registry.registration import registered_or_new
@@ -118,7 +117,7 @@ class _Start(NamedTuple):
     lifetime: int | None
 
 
-class _SingleLane(Lane):
+class _SingleLane(EnvView):
     """A lane of a single agent's task, which can be reset alone."""
 
     def reset(
@@ -133,7 +132,7 @@ class _SingleLane(Lane):
 class _BatchVecEnv(LanesVecEnv):
     """Every agent of every team of a `Batch` is a lane; a single agent is a team of one."""
 
-    _lane_type = Lane
+    _lane_type = EnvView
 
     def __init__(
         self,
@@ -146,7 +145,7 @@ class _BatchVecEnv(LanesVecEnv):
         render_lanes: Sequence[int] | None = None,
     ) -> None:
         task = batch.task
-        self.num_teams, self.agents = batch.lanes, task.names
+        self.num_teams, self.agents = batch.num_envs, task.names
         self._task, self._batch, self._action_dim = task, batch, action_dim
         self._begun, self._owned = np.zeros(self.num_teams, bool), task.owned
         action_space, self._rescaled = arguments.action_space(action_range, action_dim)
@@ -181,10 +180,8 @@ class _BatchVecEnv(LanesVecEnv):
 
     def _repr_html_(self) -> str:
         """A card for notebooks: spaces, episodes and task."""
-        from sme_registry.envs import cards
-
         spaces = self.observation_space, self.action_space
-        return cards.html(self, *spaces, autoreset=AutoresetMode.SAME_STEP.value)
+        return html_card(self, *spaces, autoreset=AutoresetMode.SAME_STEP.value)
 
     def get_images(self) -> list[Frame]:
         """The frames of the chosen lanes or teams, each `[H, W, 3]` uint8; `render` tiles them."""
@@ -248,7 +245,7 @@ class _BatchVecEnv(LanesVecEnv):
     def _start(self, seed: int | None, options: list[dict[str, Any]]) -> _Start:
         """How a team begins an episode, from its seed and the options of its lanes."""
         for of_lane in options:
-            arguments.refuse_unknown_options(of_lane, self._batch.reset_options)
+            arguments.refuse_unknown_options(of_lane, self._batch.schedule.reset_options)
         shape = (self._task.spec.state_dim,)
         states = [arguments.initial_states(of["state"], shape) for of in options if "state" in of]
         if states and (
@@ -339,13 +336,8 @@ class SMEVecEnv(_BatchVecEnv):
         **overrides: Any,
     ) -> None:
         named, num_envs = registered_or_new(spec_or_id), integer_in("num_envs", num_envs, 1)
-        batch: Batch
-        if "stream" in named.kwargs:
-            tasks = arguments.load_stream_tasks(type(self), named.kwargs["stream"], overrides)
-            batch = StreamBatch(tasks, num_envs)
-        else:
-            task = arguments.load_overridden(type(self), named.kwargs["spec"], overrides)
-            batch = Batch(arguments.single_agent(task), num_envs)
+        document = named.kwargs.get("stream", named.kwargs.get("spec"))
+        batch = Batch(Schedule.load(type(self), document, overrides), num_envs)
         kwargs = {**named.kwargs, "action_range": action_range, **overrides}
         env_spec = renamed_by_content(dataclasses.replace(named, kwargs=kwargs), batch.document)
         A, width = batch.document.action_dim, batch.observation_dim
@@ -379,7 +371,7 @@ class SMETeamVecEnv(_BatchVecEnv):
         **overrides: Any,
     ) -> None:
         task = arguments.load_overridden(type(self), spec_or_id, overrides)
-        arguments.without_extension(task)
+        arguments.without_safety_or_observation(task)
         # For each channel of the joint action: the agent that owns it, and the entry of its action.
         self._owner = np.repeat(np.arange(len(task.owned)), [o.stop - o.start for o in task.owned])
         self._entry = np.concatenate([np.arange(part.stop - part.start) for part in task.owned])
@@ -405,8 +397,7 @@ class SingleVecEnv(LanesVecEnv):
     """One environment, bit for bit `SMEVecEnv` with one, without the overhead of a batch."""
 
     def __init__(self, document: SMESpec | StreamSpec, *, action_range: ActionRange) -> None:
-        single: type[SMEEnv] = SMEStreamEnv if isinstance(document, StreamSpec) else SMEEnv
-        self._env = single(document, action_range=action_range)  # type: ignore[arg-type]
+        self._env = SMEEnv(document, action_range=action_range)
         super().__init__([self._env])
 
     def reset(self) -> Observation:

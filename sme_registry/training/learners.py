@@ -32,7 +32,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from sme_registry.envs.lanes import Lane
+from sme_registry.envs.vector import EnvView
 from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation import Perceptron, Policy, TeamPolicy
 from sme_registry.evaluation.models import saved_sb3, torch_policy
@@ -233,12 +233,12 @@ class IndependentModels:
         return joint.reshape(self.env.num_envs, -1)
 
 
-def _lane(env: Any, observation_dim: int, action_dim: int, low: float) -> Lane:
+def _lane(env: Any, observation_dim: int, action_dim: int, low: float) -> EnvView:
     """An environment as an agent sees it: its spaces."""
     box = gymnasium.spaces.Box
     observation_space = box(0.0, 1.0, (observation_dim,), np.float32)
     action_space = box(low, 1.0, (action_dim,), np.float32)
-    return Lane(
+    return EnvView(
         env, 0, observation_space=observation_space, action_space=action_space, render_mode=None
     )
 

@@ -31,7 +31,7 @@ class Lane:
 
     def __init__(self, task, engine, state, t=0, r_cum=0.0):
         self.task, self.engine = task, engine
-        self.buffer, self.numbers = engine.new_lane()
+        self.buffer, self.numbers, _ = engine.new_buffer()
         self.numbers[LANE_STATE:] = state
 
     def step(self, action):

@@ -22,8 +22,7 @@ from sme_registry.errors import (
     WrapperError,
 )
 from sme_registry.spec import EnvFile, catalogue
-from sme_registry.testing.comparing import expect_same
-from sme_registry.testing.episodes import mixed_actions
+from sme_registry.testing import expect_same, mixed_actions
 
 ROOT = Path(sme_registry.__file__).resolve().parents[1]
 

@@ -1,10 +1,11 @@
 """Single agents' environments and batches keep every promise: each kind, edges, every mode.
 
 That every entry of the catalogue is drawn and stepped as published is in `tests/spec`, kinds of
-safety and observation are in `tests/envs/test_extension.py`, teams in `test_teams_conform.py`.
+safety and observation are in `tests/envs/test_safety_observation.py`, and teams are below.
 """
 
 import copy
+import functools
 import warnings
 
 import gymnasium
@@ -13,13 +14,18 @@ import pettingzoo
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from pettingzoo.utils.conversions import aec_to_parallel, parallel_to_aec
+from pettingzoo.utils.conversions import (
+    aec_to_parallel,
+    aec_to_parallel_wrapper,
+    parallel_to_aec,
+)
 
 import sme_registry
 from sme_registry import SMESpec, testing
 from sme_registry.envs import SMEVectorEnv
 from sme_registry.spec import catalogue
 from sme_registry.spec.catalogue import EnvFile
+from sme_registry.testing import expect_same, next_action, play
 
 NAMES = [file.versioned_name for file in catalogue.entries(EnvFile) if file.spec.team is None]
 KINDS = ["Default", "StateDim64", "ActionDim16", "Plane10", "HardFragile", "HardSafeMixed"]
@@ -27,10 +33,10 @@ KINDS = ["Default", "StateDim64", "ActionDim16", "Plane10", "HardFragile", "Hard
 
 @pytest.mark.parametrize("name", KINDS)
 def test_an_entry_of_each_kind_passes_the_conformance_kit(name):
-    testing.check_sme(f"SME/{name}-v1")
+    testing.check_env(f"SME/{name}-v1")
 
 
-@pytest.mark.parametrize("name", ["Default", "HardSafeMixed"])
+@pytest.mark.parametrize("name", KINDS)
 def test_ids_pass_the_checkers_of_gymnasium_and_sb3(name):
     # With the id, and so the EnvSpec: check_env then also makes and tries each render mode.
     check_env(gymnasium.make(f"SME/{name}-v1").unwrapped, skip_render_check=name != "Default")
@@ -64,7 +70,7 @@ def test_every_catalogue_entry_has_an_id_by_name_and_one_by_content():
     ids=lambda fields: ",".join(fields),
 )  # fmt: skip
 def test_specs_at_the_edges_pass_the_conformance_kit(fields):
-    testing.check_sme(fields)
+    testing.check_env(fields)
 
 
 # Ends early and late, pays late, and its lanes drift apart.
@@ -99,8 +105,7 @@ def test_make_vec_gives_the_same_numbers_in_every_mode(monkeypatch):
 
 
 def test_a_batch_of_a_hard_task_equals_its_singles_in_all_autoreset_modes():
-    for seed in range(2):
-        testing.check_vector(HARD, seed=seed)
+    testing.check_env(HARD, seed=1)
 
 
 def test_a_lane_does_not_depend_on_how_many_others_there_are():
@@ -154,7 +159,14 @@ def spoil(returned):
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # importing PettingZoo's tests warns of their own module's age
-    from pettingzoo.test import api_test, render_test, seed_test
+    from pettingzoo.test import (
+        api_test,
+        parallel_api_test,
+        parallel_seed_test,
+        render_test,
+        seed_test,
+    )
+    from pettingzoo.test.state_test import state_test
 
 TEAMS = [file.versioned_name for file in catalogue.entries(EnvFile) if file.spec.team is not None]
 UNEQUAL = {
@@ -185,9 +197,47 @@ def test_teams_at_the_edges_pass_the_conformance_kit(fields):
     testing.check_team(fields)
 
 
-def test_a_team_in_turns_by_make_aec_passes_pettingzoos_tests():
-    api_test(sme_registry.make_aec("Team4-v1", horizon=20), num_cycles=100)
-    seed_test(lambda: sme_registry.make_aec("Team4-v1", horizon=20))
+@pytest.mark.filterwarnings("ignore:Agents have different", "ignore:Observations are different")
+@pytest.mark.parametrize("action_range", ["unit", "symmetric"])
+@pytest.mark.parametrize("fields", [{}, {"k": 3, "D": 0.3, "team": UNEQUAL}], ids=["four", "three"])
+def test_a_team_passes_pettingzoos_tests(fields, action_range):
+    kwargs = {"horizon": 20, "action_range": action_range, **fields}
+    make = functools.partial(sme_registry.make_parallel, "Team4-v1", **kwargs)
+    make_aec = functools.partial(sme_registry.make_aec, "Team4-v1", **kwargs)
+    parallel_api_test(make(), num_cycles=100)
+    api_test(make_aec(), num_cycles=100)
+    parallel_seed_test(make)
+    seed_test(make_aec)
+    state_test(make_aec(), make())
+
+
+@pytest.mark.parametrize("fields", [{}, {"k": 3, "D": 0.3, "team": UNEQUAL}], ids=["four", "three"])
+def test_turns_and_back_keep_every_number(fields):
+    make = functools.partial(sme_registry.make_parallel, "Team4-v1", horizon=12, **fields)
+    # Not `aec_to_parallel`, which would return the original environment.
+    converted = aec_to_parallel_wrapper(parallel_to_aec(make()))
+    converted.task = make().task
+    expect_same("parallel, AEC and back", play(converted, 1, 2), play(make(), 1, 2))
+
+    env, aec, rng = make(), parallel_to_aec(make()), np.random.default_rng(3)
+    observations, infos = env.reset(seed=1)
+    aec.reset(seed=1)
+    rewards = dict.fromkeys(env.agents, 0.0)
+    terminated = truncated = dict.fromkeys(env.agents, False)
+    playing = True
+    while playing:
+        playing = bool(env.agents)
+        actions = next_action(env, rng) if playing else dict.fromkeys(env.possible_agents)
+        for agent in actions:
+            name = aec.agent_selection
+            assert name == agent or not playing  # after the end, they follow by their names
+            expected = (
+                each[name] for each in (observations, rewards, terminated, truncated, infos)
+            )
+            expect_same(f"{name} in an AEC environment", list(aec.last()), list(expected))
+            aec.step(actions[name])
+        if playing:
+            observations, rewards, terminated, truncated, infos = env.step(actions)
 
 
 def test_a_team_passes_pettingzoos_render_test(monkeypatch):

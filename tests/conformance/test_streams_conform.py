@@ -7,7 +7,7 @@ from gymnasium.utils.env_checker import check_env
 
 import sme_registry
 from sme_registry import SMESpec, StreamSpec, testing
-from sme_registry.envs import SMEStreamEnv, SMEStreamVectorEnv
+from sme_registry.envs import SMEEnv, SMEVectorEnv
 from sme_registry.errors import (
     NameTakenError,
     StreamError,
@@ -56,19 +56,34 @@ def test_streams_of_the_catalogue_have_their_ids():
             assert again.unwrapped.stream == stream
             assert again.spec.id == env_id
     check_env(gymnasium.make("SME/Switch5-v1").unwrapped)
-    testing.check_env_spec("Switch5-v1")
+
+
+def test_an_env_spec_of_earlier_versions_makes_the_stream():
+    places = {
+        "entry_point": "sme_registry.envs:SMEStreamEnv",
+        "vector_entry_point": "sme_registry.envs:SMEStreamVectorEnv",
+    }
+    kwargs = {"stream": SHORT.to_dict(), "action_range": "symmetric"}
+    text = EnvSpec(id=f"SME/{SHORT.content_name}-v1", **places, kwargs=kwargs).to_json()
+    env, batch = (
+        gymnasium.make(EnvSpec.from_json(text)),
+        gymnasium.make_vec(EnvSpec.from_json(text)),
+    )
+    assert env.unwrapped.stream == batch.unwrapped.stream == SHORT
+    assert env.action_space.low[0] == batch.single_action_space.low[0] == -1.0
+    assert not hasattr(gymnasium.make("SME/Default-v1").unwrapped, "stream")
 
 
 def test_names_make_single_environments_and_native_batches():
     for name in ("Switch5", "SME/Switch5-v1", "sme_registry:SME/StreamSwitch5-v1"):
         env, batch = sme_registry.make(name), sme_registry.make_vec(name, 2)
-        assert isinstance(env.unwrapped, SMEStreamEnv)
-        assert isinstance(batch.unwrapped, SMEStreamVectorEnv)
+        assert isinstance(env.unwrapped, SMEEnv)
+        assert isinstance(batch.unwrapped, SMEVectorEnv)
         assert env.spec.id == batch.spec.id == f"SME/{name.split('/')[-1].removesuffix('-v1')}-v1"
     batch = gymnasium.make_vec("SME/Switch5Symmetric-v1", num_envs=2, autoreset_mode="SameStep")
     assert batch.single_action_space.low[0] == -1.0
-    assert str(batch) == "SMEStreamVectorEnv(SME/Switch5-v1, num_envs=2)"
-    assert repr(env.unwrapped) == "SMEStreamEnv(SME/Switch5-v1)"
+    assert str(batch) == "SMEVectorEnv(SME/Switch5-v1, num_envs=2)"
+    assert repr(env.unwrapped) == "SMEEnv(SME/Switch5-v1)"
 
 
 def test_a_stream_of_ones_own_goes_by_content_or_by_a_registered_name():
@@ -100,14 +115,14 @@ def test_a_stream_where_one_task_is_needed_is_a_typed_error(name):
         sme_registry.make_parallel(name)
 
 
-class _Forgets(SMEStreamEnv):
+class _Forgets(SMEEnv):
     """Restarts the life at each reset."""
 
     def _live(self, lifetime):
         return super()._live(0)
 
 
-class _Lags(SMEStreamEnv):
+class _Lags(SMEEnv):
     """Tells the phase of the observation, rather than that of the action."""
 
     def step(self, action):
@@ -115,7 +130,7 @@ class _Lags(SMEStreamEnv):
         return *returned, {**info, "phase": self._phase}
 
 
-class _Swaps(SMEStreamVectorEnv):
+class _Swaps(SMEVectorEnv):
     """Switches one lane too late."""
 
     def reset(self, **arguments):

@@ -9,7 +9,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from sme_registry import StreamSpec
-from sme_registry.envs import SMEEnv, SMEStreamEnv, SMEStreamVectorEnv, SMEVectorEnv
+from sme_registry.envs import SMEEnv, SMEVectorEnv
 from sme_registry.errors import (
     ActionError,
     EpisodeError,
@@ -17,8 +17,7 @@ from sme_registry.errors import (
     ResourceLimitError,
     UnexpectedKeywordError,
 )
-from sme_registry.testing.comparing import expect_same
-from sme_registry.testing.episodes import as_action, mixed_actions, next_action
+from sme_registry.testing import expect_same, mixed_actions, next_action
 
 SPEC = {"state_dim": 4, "action_dim": 2, "horizon": 12, "complexity": 2}
 MODES = [mode.value for mode in AutoresetMode]
@@ -58,8 +57,8 @@ def both_reset(batch, singles, mask, seed=None):
 @pytest.mark.parametrize("switch", ["episode", "step"])
 def test_a_batch_of_lives_equals_its_singles_in_every_bit(switch, mode):
     spec = stream(switch, observes_phase=switch == "step")
-    batch = SMEStreamVectorEnv(spec, 5, autoreset_mode=mode)
-    makers = [functools.partial(SMEStreamEnv, spec)] * 5
+    batch = SMEVectorEnv(spec, 5, autoreset_mode=mode)
+    makers = [functools.partial(SMEEnv, spec)] * 5
     singles = SyncVectorEnv(makers, autoreset_mode=AutoresetMode(mode))
     rng = np.random.default_rng(0)
     apart = 0
@@ -81,11 +80,11 @@ def test_a_batch_of_lives_equals_its_singles_in_every_bit(switch, mode):
                 one = np.arange(5) == t // 20
                 expect_same("new life", *both_reset(batch, singles, one, [9] * 5))
     assert step[4]["lifetime"].min() > spec.steps
-    assert apart > 10  # lanes that were in different pieces at once
+    assert apart > 10  # lanes that were in different segments at once
 
 
 def test_a_phase_is_left_at_the_next_reset():
-    env = SMEStreamEnv(stream(D=0.0))
+    env = SMEEnv(stream(D=0.0))
     env.reset(seed=0)
     # Episodes of 12 steps: 37 is passed in the fourth, and so on; after 182 the last phase goes on.
     lengths = [(0, 48), (1, 24), (2, 24), (0, 36), (1, 24), (2, 84)]
@@ -96,7 +95,7 @@ def test_a_phase_is_left_at_the_next_reset():
 def test_a_phase_is_left_at_once_however_far_away_the_switch_is():
     phases = [{"spec": SPEC, "steps": 700}, {"spec": SPEC | {"seed": 1}, "steps": 100}]
     for spec in (stream("step", D=0.0), StreamSpec(phases=phases, switch="step")):
-        env, steps = SMEStreamEnv(spec), spec.steps + 20
+        env, steps = SMEEnv(spec), spec.steps + 20
         env.reset(seed=0)
         expected = [(i + 1, spec.pieces[spec.piece_at(i)].phase) for i in range(steps)]
         assert phases_seen(env, steps) == expected
@@ -105,7 +104,7 @@ def test_a_phase_is_left_at_once_however_far_away_the_switch_is():
 def test_state_and_what_is_to_be_paid_carry_over_a_switch_within_an_episode():
     specs = SPEC | {"k": 12}, SPEC | {"k": 2, "seed": 1}
     phases = [{"spec": spec, "steps": 9} for spec in specs]
-    env = SMEStreamEnv(StreamSpec(phases=phases, switch="step", observes_phase=True))
+    env = SMEEnv(StreamSpec(phases=phases, switch="step", observes_phase=True))
     env.reset(seed=0)
     for t in range(1, 13):
         task, s = env.task, env.state
@@ -125,7 +124,7 @@ def test_state_and_what_is_to_be_paid_carry_over_a_switch_within_an_episode():
 
 
 def test_a_reset_continues_the_life_and_a_seed_begins_a_new_one():
-    env, batch = SMEStreamEnv(stream()), SMEStreamVectorEnv(stream(), 2)
+    env, batch = SMEEnv(stream()), SMEVectorEnv(stream(), 2)
     assert env.reset(seed=0)[1]["lifetime"] == 0
     phases_seen(env, 50, env.task.optimal_action(env.state))
     _, info = env.reset()
@@ -144,7 +143,7 @@ def test_a_reset_continues_the_life_and_a_seed_begins_a_new_one():
 @pytest.mark.parametrize("switch", ["episode", "step"])
 def test_a_life_may_begin_after_some_steps(switch):
     spec = stream(switch, D=0.0)
-    env, batch = SMEStreamEnv(spec), SMEStreamVectorEnv(spec, 2, autoreset_mode="SameStep")
+    env, batch = SMEEnv(spec), SMEVectorEnv(spec, 2, autoreset_mode="SameStep")
     for lifetime, phase in ((36, 0), (61, 2), (400, 2)):
         options = {"lifetime": lifetime}
         observation, info = env.reset(seed=1, options=options)
@@ -161,7 +160,7 @@ def test_a_life_may_begin_after_some_steps(switch):
 
 
 def test_another_lifetime_or_that_of_a_task_is_refused_and_nothing_changes():
-    env, batch = SMEStreamEnv(stream()), SMEStreamVectorEnv(stream(), 2)
+    env, batch = SMEEnv(stream()), SMEVectorEnv(stream(), 2)
     for each in env, batch:
         each.reset(seed=0)
         for lifetime in (-1, 2.5, "late", None, 2**62 + 1, 2**63 - 1, 2**70):
@@ -181,7 +180,7 @@ def test_another_lifetime_or_that_of_a_task_is_refused_and_nothing_changes():
 
 
 def test_a_refused_action_and_an_autoreset_are_no_steps_of_the_life():
-    env = SMEStreamEnv(stream("step", D=0.0))
+    env = SMEEnv(stream("step", D=0.0))
     env.reset(seed=0)
     for lifetime in range(1, 41):  # beyond the switch at 37
         with pytest.raises(ActionError):
@@ -194,14 +193,14 @@ def test_a_refused_action_and_an_autoreset_are_no_steps_of_the_life():
             with pytest.raises(EpisodeError):
                 env.step(HALF)
             env.reset()
-    batch = SMEStreamVectorEnv(stream(D=0.0), 2)
+    batch = SMEVectorEnv(stream(D=0.0), 2)
     batch.reset(seed=0)
     lifetimes = [batch.step(np.full((2, 2), 0.5))[4]["lifetime"][0] for _ in range(14)]
     assert lifetimes == [*range(1, 13), 12, 13]
 
 
 def test_lanes_in_different_pieces_refuse_an_action_together():
-    batch = SMEStreamVectorEnv(stream("step"), 4, autoreset_mode="SameStep")
+    batch = SMEVectorEnv(stream("step"), 4, autoreset_mode="SameStep")
     batch.reset(seed=0)
     rng = np.random.default_rng(0)
     while len(set(batch.get_attr("task"))) == 1:
@@ -216,24 +215,24 @@ def test_lanes_in_different_pieces_refuse_an_action_together():
         np.testing.assert_array_equal(batch.state, before)
     action = next_action(batch, rng)
     expect_same("the step after it", batch.step(action), twin.step(action))
-    with pytest.raises(EpisodeError, match=r"different pieces.*get_attr\('task'\)"):
+    with pytest.raises(EpisodeError, match=r"different segments.*get_attr\('task'\)"):
         _ = twin.task
 
 
 def test_a_stream_of_one_phase_has_the_numbers_of_its_task():
     spec = SPEC | {"k": 5, "D": 0.2}
     one = StreamSpec(phases=[{"spec": spec, "steps": 10}])
-    pairs = [(SMEEnv(spec), SMEStreamEnv(one)), (SMEVectorEnv(spec, 3), SMEStreamVectorEnv(one, 3))]
+    pairs = [(SMEEnv(spec), SMEEnv(one)), (SMEVectorEnv(spec, 3), SMEVectorEnv(one, 3))]
     for plain, env in pairs:
         rng = np.random.default_rng(0)
         assert env.observation_space == plain.observation_space
         np.testing.assert_array_equal(env.reset(seed=0)[0], plain.reset(seed=0)[0])
         for _ in range(60):
             unit = mixed_actions(plain.task.optimal_action(plain.state), rng)
-            got, expected = env.step(as_action(env, unit)), plain.step(as_action(plain, unit))
+            got, expected = env.step(unit), plain.step(unit)
             expect_same("step", got[:4], expected[:4])
             expect_same("info", {key: got[4][key] for key in expected[4]}, expected[4])
-            if isinstance(env, SMEStreamEnv) and (got[2] or got[3]):
+            if isinstance(env, SMEEnv) and (got[2] or got[3]):
                 expect_same("reset", env.reset()[0], plain.reset()[0])
 
 
@@ -248,16 +247,16 @@ def test_fields_of_specs_are_refused_with_the_way_to_another_stream(make):
 
 
 def test_a_batch_that_does_not_fit_in_memory_is_refused():
-    with pytest.raises(ResourceLimitError, match="fewer lanes"):
-        SMEStreamVectorEnv(stream(), 2**40)
+    with pytest.raises(ResourceLimitError, match="fewer environments"):
+        SMEVectorEnv(stream(), 2**40)
 
 
 def test_frames_show_the_task_in_force():
     pytest.importorskip("pygame")
     phases = [{"spec": SPEC | {"k": k}, "steps": 3} for k in (2, 3)]
     spec = StreamSpec(phases=phases, switch="step")
-    env = SMEStreamEnv(spec, render_mode="rgb_array")
-    batch = SMEStreamVectorEnv(spec, 2, render_mode="rgb_array")
+    env = SMEEnv(spec, render_mode="rgb_array")
+    batch = SMEVectorEnv(spec, 2, render_mode="rgb_array")
     env.reset(seed=0)
     batch.reset(seed=0)
     tops = []

@@ -48,12 +48,12 @@ def test_disabled_refuses_to_step_ended_lanes_and_resets_those_asked_for():
     env.reset(seed=0)
     env.step(HALF)
     last = env.step(HALF)[0]
-    with pytest.raises(EpisodeError, match=r"3 lanes have ended.*reset_mask"):
+    with pytest.raises(EpisodeError, match=r"3 environments have ended.*reset_mask"):
         env.step(HALF)
     observations, _ = env.reset(options={"reset_mask": np.array([True, False, True])})
     np.testing.assert_array_equal(observations[1], last[1])
     assert not observations[[0, 2], 2:].any()
-    with pytest.raises(EpisodeError, match=r"1 lanes have ended \(the first is lane 1\)"):
+    with pytest.raises(EpisodeError, match=r"1 environments have ended \(the first is 1\)"):
         env.step(HALF)
     env.reset(options={"reset_mask": np.array([False, True, False])})
     assert env.step(HALF)[0][:, 2].tolist() == [0.5] * 3
@@ -122,7 +122,7 @@ def test_a_batch_that_cannot_be_made_is_a_typed_error():
     for kwargs, error, words in (
         ({"num_envs": 0}, OptionError, "num_envs=0.*at least 1"),
         ({"num_envs": 2.0}, OptionError, "num_envs=2.0"),
-        ({"num_envs": 2**40}, ResourceLimitError, "fewer lanes"),
+        ({"num_envs": 2**40}, ResourceLimitError, "fewer environments"),
         ({"autoreset_mode": "Sometimes"}, OptionError, "'NextStep', 'SameStep' or 'Disabled'"),
         ({"render_mode": "human"}, OptionError, "single environment"),
         ({"render_lanes": [0]}, OptionError, "needs render_mode='rgb_array'"),
@@ -223,7 +223,7 @@ def test_attributes_of_lanes_are_asked_for_as_of_gymnasiums_vectors(mode):
     assert env.get_attr("label") == ("d",) * 3
     env.set_attr("act", lambda x: x + 1)
     assert env.call("act", 2) == (3, 3, 3)
-    with pytest.raises(OptionError, match="each of the 3 lanes"):
+    with pytest.raises(OptionError, match="each of the 3 environments"):
         env.set_attr("label", ["a", "b"])
     with pytest.raises(AttributeError, match="nothing"):
         env.get_attr("nothing")

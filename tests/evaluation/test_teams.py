@@ -8,7 +8,7 @@ import pytest
 
 from sme_registry import SMESpec, evaluate, materialize
 from sme_registry.compiled import engine
-from sme_registry.envs.shared import (
+from sme_registry.envs.team import (
     shared_action_dim,
     shared_observation,
     shared_observation_dim,

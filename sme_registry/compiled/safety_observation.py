@@ -1,7 +1,7 @@
 """What `safety` and `observation` add to a step, as machine code, for one lane and for a batch.
 
-As in `kernels`, both do the same floating-point operations in the same order for each lane. A
-task's extension travels as one flat float64 array:
+As in `kernels`, both do the same floating-point operations in the same order for each lane. What a
+task adds travels as one flat float64 array:
     S, A, m, τ (0 without safety), r_min, how distractors move (an index of `_DYNAMICS`),
     whether layers of the mixing end with Φ (0 or 1), widest layer,
     how many layers limit and how many mix, size of all this, the limiting layers, W [A, m] and
@@ -30,12 +30,12 @@ from sme_registry.compiled.kernels import (
 )
 from sme_registry.compiled.values import (
     COST,
-    EXTENDED,
-    EXTRA_COST,
-    EXTRA_OWN,
-    EXTRA_SAFE_REGRET,
+    HAS_MORE,
     LANE_STATE,
     LANE_VALUES,
+    MORE_COST,
+    MORE_OWN,
+    MORE_SAFE_REGRET,
     OWN_DISTRACTORS,
     OWN_DRAWN,
     OWN_KEY,
@@ -50,8 +50,7 @@ _NOISE, _AUTONOMOUS = 1, 2
 _HEADER = 11
 
 
-def pack_extension(task: Task) -> npt.NDArray[np.float64]:
-    """The extension of a task as one flat array, in the order of this module's head."""
+def pack(task: Task) -> npt.NDArray[np.float64]:
     spec, layers = task.spec, (*task.limiting, *task.mixing)
     tightness = 0.0 if spec.safety is None else spec.safety.tightness
     dynamics = None if spec.observation is None else spec.observation.dynamics
@@ -70,18 +69,15 @@ def pack_extension(task: Task) -> npt.NDArray[np.float64]:
     return packed
 
 
-def extra_size(packed: npt.NDArray[np.float64]) -> int:
-    """The numbers that an extended lane has behind its plain ones: see `values.EXTRA_OWN`.
-
-    Behind them is room for two layers.
-    """
-    return EXTRA_OWN + OWN_DISTRACTORS + int(packed[2]) + 2 * int(packed[7])
+def more_size(packed: npt.NDArray[np.float64]) -> int:
+    """The numbers of a single environment behind its plain ones, with room for two layers."""
+    return MORE_OWN + OWN_DISTRACTORS + int(packed[2]) + 2 * int(packed[7])
 
 
 _PACKED = types.Array(float64, 1, "C", readonly=True)
 _U1, _U30, _U27, _U31, _U12 = (np.uint64(number) for number in (1, 30, 27, 31, 12))
 _OWN_KEY, _OWN_DRAWN, _OWN_D = map(np.uint64, (OWN_KEY, OWN_DRAWN, OWN_DISTRACTORS))
-_COST, _SAFE_REGRET, _OWN = map(np.uint64, (EXTRA_COST, EXTRA_SAFE_REGRET, EXTRA_OWN))
+_COST, _SAFE_REGRET, _OWN = map(np.uint64, (MORE_COST, MORE_SAFE_REGRET, MORE_OWN))
 _LANE_S, _LANE_R = np.uint64(LANE_STATE), np.uint64(LANE_VALUES + STEP_REWARD)
 
 
@@ -117,10 +113,7 @@ def _lane_limits(q, lane, v, extra, action, optimal, step_reward):  # type: igno
 
 @njit(error_model="numpy")
 def _lane_distractors(q, at, lane, own, free, action):  # type: ignore[no-untyped-def]
-    """Move the distractors of one lane; returns what follows their transition in `q`.
-
-    `lane[free]` begins room for what drives them, `[A]`.
-    """
+    """Move the distractors of one lane; `lane[free]` begins room for what drives them, `[A]`."""
     A, m, dynamics = np.uint64(q[1]), np.uint64(q[2]), int(q[5])
     drawn, start = uint64(lane[own + _OWN_DRAWN]), _mixed(uint64(lane[own + _OWN_KEY]))
     d = own + _OWN_D
@@ -161,8 +154,7 @@ def _lane_seen(q, at, lane, s, d, x, y, observation):  # type: ignore[no-untyped
 
 
 @njit(error_model="numpy")
-def _extended_lane_step(p, lane, start, action, optimal, observation):  # type: ignore[no-untyped-def]
-    """One step of the lane whose own numbers begin at `lane[start]`; see `step_extended_lane`."""
+def _lane_step_with_more(p, lane, start, action, optimal, observation):  # type: ignore[no-untyped-def]
     q = p[np.uint64(p[8]) :]
     S, m, widest = np.uint64(q[0]), np.uint64(q[2]), np.uint64(q[7])
     extra = start + np.uint64(p[7]) + np.uint64(p[7]) + _LANE_S + S
@@ -184,34 +176,34 @@ def _extended_lane_step(p, lane, start, action, optimal, observation):  # type: 
         at = _lane_distractors(q, at, lane, own, x, action)
     if q[2] > 0.0 or q[9] > 0.0:
         _lane_seen(q, at, lane, s, d, x, y, observation)
-    return reward, end + EXTENDED
+    return reward, end + HAS_MORE
 
 
 @njit([LANE_FLOAT32, LANE_FLOAT64], error_model="numpy", cache=True)
-def step_extended_lane(p, lane, action, optimal, observation):  # type: ignore[no-untyped-def]
-    """`kernels.step_lane`, and what the extension adds to it.
+def step_lane(p, lane, action, optimal, observation):  # type: ignore[no-untyped-def]
+    """`kernels.step_lane`, and what `safety` and `observation` add to it.
 
     Args:
-      p: the packed task, and its packed extension behind it.
-      lane: the lane's own numbers, `lane_size` of them and then `extra_size`; advanced in place.
+      p: the packed task, and what it adds, packed, behind it.
+      lane: the lane's own numbers, `lane_size` of them and then `more_size`; advanced in place.
       action: `[A]`; any numbers, clipped here.
       optimal: `[A]`, written; with `safety` `[3A]`: also the limits and the safe action.
       observation: `[S + m + 2]`, written.
 
     Returns:
-      `(reward, end)` as `kernels.step_lane`; where a step was made, EXTENDED is added to the end.
+      `(reward, end)` as `kernels.step_lane`; where a step was made, HAS_MORE is added to the end.
     """
-    return _extended_lane_step(p, lane, np.uint64(0), action, optimal, observation)
+    return _lane_step_with_more(p, lane, np.uint64(0), action, optimal, observation)
 
 
 @njit([PACKED_LANE_FLOAT32, PACKED_LANE_FLOAT64], error_model="numpy", cache=True)
-def step_packed_extended_lane(lane, action, optimal, observation):  # type: ignore[no-untyped-def]
-    """`step_extended_lane` for a lane whose own numbers follow both packed parts in one array."""
+def step_packed_lane(lane, action, optimal, observation):  # type: ignore[no-untyped-def]
+    """`step_lane` for a lane whose own numbers follow both packed parts in one array."""
     start = np.uint64(lane[8] + lane[np.uint64(lane[8]) + np.uint64(10)])
-    return _extended_lane_step(lane, lane, start, action, optimal, observation)
+    return _lane_step_with_more(lane, lane, start, action, optimal, observation)
 
 
-# The parts of `extend_many`, in its order; inlined as those of `step_many`.
+# The parts of `add_many`, in its order; inlined as those of `step_many`.
 @njit(inline="always", error_model="numpy")
 def _block_limits(q, first, count, action, optimal, x, excess, missed, values, limits):  # type: ignore[no-untyped-def]
     """Limits, safe actions, cost and safe regret of a block of lanes, from v in `x`."""
@@ -295,7 +287,7 @@ def _block_distractors(q, at, own, first, count, action, driving, start, column)
     return at + A * m + m
 
 
-EXTEND_MANY = void(
+ADD_MANY = void(
     _PACKED,
     float64[:, ::1],
     float64[:, ::1],
@@ -308,12 +300,12 @@ EXTEND_MANY = void(
 )
 
 
-@njit(EXTEND_MANY, error_model="numpy", cache=True)
-def extend_many(q, own, before, after, action, optimal, values, observation, limits):  # type: ignore[no-untyped-def]
+@njit(ADD_MANY, error_model="numpy", cache=True)
+def add_many(q, own, before, after, action, optimal, values, observation, limits):  # type: ignore[no-untyped-def]
     """Go on with a step of `B` lanes, which `kernels.step_many` has made.
 
     Args:
-      q: the packed extension.
+      q: what the task adds, packed.
       own: `[2 + m, B]` each lane's key, numbers drawn, and distractors; advanced in place.
       before: `[S, B]` the states acted in.
       after: `[S, B]` the next states.
