@@ -164,7 +164,8 @@ def _check_life(env: Any, schedule: Schedule, seed: int) -> None:
     """
     stream, rng = schedule.stream, np.random.default_rng(seed)
     steps = _MAX_STEPS if stream is None else min(stream.steps + stream.horizon, _LONGEST_LIFE)
-    lifetime, episode_seed, written = 0, cast("int | None", seed), []
+    lifetime, episode_seed = 0, cast("int | None", seed)
+    written: list[npt.NDArray[Any]] = []
     while lifetime < steps:
         segment = schedule.segment(lifetime)
         observation, info = env.reset(seed=episode_seed)

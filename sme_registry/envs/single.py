@@ -140,7 +140,9 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         if self.sme_spec.safety is not None:
             self._cost, self._safe_regret = more[MORE_COST, ...], more[MORE_SAFE_REGRET, ...]
         self._rows: list[tuple[Array, Observation]] = []
-        self._step = self._fast_step() if self._state == "running" else _refuse_step
+        self._step: Callable[[Any, Any], _Result] = _refuse_step
+        if self._state == "running":
+            self._step = self._fast_step()
 
     # Machine code cannot be pickled or copied: the copy looks it up again.
     def __getstate__(self) -> dict[str, Any]:
@@ -285,6 +287,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             else:
                 action = env._checked(action)
                 reward, end = step_float64(buffer, action, optimal, observation)
+            info: dict[str, Any]
             if lifetimes is None:
                 info = {
                     "optimal_action": optimal,

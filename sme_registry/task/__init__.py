@@ -8,8 +8,7 @@ from sme_registry.task.loading import (
     materialize_stream,
     materialize_together,
 )
-from sme_registry.task.step import Step, observe, step
-from sme_registry.task.task import Task
+from sme_registry.task.task import Step, Task, observe, step
 
 __all__ = [
     "Layer",
