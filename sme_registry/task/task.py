@@ -374,7 +374,7 @@ def observe(
     Examples:
       >>> from sme_registry.task import load, observe
       >>> states, steps, rewards = np.full((2, 8), 0.5), np.array([0, 50]), np.zeros((2, 1))
-      >>> observe(load("Default", sme_registry.SMESpec), states, steps, rewards)[:, 8].tolist()
+      >>> observe(load("Default"), states, steps, rewards)[:, 8].tolist()
       [0.0, 0.5]
     """
     columns = [s, (t / spec.horizon)[:, None], np.minimum(accumulated_reward / spec.k, 1.0)]
