@@ -216,21 +216,17 @@ def env_spec(spec: SpecLike | StreamLike, **kwargs: Any) -> EnvSpec:
       10
     """
     from sme_registry.envs import SMEEnv, arguments
-    from sme_registry.envs.base import content_id
-    from sme_registry.spec import SMESpec, StreamSpec
-    from sme_registry.spec.resolve import names_stream
+    from sme_registry.envs.base import argument_of, content_id
+    from sme_registry.spec import SMESpec
     from sme_registry.task import load
 
-    if names_stream(spec):
-        for name in SMESpec.model_fields.keys() & kwargs.keys():
-            arguments.refuse_override(SMEEnv, name)
-        stream = load(cast("StreamLike", spec), StreamSpec)
-        kwargs = {"stream": stream.to_dict(), **kwargs}
-        return EnvSpec(id=content_id(stream), **_ENTRY_POINTS, kwargs=kwargs)
+    document = load(spec)
     overrides = {name: kwargs.pop(name) for name in [*kwargs] if name in SMESpec.model_fields}
-    derived = load(cast("SpecLike", spec), SMESpec).derive(**overrides)
-    kwargs = {"spec": derived.to_dict(), **kwargs}
-    return EnvSpec(id=content_id(derived), **_ENTRY_POINTS, kwargs=kwargs)
+    arguments.check_overrides(SMEEnv, document, overrides)
+    if overrides and isinstance(document, SMESpec):
+        document = document.derive(**overrides)
+    kwargs = {argument_of(document): document.to_dict(), **kwargs}
+    return EnvSpec(id=content_id(document), **_ENTRY_POINTS, kwargs=kwargs)
 
 
 def make(spec_or_id: SpecLike | StreamLike, **kwargs: Any) -> gymnasium.Env[Any, Any]:

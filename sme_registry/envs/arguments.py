@@ -8,7 +8,7 @@ the task's digest.
 from __future__ import annotations
 
 import inspect
-from typing import Any, NoReturn
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -32,30 +32,30 @@ MAX_LIFETIME = 2**62  # at which a life may begin: its steps are counted in 64 b
 
 def load_overridden(environment: type, spec: SpecLike, overrides: dict[str, Any]) -> Task:
     """The task of an environment class that is called with these overrides of spec fields."""
-    fields = list(SMESpec.model_fields)
-    for name in overrides:
-        if name not in fields:
-            parameters = inspect.signature(environment).parameters.values()
-            named = [one.name for one in parameters if one.kind is one.KEYWORD_ONLY]
-            raise UnexpectedKeywordError(
-                f"{environment.__name__}() got an unexpected keyword argument {name!r}: must be "
-                f"{', '.join(named)} or a field of the spec ({', '.join(fields)})."
-                f"{did_you_mean(name, [*named, *fields]) or ' Remove it.'}"
-            )
+    check_overrides(environment, None, overrides)
     return load_task(spec, **overrides)
 
 
-def refuse_override(environment: type, name: str) -> NoReturn:
-    """Raise UnexpectedKeywordError on a keyword that is no argument of a stream's environment."""
-    parameters = inspect.signature(environment).parameters.values()
-    named = [one.name for one in parameters if one.kind is one.KEYWORD_ONLY]
-    advice = did_you_mean(name, named) or " Remove it."
-    if name in {*SMESpec.model_fields, *StreamSpec.model_fields}:
-        advice = f" {another_stream(name)}"
-    raise UnexpectedKeywordError(
-        f"{environment.__name__}() got an unexpected keyword argument {name!r} for a stream: must "
-        f"be {', '.join(named)}.{advice}"
-    )
+def check_overrides(
+    environment: type, document: SMESpec | StreamSpec | None, overrides: dict[str, Any]
+) -> None:
+    """Raise UnexpectedKeywordError on a keyword that is no field of a spec; streams have none."""
+    is_stream = isinstance(document, StreamSpec)
+    fields = [] if is_stream else list(SMESpec.model_fields)
+    for name in overrides:
+        if name in fields:
+            continue
+        parameters = inspect.signature(environment).parameters.values()
+        named = [one.name for one in parameters if one.kind is one.KEYWORD_ONLY]
+        advice = did_you_mean(name, [*named, *fields]) or " Remove it."
+        if is_stream and name in {*SMESpec.model_fields, *StreamSpec.model_fields}:
+            advice = f" {another_stream(name)}"
+        allowed = f"{', '.join(named)} or a field of the spec ({', '.join(fields)})"
+        raise UnexpectedKeywordError(
+            f"{environment.__name__}() got an unexpected keyword argument {name!r}"
+            f"{' for a stream' if is_stream else ''}: must be "
+            f"{', '.join(named) if is_stream else allowed}.{advice}"
+        )
 
 
 def another_stream(field: str) -> str:

@@ -6,14 +6,14 @@ A task is a stream of one segment that is never over, so every environment runs 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from sme_registry.envs import arguments
 from sme_registry.envs.types import Indices, Observation
 from sme_registry.spec import SMESpec, SpecLike, StreamLike, StreamSpec
-from sme_registry.spec.resolve import names_stream, resolve
+from sme_registry.spec.resolve import Resolved, resolve
 from sme_registry.task import Task
 from sme_registry.task.loading import draw_published
 
@@ -58,14 +58,15 @@ class Schedule:
         stream. Others are fields of a spec; a stream has none to change.
         """
         overrides = dict(overrides)
-        stream = overrides.pop("stream", document if names_stream(document) else None)
-        if stream is None:
-            task = arguments.load_overridden(environment, cast("SpecLike", document), overrides)
-            return cls.of(arguments.single_agent(task))
-        for name in overrides:
-            arguments.refuse_override(environment, name)
-        resolved = resolve(stream, StreamSpec)
-        return cls(resolved.document, draw_published(resolved))
+        stream = overrides.pop("stream", None)
+        resolved: Resolved[Any]
+        resolved = resolve(document) if stream is None else resolve(stream, StreamSpec)
+        arguments.check_overrides(environment, resolved.document, overrides)
+        if overrides:
+            resolved = Resolved(resolved.document.derive(**overrides))
+        tasks = draw_published(resolved)
+        arguments.single_agent(tasks[0])
+        return cls(resolved.document, tasks)
 
     @property
     def reset_options(self) -> tuple[str, ...]:
