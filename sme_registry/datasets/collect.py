@@ -36,7 +36,7 @@ from sme_registry.compiled.values import (
 from sme_registry.datasets.recipe import DatasetRecipe
 from sme_registry.datasets.transitions import Transitions
 from sme_registry.envs.batch import Batch
-from sme_registry.envs.types import Array, Lanes, Mask, Observation
+from sme_registry.envs.types import Array, Indices, Mask, Observation
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import Policy, TeamPolicy, as_policy
 from sme_registry.evaluation.regions import expansion
@@ -283,7 +283,7 @@ class BehaviourEpisodes:
         self.episode, self.t = np.zeros((2, lanes), np.int64)
         self.begin(np.arange(lanes), self.batch.observe())
 
-    def begin(self, lanes: Lanes, observation: Observation) -> None:
+    def begin(self, lanes: Indices, observation: Observation) -> None:
         """Begin the next episodes in these lanes."""
         for lane in lanes.tolist():
             number = self.episode[lane] = next(self._numbers)

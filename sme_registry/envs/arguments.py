@@ -123,7 +123,7 @@ def checked_seed(seed: Any) -> int | None:
     return None if seed is None else integer_in("seed", seed, 0, advice=advice)
 
 
-def refuse_unknown_options(options: dict[str, Any] | None, known: tuple[str, ...]) -> None:
+def check_options(options: dict[str, Any] | None, known: tuple[str, ...]) -> None:
     """Raise OptionError on an option that does not exist."""
     for name in options or {}:
         if name not in known:
@@ -195,7 +195,7 @@ def single_agent(task: Task) -> Task:
     return task
 
 
-def refuse_without_limits(who: str, spec: SMESpec) -> None:
+def check_has_limits(who: str, spec: SMESpec) -> None:
     """Raise OptionError if a task has no `safety`, which an algorithm or a wrapper needs."""
     if spec.safety is None:
         raise OptionError(

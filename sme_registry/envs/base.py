@@ -66,7 +66,7 @@ class GymnasiumMixin(TaskMixin):
         self._env_spec = renamed_by_content(value, self.document)
 
 
-def refuse_short_time_limit(horizon: int) -> None:
+def check_outer_time_limit(horizon: int) -> None:
     """Raise where the `reset` that calls this was called by a TimeLimit below the horizon.
 
     Such a wrapper ends an episode before its last payout. An environment has no reference to its

@@ -21,7 +21,7 @@ from sme_registry.compiled.values import (
     MORE_SAFE_REGRET,
 )
 from sme_registry.envs import arguments, infos
-from sme_registry.envs.base import GymnasiumMixin, html_card, refuse_short_time_limit
+from sme_registry.envs.base import GymnasiumMixin, check_outer_time_limit, html_card
 from sme_registry.envs.batch import Distractors
 from sme_registry.envs.rendering import RENDER_MODES, RenderMixin
 from sme_registry.envs.schedule import Schedule
@@ -174,8 +174,8 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
           OptionError: an unknown option, or a seed that is no integer of at least 0.
           WrapperError: an outer TimeLimit would end the episode before the horizon.
         """
-        refuse_short_time_limit(self.document.horizon)
-        arguments.refuse_unknown_options(options, self._schedule.reset_options)
+        check_outer_time_limit(self.document.horizon)
+        arguments.check_options(options, self._schedule.reset_options)
         S, seed = self.document.state_dim, arguments.checked_seed(seed)
         lifetime = arguments.lifetime_in(options)
         start, distractors = (

@@ -182,7 +182,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
           StateError, OptionError: as `SMEEnv.reset`.
         """
         known = (*self._batch.schedule.reset_options, "reset_mask")
-        arguments.refuse_unknown_options(options, known)
+        arguments.check_options(options, known)
         options = options or {}
         lifetime = arguments.lifetime_in(options)
         mask = self._mask(options["reset_mask"]) if "reset_mask" in options else None

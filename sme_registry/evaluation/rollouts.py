@@ -15,7 +15,7 @@ import numpy.typing as npt
 from sme_registry.compiled.values import REGRET, REWARD, SIMILARITY
 from sme_registry.envs.arguments import initial_states, single_agent
 from sme_registry.envs.batch import Batch, BatchStep
-from sme_registry.envs.types import Array, Lanes, Mask, Observation
+from sme_registry.envs.types import Array, Indices, Mask, Observation
 from sme_registry.evaluation.policies import Policy, TeamPolicy
 from sme_registry.task import Task, streams
 
@@ -37,7 +37,7 @@ class PlayStep(NamedTuple):
 def play(
     batch: Batch,
     act: Callable[[Array, Observation], npt.NDArray[Any]],
-    begin: Callable[[Lanes, Observation], None] | None = None,
+    begin: Callable[[Indices, Observation], None] | None = None,
 ) -> Iterator[PlayStep]:
     """Play the batch's episodes from where they are, until all have ended.
 
@@ -50,7 +50,7 @@ def play(
     Yields:
       Each step. What it holds is valid until the next one.
     """
-    observation, running = batch.observe(), np.ones(batch.lanes, bool)
+    observation, running = batch.observe(), np.ones(batch.num_envs, bool)
     while running.any():
         state, distractors = batch.state, batch.distractors
         action = act(state, observation)
@@ -136,7 +136,7 @@ def rollouts(
 def _sums(
     batch: Batch, act: Callable[[Array, Observation], npt.NDArray[Any]], gamma: float
 ) -> Array:
-    sums, weight = np.zeros((6 + len(batch.task.policies), batch.lanes)), 1.0
+    sums, weight = np.zeros((6 + len(batch.task.policies), batch.num_envs)), 1.0
     for step in play(batch, act):
         values = step.result.values
         similarity, regret, reward = _team_means(values[[SIMILARITY, REGRET, REWARD]])

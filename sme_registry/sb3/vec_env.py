@@ -245,7 +245,7 @@ class _BatchVecEnv(LanesVecEnv):
     def _start(self, seed: int | None, options: list[dict[str, Any]]) -> _Start:
         """How a team begins an episode, from its seed and the options of its lanes."""
         for of_lane in options:
-            arguments.refuse_unknown_options(of_lane, self._batch.schedule.reset_options)
+            arguments.check_options(of_lane, self._batch.schedule.reset_options)
         shape = (self._task.spec.state_dim,)
         states = [arguments.initial_states(of["state"], shape) for of in options if "state" in of]
         if states and (
