@@ -11,8 +11,7 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
 from sme_registry.errors import WrapperError
-from sme_registry.io.markup import card, folded, pairs_html, table_html
-from sme_registry.spec import SMESpec, StreamSpec, cards
+from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.catalogue import NAMESPACE
 from sme_registry.task import Task
 from sme_registry.task.streams import DYNAMICS_VERSION
@@ -149,11 +148,17 @@ def html_card(
     The spaces are those of a single environment, or of any agent in a team; `status` is "created",
     "running" or "ended", and None for a batch.
     """
+    from sme_registry.io.markup import card, folded, pairs_html, table_html  # loads Jinja
+    from sme_registry.spec import cards
+
     document: SMESpec | StreamSpec = env.document
+    seen = cards.observation_text(env.sme_spec)
+    if isinstance(document, StreamSpec) and document.observes_phase:
+        seen += ", one-hot of the phase"
     agents = cards.agents(document) if isinstance(document, SMESpec) else []
     span = f"float32 in [{action.low.flat[0]:g}, {action.high.flat[0]:g}]"
     facts = {
-        "observation": f"[{observation.shape[0]}] float32 in [0, 1]: {_observed(document)}",
+        "observation": f"[{observation.shape[0]}] float32 in [0, 1]: {seen}",
         "action": f"[{action.shape[0]}] {span}",
     }
     if agents:
@@ -173,10 +178,3 @@ def html_card(
         summary = f"Stream: {document.visits:,} visits, {document.steps:,} steps"
         task = cards.parts(document)
     return card(*shown, folded(summary, *task))
-
-
-def _observed(document: SMESpec | StreamSpec) -> str:
-    if isinstance(document, SMESpec):
-        return cards.observation_text(document)
-    phase = ", one-hot of the phase" if document.observes_phase else ""
-    return cards.observation_text(document.phases[0].spec) + phase

@@ -26,7 +26,7 @@ def lint_imports(folder):
 
 AT_THE_TOP = {
     "spec/document.py": "sme_registry.task",
-    "task/step.py": "torch",
+    "task/task.py": "torch",
     "compiled/engine.py": "numba",
     "envs/single.py": "pygame",
     "plots/style.py": "stable_baselines3",

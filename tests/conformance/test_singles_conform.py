@@ -199,7 +199,9 @@ def test_teams_at_the_edges_pass_the_conformance_kit(fields):
 
 @pytest.mark.filterwarnings("ignore:Agents have different", "ignore:Observations are different")
 @pytest.mark.parametrize("action_range", ["unit", "symmetric"])
-@pytest.mark.parametrize("fields", [{}, {"k": 3, "D": 0.3, "team": UNEQUAL}], ids=["four", "three"])
+@pytest.mark.parametrize(
+    "fields", [{}, {"action_dim": 4, "k": 3, "D": 0.3, "team": UNEQUAL}], ids=["four", "three"]
+)
 def test_a_team_passes_pettingzoos_tests(fields, action_range):
     kwargs = {"horizon": 20, "action_range": action_range, **fields}
     make = functools.partial(sme_registry.make_parallel, "Team4-v1", **kwargs)
@@ -211,7 +213,9 @@ def test_a_team_passes_pettingzoos_tests(fields, action_range):
     state_test(make_aec(), make())
 
 
-@pytest.mark.parametrize("fields", [{}, {"k": 3, "D": 0.3, "team": UNEQUAL}], ids=["four", "three"])
+@pytest.mark.parametrize(
+    "fields", [{}, {"action_dim": 4, "k": 3, "D": 0.3, "team": UNEQUAL}], ids=["four", "three"]
+)
 def test_turns_and_back_keep_every_number(fields):
     make = functools.partial(sme_registry.make_parallel, "Team4-v1", horizon=12, **fields)
     # Not `aec_to_parallel`, which would return the original environment.
