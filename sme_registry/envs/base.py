@@ -152,7 +152,8 @@ def html_card(
     from sme_registry.spec import cards
 
     document: SMESpec | StreamSpec = env.document
-    seen = cards.observation_text(env.sme_spec)
+    spec = document if isinstance(document, SMESpec) else document.phases[0].spec
+    seen = cards.observation_text(spec)
     if isinstance(document, StreamSpec) and document.observes_phase:
         seen += ", one-hot of the phase"
     agents = cards.agents(document) if isinstance(document, SMESpec) else []
