@@ -53,16 +53,16 @@ class GymnasiumMixin(TaskMixin):
         """
         return self._env_spec
 
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        self._env_spec = renamed_by_content(value, self.document)
+
     @property
     def stream(self) -> StreamSpec:
         """The stream that is run; an environment of a task has no such attribute."""
         if not isinstance(self.document, StreamSpec):
             raise AttributeError(f"stream: {self!r} runs a task. Its spec is sme_spec.")
         return self.document
-
-    @spec.setter
-    def spec(self, value: EnvSpec | None) -> None:
-        self._env_spec = renamed_by_content(value, self.document)
 
 
 def check_outer_time_limit(horizon: int) -> None:

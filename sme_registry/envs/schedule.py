@@ -6,7 +6,7 @@ A task is a stream of one segment that is never over, so every environment runs 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -63,7 +63,7 @@ class Schedule:
         resolved = resolve(document) if stream is None else resolve(stream, StreamSpec)
         arguments.check_overrides(environment, resolved.document, overrides)
         if overrides:
-            resolved = Resolved(resolved.document.derive(**overrides))
+            resolved = Resolved(cast("SMESpec", resolved.document).derive(**overrides))
         tasks = draw_published(resolved)
         arguments.single_agent(tasks[0])
         return cls(resolved.document, tasks)

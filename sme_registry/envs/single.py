@@ -119,7 +119,8 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
     @property
     def distractors(self) -> Array:
         """The distractors d, `[m]` float64 in [0, 1] (a copy); empty where the task has none."""
-        return self._distractors.values[0]
+        distractors: Array = self._distractors.values[0]
+        return distractors
 
     def _put_in_force(self, segment: int) -> None:
         """Run the task of a segment; the episode, if one is running, goes on by `_load_engine`."""

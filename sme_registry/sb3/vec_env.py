@@ -336,7 +336,7 @@ class SMEVecEnv(_BatchVecEnv):
         **overrides: Any,
     ) -> None:
         named, num_envs = registered_or_new(spec_or_id), integer_in("num_envs", num_envs, 1)
-        document = named.kwargs.get("stream", named.kwargs.get("spec"))
+        document: Any = named.kwargs.get("stream", named.kwargs.get("spec"))
         batch = Batch(Schedule.load(type(self), document, overrides), num_envs)
         kwargs = {**named.kwargs, "action_range": action_range, **overrides}
         env_spec = renamed_by_content(dataclasses.replace(named, kwargs=kwargs), batch.document)
