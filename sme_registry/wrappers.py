@@ -32,7 +32,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv
 
-from sme_registry.envs.arguments import refuse_without_limits
+from sme_registry.envs.arguments import check_has_limits
 from sme_registry.envs.episodes import Episode, Episodes, info_of_lanes
 from sme_registry.errors import OptionError
 from sme_registry.io import refuse_existing
@@ -290,4 +290,4 @@ def _check_limits(wrapper: Any, env: Any) -> None:
             f"{name}: {env!r:.80} has no `sme_spec`. Wrap an environment of sme_registry.make, "
             "or a vector of sme_registry.make_vec."
         ) from None
-    refuse_without_limits(name, spec)
+    check_has_limits(name, spec)

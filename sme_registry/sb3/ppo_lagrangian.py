@@ -27,7 +27,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sme_registry.envs.arguments import refuse_without_limits
+from sme_registry.envs.arguments import check_has_limits
 from sme_registry.errors import OptionError
 from sme_registry.io import number_in
 from sme_registry.spec import SMESpec
@@ -43,7 +43,7 @@ def spec_with_limits(algorithm: str, env: Any) -> SMESpec:
         raise OptionError(
             f"{algorithm}: the environment has no `sme_spec`. Use an environment of sme_registry."
         ) from None
-    refuse_without_limits(algorithm, spec)
+    check_has_limits(algorithm, spec)
     return spec
 
 

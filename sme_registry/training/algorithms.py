@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sme_registry.datasets import record
-from sme_registry.envs.arguments import refuse_without_limits
+from sme_registry.envs.arguments import check_has_limits
 from sme_registry.errors import OptionError, SpecError, UnknownNameError, did_you_mean
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.io import choice, import_object, require_packages
@@ -98,7 +98,7 @@ class Entry:
         """Check that it can learn a task or live in a stream, beyond what a plan itself says."""
         if self.needs_limits:
             spec = document if isinstance(document, SMESpec) else document.phases[0].spec
-            refuse_without_limits(self.name, spec)
+            check_has_limits(self.name, spec)
         if self.kind == "jax":
             _check_in_jax(document)
 
