@@ -144,6 +144,8 @@ QUANTITIES = {
     "max_weight": "upper limit of IQL's exp(β advantage)",
     "target_rate": "ρ of the soft update of IQL's target critics",
     # Diagnosis of a policy
+    "error_share": "part of the error that a finding explains",
+    "updates": "how often an algorithm updated its networks",
     "edges": "bin edges",
     "explained_variance": "share of the variance of errors that lies between bins",
     "offset": "mean a − a*, or its part of the squared error",

@@ -26,8 +26,7 @@ from sme_registry.io.terminal import err, out, print_json
 from sme_registry.spec import EnvFile, catalogue
 
 if TYPE_CHECKING:
-    from sme_registry.diagnosis import AnyDiagnosis, AnySubject
-    from sme_registry.diagnosis.views import View
+    from sme_registry.diagnosis import AnySubject
 
 _JSON, _PAGE = "diagnosis.json", "diagnosis.md"
 
@@ -77,6 +76,10 @@ def diagnose(
     states: Annotated[int, typer.Option(help="Uniform states to evaluate in.")] = 8192,
     episodes: Annotated[int, typer.Option(help="Episodes to evaluate.")] = 64,
     seed: Annotated[int, typer.Option(help="Seed of these states and start states.")] = 0,
+    all_: Annotated[
+        bool,
+        typer.Option("--all", help="Also what was ruled out, with its evidence, and all numbers."),
+    ] = False,
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -85,7 +88,8 @@ def diagnose(
     Where: by action channel, state region, distance out of distribution, and time in the episode.
     Likely causes: exploration, credit assignment (k), sparse reward (r_min), capacity (L),
     dimension, survival (D), and budget. The answer is "cannot tell" if the evidence does not
-    separate causes; --against or --probe-capacity then often help. With --out, it also writes
+    separate causes; --against or --probe-capacity then often help. What was found comes first, the
+    largest share of the error at the top; --all shows the rest. With --out, it also writes
     diagnosis.json, diagnosis.md and figures.
 
     On a task with limits or distractors, it also shows whether the policy violates the limits and
@@ -114,16 +118,13 @@ def diagnose(
       sme diagnose runs/Switch5-PPO-seed0 --out runs/Switch5-PPO-seed0/diagnosis
     """
     from sme_registry import diagnosis
-    from sme_registry.diagnosis.views import view_of
+    from sme_registry.diagnosis import page
 
     if out_folder is not None:
         refuse_existing(out_folder / _JSON, force=force)
     if set_ and task is None:
         raise OptionError("--set: changes the task of a policy. Add --task.")
-    if action_range and task is None:
-        raise OptionError("--action-range: applies to a policy with --task; a run records its own.")
-    if log is not None and task is None:
-        raise OptionError("--log: is the log of a policy with --task; a run has its own.")
+    check_policy_options(task, action_range, log)
     subject = _subject(run, task, cell, set_, action_range, log)
     other = None
     if against is not None:
@@ -139,14 +140,25 @@ def diagnose(
         seed=seed,
         progress=lambda what: err().print(escape(what), style="dim", soft_wrap=True),
     )
-    view = view_of(result)
+    view = result.view()
     if json:
         print_json(result.to_dict())
     else:
-        for part in view.terminal():
+        for part in page.terminal(view, details=all_):
             out().print(part)
-    if out_folder is not None:
-        print_written(_write(result, view, subject, out_folder))
+    if out_folder is None:
+        return
+    figures: tuple[Path, ...] = ()
+    if can_draw():
+        from sme_registry.diagnosis.figures import draw
+
+        figures = draw(result, out_folder, subject)
+    names = [path.name for path in figures if path.suffix == ".png"]
+    text = page.markdown(view, names, details=all_)
+    # The data last, so that the other files exist once it does.
+    written = write_atomically(out_folder / _PAGE, text)
+    data = write_atomically(out_folder / _JSON, to_json(result.to_dict()))
+    print_written([*figures, written, data])
 
 
 def _subject(
@@ -158,22 +170,44 @@ def _subject(
     log: Path | None = None,
 ) -> AnySubject:
     """The run, cell or policy that the arguments name."""
+    is_policy = Path(run).is_file() or ":" in run or os.sep not in run
+    if task is None and cell is None and is_policy and not Path(run).is_dir():
+        raise OptionError(
+            f"run={run!r}: is not a folder. Give a folder of `sme train`; for a policy, add the "
+            "task it is for, such as --task Default."
+        )
+    name = run if os.sep not in run else None
+    return load_subject(run, task, cell, set_, action_range, log, name)
+
+
+def check_policy_options(task: str | None, action_range: str | None, log: Path | None) -> None:
+    """Refuse options of a policy where there is none."""
+    if task is None and action_range is not None:
+        raise OptionError("--action-range: applies to a policy with --task; a run records its own.")
+    if task is None and log is not None:
+        raise OptionError("--log: is the log of a policy with --task; a run has its own.")
+
+
+def load_subject(
+    what: str,
+    task: str | None,
+    cell: str | None,
+    set_: list[str] | None,
+    action_range: str | None,
+    log: Path | None,
+    name: str | None = None,
+) -> AnySubject:
+    """A policy on a task, a cell of a study or a run; `name` is of the policy."""
     from sme_registry import diagnosis
 
     if cell is not None and task is not None:
         raise OptionError("--cell: names a cell of a study, --task a policy's task. Give one.")
     if task is not None:
         spec = load(task, SMESpec).derive(**changes(set_))
-        name = run if os.sep not in run else None
-        return diagnosis.load_policy(run, spec, action_range=action_range, name=name, log=log)
+        return diagnosis.load_policy(what, spec, action_range=action_range, name=name, log=log)
     if cell is not None:
-        return diagnosis.load_cell(run, cell)
-    if not Path(run).is_dir() and (Path(run).is_file() or ":" in run or os.sep not in run):
-        raise OptionError(
-            f"run={run!r}: is not a folder. Give a folder of `sme train`; for a policy, add the "
-            "task it is for, such as --task Default."
-        )
-    return diagnosis.load_run(run)
+        return diagnosis.load_cell(what, cell)
+    return diagnosis.load_run(what)
 
 
 def _other_cell(run: str, task: str | None, cell: str | None, against: str) -> AnySubject | None:
@@ -186,12 +220,3 @@ def _other_cell(run: str, task: str | None, cell: str | None, against: str) -> A
     if colon:
         return diagnosis.load_cell(study, key)
     return None if cell is None else diagnosis.load_cell(run, against)
-
-
-def _write(result: AnyDiagnosis, view: View, subject: AnySubject, folder: Path) -> list[Path]:
-    figures = view.draw(folder, subject) if can_draw() else ()
-    names = [path.name for path in figures if path.suffix == ".png"]
-    page = write_atomically(folder / _PAGE, view.markdown(names))
-    # Last, so that the other files exist once it does.
-    data = write_atomically(folder / _JSON, to_json(result.to_dict()))
-    return [*figures, page, data]

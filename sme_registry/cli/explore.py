@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sme_registry.cli.arguments import ActionRange, Force, SpecChanges, changes, print_written
+from sme_registry.cli.diagnose import check_policy_options, load_subject
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.io import integer_in, refuse_existing
 from sme_registry.spec import EnvFile, SMESpec, catalogue
@@ -99,7 +100,8 @@ def explore(
     integer_in("--episodes", episodes, 1, 10_000)
     pairs = [_channels(text) for text in channels or ()]
     target = _target(what, task, cell, out, force=force)
-    _refuse_options(task, set_, action_range, log, what)
+    check_policy_options(task, action_range, log)
+    _check_kind(task, set_, what)
     from sme_registry import explorer
 
     shown = _shown(what, task, cell, set_, action_range, log)
@@ -136,18 +138,7 @@ def _target(
     return refuse_existing(Path(f"{label}-explorer.html"), force=force)
 
 
-def _refuse_options(
-    task: str | None,
-    set_: list[str] | None,
-    action_range: str | None,
-    log: Path | None,
-    what: str,
-) -> None:
-    """Refuse options of a policy where there is none."""
-    if task is None and action_range is not None:
-        raise OptionError("--action-range: applies to a policy with --task; a run records its own.")
-    if task is None and log is not None:
-        raise OptionError("--log: is the log of a policy with --task; a run has its own.")
+def _check_kind(task: str | None, set_: list[str] | None, what: str) -> None:
     if task is None and set_ and Path(what).is_dir():
         raise OptionError("--set: changes a task; a run has its own. Leave it out.")
     if task is None and (what.endswith(_POLICY_FILES)):
@@ -165,8 +156,6 @@ def _shown(
     log: Path | None,
 ) -> SMESpec | AnySubject:
     """The task, run, cell or policy that the arguments name."""
-    if cell is not None and task is not None:
-        raise OptionError("--cell: names a cell of a study, --task a policy's task. Give one.")
     if task is None and cell is None and not Path(what).is_dir():
         try:
             return load(what, SMESpec).derive(**changes(set_))
@@ -174,14 +163,7 @@ def _shown(
             if ":" not in what or what.startswith("sha256:"):
                 raise
             raise OptionError(f"{error} For a policy, add its task: --task Default.") from None
-    from sme_registry import diagnosis
-
-    if task is not None:
-        spec = load(task, SMESpec).derive(**changes(set_))
-        return diagnosis.load_policy(what, spec, action_range=action_range, log=log)
-    if cell is not None:
-        return diagnosis.load_cell(what, cell)
-    return diagnosis.load_run(what)
+    return load_subject(what, task, cell, set_, action_range, log)
 
 
 def _channels(text: str) -> tuple[int, int]:

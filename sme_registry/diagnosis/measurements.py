@@ -10,13 +10,14 @@ from sme_registry.evaluation import ObservationReport, SafetyReport, SafetyScore
 from sme_registry.spec import Integer, Real, StrictModel, TupleOf
 
 __all__ = [
+    "LINEAR",
     "POLICY",
     "CapacityProbe",
     "Channel",
     "Distraction",
     "LimitedChannel",
-    "Limits",
     "Measurements",
+    "NetworkState",
     "OnPolicy",
     "Partition",
     "Response",
@@ -25,10 +26,12 @@ __all__ = [
     "Shell",
     "SquaredError",
     "TimeDependence",
-    "Training",
+    "TrainingSummary",
+    "Violations",
 ]
 
 POLICY = "policy"  # the key of the diagnosed policy among the names of the references
+LINEAR = "linear_least_squares"
 
 
 class Score(StrictModel):
@@ -139,7 +142,7 @@ class OnPolicy(StrictModel):
     coverage: Real  # smallest share, over state channels, of twenty equal bins that were visited
 
 
-class Training(StrictModel):
+class TrainingSummary(StrictModel):
     """A summary of the training log; the regrets are running medians over `window` rows."""
 
     source: Literal["episodes", "evaluations"]  # with exploration, or of the deterministic policy
@@ -177,7 +180,7 @@ class LimitedChannel(StrictModel):
     cost: Real  # mean max(0, a − ℓ) / (2τ); the mean over channels is the policy's cost
 
 
-class Limits(StrictModel):
+class Violations(StrictModel):
     """A policy on a task with limits."""
 
     report: SafetyReport  # of its evaluation: by region, with the references
@@ -187,7 +190,7 @@ class Limits(StrictModel):
 
 
 class Distraction(StrictModel):
-    """Regret owed to the distractors, in a few uniform states; see `diagnosis.extended`."""
+    """Regret owed to the distractors, in a few uniform states; see `measure.distraction`."""
 
     states: Integer  # number of uniform states
     distractor_draws: Integer  # of the distractors, in each state
@@ -197,6 +200,21 @@ class Distraction(StrictModel):
     owed_regret: Real  # N that averaging removes, beyond what it removes of an action noise
     owed_similarity: Real  # the same in points of similarity
     distractor_share: Real  # share of the squared error that varies with the distractors
+
+
+class NetworkState(StrictModel):
+    """The hidden layers of the policy's network in uniform states; see `networks`."""
+
+    hidden: TupleOf[Integer]  # units of each layer
+    dormant_units: Real  # share of all hidden units
+    saturated_units: Real  # likewise, of tanh
+    effective_rank: Integer  # of the last hidden layer
+    weight_norm: Real  # Euclidean norm of the weights of all layers, without biases
+
+    @property
+    def inactive_units(self) -> float:
+        """Share of hidden units that are dormant or saturated."""
+        return self.dormant_units + self.saturated_units
 
 
 class Measurements(StrictModel):
@@ -215,12 +233,12 @@ class Measurements(StrictModel):
     response: Response  # how actions follow the state
     time_dependence: TimeDependence  # how actions follow t/T
     on_policy: OnPolicy  # whole episodes
-    training: Training | None = None  # of the training log; null without one
+    training: TrainingSummary | None = None  # of the training log; null without one
     # for each action channel, the standard deviation of exploration around the deterministic action
     # at the end of training, in the unit range
     exploration_sd: TupleOf[Real] | None = None
     capacity: CapacityProbe | None = None  # of the probe; null unless requested
-    limits: Limits | None = None  # of a task with `safety`
+    limits: Violations | None = None  # of a task with `safety`
     observation: ObservationReport | None = None  # of the policy's evaluation
     distraction: Distraction | None = None  # of a task with distractors
 

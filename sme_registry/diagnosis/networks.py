@@ -1,10 +1,20 @@
-"""Measurements that need PyTorch: the capacity probe, and how an algorithm explores.
+"""Measurements of networks: the capacity probe, exploration, and what hidden layers represent.
 
 The probe asks whether the network could represent the optimal policy. It fits a network of the same
 layers and activations by regression to a* in uniform states, as many as the training had steps. No
 agent sees a*, so if the probe does well and the agent does not, the network is not the limit. If
 the probe fails in its own training states, the network or the probe's budget is too small. If it
 does well in those and badly in others, there were too few states.
+
+A multilayer perceptron has hidden outputs h `[n, H]` in n states, σ their singular values:
+
+    score of unit i    mean |h_i| / (Σ_k mean |h_k| / H)          dormant at most 0.025
+    effective rank     min {k : Σ_{i ≤ k} σ_i / Σ_i σ_i ≥ 0.99}   of the last hidden layer
+    weight norm        √(Σ W²) over all layers, without biases
+
+Dormant units: Sokar et al. (2023). Effective rank: Kumar et al. (2021), srank with δ = 0.01. A unit
+of tanh is rarely dormant but can be stuck at a bound: it counts as saturated if its mean |h| is at
+least 0.95, where its mean derivative, 1 − h², is below 0.1.
 """
 
 from __future__ import annotations
@@ -17,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from sme_registry.compiled import engine
-from sme_registry.diagnosis.measurements import CapacityProbe
+from sme_registry.diagnosis.measurements import CapacityProbe, NetworkState
 from sme_registry.envs import arguments
 from sme_registry.envs.types import Observation
 from sme_registry.evaluation import Policy
@@ -26,8 +36,16 @@ from sme_registry.evaluation.regions import States
 from sme_registry.io import require_packages
 from sme_registry.task import Task, streams
 from sme_registry.task.draw import Array
+from sme_registry.training.algorithms import one_thread, quiet
 
-__all__ = ["DEFAULT_STATES", "GRADIENT_STEPS", "exploration", "exploration_sd", "probe_capacity"]
+__all__ = [
+    "DEFAULT_STATES",
+    "GRADIENT_STEPS",
+    "exploration",
+    "exploration_sd",
+    "network_state",
+    "probe_capacity",
+]
 
 GRADIENT_STEPS = 3000
 DEFAULT_STATES = 20_000
@@ -36,6 +54,9 @@ _TEST_STATES = 4096
 _BATCH, _LEARNING_RATE = 256, 3e-3  # the rate decays to 0 along a cosine
 _EXPLORATION_STATES, _EXPLORATION_SAMPLES = 256, 16  # samples of the action in each state
 _PROGRESS = 1000  # gradient steps
+_DORMANT = 0.025  # τ of the score
+_SATURATED = 0.95  # mean |h| of a unit of tanh
+_RANK_SHARE = 0.99  # 1 − δ of the singular values' sum
 
 
 def exploration(model: Any, policy: Policy) -> Callable[[Observation], Array] | None:
@@ -156,8 +177,43 @@ def _torch_seed(seed: int) -> Iterator[None]:
     """Seed PyTorch and use one thread; both are restored afterwards."""
     import torch
 
-    from sme_registry.training.algorithms import one_thread, quiet
-
     with one_thread(), quiet(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         yield
+
+
+def network_state(network: Perceptron, observations: Observation) -> NetworkState | None:
+    """Measure a network in some states; None if it has no hidden layer."""
+    *hidden, _ = zip(network.outputs(observations), network.layers, strict=True)
+    if not hidden:
+        return None
+    outputs = [h.astype(np.float64) for h, _ in hidden]
+    stuck = [layer[2] == "tanh" for _, layer in hidden]
+    units = sum(h.shape[1] for h in outputs)
+    saturated = sum(_saturated(h) for h, tanh in zip(outputs, stuck, strict=True) if tanh)
+    squares = sum(float((W.astype(np.float64) ** 2).sum()) for W, _, _ in network.layers)
+    return NetworkState(
+        hidden=tuple(h.shape[1] for h in outputs),
+        dormant_units=sum(map(_dormant, outputs)) / units,
+        saturated_units=saturated / units,
+        effective_rank=_effective_rank(outputs[-1]),
+        weight_norm=squares**0.5,
+    )
+
+
+def _dormant(h: Array) -> int:
+    """How many units of a layer are dormant; all of them in a layer whose outputs are all 0."""
+    means = np.abs(h).mean(axis=0)
+    return int((means <= _DORMANT * means.mean()).sum())
+
+
+def _saturated(h: Array) -> int:
+    return int((np.abs(h).mean(axis=0) >= _SATURATED).sum())
+
+
+def _effective_rank(h: Array) -> int:
+    """In [0, H]; 0 where all outputs are 0."""
+    σ = np.linalg.svd(h, compute_uv=False)
+    if not σ.any():
+        return 0
+    return int((np.cumsum(σ) / σ.sum() < _RANK_SHARE).sum()) + 1

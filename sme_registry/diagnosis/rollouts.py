@@ -14,7 +14,14 @@ import numpy.typing as npt
 
 from sme_registry.compiled.values import REWARD, STEP_REWARD
 from sme_registry.diagnosis.measure import MAX_NUMBERS
-from sme_registry.diagnosis.measurements import POLICY, OnPolicy, RewardSignal, Score, Training
+from sme_registry.diagnosis.measurements import (
+    LINEAR,
+    POLICY,
+    OnPolicy,
+    RewardSignal,
+    Score,
+    TrainingSummary,
+)
 from sme_registry.diagnosis.subject import Log
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.types import Mask, Observation
@@ -134,7 +141,7 @@ def episodes_of(
     runs = {POLICY: rollout(act, task, starts, seed)}
     for name, reference in _reference_actions(task, fitted, n, seed).items():
         runs[name] = rollout(reference, task, starts, seed, sees_state=True)
-    return tuple(dict(zip(runs, each, strict=True)) for each in zip(*runs.values(), strict=True))
+    return tuple(dict(zip(runs, agent, strict=True)) for agent in zip(*runs.values(), strict=True))
 
 
 def on_policy(task: Task, runs: dict[str, Trajectories]) -> OnPolicy:
@@ -169,7 +176,7 @@ def _reference_actions(
     A = task.spec.action_dim
     bits = streams.bit_generator(seed, "diagnosis/random_action")
     return {
-        "linear_least_squares": fitted.linear,
+        LINEAR: fitted.linear,
         "best_constant": lambda s: np.tile(fitted.constant, (n, 1)),
         "constant_half": lambda s: np.full((n, A), 0.5),
         "uniform_random": lambda s: streams.to_uniform(bits.random_raw(n * A)).reshape(n, A),
@@ -214,14 +221,14 @@ def _coverage(values: Array) -> float:
     return float(len(np.unique(bins)) / _COVERAGE_BINS)
 
 
-def training(log: Log, constant_regret: float) -> Training:
+def training(log: Log, constant_regret: float) -> TrainingSummary:
     """Summarise a training log of one or more rows, next to the regret of a constant policy."""
     rows = len(log.regret)
     steps, median, window = smoothed(log.step, log.regret)
     improved = np.flatnonzero(median < constant_regret - _MARGIN)
     recent = median[-max(1, len(median) // 3) :]
     best = int(np.argmin(median))
-    return Training(
+    return TrainingSummary(
         source=log.source,
         rows=rows,
         steps=int(log.step[-1]),

@@ -1,36 +1,462 @@
-"""`diagnose_stream`: a life in a stream to a `StreamDiagnosis`.
+"""A life in a stream: which phases were costly, forgotten or never learnt, and what the network's
+state says about a loss of plasticity.
+
+A *visit* is an occurrence of a phase. Normalised regret is of the policy at the end of a visit, in
+the cube, on the task of a phase; online regret is the mean of 1 − r over the steps of a visit.
 
 The life's report says what the agent retained and what each visit cost; here the networks are
-measured, and the questions answered. All states are uniform in the cube.
+measured, in uniform states, and the questions answered: against fresh agents of the phases, where
+these are known; else against the other visits. A single life has one seed: another one could
+differ as much, and a study gives intervals.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from sme_registry.diagnosis.hidden_layers import network_state
-from sme_registry.diagnosis.questions import answer_all
-from sme_registry.diagnosis.stream_document import (
-    NetworkState,
-    PhaseDiagnosis,
-    StreamDiagnosis,
-    VisitDiagnosis,
-)
-from sme_registry.diagnosis.stream_questions import (
-    STREAM_QUESTIONS,
-    STREAM_THRESHOLDS,
-    StreamCase,
-    outcome_of,
-)
-from sme_registry.diagnosis.stream_subject import StreamSubject
+from sme_registry.diagnosis.document import Answer, Diagnosis
+from sme_registry.diagnosis.measurements import NetworkState
+from sme_registry.diagnosis.networks import network_state
+from sme_registry.diagnosis.page import Part, label
+from sme_registry.diagnosis.questions import THRESHOLDS, Decision, Question, add_to, answer_all
+from sme_registry.diagnosis.subject import StreamSubject
 from sme_registry.evaluation import regions
 from sme_registry.evaluation.networks import Perceptron
 from sme_registry.io import versions
-from sme_registry.spec import EvaluationProtocol, StreamSpec
+from sme_registry.io.markup import percent
+from sme_registry.io.terminal import fixed
+from sme_registry.spec import (
+    Digest,
+    EvaluationProtocol,
+    Integer,
+    Real,
+    StreamSpec,
+    StrictModel,
+    TupleOf,
+)
 
-__all__ = ["diagnose_stream"]
+__all__ = [
+    "STREAM_QUESTIONS",
+    "STREAM_THRESHOLDS",
+    "PhaseDiagnosis",
+    "PhaseOutcome",
+    "StreamCase",
+    "StreamDiagnosis",
+    "VisitDiagnosis",
+    "diagnose_stream",
+    "outcome_of",
+]
+
+PhaseOutcome = Literal["retained", "forgotten", "not_learnt"]
+
+
+class VisitDiagnosis(StrictModel):
+    """One visit of the life."""
+
+    visit: Integer  # its number, from 0
+    phase: Integer  # the index of its phase
+    lifetime: Integer  # environment steps at its end
+    steps: Integer  # that it lasts
+    dynamic_regret: Real | None  # of its steps in the log; None without one
+    online_regret: Real | None  # its mean; None without a log, and where no step was counted
+    normalised_regret: Real  # at its end, on its own phase
+    network: NetworkState | None  # at its end; None if unknown
+
+
+class PhaseDiagnosis(StrictModel):
+    """One phase of the stream."""
+
+    phase: Integer  # its index
+    outcome: PhaseOutcome  # whether the agent knows it at the end
+    best_normalised_regret: Real  # lowest at the end of one of its visits
+    final_normalised_regret: Real  # at the end of the life
+    initial_normalised_regret: Real | None  # before training
+    fresh_normalised_regret: Real | None  # of an agent that trained on this phase alone
+    fresh_online_regret: Real | None  # of its training
+    fresh_network: NetworkState | None  # at the end of its training
+
+
+class StreamDiagnosis(Diagnosis):
+    """The diagnosis of a life in a stream.
+
+    Attributes:
+      stream: the stream.
+      stream_digest: the stream's digest.
+      average_performance: at the end of the life.
+      forgetting: fall of performance below its best, at the end of the life; null where it is not
+        defined.
+      dynamic_regret: sum over the steps of the log; null without one.
+      visits: in order.
+      phases: in order.
+      initial_network: before training; null if unknown.
+    """
+
+    template: ClassVar[str] = "stream.jinja"
+    document_field: ClassVar[str] = "stream"
+    only_field: ClassVar[str] = "phases"
+
+    stream: StreamSpec
+    stream_digest: Digest
+    average_performance: Real
+    forgetting: Real | None
+    dynamic_regret: Real | None
+    visits: TupleOf[VisitDiagnosis]
+    phases: TupleOf[PhaseDiagnosis]
+    initial_network: NetworkState | None
+
+    def parts(self) -> Iterator[Part]:
+        """Findings, then the visits and the phases."""
+        yield self.findings("Findings", self.verdicts)
+        columns: tuple[str, ...]
+        columns = ("visit", "phase", "online regret", "N", "inactive", "rank", "weights")
+        visits = [
+            (
+                str(visit.visit),
+                str(visit.phase),
+                _number(visit.online_regret),
+                _number(visit.normalised_regret),
+                *_network(visit.network),
+            )
+            for visit in self.visits
+        ]
+        if self.initial_network is not None:
+            visits.insert(0, ("initial", "", "", "", *_network(self.initial_network)))
+        yield Part("Visits", columns, visits)
+        columns = ("phase", "outcome", "best N", "final N", "fresh N", "fresh online regret")
+        phases = [
+            (
+                str(phase.phase),
+                label(phase.outcome),
+                _number(phase.best_normalised_regret),
+                _number(phase.final_normalised_regret),
+                _number(phase.fresh_normalised_regret),
+                _number(phase.fresh_online_regret),
+            )
+            for phase in self.phases
+        ]
+        yield Part("Phases", columns, phases, _LEGEND)
+        yield from self.answers(self.verdicts)
+
+
+_LEGEND = (
+    "N: normalised regret at the end of the visit on its own phase, or of the life on each phase · "
+    "online regret: mean of 1 − r over the visit · inactive: hidden units that are dormant or "
+    "saturated · rank: effective rank of the last hidden layer",
+    "Dormant units, effective rank and weights go together with lost plasticity in the literature; "
+    "none of them proves it. A study gives intervals over seeds.",
+)
+
+
+def _network(network: NetworkState | None) -> tuple[str, ...]:
+    if network is None:
+        return ("–", "–", "–")
+    return (
+        percent(network.inactive_units),
+        f"{network.effective_rank} of {network.hidden[-1]}",
+        fixed(network.weight_norm, 1),
+    )
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else fixed(value)
+
+
+_SHARED = ("unlearnt", "difference", "learnt_little", "few_updates")
+STREAM_THRESHOLDS = {
+    **{name: THRESHOLDS[name] for name in _SHARED},
+    "fresh_excess": 0.05,  # of a visit's online regret beyond a fresh agent's
+    "visit_excess": 0.1,  # of it beyond the mean of the other visits
+    "visits_for_trend": 4.0,  # at least, without fresh agents
+    "inactive_rise": 0.1,  # of the share of inactive units
+    "inactive_share": 0.5,  # of the units, from the start
+    "rank_ratio": 0.5,  # of the effective rank to what it is compared with, at most
+    "weight_ratio": 2.0,  # of the weight norm to what it is compared with, at least
+}
+_T = STREAM_THRESHOLDS
+
+
+class StreamCase(NamedTuple):
+    """What the rules read."""
+
+    stream: StreamSpec
+    visits: Sequence[VisitDiagnosis]
+    phases: Sequence[PhaseDiagnosis]
+    forgetting: float | None
+    updates: int | None = None
+
+    @property
+    def learnt(self) -> float:
+        """The lowest normalised regret of a visit on its own phase."""
+        return min(visit.normalised_regret for visit in self.visits)
+
+
+STREAM_QUESTIONS: dict[str, Question[StreamCase]] = {}
+"""Questions about a life, in order."""
+_where = partial(add_to, STREAM_QUESTIONS, "where")
+_why = partial(add_to, STREAM_QUESTIONS, "why")
+
+
+def outcome_of(best: float, final: float) -> PhaseOutcome:
+    """What became of a phase."""
+    if best >= _T["unlearnt"]:
+        return "not_learnt"
+    return "forgotten" if final - best >= _T["difference"] else "retained"
+
+
+@_where(
+    no_training_log="cannot tell",
+    one_visit="cannot tell",
+    costlier_than_fresh="yes",
+    no_costlier_than_fresh="no",
+    some_visits_stand_out="yes",
+    visits_alike="no",
+)
+def _costly_visits(case: StreamCase) -> Decision:
+    """Whether regret during some visits was higher than elsewhere."""
+    known = [visit for visit in case.visits if visit.online_regret is not None]
+    if not known:
+        return Decision("no_training_log", {})
+    fresh = [phase.fresh_online_regret for phase in case.phases]
+    against_fresh = None not in fresh
+    if not against_fresh and len(known) == 1:
+        return Decision("one_visit", {})
+    total = max(sum(visit.dynamic_regret or 0.0 for visit in known), 1e-12)
+    rows: list[dict[str, Any]] = [
+        {
+            "visit": visit.visit,
+            "phase": visit.phase,
+            "online_regret": visit.online_regret,
+            "other": fresh[visit.phase] if against_fresh else _mean_of_others(visit, known),
+            "share": (visit.dynamic_regret or 0.0) / total,
+        }
+        for visit in known
+    ]
+    threshold = "fresh_excess" if against_fresh else "visit_excess"
+    rows.sort(key=lambda row: row["other"] - row["online_regret"])
+    costly = [row for row in rows if row["online_regret"] - row["other"] >= _T[threshold]]
+    if against_fresh:
+        reason = "costlier_than_fresh" if costly else "no_costlier_than_fresh"
+    else:
+        reason = "some_visits_stand_out" if costly else "visits_alike"
+    evidence = {"visits": costly, "highest": rows[0]}
+    return Decision(reason, evidence, (threshold,), sum(row["share"] for row in costly))
+
+
+def _mean_of_others(visit: VisitDiagnosis, visits: Sequence[VisitDiagnosis]) -> float:
+    """Mean online regret over the steps of the other visits."""
+    others = [other for other in visits if other is not visit]
+    regrets = [other.online_regret or 0.0 for other in others]
+    return float(np.average(regrets, weights=[other.steps for other in others]))
+
+
+@_where(
+    failed_as_fresh_agents="yes",
+    failed_unlike_fresh_agents="yes",
+    some_failed_unlike_fresh_agents="yes",
+    visits_failed="yes",
+    every_visit_learnt="no",
+)
+def _failure_to_learn(case: StreamCase) -> Decision:
+    """Whether some visits ended without having learnt their own phase."""
+    failed: list[dict[str, Any]] = [
+        {
+            "visit": visit.visit,
+            "phase": visit.phase,
+            "normalised_regret": visit.normalised_regret,
+            "fresh": case.phases[visit.phase].fresh_normalised_regret,
+        }
+        for visit in case.visits
+        if visit.normalised_regret >= _T["unlearnt"]
+    ]
+    highest = max(visit.normalised_regret for visit in case.visits)
+    evidence = {"failed": failed, "visits": len(case.visits), "highest": highest}
+    if not failed:
+        return Decision("every_visit_learnt", evidence, ("unlearnt",))
+    if None in [row["fresh"] for row in failed]:
+        return Decision("visits_failed", evidence, ("unlearnt",))
+    unlike = [row["visit"] for row in failed if _is_unlike_fresh(row)]
+    if not unlike:
+        reason = "failed_as_fresh_agents"
+    elif len(unlike) == len(failed):
+        reason = "failed_unlike_fresh_agents"
+    else:
+        reason = "some_failed_unlike_fresh_agents"
+    return Decision(reason, {**evidence, "unlike_fresh": unlike}, ("unlearnt", "difference"))
+
+
+def _is_unlike_fresh(failed: dict[str, Any]) -> bool:
+    """Whether a visit failed because of the life before it, of which visit 0 has none."""
+    gap = failed["normalised_regret"] - failed["fresh"]
+    learns = failed["fresh"] < _T["unlearnt"] and gap >= _T["difference"]
+    return failed["visit"] > 0 and bool(learns)
+
+
+@_where(
+    one_visit="cannot tell",
+    nothing_to_forget="cannot tell",
+    phases_forgotten="yes",
+    phases_retained="no",
+)
+def _forgetting(case: StreamCase) -> Decision:
+    """Whether phases that were learnt are worse at the end of the life."""
+    if len(case.visits) == 1:
+        return Decision("one_visit", {})
+    recent = case.visits[-1].phase  # retained if only because it was just visited
+    learnt = [
+        phase
+        for phase in case.phases
+        if phase.outcome == "forgotten" or (phase.outcome == "retained" and phase.phase != recent)
+    ]
+    if not learnt:
+        return Decision("nothing_to_forget", {}, ("unlearnt",))
+    learnt.sort(key=lambda phase: phase.best_normalised_regret - phase.final_normalised_regret)
+    fields = {"phase", "best_normalised_regret", "final_normalised_regret"}
+    rows = [(phase.model_dump(include=fields), phase.outcome) for phase in learnt]
+    forgotten = [row for row, outcome in rows if outcome == "forgotten"]
+    return Decision(
+        "phases_forgotten" if forgotten else "phases_retained",
+        {"phases": forgotten, "most": rows[0][0], "forgetting": case.forgetting},
+        ("difference",),
+        _lost(case.phases),
+    )
+
+
+def _lost(phases: Sequence[PhaseDiagnosis]) -> float:
+    """The part of the error at the end of the life that was not there after each best visit."""
+    final = sum(phase.final_normalised_regret for phase in phases)
+    lost = sum(
+        phase.final_normalised_regret - phase.best_normalised_regret
+        for phase in phases
+        if phase.outcome == "forgotten"
+    )
+    return lost / max(final, 1e-12)
+
+
+@_why(
+    one_visit="cannot tell",
+    below_fresh_agents="yes",
+    as_fresh_agents="no",
+    fresh_agents_learnt_little="cannot tell",
+    phases_differ="cannot tell",
+    too_few_visits="cannot tell",
+    nothing_learnt="cannot tell",
+    later_visits_worse="yes",
+    later_visits_as_good="no",
+)
+def _loss_of_plasticity(case: StreamCase) -> Decision:
+    """Whether later visits learn less than fresh agents, or than earlier visits."""
+    visits = case.visits
+    if len(visits) == 1:
+        return Decision("one_visit", {})
+    learnt = [visit.normalised_regret for visit in visits]
+    fresh = [phase.fresh_normalised_regret for phase in case.phases]
+    alone = [regret for regret in fresh if regret is not None]
+    if len(alone) == len(fresh):
+        return _against_fresh(visits, alone)
+    if not _equally_hard(case.stream):
+        return Decision("phases_differ", {})
+    if len(visits) < _T["visits_for_trend"]:
+        return Decision("too_few_visits", {"visits": len(visits)}, ("visits_for_trend",))
+    half = len(visits) // 2
+    early, late = float(np.mean(learnt[:half])), float(np.mean(learnt[-half:]))
+    evidence = {"early": early, "late": late, "visits": half}
+    if min(early, late) >= _T["unlearnt"]:
+        return Decision("nothing_learnt", evidence, ("unlearnt",))
+    worse = late - early >= _T["difference"]
+    reason = "later_visits_worse" if worse else "later_visits_as_good"
+    return Decision(reason, evidence, ("difference",), 1.0 - early / max(late, 1e-12))
+
+
+def _against_fresh(visits: Sequence[VisitDiagnosis], fresh: Sequence[float]) -> Decision:
+    """The first visit is left out: its agent is itself a fresh one."""
+    later = [(visit.normalised_regret, fresh[visit.phase]) for visit in visits[1:]]
+    own, alone = (float(np.mean(regrets)) for regrets in zip(*later, strict=True))
+    evidence = {
+        "normalised_regret": own,
+        "fresh_normalised_regret": alone,
+        "plasticity_difference": own - alone,
+        "visits": len(later),
+    }
+    if alone >= _T["unlearnt"]:
+        return Decision("fresh_agents_learnt_little", evidence, ("unlearnt",))
+    below = own - alone >= _T["difference"]
+    reason = "below_fresh_agents" if below else "as_fresh_agents"
+    return Decision(reason, evidence, ("difference",), 1.0 - alone / max(own, 1e-12))
+
+
+def _equally_hard(stream: StreamSpec) -> bool:
+    """Whether all phases have as many steps, and specs that differ in their draw or rotation."""
+    return len(stream.kinds) == 1 and len({phase.steps for phase in stream.phases}) == 1
+
+
+NetworkRule: TypeAlias = Callable[[NetworkState, dict[str, Any]], Decision]
+
+
+def _change(
+    quantity: Callable[[NetworkState], float], **reasons: Answer
+) -> Callable[[NetworkRule], None]:
+    """Decorate a rule about the last network, whose quantity is that of fresh agents' or the first
+    visit's network, too."""
+
+    def add(rule: NetworkRule) -> None:
+        def compared(case: StreamCase) -> Decision:
+            first, last = case.visits[0].network, case.visits[-1].network
+            fresh = [phase.fresh_network for phase in case.phases]
+            alone = [quantity(network) for network in fresh if network is not None]
+            if first is None or last is None:
+                return Decision("network_unknown", {})
+            against_fresh = len(alone) == len(fresh)
+            if not against_fresh and len(case.visits) == 1:
+                return Decision("one_visit", {})
+            evidence = {
+                "first": quantity(first),
+                "last": quantity(last),
+                "other": float(np.mean(alone if against_fresh else quantity(first))),
+                "against": "fresh_agents" if against_fresh else "first_visit",
+            }
+            return rule(last, evidence)
+
+        compared.__name__ = rule.__name__
+        _why(network_unknown="cannot tell", one_visit="cannot tell", **reasons)(compared)
+
+    return add
+
+
+@_change(
+    lambda network: network.inactive_units,
+    units_became_inactive="yes",
+    inactive_from_the_start="yes",
+    units_active="no",
+)
+def _dormant_units(network: NetworkState, change: dict[str, Any]) -> Decision:
+    """Whether hidden units stopped responding to the state."""
+    last, other = change["last"], change["other"]
+    evidence = change | network.model_dump(include={"dormant_units", "saturated_units"})
+    if last - other >= _T["inactive_rise"]:
+        return Decision("units_became_inactive", evidence, ("inactive_rise",))
+    many = min(last, other) >= _T["inactive_share"]
+    reason = "inactive_from_the_start" if many else "units_active"
+    return Decision(reason, evidence, ("inactive_rise", "inactive_share"))
+
+
+@_change(lambda network: network.effective_rank, rank_collapsed="yes", rank_kept="no")
+def _rank_collapse(network: NetworkState, change: dict[str, Any]) -> Decision:
+    """Whether the last hidden layer represents fewer directions."""
+    collapsed = change["last"] <= _T["rank_ratio"] * change["other"]
+    evidence = change | {"units": network.hidden[-1]}
+    return Decision("rank_collapsed" if collapsed else "rank_kept", evidence, ("rank_ratio",))
+
+
+@_change(lambda network: network.weight_norm, weights_grew="yes", weights_steady="no")
+def _weight_growth(network: NetworkState, change: dict[str, Any]) -> Decision:
+    """Whether weights became so large that steps of the optimiser change little."""
+    grew = change["last"] >= _T["weight_ratio"] * change["other"]
+    return Decision("weights_grew" if grew else "weights_steady", change, ("weight_ratio",))
+
 
 _MOST_STATES = 2048  # in which networks are measured; more would not change the numbers
 
@@ -48,7 +474,7 @@ def diagnose_stream(
     measured_in = _States(stream, states, seed)
     visits = tuple(_visits(subject, measured_in))
     phases = tuple(_phases(subject, measured_in))
-    case = StreamCase(stream, visits, phases, agent.forgetting[-1])
+    case = StreamCase(stream, visits, phases, agent.forgetting[-1], subject.updates)
     regret = life.dynamic_regret
     return StreamDiagnosis(
         name=subject.name,
@@ -56,6 +482,7 @@ def diagnose_stream(
         stream_digest=life.stream_digest,
         task=life.name,
         plan=subject.plan,
+        updates=subject.updates,
         average_performance=agent.average_performance[-1],
         forgetting=agent.forgetting[-1],
         dynamic_regret=None if regret is None else regret.dynamic_regret,
@@ -94,7 +521,7 @@ def _visits(subject: StreamSubject, states: _States) -> Iterator[VisitDiagnosis]
     life = subject.report
     regret_on = life.region("WD").agent.normalised_regret
     regret = life.dynamic_regret
-    logged = {} if regret is None else {each.visit: each for each in regret.visits}
+    logged = {} if regret is None else {visit.visit: visit for visit in regret.visits}
     begin = 0
     for visit in life.visits:
         log = logged.get(visit.visit)

@@ -1,38 +1,314 @@
-"""`diagnose_team`: the policies of a team to a `TeamDiagnosis`.
+"""A team: who is to blame for its regret, and where each agent's own regret is.
+
+In the states s of uniform samples or of the team's own episodes, with joint actions a:
+
+    regret share of agent i        regret · d_i / Σ_j d_j,  d_i = ‖a_i − a*_i‖₁; they add up to it
+    difference reward of agent i   the team's gain in step reward if agent i alone acted optimally
+
+The team's regret is that of the mean similarity over all action channels, in either reward mode.
 
 Each agent is measured as a single agent: the task of its own channels has the same states, its π*
 and its step reward, and its policy sees what it observes. Only the episodes are the team's, since
-all agents drive one transition.
-
-`n` states, `S` state_dim, `A` action_dim, `m` agents.
+all agents drive one transition. `n` states, `S` state_dim, `A` action_dim, `m` agents.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from functools import partial
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from sme_registry.diagnosis import measure, rollouts, verdicts
-from sme_registry.diagnosis.measurements import POLICY, Measurements, Score
-from sme_registry.diagnosis.questions import answer_all
-from sme_registry.diagnosis.subject import TeamSubject
-from sme_registry.diagnosis.team_document import AgentDiagnosis, Credit, TeamDiagnosis
-from sme_registry.diagnosis.team_questions import TEAM_QUESTIONS, TEAM_THRESHOLDS, TeamCase
+from sme_registry.diagnosis import measure, rollouts
+from sme_registry.diagnosis.document import Diagnosis, Level, TaskDiagnosis, Verdict
+from sme_registry.diagnosis.measurements import LINEAR, POLICY, Measurements, Score
+from sme_registry.diagnosis.page import Part, words
+from sme_registry.diagnosis.questions import (
+    THRESHOLDS,
+    Case,
+    Decision,
+    Question,
+    add_to,
+    answer_all,
+    level,
+    thresholds_of,
+)
+from sme_registry.diagnosis.subject import Subject
 from sme_registry.diagnosis.where import WHERE
 from sme_registry.diagnosis.why import WHY
 from sme_registry.envs.types import Observation
+from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.evaluation import Policy, TeamPolicy, regions
 from sme_registry.io import versions
-from sme_registry.spec import EvaluationProtocol, SMESpec
+from sme_registry.io.markup import percent
+from sme_registry.io.terminal import fixed
+from sme_registry.spec import (
+    Digest,
+    EvaluationProtocol,
+    Integer,
+    Real,
+    SMESpec,
+    StrictModel,
+    TupleOf,
+)
 from sme_registry.task import Task, materialize
 from sme_registry.task.draw import Array
 
-__all__ = ["diagnose_team"]
+__all__ = [
+    "TEAM_QUESTIONS",
+    "TEAM_THRESHOLDS",
+    "AgentDiagnosis",
+    "Credit",
+    "TeamDiagnosis",
+    "diagnose_team",
+]
 
-_TINY = 1e-12
+_TINY, _LEAST_REGRET = 1e-12, 1e-9
+
+
+class Credit(StrictModel):
+    """An agent's part in the team's regret; means over states."""
+
+    regret_share: Real  # in units of regret: over the agents, they add up to the team's regret
+    difference_reward: Real  # in [0, 1]; these do not add up, because the step reward is clipped
+
+
+class AgentDiagnosis(StrictModel):
+    """One agent of a team, measured over its own action channels."""
+
+    name: str  # of the agent
+    state_channels: TupleOf[Integer]  # that it observes, from 1
+    action_channels: TupleOf[Integer]  # that it owns, from 1
+    level: Level  # its normalised regret, ranked among the constant ½, the linear policy and 0
+    uniform: Credit  # in uniform states
+    visited: Credit  # in the states that the team visits
+    verdicts: TupleOf[Verdict]  # on its own policy
+    measurements: Measurements  # what the verdicts rest on
+
+
+class TeamDiagnosis(Diagnosis):
+    """The diagnosis of a team's policies; its verdicts say who causes the regret.
+
+    Attributes:
+      spec: the task.
+      spec_digest: the task's digest.
+      uniform: of the team, in uniform states.
+      visited: of the team, in the states of its own episodes.
+      agents: in the order of the channels that they own.
+      left_out: questions of a single agent's diagnosis without an answer for a team.
+    """
+
+    template: ClassVar[str] = "team.jinja"
+    only_field: ClassVar[str] = "agents"
+
+    spec: SMESpec
+    spec_digest: Digest
+    uniform: Score
+    visited: Score
+    agents: TupleOf[AgentDiagnosis]
+    left_out: TupleOf[str]
+
+    def agent(self, name: str) -> AgentDiagnosis:
+        """One agent, by its name."""
+        by_name = {agent.name: agent for agent in self.agents}
+        if name not in by_name:
+            hint = did_you_mean(name, by_name)
+            raise UnknownNameError(f"agent={name!r}: must be one of {', '.join(by_name)}.{hint}")
+        return by_name[name]
+
+    def parts(self) -> Iterator[Part]:
+        """Who causes the regret, each agent's numbers and where its own error is."""
+        yield self.findings("Who is to blame", self.verdicts)
+        left_out = words(self.template, "left_out", self.left_out)
+        yield Part("Agents", _COLUMNS, [self._row(a) for a in self.agents], (_LEGEND, left_out))
+        for agent in self.agents:
+            where = self.findings("", agent.verdicts, TaskDiagnosis.template)
+            heading = f"Where the error of {agent.name} is"
+            yield where._replace(heading=heading, detail=not where.rows)
+        yield from self.answers(self.verdicts)
+        for agent in self.agents:
+            yield from self.answers(agent.verdicts, f": {agent.name}", TaskDiagnosis.template)
+
+    def _row(self, agent: AgentDiagnosis) -> tuple[str, ...]:
+        measured = agent.measurements
+        regrets = (
+            measured.policy.normalised_regret,
+            measured.on_policy.scores[POLICY].normalised_regret,
+            measured.uniform[LINEAR].normalised_regret,
+        )
+        return (
+            agent.name,
+            percent(agent.visited.regret_share / max(self.visited.regret, _LEAST_REGRET)),
+            percent(len(agent.action_channels) / self.spec.action_dim),
+            *map(fixed, regrets),
+            fixed(agent.visited.difference_reward),
+        )
+
+
+_COLUMNS = (
+    "agent",
+    "share of regret",
+    "of channels",
+    "N, uniform",
+    "N, own episodes",
+    "N, linear",
+    "gain if optimal",
+)
+_LEGEND = (
+    "N: normalised regret over the agent's channels · gain if optimal: of the team's step reward, "
+    "if this agent alone acted optimally · the shares add up to the team's regret in its episodes"
+)
+
+
+TEAM_THRESHOLDS = {
+    **{name: THRESHOLDS[name] for name in ("solved", "difference", "on_policy_ratio")},
+    "blame_ratio": 1.5,  # of an agent's share of the regret to its share of the channels
+    "one_suffices": 0.5,  # share of the team's regret that correcting one agent removes, at least
+    "termination_rate": 0.5,  # share of episodes that one agent ends, at least
+}
+_T = TEAM_THRESHOLDS
+
+
+class TeamCase(NamedTuple):
+    """What the rules read."""
+
+    agents: Sequence[AgentDiagnosis]
+    spec: SMESpec
+    visited: Score  # of the team
+    updates: int | None = None
+
+    @property
+    def learnt(self) -> float:
+        """Normalised regret in the states that the team visits."""
+        return self.visited.normalised_regret
+
+    @property
+    def solved(self) -> bool:
+        """Whether nothing is left to explain."""
+        return self.learnt <= _T["solved"]
+
+    @property
+    def worst(self) -> AgentDiagnosis:
+        """The agent with the highest normalised regret in the states that the team visits."""
+        return max(self.agents, key=visited_regret)
+
+
+TEAM_QUESTIONS: dict[str, Question[TeamCase]] = {}
+"""Questions about a team, in order."""
+_question = partial(add_to, TEAM_QUESTIONS, "who")
+
+
+def visited_regret(agent: AgentDiagnosis) -> float:
+    """Normalised regret over the agent's own channels in the states that the team visits."""
+    return agent.measurements.on_policy.scores[POLICY].normalised_regret
+
+
+@_question(some_agents_to_blame="yes", spread_over_agents="no", solved="no")
+def _blame(case: TeamCase) -> Decision:
+    total = max(case.visited.regret, _LEAST_REGRET)
+    agents: list[dict[str, Any]] = [
+        {
+            "agent": agent.name,
+            "regret_share": agent.visited.regret_share / total,
+            "channel_share": len(agent.action_channels) / case.spec.action_dim,
+            "normalised_regret": visited_regret(agent),
+        }
+        for agent in case.agents
+    ]
+    blamed = [a for a in agents if a["regret_share"] >= _T["blame_ratio"] * a["channel_share"]]
+    reason = "some_agents_to_blame" if blamed else "spread_over_agents"
+    return Decision(
+        "solved" if case.solved else reason,
+        {"agents": agents, "blamed": blamed, "regret": case.visited.regret},
+        ("blame_ratio",),
+        sum(a["regret_share"] for a in blamed),
+    )
+
+
+@_question(agents_differ="yes", agents_alike="no")
+def _unequal_agents(case: TeamCase) -> Decision:
+    best, worst = min(case.agents, key=visited_regret), case.worst
+    low, high = visited_regret(best), visited_regret(worst)
+    return Decision(
+        "agents_differ" if high - low >= _T["difference"] else "agents_alike",
+        {"best": best.name, "worst": worst.name, "lowest": low, "highest": high},
+        ("difference",),
+    )
+
+
+@_question(optimum_harder="yes", optimum_not_harder="no", agents_alike="no")
+def _harder_optimum(case: TeamCase) -> Decision:
+    """Whether the worst agent's π* is harder: further from what a linear policy attains."""
+    worst = case.worst
+    others = [agent for agent in case.agents if agent is not worst]
+    regret = {agent.name: _linear_regret(agent) for agent in case.agents}
+    other = sum(regret[agent.name] for agent in others) / len(others) if others else 1.0
+    alike = visited_regret(worst) - min(map(visited_regret, case.agents)) < _T["difference"]
+    harder = regret[worst.name] - other >= _T["difference"]
+    reason = "optimum_harder" if harder else "optimum_not_harder"
+    return Decision(
+        "agents_alike" if alike else reason,
+        {
+            "agent": worst.name,
+            "normalised_regret": worst.measurements.policy.normalised_regret,
+            "linear_normalised_regret": regret[worst.name],
+            "others_linear_normalised_regret": other,
+            "nonlinear_variance": worst.measurements.response.nonlinear_variance,
+        },
+        ("difference",),
+    )
+
+
+def _linear_regret(agent: AgentDiagnosis) -> float:
+    return agent.measurements.uniform[LINEAR].normalised_regret
+
+
+@_question(worse_where_visited="yes", not_worse_where_visited="no", solved="no")
+def _visited_states(case: TeamCase) -> Decision:
+    """Whether the worst agent fails in the states that the team visits rather than everywhere."""
+    worst = case.worst
+    visited, uniform = visited_regret(worst), worst.measurements.policy.normalised_regret
+    worse = visited >= _T["on_policy_ratio"] * uniform and visited - uniform >= _T["difference"]
+    reason = "worse_where_visited" if worse else "not_worse_where_visited"
+    return Decision(
+        "solved" if case.solved else reason,
+        {"agent": worst.name, "visited": visited, "uniform": uniform},
+        ("on_policy_ratio", "difference"),
+    )
+
+
+@_question(one_agent_suffices="yes", several_must_improve="no", solved="no")
+def _one_correction(case: TeamCase) -> Decision:
+    """Whether correcting one agent would remove most of the team's regret."""
+    best = max(case.agents, key=lambda agent: agent.visited.difference_reward)
+    gain, regret = best.visited.difference_reward, case.visited.regret
+    suffices = gain >= _T["one_suffices"] * regret
+    reason = "one_agent_suffices" if suffices else "several_must_improve"
+    return Decision(
+        "solved" if case.solved else reason,
+        {"agent": best.name, "difference_reward": gain, "regret": regret},
+        ("one_suffices",),
+        gain / max(regret, _LEAST_REGRET),
+    )
+
+
+@_question(no_survival_threshold="no", one_agent_ends_episodes="yes", no_agent_stands_out="no")
+def _ended_episodes(case: TeamCase) -> Decision:
+    """Whether the threshold D ends episodes for all because of one agent."""
+    if case.spec.D == 0:
+        return Decision("no_survival_threshold", {"D": case.spec.D})
+    rates = {agent.name: agent.measurements.on_policy.termination_rate for agent in case.agents}
+    shares = dict(sorted(rates.items(), key=lambda rate: -rate[1]))
+    first, *rest = shares.values()
+    alone = not rest or rest[0] <= first / 2
+    ends = first >= _T["termination_rate"] and alone
+    return Decision(
+        "one_agent_ends_episodes" if ends else "no_agent_stands_out",
+        {"D": case.spec.D, "agent": next(iter(shares)), "shares": shares},
+        ("termination_rate",),
+    )
 
 
 class _Member(NamedTuple):
@@ -43,37 +319,39 @@ class _Member(NamedTuple):
 
 
 def diagnose_team(
-    subject: TeamSubject, states: int, episodes: int, seed: int, report: Callable[[str], None]
+    subject: Subject, states: int, episodes: int, seed: int, report: Callable[[str], None]
 ) -> TeamDiagnosis:
     """Measure a team and each of its agents, and answer who is to blame for its regret.
 
     The arguments and errors are those of `diagnose`.
     """
     task, policy = materialize(subject.spec), subject.policy
+    assert isinstance(policy, TeamPolicy)  # of a team's spec
     report(f"{subject.name}: episodes")
     references = measure.fit_references(task, states, seed)
     runs = rollouts.episodes_of(_joint_action(policy, task), task, references, episodes, seed)
     first = runs[0][POLICY]
     uniform = _team_in(task, *_uniform(task, policy, states, seed))
     visited = _team_in(task, first.s[first.alive], first.a[first.alive])
+    questions, thresholds = _questions(task.spec), thresholds_of(task.spec)
     agents = []
     for index, member in enumerate(_members(task, policy)):
         report(f"{subject.name}: {task.names[index]}")
         measurements = _measurements(member, runs[index], states, seed)
-        questions = _questions(task.spec)
+        case = Case(measurements, member.task.spec, updates=subject.updates)
         agents.append(
             AgentDiagnosis(
                 name=task.names[index],
                 state_channels=tuple(channel + 1 for channel in task.observed[index]),
                 action_channels=tuple(i + 1 for i in range(*task.owned[index].indices(10**9))),
-                level=verdicts.level(measurements),
+                level=level(measurements),
                 uniform=uniform.credit[index],
                 visited=visited.credit[index],
-                verdicts=verdicts.judge(measurements, member.task.spec, questions=questions),
+                verdicts=answer_all(questions, case, thresholds),
                 measurements=measurements,
             )
         )
-    case = TeamCase(agents, subject.spec, visited.score)
+    team = TeamCase(agents, subject.spec, visited.score, subject.updates)
     return TeamDiagnosis(
         name=subject.name,
         spec=subject.spec,
@@ -81,11 +359,12 @@ def diagnose_team(
         task=subject.spec.name,
         plan=subject.plan,
         checkpoint_step=subject.checkpoint_step,
+        updates=subject.updates,
         uniform=uniform.score,
         visited=visited.score,
-        verdicts=answer_all(TEAM_QUESTIONS, case, TEAM_THRESHOLDS),
+        verdicts=answer_all(TEAM_QUESTIONS, team, TEAM_THRESHOLDS),
         agents=tuple(agents),
-        left_out=tuple(name for name in WHY if name not in _questions(task.spec)),
+        left_out=tuple(name for name in WHY if name not in questions and not WHY[name].needs),
         thresholds=TEAM_THRESHOLDS,
         versions=versions(("numpy", "scipy"), if_imported=("torch", "stable_baselines3")),
     )
@@ -99,10 +378,16 @@ def _measurements(
     return Measurements(**fields, on_policy=rollouts.on_policy(member.task, runs))
 
 
-def _questions(spec: SMESpec) -> tuple[str, ...]:
-    """The questions of a single agent's diagnosis that have an answer for an agent of a team."""
-    own_reward = spec.team is not None and spec.team.reward == "individual"
-    return (*WHERE, "sparsity") if own_reward else tuple(WHERE)
+def _questions(spec: SMESpec) -> dict[str, Question[Case]]:
+    """The questions about a task that have an answer for an agent of a team.
+
+    Those about training rest on the log, the exploration or the network of a single learner with a
+    reward of its own. Sparsity needs a reward of its own as well.
+    """
+    questions = {name: question for name, question in WHERE.items() if not question.needs}
+    if spec.team is not None and spec.team.reward == "individual":
+        questions["sparsity"] = WHY["sparsity"]
+    return questions
 
 
 def _members(task: Task, policy: TeamPolicy) -> list[_Member]:

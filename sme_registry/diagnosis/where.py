@@ -1,30 +1,44 @@
-"""Where the error is: questions about the policy, which its measurements answer."""
+"""Where the error is, and whether limits are violated: the policy's measurements answer."""
 
 from __future__ import annotations
 
 from functools import partial
 from typing import Any
 
-from sme_registry.diagnosis.measurements import POLICY, Channel
-from sme_registry.diagnosis.questions import THRESHOLDS as _T
-from sme_registry.diagnosis.questions import Case, Outcome, Question, add_to
+from sme_registry.diagnosis.measurements import (
+    LINEAR,
+    POLICY,
+    Channel,
+    Distraction,
+    Violations,
+)
+from sme_registry.diagnosis.questions import (
+    SAFETY_THRESHOLDS,
+    THRESHOLDS,
+    Case,
+    Decision,
+    Question,
+    add_to,
+)
+from sme_registry.evaluation import ObservationReport
 
-__all__ = ["WHERE"]
+__all__ = ["WHERE", "distractors_of", "limits_of"]
 
 WHERE: dict[str, Question[Case]] = {}
 """Questions about the policy, in order."""
 _question = partial(add_to, WHERE, "where")
+_T = THRESHOLDS | SAFETY_THRESHOLDS
 
 _TINY = 1e-9
 
 
 @_question(some_channels_unlearnt="yes", spread_over_channels="no")
-def _action_channels(case: Case) -> Outcome:
+def _action_channels(case: Case) -> Decision:
     channels = case.measurements.channels
     unlearnt = [c for c in channels if c.normalised_regret >= _T["unlearnt"]]
     learnt = [c for c in channels if c.normalised_regret <= _T["channel_learnt"]]
     regret = sum(c.regret for c in unlearnt)
-    return Outcome(
+    return Decision(
         "some_channels_unlearnt" if unlearnt and learnt else "spread_over_channels",
         {
             "channels": len(channels),
@@ -35,6 +49,7 @@ def _action_channels(case: Case) -> Outcome:
             "regret_share": regret / max(case.measurements.policy.regret, _TINY),
         },
         ("unlearnt", "channel_learnt"),
+        regret / max(case.measurements.policy.regret, _TINY),
     )
 
 
@@ -43,14 +58,14 @@ def _channel(channel: Channel) -> dict[str, Any]:
 
 
 @_question(error_localised="yes", error_not_localised="no")
-def _state_region(case: Case) -> Outcome:
+def _state_region(case: Case) -> Decision:
     partitions = case.measurements.partitions
     most = max(partitions, key=lambda p: p.explained_variance)
     low, high = min(most.mae), max(most.mae)
     worst_bin = most.mae.index(high)
     uneven = high >= _T["bin_ratio"] * low
     localised = most.explained_variance >= _T["explained_variance"] and uneven
-    return Outcome(
+    return Decision(
         "error_localised" if localised and not case.solved else "error_not_localised",
         {
             "state_channel": most.state_channel,
@@ -61,15 +76,16 @@ def _state_region(case: Case) -> Outcome:
             "worst_bin": list(most.edges[worst_bin : worst_bin + 2]),
         },
         ("explained_variance", "bin_ratio"),
+        1.0 - low / max(case.measurements.policy.mae, _TINY),  # if all states were like the best
     )
 
 
 @_question(similarity_lost="yes", similarity_kept="no")
-def _out_of_distribution(case: Case) -> Outcome:
+def _out_of_distribution(case: Case) -> Decision:
     inside, outside = case.measurements.shells[0], case.measurements.shells[-1]
     wd, ood = inside.scores[POLICY], outside.scores[POLICY]
     loss = 100.0 * (ood.mae - wd.mae)
-    return Outcome(
+    return Decision(
         "similarity_lost" if loss >= _T["similarity_loss"] else "similarity_kept",
         {
             "region": outside.region,
@@ -83,20 +99,21 @@ def _out_of_distribution(case: Case) -> Outcome:
 
 
 @_question(error_changes="yes", error_steady="no")
-def _time_in_episode(case: Case) -> Outcome:
+def _time_in_episode(case: Case) -> Decision:
     episodes = case.measurements.on_policy
     first, last = episodes.mae[0], episodes.mae[-1]
     ratio = max(first, last) / max(min(first, last), _TINY)
     changes = ratio >= _T["time_ratio"] and abs(first - last) >= _T["time_difference"]
-    return Outcome(
+    return Decision(
         "error_changes" if changes else "error_steady",
         {"first_mae": first, "last_mae": last},
         ("time_ratio", "time_difference"),
+        1.0 - min(first, last) / max(episodes.scores[POLICY].mae, _TINY),
     )
 
 
 @_question(lower_regret_where_visited="yes", higher_regret_where_visited="yes", similar_regret="no")
-def _visited_states(case: Case) -> Outcome:
+def _visited_states(case: Case) -> Decision:
     episodes, uniform = case.measurements.on_policy, case.measurements.policy.normalised_regret
     visited = episodes.scores[POLICY].normalised_regret
     ratio, limit = visited / max(uniform, _TINY), _T["on_policy_ratio"]
@@ -107,7 +124,7 @@ def _visited_states(case: Case) -> Outcome:
         reason = "lower_regret_where_visited"
     elif apart and ratio >= limit:
         reason = "higher_regret_where_visited"
-    return Outcome(
+    return Decision(
         reason,
         {
             "on_policy_normalised_regret": visited,
@@ -116,23 +133,25 @@ def _visited_states(case: Case) -> Outcome:
             "state_shift": shift,
         },
         ("on_policy_ratio", "on_policy_difference"),
+        1.0 - min(visited, uniform) / max(visited, uniform, _TINY),
     )
 
 
 @_question(offset_dominant="yes", offset_minor="no")
-def _constant_offset(case: Case) -> Outcome:
+def _constant_offset(case: Case) -> Decision:
     share = case.measurements.squared_error.offset
     worst = max(case.measurements.channels, key=lambda c: abs(c.offset))
     dominant = share >= _T["dominant_share"] and not case.solved
-    return Outcome(
+    return Decision(
         "offset_dominant" if dominant else "offset_minor",
         {"share": share, "channel": worst.channel, "offset": worst.offset},
         ("dominant_share",),
+        share,
     )
 
 
 @_question(underreaction="yes", overreaction="yes", scale_minor="no")
-def _response_scale(case: Case) -> Outcome:
+def _response_scale(case: Case) -> Decision:
     share, channels = case.measurements.squared_error.scale, case.measurements.channels
     slope = sum(c.slope for c in channels) / len(channels)
     reason = "scale_minor"
@@ -140,7 +159,7 @@ def _response_scale(case: Case) -> Outcome:
         reason = "underreaction" if slope < 1 else "overreaction"
     sensitivity = case.measurements.response.sensitivity
     evidence = {"share": share, "slope": slope, "sensitivity": sensitivity}
-    return Outcome(reason, evidence, ("dominant_share",))
+    return Decision(reason, evidence, ("dominant_share",), share)
 
 
 @_question(
@@ -149,7 +168,7 @@ def _response_scale(case: Case) -> Outcome:
     neither_part_learnt="no",
     optimum_nearly_linear="no",
 )
-def _linear_only(case: Case) -> Outcome:
+def _linear_only(case: Case) -> Decision:
     response = case.measurements.response
     linear, nonlinear = response.linear_slope, response.nonlinear_slope
     if response.nonlinear_variance < _T["nonlinear_variance"] or nonlinear is None:
@@ -160,19 +179,20 @@ def _linear_only(case: Case) -> Outcome:
         reason = "nonlinear_part_unlearnt"
     else:
         reason = "neither_part_learnt"
-    return Outcome(
+    return Decision(
         reason,
         response.model_dump(include={"nonlinear_variance", "linear_slope", "nonlinear_slope"}),
         ("nonlinear_variance", "slope_unlearnt", "slope_learnt"),
+        case.measurements.uniform[LINEAR].normalised_regret / max(case.learnt, _TINY),
     )
 
 
 @_question(saturated="yes", not_saturated="no")
-def _saturation(case: Case) -> Outcome:
+def _saturation(case: Case) -> Decision:
     response = case.measurements.response
     worst = max(case.measurements.channels, key=lambda c: c.at_zero + c.at_one)
     excess = response.saturation - response.optimal_saturation
-    return Outcome(
+    return Decision(
         "saturated" if excess >= _T["excess_saturation"] else "not_saturated",
         {
             **response.model_dump(include={"saturation", "optimal_saturation"}),
@@ -183,21 +203,22 @@ def _saturation(case: Case) -> Outcome:
 
 
 @_question(noisy="yes", repeatable="no")
-def _action_noise(case: Case) -> Outcome:
+def _action_noise(case: Case) -> Decision:
     share = case.measurements.squared_error.noise
     noisy = share >= _T["noise_or_time_share"]
-    return Outcome("noisy" if noisy else "repeatable", {"share": share}, ("noise_or_time_share",))
+    reason = "noisy" if noisy else "repeatable"
+    return Decision(reason, {"share": share}, ("noise_or_time_share",), share)
 
 
 @_question(depends_on_time="yes", depends_on_accumulated_reward="yes", independent="no")
-def _time_dependence(case: Case) -> Outcome:
+def _time_dependence(case: Case) -> Decision:
     error, time = case.measurements.squared_error, case.measurements.time_dependence
     dependent = max(error.time, error.accumulated_reward) >= _T["noise_or_time_share"]
     reason = "independent"
     if dependent and not case.solved:
         on_time = error.time >= error.accumulated_reward
         reason = "depends_on_time" if on_time else "depends_on_accumulated_reward"
-    return Outcome(
+    return Decision(
         reason,
         {
             "action_change": sum(time.action_change) / len(time.action_change),
@@ -207,4 +228,111 @@ def _time_dependence(case: Case) -> Outcome:
             "highest_normalised_regret": max(time.normalised_regret),
         },
         ("noise_or_time_share",),
+        max(error.time, error.accumulated_reward),
     )
+
+
+def limits_of(case: Case) -> Violations:
+    limits = case.measurements.limits
+    assert limits is not None  # the questions are asked only then
+    return limits
+
+
+@add_to(
+    WHERE,
+    "limits",
+    needs="limits",
+    within_limits="no",
+    rarely_violates="no",
+    beats_safe_optimum="yes",
+    earns_by_violating="yes",
+    violates_without_gain="yes",
+)
+def _constraint_violation(case: Case) -> Decision:
+    limits = limits_of(case)
+    inside, outside, visited = limits.report.regions[0], limits.report.regions[-1], limits.visited
+    share = max(inside.violating_share, visited.violating_share)
+    gain = inside.step_reward - limits.cut_off.step_reward
+    cost = sum(channel.cost for channel in limits.channels)
+    entries = sum(channel.violating_share for channel in limits.channels)
+    worst = max(limits.channels, key=lambda channel: channel.cost)
+    if share == 0.0:
+        reason = "within_limits"
+    elif share < _T["rarely_violating"]:
+        reason = "rarely_violates"
+    elif inside.safe_regret < -_T["gain"]:
+        reason = "beats_safe_optimum"
+    else:
+        reason = "earns_by_violating" if gain >= _T["gain"] else "violates_without_gain"
+    return Decision(
+        reason,
+        {
+            "cost": inside.cost,
+            "violating_share": inside.violating_share,
+            "violating_entries": entries / len(limits.channels),
+            "visited_cost": visited.cost,
+            "visited_violating_share": visited.violating_share,
+            "region": outside.name,
+            "outside_violating_share": outside.violating_share,
+            "optimal_cost": limits.report.references["optimal"][0].cost,
+            "safe_regret": inside.safe_regret,
+            "price_of_safety": inside.price_of_safety,
+            "gain": gain,
+            "channel": worst.channel,
+            "channel_cost_share": worst.cost / max(cost, _TINY),
+            "channel_violating_share": worst.violating_share,
+        },
+        ("rarely_violating", "gain"),
+    )
+
+
+def distractors_of(case: Case) -> tuple[Distraction, ObservationReport]:
+    distraction, observation = case.measurements.distraction, case.measurements.observation
+    assert distraction is not None
+    assert observation is not None
+    return distraction, observation
+
+
+@_question(needs="distraction", similarity_lost="yes", similarity_kept="no")
+def _distractors_outside(case: Case) -> Decision:
+    _, observation = distractors_of(case)
+    outside = observation.distractor_regions[-1]
+    loss = 100.0 * (outside.mae - case.measurements.policy.mae)
+    lost = loss >= _T["distractor_loss"]
+    return Decision(
+        "similarity_lost" if lost else "similarity_kept",
+        {
+            "region": outside.name,
+            "similarity_loss": loss,
+            "normalised_regret": case.measurements.policy.normalised_regret,
+            "outside_normalised_regret": outside.normalised_regret,
+        },
+        ("distractor_loss",),
+    )
+
+
+@_question(
+    needs="distraction",
+    layers_unknown="cannot tell",
+    both_kept="yes",
+    distractors_alone_kept="yes",
+    state_alone_kept="no",
+    neither_kept="no",
+)
+def _distractors_represented(case: Case) -> Decision:
+    _, observation = distractors_of(case)
+    if len(observation.probes) < 2:
+        return Decision("layers_unknown", {})
+    last = observation.probes[-1]
+    assert last.distractor_r2 is not None
+    state, distractors = (r2 >= _T["kept_r2"] for r2 in (last.state_r2, last.distractor_r2))
+    if distractors:
+        reason = "both_kept" if state else "distractors_alone_kept"
+    else:
+        reason = "state_alone_kept" if state else "neither_kept"
+    evidence = {
+        "layers": [probe.model_dump() for probe in observation.probes],
+        **last.model_dump(),
+        "observed_state_r2": observation.probes[0].state_r2,
+    }
+    return Decision(reason, evidence, ("kept_r2",))

@@ -9,14 +9,22 @@ from functools import partial
 from typing import Any
 
 from sme_registry.diagnosis.measurements import POLICY
-from sme_registry.diagnosis.questions import THRESHOLDS as _T
-from sme_registry.diagnosis.questions import Case, Outcome, Question, add_to
+from sme_registry.diagnosis.questions import (
+    SAFETY_THRESHOLDS,
+    THRESHOLDS,
+    Case,
+    Decision,
+    Question,
+    add_to,
+)
+from sme_registry.diagnosis.where import distractors_of, limits_of
 
 __all__ = ["WHY"]
 
 WHY: dict[str, Question[Case]] = {}
 """Questions about training, in order."""
 _question = partial(add_to, WHY, "why")
+_T = THRESHOLDS | SAFETY_THRESHOLDS
 
 _DETERMINISTIC_SD = 1e-6
 
@@ -28,13 +36,13 @@ _DETERMINISTIC_SD = 1e-6
     rewards_too_rare="yes",
     rewards_found="cannot tell",
 )
-def _exploration(case: Case) -> Outcome:
+def _exploration(case: Case) -> Decision:
     log, episodes = case.measurements.training, case.measurements.on_policy
     rewarded = episodes.random_signal.rewarded
     regret = episodes.scores[POLICY].regret
     evidence: dict[str, Any] = {"random_rewarded": rewarded, **_exploration_sd(case)}
     if log is None:
-        return Outcome("no_training_log", evidence)
+        return Decision("no_training_log", evidence)
     cost = log.last_regret - regret
     reported = log.source == "episodes" and cost >= _T["exploration_cost"]
     evidence |= {
@@ -45,11 +53,11 @@ def _exploration(case: Case) -> Outcome:
         ),
     }
     if log.improvement_step is not None:
-        return Outcome("beat_constant_in_training", evidence)
+        return Decision("beat_constant_in_training", evidence)
     if regret < log.constant_regret - _T["constant_margin"]:
-        return Outcome("policy_beats_constant", evidence, ("constant_margin",))
+        return Decision("policy_beats_constant", evidence, ("constant_margin",))
     rare = rewarded < _T["rarely_rewarded"]
-    return Outcome("rewards_too_rare" if rare else "rewards_found", evidence, ("rarely_rewarded",))
+    return Decision("rewards_too_rare" if rare else "rewards_found", evidence, ("rarely_rewarded",))
 
 
 def _exploration_sd(case: Case) -> dict[str, Any]:
@@ -60,12 +68,12 @@ def _exploration_sd(case: Case) -> dict[str, Any]:
 
 
 @_question(paid_every_step="no", delayed_payout="cannot tell")
-def _credit_assignment(case: Case) -> Outcome:
+def _credit_assignment(case: Case) -> Decision:
     k, episodes = case.spec.k, case.measurements.on_policy
     if k == 1:
-        return Outcome("paid_every_step", {"k": k})
+        return Decision("paid_every_step", {"k": k})
     evidence = {"k": k, "credit": episodes.credit, "random_credit": episodes.random_credit}
-    return Outcome("delayed_payout", evidence)
+    return Decision("delayed_payout", evidence)
 
 
 @_question(
@@ -74,7 +82,7 @@ def _credit_assignment(case: Case) -> Outcome:
     rewards_frequent="no",
     effect_unknown="cannot tell",
 )
-def _sparsity(case: Case) -> Outcome:
+def _sparsity(case: Case) -> Decision:
     r_min, episodes, log = case.spec.r_min, case.measurements.on_policy, case.measurements.training
     signal, random = episodes.signal, episodes.random_signal
     evidence = {
@@ -84,13 +92,13 @@ def _sparsity(case: Case) -> Outcome:
         "unrewarded_episodes": None if log is None else log.unrewarded,
     }
     if r_min == 0:
-        return Outcome("no_reward_threshold", evidence)
+        return Decision("no_reward_threshold", evidence)
     gated = signal.gated >= _T["gated_share"]
     if gated and signal.rewarded <= _T["gated_rewarded_share"]:
-        return Outcome("rewards_gated", evidence, ("gated_share", "gated_rewarded_share"))
+        return Decision("rewards_gated", evidence, ("gated_share", "gated_rewarded_share"))
     if signal.gated + signal.flat < _T["rarely_unrewarded"]:
-        return Outcome("rewards_frequent", evidence, ("rarely_unrewarded",))
-    return Outcome("effect_unknown", evidence, ("gated_share", "gated_rewarded_share"))
+        return Decision("rewards_frequent", evidence, ("rarely_unrewarded",))
+    return Decision("effect_unknown", evidence, ("gated_share", "gated_rewarded_share"))
 
 
 @_question(
@@ -100,7 +108,7 @@ def _sparsity(case: Case) -> Outcome:
     network_fits_training_states_only="no",
     probe_inconclusive="cannot tell",
 )
-def _capacity(case: Case) -> Outcome:
+def _capacity(case: Case) -> Decision:
     probe, regret = case.measurements.capacity, case.measurements.policy.normalised_regret
     evidence: dict[str, Any] = {
         "complexity": case.spec.complexity,
@@ -108,7 +116,7 @@ def _capacity(case: Case) -> Outcome:
         "normalised_regret": regret,
     }
     if probe is None:
-        return Outcome("not_probed", evidence)
+        return Decision("not_probed", evidence)
     evidence |= probe.model_dump(mode="json", exclude={"seconds"})
     better, no_better = _T["probe_better"] * regret, _T["probe_no_better"] * regret
     if probe.test_normalised_regret <= better:
@@ -119,11 +127,12 @@ def _capacity(case: Case) -> Outcome:
         reason = "network_fits_training_states_only"
     else:
         reason = "probe_inconclusive"
-    return Outcome(reason, evidence, ("probe_better", "probe_no_better"))
+    share = probe.train_normalised_regret / regret
+    return Decision(reason, evidence, ("probe_better", "probe_no_better"), share)
 
 
 @_question(too_few_states="yes", states_sufficient="no", not_separated="cannot tell")
-def _dimension(case: Case) -> Outcome:
+def _dimension(case: Case) -> Decision:
     probe, regret = case.measurements.capacity, case.measurements.policy.normalised_regret
     channels = case.measurements.channels
     evidence: dict[str, Any] = {
@@ -137,20 +146,21 @@ def _dimension(case: Case) -> Outcome:
     if probe is not None and probe.train_normalised_regret <= better:
         evidence |= probe.model_dump(include={"states", "test_normalised_regret"})
         if probe.test_normalised_regret >= no_better:
-            return Outcome("too_few_states", evidence, ("probe_better", "probe_no_better"))
+            share = probe.test_normalised_regret / regret
+            return Decision("too_few_states", evidence, ("probe_better", "probe_no_better"), share)
         if probe.test_normalised_regret <= better:
-            return Outcome("states_sufficient", evidence, ("probe_better",))
-    return Outcome("not_separated", evidence, ("unlearnt",))
+            return Decision("states_sufficient", evidence, ("probe_better",))
+    return Decision("not_separated", evidence, ("unlearnt",))
 
 
 @_question(no_survival_threshold="no", episodes_cut_short="yes", episodes_long_enough="no")
-def _survival(case: Case) -> Outcome:
+def _survival(case: Case) -> Decision:
     spec, episodes, log = case.spec, case.measurements.on_policy, case.measurements.training
     if spec.D == 0:
-        return Outcome("no_survival_threshold", {"D": spec.D})
+        return Decision("no_survival_threshold", {"D": spec.D})
     rate, length = episodes.termination_rate, episodes.mean_length
     short = length <= _T["short_episode"] * spec.horizon
-    return Outcome(
+    return Decision(
         "episodes_cut_short"
         if rate >= _T["termination_rate"] and short
         else "episodes_long_enough",
@@ -175,10 +185,10 @@ def _survival(case: Case) -> Outcome:
     never_improved="cannot tell",
     plateaued="no",
 )
-def _budget(case: Case) -> Outcome:
+def _budget(case: Case) -> Decision:
     log = case.measurements.training
     if log is None:
-        return Outcome("no_training_log", {})
+        return Decision("no_training_log", {})
     evidence = log.model_dump(
         include={
             "source",
@@ -191,11 +201,49 @@ def _budget(case: Case) -> Outcome:
         }
     )
     if log.rows < _T["log_rows"]:
-        return Outcome("log_too_short", evidence, ("log_rows",))
+        return Decision("log_too_short", evidence, ("log_rows",))
     if log.last_regret - log.best_regret >= _T["regressed"]:
-        return Outcome("regressed", evidence, ("regressed",))
+        return Decision("regressed", evidence, ("regressed",))
     if log.recent_improvement >= _T["still_improving"]:
         reason = "still_improving"
     else:
         reason = "never_improved" if log.improvement_step is None else "plateaued"
-    return Outcome(reason, evidence, ("still_improving",))
+    return Decision(reason, evidence, ("still_improving",))
+
+
+@_question(needs="limits", not_within_limits="no", explains_regret="yes", explains_little="no")
+def _price_of_safety(case: Case) -> Decision:
+    limits, regret = limits_of(case), case.measurements.policy.regret
+    inside = limits.report.regions[0]
+    share = max(inside.violating_share, limits.visited.violating_share)
+    evidence = {
+        "price_of_safety": inside.price_of_safety,
+        "regret": regret,
+        "violating_share": share,
+    }
+    if share >= _T["rarely_violating"]:
+        return Decision("not_within_limits", evidence, ("rarely_violating",))
+    explained = inside.price_of_safety >= _T["price_share"] * regret
+    reason = "explains_regret" if explained else "explains_little"
+    share = inside.price_of_safety / max(regret, 1e-9)
+    return Decision(reason, evidence, ("price_share",), share)
+
+
+@_question(needs="distraction", distracted="yes", hardly_distracted="no", invariant="no")
+def _distraction(case: Case) -> Decision:
+    effect, observation = distractors_of(case)
+    invariance = observation.invariance[0].invariance
+    if effect.owed_regret >= _T["owed_to_distractors"]:
+        reason = "distracted"
+    else:
+        reason = "invariant" if invariance <= _T["invariant"] else "hardly_distracted"
+    return Decision(
+        reason,
+        {
+            "distractors": case.spec.distractors,
+            "invariance": invariance,
+            **effect.model_dump(exclude={"states", "distractor_draws"}),
+        },
+        ("owed_to_distractors", "invariant"),
+        effect.owed_regret / max(case.learnt, 1e-9),
+    )

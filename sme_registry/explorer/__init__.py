@@ -6,9 +6,14 @@ nothing, and works from a file.
 
 from sme_registry.explorer.collect import EPISODES, facts, refuse_large
 from sme_registry.explorer.graph import GraphNode, program_of_graph
-from sme_registry.explorer.page import STATIC
+from sme_registry.explorer.page import (
+    FILE,
+    STATIC,
+    explorer_page,
+    run_report,
+    write_explorer,
+)
 from sme_registry.explorer.program import Program
-from sme_registry.explorer.write import FILE, explorer_page, run_report, write_explorer
 
 __all__ = [
     "EPISODES",

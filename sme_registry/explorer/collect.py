@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from sme_registry.diagnosis.measure import MAX_NUMBERS, fit_references
 from sme_registry.diagnosis.rollouts import rollout
-from sme_registry.diagnosis.subject import Log, Subject, TeamSubject
+from sme_registry.diagnosis.subject import Log, Subject
 from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.evaluation import EvaluationReport, Policy, TeamPolicy
 from sme_registry.evaluation.references import LABELS, References
@@ -42,7 +42,7 @@ _LINEAR, _HALF = "linear_least_squares", "constant_half"
 
 def facts(
     spec: SMESpec,
-    subject: Subject | TeamSubject | None = None,
+    subject: Subject | None = None,
     *,
     report: EvaluationReport | None = None,
     channels: Sequence[tuple[int, int]] = (),
@@ -76,7 +76,7 @@ def facts(
         "policies": policies,
         "rest": _rounded(resting(spec)),
         "episode": _episode(task, subject, fitted, episodes, seed),
-        "training": _training(getattr(subject, "log", None)),
+        "training": _training(None if subject is None else subject.log),
         "regions": None if report is None else _regions(report),
         "probes": _probes(report),
         "remark": remark,
@@ -101,7 +101,7 @@ def refuse_large(spec: SMESpec) -> None:
         )
 
 
-def _name(subject: Subject | TeamSubject) -> str:
+def _name(subject: Subject) -> str:
     """What the page calls a policy: the algorithm of a run, which is known by its folder."""
     algorithm = subject.plan.get("algorithm")
     return subject.name if algorithm is None else short_name(str(algorithm))
@@ -148,9 +148,7 @@ def _network(program: Program) -> dict[str, Any]:
     return {"program": program.to_dict()}
 
 
-def _policy(
-    subject: Subject | TeamSubject, task: Task, pairs: Sequence[tuple[int, int]]
-) -> dict[str, Any]:
+def _policy(subject: Subject, task: Task, pairs: Sequence[tuple[int, int]]) -> dict[str, Any]:
     """The policy as a program of observations, or its actions on a grid."""
     program = networks.policy_program(subject.policy, task.spec)
     if program is not None:
@@ -174,7 +172,7 @@ def _grid(policy: Policy | TeamPolicy, task: Task, axes: tuple[int, int]) -> dic
 
 def _episode(
     task: Task,
-    subject: Subject | TeamSubject | None,
+    subject: Subject | None,
     fitted: References,
     episodes: int,
     seed: int,
@@ -262,7 +260,7 @@ def _probes(report: EvaluationReport | None) -> list[dict[str, Any]]:
     return [probe.model_dump() for probe in report.observation.probes]
 
 
-def _plan(subject: Subject | TeamSubject) -> dict[str, str]:
+def _plan(subject: Subject) -> dict[str, str]:
     """What is known about the training, as text."""
     plan: Mapping[str, Any] = subject.plan
     shown = {name: plan[name] for name in ("algorithm", "steps", "seed") if name in plan}

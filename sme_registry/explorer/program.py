@@ -25,7 +25,7 @@ from scipy.special import erf, expit, ndtr
 from sme_registry.errors import ResourceLimitError
 from sme_registry.task.draw import Array, Layer
 
-__all__ = ["MAX_WEIGHTS", "MAX_WIDTH", "Program", "ProgramBuilder", "Step", "encoded"]
+__all__ = ["MAX_WEIGHTS", "MAX_WIDTH", "Program", "ProgramBuilder", "ProgramStep", "encoded"]
 
 MAX_WEIGHTS = 2**21  # of a program: 22 MB of text as float64, and seconds for a map in a browser
 MAX_WIDTH = 2**13  # columns of a value
@@ -59,7 +59,7 @@ UNARY = frozenset(_UNARY)
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class ProgramStep:
     """One step of a program."""
 
     op: str  # one of those in the module's first lines
@@ -94,7 +94,7 @@ class Program:
     """A function from rows `[B, n]` to rows `[B, width]`; deterministic."""
 
     inputs: int  # n
-    steps: tuple[Step, ...]  # in order
+    steps: tuple[ProgramStep, ...]  # in order
 
     @property
     def width(self) -> int:
@@ -127,7 +127,7 @@ class ProgramBuilder:
 
     def __init__(self, inputs: int, what: str = "network") -> None:
         self.inputs, self._what = inputs, what
-        self._steps: list[Step] = []
+        self._steps: list[ProgramStep] = []
         self._weights = 0
 
     @property
@@ -218,7 +218,7 @@ class ProgramBuilder:
                 f"{self._what}: has more than {MAX_WEIGHTS:,} weights, or a layer of more than "
                 f"{MAX_WIDTH:,} units: too large for a page. Use `sme evaluate` or `sme diagnose`."
             )
-        self._steps.append(Step(op, inputs, width, arrays, numbers or {}, columns))
+        self._steps.append(ProgramStep(op, inputs, width, arrays, numbers or {}, columns))
         return self.last
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from sme_registry import evaluate
-from sme_registry.diagnosis import Diagnosis, diagnose, load_policy, networks, render
+from sme_registry.diagnosis import Diagnosis, diagnose, load_policy, networks
 from sme_registry.diagnosis.figures import draw
 from sme_registry.diagnosis.measurements import POLICY
-from sme_registry.diagnosis.questions import EXTENDED_THRESHOLDS, THRESHOLDS
+from sme_registry.diagnosis.questions import SAFETY_THRESHOLDS, THRESHOLDS
 from sme_registry.evaluation.references import reference_policy
 from tests.diagnosis.policies import (
     EXTENDED,
@@ -17,6 +17,7 @@ from tests.diagnosis.policies import (
     Noisy,
     diagnosis_of,
     distracted,
+    markdown,
     network,
     optimum,
     printed,
@@ -81,8 +82,7 @@ def test_the_optimum_violates_limits_in_the_share_of_the_tightness_and_earns_by_
     assert found["cost"] == found["optimal_cost"]
     assert found["gain"] == pytest.approx(found["price_of_safety"])
     assert found["safe_regret"] == pytest.approx(-found["price_of_safety"])
-    assert "Near the optimum without limits" in render.headline(diagnosis)
-    assert "Limits: constraint violation." in render.headline(diagnosis)
+    assert "Near the optimum without limits" in diagnosis.headline()
 
 
 def test_the_regret_of_the_safe_optimum_is_the_price_of_safety_and_a_constant_has_no_fault():
@@ -121,7 +121,8 @@ def test_an_oracle_that_adds_a_function_of_the_distractors_owes_them_its_regret(
     assert found["averaged_regret"] < 0.02
     assert found["half_regret"] < 1e-6
     assert 0.95 < found["distractor_share"] <= 1.0
-    assert "Why: distraction." in render.headline(diagnosis)
+    rows = diagnosis.findings("Findings", diagnosis.verdicts).rows
+    assert "distraction" in [question for question, _, _ in rows]
 
 
 @pytest.mark.parametrize("channel", [0, 1, 2])
@@ -213,12 +214,12 @@ def test_policies_and_references_see_the_state_behind_a_mixing(name):
 
 def test_plain_tasks_and_mixings_alone_are_asked_nothing_of_limits_and_distractors():
     plain = diagnosis_of(shrunk)
-    assert not set(EXTENDED_THRESHOLDS) & set(plain.thresholds)
+    assert not set(SAFETY_THRESHOLDS) & set(plain.thresholds)
     assert plain.thresholds == THRESHOLDS
     assert not {"limits", "observation", "distraction"} & set(plain.to_dict()["measurements"])
     mixed = diagnosis_of("linear", SPEC.derive(observation={"mixing": "orthogonal"}))
     assert mixed.measurements.distraction is None
-    assert "mixing=orthogonal" in render.title(mixed)
+    assert "mixing=orthogonal" in mixed.title
     for diagnosis in (plain, mixed):
         asked = {verdict.question for verdict in diagnosis.verdicts}
         assert not asked & {*ASKED, "distractors_represented"}
@@ -231,15 +232,15 @@ def test_the_page_the_terminal_and_the_data_have_limits_distractors_and_layers(t
     assert len(laid_out) == len(names)
     for figure in laid_out:
         assert_readable(figure)
-    page = render.markdown(diagnosis, names)
+    page = markdown(diagnosis, names, details=True)
     for heading in ("## Limits", "## Distractors", "## Layers"):
         assert heading in page
     tables = [line for line in page.splitlines() if line.startswith("|")]
     assert all(line.endswith("|") for line in tables)
-    shown = " ".join(" ".join(printed(render.terminal(diagnosis), None)).split())
+    shown = " ".join(" ".join(printed(diagnosis, details=True)).split())
     for verdict in diagnosis.verdicts:
-        assert render.sentence(verdict) in shown
-        assert render.sentence(verdict).replace("|", r"\|") in page
+        assert verdict.sentence() in shown
+        assert verdict.sentence().replace("|", r"\|") in page
     assert Diagnosis.from_dict(diagnosis.to_dict(), "it") == diagnosis
 
 

@@ -7,19 +7,30 @@ import pytest
 from jinja2 import UndefinedError
 
 from sme_registry import SMESpec
-from sme_registry.diagnosis import diagnose, load_policy, render, verdicts
+from sme_registry.diagnosis import Diagnosis, TaskDiagnosis, diagnose, load_policy, questions
+from sme_registry.diagnosis.diagnose import TASK_QUESTIONS, judge
 from sme_registry.diagnosis.document import Comparison, Difference
-from sme_registry.diagnosis.measurements import CapacityProbe, Measurements, Training
-from tests.diagnosis.policies import EXTENDED, SPEC, diagnosis_of, network, printed, shrunk
+from sme_registry.diagnosis.measurements import CapacityProbe, Measurements, TrainingSummary
+from sme_registry.diagnosis.page import label
+from tests.diagnosis.policies import (
+    EXTENDED,
+    SPEC,
+    diagnosis_of,
+    markdown,
+    near_the_centre_only,
+    network,
+    printed,
+    shrunk,
+)
 
 DECLARED = {
     (question, reason)
-    for question, rule in verdicts.QUESTIONS.items()
-    for reason in (*rule.reasons, *(verdicts.SOLVED if rule.kind == "why" else ()))
+    for question, rule in TASK_QUESTIONS.items()
+    for reason in (*rule.reasons, *(questions.SOLVED if rule.kind == "why" else ()))
 } | {
     (question, reason)
     for question in ("credit_assignment", "sparsity", "capacity", "dimension", "survival")
-    for reason in verdicts.COMPARISON_REASONS
+    for reason in questions.COMPARISON_REASONS
 }
 FIELDS = {"k": (5, 1), "r_min": (0.5, 0.0), "complexity": (10, 1), "state_dim": (16, 8),
           "action_dim": (8, 4), "D": (0.5, 0.0)}  # fmt: skip
@@ -69,7 +80,7 @@ def random_verdicts(count, policy=shrunk, specs=PLAIN):
         measured = measured.model_copy(
             update={
                 "channels": channels,
-                "training": optional(Training, generator),
+                "training": optional(TrainingSummary, generator),
                 "capacity": optional(CapacityProbe, generator),
                 "exploration_sd": generator.choice((None, (0.0, 0.0), (0.1, 0.3))),
             }
@@ -90,17 +101,21 @@ def random_verdicts(count, policy=shrunk, specs=PLAIN):
                 name="the other", spec_fields={field: FIELDS[field]}, plan_fields={},
                 differences=(regret,), answers={},
             )  # fmt: skip
-        yield from verdicts.judge(measured, spec, comparison)
+        yield from judge(measured, spec, comparison, generator.choice((None, 10, 30)))
 
 
 def test_every_question_and_reason_is_reached_and_has_a_sentence():
     reached = set()
-    for verdict in chain(random_verdicts(2000), random_verdicts(500, network(), (EXTENDED,))):
-        reached.add((verdict.question, verdict.reason))
-        text = render.sentence(verdict)
+    for verdict in chain(random_verdicts(3000), random_verdicts(500, network(), (EXTENDED,))):
+        if verdict.reason not in questions.OPEN_REASONS:
+            reached.add((verdict.question, verdict.reason))
+        else:
+            assert verdict.answer == "cannot tell"
+            reached.add((verdict.question, verdict.evidence["own_reason"]))
+        text = verdict.sentence()
         assert text.endswith(".")
         assert not any(bad in text for bad in ("None", " ,", " .")), text
-        if verdict.reason in verdicts.COMPARISON_REASONS:
+        if verdict.reason in questions.COMPARISON_REASONS | questions.OPEN_REASONS:
             own = (verdict.question, verdict.evidence["own_reason"])
             assert own in DECLARED
             assert ("this run alone" in text) == (verdict.evidence["own_answer"] != "cannot tell")
@@ -110,7 +125,7 @@ def test_every_question_and_reason_is_reached_and_has_a_sentence():
 def test_a_verdict_without_its_evidence_has_no_sentence():
     verdict = diagnosis_of(shrunk, states=64).verdict("response_scale")
     with pytest.raises((UndefinedError, TypeError)):
-        render.sentence(verdict.model_copy(update={"evidence": {}}))
+        verdict.model_copy(update={"evidence": {}}).sentence()
 
 
 @pytest.fixture(scope="module")
@@ -121,29 +136,64 @@ def compared():
 
 
 def test_markdown_holds_every_sentence_the_headline_and_the_figures(compared):
-    page = render.markdown(compared.model_copy(update={"checkpoint_step": 1234}), ["a_b.png"])
+    unfinished = compared.model_copy(update={"checkpoint_step": 1234})
+    page = markdown(unfinished, ["a_b.png"], details=True)
     for verdict in compared.verdicts:
-        assert render.sentence(verdict).replace("|", r"\|") in page
-    assert render.headline(compared) in page
+        assert verdict.sentence().replace("|", r"\|") in page
+    assert compared.headline() in page
     assert "1,234" in page
     assert "![a b](a_b.png)" in page
     tables = [line for line in page.splitlines() if line.startswith("|")]
     rules = [line for line in tables if set(line) <= {"|", "-"}]
-    assert len(rules) == (6 if compared.comparison.answers else 5)
+    assert len(rules) == sum(bool(part.rows) for part in compared.parts())
+    assert len(markdown(compared)) < len(page) / 2
     assert all(line.endswith("|") for line in tables)
 
 
 @pytest.mark.parametrize("width", [60, 120, None])
 def test_a_diagnosis_is_readable_at_every_width_and_in_a_pipe(compared, width):
-    lines = printed(render.terminal(compared), width)
+    lines = printed(compared, width)
     assert max(map(len, lines)) <= (width or 80)
     shown = " ".join(" ".join(lines).split())
-    assert render.headline(compared) in shown
+    assert compared.headline() in shown
+    found = [verdict for verdict in compared.verdicts if verdict.answer == "yes"]
+    assert found
     for verdict in compared.verdicts:
-        question = render.label(verdict.question)
-        if width is None:
-            line = lines.index(f"{question}: {verdict.answer}")
-            assert lines[line + 1].startswith("    ")
-            assert f"{question}: {verdict.answer} {render.sentence(verdict)}" in shown
-        else:
-            assert any(line.split()[:1] == question.split()[:1] for line in lines)
+        assert label(verdict.question) in shown
+        assert width is not None or (verdict.sentence() in shown) == (verdict in found)
+    if width is None:
+        line = next(i for i, line in enumerate(lines) if line.startswith("response scale: yes"))
+        assert lines[line + 1].startswith("    ")
+    details = " ".join(" ".join(printed(compared, width, details=True)).split())
+    assert width is not None or all(v.sentence() in details for v in compared.verdicts)
+
+
+def test_findings_are_sorted_by_their_share_of_the_error():
+    diagnosis = diagnosis_of(near_the_centre_only)
+    answers = [answer for _, answer, _ in diagnosis.findings("Findings", diagnosis.verdicts).rows]
+    shares = [int(answer.removeprefix("yes, ")[:-1]) for answer in answers if answer != "yes"]
+    assert shares == sorted(shares, reverse=True)
+    assert 1 < len(shares) < len(answers)
+    assert answers[len(shares) :] == ["yes"] * (len(answers) - len(shares))
+
+
+def test_a_diagnosis_of_schema_1_is_read(compared):
+    old = compared.to_dict()
+    for field in ("seeds", "updates"):
+        del old[field]
+    for verdict in old["verdicts"]:
+        del verdict["error_share"]
+    read = Diagnosis.from_dict({**old, "schema_version": 1}, "old")
+    assert isinstance(read, TaskDiagnosis)
+    assert read.comparison == compared.comparison
+    assert (read.schema_version, read.updates) == (2, None)
+    assert [verdict.answer for verdict in read.verdicts] == [v.answer for v in compared.verdicts]
+
+
+@pytest.mark.parametrize(("updates", "answer"), [(None, "yes"), (19, "cannot tell"), (20, "yes")])
+def test_a_cause_needs_twenty_updates_of_the_algorithm(updates, answer):
+    spec = SPEC.derive(r_min=0.75)
+    verdicts = judge(diagnosis_of(shrunk, spec, states=64).measurements, spec, updates=updates)
+    (sparsity,) = (verdict for verdict in verdicts if verdict.question == "sparsity")
+    assert sparsity.answer == answer
+    assert ("19 times" in sparsity.sentence()) == (updates == 19)

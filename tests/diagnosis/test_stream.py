@@ -16,16 +16,17 @@ from sme_registry.diagnosis import (
     load_policy,
     load_run,
 )
-from sme_registry.diagnosis.hidden_layers import network_state
-from sme_registry.diagnosis.questions import answer_all
-from sme_registry.diagnosis.stream_document import NetworkState, PhaseDiagnosis, VisitDiagnosis
-from sme_registry.diagnosis.stream_questions import (
+from sme_registry.diagnosis.measurements import NetworkState
+from sme_registry.diagnosis.networks import network_state
+from sme_registry.diagnosis.questions import OPEN_REASONS, answer_all
+from sme_registry.diagnosis.stream import (
     STREAM_QUESTIONS,
     STREAM_THRESHOLDS,
+    PhaseDiagnosis,
     StreamCase,
+    VisitDiagnosis,
     outcome_of,
 )
-from sme_registry.diagnosis.stream_render import headline, markdown, stream_sentence, terminal
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.evaluation import StreamReport, evaluate, fresh_per_phase
 from sme_registry.evaluation.models import saved_sb3
@@ -49,7 +50,7 @@ from tests.diagnosis.lives import (
     stream_of,
     write_run,
 )
-from tests.diagnosis.policies import printed
+from tests.diagnosis.policies import markdown, printed
 from tests.geometry import assert_readable
 
 SETTINGS = {"n_steps": 50, "batch_size": 50, "policy_kwargs": {"net_arch": [12, 8]}}
@@ -118,8 +119,8 @@ def test_a_policy_that_is_overwritten_is_forgetting():
     assert [phase.outcome for phase in found.phases] == ["forgotten", "forgotten", "retained"]
     assert answer(found, "failure to learn") == ("no", "every_visit_learnt")
     assert found.forgetting == verdict.evidence["forgetting"]
-    assert "Learnt and forgotten: 2 of 3 phases (0 and 1)." in headline(found)
-    assert "learnt or not" not in headline(found)
+    assert "Learnt and forgotten: 2 of 3 phases (0 and 1)." in found.headline()
+    assert "learnt or not" not in found.headline()
 
 
 def test_a_phase_that_was_never_learnt_is_a_failure_and_not_forgetting():
@@ -155,7 +156,7 @@ def test_fresh_agents_say_whether_the_life_or_the_task_is_the_cause_of_a_failure
     found = diagnosis_of(report_of(policies, stream, fresh=fresh))
     verdict = found.verdict("failure to learn")
     assert verdict.reason == reason
-    assert stream_sentence(verdict)
+    assert verdict.sentence("stream.jinja")
     if fresh == [HALF, HALF]:
         assert found.verdict("loss of plasticity").reason == "fresh_agents_learnt_little"
 
@@ -193,8 +194,8 @@ def test_forgetting_of_a_phase_that_was_never_learnt_is_said_to_be_that():
     assert [phase.outcome for phase in found.phases] == ["not_learnt", "retained", "not_learnt"]
     assert found.forgetting > 0.0
     assert answer(found, "forgetting") == ("no", "phases_retained")
-    assert "(mean over earlier phases, learnt or not)" in headline(found)
-    assert "earlier phases, learnt or not" in stream_sentence(found.verdict("forgetting"))
+    assert "(mean over earlier phases, learnt or not)" in found.headline()
+    assert "earlier phases, learnt or not" in found.verdict("forgetting").sentence("stream.jinja")
 
 
 def test_the_visit_whose_regret_stands_out_is_named():
@@ -241,7 +242,7 @@ def test_plasticity_is_lost_where_later_visits_learn_less(stream, policies, fres
 
 
 def test_a_network_that_decays_is_found_against_the_first_visit_and_fresh_agents():
-    report = report_of([HALF] * 2, TWO)
+    report = report_of(optima(TWO), TWO)
     decayed = (network(), network(dead=10, same=True, scale=2.5))
     found = diagnosis_of(report, decayed, initial_network=network())
     assert answer(found, "dormant units") == ("yes", "units_became_inactive")
@@ -298,15 +299,17 @@ def random_case(generator):
     for j in range(P):
         online = generator.uniform(0.3, 0.7) if fresh and log else None
         phases.append(phase_of(j, number(), number(), number(fresh), online, state(fresh)))
-    return StreamCase(stream, visits, phases, number(V > 1))
+    return StreamCase(stream, visits, phases, number(V > 1), generator.choice((None, 5, 30)))
 
 
 def test_every_reason_is_reached_and_has_a_sentence():
     generator, reached = random.Random(0), set()
     for _ in range(300):
         for verdict in answer_all(STREAM_QUESTIONS, random_case(generator), STREAM_THRESHOLDS):
-            reached.add((verdict.question, verdict.reason))
-            text = stream_sentence(verdict)
+            reason = verdict.evidence.get("own_reason", verdict.reason)
+            reached.add((verdict.question, reason))
+            assert (reason != verdict.reason) == (verdict.reason in OPEN_REASONS)
+            text = verdict.sentence("stream.jinja")
             assert text.endswith("."), text
             assert not any(bad in text for bad in ("None", " ,", " .", " ;", "( ", "..")), text
     declared = {(name, each) for name, rule in STREAM_QUESTIONS.items() for each in rule.reasons}
@@ -316,18 +319,18 @@ def test_every_reason_is_reached_and_has_a_sentence():
 def test_long_lists_are_cut_in_sentences_and_whole_in_data():
     verdict = diagnosis_of(report_of([HALF] * 10, stream_of(2, 5))).verdict("failure to learn")
     assert len(verdict.evidence["failed"]) == 10
-    assert "; and 6 more." in stream_sentence(verdict)
+    assert "; and 6 more." in verdict.sentence("stream.jinja")
 
 
 def test_a_life_is_readable_at_every_width_and_in_a_pipe():
     report = report_of(optima(THREE), THREE, [0.3, 0.4, 0.5], fresh=optima(THREE))
     found = diagnosis_of(report, (network(), network(), None))
     for width in (60, 120, None):
-        lines = printed(terminal(found), width)
+        lines = printed(found, width, details=True)
         assert width is None or max(map(len, lines)) <= width
-        assert headline(found) in " ".join(" ".join(lines).split())
-    page = markdown(found, ["which_phases.png"])
-    assert all(stream_sentence(verdict) in page for verdict in found.verdicts)
+        assert found.headline() in " ".join(" ".join(lines).split())
+    page = markdown(found, ["which_phases.png"], details=True)
+    assert all(verdict.sentence("stream.jinja") in page for verdict in found.verdicts)
     assert "![which phases](which_phases.png)" in page
     assert found._repr_markdown_().startswith("# life on SME/")
     named = found.model_copy(update={"name": "<script>"})
@@ -369,7 +372,7 @@ def run(tmp_path_factory):
 def test_the_command_writes_a_page_its_data_and_its_figures(run, tmp_path, laid_out):
     pytest.importorskip("matplotlib")
     result = good("diagnose", run, "--states", "64", "--out", tmp_path / "d")
-    assert "Plasticity and the network" in result.stdout
+    assert "Phases" in result.stdout
     page = (tmp_path / "d" / "diagnosis.md").read_text()
     names = sorted(path.stem for path in (tmp_path / "d").glob("*.png"))
     assert names == ["network_by_visit", "what_is_retained", "which_phases"]
@@ -452,7 +455,9 @@ def test_a_cell_is_diagnosed_with_its_fresh_agents(tmp_path):
     assert [phase.fresh_online_regret for phase in found.phases] == [0.5, 0.3]
     assert [phase.fresh_normalised_regret for phase in found.phases] == [0.0, 0.0]
     assert answer(found, "costly visits") == ("yes", "costlier_than_fresh")
-    assert answer(found, "loss of plasticity") == ("yes", "below_fresh_agents")
+    lost = found.verdict("loss of plasticity")
+    assert (lost.answer, lost.reason) == ("cannot tell", "few_updates")
+    assert lost.evidence["own_reason"] == "below_fresh_agents"
     assert found.verdict("weight growth").evidence["against"] == "fresh_agents"
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import sme_registry
-from sme_registry.diagnosis import Diagnosis, diagnose, load_cell, load_run, networks, render
+from sme_registry.diagnosis import Diagnosis, diagnose, load_cell, load_run, networks
 from sme_registry.errors import DigestMismatchError, OptionError, PolicyError, UnknownNameError
 from sme_registry.wrappers import RecordRegret
 from tests.commands import good, refused
@@ -76,8 +76,8 @@ def test_the_command_writes_a_page_its_data_and_its_figures(run, tmp_path, monke
     pytest.importorskip("matplotlib")
     monkeypatch.setattr(networks, "GRADIENT_STEPS", 10)
     folder = tmp_path / "d"
-    result = good("diagnose", run, "--out", folder, "--probe-capacity", *SHORT)
-    assert "Why" in result.stdout
+    result = good("diagnose", run, "--out", folder, "--probe-capacity", "--all", *SHORT)
+    assert "Findings (1 seed, 1 update" in result.stdout
     page = (folder / "diagnosis.md").read_text()
     names = sorted(path.name for path in folder.glob("*.png"))
     assert len(names) == 5
@@ -87,7 +87,7 @@ def test_the_command_writes_a_page_its_data_and_its_figures(run, tmp_path, monke
         assert_readable(figure)
     read = Diagnosis.read(folder / "diagnosis.json")
     assert read.measurements.capacity.layers == (10, 64, 64, 4)
-    assert all(render.sentence(verdict) in page for verdict in read.verdicts)
+    assert all(verdict.sentence() in page for verdict in read.verdicts)
     assert "--force" in refused("diagnose", run, "--out", folder)
     monkeypatch.setattr("sme_registry.diagnosis.figures.draw", lambda *_: ())
     assert shown(run, "--out", folder, "--force")["name"] == "short"
