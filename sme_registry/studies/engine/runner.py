@@ -196,7 +196,7 @@ class _StudyRun:
             done=queue.finished,
             console=console,
             unit="cells",
-            seconds_left=self._seconds_left,
+            seconds_left=self.seconds_left,
             enabled=progress,
         )
         self.say = self._progress.message
@@ -258,7 +258,8 @@ class _StudyRun:
         self._shown = finished, failed = self._queue.finished, self._queue.failed
         self._progress.update(finished, f"{failed} failed" if failed else "")
 
-    def _seconds_left(self) -> float:
+    def seconds_left(self) -> float:
+        """Seconds to the end, as estimated now."""
         return self._paces.seconds_left(self._queue.unfinished(), self._executor.workers)
 
     def _name(self, job: Job) -> str:
@@ -285,7 +286,7 @@ class _StudyRun:
         parts.append(f"{len(queue.waiting):,} to run")
         if queue.waiting:
             parts.append(f"{self._executor.workers} at once")
-            parts.append(f"about {duration(self._seconds_left())}")
+            parts.append(f"about {duration(self.seconds_left())}")
         say(f"study {self._file.versioned_name}: {' · '.join(parts)}")
         self._announce_other_versions()
 

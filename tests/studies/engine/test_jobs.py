@@ -11,7 +11,7 @@ from rich.console import Console
 
 from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.spec import StudyFile, StudyPlan
-from sme_registry.studies.engine import runner
+from sme_registry.studies.engine import budget
 from sme_registry.studies.engine.executors import failed
 from sme_registry.studies.engine.jobs import Job, Programs
 from sme_registry.studies.engine.ledger import Ledger
@@ -207,7 +207,7 @@ def test_the_time_left_does_not_count_compiling_as_the_speed_of_training(tmp_pat
     file = plan_file(seeds=1)
     seconds_left = []
     now = [0.0]
-    monkeypatch.setattr(runner, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(budget, "time", SimpleNamespace(monotonic=lambda: now[0]))
 
     @dataclass
     class Reporting(Refusing):
