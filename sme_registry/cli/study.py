@@ -333,6 +333,7 @@ def compare(
       sme study compare runs/smoke PPO TD3 --json
     """
     from sme_registry.studies.report import compare as comparison
+    from sme_registry.studies.report.frames import records
     from sme_registry.studies.report.texts import difference_caveats
 
     metrics = tuple(metric or comparison.DEFAULT_METRICS)
@@ -341,7 +342,7 @@ def compare(
     if out_folder is not None:
         files = comparison.write_comparison(folder, out_folder, first, second, metrics)
     if json:
-        print_json(comparison.records(differences))
+        print_json(records(differences))
         return
     for each in comparison.comparison_tables(differences):
         columns = {escape(name): "number" for name in each.frame.columns} | {"class": "name"}
