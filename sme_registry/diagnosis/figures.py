@@ -26,7 +26,7 @@ from sme_registry.evaluation import ObservationReport, SafetyScore
 from sme_registry.evaluation.references import LABELS
 from sme_registry.evaluation.tables import SAFETY_REFERENCES
 from sme_registry.plots.curves import draw_training
-from sme_registry.plots.safety import MARKERS
+from sme_registry.plots.reports import SAFETY_MARKERS
 from sme_registry.plots.streams import retention_map, tick_visits
 from sme_registry.plots.style import (
     COLOURS,
@@ -263,7 +263,7 @@ def _limits(figure: Figure, limits: Violations) -> None:
     """Reward against cost, and which action channels violate their limits."""
     left, right = figure.subplots(1, 2)
     for name in SAFETY_REFERENCES:
-        _point(left, limits.report.references[name][0], LABELS[name], MARKERS[name], GREY)
+        _point(left, limits.report.references[name][0], LABELS[name], SAFETY_MARKERS[name], GREY)
     own = {
         "this policy": limits.report.regions[0],
         "cut off at the limits": limits.cut_off,

@@ -7,10 +7,13 @@ legend, instead of in a new figure. `title` is above a new figure; None takes on
 """
 
 from sme_registry.plots.curves import cost_curve, learning_curve, training_curve
-from sme_registry.plots.decay import decay_curve
 from sme_registry.plots.maps import similarity_map
-from sme_registry.plots.observation import layer_probes, sensitivity_bars
-from sme_registry.plots.safety import reward_against_cost
+from sme_registry.plots.reports import (
+    decay_curve,
+    layer_probes,
+    reward_against_cost,
+    sensitivity_bars,
+)
 from sme_registry.plots.streams import (
     dynamic_regret_curve,
     performance_curve,

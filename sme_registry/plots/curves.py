@@ -23,14 +23,13 @@ from sme_registry.plots.style import (
     COLOURS,
     GREY,
     canvas,
-    draw_band,
-    entitle,
+    counted,
+    draw_runs,
     figure_of,
-    literal,
     look,
     name_bands,
 )
-from sme_registry.statistics import smoothed
+from sme_registry.statistics import median, smoothed
 from sme_registry.task.draw import Array
 
 if TYPE_CHECKING:
@@ -70,13 +69,11 @@ def training_curve(
       'environment steps'
     """
     step, regret = _points(episodes)
-    with canvas(ax, (6.2, 4.0), path) as (axes,):
+    with canvas(ax, (6.2, 4.0), path, title=title) as (axes,):
         draw_training(axes, step, regret, window)
         axes.axhline(0.0, color=GREY, linewidth=1.1, label="optimal")
         if visits:
             shade_visits(axes, visits)
-        if title and ax is None:
-            entitle(figure_of(axes), title)
     return figure_of(axes)
 
 
@@ -98,12 +95,10 @@ def cost_curve(
       >>> figure = cost_curve({"step": steps, "cost": 10 / steps}, "cost.pdf")
     """
     step, cost = _points(episodes, "cost")
-    with canvas(ax, (6.2, 4.0), path) as (axes,):
+    with canvas(ax, (6.2, 4.0), path, title=title) as (axes,):
         draw_training(axes, step, cost, window)
         axes.set_ylim(0.0, max(1.1 * float(cost.max()), 0.01))
         axes.set_ylabel("mean cost per step")
-        if title and ax is None:
-            entitle(figure_of(axes), title)
     return figure_of(axes)
 
 
@@ -135,18 +130,16 @@ def learning_curve(
     if not methods or not all(methods.values()):
         raise OptionError("runs: must hold one or more runs of each method.")
     lines = {
-        name: [smoothed(*_points(run), window)[:2] for run in each]
-        for name, each in methods.items()
+        name: [smoothed(*_points(run), window)[:2] for run in method]
+        for name, method in methods.items()
     }
-    with canvas(ax, (6.2, 4.0), path) as (axes,):
+    with canvas(ax, (6.2, 4.0), path, title=title) as (axes,):
         for index, (name, curves) in enumerate(lines.items()):
             _draw_method(axes, name, curves, look(index))
         axes.axhline(0.0, color=GREY, linewidth=1.1, label="optimal")
         if any(len(curves) > 1 for curves in lines.values()):
             name_bands(axes, "quartiles of runs (line: median)")
         _label_axes(axes)
-        if title and ax is None:
-            entitle(figure_of(axes), title)
     return figure_of(axes)
 
 
@@ -184,12 +177,8 @@ def _draw_method(
         )
     x = np.linspace(begin, end, _DRAWN_POINTS)
     values = np.array([np.interp(x, *curve) for curve in curves])
-    low, middle, high = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
-    label = literal(name)
-    if len(curves) > 1:
-        label += f" (n = {len(curves)})"
-        draw_band(axes, x, low, high, style["color"])
-    axes.plot(x, middle, **style, linewidth=2, markersize=4.5, markevery=0.13, label=label)
+    line = {**style, "linewidth": 2, "markersize": 4.5, "markevery": 0.13}
+    draw_runs(axes, x, values, median, line, counted(name, values))
 
 
 def _methods(runs: Any) -> dict[str, list[Any]]:
@@ -202,11 +191,11 @@ def _methods(runs: Any) -> dict[str, list[Any]]:
     if "regret" in runs:
         return _table(runs)
     methods = {}
-    for name, each in runs.items():
-        alone = isinstance(each, str | os.PathLike) or hasattr(each, "keys")
-        if not alone and not isinstance(each, Iterable):
-            raise OptionError(f"runs[{name!r}]={each!r:.60}: must be one or more runs.")
-        methods[str(name)] = [each] if alone else list(each)
+    for name, given in runs.items():
+        alone = isinstance(given, str | os.PathLike) or hasattr(given, "keys")
+        if not alone and not isinstance(given, Iterable):
+            raise OptionError(f"runs[{name!r}]={given!r:.60}: must be one or more runs.")
+        methods[str(name)] = [given] if alone else list(given)
     return methods
 
 

@@ -9,10 +9,13 @@ from typing import Any
 from sme_registry.evaluation import EvaluationReport, StreamReport
 from sme_registry.evaluation.stream_report import Visit
 from sme_registry.plots.curves import Run, cost_curve, training_curve
-from sme_registry.plots.decay import decay_curve
 from sme_registry.plots.maps import similarity_map
-from sme_registry.plots.observation import layer_probes, sensitivity_bars
-from sme_registry.plots.safety import reward_against_cost
+from sme_registry.plots.reports import (
+    decay_curve,
+    layer_probes,
+    reward_against_cost,
+    sensitivity_bars,
+)
 from sme_registry.plots.streams import (
     dynamic_regret_curve,
     performance_curve,

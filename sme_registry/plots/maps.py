@@ -13,7 +13,7 @@ from sme_registry.compiled import engine
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import as_policy
 from sme_registry.io import integer_in
-from sme_registry.plots.style import canvas, entitle, figure_of
+from sme_registry.plots.style import canvas, figure_of
 from sme_registry.spec import ActionRange, SMESpec, SpecLike, catalogue
 from sme_registry.task import load, materialize
 from sme_registry.task.draw import Array
@@ -63,21 +63,19 @@ def similarity_map(
     if not 0.0 <= time <= 1.0:
         raise OptionError(f"time={time!r:.40}: must be in [0, 1].")
     loaded = as_policy(policy, spec, action_range=action_range, name=name)
-    with canvas(ax, (5.0, 4.2), path) as (axes,):
-        side, similarity = similarity_on_grid(loaded, spec, epsilon, resolution, time)
-        scale = colour_scale(similarity)
+    side, similarity = similarity_on_grid(loaded, spec, epsilon, resolution, time)
+    scale = colour_scale(similarity)
+    inside = (side >= 0.0) & (side <= 1.0)
+    title = (
+        f"{loaded.name} on {catalogue.title(spec)}, L = {spec.complexity}\n"
+        f"mean r̃: {similarity[np.ix_(inside, inside)].mean():.3f} in the unit square, "
+        f"{similarity.mean():.3f} in the whole map"
+    )
+    with canvas(ax, (5.0, 4.2), path, title=title) as (axes,):
         image = draw_similarity(axes, similarity, epsilon, scale)
         label = f"similarity r̃  (1 = optimal)\n{scale_text(scale)}"
         bar = figure_of(axes).colorbar(image, ax=axes, label=label, ticks=scale_ticks(scale))
         bar.outline.set_visible(False)
-        inside = (side >= 0.0) & (side <= 1.0)
-        means = [similarity[np.ix_(inside, inside)].mean(), similarity.mean()]
-        if ax is None:
-            entitle(
-                figure_of(axes),
-                f"{loaded.name} on {catalogue.title(spec)}, L = {spec.complexity}\n"
-                f"mean r̃: {means[0]:.3f} in the unit square, {means[1]:.3f} in the whole map",
-            )
         axes.locator_params(nbins=5)
         axes.set_xlabel("state channel 1")
         axes.set_ylabel("state channel 2")

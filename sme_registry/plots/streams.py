@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,14 +13,14 @@ from sme_registry.evaluation import StreamReport
 from sme_registry.evaluation.dynamic_regret import DynamicRegret
 from sme_registry.evaluation.retention import LABELS, TRAINED
 from sme_registry.evaluation.stream_report import Visit, same_stream
+from sme_registry.plots.reports import read_reports
 from sme_registry.plots.style import (
     COLOURS,
     GREY,
     canvas,
-    draw_band,
-    entitle,
+    counted,
+    draw_runs,
     figure_of,
-    literal,
     look,
     name_bands,
 )
@@ -78,14 +76,15 @@ def retention_map(
     M = iqm([agent.normalised_regret for agent in agents])
     labels = [f"visit {visit.visit}" for visit in reports[0].visits]
     visited: list[tuple[int, int]] = [(visit.visit, visit.phase) for visit in reports[0].visits]
-    initial = [each for agent in agents if (each := agent.initial_normalised_regret)]
+    known = (agent.initial_normalised_regret for agent in agents)
+    initial = [regret for regret in known if regret]
     if len(initial) == len(agents):
         M = np.concatenate([iqm(initial)[None], M])
         labels = ["initial", *labels]
         visited = [(row + 1, column) for row, column in visited]
     V, P = M.shape
     size = (max(3.6, 1.9 + 0.52 * min(P, 20)), max(2.8, 1.5 + 0.32 * min(V, 30)))
-    with _panel(ax, size, path, _title(reports, title, f", {region}")) as axes:
+    with canvas(ax, size, path, title=_title(reports, title, f", {region}")) as (axes,):
         image = draw_matrix(axes, M, visited, labels, max(1.0, float(M.max())))
         axes.set_xlabel("evaluated on the task of phase")
         axes.set_ylabel("policy at the end of")
@@ -115,13 +114,14 @@ def performance_curve(
     reports = _runs(runs)
     agents = [report.region(region).agent for report in reports]
     R = 1.0 - np.array([agent.normalised_regret for agent in agents])  # [n, V, P]
-    initial = [each for agent in agents if (each := agent.initial_normalised_regret)]
+    known = (agent.initial_normalised_regret for agent in agents)
+    initial = [regret for regret in known if regret]
     x = np.arange(R.shape[1], dtype=float)
     if len(initial) == len(agents):
         R = np.concatenate([1.0 - np.array(initial)[:, None], R], axis=1)
         x = np.concatenate([[-1.0], x])
     phases = np.array([visit.phase for visit in reports[0].visits])
-    with _panel(ax, _SIZE, path, _title(reports, title)) as axes:
+    with canvas(ax, _SIZE, path, title=_title(reports, title)) as (axes,):
         lines = {f"phase {j}": (x, R[..., j]) for j in range(R.shape[2])}
         hollow = {"markersize": 4.5, "linewidth": 1.6, "markerfacecolor": "white"}
         _draw_lines(axes, lines, iqm, "IQM", **hollow)
@@ -155,9 +155,9 @@ def dynamic_regret_curve(
     """
     methods = _methods(runs)
     first = next(iter(methods.values()))
-    with _panel(ax, _SIZE, path, _title(first, title, named=len(methods) == 1)) as axes:
+    with canvas(ax, _SIZE, path, title=_title(first, title, named=len(methods) == 1)) as (axes,):
         lines = {
-            _label(name, reports): _curves([_regret(report) for report in reports])
+            counted(name, reports): _curves([_regret(report) for report in reports])
             for name, reports in methods.items()
         }
         _draw_lines(axes, lines, median, "median", linewidth=2, markersize=4.5, markevery=0.13)
@@ -196,10 +196,10 @@ def plasticity_curve(
     """
     methods = _methods(runs)
     first = next(iter(methods.values()))
-    with _panel(ax, _SIZE, path, _title(first, title, named=len(methods) == 1)) as axes:
+    with canvas(ax, _SIZE, path, title=_title(first, title, named=len(methods) == 1)) as (axes,):
         visits = np.arange(len(first[0].visits), dtype=float)
         lines = {
-            _label(name, reports): (visits, np.array([_ratios(one, region) for one in reports]))
+            counted(name, reports): (visits, np.array([_ratios(one, region) for one in reports]))
             for name, reports in methods.items()
         }
         _draw_lines(axes, lines, iqm, "IQM", linewidth=2, markersize=5)
@@ -270,17 +270,6 @@ def shade_visits(axes: Axes, visits: Sequence[Visit]) -> None:
         )  # fmt: skip
 
 
-@contextmanager
-def _panel(
-    ax: Axes | None, size: tuple[float, float], path: str | os.PathLike[str] | None, title: str
-) -> Iterator[Axes]:
-    """The axes that a figure is drawn in: the caller's, or those of a new figure with a title."""
-    with canvas(ax, size, path) as (axes,):
-        yield axes
-        if ax is None:
-            entitle(figure_of(axes), title)
-
-
 def _draw_lines(
     axes: Axes,
     lines: Mapping[str, tuple[Array, Array]],
@@ -294,10 +283,7 @@ def _draw_lines(
     """
     banded = len(lines) <= len(COLOURS) and any(len(values) > 1 for _, values in lines.values())
     for index, (label, (x, values)) in enumerate(lines.items()):
-        if banded and len(values) > 1:
-            low, high = np.quantile(values, [0.25, 0.75], axis=0)
-            draw_band(axes, x, low, high, look(index)["color"])
-        axes.plot(x, statistic(values), **look(index), **style, label=label)
+        draw_runs(axes, x, values, statistic, {**look(index), **style}, label, banded)
     if banded:
         name_bands(axes, f"quartiles of seeds (line: {name})")
 
@@ -314,23 +300,9 @@ def _methods(given: Methods) -> dict[str, list[StreamReport]]:
 
 def _runs(given: Runs) -> list[StreamReport]:
     """One report or several, those given by their paths read."""
-    alone = isinstance(given, StreamReport | str | os.PathLike) or not isinstance(given, Sequence)
-    each: Any = [given] if alone else given
-    reports = [_report(one) for one in each]
+    reports = read_reports(given, StreamReport, FILE, "runs")
     same_stream(reports)
     return reports
-
-
-def _report(given: Any) -> StreamReport:
-    if isinstance(given, StreamReport):
-        return given
-    if not isinstance(given, str | os.PathLike):
-        raise OptionError(
-            f"runs={given!r:.60}: must be a StreamReport, the path of a {FILE}, or the folder of a "
-            "run."
-        )
-    path = Path(given)
-    return StreamReport.read(path / FILE if path.is_dir() else path)
 
 
 def _draw_references(axes: Axes, reports: Sequence[StreamReport], *, trained: bool) -> None:
@@ -370,10 +342,6 @@ def _ratios(report: StreamReport, region: str) -> Array:
             "runs: a report has no fresh agents. Give evaluate_stream their policies, fresh=…."
         )
     return np.array(agent.plasticity_ratio, dtype=float)
-
-
-def _label(name: str, reports: Sequence[StreamReport]) -> str:
-    return literal(name) + (f" (n = {len(reports)})" if len(reports) > 1 else "")
 
 
 def _title(

@@ -19,6 +19,8 @@ import numpy as np
 
 from sme_registry.errors import OptionError
 from sme_registry.io import require_packages, write_atomically
+from sme_registry.statistics import Statistic
+from sme_registry.task.draw import Array
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -137,11 +139,12 @@ def canvas(
     size: tuple[float, float],
     path: str | os.PathLike[str] | None,
     panels: int = 1,
+    title: str | None = None,
 ) -> Iterator[list[Axes]]:
     """The panels that a public function draws in: the caller's, or those of a new figure.
 
-    After the block a new figure has a legend of all labelled lines below its panels; the caller's
-    axes have none. The figure is written if there is a path.
+    After the block a new figure has its title, and a legend of all labelled lines below its panels;
+    the caller's axes have neither. The figure is written if there is a path.
     """
     if path is not None:
         checked_format(path)
@@ -153,6 +156,8 @@ def canvas(
         if len(axes) != panels:
             raise OptionError(f"ax: {len(axes)} axes for {panels} panels. Give as many as panels.")
         yield axes
+        if ax is None and title:
+            entitle(figure_of(axes[0]), title)
         merge_coincident(axes)
         if ax is None:
             legend_below(figure_of(axes[0]), axes[0].get_legend_handles_labels()[0])
@@ -177,7 +182,7 @@ def legend_below(figure: Figure, handles: Sequence[Artist], most_across: int = 6
     """A legend below all panels, which covers none: as many columns as fit, and a taller figure."""
     if not handles:
         return None
-    labels = [textwrap.fill(str(each.get_label()), _LABEL_WIDTH) for each in handles]
+    labels = [textwrap.fill(str(handle.get_label()), _LABEL_WIDTH) for handle in handles]
     for across in range(min(most_across, len(handles)), 0, -1):
         legend = figure.legend(
             handles, labels, loc="outside lower center", ncols=across, columnspacing=1.4
@@ -202,6 +207,27 @@ def legend_above(axes: Axes, **options: Any) -> None:
 def draw_band(axes: Axes, x: Any, low: Any, high: Any, colour: Any) -> None:
     """The spread of a method's runs around its line."""
     axes.fill_between(x, low, high, color=colour, alpha=0.16, linewidth=0)
+
+
+def draw_runs(
+    axes: Axes,
+    x: Any,
+    runs: Array,
+    statistic: Statistic,
+    style: Mapping[str, Any],
+    label: str,
+    banded: bool = True,
+) -> None:
+    """A method's line: a statistic of `[n, X]` runs; the quartiles of several are a band."""
+    if banded and len(runs) > 1:
+        low, high = np.quantile(runs, [0.25, 0.75], axis=0)
+        draw_band(axes, x, low, high, style["color"])
+    axes.plot(x, statistic(runs), **style, label=label)
+
+
+def counted(name: str, runs: Sequence[Any] | Array) -> str:
+    """The label of a method, with the number of its runs if there are several."""
+    return literal(name) + (f" (n = {len(runs)})" if len(runs) > 1 else "")
 
 
 def name_bands(axes: Axes, label: str) -> None:
