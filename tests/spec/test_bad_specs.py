@@ -161,11 +161,11 @@ def test_all_errors_are_listed_at_once_by_the_constructor_too():
 
 def test_deriving_refuses_as_parsing_does_and_a_source_begins_its_error():
     for document in ([], None):
-        with pytest.raises(SpecError, match=r"^here\.json: \[\]: must be a valid dictionary"):
+        with pytest.raises(SpecError, match=r"^here\.json: (\[\]|None): must be a valid"):
             SMESpec.from_dict(document, "here.json")
     with pytest.raises(SpecError, match=r"complexiti=3: unknown field\. Did you mean 'complexity'"):
         SMESpec().derive(complexiti=3)
-    with pytest.raises(SpecError, match="D=1: must be a finite number in"):
+    with pytest.raises(SpecError, match="D=1: must be in"):
         SMESpec().derive(D=1)
 
 
