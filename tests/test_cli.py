@@ -361,7 +361,7 @@ class TestNew:
             (("--seed", "-3"), "seed=-3"),
             (("--state-dim", "1000000", "--action-dim", "1000000"), "GiB"),
             (("--team", '{"agents": [{"action_dim": 3}]}'), "action_dim=4"),
-            (("--team", "two"), "got 'two'"),
+            (("--team", "two"), "team='two': must be"),
             (("--team", "nowhere.json"), "cannot be read"),
             (
                 ("--safety", '{"tightness": 0.6}'),
