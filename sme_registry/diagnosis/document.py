@@ -15,7 +15,7 @@ import os
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BeforeValidator, JsonValue
+from pydantic import BeforeValidator, Field, JsonValue
 
 from sme_registry.diagnosis.measurements import POLICY, Channel, Measurements, Violations
 from sme_registry.diagnosis.page import Part, View, label, markdown, words
@@ -134,7 +134,9 @@ class Diagnosis(StrictModel):
     only_field: ClassVar[str] = ""  # that no other kind of diagnosis has
 
     schema_version: Annotated[
-        Literal[2], BeforeValidator(lambda version: 2 if version == 1 else version)
+        Literal[2],
+        BeforeValidator(lambda version: 2 if version == 1 else version),
+        Field(description="Version of the document's format; 1 is read as well."),
     ] = 2
     name: str
     task: str = ""
