@@ -163,8 +163,9 @@ def _more_numbers(task: Task) -> int:
 
 
 def _seen(task: Task, backend: Backend) -> Network:
-    if task.spec.observation is None or not task.mixing:  # or its plain task: a data set's
+    if not task.mixing:
         return np.copy
+    assert task.spec.observation is not None
     uniform = task.spec.observation.mixing == "nonlinear"
     return network(task.mixing, uniform=uniform, backend=backend)
 

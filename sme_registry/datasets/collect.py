@@ -63,8 +63,10 @@ class OptimalPolicy:
     """π* as a function from states `[B, S]` to `[B, A]`, with the same bits in any batch."""
 
     def __init__(self, task: Task, lanes: int) -> None:
-        plain = replace(task, spec=task.spec.derive(safety=None, observation=None))
-        self._batch = Batch(plain, lanes, reuse=True)  # neither changes π*, and both take time
+        # The same π* without limits and distractors, which take time.
+        spec = task.spec.derive(safety=None, observation=None)
+        plain = replace(task, spec=spec, limiting=(), distractor_transition=None, mixing=())
+        self._batch = Batch(plain, lanes, reuse=True)
         self._lanes = np.arange(lanes)
         self._observation = self._batch.observe()
         self._no_action = np.zeros((lanes, task.spec.action_dim))
