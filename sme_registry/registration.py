@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
@@ -85,16 +85,12 @@ def register(spec: SMESpec | StreamSpec, name: str) -> str:
       3
     """
     from sme_registry.envs.base import argument_of
-    from sme_registry.spec import SMESpec, as_spec, as_stream
+    from sme_registry.spec import SMESpec
     from sme_registry.spec.catalogue import NAMESPACE, SYMMETRIC
-    from sme_registry.spec.resolve import names_stream, registered
+    from sme_registry.spec.resolve import as_document, registered
     from sme_registry.task.streams import DYNAMICS_VERSION
 
-    document = (
-        as_stream(cast("StreamSpec", spec))
-        if names_stream(spec)
-        else as_spec(cast("SMESpec", spec))
-    )
+    document = as_document(spec)
     short = str(name).removeprefix(f"{NAMESPACE}/").removesuffix(f"-v{DYNAMICS_VERSION}")
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", short) or re.search(r"-v\d+$", short):
         raise OptionError(
@@ -179,8 +175,8 @@ def save(
       >>> sme_registry.load(path) == spec
       True
     """
-    from sme_registry.spec import EnvFile, StreamFile, as_spec, as_stream
-    from sme_registry.spec.resolve import names_stream
+    from sme_registry.spec import EnvFile, StreamFile, StreamSpec
+    from sme_registry.spec.resolve import as_document
     from sme_registry.task import materialize, materialize_together
     from sme_registry.task.fingerprint import fingerprint_of
 
@@ -189,16 +185,15 @@ def save(
         "description": description,
         "tags": tags,
     }
-    if names_stream(spec):
-        stream = as_stream(cast("StreamSpec", spec))
-        tasks = materialize_together(stream, [phase.spec for phase in stream.phases])
+    saved = as_document(spec)
+    if isinstance(saved, StreamSpec):
+        tasks = materialize_together(saved, [phase.spec for phase in saved.phases])
         prints = [fingerprint_of(task).to_dict() for task in tasks]
-        document = {"stream": stream.to_dict(), "digest": stream.digest, "fingerprints": prints}
+        document = {"stream": saved.to_dict(), "digest": saved.digest, "fingerprints": prints}
         StreamFile.from_dict(fields | document, str(path)).write(path)
         return Path(path)
-    spec = as_spec(cast("SMESpec", spec))
-    fingerprint = fingerprint_of(materialize(spec)).to_dict()
-    document = {"spec": spec.to_dict(), "digest": spec.digest, "fingerprint": fingerprint}
+    fingerprint = fingerprint_of(materialize(saved)).to_dict()
+    document = {"spec": saved.to_dict(), "digest": saved.digest, "fingerprint": fingerprint}
     EnvFile.from_dict(fields | document, str(path)).write(path)
     return Path(path)
 

@@ -6,6 +6,7 @@ import difflib
 import functools
 import os
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar, overload
@@ -52,7 +53,7 @@ def resolve(name: Any, kind: Any = None) -> Any:
     path of a file. A stream in place of a spec is a `StreamError`.
     """
     if not isinstance(name, str | os.PathLike):
-        resolved = Resolved(_as_document(name, kind))
+        resolved = Resolved(as_document(name, kind))
     elif isinstance(name, os.PathLike) or is_path(name):
         resolved = _of_data(read_json(name), str(name), kind)
     else:
@@ -121,7 +122,8 @@ finders[SMESpec] = lambda name: resolve(name, SMESpec).document
 finders[StreamSpec] = lambda name: resolve(name, StreamSpec).document
 
 
-def _as_document(value: Any, kind: Any) -> SMESpec | StreamSpec:
+def as_document(value: Any, kind: Any = None) -> SMESpec | StreamSpec:
+    """A spec or a stream from itself or from plain data."""
     return as_stream(value) if kind is StreamSpec or names_stream(value) else as_spec(value)
 
 
@@ -169,8 +171,13 @@ def _of_name_of(short: str, kind: type[NamedDocument]) -> Resolved[Any]:
     check_not_symmetric(short)
     if kind is StreamSpec:
         return _of_file(catalogue.find(StreamFile, short.removeprefix(catalogue.STREAM)))
-    names = [env_id.removeprefix(f"{catalogue.NAMESPACE}/") for env_id in registered]
-    return _of_file(catalogue.find(EnvFile, short, [*names, *catalogue.names(StreamFile)]))
+    return _of_file(catalogue.find(EnvFile, short, _other_names()))
+
+
+def _other_names() -> Iterator[str]:
+    """What an unknown name may have meant besides the catalogue's tasks."""
+    yield from (env_id.removeprefix(f"{catalogue.NAMESPACE}/") for env_id in registered)
+    yield from catalogue.names(StreamFile)
 
 
 def _short(name: str) -> str:
