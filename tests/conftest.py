@@ -2,6 +2,7 @@
 
 import ctypes
 import gc
+import importlib.util
 import os
 import signal
 import subprocess
@@ -45,8 +46,8 @@ def pytest_configure(config):
     """Compile the step once, before the workers and their children would each do it."""
     if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
         kernels = "sme_registry.compiled.safety_observation"
-        # Numba is an extra: no failure where it is missing.
-        subprocess.run([sys.executable, "-c", f"import {kernels}"], check=False)
+        if importlib.util.find_spec("numba"):  # an extra
+            subprocess.run([sys.executable, "-c", f"import {kernels}"], check=True)
 
 
 def pytest_collection_modifyitems(items):

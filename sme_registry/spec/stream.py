@@ -119,7 +119,7 @@ class Piece(NamedTuple):
     start: int
 
 
-class Schedule(NamedTuple):
+class SegmentTimes(NamedTuple):
     """Which piece is in force after how many environment steps.
 
     Attributes:
@@ -251,9 +251,9 @@ class StreamSpec(NamedDocument):
         return _pieces(self.phases)[0]
 
     @property
-    def schedule(self) -> Schedule:
+    def schedule(self) -> SegmentTimes:
         """`piece_at` and `next_switch`, without the cost of finding the pieces at each call."""
-        return Schedule(_pieces(self.phases)[1], self.cycle_steps, self.cycles)
+        return SegmentTimes(_pieces(self.phases)[1], self.cycle_steps, self.cycles)
 
     @property
     def switches(self) -> tuple[Any, ...]:
