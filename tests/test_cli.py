@@ -235,6 +235,15 @@ class TestShow:
         assert "complexity=10" in good("show", "core").stdout
         assert "epsilons" in good("show", "paper-v1").stdout
 
+    def test_a_stream_of_a_suite_is_shown_and_certified_by_its_digest(self):
+        """It is in no file of its own."""
+        stream = catalogue.find(SuiteFile, "continual").suite.stream_instances[-1]
+        shown = json.loads(good("show", stream.digest[:19], "--json").stdout)
+        assert shown == {"stream": stream.to_dict(), "digest": stream.digest}
+        assert stream.digest in good("show", stream.digest[:19]).stdout
+        certificates = json.loads(good("certify", stream.digest[:19], "--json").stdout)
+        assert len(certificates) == len(stream.phases)
+
     def test_a_suite_lists_its_instances_by_names_to_train_by(self, tmp_path):
         file = catalogue.find(SuiteFile, "smoke")
         shown = json.loads(good("show", "smoke", "--json").stdout)

@@ -35,7 +35,6 @@ from sme_registry.spec.catalogue import Envelope
 from sme_registry.spec.resolve import (
     check_not_bare,
     is_path,
-    names_stream,
     resolve,
 )
 
@@ -108,19 +107,16 @@ def find_file(kind: type[_File], name: str) -> _File:
     return kind.read(name) if is_path(name) else catalogue.find(kind, name)
 
 
-def find_any(name: str) -> Envelope | SMESpec:
-    """The file of a name, path or digest; a spec alone if it has no file of its own."""
+def find_any(name: str) -> Envelope | SMESpec | StreamSpec:
+    """The file of a name, path or digest; a spec or stream alone if it has no file of its own."""
     if is_path(name):
         return read_any(name)
     files = [file for kind in KINDS.values() for file in catalogue.entries(kind)]
     for file in files:
         if name in (file.name, file.versioned_name, file.digest):
             return file
-    if names_stream(name):
-        stream = resolve(name, StreamSpec).document
-        return next(f for f in files if isinstance(f, StreamFile) and f.digest == stream.digest)
     try:
-        spec = resolve(name, SMESpec).document
+        document = resolve(name).document
     except UnknownNameError as error:
         hint = did_you_mean(name.rsplit("/", 1)[-1], [file.name for file in files])
         if hint and "Did you mean" not in str(error):
@@ -128,8 +124,8 @@ def find_any(name: str) -> Envelope | SMESpec:
                 f"{name!r}: nothing in the catalogue has this name.{hint}"
             ) from None
         raise
-    same = [file for file in files if isinstance(file, EnvFile) and file.digest == spec.digest]
-    return same[0] if len(same) == 1 else spec
+    same = [file for file in files if file.digest == document.digest]
+    return same[0] if len(same) == 1 else document
 
 
 def changes(pairs: list[str] | None) -> dict[str, Any]:

@@ -152,6 +152,8 @@ def _tasks(name: str) -> list[tuple[str, SMESpec]]:
             for number, stream in zip(member.draws, member.instances, strict=True)
         ]
         return tasks + [phase for label, stream in draws for phase in _phases(label, stream)]
+    if isinstance(document, StreamSpec):
+        return _phases(name, document)
     if isinstance(document, StreamFile):
         materialize_stream(document.stream, document.fingerprints)
         return _phases(document.name, document.stream)

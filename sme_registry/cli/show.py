@@ -245,17 +245,19 @@ def show(
         _show_document(name, document, json)
 
 
-def _show_document(name: str, document: Envelope | SMESpec, json: bool) -> None:
+def _show_document(name: str, document: Envelope | SMESpec | StreamSpec, json: bool) -> None:
     if isinstance(document, SMESpec | EnvFile):
         _show_task(document, json)
     elif isinstance(document, SuiteFile):
         _show_suite(document, json)
+    elif isinstance(document, StreamSpec) and json:
+        print_json({"stream": document.to_dict(), "digest": document.digest})
     elif json:
         print_json(document.to_dict())
     elif isinstance(document, StudyFile):
         out().print(study_table([document]))
         out().print(f"{document.digest}\nTo see its runs and times: sme study plan {escape(name)}")
-    elif isinstance(document, StreamFile):
+    elif isinstance(document, StreamSpec | StreamFile):
         _show_stream(document)
     elif isinstance(document, ProtocolFile):
         fields = {**document.protocol.to_dict(), "digest": document.digest}
@@ -329,10 +331,12 @@ def _spaces(spec: SMESpec) -> dict[str, str]:
     }
 
 
-def _show_stream(file: StreamFile) -> None:
-    out().print(cards.stream_table(file.stream, _title(file)))
+def _show_stream(document: StreamSpec | StreamFile) -> None:
+    stream = document if isinstance(document, StreamSpec) else document.stream
+    title = stream.content_name if isinstance(document, StreamSpec) else _title(document)
+    out().print(cards.stream_table(stream, title))
     out().print()
-    print_pairs("Stream", cards.stream_facts(file.stream))
+    print_pairs("Stream", cards.stream_facts(stream))
 
 
 def _show_suite(file: SuiteFile, json: bool) -> None:
