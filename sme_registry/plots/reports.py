@@ -430,9 +430,10 @@ def read_reports(given: Any, kind: type[_Report], file: str, argument: str) -> l
             path = Path(report)
             report = kind.read(path / file if path.is_dir() else path)
         if not isinstance(report, kind):
+            article = "an" if kind.__name__[0] in "AEIO" else "a"
             raise OptionError(
-                f"{argument}={report!r:.60}: must be of class {kind.__name__}, the path of its "
-                f"{file}, or the folder of a run."
+                f"{argument}={report!r:.60}: must be {article} {kind.__name__}, the path of "
+                f"{article} {file}, or the folder of a run."
             )
         reports.append(report)
     return reports
