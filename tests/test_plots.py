@@ -478,7 +478,7 @@ def test_commands_write_the_figures_for_which_the_report_has_numbers(
         (lambda report: plots.decay_curve([]), "must be one or more evaluation reports"),
         (
             lambda report: plots.decay_curve(3),
-            "reports=3: must be of class EvaluationReport, the path of",
+            "reports=3: must be an EvaluationReport, the path of",
         ),
         (lambda report: plots.decay_curve(report, measures=["mae"]), "measures="),
         (
