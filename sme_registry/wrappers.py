@@ -35,7 +35,7 @@ from gymnasium.vector import VectorEnv
 from sme_registry.envs.arguments import check_has_limits
 from sme_registry.envs.episodes import Episode, Episodes, info_of_lanes
 from sme_registry.errors import OptionError
-from sme_registry.io import refuse_existing
+from sme_registry.io import check_new
 from sme_registry.spec import SMESpec
 from sme_registry.training.episodes import EpisodeLog
 
@@ -56,7 +56,7 @@ class _Recorder(Episodes):
         super().__init__(lanes, spec=spec)
         self._log: EpisodeLog | None = None
         if path is not None:
-            path = refuse_existing(path, force=force)
+            path = check_new(path, force=force)
             path.parent.mkdir(parents=True, exist_ok=True)
             self._log = EpisodeLog(path)
 

@@ -27,7 +27,7 @@ from leaderboard.documents.submission import (
 )
 from leaderboard.errors import Rejection
 from sme_registry.errors import OptionError
-from sme_registry.io import build_folder, refuse_existing, sha256_of, write_atomically
+from sme_registry.io import build_folder, check_new, sha256_of, write_atomically
 from sme_registry.spec import SuiteFile
 
 Progress = Callable[[int, int], None]
@@ -203,7 +203,7 @@ def _policy_bytes(run: SubmittedRun, policy: Path, bundle: Path) -> bytes:
 
 def _refuse_existing(folder: Path, force: bool) -> None:
     """Raise if the folder exists, unless `force` is set and it contains nothing but a bundle."""
-    refuse_existing(folder, force=force)
+    check_new(folder, force=force)
     if folder.is_dir() and not folder.is_symlink():
         others = {path.name for path in folder.iterdir()} - {FILE, ARTEFACTS}
     else:

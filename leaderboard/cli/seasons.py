@@ -15,7 +15,7 @@ from leaderboard.documents.result import Metric
 from leaderboard.documents.season import Reveal
 from leaderboard.errors import Rejection
 from sme_registry.errors import OptionError
-from sme_registry.io import read_json, refuse_existing
+from sme_registry.io import check_new, read_json
 from sme_registry.io.markup import plural
 from sme_registry.io.tables import Table
 from sme_registry.io.terminal import Progress, err, fixed, out, print_json, print_pairs
@@ -87,7 +87,7 @@ def new(
         refuse_large_answers(fields, store.document.limits.artefact_bytes)
         refuse_unrankable(fields, store.document.runs_to_rank)
     folder = Path(fields.id) if out_folder is None else out_folder
-    refuse_existing(folder)
+    check_new(folder)
     _warn_of_easy_classes(fields)
     path = _secret(board, fields.id, secret)
     # First: a season whose master is lost cannot be revealed, and the reverse does no harm.

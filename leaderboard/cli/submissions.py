@@ -32,7 +32,7 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import Knowledge, SignedWithdrawal
 from leaderboard.errors import Rejection
 from sme_registry.errors import OptionError
-from sme_registry.io import refuse_existing
+from sme_registry.io import check_new
 from sme_registry.io.terminal import Progress, err, out, print_json
 from sme_registry.spec import SuiteFile, catalogue
 
@@ -76,7 +76,7 @@ def export_sb3(
     from leaderboard.artefact.export_sb3 import export_sb3 as export
 
     target = model.with_suffix(".onnx") if out_file is None else out_file
-    refuse_existing(target, force=force)
+    check_new(target, force=force)
     path = export(model, target, vec_normalize=vec_normalize)
     out().print(f"{escape(str(path))}, {path.stat().st_size:,} bytes", soft_wrap=True)
 

@@ -27,7 +27,7 @@ from leaderboard.cli.options import (
 from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import Rejection
 from sme_registry.errors import OptionError
-from sme_registry.io import choice, refuse_existing, refuse_unwritable, write_atomically
+from sme_registry.io import check_new, check_writable, choice, write_atomically
 from sme_registry.io.tables import Table
 from sme_registry.io.terminal import Progress, err, out
 
@@ -67,7 +67,7 @@ def ticket(
     from leaderboard.documents.entry import SignedTicketRequest, TicketRequest
     from leaderboard.web import client
 
-    refuse_existing(out_file)
+    check_new(out_file)
     signing_key = SigningKey.read(key)
     # Kept until the ticket is: a request that was sent and not answered may have started one.
     request_file = out_file.with_name(f"{out_file.name}.request")
@@ -236,7 +236,7 @@ def _write_challenges(url: str, ticket: Ticket, places: dict[str, int], folder: 
     from sme_registry.seasons import Instance
     from sme_registry.seasons.wire import pack_table
 
-    refuse_unwritable(folder / "challenge.npy")
+    check_writable(folder / "challenge.npy")
     with Progress("writing", len(places), console=err(), unit="challenges") as progress:
         for done, (name, number) in enumerate(places.items(), start=1):
             with Instance(url, ticket, number) as hidden:

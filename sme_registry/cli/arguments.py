@@ -18,7 +18,7 @@ from sme_registry.errors import (
     UnknownNameError,
     did_you_mean,
 )
-from sme_registry.io import install_command, is_installed, parse_json, read_json, refuse_existing
+from sme_registry.io import check_new, install_command, is_installed, parse_json, read_json
 from sme_registry.io.tables import Table
 from sme_registry.io.terminal import err, out, print_json
 from sme_registry.spec import (
@@ -166,7 +166,7 @@ def check_document_path(path: Path, *, force: bool) -> None:
     """Check the path of a document that a command is about to write."""
     if path.suffix != ".json":
         raise OptionError(f"{path}: must end in .json, so that commands recognise it as a path.")
-    refuse_existing(path, force=force)
+    check_new(path, force=force)
 
 
 def can_draw() -> bool:

@@ -400,9 +400,9 @@ def sealed(
       sme offline sealed autumn/datasets/sealed/autumn/deep-0-v0 -o deep-0.npz
     """
     from sme_registry.datasets import train_sealed
-    from sme_registry.io import refuse_existing
+    from sme_registry.io import check_new
 
-    refuse_existing(out_file, force=force)
+    check_new(out_file, force=force)
     title = f"training {algorithm.upper()}"
     with Progress(title, max(1, steps), console=err()) as progress:
         policy = train_sealed(

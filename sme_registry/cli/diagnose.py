@@ -21,7 +21,7 @@ from sme_registry.cli.arguments import (
     print_written,
 )
 from sme_registry.errors import OptionError
-from sme_registry.io import refuse_existing, to_json, write_atomically
+from sme_registry.io import check_new, to_json, write_atomically
 from sme_registry.io.terminal import err, out, print_json
 from sme_registry.spec import EnvFile, catalogue
 
@@ -121,7 +121,7 @@ def diagnose(
     from sme_registry.diagnosis import page
 
     if out_folder is not None:
-        refuse_existing(out_folder / _JSON, force=force)
+        check_new(out_folder / _JSON, force=force)
     if set_ and task is None:
         raise OptionError("--set: changes the task of a policy. Add --task.")
     check_policy_options(task, action_range, log)

@@ -23,7 +23,7 @@ from sme_registry.cli.arguments import (
 )
 from sme_registry.errors import OptionError
 from sme_registry.evaluation.references import POLICIES
-from sme_registry.io import refuse_existing
+from sme_registry.io import check_new
 from sme_registry.io.terminal import Progress, err, print_json
 from sme_registry.spec import (
     EnvFile,
@@ -128,7 +128,7 @@ def evaluate(
     name = FILE if isinstance(document, StreamSpec) else "evaluation.json"
     target = None if out_folder is None else out_folder / name
     if target is not None:
-        refuse_existing(target, force=force)
+        check_new(target, force=force)
     if isinstance(document, StreamSpec):
         report, draw = _on_stream(given, document, resolved)
     else:

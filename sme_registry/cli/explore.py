@@ -11,7 +11,7 @@ import typer
 from sme_registry.cli.arguments import ActionRange, Force, SpecChanges, changes, print_written
 from sme_registry.cli.diagnose import check_policy_options, load_subject
 from sme_registry.errors import OptionError, UnknownNameError
-from sme_registry.io import integer_in, refuse_existing
+from sme_registry.io import check_new, integer_in
 from sme_registry.spec import EnvFile, SMESpec, catalogue
 from sme_registry.task import load
 
@@ -126,7 +126,7 @@ def _target(
     if out is not None:
         if out.suffix != ".html":
             raise OptionError(f"--out {out}: must end in .html.")
-        return refuse_existing(out, force=force)
+        return check_new(out, force=force)
     if task is None and cell is None and Path(what).is_dir():
         from sme_registry.training import EXPLORER
 
@@ -135,7 +135,7 @@ def _target(
     label = "".join(c if c.isalnum() or c in "-_" else "-" for c in name.removesuffix(".json"))
     if cell is not None:
         label += f"-{cell[:12]}"
-    return refuse_existing(Path(f"{label}-explorer.html"), force=force)
+    return check_new(Path(f"{label}-explorer.html"), force=force)
 
 
 def _check_kind(task: str | None, set_: list[str] | None, what: str) -> None:

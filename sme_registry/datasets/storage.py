@@ -48,9 +48,9 @@ from sme_registry.errors import (
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.io import (
     build_folder,
+    check_writable,
     choice,
     read_json,
-    refuse_unwritable,
     to_json,
     versions,
     write_atomically,
@@ -301,7 +301,7 @@ def _check_target(target: Path, folder: Path, recipe: DatasetRecipe, force: bool
                 f"name: {folder / parent} is a data set, and Minari lists none inside another. "
                 "Give another namespace."
             )
-    refuse_unwritable(target)
+    check_writable(target)
     if not os.path.lexists(target):
         return
     if not force:

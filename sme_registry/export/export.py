@@ -24,7 +24,7 @@ from sme_registry.export import torch_modules
 from sme_registry.export.network import INPUT, Network
 from sme_registry.export.operators import FEED_FORWARD
 from sme_registry.export.shapes import fold_shapes, read_by
-from sme_registry.io import choice, refuse_unwritable, require_packages, write_atomically
+from sme_registry.io import check_writable, choice, require_packages, write_atomically
 from sme_registry.spec import ACTION_RANGES, ActionRange, SMESpec, SpecLike
 from sme_registry.task import load
 
@@ -71,7 +71,7 @@ def export_onnx(
     """
     if not os.fspath(path).endswith(".onnx"):
         raise OptionError(f"path={os.fspath(path)!r}: must end in .onnx.")
-    refuse_unwritable(path)
+    check_writable(path)
     data = onnx_bytes(policy, spec, action_range=action_range, vec_normalize=vec_normalize)
     written = write_atomically(path, data)
     refused = _refused_by_boards(data)

@@ -71,9 +71,9 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
     return path
 
 
-def refuse_existing(path: str | os.PathLike[str], *, force: bool = False) -> Path:
+def check_new(path: str | os.PathLike[str], *, force: bool = False) -> Path:
     """Return a path that a command is about to write; call it before the work, not after."""
-    path = refuse_unwritable(path)
+    path = check_writable(path)
     if os.path.lexists(path) and not force:
         raise OptionError(
             f"{path} already exists. Use --force to replace it (in Python, force=True)."
@@ -81,7 +81,7 @@ def refuse_existing(path: str | os.PathLike[str], *, force: bool = False) -> Pat
     return path
 
 
-def refuse_unwritable(path: str | os.PathLike[str]) -> Path:
+def check_writable(path: str | os.PathLike[str]) -> Path:
     """Return a path, of a file or a folder, whose parent folders can be created and written to."""
     path = Path(path)
     try:
@@ -115,15 +115,15 @@ def claim_folder(
             f"{folder}: contains other files, such as {others[0]!r}. Give an empty or a new folder."
         )
     if names:
-        refuse_existing(folder, force=force)
-    refuse_unwritable(folder / "run")
+        check_new(folder, force=force)
+    check_writable(folder / "run")
     return folder
 
 
 @contextlib.contextmanager
 def build_folder(target: str | os.PathLike[str], *, force: bool = False) -> Iterator[Path]:
     """A temporary folder, renamed to `target` if the block succeeds; otherwise nothing changes."""
-    target = refuse_existing(target, force=force)
+    target = check_new(target, force=force)
     building, replaced = temporary_beside(target), temporary_beside(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -133,7 +133,7 @@ def build_folder(target: str | os.PathLike[str], *, force: bool = False) -> Iter
     try:
         yield building
         _flush(building)
-        refuse_existing(target, force=force)
+        check_new(target, force=force)
         _replace(building, target, replaced)
         sync_folder(target.parent)
     except OSError as error:

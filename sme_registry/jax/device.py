@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sme_registry.errors import OptionError
-from sme_registry.io import available_memory, refuse_unwritable, require_packages
+from sme_registry.io import available_memory, check_writable, require_packages
 
 _COMPILED = "/jax/core/compile/backend_compile_duration"  # an event of JAX
 _compilations = 0
@@ -33,7 +33,7 @@ def prepare() -> None:
     if folder == "off" or "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     try:
-        refuse_unwritable(Path(folder) / "entry")
+        check_writable(Path(folder) / "entry")
     except OptionError:
         print(  # no warning: training hides those of libraries
             f"sme_registry: {folder} cannot be written, so each process compiles its programs of "

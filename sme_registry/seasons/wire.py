@@ -328,7 +328,7 @@ class StepFormat:
         """The number and the actions `[L, A]` in the body of `steps`; finite, not clipped."""
         _check_size("steps", data, self.request_bytes)
         actions = np.frombuffer(data, _FLOAT, offset=_NUMBER_BYTES)
-        _refuse_not_finite(actions)
+        _check_finite(actions)
         return _number_in(data), _native(actions.reshape(self.lanes, -1))
 
     def pack_steps(self, steps: StepsAnswer) -> bytes:
@@ -396,7 +396,7 @@ def unpack_table(data: bytes, columns: int, rows: int | None = None) -> Float32:
         raise WireError(f"array of shape {shape}: must be of shape {wanted}.")
     _check_size("array", data, start + size + _FLOAT.itemsize * shape[0] * shape[1])
     entries = np.frombuffer(data, _FLOAT, offset=start + size)
-    _refuse_not_finite(entries)
+    _check_finite(entries)
     return _native(entries.reshape(shape))
 
 
@@ -422,6 +422,6 @@ def _check_size(what: str, data: bytes, expected: int) -> None:
         raise WireError(f"{what}: has {len(data):,} bytes: must have {expected:,}.")
 
 
-def _refuse_not_finite(numbers: Float32) -> None:
+def _check_finite(numbers: Float32) -> None:
     if not np.isfinite(numbers).all():
         raise ActionError("array: has NaN or infinite entries. Give finite numbers.")

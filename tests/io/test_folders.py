@@ -9,16 +9,16 @@ import time
 import pytest
 
 from sme_registry.errors import OptionError, PolicyError
-from sme_registry.io import build_folder, claim_folder, file_lock, is_locked, refuse_existing
+from sme_registry.io import build_folder, check_new, claim_folder, file_lock, is_locked
 
 
 def test_an_existing_path_is_refused_without_force(tmp_path):
-    assert refuse_existing(tmp_path / "new") == tmp_path / "new"
+    assert check_new(tmp_path / "new") == tmp_path / "new"
     (tmp_path / "link").symlink_to(tmp_path / "nowhere")
     for path in (tmp_path, tmp_path / "link"):
         with pytest.raises(OptionError, match=r"already exists\. Use --force to replace it"):
-            refuse_existing(path)
-        assert refuse_existing(path, force=True) == path
+            check_new(path)
+        assert check_new(path, force=True) == path
 
 
 @pytest.mark.parametrize("place", ["file/evaluation.json", "file/a/b", "null\0"])
@@ -26,7 +26,7 @@ def test_a_path_that_cannot_be_written_is_refused_before_the_work(tmp_path, plac
     (tmp_path / "file").write_text("")
     path = tmp_path / place
     for check in (
-        refuse_existing,
+        check_new,
         lambda path: claim_folder(path, []),
         lambda path: build_folder(path).__enter__(),
     ):

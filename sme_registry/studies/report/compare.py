@@ -12,7 +12,7 @@ from pathlib import Path
 import pandas as pd
 
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
-from sme_registry.io import refuse_unwritable, to_json, write_atomically
+from sme_registry.io import check_writable, to_json, write_atomically
 from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.report.analysis import (
@@ -124,7 +124,7 @@ def write_comparison(
     from sme_registry.studies.report.figures.comparisons import draw_differences
     from sme_registry.studies.report.figures.curves import draw_class_curves
 
-    refuse_unwritable(Path(out) / "differences.csv")
+    check_writable(Path(out) / "differences.csv")
     table = compare(folder, first, second, metrics)
     contents: dict[str, str | bytes] = {
         "differences.csv": table.to_csv(index=False, lineterminator="\n"),

@@ -27,7 +27,7 @@ from markupsafe import Markup
 from sme_registry.diagnosis import load_cell
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.explorer import explorer_page, run_report
-from sme_registry.io import refuse_unwritable, to_json, write_atomically
+from sme_registry.io import check_writable, to_json, write_atomically
 from sme_registry.io.markup import environment, plural
 from sme_registry.io.terminal import duration
 from sme_registry.spec import StudyFile
@@ -109,7 +109,7 @@ def write_report(
             "`sme study run`, and check them with `sme study status`."
         )
     target = Path(folder) / REPORT if out is None else Path(out)
-    refuse_unwritable(target / "index.html")
+    check_writable(target / "index.html")
     failures = {key: failure.error for key, failure in ledger.failures(keys).items()}
     models = {key: path for key in results if (path := ledger.model_path(key)).exists()}
     analysis = analyse(file, results, failures, requested=requested(ledger, file))
