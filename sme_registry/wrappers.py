@@ -37,7 +37,7 @@ from sme_registry.envs.episodes import Episode, Episodes, info_of_lanes
 from sme_registry.errors import OptionError
 from sme_registry.io import check_new
 from sme_registry.spec import SMESpec
-from sme_registry.training.episodes import EpisodeLog
+from sme_registry.training.record import EpisodeLog
 
 try:
     from gymnasium.vector import VectorWrapper

@@ -2,6 +2,7 @@
 
 import io
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -20,10 +21,10 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sme_registry.export import export_onnx
 from sme_registry.sb3 import PPOLagrangian, PPOProjection, SMEVecEnv
-from sme_registry.sb3.regret_callback import episodes_of, finished_in
+from sme_registry.sb3.vec_env import episodes_of, finished_in
 from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.checks import check_task
 from sme_registry.training import numpy_policy
+from sme_registry.training.algorithms import find
 from sme_registry.training.models import load_checkpoint
 
 SPEC = SMESpec(state_dim=3, action_dim=2, horizon=20, safety={"tightness": 0.2}, seed=5)
@@ -152,6 +153,11 @@ def test_projected_actions_never_cost_anything(action_range):
     assert np.array_equal(policy.act(seen), actions)
 
 
+def test_a_model_that_an_older_version_saved_finds_its_policy():
+    saved = b"csme_registry.sb3.ppo_projection\nProjectedPolicy\n."  # as in the model's zip
+    assert pickle.loads(saved) is PPOProjection.policy_aliases["MlpPolicy"]
+
+
 def test_projected_actions_need_observations_that_show_the_state():
     for wrapper in (VecNormalize, lambda venv: VecFrameStack(venv, 2)):
         with pytest.raises(OptionError, match=r"must be those of the environment itself, Box\(0\."):
@@ -189,7 +195,7 @@ def test_a_task_without_limits_is_refused(algorithm, tmp_path):
             train(plain, algorithm=name, folder=tmp_path / "run")
     assert not (tmp_path / "run").exists()
     with pytest.raises(OptionError, match=f"^{algorithm}: needs a task with limits"):
-        check_task(cell(algorithm, spec=plain))
+        find(algorithm).check_task(plain)
 
 
 def test_hyperparameters_are_known_by_name_and_in_their_range():

@@ -3,7 +3,7 @@
 An allow-list; everything else is rejected with a stable code (`errors.CODES`):
 
     ModelProto → GraphProto → NodeProto → AttributeProto → TensorProto
-    one domain, one opset in 13 … 23, the operators of `sme_registry.export.operators`
+    one domain, one opset in 13 … 23, the operators of `sme_registry.export.FEED_FORWARD`
     one float32 input [batch, S + 2], one float32 output [batch, A]; for teams see `widths`
     dense tensors inside the file, whose data match their dimensions
 
@@ -28,7 +28,7 @@ from leaderboard.documents.submission import MAX_ARTEFACT_BYTES
 from leaderboard.errors import Rejection
 from sme_registry import SMESpec
 from sme_registry.evaluation import interface_of
-from sme_registry.export import operators
+from sme_registry.export import FEED_FORWARD
 
 IR_VERSIONS = range(4, 14)  # before 4 every tensor had to be an input, too
 OPSETS = range(13, 24)
@@ -48,7 +48,7 @@ _OPTIONAL_INPUTS = {
     "Slice": 3,
     "Split": 1,
     "Squeeze": 1,
-    **{name: 1 for name in operators.FEED_FORWARD if name.startswith("Reduce")},
+    **{name: 1 for name in FEED_FORWARD if name.startswith("Reduce")},
 }
 
 _ONNX_DOMAINS = (b"", b"ai.onnx")
@@ -166,7 +166,7 @@ class _Inspection:
                 "must be ONNX's own, ''",
                 _STANDARD,
             )
-        if operator not in operators.FEED_FORWARD:
+        if operator not in FEED_FORWARD:
             _refuse(
                 "onnx_op",
                 f"op_type={operator!r}",

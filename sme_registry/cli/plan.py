@@ -350,8 +350,8 @@ def plan(
       sme study plan smoke --folder runs/smoke --json
     """
     from sme_registry.studies.engine.budget import Estimator, Span, makespan, selected
-    from sme_registry.studies.engine.jobs import available_cores
     from sme_registry.studies.engine.ledger import Ledger
+    from sme_registry.studies.engine.queue import available_cores
 
     if plan is None:
         _list_plans(json)
@@ -470,26 +470,27 @@ def scaled_plan(
 
 def check_algorithms(algorithms: Iterable[StudyAlgorithm], errors: type[SMEError]) -> None:
     """Check a plan's algorithms; warn about those that cannot be found here by such an error."""
-    from sme_registry.studies.engine import checks
+    from sme_registry.training.algorithms import find
+    from sme_registry.training.hyperparameters import check_algorithm
 
     messages = []
     for algorithm in algorithms:
         try:
-            checks.find(algorithm.uses)
+            find(algorithm.uses).check_installed()
         except errors as error:
             unchecked = " Its hyperparameters are not checked." if algorithm.hyperparameters else ""
             messages.append(f"{error}{unchecked}")
         else:
-            checks.check_hyperparameters(algorithm)
+            check_algorithm(algorithm)
     for message in unique(messages):  # several algorithms may lack the same package
         err().print(f"[yellow]cannot run here:[/] {escape(message)}", soft_wrap=True)
 
 
 def warn_of_uneven_rollouts(plan: StudyPlan) -> None:
     """Print which rollouts do not end where the phases of streams do."""
-    from sme_registry.studies.engine import checks
+    from sme_registry.studies.engine.budget import uneven_rollouts
 
-    for uneven in checks.uneven_rollouts(plan):
+    for uneven in uneven_rollouts(plan):
         err().print(
             f"[yellow]uneven rollouts:[/] {escape(uneven.algorithm)} on "
             f"{escape(', '.join(uneven.streams))}: its rollouts of {uneven.n_steps:,} steps do not "

@@ -32,7 +32,7 @@ from sme_registry.io.terminal import duration_range, err, out, print_json
 from sme_registry.spec import StudyFile, catalogue
 
 if TYPE_CHECKING:
-    from sme_registry.studies.engine.status import CellStatus, State, StudyStatus
+    from sme_registry.studies.engine.ledger import CellStatus, State, StudyStatus
 
 
 _FAILURES_SHOWN = 20
@@ -177,7 +177,7 @@ def status(
 
       sme study status runs/all --only "class=k-*" --json
     """
-    from sme_registry.studies.engine.status import study_status
+    from sme_registry.studies.engine.ledger import study_status
 
     def scale(file: StudyFile) -> StudyFile:
         return scaled_plan(file, steps, seeds, evaluations)
@@ -234,8 +234,8 @@ def print_status(status: StudyStatus, json: bool) -> None:
     if json:
         print_json(status.to_dict())
         return
-    from sme_registry.studies.engine.jobs import available_cores
-    from sme_registry.studies.engine.status import STATES
+    from sme_registry.studies.engine.ledger import STATES
+    from sme_registry.studies.engine.queue import available_cores
 
     algorithms = unique(cell.planned.algorithm for cell in status.places)
     title = f"[bold]{status.file.versioned_name}[/] in {escape(str(status.folder))}"
@@ -268,8 +268,7 @@ def print_status(status: StudyStatus, json: bool) -> None:
 
 
 def _print_failure(status: StudyStatus, cell: CellStatus) -> None:
-    from sme_registry.studies.engine.ledger import Ledger
-    from sme_registry.studies.engine.status import label
+    from sme_registry.studies.engine.ledger import Ledger, label
 
     failure = cell.failure
     if failure is None:

@@ -36,8 +36,8 @@ from sme_registry.plots.streams import FILE
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.study import INDEPENDENT, Cell, in_jax
 from sme_registry.task.draw import Array
-from sme_registry.training import Episode, RunRecord, lives
-from sme_registry.training import episodes as episode_files
+from sme_registry.training import Episode, RunRecord
+from sme_registry.training import record as run_files
 from sme_registry.training.algorithms import find
 from sme_registry.training.hyperparameters import parameters_of
 from sme_registry.training.numpy_policy import numpy_policy
@@ -124,7 +124,7 @@ def load_policy(
     if isinstance(policy, str | Path) and str(policy).endswith(".zip"):
         policy, name = load_sb3(policy), name or Path(policy).stem
     act = numpy_policy(policy, spec, action_range=action_range)
-    episodes = None if log is None else _log_of(episode_files.read_episodes(Path(log)))
+    episodes = None if log is None else _log_of(run_files.read_episodes(Path(log)))
     explore = networks.exploration(policy, act)
     return Subject(name or act.name, spec, act, log=episodes, explore=explore)
 
@@ -160,7 +160,7 @@ def load_run(folder: str | Path) -> AnySubject:
         return Subject(name, spec, team, plan, checkpoint_step=checkpoint_step, updates=updates)
     model = load_sb3(path)
     policy = numpy_policy(model, record.spec, action_range=action_range)
-    log = _episode_log(folder / episode_files.FILE)
+    log = _episode_log(folder / run_files.EPISODES)
     explore = networks.exploration(model, policy)
     return Subject(name, spec, policy, plan, log, explore, checkpoint_step, updates)
 
@@ -284,7 +284,7 @@ def _read_cell(path: Path) -> tuple[Cell, Log | None]:
 def _cell_model(study: Path, stem: str, cell: Cell) -> Any:
     if cell.uses.startswith("reference:"):
         return reference_policy(cell.uses.partition(":")[2], cell.spec)
-    path = lives.model_of_cell(study, stem)
+    path = run_files.model_of_cell(study, stem)
     if not path.exists():
         raise OptionError(
             f"cell={stem[:12]!r}: its model was not kept. Finished cells are not run again, so run "
@@ -299,7 +299,7 @@ def _example_key(study: Path) -> str:
 
 
 def _episode_log(path: Path) -> Log | None:
-    return _log_of(episode_files.read_episodes(path)) if path.exists() else None
+    return _log_of(run_files.read_episodes(path)) if path.exists() else None
 
 
 def _log_of(rows: list[Episode]) -> Log | None:
@@ -312,7 +312,7 @@ def _log_of(rows: list[Episode]) -> Log | None:
 def _life_of_run(folder: Path, name: str, record: RunRecord, plan: dict[str, Any]) -> StreamSubject:
     """The life of a run of `sme train`."""
     assert record.stream is not None  # of a life
-    kept = lives.Snapshots(folder / lives.FOLDER, record.stream)
+    kept = run_files.Snapshots(folder / run_files.SNAPSHOTS, record.stream)
     path = folder / FILE
     if not path.exists():
         raise OptionError(
@@ -322,8 +322,8 @@ def _life_of_run(folder: Path, name: str, record: RunRecord, plan: dict[str, Any
     missing = [file.name for file in (kept.initial, *kept.visits) if not file.exists()]
     if missing:
         raise OptionError(
-            f"run={str(folder)!r}: {lives.FOLDER}/ lacks {missing[0]}. Copy the whole folder "
-            "of the run, or train it again with --force."
+            f"run={str(folder)!r}: {run_files.SNAPSHOTS}/ lacks {missing[0]}. Copy the whole "
+            "folder of the run, or train it again with --force."
         )
     report = StreamReport.read(path)
     if report.stream_digest != record.stream_digest:
@@ -352,11 +352,11 @@ def _life_in_cell(
     fresh = [path.with_stem(_stem(other)) for other in cell.fresh]
     if fresh and all(result.exists() for result in fresh):
         report = _with_fresh(report, fresh)
-    kept = lives.Snapshots(lives.folder_of_cell(study, path.stem), cell.stream)
+    kept = run_files.Snapshots(run_files.folder_of_cell(study, path.stem), cell.stream)
     of_visits = _kept(kept.visits, cell.stream, cell.action_range)
     initial = _kept([kept.initial], cell.stream, cell.action_range)
     alone = [
-        _kept([lives.model_of_cell(study, other.digest)], other.document, cell.action_range)
+        _kept([run_files.model_of_cell(study, other.digest)], other.document, cell.action_range)
         for other in cell.fresh
     ]
     return StreamSubject(

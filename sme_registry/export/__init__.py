@@ -9,9 +9,26 @@ if TYPE_CHECKING:
 
 __all__ = ["export_onnx", "onnx_bytes"]
 
+_NAMES = """
+    Abs Acos Acosh Add And ArgMax ArgMin Asin Asinh Atan Atanh BatchNormalization Cast Ceil Celu
+    Clip Concat Constant Cos Cosh Div Elu Equal Erf Exp Flatten Floor Gather GatherElements Gelu
+    Gemm Greater GreaterOrEqual HardSigmoid HardSwish Identity LayerNormalization LeakyRelu Less
+    LessOrEqual Log LogSoftmax MatMul Max Mean Min Mish Mod Mul Neg Not Or PRelu Pow
+    RMSNormalization Reciprocal ReduceL1 ReduceL2 ReduceLogSumExp ReduceMax ReduceMean ReduceMin
+    ReduceProd ReduceSum ReduceSumSquare Relu Reshape Round Selu Sigmoid Sign Sin Sinh Slice Softmax
+    Softplus Softsign Split Sqrt Squeeze Sub Sum Tan Tanh ThresholdedRelu Transpose Unsqueeze Where
+    Xor
+"""
+FEED_FORWARD = frozenset(_NAMES.split())
+"""The operators of feed-forward networks, the only ones that boards accept.
+
+They map rows to rows with weights. Excluded: randomness, loops and branches, sequences, text, and
+arrays whose size is a number in the model, as of ConstantOfShape or Tile.
+"""
+
 
 def __getattr__(name: str) -> Any:
-    if name in __all__:  # a leaderboard needs only the list of operators
+    if name in __all__:  # a leaderboard needs only the operators
         from sme_registry.export import export
 
         return getattr(export, name)

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sme_registry.spec.study import sweep
     from sme_registry.studies.engine.cell import run_cell
+    from sme_registry.studies.engine.ledger import CellStatus, StudyStatus, study_status
     from sme_registry.studies.engine.result import CellResult
     from sme_registry.studies.engine.runner import run_study
-    from sme_registry.studies.engine.status import CellStatus, StudyStatus, study_status
     from sme_registry.studies.report.compare import compare, write_comparison
     from sme_registry.studies.report.frames import StreamFrames, StudyFrames, load, load_streams
     from sme_registry.studies.report.write import write_report
@@ -42,16 +42,16 @@ __all__ = [
 
 _LAZY = {
     "CellResult": "studies.engine.result",
-    "CellStatus": "studies.engine.status",
+    "CellStatus": "studies.engine.ledger",
     "StreamFrames": "studies.report.frames",
     "StudyFrames": "studies.report.frames",
-    "StudyStatus": "studies.engine.status",
+    "StudyStatus": "studies.engine.ledger",
     "compare": "studies.report.compare",
     "load": "studies.report.frames",
     "load_streams": "studies.report.frames",
     "run_cell": "studies.engine.cell",
     "run_study": "studies.engine.runner",
-    "study_status": "studies.engine.status",
+    "study_status": "studies.engine.ledger",
     "sweep": "spec.study",
     "write_comparison": "studies.report.compare",
     "write_report": "studies.report.write",

@@ -15,15 +15,13 @@ from sme_registry.training.algorithms import (
     full_name,
     short_name,
 )
-from sme_registry.training.episodes import read_episodes
 from sme_registry.training.hyperparameters import (
     check_hyperparameters,
     nested_hyperparameters,
     read_hyperparameters,
 )
-from sme_registry.training.lives import model_of_cell
 from sme_registry.training.numpy_policy import numpy_policy
-from sme_registry.training.record import RunRecord
+from sme_registry.training.record import RunRecord, model_of_cell, read_episodes
 from sme_registry.training.run import DEFAULT_STEPS, EXPLORER, TrainingResult, train
 
 __all__ = [

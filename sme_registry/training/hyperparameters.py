@@ -13,9 +13,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from sme_registry.datasets.offline import check_algorithm
+from sme_registry.datasets import offline
 from sme_registry.errors import OptionError, did_you_mean
 from sme_registry.io import import_object, read_json
+from sme_registry.spec import StudyAlgorithm
 from sme_registry.training.algorithms import find, is_sb3
 
 # Arguments of an algorithm's constructor that are not hyperparameters.
@@ -99,7 +100,7 @@ def check_hyperparameters(
         )
     if entry.kind == "offline":
         own = {name: hyperparameters[name] for name in hyperparameters if name not in OF_DATA_SET}
-        check_algorithm(entry.name, own)
+        offline.check_algorithm(entry.name, own)
     elif entry.kind == "jax":
         from sme_registry.jax.run import settings_of
 
@@ -108,6 +109,12 @@ def check_hyperparameters(
         settings_of(uses, hyperparameters, field)
     else:
         refuse_unknown(entry.load(), uses, hyperparameters, field, others)
+
+
+def check_algorithm(algorithm: StudyAlgorithm) -> None:
+    """Check that an algorithm of a plan has hyperparameters of these names."""
+    field = f"algorithm {algorithm.name!r}: hyperparameters"
+    check_hyperparameters(algorithm.uses, algorithm.hyperparameters, field)
 
 
 def refuse_unknown(

@@ -22,12 +22,17 @@ from sme_registry.io import is_installed, read_arrays, write_arrays, write_atomi
 from sme_registry.io.system import defer_interrupts
 from sme_registry.jax import run as jax_run
 from sme_registry.jax.program import Program, StepLog
-from sme_registry.sb3.regret_callback import log_episode
+from sme_registry.sb3.vec_env import log_episode
 from sme_registry.training.learn import RunLog, not_finite
-from sme_registry.training.lives import FOLDER as SNAPSHOTS
-from sme_registry.training.lives import Snapshots
 from sme_registry.training.models import new_sb3_model, set_weights, unloadable
-from sme_registry.training.record import CHECKPOINT, MODEL, TENSORBOARD, RunRecord
+from sme_registry.training.record import (
+    CHECKPOINT,
+    MODEL,
+    SNAPSHOTS,
+    TENSORBOARD,
+    RunRecord,
+    Snapshots,
+)
 
 _PIECE = 100  # steps between two reports of progress, and the longest wait for Ctrl-C
 _EPISODE = "episode"  # of the checkpoint: the sums of the present episode

@@ -26,16 +26,23 @@ from sme_registry.io import is_installed, write_atomically
 from sme_registry.io.system import defer_interrupts
 from sme_registry.io.terminal import Progress
 from sme_registry.sb3 import SMETeamVecEnv, SMEVecEnv
-from sme_registry.sb3.regret_callback import finished_in, log_episode
-from sme_registry.training import episodes as episode_files
+from sme_registry.sb3.vec_env import finished_in, log_episode
 from sme_registry.training.algorithms import is_sb3, short_name, silence
-from sme_registry.training.episodes import EpisodeLog
 from sme_registry.training.learners import CountedVecEnv, IndependentModels
-from sme_registry.training.lives import FOLDER as SNAPSHOTS
-from sme_registry.training.lives import Snapshots, VisitEnds
 from sme_registry.training.models import load_checkpoint, save_checkpoint
 from sme_registry.training.models import new_model as new_sb3_model
-from sme_registry.training.record import CHECKPOINT, MODEL, MODELS, TENSORBOARD, RunRecord
+from sme_registry.training.record import (
+    CHECKPOINT,
+    EPISODES,
+    MODEL,
+    MODELS,
+    SNAPSHOTS,
+    TENSORBOARD,
+    EpisodeLog,
+    RunRecord,
+    Snapshots,
+    VisitEnds,
+)
 
 _RECENT = 20  # episodes in the running mean that the progress shows
 
@@ -183,7 +190,7 @@ class RunLog:
         team = record.spec.team
         names = () if team is None else tuple(agent.name for agent in team.agents)
         self._record, self._folder = record, folder
-        self._log = EpisodeLog(folder / episode_files.FILE, first_step, names)
+        self._log = EpisodeLog(folder / EPISODES, first_step, names)
         self._wall_before = self.episodes[-1].wall_seconds if self.episodes else 0.0
         self._last_checkpoint = first_step
         self.sums = Episodes(

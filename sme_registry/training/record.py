@@ -1,8 +1,27 @@
-"""`run.json`: the plan of a training run, its versions and its progress."""
+"""The files of a training run.
+
+`run.json` (`RunRecord`) has its plan, versions and progress. `episodes.csv` (`EpisodeLog`) has a
+row for each finished episode, written as soon as it ends; that of a team has one more column for
+each agent, `regret/<agent>`, and that of a task with `safety` has `cost`, `violating_share` and
+`safe_regret`. Of a life in a stream, `Snapshots` are its models at the ends of its visits:
+
+    initial.zip       the model before training
+    visit-00.zip      at the end of visit 0, and so on; the last one is the trained model
+
+Visits count from 0, in as many digits as the last one has, at least two. The policy at the end of a
+visit has learned from all that the learner collected in it: with TD3 and SAC up to the update that
+follows its last step, with PPO up to that of the last rollout that was over by then. So it is the
+policy at the first step of the next visit, before any update that follows that step. The last visit
+ends with the training, since the last phase goes on: PPO finishes its last rollout in it.
+`jax.run.run` has the same rule.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
 import re
+from collections.abc import Callable, Sequence
 from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,7 +34,9 @@ from pydantic import (
     model_serializer,
 )
 
+from sme_registry.envs.episodes import Episode, EpisodeSafety
 from sme_registry.errors import OptionError
+from sme_registry.evaluation.models import saved_sb3
 from sme_registry.io import read_json, to_json, versions, write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
 from sme_registry.spec.document import Integer, Real, StrictModel, without_empty
@@ -23,8 +44,11 @@ from sme_registry.spec.study import INDEPENDENT, in_jax
 
 RECORD = "run.json"
 MODEL, MODELS = "model.zip", "model"  # a folder of one model for each independent agent
+EPISODES = "episodes.csv"
+SNAPSHOTS = "snapshots"  # the folder of `Snapshots`
 TENSORBOARD = "tensorboard"
 CHECKPOINT = "checkpoint.zip"
+MODELS_OF_STUDY = "models"
 PACKAGES = ("gymnasium", "numpy", "scipy", "numba", "stable_baselines3", "torch")
 
 
@@ -178,3 +202,148 @@ def _difference(one: RunRecord, other: RunRecord) -> str:
     different = [f"phases.{index}" for index, (a, b) in enumerate(phases) if a != b]
     different += [name for name in before if before[name] != now[name]]
     return f" ({different[0]} differs)"
+
+
+_AGENT_PREFIX = "regret/"
+
+
+COLUMNS = Episode._fields[:-2]
+SAFETY = EpisodeSafety._fields
+_TYPES = (int, int, float, int, float, float, int, float)
+
+
+def read_episodes(path: Path) -> list[Episode]:
+    """All complete rows; one that was cut off by a kill is skipped.
+
+    Examples:
+      >>> from pathlib import Path
+      >>> from sme_registry.training import read_episodes
+      >>> read_episodes(Path("runs/ppo/episodes.csv"))[0].length
+      100
+    """
+    try:
+        rows = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"))))
+    except (OSError, UnicodeDecodeError) as error:
+        raise OptionError(f"{path}: cannot be read: {error}. Give an episodes.csv.") from None
+    head = rows[0] if rows else []
+    columns, others = tuple(head[: len(COLUMNS)]), tuple(head[len(COLUMNS) :])
+    by_agent = all(column.startswith(_AGENT_PREFIX) for column in others)
+    if columns != COLUMNS or not (by_agent or others == SAFETY):
+        raise OptionError(
+            f"{path}: the columns must be {','.join(COLUMNS)}, and for a team "
+            f"{_AGENT_PREFIX}<agent>, or for a task with safety {','.join(SAFETY)}."
+        )
+    episodes = []
+    for row in rows[1:]:
+        try:
+            kinds = zip(_TYPES + (float,) * len(others), row, strict=True)
+            values = [kind(text) for kind, text in kinds]
+        except ValueError:  # a number or a column is missing
+            break
+        own, rest = values[: len(COLUMNS)], tuple(values[len(COLUMNS) :])
+        episode = Episode._make((*own, (), EpisodeSafety(*rest) if others == SAFETY else None))
+        episodes.append(episode._replace(agents_regret=rest) if by_agent else episode)
+    return episodes
+
+
+class EpisodeLog:
+    """Appends rows and flushes each, so that a killed run keeps all finished episodes."""
+
+    def __init__(self, path: Path, up_to_step: int = 0, agents: Sequence[str] = ()) -> None:
+        self.agents = agents
+        kept = read_episodes(path) if up_to_step and path.exists() else []
+        self.episodes = [episode for episode in kept if episode.step <= up_to_step]
+        self._path = path
+        self._write()
+
+    def _write(self) -> None:
+        """Write the head and the rows so far, and open the file for more."""
+        text = io.StringIO()
+        safety = SAFETY if self.episodes and self.episodes[0].safety is not None else ()
+        head = [*COLUMNS, *safety, *(f"{_AGENT_PREFIX}{agent}" for agent in self.agents)]
+        csv.writer(text, lineterminator="\n").writerows([head, *map(_row, self.episodes)])
+        write_atomically(self._path, text.getvalue())
+        self._stream = self._path.open("a", encoding="utf-8", newline="")
+        self._writer = csv.writer(self._stream, lineterminator="\n")
+
+    def add(self, episode: Episode) -> None:
+        """Append one row."""
+        self.episodes.append(episode)
+        if len(self.episodes) == 1 and episode.safety is not None:  # which has columns of its own
+            self.close()
+            self._write()
+            return
+        self._writer.writerow(_row(episode))
+        self._stream.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._stream.close()
+
+
+def _row(episode: Episode) -> list[int | str]:
+    *values, agents, safety = episode
+    row = (*values, *(safety or ()), *agents)
+    return [format(v, ".9g") if isinstance(v, float) else v for v in row]
+
+
+def model_of_cell(study: Path, key: str) -> Path:
+    """Where a study keeps the trained model of a cell.
+
+    Args:
+      study: its folder.
+      key: the cell's digest.
+
+    Examples:
+      >>> from pathlib import Path
+      >>> from sme_registry.training import model_of_cell
+      >>> model_of_cell(Path("study"), "66e9b7a9a266").suffix
+      '.zip'
+    """
+    return study / MODELS_OF_STUDY / f"{key.removeprefix('sha256:')}.zip"
+
+
+def folder_of_cell(study: Path, key: str) -> Path:
+    """The folder for the `Snapshots` of a cell that is a life; the arguments as above."""
+    return model_of_cell(study, key).with_suffix("")
+
+
+class Snapshots:
+    """The files of a life's models in a folder."""
+
+    def __init__(self, folder: Path, stream: StreamSpec) -> None:
+        count = stream.visits
+        digits = max(2, len(str(count - 1)))
+        self.initial = folder / "initial.zip"
+        self.visits = [folder / f"visit-{visit:0{digits}}.zip" for visit in range(count)]
+
+    def write_initial(self, model: Any) -> None:
+        """Write a model of Stable-Baselines3 before training; OptionError if that fails."""
+        write_atomically(self.initial, saved_sb3(model))
+
+    def write(self, visit: int, model: Any) -> None:
+        """Write the model at the end of a visit; OptionError if that fails."""
+        write_atomically(self.visits[visit], saved_sb3(model))
+
+
+class VisitEnds:
+    """Calls a function at the end of each visit, while steps are counted."""
+
+    def __init__(
+        self, stream: StreamSpec, on_visit: Callable[[int], object], steps: int = 0
+    ) -> None:
+        *upcoming, self._last = stream.visit_ends()
+        self._upcoming = [(visit, end) for visit, end in upcoming if end >= steps]
+        self._on_visit = on_visit
+
+    def after_step(self, steps: int) -> None:
+        """Count a step; `steps` are all that were taken, and the learner has not learned since."""
+        while self._upcoming and self._upcoming[0][1] < steps:
+            self._on_visit(self._upcoming.pop(0)[0])
+
+    def finish(self, steps: int) -> None:
+        """End the visits that are over when training ends, after its last update."""
+        self.after_step(steps + 1)
+        visit, end = self._last
+        if end <= steps:
+            self._on_visit(visit)

@@ -27,11 +27,8 @@ from sme_registry.io.terminal import Progress
 from sme_registry.plots import files as plot_files
 from sme_registry.plots.streams import FILE as STREAM
 from sme_registry.spec import StreamSpec
-from sme_registry.training import episodes as episode_files
-from sme_registry.training import lives
 from sme_registry.training.algorithms import short_name
-from sme_registry.training.episodes import read_episodes
-from sme_registry.training.record import RunRecord
+from sme_registry.training.record import EPISODES, SNAPSHOTS, RunRecord, Snapshots, read_episodes
 
 EVALUATION = "evaluation.json"
 FILES = (EVALUATION, STREAM, *plot_files.FILES)
@@ -71,7 +68,7 @@ def write_report(
 def _evaluate_life(
     record: RunRecord, stream: StreamSpec, folder: Path, on_batch: OnBatch
 ) -> StreamReport:
-    files = lives.Snapshots(folder / lives.FOLDER, stream)
+    files = Snapshots(folder / SNAPSHOTS, stream)
     report = evaluate_stream(
         files.visits,
         stream,
@@ -81,7 +78,7 @@ def _evaluate_life(
         name=short_name(record.algorithm),
         progress=on_batch,
     )
-    episodes = read_episodes(folder / episode_files.FILE)  # rounded alike in every session
+    episodes = read_episodes(folder / EPISODES)  # rounded alike in every session
     if not episodes:
         return report
     step, regret, length = zip(*((e.step, e.regret, e.length) for e in episodes), strict=True)
@@ -103,9 +100,7 @@ def _draw(
         title = f"{report.policy} on {report.title}"
         visits = report.visits if isinstance(report, StreamReport) else ()
         costs = episodes[0].safety is not None
-        figures += plot_files.write_training(
-            folder / episode_files.FILE, folder, title, visits, costs
-        )
+        figures += plot_files.write_training(folder / EPISODES, folder, title, visits, costs)
     if isinstance(report, StreamReport):
         return (*figures, *plot_files.write_stream(report, folder))
     return (*figures, *plot_files.write_evaluation(report, folder, model))

@@ -48,7 +48,6 @@ from sme_registry.spec import (
 )
 from sme_registry.spec.study import in_jax
 from sme_registry.task import load, materialize, materialize_stream
-from sme_registry.training import episodes as episode_files
 from sme_registry.training import reports
 from sme_registry.training.algorithms import (
     default_algorithm,
@@ -60,12 +59,13 @@ from sme_registry.training.algorithms import (
     require_sb3,
 )
 from sme_registry.training.hyperparameters import for_lanes, nested_hyperparameters, refuse_unknown
-from sme_registry.training.lives import FOLDER as SNAPSHOTS
 from sme_registry.training.record import (
     CHECKPOINT,
+    EPISODES,
     MODEL,
     MODELS,
     RECORD,
+    SNAPSHOTS,
     TENSORBOARD,
     RunRecord,
     versions_for,
@@ -74,7 +74,7 @@ from sme_registry.training.record import (
 REPORT = "report.md"  # written by `sme demo`
 EXPLORER = "explorer.html"  # written by `sme train` and `sme explore`
 _FILES = (
-    RECORD, episode_files.FILE, CHECKPOINT, MODEL, MODELS, SNAPSHOTS, *reports.FILES,
+    RECORD, EPISODES, CHECKPOINT, MODEL, MODELS, SNAPSHOTS, *reports.FILES,
     REPORT, EXPLORER, TENSORBOARD,
 )  # fmt: skip
 

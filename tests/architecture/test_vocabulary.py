@@ -68,12 +68,12 @@ def columns():
     """The columns of numbers in episodes.csv and in a study's data frames."""
     pytest.importorskip("pandas")
     from sme_registry.studies.report.frames import stream_frames, study_frames
-    from sme_registry.training import episodes
+    from sme_registry.training.record import COLUMNS
 
     frames = [*study_frames(catalogue.entries(StudyFile)[0].plan, {}), *stream_frames([])]
     numeric = {name for frame in frames for name in frame.select_dtypes("number").columns}
     assert {"normalised_regret", "episode_return"} < numeric
-    return numeric | set(episodes.COLUMNS)
+    return numeric | set(COLUMNS)
 
 
 def test_every_column_of_numbers_has_the_name_of_its_quantity():

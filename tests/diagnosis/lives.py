@@ -7,8 +7,9 @@ from sme_registry.diagnosis import StreamSubject, diagnose
 from sme_registry.evaluation import dynamic_regret, evaluate_stream, resolve_protocol
 from sme_registry.evaluation.networks import Perceptron
 from sme_registry.evaluation.references import reference_policy
-from sme_registry.training import RunRecord, lives
+from sme_registry.training import RunRecord
 from sme_registry.training.models import new_sb3_model
+from sme_registry.training.record import SNAPSHOTS, Snapshots
 
 SPEC = SMESpec(state_dim=3, action_dim=2, hidden_width=8, horizon=10, complexity=2)
 PROTOCOL = {"states_per_region": 64, "epsilons": [0.5]}
@@ -68,7 +69,7 @@ def write_run(folder, stream, uses):
     """A finished run of `sme train` whose models did not learn; returns these, by visit."""
     visits = stream.cycles * len(stream.phases)
     models = [model_of(uses, stream, seed) for seed in range(visits + 1)]
-    kept = lives.Snapshots(folder / lives.FOLDER, stream)
+    kept = Snapshots(folder / SNAPSHOTS, stream)
     kept.write_initial(models[visits])
     for visit in range(visits):
         kept.write(visit, models[visit])

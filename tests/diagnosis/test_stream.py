@@ -36,7 +36,7 @@ from sme_registry.spec.study import Cell
 from sme_registry.studies import run_study
 from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing
 from sme_registry.training import train
-from sme_registry.training.lives import Snapshots
+from sme_registry.training.record import Snapshots
 from tests.commands import good, refused
 from tests.diagnosis.lives import (
     PROTOCOL,

@@ -16,7 +16,7 @@ from sme_registry.explorer import FILE, facts, run_report, write_explorer
 from sme_registry.explorer.page import json_in_html
 from sme_registry.task import streams
 from sme_registry.training import Episode, RunRecord
-from sme_registry.training.episodes import EpisodeLog
+from sme_registry.training.record import EpisodeLog
 from tests.commands import good, refused
 from tests.explorer.networks import fitted, offline
 

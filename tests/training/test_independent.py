@@ -6,7 +6,7 @@ import pytest
 from sme_registry import EvaluationReport, SMESpec, evaluate
 from sme_registry.errors import OptionError
 from sme_registry.training import train
-from sme_registry.training.episodes import read_episodes
+from sme_registry.training.record import read_episodes
 from tests.training.runs import PROTOCOL, TINY, copy_files
 from tests.training.test_team_runs import TEAM
 

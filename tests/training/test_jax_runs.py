@@ -26,9 +26,8 @@ from sme_registry.export import export_onnx
 from sme_registry.io import read_arrays, write_arrays
 from sme_registry.jax.run import new_program
 from sme_registry.training import RunRecord, jax_learn, train
-from sme_registry.training.episodes import read_episodes
 from sme_registry.training.models import new_sb3_model, set_weights
-from sme_registry.training.record import CHECKPOINT
+from sme_registry.training.record import CHECKPOINT, read_episodes
 from tests.training.runs import NARROW, PROTOCOL, TINY
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")

@@ -9,8 +9,7 @@ from sme_registry import SMESpec, StreamSpec
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.evaluation import StreamReport, evaluate_stream, load_sb3
 from sme_registry.training import RunRecord, learn, train
-from sme_registry.training.episodes import read_episodes
-from sme_registry.training.lives import VisitEnds
+from sme_registry.training.record import VisitEnds, read_episodes
 from tests.training.runs import PROTOCOL, TINY
 
 pytest.importorskip("stable_baselines3")

@@ -18,20 +18,21 @@ own digest and name. The selection of the cells to run now is not: `selected` wo
 from __future__ import annotations
 
 import heapq
+import math
 import statistics
 import time
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
-from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
+from sme_registry.errors import OptionError, SMEError, UnknownNameError, did_you_mean
 from sme_registry.io import choice
-from sme_registry.spec import Cell, PlannedCell, SMESpec, StudyFile, StudyPlan
+from sme_registry.spec import Cell, PlannedCell, SMESpec, StudyAlgorithm, StudyFile, StudyPlan
 from sme_registry.spec.study import INDEPENDENT, JAX, OFFLINE, REFERENCE, in_jax
-from sme_registry.studies.engine.jobs import Job
 from sme_registry.studies.engine.result import CellResult
-from sme_registry.training.algorithms import AGENTS
+from sme_registry.training.algorithms import AGENTS, find, is_on_policy
+from sme_registry.training.hyperparameters import parameters_of
 
 # Seconds of one training step with default hyperparameters: on a fast core, and the slowest
 # measured. Other algorithms may be as fast as PPO or as slow as SAC.
@@ -126,17 +127,17 @@ class Paces:
         """Learn from a finished cell and its share of its job's wall time."""
         self._estimator.observe(result, seconds)
 
-    def report(self, job: Job, share: float, compilations: int) -> None:
-        """A job has done this share of its steps."""
-        first, now = job.cells[0], time.monotonic()
+    def report(self, cells: Sequence[Cell], share: float, compilations: int) -> None:
+        """The cells of a job have done this share of their steps."""
+        first, now = cells[0], time.monotonic()
         then, before, compiled = self._first_reports.get(first.digest, (now, share, -1))
         if compilations != compiled:
             then, before = now, share
             self._first_reports[first.digest] = (now, share, compilations)
         if share - before >= _SHARE_FOR_A_PACE:  # a program may go on from far beyond its start
-            measured = (now - then) / (share - before) / len(job.cells)
+            measured = (now - then) / (share - before) / len(cells)
             self._paces[first.uses] = 2 * measured / sum(self._estimator.seconds(first))
-        self._shares |= {cell.digest: share for cell in job.cells}
+        self._shares |= {cell.digest: share for cell in cells}
 
     def seconds_left(self, jobs: Iterable[Sequence[Cell]], workers: int) -> float:
         """Seconds to the end of the cells of running jobs and of those that wait."""
@@ -277,3 +278,50 @@ def selected(cells: Iterable[PlannedCell], only: Sequence[str] = ()) -> tuple[Pl
         for cell in cells
         if all(_KINDS[kind](cell) in names for kind, names in matching.items())
     )
+
+
+class UnevenRollouts(NamedTuple):
+    """An on-policy algorithm whose rollouts do not end where phases of streams do.
+
+    Its policy at the end of a visit has learned from fewer steps than a fresh agent's, which counts
+    as lost plasticity; `better` is the longest shorter rollout that ends where all phases do.
+    """
+
+    algorithm: str
+    n_steps: int
+    streams: tuple[str, ...]
+    better: int
+
+
+def uneven_rollouts(plan: StudyPlan) -> list[UnevenRollouts]:
+    """The algorithms of a plan that can be found here and learn from such rollouts."""
+    uneven = []
+    for algorithm in plan.algorithms if plan.streams else ():
+        try:
+            n = _rollout_steps(algorithm)
+        except SMEError:
+            continue
+        phases = {
+            member.name: math.gcd(*(phase.steps for phase in member.stream.phases))
+            for member in plan.streams
+        }
+        uneven_on = tuple(name for name, steps in phases.items() if steps % n)
+        if uneven_on:
+            together = math.gcd(*phases.values())
+            better = max(m for m in range(1, min(n, together) + 1) if together % m == 0)
+            uneven.append(UnevenRollouts(algorithm.name, n, uneven_on, better))
+    return uneven
+
+
+def _rollout_steps(algorithm: StudyAlgorithm) -> int:
+    """Steps between two updates of an on-policy algorithm; 1 for any other."""
+    uses, chosen = algorithm.uses, algorithm.hyperparameters
+    if in_jax(uses):
+        from sme_registry.jax.run import settings_of
+
+        return int(getattr(settings_of(uses, chosen), "n_steps", 1))
+    learner = find(uses).load()
+    if not is_on_policy(learner):
+        return 1
+    parameter = parameters_of(learner).get("n_steps")
+    return 1 if parameter is None else int(cast(Any, chosen.get("n_steps", parameter.default)))

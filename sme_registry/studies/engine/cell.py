@@ -33,14 +33,22 @@ from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import write_atomically
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.study import Cell
-from sme_registry.studies.engine.jobs import Lanes
 from sme_registry.studies.engine.lanes import run_lanes
-from sme_registry.studies.engine.record import EVALUATION, TRAINING, Record, life_report
-from sme_registry.studies.engine.result import CellResult, LearningCurve, OfflineResult, Timing
+from sme_registry.studies.engine.queue import Lanes
+from sme_registry.studies.engine.result import (
+    EVALUATION,
+    TRAINING,
+    CellResult,
+    LearningCurve,
+    OfflineResult,
+    Record,
+    Timing,
+    life_report,
+)
 from sme_registry.task import Task, materialize, materialize_stream
 from sme_registry.training.algorithms import find, one_thread, quiet
 from sme_registry.training.hyperparameters import check_hyperparameters
-from sme_registry.training.lives import Snapshots, VisitEnds
+from sme_registry.training.record import Snapshots, VisitEnds
 
 ReportSteps = Callable[[int, int], None]
 

@@ -19,7 +19,7 @@ import time
 import traceback
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from multiprocessing import connection
@@ -31,9 +31,9 @@ from sme_registry.io import require_packages
 from sme_registry.io.system import block_interrupts, defer_interrupts, end_with_parent
 from sme_registry.spec import Cell
 from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.jobs import CPU, Job, Report, available_cores, child_environment
 from sme_registry.studies.engine.lanes import run_lanes
-from sme_registry.studies.engine.result import CellFailure, CellResult
+from sme_registry.studies.engine.queue import CPU, Job, Report, available_cores, child_environment
+from sme_registry.studies.engine.result import CellFailure, CellResult, Outcome
 from sme_registry.training.record import versions_for
 
 RunCell = Callable[[Cell, Callable[[int, int], None] | None, Path | None], CellResult]
@@ -57,14 +57,6 @@ _SETTINGS = {
     "RAY_DEDUP_LOGS_SKIP_REGEX": ".",  # its notices of a lost node, dozens of lines each
 }
 _ADDRESSES = "Give 'local', or the host:port of a running cluster of this Ray version."
-
-
-class Outcome(NamedTuple):
-    """How a cell ended, with its model and the snapshots of a life, where these are kept."""
-
-    entry: CellResult | CellFailure
-    model: bytes | None = None
-    snapshots: Mapping[str, bytes] = {}
 
 
 class Executor(Protocol):

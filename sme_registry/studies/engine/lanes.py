@@ -36,7 +36,8 @@ from sme_registry.evaluation.rollouts import start_states
 from sme_registry.io import Arrays, to_json
 from sme_registry.io.system import end_with_parent
 from sme_registry.spec import Cell
-from sme_registry.studies.engine.jobs import (
+from sme_registry.studies.engine.ledger import read_header, read_state, write_state
+from sme_registry.studies.engine.queue import (
     CPU,
     Lanes,
     Report,
@@ -44,19 +45,16 @@ from sme_registry.studies.engine.jobs import (
     new_program,
     shape_of,
 )
-from sme_registry.studies.engine.program_state import read_header, read_state, write_state
-from sme_registry.studies.engine.record import (
+from sme_registry.studies.engine.result import (
     EVALUATION,
     TRAINING,
+    CellResult,
+    ProgramResult,
     Record,
     check_forms,
     life_report,
 )
-from sme_registry.studies.engine.result import (
-    CellResult,
-    ProgramResult,
-)
-from sme_registry.training.lives import Snapshots
+from sme_registry.training.record import Snapshots
 
 if TYPE_CHECKING:
     from sme_registry.jax.program import Evaluation, StepLog

@@ -1,34 +1,54 @@
-"""`Ledger`: a study's folder, which is all that is known about what has finished.
+"""`Ledger`: a study's folder, which is all that is known about what has finished; its status.
 
 A result is a file named by its cell's digest and renamed into place (`result` has the layout).
 Nothing else records progress, so a kill cannot leave two records that disagree. Whoever runs a cell
 holds the lock STUDY/locks/<key>, which the operating system releases when the process ends: there
 are no leases to expire or to clean up.
+
+The state of a program of JAX that runs is an .npz of its arrays and of the records of its runs,
+written every few minutes and read after a kill. Its header says for which cells, and with what it
+was made: other versions, devices or numbers of runs would go on with other bits, so such a file is
+not used.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
-from sme_registry.errors import OptionError, SMEError
-from sme_registry.io import Lock, file_lock, is_locked, read_json, to_json, write_atomically
-from sme_registry.spec import StudyFile
-from sme_registry.studies.engine.program_state import read_header
+import numpy as np
+
+from sme_registry.errors import OptionError, SMEError, UnknownNameError
+from sme_registry.io import (
+    Arrays,
+    Lock,
+    file_lock,
+    is_locked,
+    read_arrays,
+    read_json,
+    to_json,
+    write_arrays,
+    write_atomically,
+)
+from sme_registry.spec import PlannedCell, StudyFile
+from sme_registry.studies.engine.budget import Estimator, Span, selected
 from sme_registry.studies.engine.result import CellFailure, CellResult
-from sme_registry.training.lives import MODELS, folder_of_cell, model_of_cell
+from sme_registry.training.record import MODELS_OF_STUDY, folder_of_cell, model_of_cell
 
 PLAN = "plan.json"
 CELLS, FAILED, LOCKS, REPORT = "cells", "failed", "locks", "report"
 REQUESTS = "requests"  # selections of cells that were asked for, a file each
-STATES = "states"  # of programs that run, or were killed
-_STUDY_FILES = {PLAN, CELLS, FAILED, LOCKS, MODELS, REPORT, REQUESTS, STATES}
+STATE_FILES = "states"  # of programs that run, or were killed
+_STUDY_FILES = {PLAN, CELLS, FAILED, LOCKS, MODELS_OF_STUDY, REPORT, REQUESTS, STATE_FILES}
 
 
 class SavedState(NamedTuple):
@@ -172,7 +192,7 @@ class Ledger:
         """Where the state of a new program of these cells goes, made with this."""
         identity = f"{' '.join(keys)} {to_json(made_with or {})}"
         name = hashlib.sha256(identity.encode()).hexdigest()[:16]
-        return self.folder / STATES / f"{name}.npz"
+        return self.folder / STATE_FILES / f"{name}.npz"
 
     def state_of(self, key: str, made_with: Mapping[str, Any]) -> SavedState | None:
         """A saved state, made with the same, of a program that has this cell as a lane."""
@@ -191,7 +211,7 @@ class Ledger:
                 path.unlink(missing_ok=True)
 
     def _states(self) -> list[Path]:
-        return sorted((self.folder / STATES).glob("*.npz"))
+        return sorted((self.folder / STATE_FILES).glob("*.npz"))
 
     def set_aside(self, key: str) -> None:
         """Rename a cell's result or failure if it is invalid. The caller must hold the lock."""
@@ -240,3 +260,194 @@ def _read_entry(kind: type[_Entry], path: Path, key: str) -> _Entry:
     if not key == entry.key == entry.cell.digest:
         raise OptionError(f"{path}: belongs to the cell {entry.cell.digest}, not to its file name.")
     return entry
+
+
+_HEADER = "header"
+
+
+def write_state(path: Path, header: Mapping[str, Any], arrays: Arrays) -> None:
+    """Write a state; raises OptionError as `write_arrays` does."""
+    write_arrays(path, {_HEADER: np.array(to_json(header)), **arrays})
+
+
+def read_header(path: Path) -> dict[str, Any]:
+    """The header of a state; empty if there is no valid one. Reads no more than that."""
+    with contextlib.suppress(OptionError, ValueError):
+        header = json.loads(str(read_arrays(path, [_HEADER])[_HEADER]))
+        if isinstance(header, dict):
+            return header
+    return {}
+
+
+def read_state(path: Path) -> Arrays:
+    """The arrays of a state; empty if there is no valid one."""
+    with contextlib.suppress(OptionError):
+        arrays = read_arrays(path)
+        if arrays.pop(_HEADER, None) is not None:
+            return arrays
+    return {}
+
+
+State = Literal["done", "running", "failed", "waiting"]
+STATES: tuple[State, ...] = ("done", "running", "failed", "waiting")
+
+
+def label(planned: PlannedCell) -> str:
+    """A cell's name for people; see `run_label`."""
+    return run_label(planned.class_name, planned.algorithm, planned.run, planned.phase)
+
+
+def run_label(class_name: str, algorithm: str, run: int, phase: int | None = None) -> str:
+    """`PPO on k-25, run 3`, or of a fresh agent `PPO on phase 2 of Switch5 alone, run 3`."""
+    alone = "" if phase is None else f"phase {phase} of "
+    return f"{algorithm} on {alone}{class_name}{alone and ' alone'}, run {run}"
+
+
+@dataclass(frozen=True)
+class CellStatus:
+    """The state of a planned cell, and its error if it failed.
+
+    It is "running" if any process runs it, and "failed" if it failed and none runs it again. A cell
+    with several places in the plan has a state for each; `key` is its digest.
+    """
+
+    planned: PlannedCell
+    key: str
+    state: State
+    failure: CellFailure | None = None
+
+
+@dataclass(frozen=True)
+class StudyStatus:
+    """The state of a study.
+
+    Attributes:
+      places: the selected cells of the plan, in its order; see `study_status`. Those that any run
+        asked for include all that have finished, failed or are running. Streams may share fresh
+        agents, which run once and count once, except in `counts`.
+      seconds_left: of one core, for the unfinished cells; running ones count in full.
+      other_results: results in the folder that belong to no cell of the plan.
+    """
+
+    folder: Path
+    file: StudyFile
+    places: tuple[CellStatus, ...]
+    seconds_left: Span
+    other_results: int
+    never_requested: int = 0  # cells of the plan that no run asked for, where these are left out
+
+    @property
+    def cells(self) -> tuple[CellStatus, ...]:
+        """Every selected cell once."""
+        first: dict[str, CellStatus] = {}
+        for cell in self.places:
+            first.setdefault(cell.key, cell)
+        return tuple(first.values())
+
+    def count(self, state: State) -> int:
+        """How many cells are in this state."""
+        return sum(cell.state == state for cell in self.cells)
+
+    @property
+    def failed(self) -> tuple[CellStatus, ...]:
+        """The cells that failed."""
+        return tuple(cell for cell in self.cells if cell.state == "failed")
+
+    @property
+    def counts(self) -> dict[tuple[str, str], Counter[State]]:
+        """(class, algorithm) → number of cells in each state, in the plan's order."""
+        counts: dict[tuple[str, str], Counter[State]] = {}
+        for cell in self.places:
+            group = cell.planned.class_name, cell.planned.algorithm
+            counts.setdefault(group, Counter())[cell.state] += 1
+        return counts
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain JSON data."""
+        return {
+            "folder": str(self.folder),
+            "study": self.file.versioned_name,
+            "digest": self.file.digest,
+            "cells": len(self.cells),
+            **{state: self.count(state) for state in STATES},
+            "core_seconds_left": self.seconds_left._asdict(),
+            "other_results": self.other_results,
+            "never_requested": self.never_requested,
+            "groups": [
+                {"class": name, "algorithm": algorithm, **{s: counts[s] for s in STATES}}
+                for (name, algorithm), counts in self.counts.items()
+            ],
+            "failures": [
+                {
+                    "class": cell.planned.class_name,
+                    "algorithm": cell.planned.algorithm,
+                    "run": cell.planned.run,
+                    "key": cell.failure.key,
+                    "error": cell.failure.error,
+                    "attempts": cell.failure.attempts,
+                }
+                for cell in self.failed
+                if cell.failure is not None
+            ],
+        }
+
+
+def requested(ledger: Ledger, file: StudyFile) -> set[str] | None:
+    """Digests of a plan's cells that any run asked for; None if that is unknown."""
+    digests: set[str] | None = None
+    for only in ledger.requests(file):
+        with contextlib.suppress(OptionError, UnknownNameError):
+            cells = selected(file.plan.cells, only)
+            digests = (digests or set()) | {planned.cell.digest for planned in cells}
+    return digests
+
+
+def study_status(
+    folder: str | os.PathLike[str],
+    only: Sequence[str] | None = None,
+    scale: Callable[[StudyFile], StudyFile] = lambda file: file,
+) -> StudyStatus:
+    """The state of the study in a folder. Changes nothing, and may be called while it runs.
+
+    Args:
+      only: `class=GLOB`, `algorithm=GLOB`; empty for every cell of the plan, None for those that
+        any run asked for.
+      scale: applied to the folder's plan first.
+
+    Examples:
+      >>> from sme_registry.studies import study_status
+      >>> study_status("study").count("done")
+      6
+    """
+    ledger = Ledger(folder)
+    return plan_status(ledger, scale(ledger.study_file()), only)
+
+
+def plan_status(ledger: Ledger, file: StudyFile, only: Sequence[str] | None) -> StudyStatus:
+    """The state of a plan's selected cells in a folder; see `study_status`."""
+    every = file.plan.cells
+    keys = {id(planned): planned.cell.digest for planned in every}
+    results, failures = ledger.results(), ledger.failures()
+    estimator = Estimator(results.values())
+    places = []
+    for planned in selected(every, only or ()):
+        key = keys[id(planned)]
+        state: State = "done" if key in results else "failed" if key in failures else "waiting"
+        if state != "done" and ledger.is_running(key):
+            state = "running"
+        failure = failures.get(key) if state == "failed" else None
+        places.append(CellStatus(planned, key, state, failure))
+    asked = requested(ledger, file) if only is None else None
+    shown = [
+        cell for cell in places if asked is None or cell.state != "waiting" or cell.key in asked
+    ]
+    unfinished = {c.key: c.planned.cell for c in shown if c.state in ("running", "waiting")}
+    spans = [estimator.seconds(cell) for cell in unfinished.values()]
+    return StudyStatus(
+        folder=ledger.folder,
+        file=file,
+        places=tuple(shown),
+        seconds_left=Span(sum(span.low for span in spans), sum(span.high for span in spans)),
+        other_results=len(results.keys() - set(keys.values())),
+        never_requested=len({cell.key for cell in places} - {cell.key for cell in shown}),
+    )

@@ -15,22 +15,20 @@ from sme_registry.io import integer_in
 from sme_registry.io.terminal import Progress, duration
 from sme_registry.spec import PlannedCell, StudyFile, StudyPlan
 from sme_registry.spec.study import in_jax
-from sme_registry.studies.engine import checks
 from sme_registry.studies.engine.budget import Paces, first_places, selected
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.executors import (
     Executor,
     InProcess,
     OnRay,
-    Outcome,
     Processes,
     RunCell,
 )
-from sme_registry.studies.engine.jobs import CPU, Job, Programs, platform_of
-from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.engine.queue import Ended, Queue
-from sme_registry.studies.engine.result import CellFailure, CellResult
-from sme_registry.studies.engine.status import StudyStatus, label, plan_status
+from sme_registry.studies.engine.ledger import Ledger, StudyStatus, label, plan_status
+from sme_registry.studies.engine.queue import CPU, Ended, Job, Programs, Queue, platform_of
+from sme_registry.studies.engine.result import CellFailure, CellResult, Outcome
+from sme_registry.training.algorithms import find
+from sme_registry.training.hyperparameters import check_algorithm
 from sme_registry.training.record import versions_for
 
 EXECUTORS = ("processes", "in-process", "ray")
@@ -123,10 +121,10 @@ def _check(plan: StudyPlan, planned: Collection[PlannedCell]) -> None:
     names = {cell.algorithm for cell in planned}
     for algorithm in plan.algorithms:
         if algorithm.name in names:
-            checks.find(algorithm.uses)
-            checks.check_hyperparameters(algorithm)
+            find(algorithm.uses).check_installed()
+            check_algorithm(algorithm)
     for cell in planned:
-        checks.check_task(cell.cell)
+        find(cell.cell.uses).check_task(cell.cell.document)
 
 
 def _refuse_without_jax(**options: Any) -> None:
@@ -246,7 +244,7 @@ class _StudyRun:
             self.say(f"{self._name(job)}: {note}")
             return
         share = done / total if total else 1.0
-        self._paces.report(job, share, compilations)
+        self._paces.report(job.cells, share, compilations)
         state = f"{done:,} of {total:,} steps" if done < total else "evaluating"
         self._progress.update_part(self._name(job), share, state)
 

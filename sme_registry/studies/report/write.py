@@ -32,8 +32,7 @@ from sme_registry.io.markup import environment, plural
 from sme_registry.io.terminal import duration
 from sme_registry.spec import StudyFile
 from sme_registry.spec.study import in_jax
-from sme_registry.studies.engine.ledger import REPORT, Ledger
-from sme_registry.studies.engine.status import requested, run_label
+from sme_registry.studies.engine.ledger import REPORT, Ledger, requested, run_label
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.figures import Picture, draw_figures
 from sme_registry.studies.report.findings import findings

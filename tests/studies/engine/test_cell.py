@@ -18,9 +18,9 @@ from sme_registry.errors import (
 )
 from sme_registry.spec import Cell, EvaluationProtocol
 from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.checks import check_task
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.task import materialize
+from sme_registry.training.algorithms import find
 
 SPEC = SMESpec(state_dim=2, action_dim=2, horizon=20)
 
@@ -291,7 +291,7 @@ def test_more_noise_makes_worse_data_and_other_cells():
 
 def test_bad_cells_are_refused_in_words():
     spec = SMESpec(state_dim=2, action_dim=1)
-    check_task(offline("jax:PPO", spec=spec.derive(safety={"tightness": 0.2})))
+    find("jax:PPO").check_task(spec.derive(safety={"tightness": 0.2}))
     with pytest.raises(UnknownNameError, match="offline:iql"):
         run_cell(offline("offline:iq"))
     with pytest.raises(SpecError, match="nu"):

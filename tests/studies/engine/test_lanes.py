@@ -19,8 +19,7 @@ from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies.engine import lanes
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.executors import InProcess
-from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.engine.program_state import read_header, read_state, write_state
+from sme_registry.studies.engine.ledger import Ledger, read_header, read_state, write_state
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.engine.runner import run_study
 from sme_registry.studies.report.compare import implementation_caveats

@@ -14,13 +14,12 @@ from sme_registry.spec import Cell, StudyFile, StudyPlan
 from sme_registry.studies.engine import lanes
 from sme_registry.studies.engine.budget import Estimator
 from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.checks import check_task
-from sme_registry.studies.engine.jobs import Programs
-from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.engine.ledger import Ledger, label, study_status
+from sme_registry.studies.engine.queue import Programs
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.engine.runner import run_study
-from sme_registry.studies.engine.status import label, study_status
-from sme_registry.training.lives import Snapshots
+from sme_registry.training.algorithms import find
+from sme_registry.training.record import Snapshots
 from tests.studies.cells import numbers
 
 pytest.importorskip("stable_baselines3")
@@ -275,8 +274,8 @@ def test_a_stream_that_agents_in_jax_cannot_live_in_is_refused_before_anything_r
 ):
     pytest.importorskip("jax")
     with pytest.raises(SMEError, match=message):
-        check_task(life(stream, "jax:PPO"))
-    check_task(life(stream, "PPO"))
+        find("jax:PPO").check_task(stream)
+    find("PPO").check_task(stream)
     file = plan_file("jax:PPO", streams=[{"name": "one", "stream": stream.to_dict()}])
     with pytest.raises(SMEError, match=message):
         ran(tmp_path / "study", file, device="cpu")

@@ -17,10 +17,9 @@ import pytest
 from rich.console import Console
 
 from sme_registry.errors import OptionError, UnknownNameError
-from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.engine.ledger import Ledger, study_status
 from sme_registry.studies.engine.result import CellFailure
 from sme_registry.studies.engine.runner import run_study
-from sme_registry.studies.engine.status import study_status
 from tests.commands import sme
 from tests.studies import cells
 from tests.studies.cells import small_file
