@@ -16,7 +16,7 @@ import numpy.typing as npt
 from matplotlib import colormaps
 from PIL import Image
 
-from sme_registry.explorer.collect import resting
+from sme_registry.explorer.page import resting
 from sme_registry.io import write_atomically
 from sme_registry.spec import EnvFile, SMESpec, StreamFile, catalogue
 from sme_registry.task import Task, materialize

@@ -118,7 +118,6 @@ def diagnose(
       sme diagnose runs/Switch5-PPO-seed0 --out runs/Switch5-PPO-seed0/diagnosis
     """
     from sme_registry import diagnosis
-    from sme_registry.diagnosis import page
 
     if out_folder is not None:
         check_new(out_folder / _JSON, force=force)
@@ -140,11 +139,10 @@ def diagnose(
         seed=seed,
         progress=lambda what: err().print(escape(what), style="dim", soft_wrap=True),
     )
-    view = result.view()
     if json:
         print_json(result.to_dict())
     else:
-        for part in page.terminal(view, details=all_):
+        for part in result.terminal(details=all_):
             out().print(part)
     if out_folder is None:
         return
@@ -154,7 +152,7 @@ def diagnose(
 
         figures = draw(result, out_folder, subject)
     names = [path.name for path in figures if path.suffix == ".png"]
-    text = page.markdown(view, names, details=all_)
+    text = result.markdown(names, details=all_)
     # The data last, so that the other files exist once it does.
     written = write_atomically(out_folder / _PAGE, text)
     data = write_atomically(out_folder / _JSON, to_json(result.to_dict()))

@@ -1,9 +1,12 @@
 """The diagnosis of one run: where its regret is, what the evidence says about why, who in a team is
 to blame, and what a life in a stream forgot, never learnt or lost."""
 
-from sme_registry.diagnosis.diagnose import diagnose
-from sme_registry.diagnosis.document import Diagnosis, TaskDiagnosis, Verdict
-from sme_registry.diagnosis.stream import StreamDiagnosis
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from sme_registry.diagnosis.document import Diagnosis, Verdict
+from sme_registry.diagnosis.stream import StreamDiagnosis, diagnose_stream
 from sme_registry.diagnosis.subject import (
     AnySubject,
     StreamSubject,
@@ -12,7 +15,10 @@ from sme_registry.diagnosis.subject import (
     load_policy,
     load_run,
 )
-from sme_registry.diagnosis.team import TeamDiagnosis
+from sme_registry.diagnosis.task import TaskDiagnosis, diagnose_task
+from sme_registry.diagnosis.team import TeamDiagnosis, diagnose_team
+from sme_registry.errors import OptionError
+from sme_registry.io import integer_in
 
 __all__ = [
     "AnySubject",
@@ -28,3 +34,52 @@ __all__ = [
     "load_policy",
     "load_run",
 ]
+
+
+def diagnose(
+    subject: AnySubject,
+    *,
+    against: AnySubject | None = None,
+    probe_capacity: bool = False,
+    states: int = 8192,
+    episodes: int = 64,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> Diagnosis:
+    """Measure a policy and the references, and answer every question about its regret.
+
+    The result is a `TaskDiagnosis`. Of a team it is a `TeamDiagnosis`: every agent is measured over
+    its own action channels, and the verdicts say who is to blame for the team's regret. Of a life
+    in a stream it is a `StreamDiagnosis`: the networks are measured at the ends of the visits, and
+    the verdicts say which phases were costly, forgotten or not learnt, and whether plasticity was
+    lost.
+
+    `against` is another run of a single agent, such as with a single axis changed, measured in the
+    same way. `probe_capacity` fits a network of the same layers to a*, in tens of seconds, where
+    the policy's network is known. `states` are uniform, in [64, 1,000,000], and `episodes` in
+    [8, 10,000]; fewer are used if a state is large.
+
+    Examples:
+      >>> from sme_registry.diagnosis import diagnose, load_policy
+      >>> subject = load_policy("constant", sme_registry.load("Default"))
+      >>> diagnosis = diagnose(subject, states=64, episodes=8)
+      >>> diagnosis.level
+      'no_better_than_constant'
+    """
+    states = integer_in("states", states, 64, 1_000_000)
+    episodes = integer_in("episodes", episodes, 8, 10_000)
+    seed = integer_in("seed", seed, 0, 2**53 - 1)
+    report = progress or (lambda description: None)
+    if isinstance(subject, Subject) and subject.spec.team is None:
+        if against is None or (isinstance(against, Subject) and against.spec.team is None):
+            return diagnose_task(
+                subject, states, episodes, seed, report, against, probe_capacity=probe_capacity
+            )
+    elif against is None and not probe_capacity:
+        if isinstance(subject, StreamSubject):
+            return diagnose_stream(subject, states, seed, report)
+        return diagnose_team(subject, states, episodes, seed, report)
+    raise OptionError(
+        "against, probe_capacity: compare runs and fit networks of single agents on one task only. "
+        "Leave them out for a team or a life in a stream."
+    )

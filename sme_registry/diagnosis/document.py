@@ -12,20 +12,24 @@ Normalised regret does not depend on k, r_min or D, so it compares runs on diffe
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, ClassVar, Literal, Self
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar
 
 from pydantic import BeforeValidator, Field, JsonValue
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.markup import escape
+from rich.table import Table as RichTable
+from rich.text import Text
 
-from sme_registry.diagnosis.measurements import POLICY, Channel, Measurements, Violations
-from sme_registry.diagnosis.page import Part, View, label, markdown, words
+from sme_registry.diagnosis.subject import AnySubject
 from sme_registry.errors import UnknownNameError, did_you_mean
-from sme_registry.evaluation.references import LABELS
-from sme_registry.evaluation.tables import SAFETY_REFERENCES
-from sme_registry.io import read_json
-from sme_registry.io.markup import fixed, percent, plural, signed
+from sme_registry.io import read_json, versions
+from sme_registry.io.markup import environment, percent, plural
+from sme_registry.io.tables import Table
 from sme_registry.spec import (
-    Digest,
     Integer,
     Real,
     SMESpec,
@@ -36,22 +40,36 @@ from sme_registry.spec import (
 )
 from sme_registry.spec.document import check_digest
 
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
 __all__ = [
     "Answer",
-    "Comparison",
     "Diagnosis",
-    "Difference",
     "Kind",
     "Level",
-    "TaskDiagnosis",
+    "Part",
     "Verdict",
+    "label",
+    "table",
+    "words",
 ]
 
 Answer = Literal["yes", "no", "cannot tell"]
 Kind = Literal["who", "where", "why", "limits"]
 Level = Literal["solved", "better_than_linear", "worse_than_linear", "no_better_than_constant"]
+T = TypeVar("T")
 
+_ANSWERS = ("question", "answer", "evidence")  # columns of a part in words
+_HEADINGS = {
+    "who": "Who is not to blame",
+    "where": "Where the error is",
+    "why": "Why",
+    "limits": "Limits",
+}
 _INCONCLUSIVE = {"learnt_little", "few_updates"}
+_STYLES = {"yes": "bold red", "no": "green", "cannot tell": "yellow"}
+_COLUMNS, _INDENT = 80, " " * 4  # of lines in a file or a pipe
 
 
 class Verdict(StrictModel):
@@ -96,22 +114,38 @@ class Verdict(StrictModel):
         return words("task.jinja", macro, self.reason, self.evidence, self.thresholds)
 
 
-class Difference(StrictModel):
-    """A quantity of this run and of the other run."""
+class Part(NamedTuple):
+    """A table under a heading: answers in words, or numbers."""
 
-    quantity: str  # its name
-    value: Real  # of this run
-    other: Real  # of the other run
+    heading: str
+    columns: tuple[str, ...] = _ANSWERS
+    rows: Sequence[tuple[str, ...]] = ()
+    notes: tuple[str, ...] = ()  # below it
+    detail: bool = False  # shown on request only
+
+    def terminal(self) -> Iterator[RenderableType]:
+        """Its lines, table and notes on a terminal or in a pipe."""
+        if self.columns == _ANSWERS:
+            yield _Answers(self.heading, self.rows)
+        else:
+            kinds = ["name", *["number"] * (len(self.columns) - 1)]
+            rows = [[escape(cell) for cell in row] for row in self.rows]
+            yield Table(self.heading, dict(zip(self.columns, kinds, strict=True)), rows)
+        for note in self.notes:
+            yield _Paragraph(note, style="dim italic")
 
 
-class Comparison(StrictModel):
-    """This run compared with another; pairs are (this run, other run)."""
-
-    name: str  # of the other run
-    spec_fields: dict[str, TupleOf[JsonValue]]  # those that differ
-    plan_fields: dict[str, TupleOf[JsonValue]]  # likewise
-    differences: TupleOf[Difference]  # of the main quantities
-    answers: dict[str, TupleOf[Answer]]  # to each question whose answers differ
+def table(
+    heading: str,
+    rows: Iterable[T],
+    columns: Mapping[str, Callable[[T], str]],
+    notes: tuple[str, ...] = (),
+    *,
+    detail: bool = True,
+) -> Part:
+    """A part with one row for each of `rows`, and the text of its cell in each column."""
+    cells = [tuple(cell(row) for cell in columns.values()) for row in rows]
+    return Part(heading, tuple(columns), cells, notes, detail)
 
 
 class Diagnosis(StrictModel):
@@ -148,6 +182,24 @@ class Diagnosis(StrictModel):
     thresholds: dict[str, Real]
     versions: dict[str, str]
 
+    @classmethod
+    def about(cls, subject: AnySubject, **fields: Any) -> Self:
+        """The diagnosis of a subject, with the fields of its kind."""
+        document: dict[str, Any] = {
+            cls.document_field: subject.document,
+            f"{cls.document_field}_digest": subject.document.digest,
+        }
+        return cls(
+            name=subject.name,
+            task=subject.task,
+            plan=subject.plan,
+            checkpoint_step=subject.checkpoint_step,
+            updates=subject.updates,
+            versions=versions(("numpy", "scipy"), if_imported=("torch", "stable_baselines3")),
+            **document,
+            **fields,
+        )
+
     @property
     def subject(self) -> tuple[SMESpec | StreamSpec, str]:
         """The task or stream, and the digest that the file states."""
@@ -160,16 +212,18 @@ class Diagnosis(StrictModel):
         document, _ = self.subject
         if isinstance(document, StreamSpec):
             phases = plural(len(document.phases), "phase")
-            visits = plural(document.cycles * len(document.phases), "visit")
+            visits = plural(document.visits, "visit")
             fields = f"S={document.state_dim}, A={document.action_dim}, {phases}, {visits}"
         else:
             fields = _main_fields(document)
         return f"{self.name} on {catalogue.title(document.named(self.task))} ({fields})"
 
-    def parts(self) -> Iterator[Part]:
-        """Findings first, then numbers; what was ruled out is a detail."""
-        yield self.findings("Findings", self.verdicts)
-        yield from self.answers(self.verdicts)
+    @property
+    def origin(self) -> str:
+        """What it is about, and the versions that its numbers depend on."""
+        versions = ", ".join(f"{name} {version}" for name, version in self.versions.items())
+        kind = "Stream" if self.document_field == "stream" else "Task"
+        return f"{kind} `{self.subject[1]}`. Versions: {versions}."
 
     def verdict(self, question: str) -> Verdict:
         """The verdict on a question, such as "credit assignment" or "credit_assignment"."""
@@ -183,11 +237,19 @@ class Diagnosis(StrictModel):
         hint = did_you_mean(partial[0] if partial else wanted, known)
         raise UnknownNameError(f"question={question!r}: must be one of {', '.join(known)}.{hint}")
 
+    def headline(self) -> str:
+        """How good the policy is."""
+        return words(self.template, "headline", self)
+
+    def parts(self) -> Iterator[Part]:
+        """Findings first, then what belongs to its kind; on request the other answers."""
+        yield self.findings("Findings", self.verdicts)
+        yield from self.answers(self.verdicts)
+
     def findings(self, heading: str, verdicts: Sequence[Verdict], template: str = "") -> Part:
         """The "yes" verdicts, largest share of the error first; names of the others below."""
         findings = [verdict for verdict in verdicts if verdict.answer == "yes"]
-        findings.sort(key=_share, reverse=True)
-        rows = [_row(verdict, template or self.template) for verdict in findings]
+        findings.sort(key=lambda v: -1.0 if v.error_share is None else v.error_share, reverse=True)
         notes = [] if findings else ["Nothing."]
         doubts = (verdict for verdict in verdicts if verdict.reason in _INCONCLUSIVE)
         notes += {verdict.reason: verdict.doubt for verdict in doubts}.values()
@@ -197,6 +259,7 @@ class Diagnosis(StrictModel):
                 notes.append(f"{text}: {', '.join(names)}.")
         updates = "" if self.updates is None else f", {plural(self.updates, 'update')}"
         basis = f"{plural(self.seeds, 'seed')}{updates}; %: share of the error"
+        rows = self._rows(findings, template)
         return Part(f"{heading} ({basis})", rows=rows, notes=tuple(notes))
 
     def answers(
@@ -206,24 +269,34 @@ class Diagnosis(StrictModel):
         for kind, heading in _HEADINGS.items():
             others = [v for v in verdicts if v.kind == kind and v.answer != "yes"]
             if others:
-                rows = [_row(verdict, template or self.template) for verdict in others]
-                yield Part(f"{heading}{of}", rows=rows, detail=True)
+                yield Part(f"{heading}{of}", rows=self._rows(others, template), detail=True)
 
-    def headline(self) -> str:
-        """How good the policy is."""
-        return words(self.template, "headline", self)
+    def _rows(self, verdicts: Iterable[Verdict], template: str) -> list[tuple[str, ...]]:
+        rows: list[tuple[str, ...]] = []
+        for verdict in verdicts:
+            share = "" if verdict.error_share is None else f", {percent(verdict.error_share)}"
+            text = verdict.sentence(template or self.template)
+            rows.append((label(verdict.question), f"{verdict.answer}{share}", text))
+        return rows
 
-    def view(self) -> View:
-        """What the terminal and the page show."""
-        _, digest = self.subject
-        kind = "Stream" if self.document_field == "stream" else "Task"
-        versions = ", ".join(f"{name} {version}" for name, version in self.versions.items())
-        origin = f"{kind} `{digest}`. Versions: {versions}."
-        return View(self.title, self.headline(), tuple(self.parts()), origin)
+    def terminal(self, *, details: bool = False) -> Iterator[RenderableType]:
+        """What `sme diagnose` prints, part by part."""
+        yield f"[bold]{escape(self.title)}[/]"
+        yield _Paragraph(self.headline())
+        for part in self.parts():
+            if details or not part.detail:
+                yield ""
+                yield from part.terminal()
+
+    def markdown(self, figures: Sequence[str] = (), *, details: bool = False) -> str:
+        """The diagnosis as a page that shows figures of the same folder."""
+        parts = [part for part in self.parts() if details or not part.detail]
+        page = _templates().get_template("page.md.jinja")
+        return page.render(diagnosis=self, parts=parts, figures=figures)
 
     def _repr_markdown_(self) -> str:
         """The page, for notebooks, which would run HTML, links and images in a name."""
-        return markdown(self.view()).replace("<", "&lt;").replace("](", "]\\(")
+        return self.markdown().replace("<", "&lt;").replace("](", "]\\(")
 
     @classmethod
     def from_dict(cls, data: Any, source: str = "") -> Self:
@@ -243,25 +316,6 @@ class Diagnosis(StrictModel):
         return diagnosis
 
 
-_HEADINGS = {
-    "who": "Who is not to blame",
-    "where": "Where the error is",
-    "why": "Why",
-    "limits": "Limits",
-}
-
-
-def _share(verdict: Verdict) -> float:
-    return -1.0 if verdict.error_share is None else verdict.error_share
-
-
-def _row(verdict: Verdict, template: str) -> tuple[str, ...]:
-    answer: str = verdict.answer
-    if verdict.error_share is not None:
-        answer += f", {percent(verdict.error_share)}"
-    return label(verdict.question), answer, verdict.sentence(template)
-
-
 def _main_fields(spec: SMESpec) -> str:
     fields = [f"S={spec.state_dim}", f"A={spec.action_dim}", f"L={spec.complexity}", f"k={spec.k}"]
     fields += [f"r_min={spec.r_min:g}", f"D={spec.D:g}"]
@@ -275,134 +329,68 @@ def _main_fields(spec: SMESpec) -> str:
     return ", ".join(fields)
 
 
-class TaskDiagnosis(Diagnosis):
-    """The diagnosis of one policy on one task.
-
-    Attributes:
-      spec: the task.
-      spec_digest: the task's digest.
-      level: normalised regret, ranked among the constant ½, the linear policy and 0.
-      comparison: with another run; null without one.
-      measurements: what the verdicts rest on.
-    """
-
-    only_field: ClassVar[str] = "measurements"
-
-    spec: SMESpec
-    spec_digest: Digest
-    level: Level
-    comparison: Comparison | None = None
-    measurements: Measurements
-
-    def parts(self) -> Iterator[Part]:
-        """Findings, the comparison, and on request the other answers and the numbers."""
-        yield self.findings("Findings", self.verdicts)
-        if self.comparison is not None:
-            yield from _comparison(self.comparison)
-        yield from self.answers(self.verdicts)
-        yield from _numbers(self.measurements)
+def label(question: str) -> str:
+    """`credit_assignment` as people read it: `credit assignment`."""
+    return question.replace("_", " ")
 
 
-def _comparison(comparison: Comparison) -> Iterator[Part]:
-    rows = [
-        (
-            label(row.quantity),
-            fixed(row.value, 3),
-            fixed(row.other, 3),
-            signed(row.value - row.other, 3),
-        )
-        for row in comparison.differences
-    ]
-    notes = (words("task.jinja", "comparison", comparison),)
-    columns = ("quantity", "this run", "other run", "difference")
-    yield Part("Compared with another run", columns, rows, notes)
-    answers = [(label(question), *pair) for question, pair in comparison.answers.items()]
-    if answers:
-        yield Part("Answers that differ", ("question", "this run", "other run"), answers)
+@cache
+def _templates() -> Environment:
+    templates = environment(Path(__file__).parent / "templates", autoescape=False)
+    templates.filters["label"] = label
+    return templates
 
 
-def _numbers(measured: Measurements) -> Iterator[Part]:
-    """Tables of the references, the action channels, and of limits, distractors and layers."""
-    names = {POLICY: "this policy", **LABELS}
-    rows: list[tuple[str, ...]] = []
-    for name, score in measured.uniform.items():
-        visited = measured.on_policy.scores.get(name, score)
-        values = score.regret, score.normalised_regret, visited.regret, visited.normalised_regret
-        rows.append((names[name], *(fixed(value, 3) for value in values)))
-    columns: tuple[str, ...]
-    columns = ("policy", "regret", "N", "regret, own episodes", "N, own episodes")
-    yield Part("Compared with the references", columns, rows, detail=True)
-    rows = [_channel(channel) for channel in measured.channels]
-    yield Part("Action channels", _CHANNEL_COLUMNS, rows, detail=True)
-    if measured.limits is not None:
-        yield from _limits(measured.limits, names)
-    if measured.distraction is not None and measured.observation is not None:
-        distraction = measured.distraction
-        regrets = {
-            "uniform": distraction.normalised_regret,
-            "actions averaged over them": distraction.averaged_regret,
-            "all at ½": distraction.half_regret,
-        }
-        regrets |= {r.name: r.normalised_regret for r in measured.observation.distractor_regions}
-        rows = [(name, fixed(regret, 3)) for name, regret in regrets.items()]
-        yield Part("Distractors", ("distractors", "normalised regret"), rows, detail=True)
-    if measured.observation is not None and measured.observation.probes:
-        rows = [
-            (
-                str(probe.layer or "observation"),
-                str(probe.units),
-                fixed(probe.state_r2),
-                "" if probe.distractor_r2 is None else fixed(probe.distractor_r2),
-            )
-            for probe in measured.observation.probes
-        ]
-        columns = ("layer", "units", "R² of the state", "R² of the distractors")
-        yield Part("Layers", columns, rows, detail=True)
+def words(template: str, macro: str, *arguments: Any) -> str:
+    """A macro of a template, on one line."""
+    macros: Any = _templates().get_template(template).module
+    return " ".join(getattr(macros, macro)(*arguments).split())
 
 
-_CHANNEL_COLUMNS = ("channel", "mae", "N", "linear N", "regret", "offset", "slope", "at 0", "at 1")
+class _Paragraph:
+    """Plain text, wrapped between words, in one of Rich's styles."""
+
+    def __init__(self, text: str, style: str = "") -> None:
+        self.text, self.style = text, style
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield Text(self.text, style=self.style) if console.is_terminal else _wrapped(self.text)
 
 
-def _channel(channel: Channel) -> tuple[str, ...]:
-    c = channel
-    regrets = (c.mae, c.normalised_regret, c.linear_normalised_regret, c.regret)
-    return (
-        str(c.channel),
-        *(fixed(value, 3) for value in regrets),
-        signed(c.offset, 3),
-        fixed(c.slope),
-        percent(c.at_zero, 1),
-        percent(c.at_one, 1),
+class _Answers:
+    """Questions, their answers, and sentences of evidence."""
+
+    def __init__(self, title: str, rows: Sequence[tuple[str, ...]]) -> None:
+        self.title, self.rows = title, rows
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield Text(self.title, style="italic")
+        if console.is_terminal:
+            yield self._table()
+            return
+        for question, answer, evidence in self.rows:
+            yield Text(f"{question}: {answer}")
+            yield _wrapped(evidence, _INDENT)
+
+    def _table(self) -> RichTable:
+        table = RichTable(show_header=False, box=None)
+        table.add_column(style="cyan", no_wrap=True, min_width=19)
+        table.add_column(no_wrap=True)
+        table.add_column(overflow="fold")
+        for question, answer, evidence in self.rows:
+            style = _STYLES[answer.partition(",")[0]]
+            table.add_row(Text(question), Text(answer, style=style), Text(evidence))
+        return table
+
+
+def _wrapped(text: str, indent: str = "") -> Text:
+    """Lines that break between words only; a word that is too long has a longer line."""
+    lines = textwrap.wrap(
+        text,
+        _COLUMNS,
+        initial_indent=indent,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
     )
-
-
-def _limits(limits: Violations, names: dict[str, str]) -> Iterator[Part]:
-    report = limits.report
-    scores = {"this policy": report.regions[0], "its actions cut off at the limits": limits.cut_off}
-    scores |= {names[name]: report.references[name][0] for name in SAFETY_REFERENCES}
-    scores |= {"this policy, states that it visits": limits.visited}
-    scores |= {f"this policy, {region.name}": region for region in report.regions[1:]}
-    columns: tuple[str, ...]
-    rows: list[tuple[str, ...]] = [
-        (
-            name,
-            fixed(s.step_reward, 3),
-            fixed(s.cost, 3),
-            percent(s.violating_share, 1),
-            fixed(s.safe_regret, 3),
-        )
-        for name, s in scores.items()
-    ]
-    columns = ("policy", "step reward", "cost", "violating share", "safe regret")
-    yield Part("Limits: reward and cost", columns, rows, detail=True)
-    rows = [
-        (
-            str(c.channel),
-            percent(c.violating_share, 1),
-            percent(c.optimal_violating_share, 1),
-            fixed(c.cost, 3),
-        )
-        for c in limits.channels
-    ]
-    columns = ("channel", "violating share", "the optimum's", "cost")
-    yield Part("Limits by action channel", columns, rows, detail=True)
+    return Text("\n".join(lines))

@@ -7,15 +7,15 @@ the network to a* is an experiment of its own, and stands.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from pydantic import JsonValue
 
-from sme_registry.diagnosis.document import Answer, Comparison, Difference, Kind, Level, Verdict
-from sme_registry.diagnosis.measurements import LINEAR, POLICY, Measurements
-from sme_registry.diagnosis.subject import Subject
-from sme_registry.spec import SMESpec
+from sme_registry.diagnosis.document import Answer, Kind, Verdict
+from sme_registry.diagnosis.measurements import Measurements
+from sme_registry.spec import Real, SMESpec, StrictModel, TupleOf
 
 __all__ = [
     "COMPARISON_REASONS",
@@ -24,13 +24,13 @@ __all__ = [
     "SOLVED",
     "THRESHOLDS",
     "Case",
+    "Comparison",
     "Decision",
+    "Difference",
     "Question",
+    "TaskCase",
     "add_to",
     "answer_all",
-    "compare",
-    "level",
-    "thresholds_of",
 ]
 
 THRESHOLDS = {
@@ -81,75 +81,6 @@ SAFETY_THRESHOLDS = {
 }
 """Of the questions about limits and distractors."""
 
-
-def thresholds_of(spec: SMESpec) -> dict[str, float]:
-    """All thresholds that verdicts on a task can use."""
-    return {**THRESHOLDS, **SAFETY_THRESHOLDS} if spec.extended else THRESHOLDS
-
-
-class AnyCase(Protocol):
-    """What the rules of a question read, of a task, a team or a life."""
-
-    @property
-    def updates(self) -> int | None: ...
-
-    @property
-    def learnt(self) -> float:
-        """Normalised regret of the run, at its best."""
-
-
-C = TypeVar("C", bound=AnyCase)
-
-
-class Decision(NamedTuple):
-    """A rule's branch, its evidence, and the thresholds that it used."""
-
-    reason: str
-    evidence: dict[str, Any]
-    thresholds: tuple[str, ...] = ()
-    error_share: float | None = None  # that a "yes" explains
-
-
-class Question(NamedTuple, Generic[C]):
-    """A question: its kind, its rule, and the answer that each reason gives."""
-
-    kind: Kind
-    rule: Callable[[C], Decision]
-    reasons: dict[str, Answer]
-    needs: str = ""  # the field of `Measurements` without which it is not asked
-
-
-def add_to(
-    questions: dict[str, Question[C]], kind: Kind, needs: str = "", **reasons: Answer
-) -> Callable[[Callable[[C], Decision]], Callable[[C], Decision]]:
-    """Decorate a rule: add the question of its name, with the answer that each reason gives."""
-
-    def add(rule: Callable[[C], Decision]) -> Callable[[C], Decision]:
-        questions[rule.__name__.removeprefix("_")] = Question(kind, rule, reasons, needs)
-        return rule
-
-    return add
-
-
-class Case(NamedTuple):
-    """What the rules of a task read."""
-
-    measurements: Measurements
-    spec: SMESpec
-    comparison: Comparison | None = None
-    updates: int | None = None
-
-    @property
-    def learnt(self) -> float:
-        """Normalised regret in uniform states."""
-        return self.measurements.policy.normalised_regret
-
-    @property
-    def solved(self) -> bool:
-        """Whether nothing is left to explain."""
-        return self.learnt <= THRESHOLDS["solved"]
-
-
 SOLVED: dict[str, Answer] = {"solved": "no"}
 """Of every "why" question about a task."""
 
@@ -184,6 +115,98 @@ _FIELD_QUESTIONS = {
 }
 
 
+class Difference(StrictModel):
+    """A quantity of this run and of the other run."""
+
+    quantity: str  # its name
+    value: Real  # of this run
+    other: Real  # of the other run
+
+
+class Comparison(StrictModel):
+    """This run compared with another; pairs are (this run, other run)."""
+
+    name: str  # of the other run
+    spec_fields: dict[str, TupleOf[JsonValue]]  # those that differ
+    plan_fields: dict[str, TupleOf[JsonValue]]  # likewise
+    differences: TupleOf[Difference]  # of the main quantities
+    answers: dict[str, TupleOf[Answer]]  # to each question whose answers differ
+
+
+class Decision(NamedTuple):
+    """A rule's branch, its evidence, and the thresholds that it used."""
+
+    reason: str
+    evidence: dict[str, Any]
+    thresholds: tuple[str, ...] = ()
+    error_share: float | None = None  # that a "yes" explains
+
+    def instead_of(self, own: Decision, own_answer: Answer) -> Decision:
+        """This decision in place of the rule's own, whose evidence is kept."""
+        kept = {"own_answer": own_answer, "own_reason": own.reason}
+        thresholds = dict.fromkeys((*own.thresholds, *self.thresholds))
+        return Decision(self.reason, {**own.evidence, **self.evidence, **kept}, tuple(thresholds))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """What the rules of a question read, of a task, a team or a life."""
+
+    updates: int | None = None
+    comparison: Comparison | None = None  # of a task, with another run
+
+    @property
+    def learnt(self) -> float:
+        """Normalised regret of the run, at its best."""
+        raise NotImplementedError
+
+    @property
+    def solved(self) -> bool:
+        """Whether nothing is left to explain."""
+        return False
+
+
+@dataclass(frozen=True)
+class TaskCase(Case):
+    """What the rules of a task read."""
+
+    measurements: Measurements
+    spec: SMESpec
+
+    @property
+    def learnt(self) -> float:
+        """Normalised regret in uniform states."""
+        return self.measurements.policy.normalised_regret
+
+    @property
+    def solved(self) -> bool:
+        return self.learnt <= THRESHOLDS["solved"]
+
+
+C = TypeVar("C", bound=Case)
+
+
+class Question(NamedTuple, Generic[C]):
+    """A question: its kind, its rule, and the answer that each reason gives."""
+
+    kind: Kind
+    rule: Callable[[C], Decision]
+    reasons: dict[str, Answer]
+    needs: str = ""  # the field of `Measurements` without which it is not asked
+
+
+def add_to(
+    questions: dict[str, Question[C]], kind: Kind, needs: str = "", **reasons: Answer
+) -> Callable[[Callable[[C], Decision]], Callable[[C], Decision]]:
+    """Decorate a rule: add the question of its name, with the answer that each reason gives."""
+
+    def add(rule: Callable[[C], Decision]) -> Callable[[C], Decision]:
+        questions[rule.__name__.removeprefix("_")] = Question(kind, rule, reasons, needs)
+        return rule
+
+    return add
+
+
 def answer_all(
     questions: Mapping[str, Question[C]], case: C, thresholds: Mapping[str, float]
 ) -> tuple[Verdict, ...]:
@@ -193,16 +216,17 @@ def answer_all(
 
 def _verdict(name: str, question: Question[C], case: C, thresholds: Mapping[str, float]) -> Verdict:
     answers = {**question.reasons, **COMPARISON_REASONS, **SOLVED, **OPEN_REASONS}
-    if question.kind == "why" and isinstance(case, Case) and case.solved:
+    if question.kind == "why" and case.solved:
         decision = Decision("solved", {"normalised_regret": case.learnt}, ("solved",))
     else:
-        own = decision = question.rule(case)
-        if question.kind == "why" and answers[own.reason] == "yes":
-            decision = _doubted(case, own)
-        if isinstance(case, Case):
-            is_open = decision is not own
-            decision = _compared(case, name, own, answers, is_open=is_open) or decision
-    answer = answers[decision.reason]
+        own = question.rule(case)
+        own_answer = answers[own.reason]
+        doubt = None
+        if question.kind == "why" and own_answer == "yes" and own.reason not in _EXPERIMENTS:
+            doubt = _doubt(case)
+        other = _comparison(case, name, own, own_answer, is_open=doubt is not None) or doubt
+        decision = own if other is None else other.instead_of(own, own_answer)
+    answer, share = answers[decision.reason], decision.error_share
     return Verdict(
         question=name,
         kind=question.kind,
@@ -210,161 +234,53 @@ def _verdict(name: str, question: Question[C], case: C, thresholds: Mapping[str,
         reason=decision.reason,
         evidence=decision.evidence,
         thresholds={threshold: thresholds[threshold] for threshold in decision.thresholds},
-        error_share=_share(decision) if answer == "yes" else None,
+        error_share=None if answer != "yes" or share is None else min(max(share, 0.0), 1.0),
     )
 
 
-def _share(decision: Decision) -> float | None:
-    share = decision.error_share
-    return None if share is None else min(max(share, 0.0), 1.0)
-
-
-def _instead(decision: Decision, own: Decision, own_answer: Answer) -> Decision:
-    """A decision in place of the rule's own, whose evidence is kept."""
-    kept = {"own_answer": own_answer, "own_reason": own.reason}
-    thresholds = dict.fromkeys((*own.thresholds, *decision.thresholds))
-    evidence = {**own.evidence, **decision.evidence, **kept}
-    return Decision(decision.reason, evidence, tuple(thresholds))
-
-
-def _doubted(case: AnyCase, decision: Decision) -> Decision:
-    """The decision, or that the run cannot name a cause."""
-    if decision.reason in _EXPERIMENTS:
-        return decision
+def _doubt(case: Case) -> Decision | None:
+    """Why the run cannot name a cause; None if it can."""
     if case.updates is not None and case.updates < THRESHOLDS["few_updates"]:
-        doubt = Decision("few_updates", {"updates": case.updates}, ("few_updates",))
-    elif case.learnt >= THRESHOLDS["learnt_little"]:
-        doubt = Decision("learnt_little", {"learnt": case.learnt}, ("learnt_little",))
-    else:
-        return decision
-    return _instead(doubt, decision, "yes")
+        return Decision("few_updates", {"updates": case.updates}, ("few_updates",))
+    if case.learnt >= THRESHOLDS["learnt_little"]:
+        return Decision("learnt_little", {"learnt": case.learnt}, ("learnt_little",))
+    return None
 
 
-def _compared(
-    case: Case, question: str, own: Decision, answers: Mapping[str, Answer], *, is_open: bool
+def _comparison(
+    case: Case, question: str, own: Decision, own_answer: Answer, *, is_open: bool
 ) -> Decision | None:
     """What a comparison in the question's field alone decides; None where it decides nothing."""
-    other = _comparison(case, question)
-    if other is None or own.reason in _FIELD_IS_OFF:
-        return None
-    answer = answers[own.reason]
-    if other.reason == "field_raises_regret":
-        decides = answer != "yes" or is_open
-    elif answers[other.reason] == "cannot tell":
-        decides = answer == "cannot tell" or own.reason in _SIGNS
-    else:
-        decides = True
-    return _instead(other, own, answer) if decides else None
-
-
-def _comparison(case: Case, question: str) -> Decision | None:
-    """A comparison with a run that is easier in one field alone; None for any other question."""
     other = case.comparison
     if other is None or len(other.spec_fields) != 1 or other.plan_fields:
         return None
     (field, (value, other_value)), *_ = other.spec_fields.items()
-    if _FIELD_QUESTIONS.get(field) != question or not _is_harder(value, other_value):
+    asked = _FIELD_QUESTIONS.get(field) == question and own.reason not in _FIELD_IS_OFF
+    if not asked or not _is_harder(value, other_value):
         return None
     regret = other.differences[0]
     difference = regret.value - regret.other
     if difference >= THRESHOLDS["difference"]:
-        reason = "field_raises_regret"
-    elif regret.other >= THRESHOLDS["learnt_little"]:
-        reason = "other_run_learnt_little"
-    elif difference > THRESHOLDS["no_difference"]:
-        reason = "difference_too_small"
+        reason, decides = "field_raises_regret", own_answer != "yes" or is_open
+    elif regret.other < THRESHOLDS["learnt_little"] and difference <= THRESHOLDS["no_difference"]:
+        reason, decides = "regret_same_or_lower", True
     else:
-        reason = "regret_same_or_lower"
-    return Decision(
-        reason,
-        {
-            "field": field,
-            "value": value,
-            "other_value": other_value,
-            "other_run": other.name,
-            "normalised_regret": regret.value,
-            "other_normalised_regret": regret.other,
-        },
-        ("difference", "no_difference", "learnt_little"),
-    )
+        learnt_little = regret.other >= THRESHOLDS["learnt_little"]
+        reason = "other_run_learnt_little" if learnt_little else "difference_too_small"
+        decides = own_answer == "cannot tell" or own.reason in _SIGNS
+    evidence = {
+        "field": field,
+        "value": value,
+        "other_value": other_value,
+        "other_run": other.name,
+        "normalised_regret": regret.value,
+        "other_normalised_regret": regret.other,
+    }
+    thresholds = ("difference", "no_difference", "learnt_little")
+    return Decision(reason, evidence, thresholds) if decides else None
 
 
 def _is_harder(value: JsonValue, other_value: JsonValue) -> bool:
     """Whether a field makes the run's task the harder one: each is harder at a higher value."""
     numbers = isinstance(value, int | float) and isinstance(other_value, int | float)
     return numbers and value > other_value  # type: ignore[operator]
-
-
-def level(measurements: Measurements) -> Level:
-    """Rank the policy among the optimum, the linear policy and the constant ½."""
-    regret = measurements.policy.normalised_regret
-    if regret <= THRESHOLDS["solved"]:
-        return "solved"
-    if regret >= THRESHOLDS["constant_level"]:
-        return "no_better_than_constant"
-    linear = measurements.uniform[LINEAR].normalised_regret
-    return "worse_than_linear" if regret > linear else "better_than_linear"
-
-
-def compare(
-    subject: Subject,
-    measured: Measurements,
-    other: Subject,
-    other_measured: Measurements,
-    judge: Callable[..., Iterable[Verdict]],
-) -> Comparison:
-    """Compare a run with another that was measured in the same way; `judge` answers for each."""
-    values, other_values = _quantities(measured), _quantities(other_measured)
-    answers, other_answers = (
-        {v.question: v.answer for v in judge(numbers, run.spec, updates=run.updates)}
-        for run, numbers in ((subject, measured), (other, other_measured))
-    )
-    return Comparison(
-        name=other.name,
-        spec_fields=_differing(subject.spec.every_field(), other.spec.every_field()),
-        plan_fields=_differing(subject.plan, other.plan),
-        differences=tuple(
-            Difference(quantity=name, value=value, other=other_values[name])
-            for name, value in values.items()
-        ),
-        answers={
-            question: (answer, other_answers[question])
-            for question, answer in answers.items()
-            if question in other_answers and answer != other_answers[question]
-        },
-    )
-
-
-def _differing(
-    fields: dict[str, JsonValue], others: dict[str, JsonValue]
-) -> dict[str, tuple[JsonValue, ...]]:
-    return {
-        field: (fields.get(field), others.get(field))
-        for field in {**others, **fields}
-        if fields.get(field) != others.get(field)
-    }
-
-
-def _quantities(measurements: Measurements) -> dict[str, float]:
-    """The quantities that are compared; normalised regret, which verdicts use, is first."""
-    on_policy, error = measurements.on_policy, measurements.squared_error
-    scores = {
-        "": measurements.policy,
-        "linear_": measurements.uniform[LINEAR],
-        "on_policy_": on_policy.scores[POLICY],
-        "outermost_shell_": measurements.shells[-1].scores[POLICY],
-    }
-    regrets = {
-        f"{prefix}{quantity}": getattr(score, quantity)
-        for prefix, score in scores.items()
-        for quantity in ("normalised_regret", "regret")
-    }
-    return {
-        **regrets,
-        "mae": measurements.policy.mae,
-        "rewarded_share": on_policy.signal.rewarded,
-        "random_rewarded_share": on_policy.random_signal.rewarded,
-        "squared_error_offset": error.offset,
-        "squared_error_scale": error.scale,
-        "saturation": measurements.response.saturation,
-    }

@@ -13,22 +13,28 @@ differ as much, and a study gives intervals.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from sme_registry.diagnosis.document import Answer, Diagnosis
+from sme_registry.diagnosis.behaviour import network_state
+from sme_registry.diagnosis.document import Answer, Diagnosis, Part, label, table
 from sme_registry.diagnosis.measurements import NetworkState
-from sme_registry.diagnosis.networks import network_state
-from sme_registry.diagnosis.page import Part, label
-from sme_registry.diagnosis.questions import THRESHOLDS, Decision, Question, add_to, answer_all
+from sme_registry.diagnosis.questions import (
+    THRESHOLDS,
+    Case,
+    Decision,
+    Question,
+    add_to,
+    answer_all,
+)
 from sme_registry.diagnosis.subject import StreamSubject
+from sme_registry.envs.types import Observation
 from sme_registry.evaluation import regions
 from sme_registry.evaluation.networks import Perceptron
-from sme_registry.io import versions
-from sme_registry.io.markup import percent
-from sme_registry.io.terminal import fixed
+from sme_registry.io.markup import fixed, percent
 from sme_registry.spec import (
     Digest,
     EvaluationProtocol,
@@ -111,7 +117,6 @@ class StreamDiagnosis(Diagnosis):
     def parts(self) -> Iterator[Part]:
         """Findings, then the visits and the phases."""
         yield self.findings("Findings", self.verdicts)
-        columns: tuple[str, ...]
         columns = ("visit", "phase", "online regret", "N", "inactive", "rank", "weights")
         visits = [
             (
@@ -126,19 +131,15 @@ class StreamDiagnosis(Diagnosis):
         if self.initial_network is not None:
             visits.insert(0, ("initial", "", "", "", *_network(self.initial_network)))
         yield Part("Visits", columns, visits)
-        columns = ("phase", "outcome", "best N", "final N", "fresh N", "fresh online regret")
-        phases = [
-            (
-                str(phase.phase),
-                label(phase.outcome),
-                _number(phase.best_normalised_regret),
-                _number(phase.final_normalised_regret),
-                _number(phase.fresh_normalised_regret),
-                _number(phase.fresh_online_regret),
-            )
-            for phase in self.phases
-        ]
-        yield Part("Phases", columns, phases, _LEGEND)
+        phases: dict[str, Callable[[PhaseDiagnosis], str]] = {
+            "phase": lambda phase: str(phase.phase),
+            "outcome": lambda phase: label(phase.outcome),
+            "best N": lambda phase: _number(phase.best_normalised_regret),
+            "final N": lambda phase: _number(phase.final_normalised_regret),
+            "fresh N": lambda phase: _number(phase.fresh_normalised_regret),
+            "fresh online regret": lambda phase: _number(phase.fresh_online_regret),
+        }
+        yield table("Phases", self.phases, phases, _LEGEND, detail=False)
         yield from self.answers(self.verdicts)
 
 
@@ -162,7 +163,7 @@ def _network(network: NetworkState | None) -> tuple[str, ...]:
 
 
 def _number(value: float | None) -> str:
-    return "–" if value is None else fixed(value)
+    return "–" if value is None else fixed(value, 3)
 
 
 _SHARED = ("unlearnt", "difference", "learnt_little", "few_updates")
@@ -179,14 +180,14 @@ STREAM_THRESHOLDS = {
 _T = STREAM_THRESHOLDS
 
 
-class StreamCase(NamedTuple):
+@dataclass(frozen=True)
+class StreamCase(Case):
     """What the rules read."""
 
     stream: StreamSpec
     visits: Sequence[VisitDiagnosis]
     phases: Sequence[PhaseDiagnosis]
     forgetting: float | None
-    updates: int | None = None
 
     @property
     def learnt(self) -> float:
@@ -393,67 +394,68 @@ def _equally_hard(stream: StreamSpec) -> bool:
     return len(stream.kinds) == 1 and len({phase.steps for phase in stream.phases}) == 1
 
 
-NetworkRule: TypeAlias = Callable[[NetworkState, dict[str, Any]], Decision]
+_UNKNOWN: dict[str, Answer] = {"network_unknown": "cannot tell", "one_visit": "cannot tell"}
 
 
-def _change(
-    quantity: Callable[[NetworkState], float], **reasons: Answer
-) -> Callable[[NetworkRule], None]:
-    """Decorate a rule about the last network, whose quantity is that of fresh agents' or the first
-    visit's network, too."""
+def _change(case: StreamCase, quantity: str) -> dict[str, Any]:
+    """A quantity of the last network, and of fresh agents' or the first visit's to compare it with.
 
-    def add(rule: NetworkRule) -> None:
-        def compared(case: StreamCase) -> Decision:
-            first, last = case.visits[0].network, case.visits[-1].network
-            fresh = [phase.fresh_network for phase in case.phases]
-            alone = [quantity(network) for network in fresh if network is not None]
-            if first is None or last is None:
-                return Decision("network_unknown", {})
-            against_fresh = len(alone) == len(fresh)
-            if not against_fresh and len(case.visits) == 1:
-                return Decision("one_visit", {})
-            evidence = {
-                "first": quantity(first),
-                "last": quantity(last),
-                "other": float(np.mean(alone if against_fresh else quantity(first))),
-                "against": "fresh_agents" if against_fresh else "first_visit",
-            }
-            return rule(last, evidence)
-
-        compared.__name__ = rule.__name__
-        _why(network_unknown="cannot tell", one_visit="cannot tell", **reasons)(compared)
-
-    return add
+    Without a network, or without another one, it is only the reason why.
+    """
+    first, last = case.visits[0].network, case.visits[-1].network
+    if first is None or last is None:
+        return {"reason": "network_unknown"}
+    alone = [phase.fresh_network for phase in case.phases]
+    if None not in alone:
+        against, others = "fresh_agents", alone
+    elif len(case.visits) > 1:
+        against, others = "first_visit", [first]
+    else:
+        return {"reason": "one_visit"}
+    return {
+        "first": getattr(first, quantity),
+        "last": getattr(last, quantity),
+        "other": float(np.mean([getattr(network, quantity) for network in others])),
+        "against": against,
+    }
 
 
-@_change(
-    lambda network: network.inactive_units,
+@_why(
+    **_UNKNOWN,
     units_became_inactive="yes",
     inactive_from_the_start="yes",
     units_active="no",
 )
-def _dormant_units(network: NetworkState, change: dict[str, Any]) -> Decision:
+def _dormant_units(case: StreamCase) -> Decision:
     """Whether hidden units stopped responding to the state."""
-    last, other = change["last"], change["other"]
+    change, network = _change(case, "inactive_units"), case.visits[-1].network
+    if network is None or "reason" in change:
+        return Decision(change["reason"], {})
     evidence = change | network.model_dump(include={"dormant_units", "saturated_units"})
-    if last - other >= _T["inactive_rise"]:
+    if change["last"] - change["other"] >= _T["inactive_rise"]:
         return Decision("units_became_inactive", evidence, ("inactive_rise",))
-    many = min(last, other) >= _T["inactive_share"]
+    many = min(change["last"], change["other"]) >= _T["inactive_share"]
     reason = "inactive_from_the_start" if many else "units_active"
     return Decision(reason, evidence, ("inactive_rise", "inactive_share"))
 
 
-@_change(lambda network: network.effective_rank, rank_collapsed="yes", rank_kept="no")
-def _rank_collapse(network: NetworkState, change: dict[str, Any]) -> Decision:
+@_why(**_UNKNOWN, rank_collapsed="yes", rank_kept="no")
+def _rank_collapse(case: StreamCase) -> Decision:
     """Whether the last hidden layer represents fewer directions."""
+    change, network = _change(case, "effective_rank"), case.visits[-1].network
+    if network is None or "reason" in change:
+        return Decision(change["reason"], {})
     collapsed = change["last"] <= _T["rank_ratio"] * change["other"]
     evidence = change | {"units": network.hidden[-1]}
     return Decision("rank_collapsed" if collapsed else "rank_kept", evidence, ("rank_ratio",))
 
 
-@_change(lambda network: network.weight_norm, weights_grew="yes", weights_steady="no")
-def _weight_growth(network: NetworkState, change: dict[str, Any]) -> Decision:
+@_why(**_UNKNOWN, weights_grew="yes", weights_steady="no")
+def _weight_growth(case: StreamCase) -> Decision:
     """Whether weights became so large that steps of the optimiser change little."""
+    change = _change(case, "weight_norm")
+    if "reason" in change:
+        return Decision(change["reason"], {})
     grew = change["last"] >= _T["weight_ratio"] * change["other"]
     return Decision("weights_grew" if grew else "weights_steady", change, ("weight_ratio",))
 
@@ -464,68 +466,58 @@ _MOST_STATES = 2048  # in which networks are measured; more would not change the
 def diagnose_stream(
     subject: StreamSubject, states: int, seed: int, report: Callable[[str], None]
 ) -> StreamDiagnosis:
-    """Measure the networks of a life, and answer every question about it.
-
-    The arguments and errors are those of `diagnose`.
-    """
+    """The arguments and errors are those of `diagnose`."""
     life = subject.report
-    stream, agent = life.stream, life.region("WD").agent
+    agent, regret = life.region("WD").agent, life.dynamic_regret
     report(f"{subject.name}: networks")
-    measured_in = _States(stream, states, seed)
+    measured_in = _observation(life.stream, states, seed)
     visits = tuple(_visits(subject, measured_in))
     phases = tuple(_phases(subject, measured_in))
-    case = StreamCase(stream, visits, phases, agent.forgetting[-1], subject.updates)
-    regret = life.dynamic_regret
-    return StreamDiagnosis(
-        name=subject.name,
-        stream=stream,
-        stream_digest=life.stream_digest,
-        task=life.name,
-        plan=subject.plan,
-        updates=subject.updates,
+    case = StreamCase(life.stream, visits, phases, agent.forgetting[-1], updates=subject.updates)
+    return StreamDiagnosis.about(
+        subject,
         average_performance=agent.average_performance[-1],
         forgetting=agent.forgetting[-1],
         dynamic_regret=None if regret is None else regret.dynamic_regret,
         verdicts=answer_all(STREAM_QUESTIONS, case, STREAM_THRESHOLDS),
         visits=visits,
         phases=phases,
-        initial_network=measured_in.of(subject.initial_network, 0),
+        initial_network=_state(subject.initial_network, _shown(life.stream, measured_in, 0)),
         thresholds=STREAM_THRESHOLDS,
-        versions=versions(("numpy", "scipy"), if_imported=("torch", "stable_baselines3")),
     )
 
 
-class _States:
-    """The states in which networks are measured, the same for all of them."""
-
-    def __init__(self, stream: StreamSpec, states: int, seed: int) -> None:
-        self._stream = stream
-        spec = stream.phases[0].spec
-        count = min(states, _MOST_STATES, regions.batch_rows(spec))
-        protocol = EvaluationProtocol(states_per_region=count, seed=seed)
-        (drawn,) = regions.states(protocol, 0, spec, rows=count)
-        self._observation = drawn.observation(drawn.s, spec.horizon)
-
-    def of(self, network: Perceptron | None, phase: int | None) -> NetworkState | None:
-        """The state of a network; None of an unknown one."""
-        if network is None:
-            return None
-        if phase is None or not self._stream.observes_phase:
-            return network_state(network, self._observation)
-        shown = np.zeros((len(self._observation), self._stream.observed_phases), np.float32)
-        shown[:, phase] = 1.0
-        return network_state(network, np.concatenate([self._observation, shown], axis=1))
+def _observation(stream: StreamSpec, states: int, seed: int) -> Observation:
+    """What all networks are measured on: uniform states of the first phase's task."""
+    spec = stream.phases[0].spec
+    count = min(states, _MOST_STATES, regions.batch_rows(spec))
+    protocol = EvaluationProtocol(states_per_region=count, seed=seed)
+    (drawn,) = regions.states(protocol, 0, spec, rows=count)
+    return drawn.observation(drawn.s, spec.horizon)
 
 
-def _visits(subject: StreamSubject, states: _States) -> Iterator[VisitDiagnosis]:
+def _shown(stream: StreamSpec, observation: Observation, phase: int) -> Observation:
+    """Observations with the phase, where the agent observes it."""
+    if not stream.observes_phase:
+        return observation
+    shown = np.zeros((len(observation), stream.observed_phases), np.float32)
+    shown[:, phase] = 1.0
+    return np.concatenate([observation, shown], axis=1)
+
+
+def _state(network: Perceptron | None, observation: Observation) -> NetworkState | None:
+    return None if network is None else network_state(network, observation)
+
+
+def _visits(subject: StreamSubject, observation: Observation) -> Iterator[VisitDiagnosis]:
     life = subject.report
     regret_on = life.region("WD").agent.normalised_regret
     regret = life.dynamic_regret
     logged = {} if regret is None else {visit.visit: visit for visit in regret.visits}
+    networks = subject.networks or (None,) * len(life.visits)
     begin = 0
-    for visit in life.visits:
+    for visit, network in zip(life.visits, networks, strict=True):
         log = logged.get(visit.visit)
-        network = None if subject.networks is None else subject.networks[visit.visit]
         yield VisitDiagnosis(
             visit=visit.visit,
             phase=visit.phase,
@@ -534,28 +526,31 @@ def _visits(subject: StreamSubject, states: _States) -> Iterator[VisitDiagnosis]
             dynamic_regret=None if log is None else log.dynamic_regret,
             online_regret=None if log is None else log.online_regret,
             normalised_regret=regret_on[visit.visit][visit.phase],
-            network=states.of(network, visit.phase),
+            network=_state(network, _shown(life.stream, observation, visit.phase)),
         )
         begin = visit.lifetime
 
 
-def _phases(subject: StreamSubject, states: _States) -> Iterator[PhaseDiagnosis]:
+def _phases(subject: StreamSubject, observation: Observation) -> Iterator[PhaseDiagnosis]:
     life = subject.report
     agent, regret = life.region("WD").agent, life.dynamic_regret
-    M = np.array(agent.normalised_regret)
-    fresh_regret = None if regret is None else regret.fresh_online_regret
-    initial, fresh = agent.initial_normalised_regret, agent.fresh_normalised_regret
-    P = len(life.stream.phases)
-    for phase in range(P):
+    M, P = np.array(agent.normalised_regret), len(life.stream.phases)
+    unknown = (None,) * P
+    columns = (
+        agent.initial_normalised_regret or unknown,
+        agent.fresh_normalised_regret or unknown,
+        (None if regret is None else regret.fresh_online_regret) or unknown,
+        subject.fresh_networks or unknown,
+    )
+    for phase, (initial, fresh, online, network) in enumerate(zip(*columns, strict=True)):
         best, final = float(M[phase::P, phase].min()), float(M[-1, phase])
-        network = None if subject.fresh_networks is None else subject.fresh_networks[phase]
         yield PhaseDiagnosis(
             phase=phase,
             outcome=outcome_of(best, final),
             best_normalised_regret=best,
             final_normalised_regret=final,
-            initial_normalised_regret=None if initial is None else initial[phase],
-            fresh_normalised_regret=None if fresh is None else fresh[phase],
-            fresh_online_regret=None if fresh_regret is None else fresh_regret[phase],
-            fresh_network=states.of(network, None),
+            initial_normalised_regret=initial,
+            fresh_normalised_regret=fresh,
+            fresh_online_regret=online,
+            fresh_network=_state(network, observation),
         )

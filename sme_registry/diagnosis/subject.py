@@ -1,4 +1,4 @@
-"""`Subject`: what to diagnose, loaded from a run's folder, from a cell of a study, or a policy.
+"""What to diagnose: a run of `sme train`, a cell of a study, or any policy on its task.
 
 A run is a folder of `sme train`. A cell is named by the study's folder and by its key: its digest,
 or as many of the first digits as only one cell has. The study must have kept the cell's model.
@@ -10,19 +10,21 @@ of their own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 from pydantic import JsonValue
 
-from sme_registry.diagnosis import networks
+from sme_registry.diagnosis.behaviour import Log, exploration
 from sme_registry.envs.types import Observation
 from sme_registry.errors import OptionError, SMEError, SpecError, UnknownNameError
 from sme_registry.evaluation import (
     EvaluationReport,
+    OfflinePolicy,
     Policy,
     StreamReport,
     TeamPolicy,
@@ -31,12 +33,12 @@ from sme_registry.evaluation import (
 )
 from sme_registry.evaluation.networks import Perceptron
 from sme_registry.evaluation.references import reference_policy
+from sme_registry.export.network import of_offline_policy
 from sme_registry.io import read_json
 from sme_registry.plots.streams import FILE
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.study import INDEPENDENT, Cell, in_jax
-from sme_registry.task.draw import Array
-from sme_registry.training import Episode, RunRecord
+from sme_registry.training import RunRecord
 from sme_registry.training import record as run_files
 from sme_registry.training.algorithms import find
 from sme_registry.training.hyperparameters import parameters_of
@@ -45,28 +47,18 @@ from sme_registry.training.record import CHECKPOINT, MODEL
 
 __all__ = [
     "AnySubject",
-    "Log",
     "StreamSubject",
     "Subject",
     "cell_path",
     "load_cell",
     "load_policy",
     "load_run",
+    "perceptron_of",
 ]
 
 _MIN_DIGITS = 6
+_REFERENCE = "reference:"
 Networks = tuple[Perceptron | None, ...]  # None: of an unknown kind
-
-
-@dataclass(frozen=True, eq=False)
-class Log:
-    """The regret of a training over its steps, `[N]` each; None in a log of evaluations."""
-
-    source: Literal["episodes", "evaluations"]
-    step: Array  # environment steps
-    regret: Array  # mean regret of an episode, or of an evaluation
-    unrewarded: Array | None = None  # which episodes had no reward at all
-    terminated: Array | None = None  # which episodes D terminated
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +74,15 @@ class Subject:
     checkpoint_step: int | None = None  # of an unfinished run, the steps at its checkpoint
     updates: int | None = None  # of the algorithm; None if unknown
 
+    @property
+    def document(self) -> SMESpec:
+        return self.spec
+
+    @property
+    def task(self) -> str:
+        """What the file of the task calls it."""
+        return self.spec.name
+
 
 @dataclass(frozen=True, eq=False)
 class StreamSubject:
@@ -94,9 +95,25 @@ class StreamSubject:
     initial_network: Perceptron | None = None  # before training
     fresh_networks: Networks | None = None  # of the fresh agent of each phase
     updates: int | None = None
+    checkpoint_step: ClassVar[None] = None  # it has ended
+
+    @property
+    def document(self) -> StreamSpec:
+        return self.report.stream
+
+    @property
+    def task(self) -> str:
+        """What the file of the stream calls it."""
+        return self.report.name
 
 
 AnySubject: TypeAlias = Subject | StreamSubject
+
+
+def perceptron_of(policy: Policy) -> Perceptron | None:
+    """The multilayer perceptron that a policy is, whatever trained it; None if it is another."""
+    act = of_offline_policy(policy.act) if isinstance(policy.act, OfflinePolicy) else policy.act
+    return act if isinstance(act, Perceptron) else None
 
 
 def load_policy(
@@ -116,17 +133,12 @@ def load_policy(
       >>> load_policy("linear", sme_registry.load("Default")).name
       'linear'
     """
-    if spec.team is not None:
-        if log is not None:
-            raise OptionError("log: of a team is not used. Leave it out.")
-        team = as_policy(policy, spec, action_range=action_range)
-        return Subject(name or team.name, spec, team)
-    if isinstance(policy, str | Path) and str(policy).endswith(".zip"):
+    if spec.team is not None and log is not None:
+        raise OptionError("log: of a team is not used. Leave it out.")
+    if spec.team is None and isinstance(policy, str | Path) and str(policy).endswith(".zip"):
         policy, name = load_sb3(policy), name or Path(policy).stem
-    act = numpy_policy(policy, spec, action_range=action_range)
-    episodes = None if log is None else _log_of(run_files.read_episodes(Path(log)))
-    explore = networks.exploration(policy, act)
-    return Subject(name or act.name, spec, act, log=episodes, explore=explore)
+    episodes = None if log is None else _log_of_episodes(Path(log))
+    return _subject(name, policy, spec, action_range, log=episodes)
 
 
 def load_run(folder: str | Path) -> AnySubject:
@@ -149,20 +161,141 @@ def load_run(folder: str | Path) -> AnySubject:
     name = folder.name or str(folder)
     fields = ("algorithm", "hyperparameters", "seed", "action_range", "num_envs", "steps")
     plan = {field: getattr(record, field) for field in fields}
+    updates = _updates(record.algorithm, record.hyperparameters, record.steps_done, record.num_envs)
     if record.stream is not None:
-        return _life_of_run(folder, name, record, plan)
+        kept = run_files.Snapshots(folder / run_files.SNAPSHOTS, record.stream)
+        report = _report_of_life(folder, record, kept)
+        return _life(name, report, kept, record.action_range, plan, updates)
     path, checkpoint_step = _model_of_run(folder, record)
-    steps = record.steps_done if checkpoint_step is None else checkpoint_step
-    updates = _updates(record.algorithm, record.hyperparameters, steps, record.num_envs)
-    spec, action_range = record.spec.named(record.task), record.action_range
+    log = folder / run_files.EPISODES
+    return _subject(
+        name,
+        str(path) if record.independent else load_sb3(path),
+        record.spec.named(record.task),
+        record.action_range,
+        plan=plan,
+        log=_log_of_episodes(log) if record.spec.team is None and log.exists() else None,
+        checkpoint_step=checkpoint_step,
+        updates=updates,
+    )
+
+
+def load_cell(study: str | Path, key: str) -> AnySubject:
+    """A finished cell of a study that kept its model; a life in a stream also without its models.
+
+    `key` is the cell's digest, with or without `sha256:`, or its first digits.
+
+    Examples:
+      >>> from sme_registry.diagnosis import load_cell
+      >>> from sme_registry.studies import study_status
+      >>> cells = study_status("study").cells
+      >>> key = next(cell.key for cell in cells if cell.planned.algorithm == "PPO")
+      >>> load_cell("study", key).plan["algorithm"]
+      'PPO'
+    """
+    study = Path(study)
+    path = cell_path(study, key)
+    result = read_json(path)
+    with _reading(path):
+        cell, log = Cell.from_dict(result["cell"], str(path)), _log_of_evaluations(result["curve"])
+    if cell.uses.startswith(INDEPENDENT):
+        raise OptionError(
+            f"cell={path.stem[:12]!r}: has a model for each agent. Train it with `sme train "
+            "--independent`, and diagnose that run."
+        )
+    fields = ("hyperparameters", "seed", "action_range", "steps")
+    plan = {"algorithm": cell.uses, **{field: getattr(cell, field) for field in fields}}
+    name = f"{cell.uses}, cell {path.stem[:12]}"
+    updates = _updates(cell.uses, cell.hyperparameters, cell.steps)
+    if cell.stream is not None:
+        kept = run_files.Snapshots(run_files.folder_of_cell(study, path.stem), cell.stream)
+        fresh = _fresh_networks(study, cell)
+        report = _report(result, path)
+        assert isinstance(report, StreamReport)  # of a life
+        report = _with_fresh(report, cell, path)
+        return _life(name, report, kept, cell.action_range, plan, updates, fresh)
+    return _subject(
+        name,
+        _model_of_cell(study, path.stem, cell),
+        cell.spec,
+        None if cell.uses.startswith(_REFERENCE) else cell.action_range,
+        plan=plan,
+        log=log if cell.spec.team is None else None,
+        updates=updates,
+    )
+
+
+def cell_path(study: Path, key: str) -> Path:
+    """The result of a finished cell of a study, by its key."""
+    results = sorted((study / "cells").glob("*.json"))
+    if not results:
+        raise OptionError(
+            f"run={str(study)!r}: no study with finished cells. Give a folder of `sme study run`, "
+            "or omit --cell for a run."
+        )
+    digits = key.removeprefix("sha256:").lower()
+    matches = [path for path in results if path.stem.startswith(digits)]
+    if len(matches) != 1 or len(digits) < _MIN_DIGITS:
+        raise UnknownNameError(
+            f"cell={key!r}: matches {len(matches)} of {len(results)} finished cells. Give "
+            f"{_MIN_DIGITS} or more digits that match only one, such as {_example_key(study)}."
+        )
+    return matches[0]
+
+
+def _example_key(study: Path) -> str:
+    path = min((study / "cells").glob("*.json"), default=None)
+    return path.stem[:12] if path else "KEY"
+
+
+def _subject(
+    name: str | None, model: Any, spec: SMESpec, action_range: str | None, **known: Any
+) -> Subject:
+    """A model on a task, by default under the policy's own name."""
     if spec.team is not None:
-        team = as_policy(str(path), spec, action_range=action_range)
-        return Subject(name, spec, team, plan, checkpoint_step=checkpoint_step, updates=updates)
-    model = load_sb3(path)
-    policy = numpy_policy(model, record.spec, action_range=action_range)
-    log = _episode_log(folder / run_files.EPISODES)
-    explore = networks.exploration(model, policy)
-    return Subject(name, spec, policy, plan, log, explore, checkpoint_step, updates)
+        team = as_policy(model, spec, action_range=action_range)
+        return Subject(name or team.name, spec, team, **known)
+    policy = numpy_policy(model, spec, action_range=action_range)
+    explore = exploration(model, policy)
+    return Subject(name or policy.name, spec, policy, explore=explore, **known)
+
+
+def _life(
+    name: str,
+    report: StreamReport,
+    kept: run_files.Snapshots,
+    action_range: str,
+    plan: dict[str, Any],
+    updates: int | None,
+    fresh: Networks | None = None,
+) -> StreamSubject:
+    """A life with the networks that were kept of it."""
+    networks = _networks(kept.visits, report.stream, action_range)
+    initial = _networks([kept.initial], report.stream, action_range)
+    before = None if initial is None else initial[0]
+    return StreamSubject(name, report, plan, networks, before, fresh, updates)
+
+
+def _networks(
+    paths: Sequence[Path], document: SMESpec | StreamSpec, action_range: str
+) -> Networks | None:
+    """The networks of models; None if one of them was not kept."""
+    if not all(path.exists() for path in paths):
+        return None
+    models = map(load_sb3, paths)
+    return tuple(
+        perceptron_of(numpy_policy(model, document, action_range=action_range)) for model in models
+    )
+
+
+def _fresh_networks(study: Path, cell: Cell) -> Networks | None:
+    """The network of the fresh agent of each phase; None if one of them was not kept."""
+    networks = [
+        _networks([run_files.model_of_cell(study, fresh.digest)], fresh.document, cell.action_range)
+        for fresh in cell.fresh
+    ]
+    known = [network for network in networks if network is not None]
+    return tuple(network for (network,) in known) if 0 < len(known) == len(networks) else None
 
 
 def _model_of_run(folder: Path, record: RunRecord) -> tuple[Path, int | None]:
@@ -185,60 +318,86 @@ def _model_of_run(folder: Path, record: RunRecord) -> tuple[Path, int | None]:
     return path, record.steps_done
 
 
-def load_cell(study: str | Path, key: str) -> AnySubject:
-    """A finished cell of a study that kept its model; a life in a stream also without its models.
-
-    `key` is the cell's digest, with or without `sha256:`, or its first digits.
-
-    Examples:
-      >>> from sme_registry.diagnosis import load_cell
-      >>> from sme_registry.studies import study_status
-      >>> cells = study_status("study").cells
-      >>> key = next(cell.key for cell in cells if cell.planned.algorithm == "PPO")
-      >>> load_cell("study", key).plan["algorithm"]
-      'PPO'
-    """
-    study = Path(study)
-    path = cell_path(study, key)
-    cell, log = _read_cell(path)
-    if cell.uses.startswith(INDEPENDENT):
+def _model_of_cell(study: Path, stem: str, cell: Cell) -> Any:
+    if cell.uses.startswith(_REFERENCE):
+        return reference_policy(cell.uses.removeprefix(_REFERENCE), cell.spec)
+    path = run_files.model_of_cell(study, stem)
+    if not path.exists():
         raise OptionError(
-            f"cell={path.stem[:12]!r}: has a model for each agent. Train it with `sme train "
-            "--independent`, and diagnose that run."
+            f"cell={stem[:12]!r}: its model was not kept. Finished cells are not run again, so run "
+            "the study in a new folder, with --keep-models."
         )
-    fields = ("hyperparameters", "seed", "action_range", "steps")
-    plan = {"algorithm": cell.uses, **{field: getattr(cell, field) for field in fields}}
-    name = f"{cell.uses}, cell {path.stem[:12]}"
-    updates = _updates(cell.uses, cell.hyperparameters, cell.steps)
-    if cell.stream is not None:
-        return _life_in_cell(study, name, path, cell, plan, updates)
-    model = _cell_model(study, path.stem, cell)
-    reference = callable(model) or isinstance(model, dict)
-    action_range = None if reference else cell.action_range
-    if cell.spec.team is not None:
-        team = as_policy(model, cell.spec, action_range=action_range)
-        return Subject(name, cell.spec, team, plan, updates=updates)
-    policy = numpy_policy(model, cell.spec, action_range=action_range)
-    explore = networks.exploration(model, policy)
-    return Subject(name, cell.spec, policy, plan, log, explore, updates=updates)
+    return load_sb3(path)
 
 
-def cell_path(study: Path, key: str) -> Path:
-    """The result of a finished cell of a study, by its key."""
-    results = sorted((study / "cells").glob("*.json"))
-    if not results:
+def _report_of_life(folder: Path, record: RunRecord, kept: run_files.Snapshots) -> StreamReport:
+    """The report of a finished life, with all of whose models it is diagnosed."""
+    path = folder / FILE
+    if not path.exists():
         raise OptionError(
-            f"run={str(study)!r}: no study with finished cells. Give a folder of `sme study run`, "
-            "or omit --cell for a run."
+            f"run={str(folder)!r}: contains no {FILE} yet. A life in a stream is diagnosed when it "
+            "has ended. Continue it with `sme train … --resume`."
         )
-    digits = key.removeprefix("sha256:").lower()
-    matches = [path for path in results if path.stem.startswith(digits)]
-    if len(matches) != 1 or len(digits) < _MIN_DIGITS:
-        raise UnknownNameError(
-            f"cell={key!r}: matches {len(matches)} of {len(results)} finished cells. Give "
-            f"{_MIN_DIGITS} or more digits that match only one, such as {_example_key(study)}."
+    missing = [file.name for file in (kept.initial, *kept.visits) if not file.exists()]
+    if missing:
+        raise OptionError(
+            f"run={str(folder)!r}: {run_files.SNAPSHOTS}/ lacks {missing[0]}. Copy the whole "
+            "folder of the run, or train it again with --force."
         )
-    return matches[0]
+    report = StreamReport.read(path)
+    if report.stream_digest != record.stream_digest:
+        raise OptionError(
+            f"{path}: is about the stream {report.stream_digest[:19]}…, but run.json is about "
+            f"{str(record.stream_digest)[:19]}…. Train the run again with --force."
+        )
+    return report
+
+
+def _with_fresh(report: StreamReport, cell: Cell, path: Path) -> StreamReport:
+    """The report of a cell's life, with the fresh agents of its phases once all have finished."""
+    paths = [path.with_stem(fresh.digest.removeprefix("sha256:")) for fresh in cell.fresh]
+    if not paths or not all(other.exists() for other in paths):
+        return report
+    results = [read_json(other) for other in paths]
+    reports = [_report(result, other) for result, other in zip(results, paths, strict=True)]
+    regrets = [result.get("online_regret") for result in results]
+    known = report.dynamic_regret is not None and None not in regrets
+    return report.with_fresh(reports, regrets if known else None)
+
+
+def _report(result: Any, path: Path) -> EvaluationReport | StreamReport:
+    """The report in the result of a cell."""
+    with _reading(path):
+        if result.get("report"):
+            return EvaluationReport.from_dict(result["report"], str(path))
+        return StreamReport.from_dict(result["stream_report"], str(path))
+
+
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Name the file of a result that lacks something or has it in another form."""
+    try:
+        yield
+    except SpecError:
+        raise
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise OptionError(
+            f"{path}: not the result of a cell ({type(error).__name__}: {error}). Delete it and "
+            "run the study again."
+        ) from None
+
+
+def _log_of_episodes(path: Path) -> Log | None:
+    rows = run_files.read_episodes(path)
+    if not rows:
+        return None
+    step, regret, ended = np.array([(e.step, e.regret, e.terminated) for e in rows], float).T
+    return Log("episodes", step, regret, (regret >= 1.0).astype(float), ended)
+
+
+def _log_of_evaluations(curve: Any) -> Log | None:
+    step, regret = np.array(curve["steps"], float), np.array(curve["regret"], float)
+    return Log("evaluations", step, regret) if len(step) else None
 
 
 def _updates(
@@ -264,146 +423,3 @@ def _updates(
     if isinstance(rollout := settings.get("n_steps"), int):
         return steps // (rollout * num_envs)
     return None
-
-
-def _read_cell(path: Path) -> tuple[Cell, Log | None]:
-    data = read_json(path)
-    try:
-        cell, curve = Cell.from_dict(data["cell"], str(path)), data["curve"]
-        step, regret = np.array(curve["steps"], float), np.array(curve["regret"], float)
-    except SpecError:
-        raise
-    except (KeyError, TypeError, ValueError) as error:
-        raise OptionError(
-            f"{path}: not the result of a cell ({type(error).__name__}: {error}). Delete it and "
-            "run the study again."
-        ) from None
-    return cell, Log("evaluations", step, regret) if len(step) else None
-
-
-def _cell_model(study: Path, stem: str, cell: Cell) -> Any:
-    if cell.uses.startswith("reference:"):
-        return reference_policy(cell.uses.partition(":")[2], cell.spec)
-    path = run_files.model_of_cell(study, stem)
-    if not path.exists():
-        raise OptionError(
-            f"cell={stem[:12]!r}: its model was not kept. Finished cells are not run again, so run "
-            "the study in a new folder, with --keep-models."
-        )
-    return load_sb3(path)
-
-
-def _example_key(study: Path) -> str:
-    path = next(iter(sorted((study / "cells").glob("*.json"))), None)
-    return path.stem[:12] if path else "KEY"
-
-
-def _episode_log(path: Path) -> Log | None:
-    return _log_of(run_files.read_episodes(path)) if path.exists() else None
-
-
-def _log_of(rows: list[Episode]) -> Log | None:
-    if not rows:
-        return None
-    step, regret, ended = np.array([(e.step, e.regret, e.terminated) for e in rows], float).T
-    return Log("episodes", step, regret, (regret >= 1.0).astype(float), ended)
-
-
-def _life_of_run(folder: Path, name: str, record: RunRecord, plan: dict[str, Any]) -> StreamSubject:
-    """The life of a run of `sme train`."""
-    assert record.stream is not None  # of a life
-    kept = run_files.Snapshots(folder / run_files.SNAPSHOTS, record.stream)
-    path = folder / FILE
-    if not path.exists():
-        raise OptionError(
-            f"run={str(folder)!r}: contains no {FILE} yet. A life in a stream is diagnosed when it "
-            "has ended. Continue it with `sme train … --resume`."
-        )
-    missing = [file.name for file in (kept.initial, *kept.visits) if not file.exists()]
-    if missing:
-        raise OptionError(
-            f"run={str(folder)!r}: {run_files.SNAPSHOTS}/ lacks {missing[0]}. Copy the whole "
-            "folder of the run, or train it again with --force."
-        )
-    report = StreamReport.read(path)
-    if report.stream_digest != record.stream_digest:
-        raise OptionError(
-            f"{path}: is about the stream {report.stream_digest[:19]}…, but run.json is about "
-            f"{record.stream_digest[:19]}…. Train the run again with --force."
-        )
-    stream, action_range = record.stream, record.action_range
-    initial, *visits = _networks([kept.initial, *kept.visits], stream, action_range)
-    updates = _updates(record.algorithm, record.hyperparameters, record.steps_done, record.num_envs)
-    return StreamSubject(name, report, plan, tuple(visits), initial, updates=updates)
-
-
-def _life_in_cell(
-    study: Path,
-    name: str,
-    path: Path,
-    cell: Cell,
-    plan: dict[str, Any],
-    updates: int | None,
-) -> StreamSubject:
-    """The life of a cell of a study, with its fresh agents where all have finished."""
-    assert cell.stream is not None  # of a life
-    report = _report(read_json(path), path)
-    assert isinstance(report, StreamReport)
-    fresh = [path.with_stem(_stem(other)) for other in cell.fresh]
-    if fresh and all(result.exists() for result in fresh):
-        report = _with_fresh(report, fresh)
-    kept = run_files.Snapshots(run_files.folder_of_cell(study, path.stem), cell.stream)
-    of_visits = _kept(kept.visits, cell.stream, cell.action_range)
-    initial = _kept([kept.initial], cell.stream, cell.action_range)
-    alone = [
-        _kept([run_files.model_of_cell(study, other.digest)], other.document, cell.action_range)
-        for other in cell.fresh
-    ]
-    return StreamSubject(
-        name,
-        report,
-        plan,
-        of_visits,
-        initial[0] if initial else None,
-        tuple(networks[0] for networks in alone if networks) if alone and all(alone) else None,
-        updates,
-    )
-
-
-def _stem(cell: Cell) -> str:
-    return cell.digest.removeprefix("sha256:")
-
-
-def _report(result: Any, path: Path) -> EvaluationReport | StreamReport:
-    """The report in the result of a cell."""
-    kinds: dict[str, type[EvaluationReport] | type[StreamReport]] = {
-        "report": EvaluationReport,
-        "stream_report": StreamReport,
-    }
-    for name, kind in kinds.items():
-        if isinstance(result, dict) and result.get(name):
-            return kind.from_dict(result[name], str(path))
-    raise OptionError(
-        f"{path}: not the result of a cell: has neither {' nor '.join(kinds)}. Delete it and run "
-        "the study again."
-    )
-
-
-def _with_fresh(report: StreamReport, paths: list[Path]) -> StreamReport:
-    """The report with the fresh agents of all phases, from the results of their cells."""
-    results = [read_json(path) for path in paths]
-    regrets = [result.get("online_regret") for result in results]
-    known = report.dynamic_regret is not None and None not in regrets
-    reports = [_report(result, path) for result, path in zip(results, paths, strict=True)]
-    return report.with_fresh(reports, regrets if known else None)
-
-
-def _kept(paths: list[Path], document: SMESpec | StreamSpec, action_range: str) -> Networks | None:
-    """The networks of models, of which a study may have kept none."""
-    exist = all(path.exists() for path in paths)
-    return _networks(paths, document, action_range) if exist else None
-
-
-def _networks(paths: Iterable[Path], document: SMESpec | StreamSpec, action_range: str) -> Networks:
-    policies = (numpy_policy(load_sb3(p), document, action_range=action_range) for p in paths)
-    return tuple(policy.act if isinstance(policy.act, Perceptron) else None for policy in policies)

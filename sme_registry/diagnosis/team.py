@@ -15,35 +15,32 @@ all agents drive one transition. `n` states, `S` state_dim, `A` action_dim, `m` 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from sme_registry.diagnosis import measure, rollouts
-from sme_registry.diagnosis.document import Diagnosis, Level, TaskDiagnosis, Verdict
+from sme_registry.diagnosis import behaviour, measure
+from sme_registry.diagnosis.document import Diagnosis, Level, Part, Verdict, table, words
 from sme_registry.diagnosis.measurements import LINEAR, POLICY, Measurements, Score
-from sme_registry.diagnosis.page import Part, words
 from sme_registry.diagnosis.questions import (
     THRESHOLDS,
     Case,
     Decision,
     Question,
+    TaskCase,
     add_to,
     answer_all,
-    level,
-    thresholds_of,
 )
 from sme_registry.diagnosis.subject import Subject
+from sme_registry.diagnosis.task import TaskDiagnosis, level, thresholds_of
 from sme_registry.diagnosis.where import WHERE
 from sme_registry.diagnosis.why import WHY
 from sme_registry.envs.types import Observation
 from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.evaluation import Policy, TeamPolicy, regions
-from sme_registry.io import versions
-from sme_registry.io.markup import percent
-from sme_registry.io.terminal import fixed
+from sme_registry.io.markup import fixed, percent
 from sme_registry.spec import (
     Digest,
     EvaluationProtocol,
@@ -87,6 +84,16 @@ class AgentDiagnosis(StrictModel):
     verdicts: TupleOf[Verdict]  # on its own policy
     measurements: Measurements  # what the verdicts rest on
 
+    @property
+    def visited_regret(self) -> float:
+        """Normalised regret over its own channels in the states that the team visits."""
+        return self.measurements.on_policy.scores[POLICY].normalised_regret
+
+    @property
+    def linear_regret(self) -> float:
+        """Normalised regret of the linear policy over its own channels, in uniform states."""
+        return self.measurements.uniform[LINEAR].normalised_regret
+
 
 class TeamDiagnosis(Diagnosis):
     """The diagnosis of a team's policies; its verdicts say who causes the regret.
@@ -121,8 +128,7 @@ class TeamDiagnosis(Diagnosis):
     def parts(self) -> Iterator[Part]:
         """Who causes the regret, each agent's numbers and where its own error is."""
         yield self.findings("Who is to blame", self.verdicts)
-        left_out = words(self.template, "left_out", self.left_out)
-        yield Part("Agents", _COLUMNS, [self._row(a) for a in self.agents], (_LEGEND, left_out))
+        yield self._agents()
         for agent in self.agents:
             where = self.findings("", agent.verdicts, TaskDiagnosis.template)
             heading = f"Where the error of {agent.name} is"
@@ -131,36 +137,25 @@ class TeamDiagnosis(Diagnosis):
         for agent in self.agents:
             yield from self.answers(agent.verdicts, f": {agent.name}", TaskDiagnosis.template)
 
-    def _row(self, agent: AgentDiagnosis) -> tuple[str, ...]:
-        measured = agent.measurements
-        regrets = (
-            measured.policy.normalised_regret,
-            measured.on_policy.scores[POLICY].normalised_regret,
-            measured.uniform[LINEAR].normalised_regret,
-        )
-        return (
-            agent.name,
-            percent(agent.visited.regret_share / max(self.visited.regret, _LEAST_REGRET)),
-            percent(len(agent.action_channels) / self.spec.action_dim),
-            *map(fixed, regrets),
-            fixed(agent.visited.difference_reward),
-        )
+    def _agents(self) -> Part:
+        regret = max(self.visited.regret, _LEAST_REGRET)
+        columns: dict[str, Callable[[AgentDiagnosis], str]] = {
+            "agent": lambda agent: agent.name,
+            "share of regret": lambda agent: percent(agent.visited.regret_share / regret),
+            "of channels": lambda agent: percent(len(agent.action_channels) / self.spec.action_dim),
+            "N, uniform": lambda agent: fixed(agent.measurements.policy.normalised_regret, 3),
+            "N, own episodes": lambda agent: fixed(agent.visited_regret, 3),
+            "N, linear": lambda agent: fixed(agent.linear_regret, 3),
+            "gain if optimal": lambda agent: fixed(agent.visited.difference_reward, 3),
+        }
+        left_out = words(self.template, "left_out", self.left_out)
+        return table("Agents", self.agents, columns, (_LEGEND, left_out), detail=False)
 
 
-_COLUMNS = (
-    "agent",
-    "share of regret",
-    "of channels",
-    "N, uniform",
-    "N, own episodes",
-    "N, linear",
-    "gain if optimal",
-)
 _LEGEND = (
     "N: normalised regret over the agent's channels · gain if optimal: of the team's step reward, "
     "if this agent alone acted optimally · the shares add up to the team's regret in its episodes"
 )
-
 
 TEAM_THRESHOLDS = {
     **{name: THRESHOLDS[name] for name in ("solved", "difference", "on_policy_ratio")},
@@ -171,13 +166,13 @@ TEAM_THRESHOLDS = {
 _T = TEAM_THRESHOLDS
 
 
-class TeamCase(NamedTuple):
+@dataclass(frozen=True)
+class TeamCase(Case):
     """What the rules read."""
 
     agents: Sequence[AgentDiagnosis]
     spec: SMESpec
     visited: Score  # of the team
-    updates: int | None = None
 
     @property
     def learnt(self) -> float:
@@ -186,23 +181,27 @@ class TeamCase(NamedTuple):
 
     @property
     def solved(self) -> bool:
-        """Whether nothing is left to explain."""
         return self.learnt <= _T["solved"]
 
     @property
+    def best(self) -> AgentDiagnosis:
+        """The agent with the lowest normalised regret in the states that the team visits."""
+        return min(self.agents, key=lambda agent: agent.visited_regret)
+
+    @property
     def worst(self) -> AgentDiagnosis:
-        """The agent with the highest normalised regret in the states that the team visits."""
-        return max(self.agents, key=visited_regret)
+        """The agent with the highest."""
+        return max(self.agents, key=lambda agent: agent.visited_regret)
+
+    @property
+    def gap(self) -> float:
+        """How much better the best agent is than the worst."""
+        return self.worst.visited_regret - self.best.visited_regret
 
 
 TEAM_QUESTIONS: dict[str, Question[TeamCase]] = {}
 """Questions about a team, in order."""
 _question = partial(add_to, TEAM_QUESTIONS, "who")
-
-
-def visited_regret(agent: AgentDiagnosis) -> float:
-    """Normalised regret over the agent's own channels in the states that the team visits."""
-    return agent.measurements.on_policy.scores[POLICY].normalised_regret
 
 
 @_question(some_agents_to_blame="yes", spread_over_agents="no", solved="no")
@@ -213,7 +212,7 @@ def _blame(case: TeamCase) -> Decision:
             "agent": agent.name,
             "regret_share": agent.visited.regret_share / total,
             "channel_share": len(agent.action_channels) / case.spec.action_dim,
-            "normalised_regret": visited_regret(agent),
+            "normalised_regret": agent.visited_regret,
         }
         for agent in case.agents
     ]
@@ -229,11 +228,15 @@ def _blame(case: TeamCase) -> Decision:
 
 @_question(agents_differ="yes", agents_alike="no")
 def _unequal_agents(case: TeamCase) -> Decision:
-    best, worst = min(case.agents, key=visited_regret), case.worst
-    low, high = visited_regret(best), visited_regret(worst)
+    best, worst = case.best, case.worst
     return Decision(
-        "agents_differ" if high - low >= _T["difference"] else "agents_alike",
-        {"best": best.name, "worst": worst.name, "lowest": low, "highest": high},
+        "agents_differ" if case.gap >= _T["difference"] else "agents_alike",
+        {
+            "best": best.name,
+            "worst": worst.name,
+            "lowest": best.visited_regret,
+            "highest": worst.visited_regret,
+        },
         ("difference",),
     )
 
@@ -242,18 +245,16 @@ def _unequal_agents(case: TeamCase) -> Decision:
 def _harder_optimum(case: TeamCase) -> Decision:
     """Whether the worst agent's π* is harder: further from what a linear policy attains."""
     worst = case.worst
-    others = [agent for agent in case.agents if agent is not worst]
-    regret = {agent.name: _linear_regret(agent) for agent in case.agents}
-    other = sum(regret[agent.name] for agent in others) / len(others) if others else 1.0
-    alike = visited_regret(worst) - min(map(visited_regret, case.agents)) < _T["difference"]
-    harder = regret[worst.name] - other >= _T["difference"]
+    regrets = [agent.linear_regret for agent in case.agents if agent is not worst]
+    other = sum(regrets) / len(regrets) if regrets else 1.0
+    harder = worst.linear_regret - other >= _T["difference"]
     reason = "optimum_harder" if harder else "optimum_not_harder"
     return Decision(
-        "agents_alike" if alike else reason,
+        "agents_alike" if case.gap < _T["difference"] else reason,
         {
             "agent": worst.name,
             "normalised_regret": worst.measurements.policy.normalised_regret,
-            "linear_normalised_regret": regret[worst.name],
+            "linear_normalised_regret": worst.linear_regret,
             "others_linear_normalised_regret": other,
             "nonlinear_variance": worst.measurements.response.nonlinear_variance,
         },
@@ -261,15 +262,11 @@ def _harder_optimum(case: TeamCase) -> Decision:
     )
 
 
-def _linear_regret(agent: AgentDiagnosis) -> float:
-    return agent.measurements.uniform[LINEAR].normalised_regret
-
-
 @_question(worse_where_visited="yes", not_worse_where_visited="no", solved="no")
 def _visited_states(case: TeamCase) -> Decision:
     """Whether the worst agent fails in the states that the team visits rather than everywhere."""
     worst = case.worst
-    visited, uniform = visited_regret(worst), worst.measurements.policy.normalised_regret
+    visited, uniform = worst.visited_regret, worst.measurements.policy.normalised_regret
     worse = visited >= _T["on_policy_ratio"] * uniform and visited - uniform >= _T["difference"]
     reason = "worse_where_visited" if worse else "not_worse_where_visited"
     return Decision(
@@ -311,74 +308,53 @@ def _ended_episodes(case: TeamCase) -> Decision:
     )
 
 
-class _Member(NamedTuple):
-    """One agent as if it were alone."""
-
-    task: Task  # of its own action channels
-    policy: Policy  # from observations `[B, S + 2]` to its actions
-
-
 def diagnose_team(
     subject: Subject, states: int, episodes: int, seed: int, report: Callable[[str], None]
 ) -> TeamDiagnosis:
-    """Measure a team and each of its agents, and answer who is to blame for its regret.
-
-    The arguments and errors are those of `diagnose`.
-    """
+    """The arguments and errors are those of `diagnose`."""
     task, policy = materialize(subject.spec), subject.policy
     assert isinstance(policy, TeamPolicy)  # of a team's spec
     report(f"{subject.name}: episodes")
     references = measure.fit_references(task, states, seed)
-    runs = rollouts.episodes_of(_joint_action(policy, task), task, references, episodes, seed)
+    act = _joint_action(policy, task)
+    runs = behaviour.episodes_of(act, task, references, episodes, seed)
     first = runs[0][POLICY]
     uniform = _team_in(task, *_uniform(task, policy, states, seed))
     visited = _team_in(task, first.s[first.alive], first.a[first.alive])
     questions, thresholds = _questions(task.spec), thresholds_of(task.spec)
     agents = []
-    for index, member in enumerate(_members(task, policy)):
-        report(f"{subject.name}: {task.names[index]}")
-        measurements = _measurements(member, runs[index], states, seed)
-        case = Case(measurements, member.task.spec, updates=subject.updates)
+    for index, name in enumerate(task.names):
+        report(f"{subject.name}: {name}")
+        own, alone = _alone(task, policy, index)
+        fitted = measure.fit_references(own, states, seed)
+        fields, _ = measure.fixed_states(alone, own, fitted, states, seed)
+        measured = Measurements(**fields, on_policy=behaviour.on_policy(own, runs[index]))
+        case = TaskCase(measured, own.spec, updates=subject.updates)
         agents.append(
             AgentDiagnosis(
-                name=task.names[index],
+                name=name,
                 state_channels=tuple(channel + 1 for channel in task.observed[index]),
                 action_channels=tuple(i + 1 for i in range(*task.owned[index].indices(10**9))),
-                level=level(measurements),
+                level=level(measured),
                 uniform=uniform.credit[index],
                 visited=visited.credit[index],
                 verdicts=answer_all(questions, case, thresholds),
-                measurements=measurements,
+                measurements=measured,
             )
         )
-    team = TeamCase(agents, subject.spec, visited.score, subject.updates)
-    return TeamDiagnosis(
-        name=subject.name,
-        spec=subject.spec,
-        spec_digest=subject.spec.digest,
-        task=subject.spec.name,
-        plan=subject.plan,
-        checkpoint_step=subject.checkpoint_step,
-        updates=subject.updates,
+    team = TeamCase(agents, subject.spec, visited.score, updates=subject.updates)
+    return TeamDiagnosis.about(
+        subject,
         uniform=uniform.score,
         visited=visited.score,
         verdicts=answer_all(TEAM_QUESTIONS, team, TEAM_THRESHOLDS),
         agents=tuple(agents),
         left_out=tuple(name for name in WHY if name not in questions and not WHY[name].needs),
         thresholds=TEAM_THRESHOLDS,
-        versions=versions(("numpy", "scipy"), if_imported=("torch", "stable_baselines3")),
     )
 
 
-def _measurements(
-    member: _Member, runs: dict[str, rollouts.Trajectories], states: int, seed: int
-) -> Measurements:
-    fitted = measure.fit_references(member.task, states, seed)
-    fields, _ = measure.fixed_states(member.policy, member.task, fitted, states, seed)
-    return Measurements(**fields, on_policy=rollouts.on_policy(member.task, runs))
-
-
-def _questions(spec: SMESpec) -> dict[str, Question[Case]]:
+def _questions(spec: SMESpec) -> dict[str, Question[TaskCase]]:
     """The questions about a task that have an answer for an agent of a team.
 
     Those about training rest on the log, the exploration or the network of a single learner with a
@@ -390,22 +366,18 @@ def _questions(spec: SMESpec) -> dict[str, Question[Case]]:
     return questions
 
 
-def _members(task: Task, policy: TeamPolicy) -> list[_Member]:
-    """Each agent's own task and policy."""
-    members = []
-    for index, member in enumerate(policy.members):
-        owned = task.owned[index]
-        fields = {**task.spec.to_dict(), "team": None, "action_dim": member.action_dim}
-        own = Task(
-            spec=SMESpec.from_dict(fields),
-            W=task.W[owned],
-            b=task.b,
-            policies=(task.policies[index],),
-            observed=(task.observed[index],),
-        )
-        act = _own_action(policy, index)
-        members.append(_Member(own, Policy(member.agent, "unit", act, member.action_dim)))
-    return members
+def _alone(task: Task, policy: TeamPolicy, index: int) -> tuple[Task, Policy]:
+    """The task of an agent's own action channels, and its policy of observations `[B, S + 2]`."""
+    member, owned = policy.members[index], task.owned[index]
+    fields = {**task.spec.to_dict(), "team": None, "action_dim": member.action_dim}
+    own = Task(
+        spec=SMESpec.from_dict(fields),
+        W=task.W[owned],
+        b=task.b,
+        policies=(task.policies[index],),
+        observed=(task.observed[index],),
+    )
+    return own, Policy(member.agent, "unit", _own_action(policy, index), member.action_dim)
 
 
 def _own_action(policy: TeamPolicy, index: int) -> Callable[[Observation], Array]:

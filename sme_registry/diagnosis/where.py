@@ -15,16 +15,16 @@ from sme_registry.diagnosis.measurements import (
 from sme_registry.diagnosis.questions import (
     SAFETY_THRESHOLDS,
     THRESHOLDS,
-    Case,
     Decision,
     Question,
+    TaskCase,
     add_to,
 )
 from sme_registry.evaluation import ObservationReport
 
 __all__ = ["WHERE", "distractors_of", "limits_of"]
 
-WHERE: dict[str, Question[Case]] = {}
+WHERE: dict[str, Question[TaskCase]] = {}
 """Questions about the policy, in order."""
 _question = partial(add_to, WHERE, "where")
 _T = THRESHOLDS | SAFETY_THRESHOLDS
@@ -33,7 +33,7 @@ _TINY = 1e-9
 
 
 @_question(some_channels_unlearnt="yes", spread_over_channels="no")
-def _action_channels(case: Case) -> Decision:
+def _action_channels(case: TaskCase) -> Decision:
     channels = case.measurements.channels
     unlearnt = [c for c in channels if c.normalised_regret >= _T["unlearnt"]]
     learnt = [c for c in channels if c.normalised_regret <= _T["channel_learnt"]]
@@ -58,7 +58,7 @@ def _channel(channel: Channel) -> dict[str, Any]:
 
 
 @_question(error_localised="yes", error_not_localised="no")
-def _state_region(case: Case) -> Decision:
+def _state_region(case: TaskCase) -> Decision:
     partitions = case.measurements.partitions
     most = max(partitions, key=lambda p: p.explained_variance)
     low, high = min(most.mae), max(most.mae)
@@ -81,7 +81,7 @@ def _state_region(case: Case) -> Decision:
 
 
 @_question(similarity_lost="yes", similarity_kept="no")
-def _out_of_distribution(case: Case) -> Decision:
+def _out_of_distribution(case: TaskCase) -> Decision:
     inside, outside = case.measurements.shells[0], case.measurements.shells[-1]
     wd, ood = inside.scores[POLICY], outside.scores[POLICY]
     loss = 100.0 * (ood.mae - wd.mae)
@@ -99,7 +99,7 @@ def _out_of_distribution(case: Case) -> Decision:
 
 
 @_question(error_changes="yes", error_steady="no")
-def _time_in_episode(case: Case) -> Decision:
+def _time_in_episode(case: TaskCase) -> Decision:
     episodes = case.measurements.on_policy
     first, last = episodes.mae[0], episodes.mae[-1]
     ratio = max(first, last) / max(min(first, last), _TINY)
@@ -113,8 +113,8 @@ def _time_in_episode(case: Case) -> Decision:
 
 
 @_question(lower_regret_where_visited="yes", higher_regret_where_visited="yes", similar_regret="no")
-def _visited_states(case: Case) -> Decision:
-    episodes, uniform = case.measurements.on_policy, case.measurements.policy.normalised_regret
+def _visited_states(case: TaskCase) -> Decision:
+    episodes, uniform = case.measurements.on_policy, case.learnt
     visited = episodes.scores[POLICY].normalised_regret
     ratio, limit = visited / max(uniform, _TINY), _T["on_policy_ratio"]
     apart = abs(visited - uniform) >= _T["on_policy_difference"]
@@ -138,7 +138,7 @@ def _visited_states(case: Case) -> Decision:
 
 
 @_question(offset_dominant="yes", offset_minor="no")
-def _constant_offset(case: Case) -> Decision:
+def _constant_offset(case: TaskCase) -> Decision:
     share = case.measurements.squared_error.offset
     worst = max(case.measurements.channels, key=lambda c: abs(c.offset))
     dominant = share >= _T["dominant_share"] and not case.solved
@@ -151,7 +151,7 @@ def _constant_offset(case: Case) -> Decision:
 
 
 @_question(underreaction="yes", overreaction="yes", scale_minor="no")
-def _response_scale(case: Case) -> Decision:
+def _response_scale(case: TaskCase) -> Decision:
     share, channels = case.measurements.squared_error.scale, case.measurements.channels
     slope = sum(c.slope for c in channels) / len(channels)
     reason = "scale_minor"
@@ -168,7 +168,7 @@ def _response_scale(case: Case) -> Decision:
     neither_part_learnt="no",
     optimum_nearly_linear="no",
 )
-def _linear_only(case: Case) -> Decision:
+def _linear_only(case: TaskCase) -> Decision:
     response = case.measurements.response
     linear, nonlinear = response.linear_slope, response.nonlinear_slope
     if response.nonlinear_variance < _T["nonlinear_variance"] or nonlinear is None:
@@ -188,7 +188,7 @@ def _linear_only(case: Case) -> Decision:
 
 
 @_question(saturated="yes", not_saturated="no")
-def _saturation(case: Case) -> Decision:
+def _saturation(case: TaskCase) -> Decision:
     response = case.measurements.response
     worst = max(case.measurements.channels, key=lambda c: c.at_zero + c.at_one)
     excess = response.saturation - response.optimal_saturation
@@ -203,7 +203,7 @@ def _saturation(case: Case) -> Decision:
 
 
 @_question(noisy="yes", repeatable="no")
-def _action_noise(case: Case) -> Decision:
+def _action_noise(case: TaskCase) -> Decision:
     share = case.measurements.squared_error.noise
     noisy = share >= _T["noise_or_time_share"]
     reason = "noisy" if noisy else "repeatable"
@@ -211,7 +211,7 @@ def _action_noise(case: Case) -> Decision:
 
 
 @_question(depends_on_time="yes", depends_on_accumulated_reward="yes", independent="no")
-def _time_dependence(case: Case) -> Decision:
+def _time_dependence(case: TaskCase) -> Decision:
     error, time = case.measurements.squared_error, case.measurements.time_dependence
     dependent = max(error.time, error.accumulated_reward) >= _T["noise_or_time_share"]
     reason = "independent"
@@ -232,7 +232,7 @@ def _time_dependence(case: Case) -> Decision:
     )
 
 
-def limits_of(case: Case) -> Violations:
+def limits_of(case: TaskCase) -> Violations:
     limits = case.measurements.limits
     assert limits is not None  # the questions are asked only then
     return limits
@@ -248,7 +248,7 @@ def limits_of(case: Case) -> Violations:
     earns_by_violating="yes",
     violates_without_gain="yes",
 )
-def _constraint_violation(case: Case) -> Decision:
+def _constraint_violation(case: TaskCase) -> Decision:
     limits = limits_of(case)
     inside, outside, visited = limits.report.regions[0], limits.report.regions[-1], limits.visited
     share = max(inside.violating_share, visited.violating_share)
@@ -286,7 +286,7 @@ def _constraint_violation(case: Case) -> Decision:
     )
 
 
-def distractors_of(case: Case) -> tuple[Distraction, ObservationReport]:
+def distractors_of(case: TaskCase) -> tuple[Distraction, ObservationReport]:
     distraction, observation = case.measurements.distraction, case.measurements.observation
     assert distraction is not None
     assert observation is not None
@@ -294,7 +294,7 @@ def distractors_of(case: Case) -> tuple[Distraction, ObservationReport]:
 
 
 @_question(needs="distraction", similarity_lost="yes", similarity_kept="no")
-def _distractors_outside(case: Case) -> Decision:
+def _distractors_outside(case: TaskCase) -> Decision:
     _, observation = distractors_of(case)
     outside = observation.distractor_regions[-1]
     loss = 100.0 * (outside.mae - case.measurements.policy.mae)
@@ -304,7 +304,7 @@ def _distractors_outside(case: Case) -> Decision:
         {
             "region": outside.name,
             "similarity_loss": loss,
-            "normalised_regret": case.measurements.policy.normalised_regret,
+            "normalised_regret": case.learnt,
             "outside_normalised_regret": outside.normalised_regret,
         },
         ("distractor_loss",),
@@ -319,7 +319,7 @@ def _distractors_outside(case: Case) -> Decision:
     state_alone_kept="no",
     neither_kept="no",
 )
-def _distractors_represented(case: Case) -> Decision:
+def _distractors_represented(case: TaskCase) -> Decision:
     _, observation = distractors_of(case)
     if len(observation.probes) < 2:
         return Decision("layers_unknown", {})

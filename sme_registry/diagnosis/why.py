@@ -12,16 +12,16 @@ from sme_registry.diagnosis.measurements import POLICY
 from sme_registry.diagnosis.questions import (
     SAFETY_THRESHOLDS,
     THRESHOLDS,
-    Case,
     Decision,
     Question,
+    TaskCase,
     add_to,
 )
 from sme_registry.diagnosis.where import distractors_of, limits_of
 
 __all__ = ["WHY"]
 
-WHY: dict[str, Question[Case]] = {}
+WHY: dict[str, Question[TaskCase]] = {}
 """Questions about training, in order."""
 _question = partial(add_to, WHY, "why")
 _T = THRESHOLDS | SAFETY_THRESHOLDS
@@ -36,7 +36,7 @@ _DETERMINISTIC_SD = 1e-6
     rewards_too_rare="yes",
     rewards_found="cannot tell",
 )
-def _exploration(case: Case) -> Decision:
+def _exploration(case: TaskCase) -> Decision:
     log, episodes = case.measurements.training, case.measurements.on_policy
     rewarded = episodes.random_signal.rewarded
     regret = episodes.scores[POLICY].regret
@@ -60,7 +60,7 @@ def _exploration(case: Case) -> Decision:
     return Decision("rewards_too_rare" if rare else "rewards_found", evidence, ("rarely_rewarded",))
 
 
-def _exploration_sd(case: Case) -> dict[str, Any]:
+def _exploration_sd(case: TaskCase) -> dict[str, Any]:
     sd = case.measurements.exploration_sd
     if sd is None:
         return {"exploration_sd": None}
@@ -68,7 +68,7 @@ def _exploration_sd(case: Case) -> dict[str, Any]:
 
 
 @_question(paid_every_step="no", delayed_payout="cannot tell")
-def _credit_assignment(case: Case) -> Decision:
+def _credit_assignment(case: TaskCase) -> Decision:
     k, episodes = case.spec.k, case.measurements.on_policy
     if k == 1:
         return Decision("paid_every_step", {"k": k})
@@ -82,7 +82,7 @@ def _credit_assignment(case: Case) -> Decision:
     rewards_frequent="no",
     effect_unknown="cannot tell",
 )
-def _sparsity(case: Case) -> Decision:
+def _sparsity(case: TaskCase) -> Decision:
     r_min, episodes, log = case.spec.r_min, case.measurements.on_policy, case.measurements.training
     signal, random = episodes.signal, episodes.random_signal
     evidence = {
@@ -108,8 +108,8 @@ def _sparsity(case: Case) -> Decision:
     network_fits_training_states_only="no",
     probe_inconclusive="cannot tell",
 )
-def _capacity(case: Case) -> Decision:
-    probe, regret = case.measurements.capacity, case.measurements.policy.normalised_regret
+def _capacity(case: TaskCase) -> Decision:
+    probe, regret = case.measurements.capacity, case.learnt
     evidence: dict[str, Any] = {
         "complexity": case.spec.complexity,
         "nonlinear_variance": case.measurements.response.nonlinear_variance,
@@ -132,8 +132,8 @@ def _capacity(case: Case) -> Decision:
 
 
 @_question(too_few_states="yes", states_sufficient="no", not_separated="cannot tell")
-def _dimension(case: Case) -> Decision:
-    probe, regret = case.measurements.capacity, case.measurements.policy.normalised_regret
+def _dimension(case: TaskCase) -> Decision:
+    probe, regret = case.measurements.capacity, case.learnt
     channels = case.measurements.channels
     evidence: dict[str, Any] = {
         "state_dim": case.spec.state_dim,
@@ -154,7 +154,7 @@ def _dimension(case: Case) -> Decision:
 
 
 @_question(no_survival_threshold="no", episodes_cut_short="yes", episodes_long_enough="no")
-def _survival(case: Case) -> Decision:
+def _survival(case: TaskCase) -> Decision:
     spec, episodes, log = case.spec, case.measurements.on_policy, case.measurements.training
     if spec.D == 0:
         return Decision("no_survival_threshold", {"D": spec.D})
@@ -185,7 +185,7 @@ def _survival(case: Case) -> Decision:
     never_improved="cannot tell",
     plateaued="no",
 )
-def _budget(case: Case) -> Decision:
+def _budget(case: TaskCase) -> Decision:
     log = case.measurements.training
     if log is None:
         return Decision("no_training_log", {})
@@ -212,7 +212,7 @@ def _budget(case: Case) -> Decision:
 
 
 @_question(needs="limits", not_within_limits="no", explains_regret="yes", explains_little="no")
-def _price_of_safety(case: Case) -> Decision:
+def _price_of_safety(case: TaskCase) -> Decision:
     limits, regret = limits_of(case), case.measurements.policy.regret
     inside = limits.report.regions[0]
     share = max(inside.violating_share, limits.visited.violating_share)
@@ -230,7 +230,7 @@ def _price_of_safety(case: Case) -> Decision:
 
 
 @_question(needs="distraction", distracted="yes", hardly_distracted="no", invariant="no")
-def _distraction(case: Case) -> Decision:
+def _distraction(case: TaskCase) -> Decision:
     effect, observation = distractors_of(case)
     invariance = observation.invariance[0].invariance
     if effect.owed_regret >= _T["owed_to_distractors"]:

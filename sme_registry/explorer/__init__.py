@@ -4,15 +4,17 @@ It carries the networks of the task and of the policy and computes them in the b
 nothing, and works from a file.
 """
 
-from sme_registry.explorer.collect import EPISODES, facts, refuse_large
-from sme_registry.explorer.graph import GraphNode, program_of_graph
 from sme_registry.explorer.page import (
+    EPISODES,
     FILE,
     STATIC,
     explorer_page,
+    facts,
+    refuse_large,
     run_report,
     write_explorer,
 )
+from sme_registry.explorer.policies import GraphNode, program_of_graph
 from sme_registry.explorer.program import Program
 
 __all__ = [

@@ -1,5 +1,9 @@
 """The page: one HTML file that carries its data and its script, and loads nothing.
 
+The networks of the task and of a policy are in the data as programs, so that the page computes π*,
+the policy's action and the regret in any state. A policy whose network is unknown is sampled
+instead, on a grid over two of the inputs, with the others at the values of `resting`.
+
 Text from outside is only ever in the data, which is JSON in which `<`, `>` and `&` are escaped; the
 script puts it on the page as text. A content security policy allows this script and this style by
 their hashes, and nothing else: no other code, and no network.
@@ -9,35 +13,59 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import itertools
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from markupsafe import Markup
 
-from sme_registry.diagnosis.subject import AnySubject, StreamSubject, cell_path
-from sme_registry.errors import OptionError
-from sme_registry.evaluation import EvaluationReport
-from sme_registry.explorer.collect import EPISODES, facts
+from sme_registry.diagnosis.behaviour import Log, rollout
+from sme_registry.diagnosis.measure import MAX_NUMBERS, fit_references
+from sme_registry.diagnosis.subject import AnySubject, StreamSubject, Subject, cell_path
+from sme_registry.errors import OptionError, ResourceLimitError
+from sme_registry.evaluation import EvaluationReport, Policy, TeamPolicy
+from sme_registry.evaluation.references import LABELS, References
+from sme_registry.explorer import program as programs
+from sme_registry.explorer.policies import policy_program
+from sme_registry.explorer.program import MAX_WEIGHTS, encoded
 from sme_registry.io import read_json, write_atomically
 from sme_registry.io.markup import environment
-from sme_registry.spec import SMESpec
+from sme_registry.spec import SMESpec, catalogue
+from sme_registry.statistics import smoothed
+from sme_registry.task import Task, materialize, memory, streams
+from sme_registry.task.draw import Array
 from sme_registry.training import EXPLORER as FILE
+from sme_registry.training import short_name
 from sme_registry.training.reports import EVALUATION
 from sme_registry.version import __version__
 
-__all__ = ["FILE", "STATIC", "explorer_page", "run_report", "write_explorer"]
+__all__ = [
+    "EPISODES",
+    "FILE",
+    "MAX_INPUTS",
+    "STATIC",
+    "explorer_page",
+    "facts",
+    "refuse_large",
+    "run_report",
+    "write_explorer",
+]
 
+EPISODES = 64
+MAX_INPUTS = 512  # each has a slider
+_GRID = 81  # points along a side of a sampled map
+_EPSILON = 1.0  # of a sampled map: [−½, 1½]²
+_FIT_STATES = 2048
+_MAX_HORIZON = 20_000  # longer episodes are not run
+_TIMES, _LINE, _DOTS = 200, 300, 500  # points of a drawn line, and dots of a training
+_LINEAR, _HALF = "linear_least_squares", "constant_half"
 _ASSETS = Path(__file__).parent / "assets"
-_ESCAPES = {
-    "<": "\\u003c",
-    ">": "\\u003e",
-    "&": "\\u0026",
-    "\u2028": "\\u2028",
-    "\u2029": "\\u2029",
-}
+_ESCAPES = str.maketrans({letter: f"\\u{ord(letter):04x}" for letter in "<>&\u2028\u2029"})
 
 
 def write_explorer(
@@ -80,7 +108,7 @@ def explorer_page(
             "FILE, the task of its phase."
         )
     spec, subject = (shown, None) if isinstance(shown, SMESpec) else (shown.spec, shown)
-    content = facts(
+    data = facts(
         spec,
         subject,
         report=report,
@@ -89,27 +117,13 @@ def explorer_page(
         seed=seed,
         remark=remark,
     )
-    return _page(content, static)
-
-
-def run_report(folder: str | os.PathLike[str], cell: str | None = None) -> EvaluationReport | None:
-    """The evaluation of a run's folder, or of a finished cell of a study; None if there is none."""
-    if cell is not None:
-        result = read_json(cell_path(Path(folder), cell))
-        return EvaluationReport.from_dict(result["report"]) if "report" in result else None
-    path = Path(folder) / EVALUATION
-    return EvaluationReport.read(path) if path.exists() else None
-
-
-def _page(data: dict[str, Any], static: str) -> str:
-    title = f"{data['name']} on {data['title']}" if data["name"] else data["title"]
     script, style = STATIC["explorer.js"], STATIC["explorer.css"]
     sources = ("'self' file:",) * 2 if static else tuple(f"'{_hash(x)}'" for x in (script, style))
     return (
         environment(_ASSETS, autoescape=True)
         .get_template("page.html.jinja")
         .render(
-            title=title,
+            title=f"{data['name']} on {data['title']}" if data["name"] else data["title"],
             kind="Policy and task" if data["name"] else "Task",
             version=__version__,
             data=Markup(json_in_html(data)),
@@ -122,12 +136,19 @@ def _page(data: dict[str, Any], static: str) -> str:
     )
 
 
+def run_report(folder: str | os.PathLike[str], cell: str | None = None) -> EvaluationReport | None:
+    """The evaluation of a run's folder, or of a finished cell of a study; None if there is none."""
+    if cell is not None:
+        result = read_json(cell_path(Path(folder), cell))
+        return EvaluationReport.from_dict(result["report"]) if "report" in result else None
+    path = Path(folder) / EVALUATION
+    return EvaluationReport.read(path) if path.exists() else None
+
+
 def json_in_html(data: Any) -> str:
     """Data as JSON that no text in it can end, inside a `<script>` element."""
     text = json.dumps(data, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
-    for letter, escaped in _ESCAPES.items():
-        text = text.replace(letter, escaped)
-    return text
+    return text.translate(_ESCAPES)
 
 
 def _hash(text: str) -> str:
@@ -147,3 +168,239 @@ STATIC = {
     "explorer.css": _asset("explorer.css"),
 }
 """The script and the style of every page, by name."""
+
+
+def facts(
+    spec: SMESpec,
+    subject: Subject | None = None,
+    *,
+    report: EvaluationReport | None = None,
+    channels: Sequence[tuple[int, int]] = (),
+    episodes: int = EPISODES,
+    seed: int = 0,
+    remark: str = "",
+) -> dict[str, Any]:
+    """The data of a page."""
+    refuse_large(spec)
+    pairs = [_pair(pair, programs.point_width(spec)) for pair in channels]
+    task = materialize(spec)
+    optimal, limit = programs.optimal(task), programs.limit(task)
+    fitted = fit_references(task, _FIT_STATES, seed)
+    references = {
+        _LINEAR: programs.linear(task, fitted),
+        _HALF: programs.constant(task, np.full(spec.action_dim, 0.5)),
+    }
+    policies = [
+        {"name": LABELS[name], "of": "point", "program": program.to_dict()}
+        for name, program in references.items()
+    ]
+    name = None
+    if subject is not None:
+        name = _name(subject)
+        policies.insert(0, {"name": name, **_policy(subject, task, pairs or [(0, 1)])})
+    return {
+        "title": catalogue.title(spec),
+        "name": name,
+        "digest": spec.digest,
+        "task": _task(task),
+        "optimal": optimal.to_dict(),
+        "limit": None if limit is None else limit.to_dict(),
+        "observe": programs.observe(task).to_dict(),
+        "policies": policies,
+        "rest": _rounded(resting(spec)),
+        "episode": _episode(task, subject, fitted, episodes, seed),
+        "training": _training(None if subject is None else subject.log),
+        "regions": None if report is None else _regions(report),
+        "probes": _probes(report),
+        "remark": remark,
+        "plan": {} if subject is None else _plan(subject),
+    }
+
+
+def refuse_large(spec: SMESpec) -> None:
+    """Raise OptionError or ResourceLimitError if a task is too large for a page."""
+    inputs = programs.point_width(spec)
+    if inputs > MAX_INPUTS:
+        raise OptionError(
+            f"state_dim={spec.state_dim}: with {inputs} inputs, and a page has a slider for each: "
+            f"must be at most {MAX_INPUTS}. Use `sme evaluate` or `sme diagnose`."
+        )
+    weights = memory.parameter_bytes(spec) // 8
+    if weights > MAX_WEIGHTS:
+        raise ResourceLimitError(
+            f"complexity={spec.complexity}, hidden_width={spec.hidden_width}, "
+            f"state_dim={spec.state_dim}: a task of {weights:,} numbers is too large for a page: "
+            f"must be at most {MAX_WEIGHTS:,}. Use `sme evaluate` or `sme diagnose`."
+        )
+
+
+def _name(subject: Subject) -> str:
+    """What the page calls a policy: the algorithm of a run, which is known by its folder."""
+    algorithm = subject.plan.get("algorithm")
+    return subject.name if algorithm is None else short_name(str(algorithm))
+
+
+def resting(spec: SMESpec) -> Array:
+    """The point at which a page opens: the cube's centre, halfway through an episode, r_cum = 0."""
+    return np.array([*[0.5] * (spec.state_dim + spec.distractors), 0.5, 0.0])
+
+
+def _pair(channels: tuple[int, int], inputs: int) -> tuple[int, int]:
+    first, second = channels
+    if first == second or not all(1 <= each <= inputs - 2 for each in channels):
+        raise OptionError(
+            f"--channels {first},{second}: must be two different channels in [1, {inputs - 2}]. "
+            "State channels come first, then distractors."
+        )
+    return first - 1, second - 1
+
+
+def _task(task: Task) -> dict[str, Any]:
+    spec = task.spec
+    return {
+        "S": spec.state_dim,
+        "A": spec.action_dim,
+        "m": spec.distractors,
+        "L": spec.complexity,
+        "k": spec.k,
+        "r_min": spec.r_min,
+        "D": spec.D,
+        "T": spec.horizon,
+        "tau": None if spec.safety is None else spec.safety.tightness,
+        "mixing": "none" if spec.observation is None else spec.observation.mixing,
+        "agents": []
+        if spec.team is None
+        else [
+            {"name": name, "from": owned.start + 1, "to": owned.stop}
+            for name, owned in zip(task.names, task.owned, strict=True)
+        ],
+    }
+
+
+def _policy(subject: Subject, task: Task, pairs: Sequence[tuple[int, int]]) -> dict[str, Any]:
+    """The policy as a program of observations, or its actions on a grid."""
+    program = policy_program(subject.policy, task.spec)
+    if program is not None:
+        return {"of": "observation", "program": program.to_dict()}
+    recurrent = getattr(subject.policy, "episodes", None) is not None
+    grids = [_grid(subject.policy, task, pair) for pair in dict.fromkeys(pairs)]
+    return {"of": "grid", "recurrent": recurrent, "grids": grids}
+
+
+def _grid(policy: Policy | TeamPolicy, task: Task, axes: tuple[int, int]) -> dict[str, Any]:
+    """Actions `[_GRID, _GRID, A]` over two inputs; rows by the second."""
+    side = np.linspace(-_EPSILON / 2.0, 1.0 + _EPSILON / 2.0, _GRID)
+    points = np.tile(resting(task.spec), (_GRID * _GRID, 1))
+    points[:, axes[0]] = np.tile(side, _GRID)
+    points[:, axes[1]] = np.repeat(side, _GRID)
+    seen = programs.observe(task)(points).astype(np.float32)
+    rows = [np.clip(policy(each), 0.0, 1.0) for each in np.array_split(seen, _GRID)]
+    actions = np.concatenate(rows).astype(np.float32)
+    return {"axes": list(axes), "n": _GRID, "epsilon": _EPSILON, "actions": encoded(actions)}
+
+
+def _episode(
+    task: Task,
+    subject: Subject | None,
+    fitted: References,
+    episodes: int,
+    seed: int,
+) -> dict[str, Any] | None:
+    """The regret of each step of an episode, over some episodes; None if they are too long."""
+    S, A, T = task.spec.state_dim, task.spec.action_dim, task.spec.horizon
+    if T > _MAX_HORIZON:
+        return None
+    n = max(1, min(episodes, MAX_NUMBERS // (T * (S + A + 8))))
+    starts = streams.uniform(seed, "explorer/starts", n * S).reshape(n, S)
+
+    def steps(act: Callable[[Any], Any], *, sees_state: bool = False) -> tuple[Array, Any]:
+        runs = rollout(act, task, starts, seed, sees_state=sees_state)
+        return 1.0 - np.mean([run.reward for run in runs], axis=0), runs[0].alive
+
+    half = np.full((n, A), 0.5)
+    lines = {
+        LABELS[name]: _over_time(*steps(act, sees_state=True), T)["mean"]
+        for name, act in ((_LINEAR, fitted.linear), (_HALF, lambda s: half))
+    }
+    own = {} if subject is None else _over_time(*steps(subject.policy.start()), T)
+    return {"episodes": n, "t": _edges(T)[:-1].tolist(), "references": lines, **own}
+
+
+def _edges(T: int) -> npt.NDArray[np.int64]:
+    return np.linspace(0, T, min(T, _TIMES) + 1).round().astype(np.int64)
+
+
+def _over_time(regret: Array, alive: npt.NDArray[np.bool_], T: int) -> dict[str, Any]:
+    """Mean and deciles of `[t, n]` regrets over running episodes, by time; None after the last."""
+    rows: dict[str, list[Any]] = {"mean": [], "low": [], "high": [], "running": []}
+    for low, high in itertools.pairwise(_edges(T)):
+        values = regret[low:high][alive[low:high]]
+        numbers: list[float] | list[None] = [None] * 3
+        if len(values):
+            numbers = _rounded([values.mean(), *np.quantile(values, [0.1, 0.9])])
+        for name, number in zip(("mean", "low", "high"), numbers, strict=True):
+            rows[name].append(number)
+        running = alive[low:high].mean() if low < len(alive) else 0.0
+        rows["running"].append(round(float(running), 4))
+    return rows
+
+
+def _training(log: Log | None) -> dict[str, Any] | None:
+    if log is None:
+        return None
+    x, y, window = smoothed(log.step, log.regret)
+    order = np.argsort(log.step, kind="stable")
+    dots, line = _thinned(len(order), _DOTS), _thinned(len(x), _LINE)
+    return {
+        "each": "episode" if log.source == "episodes" else "evaluation",
+        "count": len(log.step),
+        "window": window,
+        "dots": [_rounded(log.step[order][dots]), _rounded(log.regret[order][dots])],
+        "line": [_rounded(x[line]), _rounded(y[line])],
+    }
+
+
+def _thinned(count: int, most: int) -> npt.NDArray[np.int64]:
+    return np.unique(np.linspace(0, count - 1, most).round().astype(np.int64))
+
+
+def _regions(report: EvaluationReport) -> dict[str, Any]:
+    shown = {report.policy: report.regions} | {
+        LABELS[name]: report.references[name]
+        for name in (_LINEAR, _HALF)
+        if name in report.references
+    }
+    return {
+        "names": [region.name for region in report.regions],
+        "epsilon": [region.epsilon_high for region in report.regions],
+        "lines": {
+            name: _rounded([region.normalised_regret for region in regions])
+            for name, regions in shown.items()
+        },
+    }
+
+
+def _probes(report: EvaluationReport | None) -> list[dict[str, Any]]:
+    if report is None or report.observation is None:
+        return []
+    return [probe.model_dump() for probe in report.observation.probes]
+
+
+def _plan(subject: Subject) -> dict[str, str]:
+    """What is known about the training, as text."""
+    plan: dict[str, Any] = subject.plan
+    names = [name for name in ("algorithm", "steps", "seed") if name in plan]
+    shown = {"run": subject.name} if names else {}
+    shown |= {name: plan[name] for name in names}
+    texts = {name: f"{v:,}" if name == "steps" else str(v) for name, v in shown.items()}
+    settings = plan.get("hyperparameters") or {}
+    if settings:
+        texts["hyperparameters"] = ", ".join(f"{k} = {v}" for k, v in sorted(settings.items()))
+    if subject.checkpoint_step is not None:
+        texts["checkpoint"] = f"unfinished, at step {subject.checkpoint_step:,}"
+    return texts
+
+
+def _rounded(values: Any) -> list[float]:
+    """Numbers with six digits, which is more than a screen shows."""
+    return [float(f"{value:.6g}") for value in np.asarray(values, dtype=np.float64)]

@@ -1,4 +1,4 @@
-"""`Program`: a feed-forward network as plain steps, which NumPy and a page's script compute alike.
+"""A network as plain steps, a `Program`, which NumPy and a page's script compute alike.
 
 Value 0 is the input `[B, n]`, and step i computes value i from earlier ones. The last value is the
 output. All sums are in float64; weights keep the type that they were given in.
@@ -9,6 +9,13 @@ output. All sums are in float64; weights keep the type that they were given in.
     clip       to [low, high]                           normalise  (x − mean x) / √(var x + epsilon)
     phi        Φ(x), the standard normal CDF            round32    to the nearest float32
     relu, tanh, sigmoid, softplus, elu (alpha), leaky_relu (alpha), erf, exp, sqrt, abs, neg
+
+Every program of a task has the same input, a *point* x = (s, d, t/T, r_cum/k): S state channels, m
+distractors, and the two other entries of an observation. Source: METHOD, sections 1, 5, 8 and 9.
+
+    optimal(x)      π*(s)                         `[B, A]`
+    limit(x)        ℓ(s) = 1 − 2τ v(s)            `[B, A]`, with safety
+    observe(x)      (M(s, d), t/T, r_cum/k)       `[B, S + m + 2]`, rounded to float32
 """
 
 from __future__ import annotations
@@ -23,20 +30,37 @@ import numpy.typing as npt
 from scipy.special import erf, expit, ndtr
 
 from sme_registry.errors import ResourceLimitError
+from sme_registry.evaluation.references import References
+from sme_registry.spec import SMESpec
+from sme_registry.task import Task
 from sme_registry.task.draw import Array, Layer
 
-__all__ = ["MAX_WEIGHTS", "MAX_WIDTH", "Program", "ProgramBuilder", "ProgramStep", "encoded"]
+__all__ = [
+    "MAX_WEIGHTS",
+    "MAX_WIDTH",
+    "OPERATIONS",
+    "Program",
+    "ProgramBuilder",
+    "ProgramStep",
+    "constant",
+    "encoded",
+    "limit",
+    "linear",
+    "observe",
+    "optimal",
+    "point_width",
+]
 
 MAX_WEIGHTS = 2**21  # of a program: 22 MB of text as float64, and seconds for a map in a browser
 MAX_WIDTH = 2**13  # columns of a value
 
-_BINARY: dict[str, Callable[..., Any]] = {
+OPERATIONS: dict[str, Callable[..., Any]] = {
+    "dense": lambda x, W, b: x @ W.T + b,
+    "concat": lambda *x: np.concatenate(x, axis=1),
     "add": np.add,
     "sub": np.subtract,
     "mul": np.multiply,
     "div": np.divide,
-}
-_UNARY: dict[str, Callable[..., Any]] = {
     "phi": ndtr,
     "round32": lambda x: x.astype(np.float32).astype(np.float64),
     "relu": lambda x: np.maximum(x, 0.0),
@@ -55,7 +79,6 @@ _UNARY: dict[str, Callable[..., Any]] = {
         (x - x.mean(axis=1, keepdims=True)) / np.sqrt(x.var(axis=1, keepdims=True) + epsilon)
     ),
 }
-UNARY = frozenset(_UNARY)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,20 +96,13 @@ class ProgramStep:
 
     def compute(self, values: list[Array]) -> Array:
         """Its value `[B, width]`, from all earlier values."""
-        x = [values[i] for i in self.inputs]
-        if self.op == "dense":
-            W, b = (self.arrays[name].astype(np.float64) for name in "Wb")
-            return np.asarray(x[0] @ W.T + b)
+        operands = [values[i] for i in self.inputs]
+        operands += [array.astype(np.float64) for array in self.arrays.values()]
         if self.op == "constant":
-            return np.tile(self.arrays["v"].astype(np.float64), (len(values[0]), 1))
+            return np.tile(operands[0], (len(values[0]), 1))
         if self.op == "columns":
-            return np.asarray(x[0][:, list(self.columns)])
-        if self.op == "concat":
-            return np.concatenate(x, axis=1)
-        if self.op in _BINARY:
-            operands = [*x, *(v.astype(np.float64) for v in self.arrays.values())]
-            return np.asarray(_BINARY[self.op](*operands))
-        return np.asarray(_UNARY[self.op](x[0], **self.numbers))
+            return np.asarray(operands[0][:, list(self.columns)])
+        return np.asarray(OPERATIONS[self.op](*operands, **self.numbers))
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,3 +243,63 @@ def encoded(array: npt.NDArray[Any]) -> dict[str, str]:
     kind = "f4" if array.dtype == np.float32 else "f8"
     data = np.ascontiguousarray(array, dtype=f"<{kind}").tobytes()
     return {kind: base64.b64encode(data).decode("ascii")}
+
+
+def point_width(spec: SMESpec) -> int:
+    """Entries of a point: S + m + 2."""
+    return spec.state_dim + spec.distractors + 2
+
+
+def optimal(task: Task) -> Program:
+    """π* of a point; of a team, each agent's from what it observes."""
+    spec = task.spec
+    build = ProgramBuilder(point_width(spec), "π*")
+    actions = [
+        build.layers(build.columns(0, tuple(observed)), layers)
+        for observed, layers in zip(task.observed, task.policies, strict=True)
+    ]
+    build.concat(*actions)
+    return build.build()
+
+
+def limit(task: Task) -> Program | None:
+    """ℓ of a point; None without safety."""
+    if task.spec.safety is None:
+        return None
+    build = ProgramBuilder(point_width(task.spec), "the network of the limits")
+    v = build.layers(build.columns(0, tuple(range(task.spec.state_dim))), task.limiting)
+    build.affine(v, -2.0 * task.spec.safety.tightness, 1.0)
+    return build.build()
+
+
+def observe(task: Task) -> Program:
+    """What the policy sees in a point, rounded to float32."""
+    spec = task.spec
+    n = spec.state_dim + spec.distractors
+    build = ProgramBuilder(point_width(spec), "the mixing")
+    x = 0
+    if spec.observation is not None and spec.observation.mixing != "none":
+        x = build.columns(0, tuple(range(n)))
+        if spec.observation.mixing == "orthogonal":
+            ((W, b),) = task.mixing
+            x = build.dense(x, W, b)
+        else:
+            x = build.layers(x, task.mixing)
+        x = build.concat(x, build.columns(0, (n, n + 1)))
+    build.unary("round32", x)
+    return build.build()
+
+
+def linear(task: Task, fitted: References) -> Program:
+    """The linear least-squares policy of a report, of a point."""
+    build = ProgramBuilder(point_width(task.spec), "the linear policy")
+    s = build.columns(0, tuple(range(task.spec.state_dim)))
+    build.dense(s, fitted.slope.T.copy(), fitted.intercept - 0.5 * fitted.slope.sum(axis=0))
+    return build.build()
+
+
+def constant(task: Task, action: Array) -> Program:
+    """One action `[A]` in every point."""
+    build = ProgramBuilder(point_width(task.spec), "the constant policy")
+    build.constant(action)
+    return build.build()

@@ -1,4 +1,4 @@
-"""Tables and sentences that stay readable at any width.
+"""Tables that stay readable at any width.
 
 No cell is cut, no word broken, no column dropped. In a narrow terminal a table first loses its
 lines, then wraps columns of text between words; where that is not enough, each row becomes a block.
@@ -8,7 +8,6 @@ Output that is no terminal has one line per row, however long, for `grep` and `a
 from __future__ import annotations
 
 import itertools
-import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -180,60 +179,3 @@ def _padded(text: str, width: int, kind: str) -> str:
 def _pair(heading: str, text: Text) -> Text:
     name = Text(f"{' '.join(heading.split())} ", style="dim")
     return Text.assemble(name, Text(", ").join(text.split("\n")))
-
-
-_COLUMNS = 80  # of lines in a file or a pipe
-_INDENT = 4
-
-
-class Paragraph:
-    """Plain text, wrapped between words, in one of Rich's styles."""
-
-    def __init__(self, text: str, style: str = "") -> None:
-        self.text, self.style = text, style
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        if console.is_terminal:
-            yield Text(self.text, style=self.style)
-        else:
-            yield _wrapped(self.text)
-
-
-class Answers:
-    """Questions, their answers, and sentences of evidence."""
-
-    def __init__(
-        self, title: str, rows: Iterable[tuple[str, str, str]], styles: dict[str, str]
-    ) -> None:
-        self.title, self.rows, self.styles = title, list(rows), styles
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield Text(self.title, style="italic")
-        if console.is_terminal:
-            yield self._table()
-            return
-        for question, answer, evidence in self.rows:
-            yield Text(f"{question}: {answer}")
-            yield _wrapped(evidence, " " * _INDENT)
-
-    def _table(self) -> RichTable:
-        table = RichTable(show_header=False, box=None)
-        table.add_column(style="cyan", no_wrap=True, min_width=19)
-        table.add_column(no_wrap=True, min_width=max(map(len, self.styles)))
-        table.add_column(overflow="fold")
-        for question, answer, evidence in self.rows:
-            table.add_row(Text(question), Text(answer, style=self.styles[answer]), Text(evidence))
-        return table
-
-
-def _wrapped(text: str, indent: str = "") -> Text:
-    """Lines that break between words only; a word that is too long has a longer line."""
-    lines = textwrap.wrap(
-        text,
-        _COLUMNS,
-        initial_indent=indent,
-        subsequent_indent=indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
-    return Text("\n".join(lines))

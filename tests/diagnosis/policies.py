@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import Console
 
 from sme_registry import SMESpec
-from sme_registry.diagnosis import diagnose, load_policy, page
+from sme_registry.diagnosis import diagnose, load_policy
 from sme_registry.evaluation import Perceptron
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.io.terminal import out
@@ -39,12 +39,12 @@ def diagnosis_of(policy, spec=SPEC, **options):
 
 def markdown(diagnosis, figures=(), details=False):
     """The page of a diagnosis."""
-    return page.markdown(diagnosis.view(), figures, details=details)
+    return diagnosis.markdown(figures, details=details)
 
 
 def printed(diagnosis, width=None, details=False):
     """The lines on a terminal of this width, or in a pipe."""
-    parts = page.terminal(diagnosis.view(), details=details)
+    parts = diagnosis.terminal(details=details)
     text = io.StringIO()
     with contextlib.redirect_stdout(text):
         console = out()

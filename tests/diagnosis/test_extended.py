@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sme_registry import evaluate
-from sme_registry.diagnosis import Diagnosis, diagnose, load_policy, networks
+from sme_registry.diagnosis import Diagnosis, behaviour, diagnose, load_policy
 from sme_registry.diagnosis.figures import draw
 from sme_registry.diagnosis.measurements import POLICY
 from sme_registry.diagnosis.questions import SAFETY_THRESHOLDS, THRESHOLDS
@@ -246,7 +246,7 @@ def test_the_page_the_terminal_and_the_data_have_limits_distractors_and_layers(t
 
 def test_the_capacity_probe_sees_what_the_agent_sees(monkeypatch):
     pytest.importorskip("torch")
-    monkeypatch.setattr(networks, "GRADIENT_STEPS", 1000)  # it tells how far it is
+    monkeypatch.setattr(behaviour, "GRADIENT_STEPS", 1000)  # it tells how far it is
     subject = load_policy(network(), EXTENDED)
     said = []
     found = diagnose(subject, states=64, episodes=8, probe_capacity=True, progress=said.append)

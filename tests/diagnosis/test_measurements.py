@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sme_registry import evaluate, materialize
-from sme_registry.diagnosis import measure, rollouts
+from sme_registry.diagnosis import behaviour, measure
 from sme_registry.diagnosis.measurements import POLICY
 from tests.diagnosis.policies import (
     DEEP,
@@ -75,17 +75,16 @@ def test_rewards_of_an_episode_that_D_terminated_before_a_payout_have_no_credit(
     alive = np.array([[1, 1], [1, 1], [0, 1], [0, 1]], bool)
     payout_due = np.array([[0, 0], [0, 1], [0, 0], [0, 1]], bool)
     zeros = np.zeros((4, 2))
-    trajectories = rollouts.Trajectories(
+    trajectories = behaviour.Trajectories(
         np.zeros((4, 2, 1)), np.zeros((4, 2, 1)), zeros, zeros, reward, payout, alive, payout_due,
         np.array([True, False]),
     )  # fmt: skip
     by_hand = np.corrcoef([0.2, 0.9, 0.4, 0.6], [1.1, 1.1, 1.0, 1.0])[0, 1] ** 2
-    assert rollouts._credit(trajectories) == pytest.approx(by_hand)
+    assert behaviour._credit(trajectories) == pytest.approx(by_hand)
 
 
 def test_the_probe_fits_what_a_network_can_represent_and_fails_at_the_rest(monkeypatch):
     torch = pytest.importorskip("torch")
-    from sme_registry.diagnosis import networks
     from sme_registry.evaluation.networks import Perceptron
 
     def probe(widths, spec, states):
@@ -94,10 +93,10 @@ def test_the_probe_fits_what_a_network_can_represent_and_fails_at_the_rest(monke
             for pair in itertools.pairwise(widths)
         ]
         network = Perceptron((*inner, (*last[:2], "identity")))
-        return networks.probe_capacity(network, materialize(spec), states, 0, lambda done: None)
+        return behaviour.probe_capacity(network, materialize(spec), states, 0, lambda done: None)
 
-    monkeypatch.setattr(networks, "GRADIENT_STEPS", 300)
-    monkeypatch.setattr(networks, "_MIN_STATES", 16)
+    monkeypatch.setattr(behaviour, "GRADIENT_STEPS", 300)
+    monkeypatch.setattr(behaviour, "_MIN_STATES", 16)
     torch.manual_seed(5)
     state = torch.random.get_rng_state()
     wide = probe((10, 64, 4), SPEC, 5000)

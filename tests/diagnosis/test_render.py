@@ -8,10 +8,10 @@ from jinja2 import UndefinedError
 
 from sme_registry import SMESpec
 from sme_registry.diagnosis import Diagnosis, TaskDiagnosis, diagnose, load_policy, questions
-from sme_registry.diagnosis.diagnose import TASK_QUESTIONS, judge
-from sme_registry.diagnosis.document import Comparison, Difference
+from sme_registry.diagnosis.document import label
 from sme_registry.diagnosis.measurements import CapacityProbe, Measurements, TrainingSummary
-from sme_registry.diagnosis.page import label
+from sme_registry.diagnosis.questions import Comparison, Difference
+from sme_registry.diagnosis.task import TASK_QUESTIONS, judge
 from tests.diagnosis.policies import (
     EXTENDED,
     SPEC,

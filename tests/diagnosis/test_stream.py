@@ -16,8 +16,8 @@ from sme_registry.diagnosis import (
     load_policy,
     load_run,
 )
+from sme_registry.diagnosis.behaviour import network_state
 from sme_registry.diagnosis.measurements import NetworkState
-from sme_registry.diagnosis.networks import network_state
 from sme_registry.diagnosis.questions import OPEN_REASONS, answer_all
 from sme_registry.diagnosis.stream import (
     STREAM_QUESTIONS,
@@ -299,7 +299,9 @@ def random_case(generator):
     for j in range(P):
         online = generator.uniform(0.3, 0.7) if fresh and log else None
         phases.append(phase_of(j, number(), number(), number(fresh), online, state(fresh)))
-    return StreamCase(stream, visits, phases, number(V > 1), generator.choice((None, 5, 30)))
+    return StreamCase(
+        stream, visits, phases, number(V > 1), updates=generator.choice((None, 5, 30))
+    )
 
 
 def test_every_reason_is_reached_and_has_a_sentence():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import sme_registry
-from sme_registry.diagnosis import Diagnosis, diagnose, load_cell, load_run, networks
+from sme_registry.diagnosis import Diagnosis, behaviour, diagnose, load_cell, load_run
 from sme_registry.errors import DigestMismatchError, OptionError, PolicyError, UnknownNameError
 from sme_registry.wrappers import RecordRegret
 from tests.commands import good, refused
@@ -74,7 +74,7 @@ def test_an_unfinished_run_is_diagnosed_from_its_checkpoint(run, tmp_path):
 
 def test_the_command_writes_a_page_its_data_and_its_figures(run, tmp_path, monkeypatch, figures):
     pytest.importorskip("matplotlib")
-    monkeypatch.setattr(networks, "GRADIENT_STEPS", 10)
+    monkeypatch.setattr(behaviour, "GRADIENT_STEPS", 10)
     folder = tmp_path / "d"
     result = good("diagnose", run, "--out", folder, "--probe-capacity", "--all", *SHORT)
     assert "Findings (1 seed, 1 update" in result.stdout

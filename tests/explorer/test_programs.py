@@ -8,8 +8,8 @@ from sme_registry.diagnosis import load_policy
 from sme_registry.errors import ResourceLimitError
 from sme_registry.evaluation import as_policy
 from sme_registry.evaluation.references import reference_policy
-from sme_registry.explorer import networks
-from sme_registry.explorer.graph import GraphNode, program_of_graph
+from sme_registry.explorer import policies, program
+from sme_registry.explorer.policies import GraphNode, program_of_graph
 from sme_registry.explorer.program import MAX_WEIGHTS, MAX_WIDTH, ProgramBuilder
 from tests.explorer.networks import arrays, observations, offline, perceptron
 
@@ -18,7 +18,7 @@ TASKS = ["Default", "Complexity50", "Safety20", "MixedLinear", "HardSafeMixed", 
 
 
 def points(spec, rows=64):
-    return 2.0 * np.random.default_rng(3).random((rows, networks.point_width(spec))) - 0.5
+    return 2.0 * np.random.default_rng(3).random((rows, program.point_width(spec))) - 0.5
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -26,8 +26,8 @@ def test_the_optimum_and_the_limits_are_the_tasks_own(name):
     task = materialize(load(name, SMESpec))
     x = points(task.spec)
     s = x[:, : task.spec.state_dim]
-    np.testing.assert_allclose(networks.optimal(task)(x), task.optimal_action(s), atol=1e-12)
-    limit = networks.limit(task)
+    np.testing.assert_allclose(program.optimal(task)(x), task.optimal_action(s), atol=1e-12)
+    limit = program.limit(task)
     if task.spec.safety is None:
         assert limit is None
     else:
@@ -39,23 +39,23 @@ def test_the_optimum_and_the_limits_are_the_tasks_own(name):
 def test_a_policy_sees_what_the_task_shows(name):
     task = materialize(load(name, SMESpec))
     x = points(task.spec)
-    seen = networks.observe(task)(x)
+    seen = program.observe(task)(x)
     np.testing.assert_allclose(seen, observations(task.spec, x), atol=1e-6)
     assert np.array_equal(seen, seen.astype(np.float32))
 
 
 def program_of(policy, **options):
-    return networks.policy_program(load_policy(policy, SPEC, **options).policy, SPEC)
+    return policies.policy_program(load_policy(policy, SPEC, **options).policy, SPEC)
 
 
 def same_actions(prepared, spec=SPEC):
     """The program of a policy acts as the policy."""
-    program = networks.policy_program(prepared, spec)
+    program = policies.policy_program(prepared, spec)
     assert program is not None
     seen = points(spec).astype(np.float32)
     expected = np.clip(prepared(seen), 0.0, 1.0)
     assert expected.std() > 0.05  # no constant
-    np.testing.assert_allclose(np.clip(program(seen), 0.0, 1.0), expected, atol=networks.TOLERANCE)
+    np.testing.assert_allclose(np.clip(program(seen), 0.0, 1.0), expected, atol=policies.TOLERANCE)
 
 
 def known(policy, **options):

@@ -1,0 +1,346 @@
+"""One policy on one task: its measurements, the verdicts, and a comparison with another run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, ClassVar
+
+from pydantic import JsonValue
+
+from sme_registry.diagnosis import behaviour, measure
+from sme_registry.diagnosis.document import Diagnosis, Level, Part, Verdict, label, table, words
+from sme_registry.diagnosis.measurements import (
+    LINEAR,
+    POLICY,
+    CapacityProbe,
+    Measurements,
+    Violations,
+)
+from sme_registry.diagnosis.questions import (
+    SAFETY_THRESHOLDS,
+    THRESHOLDS,
+    Comparison,
+    Difference,
+    TaskCase,
+    answer_all,
+)
+from sme_registry.diagnosis.subject import Subject, perceptron_of
+from sme_registry.diagnosis.where import WHERE
+from sme_registry.diagnosis.why import WHY
+from sme_registry.evaluation import Policy, evaluate
+from sme_registry.evaluation.references import LABELS
+from sme_registry.evaluation.tables import SAFETY_REFERENCES
+from sme_registry.io.markup import fixed, percent, signed
+from sme_registry.spec import Digest, EvaluationProtocol, SMESpec
+from sme_registry.task import Task, materialize
+
+__all__ = ["TASK_QUESTIONS", "TaskDiagnosis", "diagnose_task", "judge", "level", "thresholds_of"]
+
+TASK_QUESTIONS = {**WHERE, **WHY}
+
+
+class TaskDiagnosis(Diagnosis):
+    """The diagnosis of one policy on one task.
+
+    Attributes:
+      spec: the task.
+      spec_digest: the task's digest.
+      level: normalised regret, ranked among the constant ½, the linear policy and 0.
+      comparison: with another run; null without one.
+      measurements: what the verdicts rest on.
+    """
+
+    only_field: ClassVar[str] = "measurements"
+
+    spec: SMESpec
+    spec_digest: Digest
+    level: Level
+    comparison: Comparison | None = None
+    measurements: Measurements
+
+    def parts(self) -> Iterator[Part]:
+        """Findings, the comparison, and on request the other answers and the numbers."""
+        yield self.findings("Findings", self.verdicts)
+        if self.comparison is not None:
+            yield from _parts_of_comparison(self.comparison)
+        yield from self.answers(self.verdicts)
+        yield from _numbers(self.measurements)
+
+
+def _parts_of_comparison(comparison: Comparison) -> Iterator[Part]:
+    columns: dict[str, Callable[[Difference], str]] = {
+        "quantity": lambda row: label(row.quantity),
+        "this run": lambda row: fixed(row.value, 3),
+        "other run": lambda row: fixed(row.other, 3),
+        "difference": lambda row: signed(row.value - row.other, 3),
+    }
+    notes = (words("task.jinja", "comparison", comparison),)
+    yield table("Compared with another run", comparison.differences, columns, notes, detail=False)
+    if comparison.answers:
+        answers = [(label(question), *pair) for question, pair in comparison.answers.items()]
+        yield Part("Answers that differ", ("question", "this run", "other run"), answers)
+
+
+def _numbers(measured: Measurements) -> Iterator[Part]:
+    """Tables of the references, the action channels, and of limits, distractors and layers."""
+    visited = {**measured.uniform, **measured.on_policy.scores}
+    yield table(
+        "Compared with the references",
+        measured.uniform,
+        {
+            "policy": lambda name: _NAMES[name],
+            "regret": lambda name: fixed(measured.uniform[name].regret, 3),
+            "N": lambda name: fixed(measured.uniform[name].normalised_regret, 3),
+            "regret, own episodes": lambda name: fixed(visited[name].regret, 3),
+            "N, own episodes": lambda name: fixed(visited[name].normalised_regret, 3),
+        },
+    )
+    yield table(
+        "Action channels",
+        measured.channels,
+        {
+            "channel": lambda c: str(c.channel),
+            "mae": lambda c: fixed(c.mae, 3),
+            "N": lambda c: fixed(c.normalised_regret, 3),
+            "linear N": lambda c: fixed(c.linear_normalised_regret, 3),
+            "regret": lambda c: fixed(c.regret, 3),
+            "offset": lambda c: signed(c.offset, 3),
+            "slope": lambda c: fixed(c.slope),
+            "at 0": lambda c: percent(c.at_zero, 1),
+            "at 1": lambda c: percent(c.at_one, 1),
+        },
+    )
+    if measured.limits is not None:
+        yield from _limits(measured.limits)
+    distraction, observation = measured.distraction, measured.observation
+    if distraction is not None and observation is not None:
+        regrets = {
+            "uniform": distraction.normalised_regret,
+            "actions averaged over them": distraction.averaged_regret,
+            "all at ½": distraction.half_regret,
+            **{r.name: r.normalised_regret for r in observation.distractor_regions},
+        }
+        rows = [(name, fixed(regret, 3)) for name, regret in regrets.items()]
+        yield Part("Distractors", ("distractors", "normalised regret"), rows, detail=True)
+    if observation is not None and observation.probes:
+        yield table(
+            "Layers",
+            observation.probes,
+            {
+                "layer": lambda p: str(p.layer or "observation"),
+                "units": lambda p: str(p.units),
+                "R² of the state": lambda p: fixed(p.state_r2),
+                "R² of the distractors": lambda p: (
+                    "" if p.distractor_r2 is None else fixed(p.distractor_r2)
+                ),
+            },
+        )
+
+
+_NAMES = {POLICY: "this policy", **LABELS}
+
+
+def _limits(limits: Violations) -> Iterator[Part]:
+    report = limits.report
+    scores = {
+        "this policy": report.regions[0],
+        "its actions cut off at the limits": limits.cut_off,
+        **{_NAMES[name]: report.references[name][0] for name in SAFETY_REFERENCES},
+        "this policy, states that it visits": limits.visited,
+        **{f"this policy, {region.name}": region for region in report.regions[1:]},
+    }
+    yield table(
+        "Limits: reward and cost",
+        scores,
+        {
+            "policy": lambda name: name,
+            "step reward": lambda name: fixed(scores[name].step_reward, 3),
+            "cost": lambda name: fixed(scores[name].cost, 3),
+            "violating share": lambda name: percent(scores[name].violating_share, 1),
+            "safe regret": lambda name: fixed(scores[name].safe_regret, 3),
+        },
+    )
+    yield table(
+        "Limits by action channel",
+        limits.channels,
+        {
+            "channel": lambda c: str(c.channel),
+            "violating share": lambda c: percent(c.violating_share, 1),
+            "the optimum's": lambda c: percent(c.optimal_violating_share, 1),
+            "cost": lambda c: fixed(c.cost, 3),
+        },
+    )
+
+
+def diagnose_task(
+    subject: Subject,
+    states: int,
+    episodes: int,
+    seed: int,
+    report: Callable[[str], None],
+    against: Subject | None = None,
+    *,
+    probe_capacity: bool = False,
+) -> TaskDiagnosis:
+    """The arguments and errors are those of `diagnose`."""
+    measured = _measurements(subject, states, episodes, seed, report)
+    if probe_capacity:
+        probe = _probe(subject, seed, report)
+        measured = measured.model_copy(update={"capacity": probe})
+    comparison = None
+    if against is not None:
+        other = _measurements(against, states, episodes, seed, report)
+        comparison = _compare(subject, measured, against, other)
+    return TaskDiagnosis.about(
+        subject,
+        level=level(measured),
+        verdicts=judge(measured, subject.spec, comparison, subject.updates),
+        comparison=comparison,
+        thresholds=thresholds_of(subject.spec),
+        measurements=measured,
+    )
+
+
+def judge(
+    measured: Measurements,
+    spec: SMESpec,
+    comparison: Comparison | None = None,
+    updates: int | None = None,
+) -> tuple[Verdict, ...]:
+    """Answer all questions that the measurements can answer."""
+    asked = {
+        name: question
+        for name, question in TASK_QUESTIONS.items()
+        if not question.needs or getattr(measured, question.needs) is not None
+    }
+    case = TaskCase(measured, spec, comparison=comparison, updates=updates)
+    return answer_all(asked, case, thresholds_of(spec))
+
+
+def thresholds_of(spec: SMESpec) -> dict[str, float]:
+    """All thresholds that verdicts on a task can use."""
+    return {**THRESHOLDS, **SAFETY_THRESHOLDS} if spec.extended else THRESHOLDS
+
+
+def level(measurements: Measurements) -> Level:
+    """Rank the policy among the optimum, the linear policy and the constant ½."""
+    regret = measurements.policy.normalised_regret
+    if regret <= THRESHOLDS["solved"]:
+        return "solved"
+    if regret >= THRESHOLDS["constant_level"]:
+        return "no_better_than_constant"
+    linear = measurements.uniform[LINEAR].normalised_regret
+    return "worse_than_linear" if regret > linear else "better_than_linear"
+
+
+def _measurements(
+    subject: Subject, states: int, episodes: int, seed: int, report: Callable[[str], None]
+) -> Measurements:
+    task, policy = materialize(subject.spec), subject.policy
+    assert isinstance(policy, Policy)  # of a single agent
+    references = measure.fit_references(task, states, seed)
+    report(f"{subject.name}: uniform states and shells")
+    fields, sample = measure.fixed_states(policy, task, references, states, seed)
+    report(f"{subject.name}: episodes")
+    (runs,) = behaviour.episodes_of(policy.start(), task, references, episodes, seed)
+    on_policy = fields["on_policy"] = behaviour.on_policy(task, runs)
+    if subject.log is not None:
+        constant = min(on_policy.scores[name].regret for name in behaviour.CONSTANTS)
+        fields["training"] = behaviour.training(subject.log, constant)
+    if subject.explore is not None:
+        explored = behaviour.exploration_sd(subject.explore, sample.observation, seed)
+        fields["exploration_sd"] = explored
+    if subject.spec.extended:
+        report(f"{subject.name}: limits and distractors")
+        fields |= _limits_and_distractors(policy, task, sample, runs[POLICY], seed)
+    return Measurements(**fields)
+
+
+def _limits_and_distractors(
+    policy: Policy, task: Task, sample: measure.Sample, run: behaviour.Trajectories, seed: int
+) -> dict[str, Any]:
+    """The fields of `Measurements` that tasks with `safety` or `observation` have."""
+    protocol = EvaluationProtocol(states_per_region=len(sample.s), seed=seed)
+    evaluated = evaluate(policy, task.spec, protocol)
+    fields: dict[str, Any] = {"observation": evaluated.observation}
+    if evaluated.safety is not None:
+        visited = run.s[run.alive], run.a[run.alive]
+        fields["limits"] = measure.limits(task, sample, visited, evaluated.safety)
+    if task.spec.distractors:
+        fields["distraction"] = measure.distraction(policy, task, sample, seed)
+    return fields
+
+
+def _probe(subject: Subject, seed: int, report: Callable[[str], None]) -> CapacityProbe | None:
+    assert isinstance(subject.policy, Policy)  # of a single agent
+    network = perceptron_of(subject.policy)
+    if network is None:
+        return None
+
+    def progress(done: int) -> None:
+        total = behaviour.GRADIENT_STEPS
+        report(f"{subject.name}: capacity, {done:,} of {total:,} gradient steps")
+
+    steps = subject.plan.get("steps")
+    count = steps if isinstance(steps, int) and steps else behaviour.DEFAULT_STATES
+    return behaviour.probe_capacity(network, materialize(subject.spec), count, seed, progress)
+
+
+def _compare(
+    subject: Subject, measured: Measurements, other: Subject, other_measured: Measurements
+) -> Comparison:
+    """Compare a run with another that was measured in the same way."""
+    values, other_values = _quantities(measured), _quantities(other_measured)
+    answers, other_answers = (
+        {v.question: v.answer for v in judge(numbers, run.spec, updates=run.updates)}
+        for run, numbers in ((subject, measured), (other, other_measured))
+    )
+    return Comparison(
+        name=other.name,
+        spec_fields=_differing(subject.spec.every_field(), other.spec.every_field()),
+        plan_fields=_differing(subject.plan, other.plan),
+        differences=tuple(
+            Difference(quantity=name, value=value, other=other_values[name])
+            for name, value in values.items()
+        ),
+        answers={
+            question: (answer, other_answers[question])
+            for question, answer in answers.items()
+            if question in other_answers and answer != other_answers[question]
+        },
+    )
+
+
+def _differing(
+    fields: dict[str, JsonValue], others: dict[str, JsonValue]
+) -> dict[str, tuple[JsonValue, ...]]:
+    return {
+        field: (fields.get(field), others.get(field))
+        for field in {**others, **fields}
+        if fields.get(field) != others.get(field)
+    }
+
+
+def _quantities(measurements: Measurements) -> dict[str, float]:
+    """The quantities that are compared; normalised regret, which verdicts use, is first."""
+    on_policy, error = measurements.on_policy, measurements.squared_error
+    scores = {
+        "": measurements.policy,
+        "linear_": measurements.uniform[LINEAR],
+        "on_policy_": on_policy.scores[POLICY],
+        "outermost_shell_": measurements.shells[-1].scores[POLICY],
+    }
+    regrets = {
+        f"{prefix}{quantity}": getattr(score, quantity)
+        for prefix, score in scores.items()
+        for quantity in ("normalised_regret", "regret")
+    }
+    return {
+        **regrets,
+        "mae": measurements.policy.mae,
+        "rewarded_share": on_policy.signal.rewarded,
+        "random_rewarded_share": on_policy.random_signal.rewarded,
+        "squared_error_offset": error.offset,
+        "squared_error_scale": error.scale,
+        "saturation": measurements.response.saturation,
+    }
