@@ -29,12 +29,12 @@ from leaderboard.artefact.graph import (
 )
 from leaderboard.artefact.wire import Budget, WireError, signed, varints
 from leaderboard.errors import Rejection
-from sme_registry.explorer import GraphNode, Program, program_of_graph
+from sme_registry.explorer import GraphNode, NetworkProgram, program_of_graph
 
 _INTEGERS = {INT32: "<i4", INT64: "<i8"}
 
 
-def network_of(data: bytes, observation_dim: int, action_dim: int) -> Program | None:
+def network_of(data: bytes, observation_dim: int, action_dim: int) -> NetworkProgram | None:
     """The network of an ONNX file; None if it is no network that a page can compute.
 
     Args:

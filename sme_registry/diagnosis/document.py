@@ -29,15 +29,7 @@ from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.io import read_json, versions
 from sme_registry.io.markup import environment, percent, plural
 from sme_registry.io.tables import Table
-from sme_registry.spec import (
-    Integer,
-    Real,
-    SMESpec,
-    StreamSpec,
-    StrictModel,
-    TupleOf,
-    catalogue,
-)
+from sme_registry.spec import Integer, Real, SMESpec, StreamSpec, StrictModel, TupleOf, catalogue
 from sme_registry.spec.document import check_digest
 
 if TYPE_CHECKING:
@@ -242,9 +234,14 @@ class Diagnosis(StrictModel):
         return words(self.template, "headline", self)
 
     def parts(self) -> Iterator[Part]:
-        """Findings first, then what belongs to its kind; on request the other answers."""
+        """Findings first, then the tables of its kind; on request the other answers."""
         yield self.findings("Findings", self.verdicts)
+        yield from self.tables()
         yield from self.answers(self.verdicts)
+
+    def tables(self) -> Iterator[Part]:
+        """What only its kind of diagnosis shows, directly after the findings."""
+        return iter(())
 
     def findings(self, heading: str, verdicts: Sequence[Verdict], template: str = "") -> Part:
         """The "yes" verdicts, largest share of the error first; names of the others below."""

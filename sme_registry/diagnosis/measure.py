@@ -25,7 +25,7 @@ from sme_registry.diagnosis.measurements import (
     LINEAR,
     POLICY,
     Channel,
-    Distraction,
+    DistractorRegret,
     LimitedChannel,
     Partition,
     Response,
@@ -36,10 +36,10 @@ from sme_registry.diagnosis.measurements import (
     Violations,
 )
 from sme_registry.envs.types import Observation
-from sme_registry.evaluation import Policy, SafetyReport, SafetyScore, references
+from sme_registry.evaluation import Policy, SafetyReport, SafetyScore, references, regions
 from sme_registry.evaluation.measure import TOLERANCE, SafetyStats
-from sme_registry.evaluation.regions import States, Uniform, expansion, region_name, states
-from sme_registry.spec import EvaluationProtocol
+from sme_registry.evaluation.regions import States, Uniform
+from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.task import Task, streams
 from sme_registry.task.draw import Array
 
@@ -48,6 +48,7 @@ __all__ = [
     "Sample",
     "affordable",
     "distraction",
+    "draw",
     "fit_references",
     "fixed_states",
     "limits",
@@ -99,19 +100,27 @@ def fit_references(task: Task, states: int, seed: int) -> references.References:
     return references.fit(s, engine(task).optimal_action(s), agents)
 
 
+def draw(spec: SMESpec, count: int, seed: int, region: int = 0) -> States:
+    """So many states of a region, by default uniform in the cube."""
+    protocol = EvaluationProtocol(states_per_region=count, seed=seed)
+    (drawn,) = regions.states(protocol, region, spec, rows=count)
+    return drawn
+
+
 def sample(
     policy: Policy,
     task: Task,
     fitted: references.References,
-    protocol: EvaluationProtocol,
-    region: int,
+    count: int,
+    seed: int,
+    region: int = 0,
 ) -> Sample:
     """A region's states with the actions of the policy and of the references."""
-    (drawn,) = states(protocol, region, task.spec, rows=protocol.states_per_region)
+    drawn = draw(task.spec, count, seed, region)
     observation = drawn.observation(drawn.seen(task), task.spec.horizon)
     s = drawn.s.astype(np.float64)
     optimal = engine(task).optimal_action(s)
-    random = streams.uniform(protocol.seed, f"diagnosis/{region}/random", optimal.size)
+    random = streams.uniform(seed, f"diagnosis/{region}/random", optimal.size)
     actions = fitted.actions(s, optimal, random.reshape(optimal.shape))
     return Sample(drawn, observation, s, clipped_actions(policy, observation), optimal, actions)
 
@@ -120,8 +129,7 @@ def fixed_states(
     policy: Policy, task: Task, fitted: references.References, states: int, seed: int
 ) -> tuple[dict[str, Any], Sample]:
     """The fields of `Measurements` that need no episodes, and the uniform states."""
-    protocol = EvaluationProtocol(states_per_region=affordable(task, states), seed=seed)
-    uniform = sample(policy, task, fitted, protocol, 0)
+    uniform = sample(policy, task, fitted, affordable(task, states), seed)
     uniform_scores = scores(task, uniform)
     dependence, time_variance = time_dependence(policy, task, uniform)
     fields = {
@@ -192,7 +200,7 @@ def partitions(task: Task, states: Sample) -> tuple[Partition, ...]:
     mae = states.absolute_error.mean(axis=1)
     regret = 1.0 - task.reward_of(1.0 - mae)
     by_channel = (_partition(j + 1, s, mae, regret) for j, s in enumerate(states.s.T))
-    return (_partition(None, expansion(states.s), mae, regret), *by_channel)
+    return (_partition(None, regions.expansion(states.s), mae, regret), *by_channel)
 
 
 def _partition(state_channel: int | None, values: Array, mae: Array, regret: Array) -> Partition:
@@ -215,14 +223,14 @@ def shells(
     policy: Policy, task: Task, fitted: references.References, seed: int, wd: dict[str, Score]
 ) -> tuple[Shell, ...]:
     """The cube, whose scores the caller has, and the five shells around it."""
-    protocol = EvaluationProtocol(states_per_region=affordable(task, _SHELL_STATES), seed=seed)
+    count = affordable(task, _SHELL_STATES)
+
+    def scores_in(region: int) -> dict[str, Score]:
+        return scores(task, sample(policy, task, fitted, count, seed, region)) if region else wd
+
     return tuple(
-        Shell(
-            region=region_name(region),
-            epsilon=epsilon,
-            scores=scores(task, sample(policy, task, fitted, protocol, region)) if region else wd,
-        )
-        for region, (_, epsilon) in enumerate(protocol.edges)
+        Shell(region=regions.region_name(region), epsilon=epsilon, scores=scores_in(region))
+        for region, (_, epsilon) in enumerate(EvaluationProtocol().edges)
     )
 
 
@@ -372,7 +380,7 @@ class _Draws(NamedTuple):
     squared_error: float  # mean over draws, states and channels; never below the variance
 
 
-def distraction(policy: Policy, task: Task, states: Sample, seed: int) -> Distraction:
+def distraction(policy: Policy, task: Task, states: Sample, seed: int) -> DistractorRegret:
     """How much of a policy's regret is owed to the distractors, in a few uniform states."""
     m, numbers = task.spec.distractors, task.spec.observation_dim + task.spec.action_dim
     few = min(_DISTRACTED_STATES, len(states.s), max(8, MAX_NUMBERS // (_DRAWS * numbers)))
@@ -397,7 +405,7 @@ def distraction(policy: Policy, task: Task, states: Sample, seed: int) -> Distra
         repeated = _draws(act, [drawn.d] * _DRAWS, optimal, half)
     owed = max(0.0, (varied.regret - varied.averaged) - (repeated.regret - repeated.averaged))
     centre = act(np.full((few, m), 0.5))
-    return Distraction(
+    return DistractorRegret(
         states=few,
         distractor_draws=_DRAWS,
         normalised_regret=varied.regret,

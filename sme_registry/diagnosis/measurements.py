@@ -1,4 +1,4 @@
-"""What a diagnosis measures of one policy; its verdicts rest on these numbers."""
+"""What a diagnosis measures of one policy or of a life; its verdicts rest on these numbers."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ __all__ = [
     "POLICY",
     "CapacityProbe",
     "Channel",
-    "Distraction",
+    "DistractorRegret",
     "LimitedChannel",
     "Measurements",
     "NetworkState",
     "OnPolicy",
     "Partition",
+    "PhaseDiagnosis",
+    "PhaseOutcome",
     "Response",
     "RewardSignal",
     "Score",
@@ -28,8 +30,10 @@ __all__ = [
     "TimeDependence",
     "TrainingSummary",
     "Violations",
+    "VisitDiagnosis",
 ]
 
+PhaseOutcome = Literal["retained", "forgotten", "not_learnt"]
 POLICY = "policy"  # the key of the diagnosed policy among the names of the references
 LINEAR = "linear_least_squares"
 
@@ -189,7 +193,7 @@ class Violations(StrictModel):
     channels: TupleOf[LimitedChannel]  # by action channel
 
 
-class Distraction(StrictModel):
+class DistractorRegret(StrictModel):
     """Regret owed to the distractors, in a few uniform states; see `measure.distraction`."""
 
     states: Integer  # number of uniform states
@@ -217,6 +221,32 @@ class NetworkState(StrictModel):
         return self.dormant_units + self.saturated_units
 
 
+class VisitDiagnosis(StrictModel):
+    """One visit of the life."""
+
+    visit: Integer  # its number, from 0
+    phase: Integer  # the index of its phase
+    lifetime: Integer  # environment steps at its end
+    steps: Integer  # that it lasts
+    dynamic_regret: Real | None  # of its steps in the log; None without one
+    online_regret: Real | None  # its mean; None without a log, and where no step was counted
+    normalised_regret: Real  # at its end, on its own phase
+    network: NetworkState | None  # at its end; None if unknown
+
+
+class PhaseDiagnosis(StrictModel):
+    """One phase of the stream."""
+
+    phase: Integer  # its index
+    outcome: PhaseOutcome  # whether the agent knows it at the end
+    best_normalised_regret: Real  # lowest at the end of one of its visits
+    final_normalised_regret: Real  # at the end of the life
+    initial_normalised_regret: Real | None  # before training
+    fresh_normalised_regret: Real | None  # of an agent that trained on this phase alone
+    fresh_online_regret: Real | None  # of its training
+    fresh_network: NetworkState | None  # at the end of its training
+
+
 class Measurements(StrictModel):
     """Everything that was measured; None for what is unknown or was not measured.
 
@@ -240,7 +270,7 @@ class Measurements(StrictModel):
     capacity: CapacityProbe | None = None  # of the probe; null unless requested
     limits: Violations | None = None  # of a task with `safety`
     observation: ObservationReport | None = None  # of the policy's evaluation
-    distraction: Distraction | None = None  # of a task with distractors
+    distraction: DistractorRegret | None = None  # of a task with distractors
 
     @model_serializer(mode="wrap")
     def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:

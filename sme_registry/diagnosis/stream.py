@@ -15,14 +15,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 
+from sme_registry.diagnosis import measure
 from sme_registry.diagnosis.behaviour import network_state
 from sme_registry.diagnosis.document import Answer, Diagnosis, Part, label, table
-from sme_registry.diagnosis.measurements import NetworkState
+from sme_registry.diagnosis.measurements import (
+    NetworkState,
+    PhaseDiagnosis,
+    PhaseOutcome,
+    VisitDiagnosis,
+)
 from sme_registry.diagnosis.questions import (
+    OPEN_REASONS,
     THRESHOLDS,
     Case,
     Decision,
@@ -35,55 +42,16 @@ from sme_registry.envs.types import Observation
 from sme_registry.evaluation import regions
 from sme_registry.evaluation.networks import Perceptron
 from sme_registry.io.markup import fixed, percent
-from sme_registry.spec import (
-    Digest,
-    EvaluationProtocol,
-    Integer,
-    Real,
-    StreamSpec,
-    StrictModel,
-    TupleOf,
-)
+from sme_registry.spec import Digest, Real, StreamSpec, TupleOf
 
 __all__ = [
     "STREAM_QUESTIONS",
     "STREAM_THRESHOLDS",
-    "PhaseDiagnosis",
-    "PhaseOutcome",
     "StreamCase",
     "StreamDiagnosis",
-    "VisitDiagnosis",
     "diagnose_stream",
     "outcome_of",
 ]
-
-PhaseOutcome = Literal["retained", "forgotten", "not_learnt"]
-
-
-class VisitDiagnosis(StrictModel):
-    """One visit of the life."""
-
-    visit: Integer  # its number, from 0
-    phase: Integer  # the index of its phase
-    lifetime: Integer  # environment steps at its end
-    steps: Integer  # that it lasts
-    dynamic_regret: Real | None  # of its steps in the log; None without one
-    online_regret: Real | None  # its mean; None without a log, and where no step was counted
-    normalised_regret: Real  # at its end, on its own phase
-    network: NetworkState | None  # at its end; None if unknown
-
-
-class PhaseDiagnosis(StrictModel):
-    """One phase of the stream."""
-
-    phase: Integer  # its index
-    outcome: PhaseOutcome  # whether the agent knows it at the end
-    best_normalised_regret: Real  # lowest at the end of one of its visits
-    final_normalised_regret: Real  # at the end of the life
-    initial_normalised_regret: Real | None  # before training
-    fresh_normalised_regret: Real | None  # of an agent that trained on this phase alone
-    fresh_online_regret: Real | None  # of its training
-    fresh_network: NetworkState | None  # at the end of its training
 
 
 class StreamDiagnosis(Diagnosis):
@@ -114,9 +82,8 @@ class StreamDiagnosis(Diagnosis):
     phases: TupleOf[PhaseDiagnosis]
     initial_network: NetworkState | None
 
-    def parts(self) -> Iterator[Part]:
-        """Findings, then the visits and the phases."""
-        yield self.findings("Findings", self.verdicts)
+    def tables(self) -> Iterator[Part]:
+        """The visits and the phases."""
         columns = ("visit", "phase", "online regret", "N", "inactive", "rank", "weights")
         visits = [
             (
@@ -140,7 +107,6 @@ class StreamDiagnosis(Diagnosis):
             "fresh online regret": lambda phase: _number(phase.fresh_online_regret),
         }
         yield table("Phases", self.phases, phases, _LEGEND, detail=False)
-        yield from self.answers(self.verdicts)
 
 
 _LEGEND = (
@@ -166,9 +132,8 @@ def _number(value: float | None) -> str:
     return "–" if value is None else fixed(value, 3)
 
 
-_SHARED = ("unlearnt", "difference", "learnt_little", "few_updates")
 STREAM_THRESHOLDS = {
-    **{name: THRESHOLDS[name] for name in _SHARED},
+    **{name: THRESHOLDS[name] for name in ("unlearnt", "difference", *OPEN_REASONS)},
     "fresh_excess": 0.05,  # of a visit's online regret beyond a fresh agent's
     "visit_excess": 0.1,  # of it beyond the mean of the other visits
     "visits_for_trend": 4.0,  # at least, without fresh agents
@@ -193,6 +158,11 @@ class StreamCase(Case):
     def learnt(self) -> float:
         """The lowest normalised regret of a visit on its own phase."""
         return min(visit.normalised_regret for visit in self.visits)
+
+    def fresh(self, quantity: str) -> list[Any]:
+        """A quantity of each phase's fresh agent; empty unless all of them are known."""
+        values = [getattr(phase, f"fresh_{quantity}") for phase in self.phases]
+        return [] if None in values else values
 
 
 STREAM_QUESTIONS: dict[str, Question[StreamCase]] = {}
@@ -221,9 +191,8 @@ def _costly_visits(case: StreamCase) -> Decision:
     known = [visit for visit in case.visits if visit.online_regret is not None]
     if not known:
         return Decision("no_training_log", {})
-    fresh = [phase.fresh_online_regret for phase in case.phases]
-    against_fresh = None not in fresh
-    if not against_fresh and len(known) == 1:
+    fresh = case.fresh("online_regret")
+    if not fresh and len(known) == 1:
         return Decision("one_visit", {})
     total = max(sum(visit.dynamic_regret or 0.0 for visit in known), 1e-12)
     rows: list[dict[str, Any]] = [
@@ -231,15 +200,15 @@ def _costly_visits(case: StreamCase) -> Decision:
             "visit": visit.visit,
             "phase": visit.phase,
             "online_regret": visit.online_regret,
-            "other": fresh[visit.phase] if against_fresh else _mean_of_others(visit, known),
+            "other": fresh[visit.phase] if fresh else _mean_of_others(visit, known),
             "share": (visit.dynamic_regret or 0.0) / total,
         }
         for visit in known
     ]
-    threshold = "fresh_excess" if against_fresh else "visit_excess"
+    threshold = "fresh_excess" if fresh else "visit_excess"
     rows.sort(key=lambda row: row["other"] - row["online_regret"])
     costly = [row for row in rows if row["online_regret"] - row["other"] >= _T[threshold]]
-    if against_fresh:
+    if fresh:
         reason = "costlier_than_fresh" if costly else "no_costlier_than_fresh"
     else:
         reason = "some_visits_stand_out" if costly else "visits_alike"
@@ -318,23 +287,18 @@ def _forgetting(case: StreamCase) -> Decision:
     fields = {"phase", "best_normalised_regret", "final_normalised_regret"}
     rows = [(phase.model_dump(include=fields), phase.outcome) for phase in learnt]
     forgotten = [row for row, outcome in rows if outcome == "forgotten"]
+    # The part of the error at the end of the life that was not there after each best visit.
+    lost = sum(
+        phase.final_normalised_regret - phase.best_normalised_regret
+        for phase in case.phases
+        if phase.outcome == "forgotten"
+    )
     return Decision(
         "phases_forgotten" if forgotten else "phases_retained",
         {"phases": forgotten, "most": rows[0][0], "forgetting": case.forgetting},
         ("difference",),
-        _lost(case.phases),
+        lost / max(sum(phase.final_normalised_regret for phase in case.phases), 1e-12),
     )
-
-
-def _lost(phases: Sequence[PhaseDiagnosis]) -> float:
-    """The part of the error at the end of the life that was not there after each best visit."""
-    final = sum(phase.final_normalised_regret for phase in phases)
-    lost = sum(
-        phase.final_normalised_regret - phase.best_normalised_regret
-        for phase in phases
-        if phase.outcome == "forgotten"
-    )
-    return lost / max(final, 1e-12)
 
 
 @_why(
@@ -354,11 +318,10 @@ def _loss_of_plasticity(case: StreamCase) -> Decision:
     if len(visits) == 1:
         return Decision("one_visit", {})
     learnt = [visit.normalised_regret for visit in visits]
-    fresh = [phase.fresh_normalised_regret for phase in case.phases]
-    alone = [regret for regret in fresh if regret is not None]
-    if len(alone) == len(fresh):
-        return _against_fresh(visits, alone)
-    if not _equally_hard(case.stream):
+    if fresh := case.fresh("normalised_regret"):
+        return _against_fresh(visits, fresh)
+    # Phases are equally hard if their specs differ in the draw or rotation, and not in the steps.
+    if len(case.stream.kinds) > 1 or len({phase.steps for phase in case.stream.phases}) > 1:
         return Decision("phases_differ", {})
     if len(visits) < _T["visits_for_trend"]:
         return Decision("too_few_visits", {"visits": len(visits)}, ("visits_for_trend",))
@@ -389,11 +352,6 @@ def _against_fresh(visits: Sequence[VisitDiagnosis], fresh: Sequence[float]) -> 
     return Decision(reason, evidence, ("difference",), 1.0 - alone / max(own, 1e-12))
 
 
-def _equally_hard(stream: StreamSpec) -> bool:
-    """Whether all phases have as many steps, and specs that differ in their draw or rotation."""
-    return len(stream.kinds) == 1 and len({phase.steps for phase in stream.phases}) == 1
-
-
 _UNKNOWN: dict[str, Answer] = {"network_unknown": "cannot tell", "one_visit": "cannot tell"}
 
 
@@ -405,8 +363,7 @@ def _change(case: StreamCase, quantity: str) -> dict[str, Any]:
     first, last = case.visits[0].network, case.visits[-1].network
     if first is None or last is None:
         return {"reason": "network_unknown"}
-    alone = [phase.fresh_network for phase in case.phases]
-    if None not in alone:
+    if alone := case.fresh("network"):
         against, others = "fresh_agents", alone
     elif len(case.visits) > 1:
         against, others = "first_visit", [first]
@@ -420,12 +377,7 @@ def _change(case: StreamCase, quantity: str) -> dict[str, Any]:
     }
 
 
-@_why(
-    **_UNKNOWN,
-    units_became_inactive="yes",
-    inactive_from_the_start="yes",
-    units_active="no",
-)
+@_why(**_UNKNOWN, units_became_inactive="yes", inactive_from_the_start="yes", units_active="no")
 def _dormant_units(case: StreamCase) -> Decision:
     """Whether hidden units stopped responding to the state."""
     change, network = _change(case, "inactive_units"), case.visits[-1].network
@@ -470,9 +422,11 @@ def diagnose_stream(
     life = subject.report
     agent, regret = life.region("WD").agent, life.dynamic_regret
     report(f"{subject.name}: networks")
-    measured_in = _observation(life.stream, states, seed)
-    visits = tuple(_visits(subject, measured_in))
-    phases = tuple(_phases(subject, measured_in))
+    spec = life.stream.phases[0].spec
+    drawn = measure.draw(spec, min(states, _MOST_STATES, regions.batch_rows(spec)), seed)
+    observation = drawn.observation(drawn.s, spec.horizon)
+    visits = tuple(_visits(subject, observation))
+    phases = tuple(_phases(subject, observation))
     case = StreamCase(life.stream, visits, phases, agent.forgetting[-1], updates=subject.updates)
     return StreamDiagnosis.about(
         subject,
@@ -482,37 +436,27 @@ def diagnose_stream(
         verdicts=answer_all(STREAM_QUESTIONS, case, STREAM_THRESHOLDS),
         visits=visits,
         phases=phases,
-        initial_network=_state(subject.initial_network, _shown(life.stream, measured_in, 0)),
+        initial_network=_state(subject.initial_network, observation, life.stream, 0),
         thresholds=STREAM_THRESHOLDS,
     )
 
 
-def _observation(stream: StreamSpec, states: int, seed: int) -> Observation:
-    """What all networks are measured on: uniform states of the first phase's task."""
-    spec = stream.phases[0].spec
-    count = min(states, _MOST_STATES, regions.batch_rows(spec))
-    protocol = EvaluationProtocol(states_per_region=count, seed=seed)
-    (drawn,) = regions.states(protocol, 0, spec, rows=count)
-    return drawn.observation(drawn.s, spec.horizon)
-
-
-def _shown(stream: StreamSpec, observation: Observation, phase: int) -> Observation:
-    """Observations with the phase, where the agent observes it."""
-    if not stream.observes_phase:
-        return observation
-    shown = np.zeros((len(observation), stream.observed_phases), np.float32)
-    shown[:, phase] = 1.0
-    return np.concatenate([observation, shown], axis=1)
-
-
-def _state(network: Perceptron | None, observation: Observation) -> NetworkState | None:
-    return None if network is None else network_state(network, observation)
+def _state(
+    network: Perceptron | None, observation: Observation, stream: StreamSpec, phase: int
+) -> NetworkState | None:
+    """The state of a network in a phase, where the agent observes that; None of an unknown one."""
+    if network is None:
+        return None
+    if stream.observes_phase:
+        shown = np.zeros((len(observation), stream.observed_phases), np.float32)
+        shown[:, phase] = 1.0
+        observation = np.concatenate([observation, shown], axis=1)
+    return network_state(network, observation)
 
 
 def _visits(subject: StreamSubject, observation: Observation) -> Iterator[VisitDiagnosis]:
-    life = subject.report
+    life, regret = subject.report, subject.report.dynamic_regret
     regret_on = life.region("WD").agent.normalised_regret
-    regret = life.dynamic_regret
     logged = {} if regret is None else {visit.visit: visit for visit in regret.visits}
     networks = subject.networks or (None,) * len(life.visits)
     begin = 0
@@ -526,7 +470,7 @@ def _visits(subject: StreamSubject, observation: Observation) -> Iterator[VisitD
             dynamic_regret=None if log is None else log.dynamic_regret,
             online_regret=None if log is None else log.online_regret,
             normalised_regret=regret_on[visit.visit][visit.phase],
-            network=_state(network, _shown(life.stream, observation, visit.phase)),
+            network=_state(network, observation, life.stream, visit.phase),
         )
         begin = visit.lifetime
 
@@ -552,5 +496,5 @@ def _phases(subject: StreamSubject, observation: Observation) -> Iterator[PhaseD
             initial_normalised_regret=initial,
             fresh_normalised_regret=fresh,
             fresh_online_regret=online,
-            fresh_network=_state(network, observation),
+            fresh_network=None if network is None else network_state(network, observation),
         )

@@ -60,14 +60,16 @@ class TaskDiagnosis(Diagnosis):
 
     def parts(self) -> Iterator[Part]:
         """Findings, the comparison, and on request the other answers and the numbers."""
-        yield self.findings("Findings", self.verdicts)
-        if self.comparison is not None:
-            yield from _parts_of_comparison(self.comparison)
-        yield from self.answers(self.verdicts)
+        yield from super().parts()
         yield from _numbers(self.measurements)
 
+    def tables(self) -> Iterator[Part]:
+        """The comparison, if there is one."""
+        if self.comparison is not None:
+            yield from _tables_of(self.comparison)
 
-def _parts_of_comparison(comparison: Comparison) -> Iterator[Part]:
+
+def _tables_of(comparison: Comparison) -> Iterator[Part]:
     columns: dict[str, Callable[[Difference], str]] = {
         "quantity": lambda row: label(row.quantity),
         "this run": lambda row: fixed(row.value, 3),

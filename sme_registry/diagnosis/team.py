@@ -15,9 +15,9 @@ all agents drive one transition. `n` states, `S` state_dim, `A` action_dim, `m` 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -39,17 +39,9 @@ from sme_registry.diagnosis.where import WHERE
 from sme_registry.diagnosis.why import WHY
 from sme_registry.envs.types import Observation
 from sme_registry.errors import UnknownNameError, did_you_mean
-from sme_registry.evaluation import Policy, TeamPolicy, regions
+from sme_registry.evaluation import Policy, TeamPolicy
 from sme_registry.io.markup import fixed, percent
-from sme_registry.spec import (
-    Digest,
-    EvaluationProtocol,
-    Integer,
-    Real,
-    SMESpec,
-    StrictModel,
-    TupleOf,
-)
+from sme_registry.spec import Digest, Integer, Real, SMESpec, StrictModel, TupleOf
 from sme_registry.task import Task, materialize
 from sme_registry.task.draw import Array
 
@@ -316,11 +308,12 @@ def diagnose_team(
     assert isinstance(policy, TeamPolicy)  # of a team's spec
     report(f"{subject.name}: episodes")
     references = measure.fit_references(task, states, seed)
-    act = _joint_action(policy, task)
-    runs = behaviour.episodes_of(act, task, references, episodes, seed)
+    runs = behaviour.episodes_of(policy.start(), task, references, episodes, seed)
     first = runs[0][POLICY]
-    uniform = _team_in(task, *_uniform(task, policy, states, seed))
-    visited = _team_in(task, first.s[first.alive], first.a[first.alive])
+    drawn = measure.draw(task.spec, measure.affordable(task, states), seed)
+    actions = np.clip(policy(drawn.observation(drawn.s, task.spec.horizon)), 0.0, 1.0)
+    uniform, uniform_credit = _team_in(task, drawn.s.astype(np.float64), actions)
+    visited, visited_credit = _team_in(task, first.s[first.alive], first.a[first.alive])
     questions, thresholds = _questions(task.spec), thresholds_of(task.spec)
     agents = []
     for index, name in enumerate(task.names):
@@ -336,17 +329,17 @@ def diagnose_team(
                 state_channels=tuple(channel + 1 for channel in task.observed[index]),
                 action_channels=tuple(i + 1 for i in range(*task.owned[index].indices(10**9))),
                 level=level(measured),
-                uniform=uniform.credit[index],
-                visited=visited.credit[index],
+                uniform=uniform_credit[index],
+                visited=visited_credit[index],
                 verdicts=answer_all(questions, case, thresholds),
                 measurements=measured,
             )
         )
-    team = TeamCase(agents, subject.spec, visited.score, updates=subject.updates)
+    team = TeamCase(agents, subject.spec, visited, updates=subject.updates)
     return TeamDiagnosis.about(
         subject,
-        uniform=uniform.score,
-        visited=visited.score,
+        uniform=uniform,
+        visited=visited,
         verdicts=answer_all(TEAM_QUESTIONS, team, TEAM_THRESHOLDS),
         agents=tuple(agents),
         left_out=tuple(name for name in WHY if name not in questions and not WHY[name].needs),
@@ -377,60 +370,23 @@ def _alone(task: Task, policy: TeamPolicy, index: int) -> tuple[Task, Policy]:
         policies=(task.policies[index],),
         observed=(task.observed[index],),
     )
-    return own, Policy(member.agent, "unit", _own_action(policy, index), member.action_dim)
+
+    def act(observations: Observation) -> Array:
+        return member.policy(member.observe(observations))[:, : member.action_dim]
+
+    return own, Policy(member.agent, "unit", act, member.action_dim)
 
 
-def _own_action(policy: TeamPolicy, index: int) -> Callable[[Observation], Array]:
-    member = policy.members[index]
-    return lambda observations: member.policy(member.observe(observations))[:, : member.action_dim]
-
-
-def _joint_action(policy: TeamPolicy, task: Task) -> Callable[[Observation], Array]:
-    """Joint actions `[n, A]` from joint observations `[n, S + 1 + m]`, each with its own r_cum."""
-    S = task.spec.state_dim
-    started = replace(
-        policy,
-        members=tuple(member._replace(policy=member.policy.start()) for member in policy.members),
-    )
-    acts = [_own_action(started, index) for index in range(len(policy.members))]
-
-    def act(joint: Observation) -> Array:
-        columns = [*range(S + 1)]
-        return np.concatenate(
-            [own(joint[:, [*columns, S + 1 + index]]) for index, own in enumerate(acts)], axis=1
-        )
-
-    return act
-
-
-def _uniform(task: Task, policy: TeamPolicy, states: int, seed: int) -> tuple[Array, Array]:
-    """The uniform states `[N, S]` in which every agent is measured, and the joint actions."""
-    count = measure.affordable(task, states)
-    protocol = EvaluationProtocol(states_per_region=count, seed=seed)
-    (drawn,) = regions.states(protocol, 0, task.spec, rows=count)
-    observation = drawn.observation(drawn.s, task.spec.horizon)
-    return drawn.s.astype(np.float64), np.clip(policy(observation), 0.0, 1.0)
-
-
-class _Team(NamedTuple):
-    """The team in some states."""
-
-    score: Score
-    credit: list[Credit]  # of each agent
-
-
-def _team_in(task: Task, s: Array, a: Array) -> _Team:
-    """The team in states `[N, S]` with joint actions `[N, A]`."""
+def _team_in(task: Task, s: Array, a: Array) -> tuple[Score, list[Credit]]:
+    """The team, and each agent's part, in states `[N, S]` with joint actions `[N, A]`."""
     optimal = task.optimal_action(s)
     mae = float(np.abs(a - optimal).mean())
     half = max(float(np.abs(0.5 - optimal).mean()), _TINY)
     regret = float(task.regret(s, a).mean())
     shares = task.regret_shares(s, a).mean(axis=0)
     gains = task.difference_rewards(s, a).mean(axis=0)
-    return _Team(
-        Score(regret=regret, mae=mae, normalised_regret=mae / half),
-        [
-            Credit(regret_share=float(share), difference_reward=float(gain))
-            for share, gain in zip(shares, gains, strict=True)
-        ],
-    )
+    credit = [
+        Credit(regret_share=float(share), difference_reward=float(gain))
+        for share, gain in zip(shares, gains, strict=True)
+    ]
+    return Score(regret=regret, mae=mae, normalised_regret=mae / half), credit

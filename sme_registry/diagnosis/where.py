@@ -9,7 +9,7 @@ from sme_registry.diagnosis.measurements import (
     LINEAR,
     POLICY,
     Channel,
-    Distraction,
+    DistractorRegret,
     Violations,
 )
 from sme_registry.diagnosis.questions import (
@@ -286,7 +286,7 @@ def _constraint_violation(case: TaskCase) -> Decision:
     )
 
 
-def distractors_of(case: TaskCase) -> tuple[Distraction, ObservationReport]:
+def distractors_of(case: TaskCase) -> tuple[DistractorRegret, ObservationReport]:
     distraction, observation = case.measurements.distraction, case.measurements.observation
     assert distraction is not None
     assert observation is not None

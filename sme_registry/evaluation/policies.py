@@ -137,8 +137,9 @@ class TeamPolicy:
         return self._joint_actions([observations] * len(self.members))
 
     def start(self) -> Callable[[Observation], Array]:
-        """The joint actions in a batch of episodes; see `act_in`."""
-        return self.act_in
+        """The joint actions in a batch of episodes, with recurrent agents' state; see `act_in`."""
+        members = (member._replace(policy=member.policy.start()) for member in self.members)
+        return replace(self, members=tuple(members)).act_in
 
     def act_in(self, joint: Observation) -> Array:
         """Joint actions `[B, A]` from s, t/T and each agent's r_cum/k, `[B, S + 1 + n]`."""

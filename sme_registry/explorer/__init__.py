@@ -15,14 +15,14 @@ from sme_registry.explorer.page import (
     write_explorer,
 )
 from sme_registry.explorer.policies import GraphNode, program_of_graph
-from sme_registry.explorer.program import Program
+from sme_registry.explorer.program import NetworkProgram
 
 __all__ = [
     "EPISODES",
     "FILE",
     "STATIC",
     "GraphNode",
-    "Program",
+    "NetworkProgram",
     "explorer_page",
     "facts",
     "program_of_graph",

@@ -18,7 +18,7 @@ from sme_registry.diagnosis.subject import perceptron_of
 from sme_registry.errors import PolicyError, ResourceLimitError
 from sme_registry.evaluation import Perceptron, Policy, TeamPolicy
 from sme_registry.evaluation.models import ModulePredictor, OnnxNetwork
-from sme_registry.explorer.program import OPERATIONS, Program, ProgramBuilder, point_width
+from sme_registry.explorer.program import OPERATIONS, NetworkProgram, ProgramBuilder, point_width
 from sme_registry.export.torch_modules import traced
 from sme_registry.io import is_installed
 from sme_registry.spec import SMESpec
@@ -35,7 +35,7 @@ class _UnknownNetwork(Exception):
     """Something that is no part of a feed-forward network, or not understood."""
 
 
-def policy_program(policy: Policy | TeamPolicy, spec: SMESpec) -> Program | None:
+def policy_program(policy: Policy | TeamPolicy, spec: SMESpec) -> NetworkProgram | None:
     """Actions of the unit range, not clipped, as a program of observations; None if unknown.
 
     The program is used only if its actions equal the policy's own in probes inside and outside the
@@ -72,7 +72,7 @@ def _append(build: ProgramBuilder, observation: int, policy: Policy) -> None:
     if perceptron is not None:
         x = _append_perceptron(build, observation, perceptron)
     else:
-        program = act if isinstance(act, Program) else _exported(act, width)
+        program = act if isinstance(act, NetworkProgram) else _exported(act, width)
         if program is None or program.inputs != width:
             raise _UnknownNetwork
         x = build.append(program, observation)
@@ -109,7 +109,7 @@ def _append_team(build: ProgramBuilder, team: TeamPolicy, spec: SMESpec) -> None
     build.concat(*actions)
 
 
-def _exported(act: Any, width: int) -> Program | None:
+def _exported(act: Any, width: int) -> NetworkProgram | None:
     """The program of an ONNX file, or of a module that PyTorch can export."""
     if isinstance(act, OnnxNetwork):
         return read_onnx(act.path.read_bytes())
@@ -131,7 +131,7 @@ class GraphNode(NamedTuple):
     attributes: Mapping[str, Any]  # by name: integers, floats, lists of them, and tensors as arrays
 
 
-def read_onnx(data: bytes) -> Program | None:
+def read_onnx(data: bytes) -> NetworkProgram | None:
     """The network of an ONNX file; None if it is unknown, or the package onnx is not installed.
 
     The file is parsed by the package onnx: give only a file whose author you trust.
@@ -175,7 +175,7 @@ def program_of_graph(
     input: str,
     output: str,
     width: int,
-) -> Program | None:
+) -> NetworkProgram | None:
     """The program of a graph."""
     build = ProgramBuilder(width)
     values: dict[str, _Value] = {**constants, input: 0}

@@ -1,4 +1,4 @@
-"""A network as plain steps, a `Program`, which NumPy and a page's script compute alike.
+"""A network as plain steps, a `NetworkProgram`, which NumPy and a page's script compute alike.
 
 Value 0 is the input `[B, n]`, and step i computes value i from earlier ones. The last value is the
 output. All sums are in float64; weights keep the type that they were given in.
@@ -39,7 +39,7 @@ __all__ = [
     "MAX_WEIGHTS",
     "MAX_WIDTH",
     "OPERATIONS",
-    "Program",
+    "NetworkProgram",
     "ProgramBuilder",
     "ProgramStep",
     "constant",
@@ -106,7 +106,7 @@ class ProgramStep:
 
 
 @dataclass(frozen=True, eq=False)
-class Program:
+class NetworkProgram:
     """A function from rows `[B, n]` to rows `[B, width]`; deterministic."""
 
     inputs: int  # n
@@ -200,7 +200,7 @@ class ProgramBuilder:
         """x scale + shift."""
         return self.binary("add", self.binary("mul", x, np.array([scale])), np.array([shift]))
 
-    def append(self, program: Program, x: int) -> int:
+    def append(self, program: NetworkProgram, x: int) -> int:
         """The steps of another program, whose input is the value x."""
         numbers = [x]
         for step in program.steps:
@@ -213,9 +213,9 @@ class ProgramBuilder:
             )  # fmt: skip
         return numbers[-1]
 
-    def build(self) -> Program:
+    def build(self) -> NetworkProgram:
         """The program; its output is the newest value."""
-        return Program(self.inputs, tuple(self._steps))
+        return NetworkProgram(self.inputs, tuple(self._steps))
 
     def _add(
         self,
@@ -250,7 +250,7 @@ def point_width(spec: SMESpec) -> int:
     return spec.state_dim + spec.distractors + 2
 
 
-def optimal(task: Task) -> Program:
+def optimal(task: Task) -> NetworkProgram:
     """π* of a point; of a team, each agent's from what it observes."""
     spec = task.spec
     build = ProgramBuilder(point_width(spec), "π*")
@@ -262,7 +262,7 @@ def optimal(task: Task) -> Program:
     return build.build()
 
 
-def limit(task: Task) -> Program | None:
+def limit(task: Task) -> NetworkProgram | None:
     """ℓ of a point; None without safety."""
     if task.spec.safety is None:
         return None
@@ -272,7 +272,7 @@ def limit(task: Task) -> Program | None:
     return build.build()
 
 
-def observe(task: Task) -> Program:
+def observe(task: Task) -> NetworkProgram:
     """What the policy sees in a point, rounded to float32."""
     spec = task.spec
     n = spec.state_dim + spec.distractors
@@ -290,7 +290,7 @@ def observe(task: Task) -> Program:
     return build.build()
 
 
-def linear(task: Task, fitted: References) -> Program:
+def linear(task: Task, fitted: References) -> NetworkProgram:
     """The linear least-squares policy of a report, of a point."""
     build = ProgramBuilder(point_width(task.spec), "the linear policy")
     s = build.columns(0, tuple(range(task.spec.state_dim)))
@@ -298,7 +298,7 @@ def linear(task: Task, fitted: References) -> Program:
     return build.build()
 
 
-def constant(task: Task, action: Array) -> Program:
+def constant(task: Task, action: Array) -> NetworkProgram:
     """One action `[A]` in every point."""
     build = ProgramBuilder(point_width(task.spec), "the constant policy")
     build.constant(action)

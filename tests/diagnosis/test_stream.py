@@ -17,14 +17,12 @@ from sme_registry.diagnosis import (
     load_run,
 )
 from sme_registry.diagnosis.behaviour import network_state
-from sme_registry.diagnosis.measurements import NetworkState
+from sme_registry.diagnosis.measurements import NetworkState, PhaseDiagnosis, VisitDiagnosis
 from sme_registry.diagnosis.questions import OPEN_REASONS, answer_all
 from sme_registry.diagnosis.stream import (
     STREAM_QUESTIONS,
     STREAM_THRESHOLDS,
-    PhaseDiagnosis,
     StreamCase,
-    VisitDiagnosis,
     outcome_of,
 )
 from sme_registry.errors import OptionError, UnknownNameError

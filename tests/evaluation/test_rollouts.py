@@ -1,14 +1,16 @@
 """Episodes side by side: the scores of single environments, and of SB3's own evaluation."""
 
 import importlib.util
+import itertools
 import warnings
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
 
 import sme_registry
-from sme_registry import SMESpec, make_parallel, materialize
+from sme_registry import SMESpec, load, make_parallel, materialize
 from sme_registry.errors import ActionError, SpecError, StateError
 from sme_registry.evaluation import Perceptron, as_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
@@ -92,6 +94,20 @@ def test_a_recurrent_model_keeps_its_state_during_an_episode():
         np.testing.assert_allclose(found.episode_return, expected, atol=2e-3)
     without_memory = rollouts(policy.__call__, task, states)
     assert np.abs(without_memory.episode_return - expected).max() > 0.02
+
+
+def test_a_recurrent_agent_of_a_team_keeps_its_state_during_an_episode():
+    def calls():
+        numbers = itertools.count()
+        return lambda o: np.full((len(o), 2), 0.1 * next(numbers))
+
+    team = as_policy("constant", load("Team2"))
+    members = [m._replace(policy=replace(m.policy, episodes=calls)) for m in team.members]
+    recurrent = replace(team, members=tuple(members))
+    for _ in range(2):  # the second batch starts anew
+        act = recurrent.start()
+        actions = [act(np.full((3, 11), 0.5, np.float32)) for _ in range(3)]
+        np.testing.assert_allclose(np.mean(actions, axis=(1, 2)), [0.0, 0.1, 0.2])
 
 
 @both_tasks
