@@ -43,7 +43,7 @@ from sme_registry.spec import (
     catalogue,
 )
 from sme_registry.spec.resolve import is_path
-from sme_registry.spec.study import INDEPENDENT, sweep
+from sme_registry.spec.study import parse_uses, sweep
 from sme_registry.task import load
 
 
@@ -124,7 +124,7 @@ class PlanOptions(ClassOptions):
             "-a",
             metavar="[NAME=]USES",
             help="PPO, TD3, SAC, … of Stable-Baselines3, jax:PPO, module:function, "
-            "reference:linear, reference:constant, offline:bc, … Repeatable.",
+            "train:module:function, reference:linear, offline:bc, … Repeatable.",
         ),
     ] = None
     steps: Annotated[
@@ -183,7 +183,7 @@ class PlanOptions(ClassOptions):
                 "uses": uses,
                 "hyperparameters": nested_hyperparameters(settings.get(name, {})),
                 "action_range": action_range,
-                **({"steps": 0} if uses.startswith("reference:") else {}),
+                **({"steps": 0} if parse_uses(uses)[0] == "reference" else {}),
             }
             for name, uses in uses_of
             for action_range in ranges
@@ -246,8 +246,9 @@ def _short_name(uses: str) -> str:
     """The name of an algorithm in a plan: `TQC`, `linear`, `jax-PPO`, `independent PPO`."""
     from sme_registry.training.algorithms import folder_name
 
-    if uses.startswith(INDEPENDENT):
-        return f"independent {_short_name(uses.removeprefix(INDEPENDENT))}"
+    kind, name = parse_uses(uses)
+    if kind == "independent":
+        return f"independent {_short_name(name)}"
     return folder_name(uses)
 
 
@@ -349,14 +350,14 @@ def plan(
 
       sme study plan smoke --folder runs/smoke --json
     """
-    from sme_registry.studies.engine.budget import Estimator, Span, makespan, selected
+    from sme_registry.studies.engine.budget import Estimator, Span, makespan, selected, with_sources
     from sme_registry.studies.engine.ledger import Ledger
     from sme_registry.studies.engine.queue import available_cores
 
     if plan is None:
         _list_plans(json)
         return
-    file = scaled_plan(find_file(StudyFile, plan), steps, seeds, evaluations, agents)
+    file = with_sources(scaled_plan(find_file(StudyFile, plan), steps, seeds, evaluations, agents))
     planned = selected(file.plan.cells, only or ())
     cells = {cell.cell.digest: cell.cell for cell in planned}
     results = {} if folder is None else Ledger(folder).results()
@@ -470,9 +471,12 @@ def scaled_plan(
 
 def check_algorithms(algorithms: Iterable[StudyAlgorithm], errors: type[SMEError]) -> None:
     """Check a plan's algorithms; warn about those that cannot be found here by such an error."""
-    from sme_registry.training.algorithms import find
+    from sme_registry.training.algorithms import code_notice, find
     from sme_registry.training.hyperparameters import check_algorithm
 
+    algorithms = list(algorithms)
+    if notice := code_notice(algorithm.uses for algorithm in algorithms):
+        err().print(escape(notice), soft_wrap=True)
     messages = []
     for algorithm in algorithms:
         try:

@@ -59,8 +59,9 @@ def train(
         typer.Option(
             "--algorithm",
             "-a",
-            help="TD3, SAC, DDPG, PPO, A2C, or module:Class, such as sb3_contrib:TQC; for tasks "
-            "with safety also PPOLagrangian, PPOProjection. Default TD3, for teams PPO.",
+            help="TD3, SAC, DDPG, PPO, A2C, module:Class, such as sb3_contrib:TQC, or "
+            "train:module:function for a function of yours; for tasks with safety also "
+            "PPOLagrangian, PPOProjection. Default TD3, for teams PPO.",
         ),
     ] = None,
     agents: Annotated[

@@ -37,7 +37,7 @@ from sme_registry.export.network import of_offline_policy
 from sme_registry.io import read_json
 from sme_registry.plots.streams import FILE
 from sme_registry.spec import SMESpec, StreamSpec
-from sme_registry.spec.study import INDEPENDENT, Cell, in_jax
+from sme_registry.spec.study import Cell, in_jax, parse_uses
 from sme_registry.training import RunRecord
 from sme_registry.training import record as run_files
 from sme_registry.training.algorithms import find
@@ -57,7 +57,6 @@ __all__ = [
 ]
 
 _MIN_DIGITS = 6
-_REFERENCE = "reference:"
 Networks = tuple[Perceptron | None, ...]  # None: of an unknown kind
 
 
@@ -198,7 +197,7 @@ def load_cell(study: str | Path, key: str) -> AnySubject:
     result = read_json(path)
     with _reading(path):
         cell, log = Cell.from_dict(result["cell"], str(path)), _log_of_evaluations(result["curve"])
-    if cell.uses.startswith(INDEPENDENT):
+    if parse_uses(cell.uses)[0] == "independent":
         raise OptionError(
             f"cell={path.stem[:12]!r}: has a model for each agent. Train it with `sme train "
             "--independent`, and diagnose that run."
@@ -218,7 +217,7 @@ def load_cell(study: str | Path, key: str) -> AnySubject:
         name,
         _model_of_cell(study, path.stem, cell),
         cell.spec,
-        None if cell.uses.startswith(_REFERENCE) else cell.action_range,
+        None if parse_uses(cell.uses)[0] == "reference" else cell.action_range,
         plan=plan,
         log=log if cell.spec.team is None else None,
         updates=updates,
@@ -319,8 +318,9 @@ def _model_of_run(folder: Path, record: RunRecord) -> tuple[Path, int | None]:
 
 
 def _model_of_cell(study: Path, stem: str, cell: Cell) -> Any:
-    if cell.uses.startswith(_REFERENCE):
-        return reference_policy(cell.uses.removeprefix(_REFERENCE), cell.spec)
+    kind, name = parse_uses(cell.uses)
+    if kind == "reference":
+        return reference_policy(name, cell.spec)
     path = run_files.model_of_cell(study, stem)
     if not path.exists():
         raise OptionError(
@@ -408,7 +408,7 @@ def _updates(
     An on-policy algorithm does so after each rollout, another one every `train_freq` steps after
     `learning_starts`. None of an algorithm without these hyperparameters.
     """
-    name = uses.removeprefix(INDEPENDENT).removeprefix("jax:")
+    name = parse_uses(uses)[1]
     if ":" in name:  # a reference, a learner of offline data or somebody's module
         return None
     try:

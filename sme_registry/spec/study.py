@@ -19,6 +19,7 @@ from pydantic import Field, JsonValue, model_validator
 
 from sme_registry.errors import OptionError, SpecError
 from sme_registry.spec.document import (
+    Digest,
     Document,
     Integer,
     Name,
@@ -41,44 +42,64 @@ FRESH_EVALUATIONS = 10  # at most, of a fresh agent
 Steps = Annotated[Integer, Field(ge=0, le=10**10)]
 
 
-OFFLINE = "offline:"  # the beginning of a `uses` that learns from data
-REFERENCE = "reference:"  # of one that learns nothing
-INDEPENDENT = "independent:"  # of one with a model for each agent of a team
-JAX = "jax:"  # of one that runs with its environment in a program of JAX
+JAX, INDEPENDENT = "jax:", "independent:"
+KINDS = ("offline", "reference", "independent", "jax", "train")
+
+
+def parse_uses(uses: str) -> tuple[str, str]:
+    """The kind of a learner and its name: `("jax", "PPO")` for "jax:PPO".
+
+    A name without a prefix is of kind "sb3": of Stable-Baselines3, or written for its environments.
+    Of "train:module:function" the name is `module:function`.
+    """
+    kind, colon, name = uses.partition(":")
+    # `train:make` is a function of a module `train` that returns a model.
+    if colon and kind in KINDS and (kind != "train" or ":" in name):
+        return kind, name
+    return "sb3", uses
 
 
 def in_jax(uses: str) -> bool:
     """Whether an algorithm runs in a program of JAX."""
-    return uses.startswith(JAX)
+    return parse_uses(uses)[0] == "jax"
 
 
 def _check_task(uses: str, setting: Setting, field: str) -> None:
     """Raise ValueError, which Pydantic reports, if an algorithm cannot learn a task."""
-    if uses.startswith(OFFLINE) and setting.team is not None:
+    kind, name = parse_uses(uses)
+    if setting.team is None:
+        if kind == "independent":
+            raise ValueError(
+                f"{field}={uses!r}: needs a team, and this task has a single agent. Use {name!r}."
+            )
+        return
+    reasons = {
+        "offline": ", because data sets are collected for a single agent. Use an algorithm that "
+        "learns online, such as PPO.",
+        "jax": f". Use an algorithm of Stable-Baselines3, such as {name!r}.",
+        "train": ", because its environment has a single agent. Use an algorithm of "
+        "Stable-Baselines3, such as PPO.",
+    }
+    if kind in reasons:
+        agents = len(setting.team.agents)
         raise ValueError(
-            f"{field}={uses!r}: cannot learn a task for {len(setting.team.agents)} agents, because "
-            "data sets are collected for a single agent. Use an algorithm that learns online, such "
-            "as PPO."
-        )
-    if uses.startswith(INDEPENDENT) and setting.team is None:
-        raise ValueError(
-            f"{field}={uses!r}: needs a team, and this task has a single agent. Use "
-            f"{uses.removeprefix(INDEPENDENT)!r}."
-        )
-    if in_jax(uses) and setting.team is not None:
-        raise ValueError(
-            f"{field}={uses!r}: cannot learn a task for {len(setting.team.agents)} agents. Use an "
-            f"algorithm of Stable-Baselines3, such as {uses.removeprefix(JAX)!r}."
+            f"{field}={uses!r}: cannot learn a task for {agents} agents{reasons[kind]}"
         )
 
 
 def _check_stream(uses: str, field: str) -> None:
     """Raise ValueError, which Pydantic reports, if an algorithm cannot live in a stream."""
-    if uses.startswith((OFFLINE, INDEPENDENT, REFERENCE)):
+    if parse_uses(uses)[0] not in ("sb3", "jax"):
         raise ValueError(
-            f"{field}={uses!r}: cannot live in a stream. Use an algorithm that learns online, such "
-            "as PPO. Every stream's report has reference agents."
+            f"{field}={uses!r}: cannot live in a stream. Use an algorithm that learns online and "
+            "is evaluated on the way, such as PPO. Every stream's report has reference agents."
         )
+
+
+def _check_source(uses: str, source: str | None) -> None:
+    """Raise ValueError, which Pydantic reports, if an algorithm has no source of its own."""
+    if source is not None and parse_uses(uses)[0] != "train":
+        raise ValueError(f"source={source!r}: is for uses='train:module:function'. Leave it out.")
 
 
 class StudyAlgorithm(StrictModel):
@@ -87,19 +108,30 @@ class StudyAlgorithm(StrictModel):
     Attributes:
       name: its name in reports, unique in the plan.
       uses: an algorithm of Stable-Baselines3 ("PPO"), the same in a program of JAX ("jax:PPO"), an
-        installed entry point of the group `sme_registry.algorithms`, `module:function`, or
+        installed entry point of the group `sme_registry.algorithms`, `module:function`, which
+        returns a model, `train:module:function`, which trains in any way and returns a policy, or
         `reference:constant`, `reference:linear`, `reference:random`, `reference:optimal`, which
         learn nothing. The agents of a team share one model; `independent:PPO` has one for each.
       hyperparameters: where they differ from the algorithm's defaults.
       action_range: of the environment it acts in: [−1, 1] ("symmetric") or [0, 1] ("unit").
       steps: its budget on single tasks; null takes the plan's.
+      source: of `train:module:function`, the SHA-256 of the module's source. A run fills it in,
+        and refuses another source than a plan states.
     """
+
+    fields_added_later: ClassVar[tuple[str, ...]] = ("source",)
 
     name: Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9 ._+()-]+$")]
     uses: Annotated[str, Field(min_length=1, max_length=200)]
     hyperparameters: dict[str, JsonValue] = Field(default_factory=dict)
     action_range: ActionRange = "symmetric"
     steps: Steps | None = None
+    source: Digest | None = None
+
+    @model_validator(mode="after")
+    def _has_a_source(self) -> Self:
+        _check_source(self.uses, self.source)
+        return self
 
 
 class Cell(Document):
@@ -112,6 +144,7 @@ class Cell(Document):
       spec: the task; of a life in a stream that of its first phase.
       stream: the stream; None for a single task.
       uses: the algorithm, as in the plan.
+      source: the SHA-256 of its module's source, as in the plan.
       hyperparameters: where they differ from the algorithm's defaults.
       action_range: of the environment that the agent acts in.
       seed: of training.
@@ -121,12 +154,13 @@ class Cell(Document):
       protocol: of the evaluation within and out of distribution at the end.
     """
 
-    fields_added_later: ClassVar[tuple[str, ...]] = ("stream",)
+    fields_added_later: ClassVar[tuple[str, ...]] = ("stream", "source")
 
     schema_version: SchemaVersion = 1
     spec: SMESpec
     stream: StreamSpec | None = None
     uses: str
+    source: Digest | None = None
     hyperparameters: dict[str, JsonValue]
     action_range: ActionRange
     seed: Annotated[Integer, Field(ge=0, lt=2**32)]
@@ -138,6 +172,7 @@ class Cell(Document):
     @model_validator(mode="after")
     def _task_suits_the_algorithm(self) -> Self:
         _check_task(self.uses, self.spec, "uses")
+        _check_source(self.uses, self.source)
         if self.stream is None:
             return self
         _check_stream(self.uses, "uses")
@@ -291,6 +326,7 @@ class StudyPlan(Document):
         cell = Cell(
             **_lived_in(document),
             uses=algorithm.uses,
+            source=algorithm.source,
             hyperparameters=algorithm.hyperparameters,
             action_range=algorithm.action_range,
             seed=run,

@@ -6,22 +6,30 @@
     jax:PPO, …             the same in JAX, with its environment in one program
     offline:bc, …          learns from a data set
     reference:linear, …    a reference policy, which learns nothing
+    train:module:name      a function of any framework, `train(env, steps, seed) -> policy`
     an entry point         of the group `sme_registry.algorithms`, in an installed package
     module:name            imported, from this folder or installed
 
 An entry point or `module:name` is either a class like those of Stable-Baselines3
-(`sb3_contrib:TQC`), or a function that returns a model; see `learners`.
+(`sb3_contrib:TQC`), or a function that returns a model; see `models`. Of `train:…` see
+`functions`.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import importlib
+import importlib.machinery
 import importlib.metadata
+import importlib.util
 import io
+import os
+import sys
 import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from sme_registry.datasets import record
@@ -30,7 +38,7 @@ from sme_registry.errors import OptionError, SpecError, UnknownNameError, did_yo
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.io import choice, import_object, require_packages
 from sme_registry.spec import SMESpec, StreamSpec
-from sme_registry.spec.study import INDEPENDENT, JAX, OFFLINE, REFERENCE, in_jax
+from sme_registry.spec.study import JAX, in_jax, parse_uses
 
 ENTRY_POINTS = "sme_registry.algorithms"
 AGENTS = ("sb3", "jax")  # whose implementation of an algorithm is trained
@@ -55,6 +63,8 @@ class Entry:
 
     def load(self, field: str = "uses") -> Any:
         """The class or function that makes a model."""
+        if self.kind == "train":
+            return load_function(self.name, field)[0]
         if self.kind not in ("sb3", "independent"):
             raise OptionError(
                 f"{field}='{self.prefix}{self.name}': is no algorithm of Stable-Baselines3's kind. "
@@ -81,6 +91,8 @@ class Entry:
         """Check that what learns is installed here, where that can be told in little time."""
         if self.kind == "jax":
             importlib.import_module("sme_registry.jax")  # raises where JAX is missing
+        elif self.kind == "train":
+            self.load()
         elif self.kind in ("sb3", "independent"):
             require_sb3()
             if not self.place or self.kind == "independent":
@@ -127,27 +139,121 @@ LEARNERS: dict[str, Entry] = {
         *(Entry("reference", name) for name in POLICIES),
     )
 }
-_PREFIXES = (REFERENCE, OFFLINE, INDEPENDENT, JAX)
 
 
 def find(uses: str, field: str = "uses") -> Entry:
     """The entry of a name, in any case. A name of no table may be an entry point: see `load`."""
-    prefix = next((prefix for prefix in _PREFIXES if uses.startswith(prefix)), "")
-    name = uses.removeprefix(prefix)
-    if prefix == INDEPENDENT:
-        entry = find(name, field)
-        return Entry("independent", entry.name, entry.about, entry.place, entry.needs_limits)
-    same_kind = {known: entry for known, entry in LEARNERS.items() if entry.prefix == prefix}
+    kind, name = parse_uses(uses)
+    if kind == "train":
+        return Entry(kind, name)
+    if kind == "independent":
+        return replace(find(name, field), kind=kind)
+    same_kind = {known: entry for known, entry in LEARNERS.items() if entry.kind == kind}
     for known, entry in same_kind.items():
         if known.casefold() == uses.casefold():
             return entry
-    if prefix:
-        hint = " Other algorithms run without JAX." if prefix == JAX else ""
+    if kind != "sb3":
+        hint = " Other algorithms run without JAX." if kind == "jax" else ""
         raise UnknownNameError(
             f"{field}={uses!r}: must be one of {', '.join(same_kind)}.{hint}"
             f"{did_you_mean(name, [entry.name for entry in same_kind.values()])}"
         )
     return Entry("sb3", name)
+
+
+def code_notice(uses: Iterable[str]) -> str:
+    """Whose code runs to find these algorithms; empty where they name no modules that are here."""
+    modules = dict.fromkeys(filter(None, map(_module_of, uses)))
+    found = [module for module in modules if _path_of(module)]
+    return f"This plan runs the code of {', '.join(found)}." if found else ""
+
+
+def _module_of(uses: str) -> str | None:
+    """The module that a name in `uses` names."""
+    kind, name = parse_uses(uses)
+    kind, name = parse_uses(name) if kind == "independent" else (kind, name)
+    return name.partition(":")[0] if kind in ("sb3", "train") and ":" in name else None
+
+
+def source_of(uses: str, field: str = "uses") -> str | None:
+    """The digest of the module's source of `train:module:function`, which is not imported."""
+    kind, name = parse_uses(uses)
+    return _source(name, field)[1] if kind == "train" else None
+
+
+def load_function(name: str, field: str = "uses") -> tuple[Callable[..., Any], str]:
+    """The function `module:function` of the source that is there now, and the source's digest.
+
+    The source is run again where it has changed since, so what runs is what the digest says.
+    """
+    module_name, _, attribute = name.partition(":")
+    with working_directory_importable():
+        path, digest, source = _source(name, field)
+        module = sys.modules.get(module_name)
+        try:
+            if module is None or _loaded.get(module_name) != digest:
+                importlib.import_module(module_name.rpartition(".")[0] or "sys")
+                spec = importlib.util.spec_from_file_location(module_name, path)
+                module = module or importlib.util.module_from_spec(spec)  # type: ignore[arg-type]
+                sys.modules[module_name] = module
+                exec(compile(source, path, "exec"), vars(module))
+                _loaded[module_name] = digest
+        except Exception as error:
+            sys.modules.pop(module_name, None)
+            raise OptionError(
+                f"{field}='train:{name}': {module_name} cannot be imported: "
+                f"{type(error).__name__}: {error}. Correct it."
+            ) from error
+    function = getattr(module, attribute, None)
+    if not callable(function):
+        functions = [known for known, value in vars(module).items() if callable(value)]
+        raise OptionError(
+            f"{field}='train:{name}': {path} has no function {attribute!r}."
+            f"{did_you_mean(attribute, functions)} Define {attribute}(env, steps, seed), which "
+            "returns a policy."
+        )
+    return function, digest
+
+
+_loaded: dict[str, str] = {}  # the digest of the source that a module has run
+
+
+def _source(name: str, field: str) -> tuple[str, str, bytes]:
+    """The path, the digest and the bytes of a module's source. Imports nothing."""
+    module = name.partition(":")[0]
+    path = _path_of(module)
+    if not path or not path.endswith(".py"):
+        raise OptionError(
+            f"{field}='train:{name}': there is no Python module {module!r}. It must be "
+            "train:module:function, with the module in the working directory or installed."
+        )
+    source = Path(path).read_bytes()
+    return path, f"sha256:{hashlib.sha256(source).hexdigest()}", source
+
+
+def _path_of(module: str) -> str | None:
+    """The file of a module or a package; None if there is none. Imports nothing."""
+    places: Any = None
+    found: Any = None
+    with working_directory_importable():
+        for end in (i for i, letter in enumerate(f"{module}.") if letter == "."):
+            found = importlib.machinery.PathFinder.find_spec(module[:end], places)
+            if found is None:
+                return None
+            places = found.submodule_search_locations
+    path: str | None = found.origin
+    return path
+
+
+@contextlib.contextmanager
+def working_directory_importable() -> Iterator[None]:
+    """Modules in the working directory can be imported inside the block."""
+    folder = os.getcwd()
+    sys.path.insert(0, folder)
+    try:
+        yield
+    finally:
+        sys.path.remove(folder)
 
 
 def _check_in_jax(document: SMESpec | StreamSpec) -> None:

@@ -101,6 +101,9 @@ def check_hyperparameters(
     if entry.kind == "offline":
         own = {name: hyperparameters[name] for name in hyperparameters if name not in OF_DATA_SET}
         offline.check_algorithm(entry.name, own)
+    elif entry.kind == "train":
+        names = _names(entry.load(field), ("env", "steps", "seed"))
+        _refuse_names(field, uses, hyperparameters, names, others)
     elif entry.kind == "jax":
         from sme_registry.jax.run import settings_of
 

@@ -1,4 +1,4 @@
-"""`Learner`: what a cell trains, a model of Stable-Baselines3's kind in its environments.
+"""`SB3Learner`: a model of Stable-Baselines3's kind, or one for each agent of a team.
 
 A single agent learns in one environment, as its algorithm is defined. The agents of a team share a
 model, which gets the transitions of each, or have one each. A step of a team is one step of all its
@@ -20,7 +20,7 @@ import copy
 import io
 import time
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Never
 
@@ -28,23 +28,28 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 import torch
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 
+from sme_registry.envs.episodes import Episode, Episodes
 from sme_registry.envs.vector import EnvView
 from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation import Perceptron, Policy, TeamPolicy
 from sme_registry.evaluation.models import saved_sb3, torch_policy
-from sme_registry.io import write_atomically
-from sme_registry.sb3 import LanesVecEnv, SMETeamVecEnv
-from sme_registry.sb3.vec_env import SingleVecEnv
+from sme_registry.io import is_installed, write_atomically
+from sme_registry.sb3 import LanesVecEnv, SMETeamVecEnv, SMEVecEnv
+from sme_registry.sb3.vec_env import SingleVecEnv, finished_in, log_episode
 from sme_registry.spec import ActionRange, SMESpec, StreamSpec
 from sme_registry.task import materialize
-from sme_registry.training.algorithms import default_num_envs, find, is_sb3
+from sme_registry.training.algorithms import default_num_envs, find, is_sb3, silence
 from sme_registry.training.hyperparameters import for_lanes
-from sme_registry.training.models import new_model
+from sme_registry.training.learn import Watch
+from sme_registry.training.models import load_checkpoint, new_model, save_checkpoint
 from sme_registry.training.numpy_policy import numpy_policy, numpy_team_policy
+from sme_registry.training.record import VisitEnds
 
 _MODEL = "{}.zip"  # of an agent, in the folder of models and in the checkpoint
 Floats = npt.NDArray[np.float32]
@@ -134,11 +139,6 @@ class IndependentModels:
         """Steps of the team over all environments."""
         return int(next(iter(self.models.values())).num_timesteps)
 
-    @property
-    def n_steps(self) -> int:
-        """Steps of a rollout in each environment."""
-        return int(next(iter(self.models.values())).n_steps)
-
     def learn(self, steps: int, on_rollout: Callable[[], None] = lambda: None) -> None:
         """Learn until `num_timesteps` is at least `steps`."""
         set_random_seed(self._seed)
@@ -192,7 +192,7 @@ class IndependentModels:
         for model in models:
             model.policy.set_training_mode(False)
             model.rollout_buffer.reset()
-        for _ in range(self.n_steps):
+        for _ in range(models[0].n_steps):
             acted = [_act(model, seen) for model, seen in zip(models, observations, strict=True)]
             joint = self._join([clipped for *_, clipped in acted])
             rows, rewards, dones, infos = self.env.step(joint)
@@ -265,12 +265,14 @@ def _check(model: Any, uses: str) -> None:
         )
 
 
-class Learner:
-    """A model, or a model for each agent of a team, in its environments: a single run.
+class SB3Learner:
+    """A model, or a model for each agent of a team, in its environments: a `Learner`.
+
+    With `num_envs` they are those of `sme train`, which log the returns of episodes.
 
     Attributes:
       env: the environments, which count the steps of the task.
-      model: what learns in them; of independent agents, all their models.
+      model: what learns in them; of independent agents, a dict from each to its model.
     """
 
     def __init__(
@@ -282,42 +284,91 @@ class Learner:
         steps: int,
         hyperparameters: Mapping[str, Any],
         action_range: ActionRange,
+        num_envs: int | None = None,
+        field: str = "uses",
     ) -> None:
         self._uses, self._document, self._action_range = uses, document, action_range
+        self._seed, self._steps = seed, steps
         spec = document if isinstance(document, SMESpec) else document.phases[0].spec
-        entry = find(uses)
-        self._single = spec.team is None
-        self.env: Any
-        if spec.team is None:
-            self.env = CountedVecEnv(SingleVecEnv(document, action_range=action_range))
+        entry = find(uses, field)
+        self._single, monitored = spec.team is None, num_envs is not None
+        env: Any
+        if spec.team is not None:
+            algorithm = entry.load(field)
+            num_envs = num_envs or default_num_envs(spec, algorithm)
+            env = SMETeamVecEnv(spec, num_envs, action_range=action_range)
+            lanes = num_envs if entry.kind == "independent" else env.num_envs
+            hyperparameters = {**for_lanes(algorithm, lanes, hyperparameters), **hyperparameters}
+        elif num_envs in (None, 1):
+            env = SingleVecEnv(document, action_range=action_range)
         else:
-            algorithm = entry.load()
-            num_envs = default_num_envs(spec, algorithm)
-            self.env = CountedVecEnv(SMETeamVecEnv(spec, num_envs, action_range=action_range))
-            lanes = num_envs if entry.kind == "independent" else self.env.num_envs
-            hyperparameters = {
-                **for_lanes(algorithm, lanes, hyperparameters),
-                **hyperparameters,
-            }
-        self._independent = entry.kind == "independent"
-        self._steps = steps if self._independent else steps * len(self.env.names)
+            env = SMEVecEnv(document, num_envs, action_range=action_range)
         options: dict[str, Any] = {"seed": seed, "hyperparameters": hyperparameters}
-        if self._independent:
-            self.model: Any = IndependentModels(entry.name, self.env, steps=steps, **options)
-        else:
-            self.model = new_model(uses, self.env, steps=self._steps, **options)
+        self._independent: IndependentModels | None = None
+        if entry.kind == "independent":
+            self.env: Any = CountedVecEnv(env)
+            self._independent = IndependentModels(entry.name, self.env, steps=steps, **options)
+            self.model: Any = self._independent.models
+            return
+        self.env = CountedVecEnv(VecMonitor(env) if monitored else env)
+        transitions = steps * len(self.env.names)
+        self.model = new_model(uses, self.env, steps=transitions, field=field, **options)
 
-    def learn(self) -> None:
-        """Learn from at least the steps of the run."""
-        self.model.learn(self._steps)
+    @property
+    def _models(self) -> list[Any]:
+        return [self.model] if self._independent is None else list(self.model.values())
+
+    @property
+    def steps(self) -> int:
+        """Environment steps so far."""
+        return int(self.env.steps)
+
+    @property
+    def total(self) -> int:
+        """Environment steps at the end: on-policy algorithms collect whole rollouts."""
+        first = self._models[0]
+        rollout: int = first.n_steps if hasattr(first, "rollout_buffer") else 1
+        chunk: int = rollout * self.env.num_envs // len(self.env.names)
+        return self.steps + -(-max(0, self._steps - self.steps) // chunk) * chunk
+
+    def learn(self, watch: Watch) -> None:
+        """Take at least the steps that are left; after each of them, `watch.on_steps`."""
+        stream, first_step = self._document, self.steps
+        visits = None
+        if isinstance(stream, StreamSpec):
+            visits = VisitEnds(stream, watch.on_visit, first_step)
+
+        def after_step(steps: int) -> None:
+            watch.on_steps()
+            if visits is not None:
+                visits.after_step(steps)
+
+        self.env.after_step = after_step
+        if first_step < self._steps:
+            self._learn(watch, first_step)
+        watch.on_pause()
+        if visits is not None:  # the last one ends with the training
+            visits.finish(self.steps)
+
+    def _learn(self, watch: Watch, first_step: int) -> None:
+        left = (self._steps - first_step) * len(self.env.names)
+        if self._independent is not None:
+            self._independent.learn(self._steps, watch.on_pause)
+        elif watch.pauses:
+            self.model.learn(left, callback=_Pauses(watch), reset_num_timesteps=first_step == 0)
+        else:
+            self.model.learn(left)
+
+    def add_to(self, sums: Episodes) -> list[Episode]:
+        """Add the last step to sums; returns the episodes that ended in it."""
+        return finished_in(sums, *self.env.last)
 
     def policy(self) -> Policy | TeamPolicy:
         """The present policy. Training may change it."""
         range_ = self._action_range
         if self._single:
             return numpy_policy(self.model, self._document, action_range=range_)
-        models = self.model.models if self._independent else self.model
-        return numpy_team_policy(models, self.env.sme_spec, action_range=range_)
+        return numpy_team_policy(self.model, self.env.sme_spec, action_range=range_)
 
     def lasting_policy(self) -> Policy:
         """The present policy of a single agent, which further training does not change."""
@@ -335,13 +386,91 @@ class Learner:
             ) from error
         return numpy_policy(copied, self._document, action_range=self._action_range)
 
+    def is_finite(self) -> bool:
+        """Whether all weights are finite."""
+        weights = (weight for model in self._models for weight in model.policy.parameters())
+        # Squared: products of weights that are finite and huge are not, and nor are the actions.
+        return all(bool(torch.isfinite(weight.square()).all()) for weight in weights)
+
+    def restore(self, checkpoint: Path) -> None:
+        """Go on from a checkpoint, with random numbers of its own."""
+        if self._independent is not None:
+            self._independent.load_checkpoint(checkpoint)
+            self.env.steps = self._independent.num_timesteps
+            return
+        changes: dict[str, Any] = {}
+        if hasattr(self.model, "buffer_size"):
+            changes["buffer_size"] = self.model.buffer_size
+        self.model = model = load_checkpoint(type(self.model), checkpoint, self.env, **changes)
+        # Another stream than the first session's, the same whenever this session is repeated.
+        sequence = np.random.SeedSequence([self._seed, model.num_timesteps])
+        model.set_random_seed(int(sequence.generate_state(1)[0] >> 1))
+        self.env.steps = int(model.num_timesteps) // len(self.env.names)
+        if isinstance(self._document, StreamSpec):  # a seed begins a new life, here where it was
+            self.env.set_options({"lifetime": self.env.steps})
+
+    def save_checkpoint(self, path: Path, sums: Any = None) -> None:
+        """Write a checkpoint; the present episodes restart, so their sums are not in it."""
+        if self._independent is not None:
+            self._independent.save_checkpoint(path)
+        else:
+            save_checkpoint(self.model, path)
+
     def save(self, path: Path) -> None:
-        """Write the model; nothing of one that cannot be saved."""
-        if self._independent:
-            self.model.save_checkpoint(path)
+        """Write the model, of independent agents a folder; nothing of one that cannot be saved."""
+        if self._independent is not None:
+            save = self._independent.save_checkpoint if path.suffix else self._independent.save
+            save(path)
         elif is_sb3(self.model):
             write_atomically(path, saved_sb3(self.model))
         elif hasattr(self.model, "save"):
             archive = io.BytesIO()
             self.model.save(archive)
             write_atomically(path, archive.getvalue())
+
+    def begin_log(self, folder: Path) -> None:
+        """Log to TensorBoard in a folder if it is installed; independent agents each in its own."""
+        for model in self._models:
+            silence(model)
+        if not is_installed("tensorboard"):
+            return
+        if self._independent is None:
+            self.model.set_logger(configure(str(folder), ["tensorboard"]))
+            return
+        for name, model in self.model.items():
+            model.set_logger(configure(str(folder / name), ["tensorboard"]))
+
+    def log(self, episodes: Sequence[Episode]) -> None:
+        """Log finished episodes."""
+        names = self.env.names
+        for episode in episodes:
+            if self._independent is None:
+                log_episode(self.model.logger, episode, names if len(names) > 1 else ())
+                continue
+            by_agent = episode.agents_regret or (episode.regret,)
+            for model, regret in zip(self._models, by_agent, strict=True):
+                model.logger.record_mean("rollout/regret", regret)
+
+    def close(self) -> None:
+        """Close the logs and the environments."""
+        for model in self._models:
+            model.logger.close()
+        self.env.close()
+
+
+class _Pauses(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped without SB3
+    """Calls `watch.on_pause` between rollouts.
+
+    There the model is consistent: it has learnt from all transitions, and they are in its replay
+    buffer. For off-policy algorithms that is after each environment step.
+    """
+
+    def __init__(self, watch: Watch) -> None:
+        super().__init__()
+        self._watch = watch
+
+    def _on_rollout_start(self) -> None:
+        self._watch.on_pause()
+
+    def _on_step(self) -> bool:
+        return True

@@ -32,7 +32,7 @@ from sme_registry.evaluation.models import saved_sb3
 from sme_registry.io import write_atomically
 from sme_registry.sb3 import SMEVecEnv
 from sme_registry.spec import ActionRange, SMESpec, StreamSpec
-from sme_registry.spec.study import JAX
+from sme_registry.spec.study import parse_uses
 from sme_registry.training.algorithms import find, is_sb3, replay_settings, silence
 from sme_registry.training.hyperparameters import policy_alias, refuse_unknown, resolved
 
@@ -108,7 +108,7 @@ def new_sb3_model(
     if "buffer_size" in settings:
         settings["buffer_size"] = min(settings["buffer_size"], max(1, steps))
     return new_model(
-        uses.removeprefix(JAX),
+        parse_uses(uses)[1],
         SMEVecEnv(document, 1, action_range=action_range),
         seed=seed,
         steps=steps,

@@ -40,7 +40,7 @@ from sme_registry.evaluation.models import saved_sb3
 from sme_registry.io import read_json, to_json, versions, write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
 from sme_registry.spec.document import Integer, Real, StrictModel, without_empty
-from sme_registry.spec.study import INDEPENDENT, in_jax
+from sme_registry.spec.study import in_jax, parse_uses
 
 RECORD = "run.json"
 MODEL, MODELS = "model.zip", "model"  # a folder of one model for each independent agent
@@ -54,7 +54,10 @@ PACKAGES = ("gymnasium", "numpy", "scipy", "numba", "stable_baselines3", "torch"
 
 def versions_for(uses: str) -> dict[str, str]:
     """Installed versions that the numbers depend on, including the algorithm's own package."""
-    package = uses.removeprefix(INDEPENDENT).partition(":")[0].partition(".")[0]
+    kind, name = parse_uses(uses)
+    package = (
+        (name if kind in ("independent", "train") else uses).partition(":")[0].partition(".")[0]
+    )
     return versions([*PACKAGES, package, *(["jaxlib"] if in_jax(uses) else [])])
 
 
@@ -84,6 +87,7 @@ class RunRecord(StrictModel):
       hyperparameters: those that differ from the algorithm's defaults. `sme train` sets some for
         several environments and for teams; see `hyperparameters.for_lanes`.
       device: of agents in JAX: "cpu", "gpu" or "tpu".
+      source: of `train:module:function`, the SHA-256 of the module's source; empty for any other.
       seed: of training.
       action_range: of the environment that the agent acts in.
       num_envs: environments that step together.
@@ -115,6 +119,7 @@ class RunRecord(StrictModel):
         default_factory=dict
     )
     device: str = ""
+    source: str = ""
     seed: Integer
     action_range: Literal["unit", "symmetric"]
     num_envs: Integer
@@ -133,7 +138,7 @@ class RunRecord(StrictModel):
 
     @model_serializer(mode="wrap")
     def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return without_empty(handler(self), "stream", "stream_digest")
+        return without_empty(handler(self), "stream", "stream_digest", "source")
 
     @classmethod
     def read(cls, folder: Path) -> RunRecord | None:

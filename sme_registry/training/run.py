@@ -16,6 +16,7 @@ time writes the files:
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 from collections.abc import Mapping
@@ -46,7 +47,7 @@ from sme_registry.spec import (
     StreamSpec,
     catalogue,
 )
-from sme_registry.spec.study import in_jax
+from sme_registry.spec.study import INDEPENDENT, in_jax, parse_uses
 from sme_registry.task import load, materialize, materialize_stream
 from sme_registry.training import reports
 from sme_registry.training.algorithms import (
@@ -54,11 +55,15 @@ from sme_registry.training.algorithms import (
     default_num_envs,
     find,
     full_name,
+    is_sb3,
     one_thread,
     quiet,
     require_sb3,
+    source_of,
 )
+from sme_registry.training.functions import FunctionLearner
 from sme_registry.training.hyperparameters import for_lanes, nested_hyperparameters, refuse_unknown
+from sme_registry.training.learn import Learner, learn
 from sme_registry.training.record import (
     CHECKPOINT,
     EPISODES,
@@ -141,11 +146,13 @@ def train(
 
     Args:
       algorithm: a name of `algorithms.LEARNERS` that trains in an environment, in any case, an
-        entry point, or "module:Class"; None takes TD3, and PPO for a team.
+        entry point, "module:Class", or "train:module:function" (see `functions`); None takes TD3,
+        and PPO for a team.
       steps: environment steps over all environments; None takes 20,000, and those of a stream. One
         step of a team is a step of all its agents. PPO and A2C finish their last rollout.
       hyperparameters: as JSON values, such as
         {"learning_rate": 1e-4, "policy_kwargs": {"net_arch": [64, 64]}}. Dotted names are nested.
+        Of "train:module:function", keyword arguments.
       independent: whether each agent of a team has a model of its own, which learns from its
         observations and rewards; otherwise they share one. For on-policy algorithms.
       action_range: of the policy's actions, "symmetric" [−1, 1] or "unit" [0, 1].
@@ -190,19 +197,18 @@ def train(
         materialize(plan.spec)
     folder = Path(folder)
     record = _new_or_continued(folder, plan, resume=resume, force=force)
-    with quiet(), one_thread():
-        training = _training(record)
+    with quiet(), one_thread() if _uses_torch(record) else contextlib.nullcontext():
         # Rejects values of hyperparameters, and tasks, before the folder is created.
-        model = training.new_model(record)
+        learner = _learner(record)
         if record.sessions == 1:
             claim_folder(folder, _FILES if force else (), force=force)
         with _lock(folder):
             if record.sessions == 1:
                 _remove_run(folder)
             record.write(folder)
-            record, episodes, model = training.learn(model, record, folder, progress, console)
+            record, episodes = learn(learner, record, folder, progress, console)
             report, figures = reports.write_report(
-                model, record, episodes, folder, progress, console
+                learner.model, record, episodes, folder, progress, console
             )
             record = record.updated(status="finished")
             record.write(folder)
@@ -293,6 +299,8 @@ def _with_algorithm(
             f"algorithm={uses!r}: is a name for studies. Train {entry.name!r} with "
             "independent=True (in the terminal, --independent)."
         )
+    if entry.kind == "train":
+        return _with_function(plan, uses, num_envs, settings)
     entry.check_task(plan.document)
     algorithm = entry.load("algorithm")
     refuse_unknown(algorithm, uses, settings)
@@ -309,6 +317,29 @@ def _with_algorithm(
         algorithm=uses,
         hyperparameters=settings,
         num_envs=num_envs,
+        versions=versions_for(uses),
+    )
+
+
+def _with_function(
+    plan: RunRecord, uses: str, num_envs: int | None, settings: dict[str, Any]
+) -> RunRecord:
+    """The same for a function that trains."""
+    if num_envs not in (None, 1):
+        raise OptionError(
+            f"num_envs={num_envs!r}: must be 1 for {uses!r}, whose function gets one environment. "
+            "Leave it out."
+        )
+    subject = "stream" if plan.stream is not None else "team" if plan.spec.team is not None else ""
+    if subject:
+        raise OptionError(
+            f"algorithm={uses!r}: is for a task of a single agent, and this is a {subject}. Train "
+            "an algorithm of Stable-Baselines3, such as PPO."
+        )
+    return plan.updated(
+        algorithm=uses,
+        hyperparameters=settings,
+        source=source_of(uses, "algorithm"),
         versions=versions_for(uses),
     )
 
@@ -340,15 +371,37 @@ def _with_jax_algorithm(
     )
 
 
-def _training(record: RunRecord) -> Any:
-    """The module with `new_model` and `learn` for a run."""
-    if in_jax(record.algorithm):
-        from sme_registry.training import jax_learn
+def _uses_torch(record: RunRecord) -> bool:
+    return parse_uses(record.algorithm)[0] != "train"
 
-        return jax_learn
-    from sme_registry.training import learn
 
-    return learn
+def _learner(record: RunRecord) -> Learner:
+    """What a run trains, new."""
+    kind, name = parse_uses(record.algorithm)
+    if kind == "jax":
+        from sme_registry.training.jax_learner import JAXLearner
+
+        return JAXLearner(record)
+    options: dict[str, Any] = {
+        "seed": record.seed,
+        "steps": record.steps,
+        "hyperparameters": record.hyperparameters,
+        "action_range": record.action_range,
+        "field": "algorithm",
+    }
+    if kind == "train":
+        return FunctionLearner(name, record.spec, **options)
+    from sme_registry.training.learners import SB3Learner
+
+    uses = f"{INDEPENDENT * record.independent}{name}"
+    learner = SB3Learner(uses, record.document, num_envs=record.num_envs, **options)
+    if not (record.independent or is_sb3(learner.model)):
+        raise OptionError(
+            f"algorithm={name!r}: returned a {type(learner.model).__name__}, which is no model of "
+            "Stable-Baselines3, so its training cannot be logged or resumed. Train it in a study: "
+            f"`sme study new plan.json -t TASK -a {name}`, or as train:module:function."
+        )
+    return learner
 
 
 def _new_or_continued(folder: Path, plan: RunRecord, *, resume: bool, force: bool) -> RunRecord:
@@ -361,7 +414,7 @@ def _new_or_continued(folder: Path, plan: RunRecord, *, resume: bool, force: boo
             f"{folder}: contains no run to resume. Leave out --resume to start one (in Python, "
             "resume=True), or give the folder of the run."
         )
-    if previous is None and in_jax(plan.algorithm):
+    if previous is None and parse_uses(plan.algorithm)[0] in ("jax", "train"):
         return plan
     if previous is None:
         lanes = plan.num_envs * (1 if plan.independent else plan.agents)
@@ -373,6 +426,11 @@ def _new_or_continued(folder: Path, plan: RunRecord, *, resume: bool, force: boo
             f"{folder}: contains a {previous.status} run of {previous.algorithm}{reason}. Only "
             "interrupted runs can be resumed, also with more steps. Give another folder, or use "
             "--force to replace it (in Python, force=True)."
+        )
+    if parse_uses(previous.algorithm)[0] == "train":
+        raise OptionError(
+            f"{folder}: contains an unfinished run of {previous.algorithm}, which has no "
+            "checkpoints. Use --force to start again (in Python, force=True)."
         )
     if not resume:
         raise OptionError(

@@ -1,6 +1,7 @@
 """Runs on streams: snapshots, what is reported, resuming in mid-life, and what is refused."""
 
 import json
+import signal
 
 import numpy as np
 import pytest
@@ -8,11 +9,13 @@ import pytest
 from sme_registry import SMESpec, StreamSpec
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.evaluation import StreamReport, evaluate_stream, load_sb3
-from sme_registry.training import RunRecord, learn, train
+from sme_registry.training import RunRecord, train
 from sme_registry.training.record import VisitEnds, read_episodes
 from tests.training.runs import PROTOCOL, TINY
 
 pytest.importorskip("stable_baselines3")
+
+from sme_registry.training.learners import SB3Learner
 
 # Nobody is rewarded in phase 1, so that every regret says in which phase it was.
 BARREN = TINY.derive(seed=6, r_min=0.999)
@@ -103,15 +106,15 @@ def test_the_report_of_a_life_is_about_its_snapshots_and_its_episodes(lived):
 
 def killed(folder, monkeypatch, at_step, stream=STREAM):
     """A life that ends right after the checkpoint of a step."""
-    save = learn._save_checkpoint
+    save = SB3Learner.save_checkpoint
 
-    def save_and_end(model, log):
-        save(model, log)
-        if model.num_timesteps >= at_step:
-            raise KeyboardInterrupt
+    def save_and_end(learner, *arguments):
+        save(learner, *arguments)
+        if learner.steps >= at_step:
+            signal.raise_signal(signal.SIGINT)  # delivered when the record is written, too
 
     with monkeypatch.context() as patch:
-        patch.setattr(learn, "_save_checkpoint", save_and_end)
+        patch.setattr(SB3Learner, "save_checkpoint", save_and_end)
         with pytest.raises(KeyboardInterrupt):
             life(folder, stream)
 

@@ -29,9 +29,9 @@ from typing import Any, NamedTuple, cast
 from sme_registry.errors import OptionError, SMEError, UnknownNameError, did_you_mean
 from sme_registry.io import choice
 from sme_registry.spec import Cell, PlannedCell, SMESpec, StudyAlgorithm, StudyFile, StudyPlan
-from sme_registry.spec.study import INDEPENDENT, JAX, OFFLINE, REFERENCE, in_jax
+from sme_registry.spec.study import in_jax, parse_uses
 from sme_registry.studies.engine.result import CellResult
-from sme_registry.training.algorithms import AGENTS, find, is_on_policy
+from sme_registry.training.algorithms import AGENTS, find, is_on_policy, source_of
 from sme_registry.training.hyperparameters import parameters_of
 
 # Seconds of one training step with default hyperparameters: on a fast core, and the slowest
@@ -156,10 +156,10 @@ class Paces:
 
 def _work(cell: Cell) -> Span:
     """A cell's seconds by the table, without its start."""
-    uses = cell.uses.removeprefix(INDEPENDENT)
-    transitions = 0 if uses.startswith(REFERENCE) else cell.steps * _agents(cell.spec)
+    kind, name = parse_uses(cell.uses)
+    transitions = 0 if kind == "reference" else cell.steps * _agents(cell.spec)
     states = cell.protocol.states_per_region * len(cell.protocol.edges)
-    step = SECONDS_PER_STEP.get(uses, _UNKNOWN)
+    step = SECONDS_PER_STEP.get(name if kind == "independent" else cell.uses, _UNKNOWN)
 
     inner = [spec.complexity - 1 for spec in cell.specs]
     layers = sum(inner) / len(inner)
@@ -228,14 +228,39 @@ def with_agents(file: StudyFile, agents: str) -> StudyFile:
     fields = file.plan.to_dict()
     for algorithm in fields["algorithms"]:
         uses = algorithm["uses"]
+        kind, name = parse_uses(uses)
         if agents == "sb3":
-            algorithm["uses"] = uses.removeprefix(JAX)
-        elif not uses.startswith((REFERENCE, OFFLINE)):
+            algorithm["uses"] = name if kind == "jax" else uses
+        elif kind not in ("reference", "offline"):
             from sme_registry.jax.run import full_name
 
             algorithm["uses"] = full_name(uses, f"algorithm {algorithm['name']!r}: uses")
     plan = StudyPlan.from_dict(fields, f"the plan with agents={agents}")
     return _renamed(file, plan, f"-{agents}")
+
+
+def with_sources(file: StudyFile) -> StudyFile:
+    """The plan with the digest of the source of each `train:…`; imports none of the modules.
+
+    A module that is not here is left as it is: an algorithm that does not run needs none.
+    """
+    fields = file.plan.to_dict()
+    for algorithm in fields["algorithms"]:
+        name, stated = f"algorithm {algorithm['name']!r}", algorithm.get("source")
+        try:
+            source = source_of(algorithm["uses"])
+        except OptionError:
+            continue
+        if source is None:
+            continue
+        if stated not in (None, source):
+            raise OptionError(
+                f"{name}: source={stated!r}: the source of the module is {source!r} now. Restore "
+                "the module, or leave source out of the plan for new results."
+            )
+        algorithm["source"] = source
+    plan = StudyPlan.from_dict(fields, "the plan")
+    return file.model_copy(update={"plan": plan, "digest": plan.digest})
 
 
 def _renamed(file: StudyFile, plan: StudyPlan, suffix: str) -> StudyFile:

@@ -3,7 +3,8 @@
     reference:…    a policy that learns nothing, evaluated as often as a learner
     offline:…      collects a data set, which it does not keep, and learns from it alone
     jax:…          the only lane of a program (`lanes`)
-    any other      a `Learner` in its environments
+    train:…        a function (`FunctionLearner`), evaluated at its end alone
+    any other      an `SB3Learner` in its environments
 
 Only the evaluations run as a batch. The same cell gives the same result on the same machine, except
 for `timing`.
@@ -47,8 +48,10 @@ from sme_registry.studies.engine.result import (
 )
 from sme_registry.task import Task, materialize, materialize_stream
 from sme_registry.training.algorithms import find, one_thread, quiet
+from sme_registry.training.functions import FunctionLearner
 from sme_registry.training.hyperparameters import check_hyperparameters
-from sme_registry.training.record import Snapshots, VisitEnds
+from sme_registry.training.learn import Watch
+from sme_registry.training.record import Snapshots
 
 ReportSteps = Callable[[int, int], None]
 
@@ -93,9 +96,49 @@ def run_cell(
     if entry.kind == "reference":
         check_hyperparameters(cell.uses, cell.hyperparameters)
         return _run_reference(cell, entry.name, progress)
+    if entry.kind == "train":
+        return _run_function(cell, entry.name, progress, model_path)
     entry.load()  # refuse a missing one before anything is made
+    from sme_registry.training.learners import SB3Learner
+
     with quiet(), one_thread():
-        return _run_learner(cell, progress, model_path)
+        learner = SB3Learner(cell.uses, cell.document, **_options(cell))
+        models = model_path and model_path.with_suffix("")
+        watch = _Evaluations(cell, progress, learner, models)
+        watch.train()
+        if learner.steps < cell.steps:
+            raise PolicyError(
+                f"uses={cell.uses!r}: learn({cell.steps}) returned after {learner.steps} steps of "
+                "its environment. It must take all of them, in that environment."
+            )
+        return watch.result_of_training(model_path)
+
+
+def _options(cell: Cell) -> dict[str, Any]:
+    """What a learner is made with."""
+    return {
+        "seed": cell.seed,
+        "steps": cell.steps,
+        "hyperparameters": cell.hyperparameters,
+        "action_range": cell.action_range,
+    }
+
+
+def _run_function(
+    cell: Cell, name: str, progress: ReportSteps, model_path: Path | None
+) -> CellResult:
+    """Train with a function, whose policy is evaluated at the end alone."""
+    learner = FunctionLearner(name, cell.spec, **_options(cell))
+    if cell.source not in (None, learner.source):
+        raise OptionError(
+            f"uses={cell.uses!r}: the source of its module is {learner.source} now, and that of "
+            f"the cell is {cell.source}. Run the study again: with another source it is another "
+            "cell."
+        )
+    cell = Cell(**dict(cell) | {"source": learner.source})
+    watch = _Evaluations(cell, progress, learner)
+    watch.train()
+    return watch.result_of_training(model_path)
 
 
 def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> CellResult:
@@ -125,77 +168,73 @@ def _run_reference(cell: Cell, name: str, progress: ReportSteps) -> CellResult:
         return evaluations.result(policy, 0)
 
 
-def _run_learner(cell: Cell, progress: ReportSteps, model_path: Path | None) -> CellResult:
-    """Train the cell's learner, and evaluate it whenever an evaluation is due."""
-    from sme_registry.training.learners import Learner
+class _Evaluations(Watch):
+    """The evaluations of a cell whose policy runs outside JAX, and the record of its training."""
 
-    evaluations = _Evaluations(cell, progress)
-    learner = Learner(
-        cell.uses,
-        cell.document,
-        seed=cell.seed,
-        steps=cell.steps,
-        hyperparameters=cell.hyperparameters,
-        action_range=cell.action_range,
-    )
-    env, life = learner.env, None
-    if cell.stream is not None:
-        life = _Life(evaluations, learner, model_path and model_path.with_suffix(""))
-
-    def after_step(steps: int) -> None:
-        if life is not None:
-            life.after_step(steps)
-        evaluations.evaluate_due(steps, learner)
-        evaluations.report(steps)
-
-    env.after_step = after_step
-    evaluations.record.start()
-    evaluations.evaluate_due(0, learner)
-    evaluations.report(0)
-    if cell.steps:
-        learner.learn()
-    if env.steps < cell.steps:
-        raise PolicyError(
-            f"uses={cell.uses!r}: learn({cell.steps}) returned after {env.steps} steps of its "
-            "environment. It must take all of them, in that environment."
-        )
-    evaluations.record.add(env.regret, env.cost)
-    evaluations.record.spend(TRAINING)
-    while evaluations.record.evaluated < cell.evaluations:
-        evaluations.evaluate(env.steps, learner.policy())
-    if model_path is not None:
-        learner.save(model_path)
-    if life is None:
-        return evaluations.result(learner.policy(), env.steps, env.seconds)
-    return evaluations.result(life.report(env.steps), env.steps, env.seconds)
-
-
-class _Evaluations:
-    """The evaluations of a cell whose policy runs outside JAX, and their record."""
-
-    def __init__(self, cell: Cell, progress: ReportSteps) -> None:
-        self.cell, self._progress = cell, progress
+    def __init__(
+        self,
+        cell: Cell,
+        progress: ReportSteps,
+        learner: Any = None,
+        models: Path | None = None,
+    ) -> None:
+        self.cell, self._progress, self._learner = cell, progress, learner
         self._tasks = _TasksInForce(cell.document)
         agents = () if cell.spec.team is None else self._tasks.after(0).names
         self.record = Record((cell,), 1, time.thread_time, agents)
         self._begun = time.thread_time()
+        self._life = None if cell.stream is None else _Life(cell, self.record, learner, models)
+
+    def train(self) -> None:
+        """Train the learner, and evaluate it whenever an evaluation is due."""
+        env, record = self._learner.env, self.record
+        record.start()
+        self._evaluate_due(0)
+        self.report(0)
+        self._learner.learn(self)
+        record.add(env.regret, env.cost)
+        record.spend(TRAINING)
+        while record.evaluated < len(record.due):
+            self.evaluate(env.steps, self._learner.policy())
+
+    def on_steps(self) -> None:
+        """Count a step, before the learner learns from it, and run what is due."""
+        steps = self._learner.steps
+        if self._life is not None:
+            self._life.after_step(steps)
+        self._evaluate_due(steps)
+        self.report(steps)
+
+    def on_visit(self, visit: int) -> None:
+        """Keep the policy."""
+        assert self._life is not None
+        self._life.end_visit(visit)
+
+    def result_of_training(self, model_path: Path | None) -> CellResult:
+        """The result, with the model where it is to be saved."""
+        learner = self._learner
+        if model_path is not None:
+            learner.save(model_path)
+        ended = learner.policy() if self._life is None else self._life.report(learner.steps)
+        return self.result(ended, learner.steps, learner.env.seconds)
 
     def report(self, steps: int) -> None:
         """Report the steps done; an algorithm may take more than those of the plan."""
         if steps <= self.cell.steps:
             self._progress(steps, self.cell.steps)
 
-    def evaluate_due(self, steps: int, learner: Any) -> None:
+    def _evaluate_due(self, steps: int) -> None:
         """Run the evaluations that are due during training; the last one waits for its end."""
         record = self.record
         while record.evaluated + 1 < len(record.due) and record.due[record.evaluated] <= steps:
             record.spend(TRAINING)
-            self.evaluate(steps, learner.policy())
+            self.evaluate(steps, self._learner.policy())
 
     def evaluate(self, steps: int, policy: Policy | TeamPolicy) -> None:
         """Run the next evaluation, after `steps` steps of training."""
         cell, k = self.cell, self.record.evaluated
-        states = start_states(cell.seed, k, cell.evaluation_episodes, cell.spec.state_dim)
+        number = k + cell.evaluations - len(self.record.due)  # a function has only the last
+        states = start_states(cell.seed, number, cell.evaluation_episodes, cell.spec.state_dim)
         done = rollouts(self._tasks.shown_to(policy, steps), self._tasks.after(steps), states)
         row = (
             steps,
@@ -254,13 +293,11 @@ class _TasksInForce:
 class _Life:
     """A learner's life while it trains: its policies at the ends of visits, and its regret."""
 
-    def __init__(self, evaluations: _Evaluations, learner: Any, models: Path | None) -> None:
-        cell, blocks = evaluations.cell, evaluations.record.blocks
+    def __init__(self, cell: Cell, record: Record, learner: Any, models: Path | None) -> None:
         assert cell.stream is not None
-        assert blocks is not None
-        self._cell, self._learner, self._blocks = cell, learner, blocks
+        assert record.blocks is not None
+        self._cell, self._learner, self._blocks = cell, learner, record.blocks
         self._uncounted: list[tuple[float, int]] = []  # regret and phase of steps
-        self._ends = VisitEnds(cell.stream, self._end_visit)
         self._files = None if models is None else Snapshots(models, cell.stream)
         self._initial, self._policies = learner.lasting_policy(), list[Policy]()
         if self._files is not None:
@@ -272,12 +309,10 @@ class _Life:
         self._uncounted.append((info["regret"], info["phase"]))
         if len(self._uncounted) >= _COUNTED_AT_ONCE:
             self._count(steps)
-        self._ends.after_step(steps)
 
     def report(self, steps: int) -> StreamReport:
         """End the life after its training: what the agent retains, and its dynamic regret."""
         self._count(steps)
-        self._ends.finish(steps)
         regret = self._blocks.dynamic_regret()
         return life_report(self._cell, self._policies, self._initial, regret)
 
@@ -287,7 +322,7 @@ class _Life:
             self._blocks.add(steps, np.array(regret)[:, None], phase)
             self._uncounted.clear()
 
-    def _end_visit(self, visit: int) -> None:
+    def end_visit(self, visit: int) -> None:
         self._policies.append(self._learner.lasting_policy())
         if self._files is not None:
             self._learner.save(self._files.visits[visit])

@@ -27,6 +27,7 @@ from sme_registry.evaluation.policies import stream_policy
 from sme_registry.io import Arrays
 from sme_registry.spec import Cell, Digest, Integer, Real, SchemaVersion, StrictModel
 from sme_registry.spec.document import without_empty
+from sme_registry.spec.study import parse_uses
 from sme_registry.training.record import versions_for
 
 _Numbers = Annotated[tuple[Real, ...], Field(strict=False)]
@@ -215,7 +216,8 @@ class Record:
 
     The runs are those of one program; one of Stable-Baselines3 is a program with one run. The k-th
     evaluation follows round(steps · k / evaluations) steps, the last one the end of training:
-    on-policy algorithms finish their last rollout, so it can be later.
+    on-policy algorithms finish their last rollout, so it can be later. A function that trains is
+    evaluated at the end alone.
 
     Attributes:
       due: steps of the evaluations.
@@ -232,7 +234,8 @@ class Record:
         clock: Callable[[], float],
         agents: Sequence[str] = (),
     ) -> None:
-        cell, n = cells[0], cells[0].evaluations
+        cell = cells[0]
+        n = min(cell.evaluations, 1 if parse_uses(cell.uses)[0] == "train" else cell.evaluations)
         self._cells, self._agents = cells, agents
         self.due = [round(cell.steps * k / n) for k in range(1, n + 1)]
         self.evaluated = 0

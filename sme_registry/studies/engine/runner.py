@@ -9,13 +9,14 @@ from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 
 from sme_registry.errors import OptionError, ResourceLimitError, UnknownNameError
 from sme_registry.io import integer_in
 from sme_registry.io.terminal import Progress, duration
 from sme_registry.spec import PlannedCell, StudyFile, StudyPlan
 from sme_registry.spec.study import in_jax
-from sme_registry.studies.engine.budget import Paces, first_places, selected
+from sme_registry.studies.engine.budget import Paces, first_places, selected, with_sources
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.executors import (
     Executor,
@@ -27,7 +28,7 @@ from sme_registry.studies.engine.executors import (
 from sme_registry.studies.engine.ledger import Ledger, StudyStatus, label, plan_status
 from sme_registry.studies.engine.queue import CPU, Ended, Job, Programs, Queue, platform_of
 from sme_registry.studies.engine.result import CellFailure, CellResult, Outcome
-from sme_registry.training.algorithms import find
+from sme_registry.training.algorithms import code_notice, find
 from sme_registry.training.hyperparameters import check_algorithm
 from sme_registry.training.record import versions_for
 
@@ -83,9 +84,11 @@ def run_study(
         jobs = integer_in("jobs", jobs, 1)
     if lanes is not None:
         lanes = integer_in("lanes", lanes, 1, 100_000)
+    plan_file = with_sources(plan_file)
     planned = first_places(selected(plan_file.plan.cells, only))
+    console = console or Console(stderr=True)
     if run is run_cell:
-        _check(plan_file.plan, planned.values())
+        _check(plan_file.plan, planned.values(), console if progress else None)
     on_ray = executor == "ray" or isinstance(executor, OnRay)
     with_jax = run is run_cell and any(in_jax(cell.cell.uses) for cell in planned.values())
     programs = _programs(plan_file.plan, device, lanes, on_ray=on_ray) if with_jax else None
@@ -101,7 +104,7 @@ def run_study(
         ledger.write_plan(plan_file)
     if queue.finished < len(planned):
         ledger.write_request(plan_file, only)
-    study = _StudyRun(plan_file, planned, queue, runs_on, console or Console(stderr=True), progress)
+    study = _StudyRun(plan_file, planned, queue, runs_on, console, progress)
     ledger.warn = study.say
     study.announce(earlier_plan)
     if keep_models:
@@ -116,13 +119,16 @@ def run_study(
     return plan_status(ledger, plan_file, only)
 
 
-def _check(plan: StudyPlan, planned: Collection[PlannedCell]) -> None:
+def _check(plan: StudyPlan, planned: Collection[PlannedCell], console: Console | None) -> None:
     """Check the algorithms of these cells, and that they have such tasks."""
     names = {cell.algorithm for cell in planned}
-    for algorithm in plan.algorithms:
-        if algorithm.name in names:
-            find(algorithm.uses).check_installed()
-            check_algorithm(algorithm)
+    algorithms = [algorithm for algorithm in plan.algorithms if algorithm.name in names]
+    notice = code_notice(algorithm.uses for algorithm in algorithms)
+    if notice and console is not None:
+        console.print(escape(notice), highlight=False, soft_wrap=True)
+    for algorithm in algorithms:
+        find(algorithm.uses).check_installed()
+        check_algorithm(algorithm)
     for cell in planned:
         find(cell.cell.uses).check_task(cell.cell.document)
 

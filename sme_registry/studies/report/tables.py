@@ -52,6 +52,7 @@ import pandas as pd
 
 from sme_registry import statistics
 from sme_registry.spec import StudyAlgorithm, StudyFile
+from sme_registry.spec.study import parse_uses
 from sme_registry.statistics import Array, Statistic
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.report.analysis import (
@@ -130,7 +131,7 @@ def analyse(
         classes=classes,
         streams=stream_infos(plan),
         algorithms=names,
-        learners=tuple(a.name for a in present if not a.uses.startswith("reference:")),
+        learners=tuple(a.name for a in present if parse_uses(a.uses)[0] != "reference"),
         groups=groups(classes, names, set(by_place(runs))),
         runs=runs,
         offline_runs=offline_runs(results, plan.algorithms),
@@ -371,7 +372,7 @@ def learner_names(algorithms: Sequence[StudyAlgorithm]) -> dict[str, str]:
             for key in sorted({key for each in alike for key in each})
             if any(each.get(key) != alike[0].get(key) for each in alike)
         ]
-        name = algorithm.uses.removeprefix("offline:").upper()
+        name = parse_uses(algorithm.uses)[1].upper()
         names[algorithm.name] = f"{name} ({', '.join(differing)})" if differing else name
     return names
 
