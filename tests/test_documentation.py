@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from sme_registry import load
 from sme_registry.spec import EnvFile, ObservationSpec, SafetySpec, SMESpec, SuiteFile
 from sme_registry.spec.catalogue import names
+from sme_registry.studies.engine.executors import InProcess, Processes
 from sme_registry.task.certificate import certify
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -39,6 +40,16 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatc
     namespace = {"__name__": "page"}
     for block in blocks:
         exec(compile(block, page, "exec"), namespace)
+
+
+@pytest.fixture
+def in_process(monkeypatch):
+    """Cells run in this process: a page's studies are small, and a process takes two seconds."""
+
+    def here(executor, jobs, progress):
+        return InProcess(executor._run, executor._keep_models).map(jobs, progress)
+
+    monkeypatch.setattr(Processes, "map", here)
 
 
 @pytest.mark.parametrize(
@@ -69,11 +80,11 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatc
                 "--agents jax": "",
                 "5_000": "500",
                 "--seeds 5 --evaluations 20": "--seeds 1 --evaluations 2",
-                "--folder runs/lives": "--folder runs/lives --executor in-process",
             },
         ),
     ],
 )
+@pytest.mark.usefixtures("in_process")
 def test_a_tutorial_works_from_top_to_bottom(name, packages, shorter, tmp_path, monkeypatch):
     for package in packages.split():
         pytest.importorskip(package)
@@ -96,6 +107,7 @@ def test_a_tutorial_works_from_top_to_bottom(name, packages, shorter, tmp_path, 
                     subprocess.run(shlex.split(line), check=True)
 
 
+@pytest.mark.usefixtures("in_process")
 def test_the_page_on_the_leaderboard_leads_from_an_own_suite_to_a_rank(tmp_path, monkeypatch):
     for package in ("torch", "onnx", "onnxruntime"):
         pytest.importorskip(package)

@@ -52,7 +52,7 @@ def test_without_torchrl_an_example_helps_or_says_what_is_wrong(
 @pytest.mark.parametrize("example", PPO_EXAMPLES, ids=lambda path: path.stem)
 def test_ppo_of_a_framework_lowers_the_exact_regret(example):
     """Where the framework is missing, the example says so in one line."""
-    done = run(example, "--steps", "4096")
+    done = run(example, "--steps", "2048")
     print(done.stdout)  # for `make frameworks`
     missing = r"\S+ is not installed. docs/guides/frameworks.md has the command.\n"
     if re.fullmatch(missing, done.stderr):
@@ -66,7 +66,7 @@ def test_ppo_of_a_framework_lowers_the_exact_regret(example):
 
 def test_the_torchrl_example_trains():
     pytest.importorskip("torchrl")
-    done = run(ROOT / "examples" / "torchrl_team.py", "--env", "Team2", "--steps", "4096")
+    done = run(ROOT / "examples" / "torchrl_team.py", "--env", "Team2", "--steps", "2048")
     assert done.returncode == 0, done.stderr
     before, after = (
         [float(value) for value in line.split()[3:]]

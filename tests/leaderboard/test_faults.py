@@ -13,7 +13,7 @@ from leaderboard.store import collect_garbage
 from tests.leaderboard.conftest import put_submission, tiny_board
 from tests.leaderboard.store.synthetic import synthetic_result
 
-SUBMISSIONS, SCORERS, KILLS = 60, 2, 5
+SUBMISSIONS, SCORERS, KILLS = 40, 2, 4
 # One in so many has a policy, whose sandbox takes a moment to start. The others have none, and are
 # refused for it.
 REAL = 10
