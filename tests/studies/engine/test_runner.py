@@ -65,6 +65,12 @@ if __name__ == "__main__":
 """
 
 
+@pytest.fixture(autouse=True)
+def _processes_start_sooner(monkeypatch):
+    """Loading Numba takes longer than a small cell."""
+    monkeypatch.setenv("SME_BACKEND", "numpy")
+
+
 @pytest.fixture
 def notes(tmp_path):
     folder = tmp_path / "notes"
