@@ -338,7 +338,8 @@ def limits(
     task: Task, states: Sample, visited: tuple[Array, Array], report: SafetyReport
 ) -> Violations:
     """What a policy does to the limits, in uniform states and in those of its episodes."""
-    limit, tightest = task.limit(states.s), 2.0 * _tightness(task)
+    assert task.spec.safety is not None  # it is measured only then
+    limit, tightest = task.limit(states.s), 2.0 * task.spec.safety.tightness
     above = [a - limit for a in (states.a, states.optimal)]
     own, optimal = ((excess > TOLERANCE).mean(axis=0) for excess in above)
     cost = np.maximum(0.0, above[0]).mean(axis=0) / tightest
@@ -358,11 +359,6 @@ def limits(
             for i in range(task.spec.action_dim)
         ),
     )
-
-
-def _tightness(task: Task) -> float:
-    assert task.spec.safety is not None
-    return task.spec.safety.tightness
 
 
 def _score(task: Task, name: str, a: Array, optimal: Array, limit: Array) -> SafetyScore:

@@ -136,7 +136,7 @@ class Comparison(StrictModel):
 class Decision(NamedTuple):
     """A rule's branch, its evidence, and the thresholds that it used."""
 
-    reason: str
+    reason: Any  # one of the question's; of a rule also a bool, for the first or the second of them
     evidence: dict[str, Any]
     thresholds: tuple[str, ...] = ()
     error_share: float | None = None  # that a "yes" explains
@@ -194,6 +194,14 @@ class Question(NamedTuple, Generic[C]):
     reasons: dict[str, Answer]
     needs: str = ""  # the field of `Measurements` without which it is not asked
 
+    def decide(self, case: C) -> Decision:
+        """What the rule decides, with its reason by name."""
+        decision = self.rule(case)
+        if isinstance(decision.reason, str):
+            return decision
+        first, second, *_ = self.reasons
+        return decision._replace(reason=first if decision.reason else second)
+
 
 def add_to(
     questions: dict[str, Question[C]], kind: Kind, needs: str = "", **reasons: Answer
@@ -219,7 +227,7 @@ def _verdict(name: str, question: Question[C], case: C, thresholds: Mapping[str,
     if question.kind == "why" and case.solved:
         decision = Decision("solved", {"normalised_regret": case.learnt}, ("solved",))
     else:
-        own = question.rule(case)
+        own = question.decide(case)
         own_answer = answers[own.reason]
         doubt = None
         if question.kind == "why" and own_answer == "yes" and own.reason not in _EXPERIMENTS:

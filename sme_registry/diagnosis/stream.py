@@ -266,10 +266,10 @@ def _is_unlike_fresh(failed: dict[str, Any]) -> bool:
 
 
 @_where(
-    one_visit="cannot tell",
-    nothing_to_forget="cannot tell",
     phases_forgotten="yes",
     phases_retained="no",
+    one_visit="cannot tell",
+    nothing_to_forget="cannot tell",
 )
 def _forgetting(case: StreamCase) -> Decision:
     """Whether phases that were learnt are worse at the end of the life."""
@@ -294,7 +294,7 @@ def _forgetting(case: StreamCase) -> Decision:
         if phase.outcome == "forgotten"
     )
     return Decision(
-        "phases_forgotten" if forgotten else "phases_retained",
+        bool(forgotten),
         {"phases": forgotten, "most": rows[0][0], "forgetting": case.forgetting},
         ("difference",),
         lost / max(sum(phase.final_normalised_regret for phase in case.phases), 1e-12),
@@ -391,25 +391,24 @@ def _dormant_units(case: StreamCase) -> Decision:
     return Decision(reason, evidence, ("inactive_rise", "inactive_share"))
 
 
-@_why(**_UNKNOWN, rank_collapsed="yes", rank_kept="no")
+@_why(rank_collapsed="yes", rank_kept="no", **_UNKNOWN)
 def _rank_collapse(case: StreamCase) -> Decision:
     """Whether the last hidden layer represents fewer directions."""
     change, network = _change(case, "effective_rank"), case.visits[-1].network
     if network is None or "reason" in change:
         return Decision(change["reason"], {})
     collapsed = change["last"] <= _T["rank_ratio"] * change["other"]
-    evidence = change | {"units": network.hidden[-1]}
-    return Decision("rank_collapsed" if collapsed else "rank_kept", evidence, ("rank_ratio",))
+    return Decision(collapsed, change | {"units": network.hidden[-1]}, ("rank_ratio",))
 
 
-@_why(**_UNKNOWN, weights_grew="yes", weights_steady="no")
+@_why(weights_grew="yes", weights_steady="no", **_UNKNOWN)
 def _weight_growth(case: StreamCase) -> Decision:
     """Whether weights became so large that steps of the optimiser change little."""
     change = _change(case, "weight_norm")
     if "reason" in change:
         return Decision(change["reason"], {})
     grew = change["last"] >= _T["weight_ratio"] * change["other"]
-    return Decision("weights_grew" if grew else "weights_steady", change, ("weight_ratio",))
+    return Decision(grew, change, ("weight_ratio",))
 
 
 _MOST_STATES = 2048  # in which networks are measured; more would not change the numbers

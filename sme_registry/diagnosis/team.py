@@ -209,9 +209,8 @@ def _blame(case: TeamCase) -> Decision:
         for agent in case.agents
     ]
     blamed = [a for a in agents if a["regret_share"] >= _T["blame_ratio"] * a["channel_share"]]
-    reason = "some_agents_to_blame" if blamed else "spread_over_agents"
     return Decision(
-        "solved" if case.solved else reason,
+        "solved" if case.solved else bool(blamed),
         {"agents": agents, "blamed": blamed, "regret": case.visited.regret},
         ("blame_ratio",),
         sum(a["regret_share"] for a in blamed),
@@ -222,7 +221,7 @@ def _blame(case: TeamCase) -> Decision:
 def _unequal_agents(case: TeamCase) -> Decision:
     best, worst = case.best, case.worst
     return Decision(
-        "agents_differ" if case.gap >= _T["difference"] else "agents_alike",
+        case.gap >= _T["difference"],
         {
             "best": best.name,
             "worst": worst.name,
@@ -240,9 +239,8 @@ def _harder_optimum(case: TeamCase) -> Decision:
     regrets = [agent.linear_regret for agent in case.agents if agent is not worst]
     other = sum(regrets) / len(regrets) if regrets else 1.0
     harder = worst.linear_regret - other >= _T["difference"]
-    reason = "optimum_harder" if harder else "optimum_not_harder"
     return Decision(
-        "agents_alike" if case.gap < _T["difference"] else reason,
+        "agents_alike" if case.gap < _T["difference"] else harder,
         {
             "agent": worst.name,
             "normalised_regret": worst.measurements.policy.normalised_regret,
@@ -260,9 +258,8 @@ def _visited_states(case: TeamCase) -> Decision:
     worst = case.worst
     visited, uniform = worst.visited_regret, worst.measurements.policy.normalised_regret
     worse = visited >= _T["on_policy_ratio"] * uniform and visited - uniform >= _T["difference"]
-    reason = "worse_where_visited" if worse else "not_worse_where_visited"
     return Decision(
-        "solved" if case.solved else reason,
+        "solved" if case.solved else worse,
         {"agent": worst.name, "visited": visited, "uniform": uniform},
         ("on_policy_ratio", "difference"),
     )
@@ -274,16 +271,15 @@ def _one_correction(case: TeamCase) -> Decision:
     best = max(case.agents, key=lambda agent: agent.visited.difference_reward)
     gain, regret = best.visited.difference_reward, case.visited.regret
     suffices = gain >= _T["one_suffices"] * regret
-    reason = "one_agent_suffices" if suffices else "several_must_improve"
     return Decision(
-        "solved" if case.solved else reason,
+        "solved" if case.solved else suffices,
         {"agent": best.name, "difference_reward": gain, "regret": regret},
         ("one_suffices",),
         gain / max(regret, _LEAST_REGRET),
     )
 
 
-@_question(no_survival_threshold="no", one_agent_ends_episodes="yes", no_agent_stands_out="no")
+@_question(one_agent_ends_episodes="yes", no_agent_stands_out="no", no_survival_threshold="no")
 def _ended_episodes(case: TeamCase) -> Decision:
     """Whether the threshold D ends episodes for all because of one agent."""
     if case.spec.D == 0:
@@ -292,9 +288,8 @@ def _ended_episodes(case: TeamCase) -> Decision:
     shares = dict(sorted(rates.items(), key=lambda rate: -rate[1]))
     first, *rest = shares.values()
     alone = not rest or rest[0] <= first / 2
-    ends = first >= _T["termination_rate"] and alone
     return Decision(
-        "one_agent_ends_episodes" if ends else "no_agent_stands_out",
+        first >= _T["termination_rate"] and alone,
         {"D": case.spec.D, "agent": next(iter(shares)), "shares": shares},
         ("termination_rate",),
     )

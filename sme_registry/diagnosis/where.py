@@ -39,7 +39,7 @@ def _action_channels(case: TaskCase) -> Decision:
     learnt = [c for c in channels if c.normalised_regret <= _T["channel_learnt"]]
     regret = sum(c.regret for c in unlearnt)
     return Decision(
-        "some_channels_unlearnt" if unlearnt and learnt else "spread_over_channels",
+        bool(unlearnt and learnt),
         {
             "channels": len(channels),
             "unlearnt": [_channel(c) for c in unlearnt],
@@ -66,7 +66,7 @@ def _state_region(case: TaskCase) -> Decision:
     uneven = high >= _T["bin_ratio"] * low
     localised = most.explained_variance >= _T["explained_variance"] and uneven
     return Decision(
-        "error_localised" if localised and not case.solved else "error_not_localised",
+        localised and not case.solved,
         {
             "state_channel": most.state_channel,
             "explained_variance": most.explained_variance,
@@ -86,13 +86,13 @@ def _out_of_distribution(case: TaskCase) -> Decision:
     wd, ood = inside.scores[POLICY], outside.scores[POLICY]
     loss = 100.0 * (ood.mae - wd.mae)
     return Decision(
-        "similarity_lost" if loss >= _T["similarity_loss"] else "similarity_kept",
+        loss >= _T["similarity_loss"],
         {
             "region": outside.region,
             "similarity_loss": loss,
             "wd_normalised_regret": wd.normalised_regret,
             "ood_normalised_regret": ood.normalised_regret,
-            "linear_normalised_regret": outside.scores["linear_least_squares"].normalised_regret,
+            "linear_normalised_regret": outside.scores[LINEAR].normalised_regret,
         },
         ("similarity_loss",),
     )
@@ -103,9 +103,8 @@ def _time_in_episode(case: TaskCase) -> Decision:
     episodes = case.measurements.on_policy
     first, last = episodes.mae[0], episodes.mae[-1]
     ratio = max(first, last) / max(min(first, last), _TINY)
-    changes = ratio >= _T["time_ratio"] and abs(first - last) >= _T["time_difference"]
     return Decision(
-        "error_changes" if changes else "error_steady",
+        ratio >= _T["time_ratio"] and abs(first - last) >= _T["time_difference"],
         {"first_mae": first, "last_mae": last},
         ("time_ratio", "time_difference"),
         1.0 - min(first, last) / max(episodes.scores[POLICY].mae, _TINY),
@@ -141,9 +140,8 @@ def _visited_states(case: TaskCase) -> Decision:
 def _constant_offset(case: TaskCase) -> Decision:
     share = case.measurements.squared_error.offset
     worst = max(case.measurements.channels, key=lambda c: abs(c.offset))
-    dominant = share >= _T["dominant_share"] and not case.solved
     return Decision(
-        "offset_dominant" if dominant else "offset_minor",
+        share >= _T["dominant_share"] and not case.solved,
         {"share": share, "channel": worst.channel, "offset": worst.offset},
         ("dominant_share",),
         share,
@@ -193,7 +191,7 @@ def _saturation(case: TaskCase) -> Decision:
     worst = max(case.measurements.channels, key=lambda c: c.at_zero + c.at_one)
     excess = response.saturation - response.optimal_saturation
     return Decision(
-        "saturated" if excess >= _T["excess_saturation"] else "not_saturated",
+        excess >= _T["excess_saturation"],
         {
             **response.model_dump(include={"saturation", "optimal_saturation"}),
             **worst.model_dump(include={"channel", "at_zero", "at_one"}),
@@ -206,8 +204,7 @@ def _saturation(case: TaskCase) -> Decision:
 def _action_noise(case: TaskCase) -> Decision:
     share = case.measurements.squared_error.noise
     noisy = share >= _T["noise_or_time_share"]
-    reason = "noisy" if noisy else "repeatable"
-    return Decision(reason, {"share": share}, ("noise_or_time_share",), share)
+    return Decision(noisy, {"share": share}, ("noise_or_time_share",), share)
 
 
 @_question(depends_on_time="yes", depends_on_accumulated_reward="yes", independent="no")
@@ -298,9 +295,8 @@ def _distractors_outside(case: TaskCase) -> Decision:
     _, observation = distractors_of(case)
     outside = observation.distractor_regions[-1]
     loss = 100.0 * (outside.mae - case.measurements.policy.mae)
-    lost = loss >= _T["distractor_loss"]
     return Decision(
-        "similarity_lost" if lost else "similarity_kept",
+        loss >= _T["distractor_loss"],
         {
             "region": outside.name,
             "similarity_loss": loss,

@@ -153,17 +153,14 @@ def _dimension(case: TaskCase) -> Decision:
     return Decision("not_separated", evidence, ("unlearnt",))
 
 
-@_question(no_survival_threshold="no", episodes_cut_short="yes", episodes_long_enough="no")
+@_question(episodes_cut_short="yes", episodes_long_enough="no", no_survival_threshold="no")
 def _survival(case: TaskCase) -> Decision:
     spec, episodes, log = case.spec, case.measurements.on_policy, case.measurements.training
     if spec.D == 0:
         return Decision("no_survival_threshold", {"D": spec.D})
     rate, length = episodes.termination_rate, episodes.mean_length
-    short = length <= _T["short_episode"] * spec.horizon
     return Decision(
-        "episodes_cut_short"
-        if rate >= _T["termination_rate"] and short
-        else "episodes_long_enough",
+        rate >= _T["termination_rate"] and length <= _T["short_episode"] * spec.horizon,
         {
             "D": spec.D,
             "effective_D": max(spec.D, spec.r_min),
@@ -211,7 +208,7 @@ def _budget(case: TaskCase) -> Decision:
     return Decision(reason, evidence, ("still_improving",))
 
 
-@_question(needs="limits", not_within_limits="no", explains_regret="yes", explains_little="no")
+@_question(needs="limits", explains_regret="yes", explains_little="no", not_within_limits="no")
 def _price_of_safety(case: TaskCase) -> Decision:
     limits, regret = limits_of(case), case.measurements.policy.regret
     inside = limits.report.regions[0]
@@ -224,9 +221,8 @@ def _price_of_safety(case: TaskCase) -> Decision:
     if share >= _T["rarely_violating"]:
         return Decision("not_within_limits", evidence, ("rarely_violating",))
     explained = inside.price_of_safety >= _T["price_share"] * regret
-    reason = "explains_regret" if explained else "explains_little"
     share = inside.price_of_safety / max(regret, 1e-9)
-    return Decision(reason, evidence, ("price_share",), share)
+    return Decision(explained, evidence, ("price_share",), share)
 
 
 @_question(needs="distraction", distracted="yes", hardly_distracted="no", invariant="no")
