@@ -352,7 +352,7 @@ def plan(
     """
     from sme_registry.studies.engine.budget import Estimator, Span, makespan, selected, with_sources
     from sme_registry.studies.engine.ledger import Ledger
-    from sme_registry.studies.engine.queue import available_cores
+    from sme_registry.studies.engine.programs import available_cores
 
     if plan is None:
         _list_plans(json)

@@ -235,7 +235,7 @@ def print_status(status: StudyStatus, json: bool) -> None:
         print_json(status.to_dict())
         return
     from sme_registry.studies.engine.ledger import STATES
-    from sme_registry.studies.engine.queue import available_cores
+    from sme_registry.studies.engine.programs import available_cores
 
     algorithms = unique(cell.planned.algorithm for cell in status.places)
     title = f"[bold]{status.file.versioned_name}[/] in {escape(str(status.folder))}"

@@ -34,11 +34,11 @@ from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import write_atomically
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.study import Cell
-from sme_registry.studies.engine.lanes import run_lanes
-from sme_registry.studies.engine.queue import Lanes
+from sme_registry.studies.engine.programs import Lanes, run_lanes
 from sme_registry.studies.engine.result import (
     EVALUATION,
     TRAINING,
+    CellFailure,
     CellResult,
     LearningCurve,
     OfflineResult,
@@ -147,14 +147,14 @@ def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> Ce
     def report(done: int, total: int, compilations: int = 0, note: str = "", /) -> None:
         progress(done, total)
 
-    (lane,) = run_lanes((cell,), Lanes(1), report, model_path is not None)
-    if isinstance(lane.ended, PolicyError):
-        raise lane.ended
-    if model_path is not None and lane.model is not None:
-        for name, snapshot in lane.snapshots.items():
+    ((entry, model, snapshots),) = run_lanes((cell,), Lanes(1), report, model_path is not None)
+    if isinstance(entry, CellFailure):
+        raise PolicyError(entry.error.removeprefix("PolicyError: "))
+    if model_path is not None and model is not None:
+        for name, snapshot in snapshots.items():
             write_atomically(model_path.with_suffix("") / name, snapshot)
-        write_atomically(model_path, lane.model)
-    return lane.ended
+        write_atomically(model_path, model)
+    return entry
 
 
 def _run_reference(cell: Cell, name: str, progress: ReportSteps) -> CellResult:

@@ -31,17 +31,21 @@ from sme_registry.io import require_packages
 from sme_registry.io.system import block_interrupts, defer_interrupts, end_with_parent
 from sme_registry.spec import Cell
 from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.lanes import run_lanes
-from sme_registry.studies.engine.queue import CPU, Job, Report, available_cores, child_environment
-from sme_registry.studies.engine.result import CellFailure, CellResult, Outcome
-from sme_registry.training.record import versions_for
+from sme_registry.studies.engine.programs import (
+    CPU,
+    Job,
+    Report,
+    available_cores,
+    child_environment,
+    run_lanes,
+)
+from sme_registry.studies.engine.result import CellResult, Outcome, failed
 
 RunCell = Callable[[Cell, Callable[[int, int], None] | None, Path | None], CellResult]
 ReportProgress = Callable[..., None]  # called with a job and the arguments of `Report`
 Jobs = Iterator[Job | None]
 
 POLL_SECONDS = 0.2
-TRACEBACK_CHARACTERS = 4000  # kept of a failed cell's traceback or output
 _SECONDS_BETWEEN_REPORTS = 0.5
 _SECONDS_TO_END = 10.0
 # One thread for each library that would take every core: the jobs share the cores, one each.
@@ -83,16 +87,12 @@ def run_job(run: RunCell, job: Job, keep_models: bool, progress: Report) -> Iter
             yield outcome
     except (Exception, SystemExit) as error:
         for cell in unfinished.values():
-            yield failed(cell, f"{type(error).__name__}: {error}", traceback.format_exc())
+            yield failed(cell, error, traceback.format_exc())
 
 
 def _outcomes(run: RunCell, job: Job, keep_models: bool, progress: Report) -> Iterator[Outcome]:
     if job.lanes is not None:
-        for lane in run_lanes(job.cells, job.lanes, progress, keep_models):
-            if isinstance(lane.ended, CellResult):
-                yield Outcome(lane.ended, lane.model, lane.snapshots)
-            else:
-                yield failed(lane.cell, f"{type(lane.ended).__name__}: {lane.ended}", "")
+        yield from run_lanes(job.cells, job.lanes, progress, keep_models)
         return
     (cell,) = job.cells
     with tempfile.TemporaryDirectory(prefix="sme-cell-") as folder:
@@ -103,18 +103,6 @@ def _outcomes(run: RunCell, job: Job, keep_models: bool, progress: Report) -> It
     if result.key != cell.digest:
         raise RuntimeError(f"the result belongs to another cell, {result.key}")
     yield Outcome(result, saved, snapshots)
-
-
-def failed(cell: Cell, error: str, details: str) -> Outcome:
-    """A cell's failure, with the end of its traceback or output."""
-    failure = CellFailure(
-        key=cell.digest,
-        cell=cell,
-        error=error,
-        traceback=details[-TRACEBACK_CHARACTERS:],
-        versions=versions_for(cell.uses),
-    )
-    return Outcome(failure)
 
 
 def _throttled(report: Report) -> Report:

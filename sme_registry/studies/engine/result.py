@@ -208,6 +208,21 @@ class Outcome(NamedTuple):
     snapshots: Mapping[str, bytes] = {}
 
 
+def failed(cell: Cell, error: BaseException | str, details: str = "") -> Outcome:
+    """A cell's failure, with the end of its traceback or output."""
+    if isinstance(error, BaseException):
+        error = f"{type(error).__name__}: {error}"
+    failure = CellFailure(
+        key=cell.digest,
+        cell=cell,
+        error=error,
+        traceback=details[-TRACEBACK_CHARACTERS:],
+        versions=versions_for(cell.uses),
+    )
+    return Outcome(failure)
+
+
+TRACEBACK_CHARACTERS = 4000  # kept of a failed cell's traceback or output
 TRAINING, EVALUATION = 0, 1  # what time is for
 
 

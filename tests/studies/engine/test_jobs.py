@@ -12,9 +12,9 @@ from rich.console import Console
 from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies.engine import budget
-from sme_registry.studies.engine.executors import failed
 from sme_registry.studies.engine.ledger import Ledger, write_state
-from sme_registry.studies.engine.queue import Job, Programs
+from sme_registry.studies.engine.programs import Job, Programs
+from sme_registry.studies.engine.result import failed
 from sme_registry.studies.engine.runner import run_study
 
 pytest.importorskip("jax")

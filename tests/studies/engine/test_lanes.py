@@ -16,7 +16,7 @@ from rich.console import Console
 
 from sme_registry.evaluation import evaluate
 from sme_registry.spec import StudyFile, StudyPlan
-from sme_registry.studies.engine import lanes
+from sme_registry.studies.engine import programs
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.executors import InProcess
 from sme_registry.studies.engine.ledger import Ledger, read_header, read_state, write_state
@@ -38,9 +38,9 @@ STEPS = 96
 KILLED = """
 import os, signal, sys
 from tests.studies.engine import test_lanes
-from sme_registry.studies.engine import lanes
+from sme_registry.studies.engine import programs
 
-lanes.SECONDS_BETWEEN_STATES = 0.0
+programs.SECONDS_BETWEEN_STATES = 0.0
 test_lanes.ran(sys.argv[1], on_steps=lambda done: os.kill(os.getpid(), signal.SIGKILL))
 """
 
@@ -201,7 +201,7 @@ def interrupted(tmp_path_factory):
     """A study that was interrupted after its first rollout, and left a state."""
     study = tmp_path_factory.mktemp("interrupted")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lanes, "SECONDS_BETWEEN_STATES", 0.0)
+        patch.setattr(programs, "SECONDS_BETWEEN_STATES", 0.0)
         with pytest.raises(KeyboardInterrupt, match="Run the same command to continue"):
             ran(study, on_steps=interrupt)
     return study
@@ -238,8 +238,8 @@ def test_a_lane_whose_weights_are_not_finite_fails_and_the_others_go_on(whole, s
 def test_a_retry_goes_on_from_the_state_if_an_evaluation_at_the_end_failed(
     whole, study, state, monkeypatch
 ):
-    monkeypatch.setattr(lanes, "SECONDS_BETWEEN_STATES", 0.0)
-    evaluate_together = lanes._evaluate_together
+    monkeypatch.setattr(programs, "SECONDS_BETWEEN_STATES", 0.0)
+    evaluate_together = programs._evaluate_together
 
     def evaluate_one_draw(group):
         if group[0].cell.spec.seed == 2:
@@ -247,7 +247,7 @@ def test_a_retry_goes_on_from_the_state_if_an_evaluation_at_the_end_failed(
         return evaluate_together(group)
 
     with monkeypatch.context() as patch:
-        patch.setattr(lanes, "_evaluate_together", evaluate_one_draw)
+        patch.setattr(programs, "_evaluate_together", evaluate_one_draw)
         status = ran(study)
     assert (status.count("done"), status.count("failed")) == (2, 2)
     steps = []
@@ -258,7 +258,7 @@ def test_a_retry_goes_on_from_the_state_if_an_evaluation_at_the_end_failed(
 
 
 def test_lanes_of_cells_that_are_left_out_keep_their_tasks(whole, study, state, monkeypatch):
-    monkeypatch.setattr(lanes, "SECONDS_BETWEEN_STATES", 0.0)
+    monkeypatch.setattr(programs, "SECONDS_BETWEEN_STATES", 0.0)
     assert ran(study, only=["algorithm=agent", "class=small"]).count("done") == 2
     assert state.exists()  # with two lanes at the end of their training
     assert ran(study).count("done") == 4
@@ -268,7 +268,7 @@ def test_lanes_of_cells_that_are_left_out_keep_their_tasks(whole, study, state, 
 
 def test_a_program_with_other_lanes_leaves_a_state_whole(whole, study, state, monkeypatch):
     before = state.read_bytes()
-    monkeypatch.setattr(lanes, "SECONDS_BETWEEN_STATES", 0.0)
+    monkeypatch.setattr(programs, "SECONDS_BETWEEN_STATES", 0.0)
     with pytest.raises(KeyboardInterrupt):
         ran(study, lanes=2, on_steps=interrupt)
     assert state.read_bytes() == before

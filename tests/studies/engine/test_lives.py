@@ -11,11 +11,11 @@ from sme_registry import SMESpec, StreamSpec, materialize
 from sme_registry.errors import PolicyError, SMEError, SpecError
 from sme_registry.evaluation import evaluate_stream, expected_regret
 from sme_registry.spec import Cell, StudyFile, StudyPlan
-from sme_registry.studies.engine import lanes
+from sme_registry.studies.engine import programs
 from sme_registry.studies.engine.budget import Estimator
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.ledger import Ledger, label, study_status
-from sme_registry.studies.engine.queue import Programs
+from sme_registry.studies.engine.programs import Programs
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.engine.runner import run_study
 from sme_registry.training.algorithms import find
@@ -319,7 +319,7 @@ def visits(monkeypatch):
     """The visits that lives in JAX ended; and what to raise at the end of visit 1, once."""
     ended = []
     raised = []
-    original = lanes._Run._on_visit
+    original = programs._ProgramRun._on_visit
 
     def on_visit(run, visit, weights):
         ended.append(visit)
@@ -327,8 +327,8 @@ def visits(monkeypatch):
         if visit == 1 and raised:
             raise raised.pop()
 
-    monkeypatch.setattr(lanes, "SECONDS_BETWEEN_STATES", 0.0)
-    monkeypatch.setattr(lanes._Run, "_on_visit", on_visit)
+    monkeypatch.setattr(programs, "SECONDS_BETWEEN_STATES", 0.0)
+    monkeypatch.setattr(programs._ProgramRun, "_on_visit", on_visit)
     return ended, raised
 
 
