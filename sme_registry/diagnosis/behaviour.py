@@ -57,26 +57,9 @@ from sme_registry.task import Task, streams
 from sme_registry.task.draw import Array
 from sme_registry.training.algorithms import one_thread, quiet
 
-__all__ = [
-    "CONSTANTS",
-    "DEFAULT_STATES",
-    "GRADIENT_STEPS",
-    "Log",
-    "Trajectories",
-    "episodes_of",
-    "exploration",
-    "exploration_sd",
-    "network_state",
-    "on_policy",
-    "probe_capacity",
-    "rollout",
-    "training",
-]
-
 CONSTANTS = ("best_constant", "constant_half")
 _TIME_BINS, _COVERAGE_BINS = 10, 20
 _MARGIN = 0.02  # of regret below the constant action's
-_TINY = 1e-12
 GRADIENT_STEPS = 3000
 DEFAULT_STATES = 20_000
 _MIN_STATES, _MAX_STATES = 256, 50_000
@@ -124,11 +107,8 @@ class Trajectories(NamedTuple):
     @property
     def score(self) -> Score:
         """Over all steps of all episodes."""
-        mae = self.mean(self.mae)
-        return Score(
-            regret=1.0 - self.mean(self.reward),
-            mae=mae,
-            normalised_regret=mae / max(self.mean(self.constant_mae), _TINY),
+        return Score.of(
+            1.0 - self.mean(self.reward), self.mean(self.mae), self.mean(self.constant_mae)
         )
 
 

@@ -35,18 +35,6 @@ from sme_registry.spec.document import check_digest
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-__all__ = [
-    "Answer",
-    "Diagnosis",
-    "Kind",
-    "Level",
-    "Part",
-    "Verdict",
-    "label",
-    "table",
-    "words",
-]
-
 Answer = Literal["yes", "no", "cannot tell"]
 Kind = Literal["who", "where", "why", "limits"]
 Level = Literal["solved", "better_than_linear", "worse_than_linear", "no_better_than_constant"]

@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["draw"]
-
 _REFERENCES = (LINEAR, "best_constant", "constant_half", "uniform_random")
 _MOST = 32  # channels or agents in one panel
 _FRESH = "fresh agent of the phase"

@@ -43,17 +43,6 @@ from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.task import Task, streams
 from sme_registry.task.draw import Array
 
-__all__ = [
-    "MAX_NUMBERS",
-    "Sample",
-    "affordable",
-    "distraction",
-    "draw",
-    "fit_references",
-    "fixed_states",
-    "limits",
-]
-
 MAX_NUMBERS = 2**23  # of states, distractors and actions held at once: 64 MiB as float64
 _BOUND = 0.01  # an action this close to 0 or 1 is saturated
 _BINS = 5
@@ -146,12 +135,11 @@ def fixed_states(
 
 def scores(task: Task, states: Sample) -> dict[str, Score]:
     """The policy and each reference in the same states."""
-    constant_mae = max(float(np.abs(0.5 - states.optimal).mean()), _TINY)
+    constant_mae = float(np.abs(0.5 - states.optimal).mean())
 
     def score(a: Array) -> Score:
-        mae = float(np.abs(a - states.optimal).mean())
         regret = float(_regret(task, a, states.optimal).mean())
-        return Score(regret=regret, mae=mae, normalised_regret=mae / constant_mae)
+        return Score.of(regret, float(np.abs(a - states.optimal).mean()), constant_mae)
 
     return {name: score(a) for name, a in {POLICY: states.a, **states.references}.items()}
 

@@ -2,36 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from pydantic import SerializerFunctionWrapHandler, model_serializer
 
 from sme_registry.evaluation import ObservationReport, SafetyReport, SafetyScore
 from sme_registry.spec import Integer, Real, StrictModel, TupleOf
-
-__all__ = [
-    "LINEAR",
-    "POLICY",
-    "CapacityProbe",
-    "Channel",
-    "DistractorRegret",
-    "LimitedChannel",
-    "Measurements",
-    "NetworkState",
-    "OnPolicy",
-    "Partition",
-    "PhaseDiagnosis",
-    "PhaseOutcome",
-    "Response",
-    "RewardSignal",
-    "Score",
-    "Shell",
-    "SquaredError",
-    "TimeDependence",
-    "TrainingSummary",
-    "Violations",
-    "VisitDiagnosis",
-]
 
 PhaseOutcome = Literal["retained", "forgotten", "not_learnt"]
 POLICY = "policy"  # the key of the diagnosed policy among the names of the references
@@ -45,6 +21,11 @@ class Score(StrictModel):
     mae: Real  # mean |a − a*|
     # mean regret over that of the constant ½: 0 at the optimum, 1 at the constant
     normalised_regret: Real
+
+    @classmethod
+    def of(cls, regret: float, mae: float, constant_mae: float) -> Self:
+        """From means over the states; `constant_mae` is of the constant ½."""
+        return cls(regret=regret, mae=mae, normalised_regret=mae / max(constant_mae, 1e-12))
 
 
 class Channel(StrictModel):

@@ -17,22 +17,6 @@ from sme_registry.diagnosis.document import Answer, Kind, Verdict
 from sme_registry.diagnosis.measurements import Measurements
 from sme_registry.spec import Real, SMESpec, StrictModel, TupleOf
 
-__all__ = [
-    "COMPARISON_REASONS",
-    "OPEN_REASONS",
-    "SAFETY_THRESHOLDS",
-    "SOLVED",
-    "THRESHOLDS",
-    "Case",
-    "Comparison",
-    "Decision",
-    "Difference",
-    "Question",
-    "TaskCase",
-    "add_to",
-    "answer_all",
-]
-
 THRESHOLDS = {
     "solved": 0.1,  # normalised regret at most: nothing is left to explain
     "constant_level": 0.95,  # normalised regret at least: no better than the constant ½

@@ -44,15 +44,6 @@ from sme_registry.evaluation.networks import Perceptron
 from sme_registry.io.markup import fixed, percent
 from sme_registry.spec import Digest, Real, StreamSpec, TupleOf
 
-__all__ = [
-    "STREAM_QUESTIONS",
-    "STREAM_THRESHOLDS",
-    "StreamCase",
-    "StreamDiagnosis",
-    "diagnose_stream",
-    "outcome_of",
-]
-
 
 class StreamDiagnosis(Diagnosis):
     """The diagnosis of a life in a stream.

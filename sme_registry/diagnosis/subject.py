@@ -45,17 +45,6 @@ from sme_registry.training.hyperparameters import parameters_of
 from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.record import CHECKPOINT, MODEL
 
-__all__ = [
-    "AnySubject",
-    "StreamSubject",
-    "Subject",
-    "cell_path",
-    "load_cell",
-    "load_policy",
-    "load_run",
-    "perceptron_of",
-]
-
 _MIN_DIGITS = 6
 Networks = tuple[Perceptron | None, ...]  # None: of an unknown kind
 

@@ -34,8 +34,6 @@ from sme_registry.io.markup import fixed, percent, signed
 from sme_registry.spec import Digest, EvaluationProtocol, SMESpec
 from sme_registry.task import Task, materialize
 
-__all__ = ["TASK_QUESTIONS", "TaskDiagnosis", "diagnose_task", "judge", "level", "thresholds_of"]
-
 TASK_QUESTIONS = {**WHERE, **WHY}
 
 

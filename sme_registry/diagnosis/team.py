@@ -45,16 +45,7 @@ from sme_registry.spec import Digest, Integer, Real, SMESpec, StrictModel, Tuple
 from sme_registry.task import Task, materialize
 from sme_registry.task.draw import Array
 
-__all__ = [
-    "TEAM_QUESTIONS",
-    "TEAM_THRESHOLDS",
-    "AgentDiagnosis",
-    "Credit",
-    "TeamDiagnosis",
-    "diagnose_team",
-]
-
-_TINY, _LEAST_REGRET = 1e-12, 1e-9
+_LEAST_REGRET = 1e-9
 
 
 class Credit(StrictModel):
@@ -375,13 +366,11 @@ def _alone(task: Task, policy: TeamPolicy, index: int) -> tuple[Task, Policy]:
 def _team_in(task: Task, s: Array, a: Array) -> tuple[Score, list[Credit]]:
     """The team, and each agent's part, in states `[N, S]` with joint actions `[N, A]`."""
     optimal = task.optimal_action(s)
-    mae = float(np.abs(a - optimal).mean())
-    half = max(float(np.abs(0.5 - optimal).mean()), _TINY)
-    regret = float(task.regret(s, a).mean())
+    mae, constant_mae = (float(np.abs(x - optimal).mean()) for x in (a, 0.5))
     shares = task.regret_shares(s, a).mean(axis=0)
     gains = task.difference_rewards(s, a).mean(axis=0)
     credit = [
         Credit(regret_share=float(share), difference_reward=float(gain))
         for share, gain in zip(shares, gains, strict=True)
     ]
-    return Score(regret=regret, mae=mae, normalised_regret=mae / half), credit
+    return Score.of(float(task.regret(s, a).mean()), mae, constant_mae), credit

@@ -22,8 +22,6 @@ from sme_registry.diagnosis.questions import (
 )
 from sme_registry.evaluation import ObservationReport
 
-__all__ = ["WHERE", "distractors_of", "limits_of"]
-
 WHERE: dict[str, Question[TaskCase]] = {}
 """Questions about the policy, in order."""
 _question = partial(add_to, WHERE, "where")

@@ -19,8 +19,6 @@ from sme_registry.diagnosis.questions import (
 )
 from sme_registry.diagnosis.where import distractors_of, limits_of
 
-__all__ = ["WHY"]
-
 WHY: dict[str, Question[TaskCase]] = {}
 """Questions about training, in order."""
 _question = partial(add_to, WHY, "why")

@@ -39,23 +39,11 @@ from sme_registry.spec import SMESpec, catalogue
 from sme_registry.statistics import smoothed
 from sme_registry.task import Task, materialize, memory, streams
 from sme_registry.task.draw import Array
-from sme_registry.training import EXPLORER as FILE
-from sme_registry.training import short_name
+from sme_registry.training import EXPLORER, short_name
 from sme_registry.training.reports import EVALUATION
 from sme_registry.version import __version__
 
-__all__ = [
-    "EPISODES",
-    "FILE",
-    "MAX_INPUTS",
-    "STATIC",
-    "explorer_page",
-    "facts",
-    "refuse_large",
-    "run_report",
-    "write_explorer",
-]
-
+FILE = EXPLORER
 EPISODES = 64
 MAX_INPUTS = 512  # each has a slider
 _GRID = 81  # points along a side of a sampled map

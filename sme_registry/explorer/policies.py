@@ -25,8 +25,6 @@ from sme_registry.spec import SMESpec
 from sme_registry.task import streams
 from sme_registry.task.draw import Array
 
-__all__ = ["TOLERANCE", "GraphNode", "policy_program", "probe_points", "program_of_graph"]
-
 TOLERANCE = 1e-5  # of an action in [0, 1]; a policy's own float32 sums move it by 1e-6
 _PROBES = 256
 

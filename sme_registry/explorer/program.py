@@ -35,22 +35,6 @@ from sme_registry.spec import SMESpec
 from sme_registry.task import Task
 from sme_registry.task.draw import Array, Layer
 
-__all__ = [
-    "MAX_WEIGHTS",
-    "MAX_WIDTH",
-    "OPERATIONS",
-    "NetworkProgram",
-    "ProgramBuilder",
-    "ProgramStep",
-    "constant",
-    "encoded",
-    "limit",
-    "linear",
-    "observe",
-    "optimal",
-    "point_width",
-]
-
 MAX_WEIGHTS = 2**21  # of a program: 22 MB of text as float64, and seconds for a map in a browser
 MAX_WIDTH = 2**13  # columns of a value
 
