@@ -169,7 +169,7 @@ class PlanOptions(ClassOptions):
         """Each `[NAME=]USES` with each action range."""
         if not self.algorithm:
             raise OptionError("--algorithm: is required, such as --algorithm PPO.")
-        from sme_registry.training.hyperparameters import nested_hyperparameters
+        from sme_registry.training.algorithms import nested_hyperparameters
 
         ranges = self.action_range or ["symmetric"]
         uses_of: list[tuple[str, str]] = []
@@ -471,8 +471,7 @@ def scaled_plan(
 
 def check_algorithms(algorithms: Iterable[StudyAlgorithm], errors: type[SMEError]) -> None:
     """Check a plan's algorithms; warn about those that cannot be found here by such an error."""
-    from sme_registry.training.algorithms import code_notice, find
-    from sme_registry.training.hyperparameters import check_algorithm
+    from sme_registry.training.algorithms import check_algorithm, code_notice, find
 
     algorithms = list(algorithms)
     if notice := code_notice(algorithm.uses for algorithm in algorithms):

@@ -40,8 +40,7 @@ from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.study import Cell, in_jax, parse_uses
 from sme_registry.training import RunRecord
 from sme_registry.training import record as run_files
-from sme_registry.training.algorithms import find
-from sme_registry.training.hyperparameters import parameters_of
+from sme_registry.training.algorithms import find, parameters_of
 from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.record import CHECKPOINT, MODEL
 

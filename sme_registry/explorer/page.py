@@ -40,7 +40,7 @@ from sme_registry.statistics import smoothed
 from sme_registry.task import Task, materialize, memory, streams
 from sme_registry.task.draw import Array
 from sme_registry.training import EXPLORER, short_name
-from sme_registry.training.reports import EVALUATION
+from sme_registry.training.learn import EVALUATION
 from sme_registry.version import __version__
 
 FILE = EXPLORER

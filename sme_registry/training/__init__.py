@@ -10,15 +10,13 @@ Importing this module imports neither PyTorch nor JAX.
 from sme_registry.envs.episodes import Episode
 from sme_registry.training.algorithms import (
     ALGORITHMS,
+    check_hyperparameters,
     default_algorithm,
     folder_name,
     full_name,
-    short_name,
-)
-from sme_registry.training.hyperparameters import (
-    check_hyperparameters,
     nested_hyperparameters,
     read_hyperparameters,
+    short_name,
 )
 from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.record import RunRecord, model_of_cell, read_episodes

@@ -13,32 +13,33 @@
 An entry point or `module:name` is either a class like those of Stable-Baselines3
 (`sb3_contrib:TQC`), or a function that returns a model; see `models`. Of `train:…` see
 `functions`.
+
+Hyperparameters are JSON values. Importing this module does not import PyTorch.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import importlib
 import importlib.machinery
 import importlib.metadata
 import importlib.util
+import inspect
 import io
-import os
-import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from sme_registry.datasets import record
+from sme_registry.datasets import offline, record
 from sme_registry.envs.arguments import check_has_limits
 from sme_registry.errors import OptionError, SpecError, UnknownNameError, did_you_mean
 from sme_registry.evaluation.references import POLICIES
-from sme_registry.io import choice, import_object, require_packages
-from sme_registry.spec import SMESpec, StreamSpec
+from sme_registry.io import choice, import_object, read_json, require_packages
+from sme_registry.spec import SMESpec, StreamSpec, StudyAlgorithm
 from sme_registry.spec.study import JAX, in_jax, parse_uses
+from sme_registry.training.functions import load_function, path_of
 
 ENTRY_POINTS = "sme_registry.algorithms"
 AGENTS = ("sb3", "jax")  # whose implementation of an algorithm is trained
@@ -52,7 +53,6 @@ class Entry:
 
     kind: str  # "sb3", also what others wrote for its environments; or a prefix without its colon
     name: str  # without the prefix
-    about: str = ""
     place: str = ""
     needs_limits: bool = False
 
@@ -95,11 +95,9 @@ class Entry:
             self.load()
         elif self.kind in ("sb3", "independent"):
             require_sb3()
-            if not self.place or self.kind == "independent":
-                self._check_kind(self.load())
-
-    def _check_kind(self, algorithm: Any) -> None:
-        if self.kind == "independent" and not is_on_policy(algorithm):
+            algorithm = None if self.place and self.kind == "sb3" else self.load()
+            if self.kind != "independent" or is_on_policy(algorithm):
+                return
             raise OptionError(
                 f"uses='{self.prefix}{self.name}': must be an on-policy algorithm, such as "
                 "independent:PPO, because the models of a team learn from the same rollouts. Use "
@@ -113,6 +111,12 @@ class Entry:
             check_has_limits(self.name, spec)
         if self.kind == "jax":
             _check_in_jax(document)
+        if self.kind == "train" and (isinstance(document, StreamSpec) or document.team):
+            raise SpecError(
+                f"train:{self.name}: is for a task of a single agent, and this is a "
+                f"{'stream' if isinstance(document, StreamSpec) else 'team'}. Train an algorithm "
+                "of Stable-Baselines3, such as PPO."
+            )
 
 
 _OF_SB3 = {
@@ -132,8 +136,8 @@ ALGORITHMS = _OF_SB3 | _OF_OURS
 LEARNERS: dict[str, Entry] = {
     entry.prefix + entry.name: entry
     for entry in (
-        *(Entry("sb3", name, text, "stable_baselines3") for name, text in _OF_SB3.items()),
-        *(Entry("sb3", name, text, "sme_registry.sb3", True) for name, text in _OF_OURS.items()),
+        *(Entry("sb3", name, "stable_baselines3") for name in _OF_SB3),
+        *(Entry("sb3", name, "sme_registry.sb3", needs_limits=True) for name in _OF_OURS),
         *(Entry("jax", name) for name in ("PPO", "TD3", "SAC")),
         *(Entry("offline", name) for name in record.ALGORITHMS),
         *(Entry("reference", name) for name in POLICIES),
@@ -164,7 +168,7 @@ def find(uses: str, field: str = "uses") -> Entry:
 def code_notice(uses: Iterable[str]) -> str:
     """Whose code runs to find these algorithms; empty where they name no modules that are here."""
     modules = dict.fromkeys(filter(None, map(_module_of, uses)))
-    found = [module for module in modules if _path_of(module)]
+    found = [module for module in modules if path_of(module)]
     return f"This plan runs the code of {', '.join(found)}." if found else ""
 
 
@@ -173,87 +177,6 @@ def _module_of(uses: str) -> str | None:
     kind, name = parse_uses(uses)
     kind, name = parse_uses(name) if kind == "independent" else (kind, name)
     return name.partition(":")[0] if kind in ("sb3", "train") and ":" in name else None
-
-
-def source_of(uses: str, field: str = "uses") -> str | None:
-    """The digest of the module's source of `train:module:function`, which is not imported."""
-    kind, name = parse_uses(uses)
-    return _source(name, field)[1] if kind == "train" else None
-
-
-def load_function(name: str, field: str = "uses") -> tuple[Callable[..., Any], str]:
-    """The function `module:function` of the source that is there now, and the source's digest.
-
-    The source is run again where it has changed since, so what runs is what the digest says.
-    """
-    module_name, _, attribute = name.partition(":")
-    with working_directory_importable():
-        path, digest, source = _source(name, field)
-        module = sys.modules.get(module_name)
-        try:
-            if module is None or _loaded.get(module_name) != digest:
-                importlib.import_module(module_name.rpartition(".")[0] or "sys")
-                spec = importlib.util.spec_from_file_location(module_name, path)
-                module = module or importlib.util.module_from_spec(spec)  # type: ignore[arg-type]
-                sys.modules[module_name] = module
-                exec(compile(source, path, "exec"), vars(module))
-                _loaded[module_name] = digest
-        except Exception as error:
-            sys.modules.pop(module_name, None)
-            raise OptionError(
-                f"{field}='train:{name}': {module_name} cannot be imported: "
-                f"{type(error).__name__}: {error}. Correct it."
-            ) from error
-    function = getattr(module, attribute, None)
-    if not callable(function):
-        functions = [known for known, value in vars(module).items() if callable(value)]
-        raise OptionError(
-            f"{field}='train:{name}': {path} has no function {attribute!r}."
-            f"{did_you_mean(attribute, functions)} Define {attribute}(env, steps, seed), which "
-            "returns a policy."
-        )
-    return function, digest
-
-
-_loaded: dict[str, str] = {}  # the digest of the source that a module has run
-
-
-def _source(name: str, field: str) -> tuple[str, str, bytes]:
-    """The path, the digest and the bytes of a module's source. Imports nothing."""
-    module = name.partition(":")[0]
-    path = _path_of(module)
-    if not path or not path.endswith(".py"):
-        raise OptionError(
-            f"{field}='train:{name}': there is no Python module {module!r}. It must be "
-            "train:module:function, with the module in the working directory or installed."
-        )
-    source = Path(path).read_bytes()
-    return path, f"sha256:{hashlib.sha256(source).hexdigest()}", source
-
-
-def _path_of(module: str) -> str | None:
-    """The file of a module or a package; None if there is none. Imports nothing."""
-    places: Any = None
-    found: Any = None
-    with working_directory_importable():
-        for end in (i for i, letter in enumerate(f"{module}.") if letter == "."):
-            found = importlib.machinery.PathFinder.find_spec(module[:end], places)
-            if found is None:
-                return None
-            places = found.submodule_search_locations
-    path: str | None = found.origin
-    return path
-
-
-@contextlib.contextmanager
-def working_directory_importable() -> Iterator[None]:
-    """Modules in the working directory can be imported inside the block."""
-    folder = os.getcwd()
-    sys.path.insert(0, folder)
-    try:
-        yield
-    finally:
-        sys.path.remove(folder)
 
 
 def _check_in_jax(document: SMESpec | StreamSpec) -> None:
@@ -406,3 +329,210 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+# Arguments of an algorithm's constructor that are not hyperparameters.
+_RESERVED = ("self", "policy", "env", "seed", "device", "verbose", "tensorboard_log")
+# Arguments of a policy's constructor that the algorithm passes.
+_PASSED = ("self", "observation_space", "action_space", "lr_schedule")
+OF_DATA_SET = ("nu", "transitions", "batch_size")  # of `offline:…`, and not the learner's
+_ROLLOUT, _MIN_ROLLOUT = 2048, 16  # SB3's default for PPO in one environment; ours at least
+
+
+def nested_hyperparameters(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """Hyperparameters whose dotted names are resolved: `policy_kwargs.net_arch` is in a dict.
+
+    Examples:
+      >>> from sme_registry.training import nested_hyperparameters
+      >>> nested_hyperparameters({"policy_kwargs.net_arch": [64, 64], "gamma": 0.9})
+      {'policy_kwargs': {'net_arch': [64, 64]}, 'gamma': 0.9}
+    """
+    nested: dict[str, Any] = {}
+    for name, value in flat.items():
+        *parents, last = name.split(".")
+        block: Any = nested
+        for parent in parents:
+            block = block.setdefault(parent, {}) if isinstance(block, dict) else None
+        if not all((*parents, last)) or not isinstance(block, dict) or last in block:
+            raise OptionError(
+                f"hyperparameters.{name}: is not a name, or is set twice. Use one name for each "
+                "value, such as policy_kwargs.net_arch."
+            )
+        block[last] = dict(value) if isinstance(value, Mapping) else value  # the caller's stays
+    return nested
+
+
+def read_hyperparameters(path: Path) -> dict[str, Any]:
+    """The hyperparameters in a JSON file: an object of names and values.
+
+    Examples:
+      >>> from pathlib import Path
+      >>> from sme_registry.training import read_hyperparameters
+      >>> _ = Path("ppo.json").write_text('{"n_steps": 256}')
+      >>> read_hyperparameters(Path("ppo.json"))
+      {'n_steps': 256}
+    """
+    values = read_json(path)
+    if not isinstance(values, dict):
+        raise OptionError(
+            f"{path}: must be an object of hyperparameters, such as "
+            '{"learning_rate": 0.0001, "policy_kwargs": {"net_arch": [64, 64]}}.'
+        )
+    return nested_hyperparameters(values)
+
+
+def check_hyperparameters(
+    uses: str,
+    hyperparameters: Mapping[str, Any],
+    field: str = "hyperparameters",
+    others: Iterable[str] = (),
+) -> None:
+    """Check that an algorithm has hyperparameters of these names; values only in JAX and offline.
+
+    The names are those of the constructor, or of the function, and in `policy_kwargs` those of the
+    policy's constructor.
+
+    Error messages call them `field`, and may suggest one of `others`, which the caller accepts.
+
+    Examples:
+      >>> from sme_registry.training import check_hyperparameters
+      >>> check_hyperparameters("PPO", {"learning_rate": 1e-4})
+      >>> check_hyperparameters("PPO", {"learning_rat": 1e-4})
+      Traceback (most recent call last):
+      ...
+      sme_registry.errors.OptionError: hyperparameters.learning_rat: PPO has no such ...
+    """
+    if not hyperparameters:
+        return
+    entry = find(uses)
+    if entry.kind == "reference":
+        raise OptionError(
+            f"hyperparameters={sorted(hyperparameters)}: {uses} has no hyperparameters. Leave them "
+            "out."
+        )
+    if entry.kind == "offline":
+        own = {name: hyperparameters[name] for name in hyperparameters if name not in OF_DATA_SET}
+        offline.check_algorithm(entry.name, own)
+    elif entry.kind == "train":
+        names = _names(entry.load(field), ("env", "steps", "seed"))
+        _refuse_names(field, uses, hyperparameters, names, others)
+    elif entry.kind == "jax":
+        from sme_registry.jax.run import settings_of
+
+        if others:  # where Stable-Baselines3 is needed anyway
+            refuse_unknown(find(entry.name).load(), entry.name, hyperparameters, field, others)
+        settings_of(uses, hyperparameters, field)
+    else:
+        refuse_unknown(entry.load(), uses, hyperparameters, field, others)
+
+
+def check_algorithm(algorithm: StudyAlgorithm) -> None:
+    """Check that an algorithm of a plan has hyperparameters of these names."""
+    field = f"algorithm {algorithm.name!r}: hyperparameters"
+    check_hyperparameters(algorithm.uses, algorithm.hyperparameters, field)
+
+
+def refuse_unknown(
+    algorithm: Any,
+    uses: str,
+    hyperparameters: Mapping[str, Any],
+    field: str = "hyperparameters",
+    others: Iterable[str] = (),
+) -> None:
+    """Raise OptionError if an algorithm's class or function has no hyperparameter of a name."""
+    if not isinstance(algorithm, type) or not is_sb3(algorithm):
+        environment = next(iter(inspect.signature(algorithm).parameters), "env")
+        names = _names(algorithm, (environment, "seed"))
+        _refuse_names(field, uses, hyperparameters, names, others)
+        return
+    _refuse_names(field, uses, hyperparameters, _names(algorithm, _RESERVED), others)
+    policy_kwargs = hyperparameters.get("policy_kwargs")
+    if isinstance(policy_kwargs, Mapping):
+        names = _names(_policy_class(algorithm), _PASSED)
+        _refuse_names(f"{field}.policy_kwargs", f"{uses}'s policy", policy_kwargs, names)
+
+
+def resolved(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
+    """JSON values for a constructor: tuples for lists, and the classes named in `policy_kwargs`."""
+    values = {k: tuple(v) if isinstance(v, list) else v for k, v in hyperparameters.items()}
+    policy_kwargs = values.get("policy_kwargs")
+    if isinstance(policy_kwargs, Mapping):
+        values["policy_kwargs"] = {
+            name: import_object(value, f"hyperparameters.policy_kwargs.{name}", OptionError)
+            if isinstance(value, str) and ":" in value
+            else value
+            for name, value in policy_kwargs.items()
+        }
+    return values
+
+
+def policy_alias(algorithm: Any) -> str:
+    """SB3's name of an algorithm's perceptron policy: "MlpPolicy", or "MlpLstmPolicy"."""
+    aliases: list[str] = ["MlpPolicy", *algorithm.policy_aliases]
+    return next(a for a in aliases if a in algorithm.policy_aliases and a.startswith("Mlp"))
+
+
+def _policy_class(algorithm: Any) -> Any:
+    return algorithm.policy_aliases[policy_alias(algorithm)]
+
+
+def for_lanes(algorithm: Any, lanes: int, chosen: Iterable[str] = ()) -> dict[str, int]:
+    """The changes to SB3's defaults that keep an algorithm the same in several lanes at once.
+
+    A lane is an environment, or one agent of a team. SB3's `n_steps` counts the steps of each: PPO
+    in 8 would collect 16,384 transitions for one update, so the rollout of 2,048 is divided. And
+    TD3 in 8 would learn an eighth as often, so it gets one update for each transition.
+
+    On Team4, r̃ was 0.77 after 16,384 steps of PPO with SB3's defaults, and 0.85 divided.
+    """
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+    if not isinstance(algorithm, type):
+        return {}
+    if issubclass(algorithm, OnPolicyAlgorithm) and "n_steps" not in chosen:
+        default = parameters_of(algorithm)["n_steps"].default
+        n_steps = min(default, max(_MIN_ROLLOUT, _ROLLOUT // lanes))
+        return {} if n_steps == default else {"n_steps": n_steps}
+    if issubclass(algorithm, OffPolicyAlgorithm) and lanes > 1:
+        return {} if {"gradient_steps", "train_freq"} & set(chosen) else {"gradient_steps": -1}
+    return {}
+
+
+def parameters_of(function: Any) -> dict[str, inspect.Parameter]:
+    """The parameters of a function, or of a class's constructor."""
+    if not isinstance(function, type):
+        return dict(inspect.signature(function).parameters)
+    parameters: dict[str, inspect.Parameter] = {}
+    for owner in function.__mro__:
+        if "__init__" not in vars(owner):
+            continue
+        own = {each.name: each for each in inspect.signature(owner).parameters.values()}
+        parameters = {**own, **parameters}
+        if not any(each.kind is each.VAR_KEYWORD for each in own.values()):
+            passed_on = inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL
+            return {name: p for name, p in parameters.items() if p.kind not in passed_on}
+    return parameters
+
+
+def _names(function: Any, reserved: Iterable[str]) -> list[str] | None:
+    """The names of a function's arguments that a user may set; None if it accepts any."""
+    parameters = parameters_of(function)
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
+        return None
+    return [name for name in parameters if name not in reserved and not name.startswith("_")]
+
+
+def _refuse_names(
+    field: str,
+    owner: str,
+    names: Iterable[str],
+    known: list[str] | None,
+    others: Iterable[str] = (),
+) -> None:
+    for name in names:
+        if known is not None and name not in known:
+            raise OptionError(
+                f"{field}.{name}: {owner} has no such hyperparameter."
+                f"{did_you_mean(name, [*known, *others])} Known: {', '.join(known) or 'none'}."
+            )

@@ -12,25 +12,33 @@ evaluated once, at the end of its training.
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import importlib
+import importlib.machinery
+import importlib.util
 import inspect
+import os
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Never
+from typing import TYPE_CHECKING, Any, Never
 
 import gymnasium
 import numpy as np
 
 from sme_registry.envs import SMEEnv
 from sme_registry.envs.episodes import Episode, Episodes, info_of_lanes
-from sme_registry.errors import OptionError, PolicyError
+from sme_registry.errors import OptionError, PolicyError, did_you_mean
 from sme_registry.evaluation import Policy, TeamPolicy, as_policy
 from sme_registry.evaluation.models import saved_sb3
 from sme_registry.io import write_atomically
 from sme_registry.spec import ActionRange, SMESpec
-from sme_registry.training.algorithms import is_sb3, load_function, working_directory_importable
-from sme_registry.training.learn import Watch
+from sme_registry.spec.study import parse_uses
+
+if TYPE_CHECKING:
+    from sme_registry.training.learn import Watch
 
 
 class FunctionLearner:
@@ -110,7 +118,8 @@ class FunctionLearner:
 
     def save(self, path: Path) -> None:
         """Write a model of Stable-Baselines3, and nothing of another policy."""
-        if "stable_baselines3" in sys.modules and is_sb3(self.model):
+        kinds = sys.modules.get("stable_baselines3.common.base_class")
+        if kinds is not None and isinstance(self.model, kinds.BaseAlgorithm):
             write_atomically(path, saved_sb3(self.model))
 
     def begin_log(self, folder: Path) -> None:
@@ -162,3 +171,84 @@ class CountedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.last = (float(result[1]), *result[2:])
         self.after_step()
         return result
+
+
+def source_of(uses: str, field: str = "uses") -> str | None:
+    """The digest of the module's source of `train:module:function`, which is not imported."""
+    kind, name = parse_uses(uses)
+    return _source(name, field)[1] if kind == "train" else None
+
+
+def load_function(name: str, field: str = "uses") -> tuple[Callable[..., Any], str]:
+    """The function `module:function` of the source that is there now, and the source's digest.
+
+    The source is run again where it has changed since, so what runs is what the digest says.
+    """
+    module_name, _, attribute = name.partition(":")
+    with working_directory_importable():
+        path, digest, source = _source(name, field)
+        module = sys.modules.get(module_name)
+        try:
+            if module is None or _loaded.get(module_name) != digest:
+                importlib.import_module(module_name.rpartition(".")[0] or "sys")
+                spec = importlib.util.spec_from_file_location(module_name, path)
+                module = module or importlib.util.module_from_spec(spec)  # type: ignore[arg-type]
+                sys.modules[module_name] = module
+                exec(compile(source, path, "exec"), vars(module))
+                _loaded[module_name] = digest
+        except Exception as error:
+            sys.modules.pop(module_name, None)
+            raise OptionError(
+                f"{field}='train:{name}': {module_name} cannot be imported: "
+                f"{type(error).__name__}: {error}. Correct it."
+            ) from error
+    function = getattr(module, attribute, None)
+    if not callable(function):
+        functions = [known for known, value in vars(module).items() if callable(value)]
+        raise OptionError(
+            f"{field}='train:{name}': {path} has no function {attribute!r}."
+            f"{did_you_mean(attribute, functions)} Define {attribute}(env, steps, seed), which "
+            "returns a policy."
+        )
+    return function, digest
+
+
+_loaded: dict[str, str] = {}  # the digest of the source that a module has run
+
+
+def _source(name: str, field: str) -> tuple[str, str, bytes]:
+    """The path, the digest and the bytes of a module's source. Imports nothing."""
+    module = name.partition(":")[0]
+    path = path_of(module)
+    if not path or not path.endswith(".py"):
+        raise OptionError(
+            f"{field}='train:{name}': there is no Python module {module!r}. It must be "
+            "train:module:function, with the module in the working directory or installed."
+        )
+    source = Path(path).read_bytes()
+    return path, f"sha256:{hashlib.sha256(source).hexdigest()}", source
+
+
+def path_of(module: str) -> str | None:
+    """The file of a module or a package; None if there is none. Imports nothing."""
+    places: Any = None
+    found: Any = None
+    with working_directory_importable():
+        for end in (i for i, letter in enumerate(f"{module}.") if letter == "."):
+            found = importlib.machinery.PathFinder.find_spec(module[:end], places)
+            if found is None:
+                return None
+            places = found.submodule_search_locations
+    path: str | None = found.origin
+    return path
+
+
+@contextlib.contextmanager
+def working_directory_importable() -> Iterator[None]:
+    """Modules in the working directory can be imported inside the block."""
+    folder = os.getcwd()
+    sys.path.insert(0, folder)
+    try:
+        yield
+    finally:
+        sys.path.remove(folder)

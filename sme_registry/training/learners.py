@@ -1,15 +1,8 @@
-"""`SB3Learner`: a model of Stable-Baselines3's kind, or one for each agent of a team.
+"""`SB3Learner` and `JAXLearner`: what runs and cells train, each a `Learner` (`learn`).
 
 A single agent learns in one environment, as its algorithm is defined. The agents of a team share a
 model, which gets the transitions of each, or have one each. A step of a team is one step of all its
 agents.
-
-Independent learners of a team are one on-policy model for each agent, trained at the same time.
-Each sees what its agent observes, (s[O_i], t/T, r_cum/k), acts on its agent's channels, and learns
-from its agent's reward alone. For each the others are part of the environment, which changes while
-they learn (de Witt et al. 2020, "Is Independent Learning All You Need in the StarCraft Multi-Agent
-Challenge?"). Their steps are collected here, for all models together, as
-`OnPolicyAlgorithm.collect_rollouts` of Stable-Baselines3 collects them for one.
 
 Imports Stable-Baselines3; import it inside functions only.
 """
@@ -19,40 +12,41 @@ from __future__ import annotations
 import copy
 import io
 import time
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Never
+from typing import TYPE_CHECKING, Any
 
-import gymnasium
 import numpy as np
-import numpy.typing as npt
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 
 from sme_registry.envs.episodes import Episode, Episodes
-from sme_registry.envs.vector import EnvView
+from sme_registry.envs.types import Array
 from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation import Perceptron, Policy, TeamPolicy
 from sme_registry.evaluation.models import saved_sb3, torch_policy
-from sme_registry.io import is_installed, write_atomically
-from sme_registry.sb3 import LanesVecEnv, SMETeamVecEnv, SMEVecEnv
+from sme_registry.io import is_installed, read_arrays, write_arrays, write_atomically
+from sme_registry.sb3 import SMETeamVecEnv, SMEVecEnv
 from sme_registry.sb3.vec_env import SingleVecEnv, finished_in, log_episode
 from sme_registry.spec import ActionRange, SMESpec, StreamSpec
-from sme_registry.task import materialize
-from sme_registry.training.algorithms import default_num_envs, find, is_sb3, silence
-from sme_registry.training.hyperparameters import for_lanes
+from sme_registry.training.algorithms import default_num_envs, find, for_lanes, is_sb3, silence
 from sme_registry.training.learn import Watch
-from sme_registry.training.models import load_checkpoint, new_model, save_checkpoint
+from sme_registry.training.models import (
+    IndependentModels,
+    load_checkpoint,
+    new_model,
+    new_sb3_model,
+    save_checkpoint,
+    set_weights,
+    unloadable,
+)
 from sme_registry.training.numpy_policy import numpy_policy, numpy_team_policy
-from sme_registry.training.record import VisitEnds
+from sme_registry.training.record import RunRecord, VisitEnds
 
-_MODEL = "{}.zip"  # of an agent, in the folder of models and in the checkpoint
-Floats = npt.NDArray[np.float32]
+if TYPE_CHECKING:
+    from sme_registry.jax.program import Program, StepLog
 
 
 class CountedVecEnv(VecEnvWrapper):  # type: ignore[misc, unused-ignore]  # untyped without SB3
@@ -91,178 +85,6 @@ class CountedVecEnv(VecEnvWrapper):  # type: ignore[misc, unused-ignore]  # unty
         self.seconds += time.thread_time() - begun
         self.after_step(self.steps)
         return result
-
-
-class _AgentLanes(LanesVecEnv):
-    """The spaces of one agent in each environment, for the constructor of its model."""
-
-    def reset(self) -> Never:
-        raise NotImplementedError("The models of a team are stepped together.")
-
-    step_wait = reset
-
-
-class IndependentModels:
-    """The models of a team's agents, in environments (`SMETeamVecEnv`) that they share."""
-
-    def __init__(
-        self, algorithm: str, env: Any, *, seed: int, steps: int, hyperparameters: Mapping[str, Any]
-    ) -> None:
-        task = materialize(env.sme_spec)
-        self.env = env
-        S = task.spec.state_dim
-        self._columns = [[*observed, S, S + 1] for observed in task.observed]
-        self._widths = [owned.stop - owned.start for owned in task.owned]
-        low = float(env.action_space.low.min())
-        # An agent's initial weights do not change when another one is added.
-        seeds = [
-            int(np.random.SeedSequence([seed, agent]).generate_state(1)[0] >> 1)
-            for agent in range(len(task.names))
-        ]
-        self.models: dict[str, Any] = {}
-        shapes = zip(task.names, self._columns, self._widths, seeds, strict=True)
-        for name, columns, width, own_seed in shapes:
-            lane = _lane(env, len(columns), width, low)
-            self.models[name] = new_model(
-                algorithm,
-                _AgentLanes([lane] * env.num_teams),
-                seed=own_seed,
-                steps=steps,
-                hyperparameters=hyperparameters,
-                field="algorithm",
-            )
-            _check(self.models[name], algorithm)
-        self._seed = seed
-
-    @property
-    def num_timesteps(self) -> int:
-        """Steps of the team over all environments."""
-        return int(next(iter(self.models.values())).num_timesteps)
-
-    def learn(self, steps: int, on_rollout: Callable[[], None] = lambda: None) -> None:
-        """Learn until `num_timesteps` is at least `steps`."""
-        set_random_seed(self._seed)
-        self.env.seed(self._seed)
-        observations = self._split(self.env.reset())
-        starts = np.ones(self.env.num_teams, bool)
-        while self.num_timesteps < steps:
-            on_rollout()
-            observations, starts = self._collect(observations, starts)
-            for model in self.models.values():
-                model._update_current_progress_remaining(model.num_timesteps, steps)
-                model.train()
-                model.logger.dump(model.num_timesteps)
-
-    def save(self, folder: Path) -> None:
-        """Write the model of each agent as `<agent>.zip` into a folder."""
-        folder.mkdir(exist_ok=True)
-        for name, model in self.models.items():
-            write_atomically(folder / _MODEL.format(name), saved_sb3(model))
-
-    def save_checkpoint(self, path: Path) -> None:
-        """Write all models into one file, whole or not at all."""
-        archive = io.BytesIO()
-        with zipfile.ZipFile(archive, "w") as members:
-            for name, model in self.models.items():
-                members.writestr(_MODEL.format(name), saved_sb3(model))
-        write_atomically(path, archive.getvalue())
-
-    def load_checkpoint(self, path: Path) -> None:
-        """Continue from the models in a file, which must come from a trusted source."""
-        try:
-            with zipfile.ZipFile(path) as members:
-                for name, model in self.models.items():
-                    content = io.BytesIO(members.read(_MODEL.format(name)))
-                    self.models[name] = type(model).load(content, env=model.env, device="cpu")
-        except Exception as error:
-            raise PolicyError(
-                f"{path}: cannot be loaded: {type(error).__name__}: {error}. Start again with "
-                "--force (in Python, force=True), or in another folder."
-            ) from error
-        # Another stream than the first session's, the same whenever this session is repeated.
-        sequence = np.random.SeedSequence([self._seed, self.num_timesteps])
-        self._seed = int(sequence.generate_state(1)[0] >> 1)
-
-    def _collect(
-        self, observations: list[Floats], starts: npt.NDArray[Any]
-    ) -> tuple[list[Floats], npt.NDArray[Any]]:
-        """One rollout of every model; returns the last observations and which begin an episode."""
-        n = len(self.models)
-        models = list(self.models.values())
-        for model in models:
-            model.policy.set_training_mode(False)
-            model.rollout_buffer.reset()
-        for _ in range(models[0].n_steps):
-            acted = [_act(model, seen) for model, seen in zip(models, observations, strict=True)]
-            joint = self._join([clipped for *_, clipped in acted])
-            rows, rewards, dones, infos = self.env.step(joint)
-            for agent, model in enumerate(models):
-                model.num_timesteps += self.env.num_teams
-                seen, (actions, values, log_probs, _) = observations[agent], acted[agent]
-                own_rewards = self._bootstrapped(agent, model, rewards[agent::n], infos[agent::n])
-                model.rollout_buffer.add(seen, actions, own_rewards, starts, values, log_probs)
-            observations, starts = self._split(rows), dones[::n]
-        for model, seen in zip(models, observations, strict=True):
-            with torch.no_grad():
-                last = model.policy.predict_values(torch.as_tensor(seen))
-            model.rollout_buffer.compute_returns_and_advantage(last_values=last, dones=starts)
-        return observations, starts
-
-    def _bootstrapped(
-        self, agent: int, model: Any, rewards: Floats, infos: list[dict[str, Any]]
-    ) -> Floats:
-        """Rewards, with the value of the last state where the horizon cut an episode off."""
-        rewards = rewards.copy()
-        for row in np.flatnonzero([info["TimeLimit.truncated"] for info in infos]):
-            seen = infos[row]["terminal_observation"][None, self._columns[agent]]
-            with torch.no_grad():
-                value = model.policy.predict_values(torch.as_tensor(seen)).item()
-            rewards[row] += model.gamma * value
-        return rewards
-
-    def _split(self, rows: Any) -> list[Floats]:
-        """Each agent's own observations `[teams, |O_i| + 2]`, from the shared ones of all lanes."""
-        by_agent = rows.reshape(self.env.num_teams, len(self._columns), -1)
-        return [np.ascontiguousarray(by_agent[:, i, c]) for i, c in enumerate(self._columns)]
-
-    def _join(self, actions: list[Floats]) -> Floats:
-        """Actions of all lanes `[teams · n, max a_i]`, from each agent's `[teams, a_i]`."""
-        joint = np.zeros((self.env.num_teams, len(actions), max(self._widths)), np.float32)
-        for agent, of_agent in enumerate(actions):
-            joint[:, agent, : of_agent.shape[1]] = of_agent
-        return joint.reshape(self.env.num_envs, -1)
-
-
-def _lane(env: Any, observation_dim: int, action_dim: int, low: float) -> EnvView:
-    """An environment as an agent sees it: its spaces."""
-    box = gymnasium.spaces.Box
-    observation_space = box(0.0, 1.0, (observation_dim,), np.float32)
-    action_space = box(low, 1.0, (action_dim,), np.float32)
-    return EnvView(
-        env, 0, observation_space=observation_space, action_space=action_space, render_mode=None
-    )
-
-
-def _act(model: Any, observations: Floats) -> tuple[Floats, Any, Any, Floats]:
-    """Sampled actions, their values and log π, and the actions clipped to the action space."""
-    with torch.no_grad():
-        sampled, values, log_probs = model.policy(torch.as_tensor(observations))
-    actions = sampled.numpy()
-    space = model.action_space
-    return actions, values, log_probs, np.clip(actions, space.low, space.high)
-
-
-def _check(model: Any, uses: str) -> None:
-    """Raise OptionError if a model does not collect rollouts as this module does."""
-    kind = type(model)
-    usual = isinstance(model, OnPolicyAlgorithm) and (
-        kind.collect_rollouts is OnPolicyAlgorithm.collect_rollouts
-    )
-    if not usual or model.use_sde:
-        raise OptionError(
-            f"algorithm={uses!r}: independent learners need an on-policy algorithm whose rollouts "
-            "are Stable-Baselines3's own, such as PPO or A2C, without use_sde."
-        )
 
 
 class SB3Learner:
@@ -474,3 +296,128 @@ class _Pauses(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped wit
 
     def _on_step(self) -> bool:
         return True
+
+
+_PIECE = 100  # steps between two reports of progress, and the longest wait for Ctrl-C
+_EPISODE = "episode"  # of the checkpoint: the sums of the present episode
+
+
+class JAXLearner:
+    """Agents in JAX: a program of one run, and the model of SB3 that gets its weights.
+
+    Its checkpoint holds everything, so a run that is resumed continues with the same bits.
+    """
+
+    def __init__(self, record: RunRecord) -> None:
+        options: dict[str, Any] = {
+            "hyperparameters": record.hyperparameters,
+            "action_range": record.action_range,
+            "steps": record.steps,
+        }
+        uses, document, seed = record.algorithm, record.document, record.seed
+        from sme_registry.jax.run import new_program
+
+        self._program: Program = new_program(
+            uses, [document], [seed], device=record.device or None, **options
+        )
+        self._model = new_sb3_model(uses, document, seed=seed, **options)
+        self._in_stream = record.stream is not None
+        self._steps, self._piece = record.steps, min(_PIECE, record.checkpoint_every)
+        self._sums = 4 if record.spec.safety is None else 7
+        self._log: StepLog | None = None
+        self._logger: Any = None
+
+    @property
+    def steps(self) -> int:
+        """Environment steps so far."""
+        return int(self._program.steps)
+
+    @property
+    def total(self) -> int:
+        """Environment steps at the end: PPO collects whole rollouts."""
+        rollout = self._program.rollout
+        return -(-max(self._steps, self.steps) // rollout) * rollout
+
+    @property
+    def model(self) -> Any:
+        """The model of Stable-Baselines3, with the present weights."""
+        set_weights(self._model, self._program.weights(0), self.steps)
+        return self._model
+
+    def learn(self, watch: Watch) -> None:
+        """Take the steps that are left; after each piece of them, `watch.on_steps`."""
+        from sme_registry.jax.run import run
+
+        program, begin = self._program, self.steps
+        watch.prepare("compiling …")
+
+        def on_log(log: StepLog) -> None:
+            self._check_finite()
+            self._log = log
+            watch.on_steps()
+            if program.steps - begin > max(self._piece, program.rollout):
+                watch.prepared()  # PPO's updates are compiled in the second piece
+
+        run(
+            program,
+            on_log=on_log,
+            on_visit=(lambda visit, _: watch.on_visit(visit)) if self._in_stream else None,
+            after_piece=watch.on_pause,
+            piece=self._piece,
+        )
+        self._check_finite()
+
+    def _check_finite(self) -> None:
+        if not self.is_finite():
+            raise ValueError("The weights are not finite.")
+
+    def add_to(self, sums: Episodes) -> list[Episode]:
+        """Add the last piece to sums; returns the episodes that ended in it."""
+        log = self._log
+        assert log is not None
+        ended = np.logical_or(log.terminated, log.truncated)
+        info = {name: value for name, value in log._asdict().items() if value is not None}
+        return sums.add(log.reward, info, log.terminated, ended)
+
+    def is_finite(self) -> bool:
+        """Whether all weights are finite."""
+        return not self._program.failed()[0]
+
+    def restore(self, checkpoint: Path) -> Array:
+        """Go on from a checkpoint; returns the sums of the present episode."""
+        sums = np.zeros((7, 1, 1))
+        try:
+            arrays = read_arrays(checkpoint)
+            sums[: self._sums, 0, 0] = arrays.pop(_EPISODE)
+            self._program.restore(arrays)
+        except (KeyError, OptionError) as error:
+            raise unloadable(checkpoint, error.__cause__ or error) from None
+        return sums
+
+    def save_checkpoint(self, path: Path, sums: Array) -> None:
+        """Write a checkpoint, with the sums of the present episode."""
+        write_arrays(path, {**self._program.save(), _EPISODE: sums[: self._sums, 0, 0]})
+
+    def save(self, path: Path) -> None:
+        """Write the model of Stable-Baselines3."""
+        write_atomically(path, saved_sb3(self.model))
+
+    def begin_log(self, folder: Path) -> None:
+        """Log to TensorBoard in a folder if it is installed."""
+        if is_installed("tensorboard"):
+            self._logger = configure(str(folder), ["tensorboard"])
+
+    def log(self, episodes: Sequence[Episode]) -> None:
+        """Log the means of the episodes that ended in a piece."""
+        if self._logger is None:
+            return
+        for episode in episodes:
+            self._logger.record_mean("rollout/ep_rew_mean", episode.episode_return)
+            self._logger.record_mean("rollout/ep_len_mean", episode.length)
+            log_episode(self._logger, episode)
+        self._logger.dump(self.steps)
+
+    def close(self) -> None:
+        """Close the log."""
+        if self._logger is not None:
+            self._logger.close()

@@ -7,6 +7,13 @@ A function that is named as an algorithm returns a model:
 so anything with `learn` and `predict` can be trained. Agents in JAX have one, too, with the same
 weights: evaluation, export to ONNX, diagnosis and leaderboards take it as any other.
 
+Independent learners of a team (`IndependentModels`) are one on-policy model for each agent, trained
+at the same time. Each sees what its agent observes, (s[O_i], t/T, r_cum/k), acts on its agent's
+channels, and learns from its agent's reward alone. For each the others are part of the environment,
+which changes while they learn (de Witt et al. 2020, "Is Independent Learning All You Need in the
+StarCraft Multi-Agent Challenge?"). Their steps are collected here, for all models together, as
+`OnPolicyAlgorithm.collect_rollouts` of Stable-Baselines3 collects them for one.
+
 A checkpoint is a model's .zip that SB3 can load with one more member, the filled part of the replay
 buffer: with two files, a kill between the writes would pair a model with the wrong buffer. That of
 an agent in JAX is an .npz of all arrays of its program.
@@ -19,23 +26,37 @@ from __future__ import annotations
 import inspect
 import io
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Never, Protocol
 
+import gymnasium
 import numpy as np
 import numpy.typing as npt
 import torch
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.utils import set_random_seed
 
+from sme_registry.envs.vector import EnvView
 from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation.models import saved_sb3
 from sme_registry.io import write_atomically
-from sme_registry.sb3 import SMEVecEnv
+from sme_registry.sb3 import LanesVecEnv, SMEVecEnv
 from sme_registry.spec import ActionRange, SMESpec, StreamSpec
 from sme_registry.spec.study import parse_uses
-from sme_registry.training.algorithms import find, is_sb3, replay_settings, silence
-from sme_registry.training.hyperparameters import policy_alias, refuse_unknown, resolved
+from sme_registry.task import materialize
+from sme_registry.training.algorithms import (
+    find,
+    is_sb3,
+    policy_alias,
+    refuse_unknown,
+    replay_settings,
+    resolved,
+    silence,
+)
 
+Floats = npt.NDArray[np.float32]
+_MODEL = "{}.zip"  # of an agent, in the folder of models and in the checkpoint
 _MEMBER = "sme_replay_buffer.npz"
 _ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
@@ -174,3 +195,172 @@ def _refill(buffer: Any, replay: dict[str, Any]) -> None:
     was_full = bool(replay["full"])
     buffer.full = was_full and filled >= buffer.buffer_size
     buffer.pos = filled if was_full and not buffer.full else int(replay["pos"])
+
+
+class _AgentLanes(LanesVecEnv):
+    """The spaces of one agent in each environment, for the constructor of its model."""
+
+    def reset(self) -> Never:
+        raise NotImplementedError("The models of a team are stepped together.")
+
+    step_wait = reset
+
+
+class IndependentModels:
+    """The models of a team's agents, in environments (`SMETeamVecEnv`) that they share."""
+
+    def __init__(
+        self, algorithm: str, env: Any, *, seed: int, steps: int, hyperparameters: Mapping[str, Any]
+    ) -> None:
+        task = materialize(env.sme_spec)
+        self.env = env
+        S = task.spec.state_dim
+        self._columns = [[*observed, S, S + 1] for observed in task.observed]
+        self._widths = [owned.stop - owned.start for owned in task.owned]
+        low = float(env.action_space.low.min())
+        # An agent's initial weights do not change when another one is added.
+        seeds = [
+            int(np.random.SeedSequence([seed, agent]).generate_state(1)[0] >> 1)
+            for agent in range(len(task.names))
+        ]
+        self.models: dict[str, Any] = {}
+        shapes = zip(task.names, self._columns, self._widths, seeds, strict=True)
+        for name, columns, width, own_seed in shapes:
+            lane = _lane(env, len(columns), width, low)
+            self.models[name] = new_model(
+                algorithm,
+                _AgentLanes([lane] * env.num_teams),
+                seed=own_seed,
+                steps=steps,
+                hyperparameters=hyperparameters,
+                field="algorithm",
+            )
+            _check(self.models[name], algorithm)
+        self._seed = seed
+
+    @property
+    def num_timesteps(self) -> int:
+        """Steps of the team over all environments."""
+        return int(next(iter(self.models.values())).num_timesteps)
+
+    def learn(self, steps: int, on_rollout: Callable[[], None] = lambda: None) -> None:
+        """Learn until `num_timesteps` is at least `steps`."""
+        set_random_seed(self._seed)
+        self.env.seed(self._seed)
+        observations = self._split(self.env.reset())
+        starts = np.ones(self.env.num_teams, bool)
+        while self.num_timesteps < steps:
+            on_rollout()
+            observations, starts = self._collect(observations, starts)
+            for model in self.models.values():
+                model._update_current_progress_remaining(model.num_timesteps, steps)
+                model.train()
+                model.logger.dump(model.num_timesteps)
+
+    def save(self, folder: Path) -> None:
+        """Write the model of each agent as `<agent>.zip` into a folder."""
+        folder.mkdir(exist_ok=True)
+        for name, model in self.models.items():
+            write_atomically(folder / _MODEL.format(name), saved_sb3(model))
+
+    def save_checkpoint(self, path: Path) -> None:
+        """Write all models into one file, whole or not at all."""
+        archive = io.BytesIO()
+        with zipfile.ZipFile(archive, "w") as members:
+            for name, model in self.models.items():
+                members.writestr(_MODEL.format(name), saved_sb3(model))
+        write_atomically(path, archive.getvalue())
+
+    def load_checkpoint(self, path: Path) -> None:
+        """Continue from the models in a file, which must come from a trusted source."""
+        try:
+            with zipfile.ZipFile(path) as members:
+                for name, model in self.models.items():
+                    content = io.BytesIO(members.read(_MODEL.format(name)))
+                    self.models[name] = type(model).load(content, env=model.env, device="cpu")
+        except Exception as error:
+            raise unloadable(path, error) from error
+        # Another stream than the first session's, the same whenever this session is repeated.
+        sequence = np.random.SeedSequence([self._seed, self.num_timesteps])
+        self._seed = int(sequence.generate_state(1)[0] >> 1)
+
+    def _collect(
+        self, observations: list[Floats], starts: npt.NDArray[Any]
+    ) -> tuple[list[Floats], npt.NDArray[Any]]:
+        """One rollout of every model; returns the last observations and which begin an episode."""
+        n = len(self.models)
+        models = list(self.models.values())
+        for model in models:
+            model.policy.set_training_mode(False)
+            model.rollout_buffer.reset()
+        for _ in range(models[0].n_steps):
+            acted = [_act(model, seen) for model, seen in zip(models, observations, strict=True)]
+            joint = self._join([clipped for *_, clipped in acted])
+            rows, rewards, dones, infos = self.env.step(joint)
+            for agent, model in enumerate(models):
+                model.num_timesteps += self.env.num_teams
+                seen, (actions, values, log_probs, _) = observations[agent], acted[agent]
+                own_rewards = self._bootstrapped(agent, model, rewards[agent::n], infos[agent::n])
+                model.rollout_buffer.add(seen, actions, own_rewards, starts, values, log_probs)
+            observations, starts = self._split(rows), dones[::n]
+        for model, seen in zip(models, observations, strict=True):
+            with torch.no_grad():
+                last = model.policy.predict_values(torch.as_tensor(seen))
+            model.rollout_buffer.compute_returns_and_advantage(last_values=last, dones=starts)
+        return observations, starts
+
+    def _bootstrapped(
+        self, agent: int, model: Any, rewards: Floats, infos: list[dict[str, Any]]
+    ) -> Floats:
+        """Rewards, with the value of the last state where the horizon cut an episode off."""
+        rewards = rewards.copy()
+        for row in np.flatnonzero([info["TimeLimit.truncated"] for info in infos]):
+            seen = infos[row]["terminal_observation"][None, self._columns[agent]]
+            with torch.no_grad():
+                value = model.policy.predict_values(torch.as_tensor(seen)).item()
+            rewards[row] += model.gamma * value
+        return rewards
+
+    def _split(self, rows: Any) -> list[Floats]:
+        """Each agent's own observations `[teams, |O_i| + 2]`, from the shared ones of all lanes."""
+        by_agent = rows.reshape(self.env.num_teams, len(self._columns), -1)
+        return [np.ascontiguousarray(by_agent[:, i, c]) for i, c in enumerate(self._columns)]
+
+    def _join(self, actions: list[Floats]) -> Floats:
+        """Actions of all lanes `[teams · n, max a_i]`, from each agent's `[teams, a_i]`."""
+        joint = np.zeros((self.env.num_teams, len(actions), max(self._widths)), np.float32)
+        for agent, of_agent in enumerate(actions):
+            joint[:, agent, : of_agent.shape[1]] = of_agent
+        return joint.reshape(self.env.num_envs, -1)
+
+
+def _lane(env: Any, observation_dim: int, action_dim: int, low: float) -> EnvView:
+    """An environment as an agent sees it: its spaces."""
+    box = gymnasium.spaces.Box
+    observation_space = box(0.0, 1.0, (observation_dim,), np.float32)
+    action_space = box(low, 1.0, (action_dim,), np.float32)
+    return EnvView(
+        env, 0, observation_space=observation_space, action_space=action_space, render_mode=None
+    )
+
+
+def _act(model: Any, observations: Floats) -> tuple[Floats, Any, Any, Floats]:
+    """Sampled actions, their values and log π, and the actions clipped to the action space."""
+    with torch.no_grad():
+        sampled, values, log_probs = model.policy(torch.as_tensor(observations))
+    actions = sampled.numpy()
+    space = model.action_space
+    return actions, values, log_probs, np.clip(actions, space.low, space.high)
+
+
+def _check(model: Any, uses: str) -> None:
+    """Raise OptionError if a model does not collect rollouts as this module does."""
+    kind = type(model)
+    usual = isinstance(model, OnPolicyAlgorithm) and (
+        kind.collect_rollouts is OnPolicyAlgorithm.collect_rollouts
+    )
+    if not usual or model.use_sde:
+        raise OptionError(
+            f"algorithm={uses!r}: independent learners need an on-policy algorithm whose rollouts "
+            "are Stable-Baselines3's own, such as PPO or A2C, without use_sde."
+        )

@@ -47,23 +47,23 @@ from sme_registry.spec import (
     StreamSpec,
     catalogue,
 )
-from sme_registry.spec.study import INDEPENDENT, in_jax, parse_uses
+from sme_registry.spec.study import INDEPENDENT, parse_uses
 from sme_registry.task import load, materialize, materialize_stream
-from sme_registry.training import reports
 from sme_registry.training.algorithms import (
+    check_hyperparameters,
     default_algorithm,
     default_num_envs,
     find,
+    for_lanes,
     full_name,
     is_sb3,
+    nested_hyperparameters,
     one_thread,
     quiet,
     require_sb3,
-    source_of,
 )
-from sme_registry.training.functions import FunctionLearner
-from sme_registry.training.hyperparameters import for_lanes, nested_hyperparameters, refuse_unknown
-from sme_registry.training.learn import Learner, learn
+from sme_registry.training.functions import FunctionLearner, source_of
+from sme_registry.training.learn import REPORT_FILES, Learner, learn, write_report
 from sme_registry.training.record import (
     CHECKPOINT,
     EPISODES,
@@ -79,7 +79,7 @@ from sme_registry.training.record import (
 REPORT = "report.md"  # written by `sme demo`
 EXPLORER = "explorer.html"  # written by `sme train` and `sme explore`
 _FILES = (
-    RECORD, EPISODES, CHECKPOINT, MODEL, MODELS, SNAPSHOTS, *reports.FILES,
+    RECORD, EPISODES, CHECKPOINT, MODEL, MODELS, SNAPSHOTS, *REPORT_FILES,
     REPORT, EXPLORER, TENSORBOARD,
 )  # fmt: skip
 
@@ -207,7 +207,7 @@ def train(
                 _remove_run(folder)
             record.write(folder)
             record, episodes = learn(learner, record, folder, progress, console)
-            report, figures = reports.write_report(
+            report, figures = write_report(
                 learner.model, record, episodes, folder, progress, console
             )
             record = record.updated(status="finished")
@@ -286,24 +286,55 @@ def _with_algorithm(
     """A plan with its algorithm, the hyperparameters that the user set, and its environments."""
     uses = full_name(default_algorithm(plan.spec) if uses is None else uses, agents)
     settings = nested_hyperparameters(hyperparameters)
-    if in_jax(uses):
-        return _with_jax_algorithm(plan, uses, num_envs, settings, device)
-    if device is not None:
-        raise OptionError(
-            f"device={device!r}: is for agents in JAX; those of Stable-Baselines3 train on the "
-            'CPU. Leave it out, or use --agents jax (in Python, agents="jax").'
-        )
     entry = find(uses, "algorithm")
     if entry.kind == "independent":
         raise OptionError(
             f"algorithm={uses!r}: is a name for studies. Train {entry.name!r} with "
             "independent=True (in the terminal, --independent)."
         )
-    if entry.kind == "train":
-        return _with_function(plan, uses, num_envs, settings)
-    entry.check_task(plan.document)
+    if device is not None and entry.kind != "jax":
+        raise OptionError(
+            f"device={device!r}: is for agents in JAX; all others train on the CPU. Leave it out, "
+            'or use --agents jax (in Python, agents="jax").'
+        )
+    if entry.kind == "jax":
+        device = _device_in_jax(uses, settings, device)
+        num_envs = _num_envs(plan, uses, num_envs)
+    else:
+        entry.check_task(plan.document)
+        num_envs = _num_envs(plan, uses, num_envs)
+        check_hyperparameters(uses, settings)
+    return plan.updated(
+        algorithm=uses,
+        hyperparameters=settings,
+        num_envs=num_envs,
+        device=device or "",
+        source=source_of(uses, "algorithm") or "",
+        versions=versions_for(uses),
+    )
+
+
+def _device_in_jax(uses: str, settings: dict[str, Any], device: str | None) -> str:
+    """The platform on which an agent in JAX trains, after a check of its hyperparameters."""
+    require_sb3()  # `model.zip` is a model of it
+    from sme_registry.jax.device import find_device
+    from sme_registry.jax.run import settings_of
+
+    settings_of(uses, settings)
+    return str(find_device(device).platform)
+
+
+def _num_envs(plan: RunRecord, uses: str, num_envs: int | None) -> int:
+    """The parallel environments of a run."""
+    entry = find(uses, "algorithm")
+    if entry.kind != "sb3":
+        if num_envs not in (None, 1):
+            raise OptionError(
+                f"num_envs={num_envs!r}: must be 1 for {uses!r}. Leave it out, or train an "
+                "algorithm of Stable-Baselines3."
+            )
+        return 1
     algorithm = entry.load("algorithm")
-    refuse_unknown(algorithm, uses, settings)
     if num_envs is None:
         num_envs = default_num_envs(plan.spec, algorithm)
     num_envs = integer_in("num_envs", num_envs, 1, 4096)
@@ -313,62 +344,7 @@ def _with_algorithm(
             "of its own. Leave it out."
         )
     integer_in("seed", plan.seed, 0, 2**32 - num_envs)
-    return plan.updated(
-        algorithm=uses,
-        hyperparameters=settings,
-        num_envs=num_envs,
-        versions=versions_for(uses),
-    )
-
-
-def _with_function(
-    plan: RunRecord, uses: str, num_envs: int | None, settings: dict[str, Any]
-) -> RunRecord:
-    """The same for a function that trains."""
-    if num_envs not in (None, 1):
-        raise OptionError(
-            f"num_envs={num_envs!r}: must be 1 for {uses!r}, whose function gets one environment. "
-            "Leave it out."
-        )
-    subject = "stream" if plan.stream is not None else "team" if plan.spec.team is not None else ""
-    if subject:
-        raise OptionError(
-            f"algorithm={uses!r}: is for a task of a single agent, and this is a {subject}. Train "
-            "an algorithm of Stable-Baselines3, such as PPO."
-        )
-    return plan.updated(
-        algorithm=uses,
-        hyperparameters=settings,
-        source=source_of(uses, "algorithm"),
-        versions=versions_for(uses),
-    )
-
-
-def _with_jax_algorithm(
-    plan: RunRecord,
-    uses: str,
-    num_envs: int | None,
-    settings: dict[str, Any],
-    device: str | None,
-) -> RunRecord:
-    """The same for an agent in JAX."""
-    require_sb3()  # `model.zip` is a model of it
-    from sme_registry.jax.device import find_device
-    from sme_registry.jax.run import settings_of
-
-    find(uses, "algorithm")
-    settings_of(uses, settings)
-    if num_envs not in (None, 1):
-        raise OptionError(
-            f"num_envs={num_envs!r}: must be 1 for agents in JAX. Leave it out, or train an "
-            "algorithm of Stable-Baselines3."
-        )
-    return plan.updated(
-        algorithm=uses,
-        hyperparameters=settings,
-        device=find_device(device).platform,
-        versions=versions_for(uses),
-    )
+    return num_envs
 
 
 def _uses_torch(record: RunRecord) -> bool:
@@ -378,10 +354,6 @@ def _uses_torch(record: RunRecord) -> bool:
 def _learner(record: RunRecord) -> Learner:
     """What a run trains, new."""
     kind, name = parse_uses(record.algorithm)
-    if kind == "jax":
-        from sme_registry.training.jax_learner import JAXLearner
-
-        return JAXLearner(record)
     options: dict[str, Any] = {
         "seed": record.seed,
         "steps": record.steps,
@@ -391,8 +363,10 @@ def _learner(record: RunRecord) -> Learner:
     }
     if kind == "train":
         return FunctionLearner(name, record.spec, **options)
-    from sme_registry.training.learners import SB3Learner
+    from sme_registry.training.learners import JAXLearner, SB3Learner
 
+    if kind == "jax":
+        return JAXLearner(record)
     uses = f"{INDEPENDENT * record.independent}{name}"
     learner = SB3Learner(uses, record.document, num_envs=record.num_envs, **options)
     if not (record.independent or is_sb3(learner.model)):

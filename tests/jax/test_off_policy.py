@@ -14,7 +14,7 @@ from sme_registry.jax.run import settings_of
 from sme_registry.jax.sac import SAC, SACProgram
 from sme_registry.jax.td3 import TD3, TD3Program
 from sme_registry.spec import SMESpec
-from sme_registry.training.hyperparameters import nested_hyperparameters
+from sme_registry.training.algorithms import nested_hyperparameters
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 

@@ -159,7 +159,7 @@ def test_a_team_and_a_stream_are_refused_where_a_document_is_read():
     stream = {"name": "s", "stream": {"phases": phases}, "draws": [0]}
     with pytest.raises(SpecError, match="cannot live in a stream"):
         plan(classes=[], streams=[stream])
-    with pytest.raises(OptionError, match="this is a team"):
+    with pytest.raises(SpecError, match="this is a team"):
         train("Team4", algorithm=uses("centre"), folder="run", progress=False)
 
 

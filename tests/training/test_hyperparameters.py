@@ -3,7 +3,7 @@
 import pytest
 
 from sme_registry.errors import OptionError, UnknownNameError
-from sme_registry.training.hyperparameters import (
+from sme_registry.training.algorithms import (
     check_hyperparameters,
     nested_hyperparameters,
     read_hyperparameters,

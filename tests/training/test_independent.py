@@ -42,7 +42,7 @@ def test_a_team_of_one_learns_exactly_what_sb3s_ppo_learns(team_run):
 
     from sme_registry.sb3 import SMETeamVecEnv, SMEVecEnv
     from sme_registry.training.algorithms import silence
-    from sme_registry.training.learners import IndependentModels
+    from sme_registry.training.models import IndependentModels
 
     spec = TINY.derive(team={"agents": [{"action_dim": 2}]})
     settings = team_run.record.hyperparameters

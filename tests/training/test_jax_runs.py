@@ -25,7 +25,7 @@ from sme_registry.evaluation.models import saved_sb3
 from sme_registry.export import export_onnx
 from sme_registry.io import read_arrays, write_arrays
 from sme_registry.jax.run import new_program
-from sme_registry.training import RunRecord, jax_learner, train
+from sme_registry.training import RunRecord, learners, train
 from sme_registry.training.models import new_sb3_model, set_weights
 from sme_registry.training.record import CHECKPOINT, read_episodes
 from tests.training.runs import NARROW, PROTOCOL, TINY
@@ -139,13 +139,13 @@ def test_the_model_of_a_stream_has_the_inputs_of_its_phases():
 def interrupted(folder, monkeypatch, **changes):
     """A run that Ctrl-C ends while it writes its first checkpoint."""
     with monkeypatch.context() as patch:
-        save = jax_learner.write_arrays
+        save = learners.write_arrays
 
         def save_and_interrupt(*arguments):
             save(*arguments)
             signal.raise_signal(signal.SIGINT)  # delivered when the record is written, too
 
-        patch.setattr(jax_learner, "write_arrays", save_and_interrupt)
+        patch.setattr(learners, "write_arrays", save_and_interrupt)
         with pytest.raises(KeyboardInterrupt):
             jax_run(folder, **changes)
 

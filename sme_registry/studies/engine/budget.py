@@ -31,8 +31,8 @@ from sme_registry.io import choice
 from sme_registry.spec import Cell, PlannedCell, SMESpec, StudyAlgorithm, StudyFile, StudyPlan
 from sme_registry.spec.study import in_jax, parse_uses
 from sme_registry.studies.engine.result import CellResult
-from sme_registry.training.algorithms import AGENTS, find, is_on_policy, source_of
-from sme_registry.training.hyperparameters import parameters_of
+from sme_registry.training.algorithms import AGENTS, find, is_on_policy, parameters_of
+from sme_registry.training.functions import source_of
 
 # Seconds of one training step with default hyperparameters: on a fast core, and the slowest
 # measured. Other algorithms may be as fast as PPO or as slow as SAC.

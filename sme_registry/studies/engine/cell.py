@@ -47,9 +47,8 @@ from sme_registry.studies.engine.result import (
     life_report,
 )
 from sme_registry.task import Task, materialize, materialize_stream
-from sme_registry.training.algorithms import find, one_thread, quiet
+from sme_registry.training.algorithms import check_hyperparameters, find, one_thread, quiet
 from sme_registry.training.functions import FunctionLearner
-from sme_registry.training.hyperparameters import check_hyperparameters
 from sme_registry.training.learn import Watch
 from sme_registry.training.record import Snapshots
 

@@ -30,8 +30,7 @@ from sme_registry.studies.engine.executors import (
 from sme_registry.studies.engine.ledger import Ledger, SavedState, StudyStatus, label, plan_status
 from sme_registry.studies.engine.programs import CPU, Job, Programs, platform_of
 from sme_registry.studies.engine.result import CellFailure, CellResult, Outcome
-from sme_registry.training.algorithms import code_notice, find
-from sme_registry.training.hyperparameters import check_algorithm
+from sme_registry.training.algorithms import check_algorithm, code_notice, find
 from sme_registry.training.record import versions_for
 
 EXECUTORS = ("processes", "in-process", "ray")
