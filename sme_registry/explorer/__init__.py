@@ -8,9 +8,9 @@ from sme_registry.explorer.page import (
     EPISODES,
     FILE,
     STATIC,
+    check_size,
     explorer_page,
     facts,
-    refuse_large,
     run_report,
     write_explorer,
 )
@@ -23,10 +23,10 @@ __all__ = [
     "STATIC",
     "GraphNode",
     "NetworkProgram",
+    "check_size",
     "explorer_page",
     "facts",
     "program_of_graph",
-    "refuse_large",
     "run_report",
     "write_explorer",
 ]

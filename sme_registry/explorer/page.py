@@ -169,7 +169,7 @@ def facts(
     remark: str = "",
 ) -> dict[str, Any]:
     """The data of a page."""
-    refuse_large(spec)
+    check_size(spec)
     pairs = [_pair(pair, programs.point_width(spec)) for pair in channels]
     task = materialize(spec)
     optimal, limit = programs.optimal(task), programs.limit(task)
@@ -186,6 +186,7 @@ def facts(
     if subject is not None:
         name = _name(subject)
         policies.insert(0, {"name": name, **_policy(subject, task, pairs or [(0, 1)])})
+    probes = () if report is None or report.observation is None else report.observation.probes
     return {
         "title": catalogue.title(spec),
         "name": name,
@@ -199,13 +200,13 @@ def facts(
         "episode": _episode(task, subject, fitted, episodes, seed),
         "training": _training(None if subject is None else subject.log),
         "regions": None if report is None else _regions(report),
-        "probes": _probes(report),
+        "probes": [probe.model_dump() for probe in probes],
         "remark": remark,
         "plan": {} if subject is None else _plan(subject),
     }
 
 
-def refuse_large(spec: SMESpec) -> None:
+def check_size(spec: SMESpec) -> None:
     """Raise OptionError or ResourceLimitError if a task is too large for a page."""
     inputs = programs.point_width(spec)
     if inputs > MAX_INPUTS:
@@ -366,12 +367,6 @@ def _regions(report: EvaluationReport) -> dict[str, Any]:
             for name, regions in shown.items()
         },
     }
-
-
-def _probes(report: EvaluationReport | None) -> list[dict[str, Any]]:
-    if report is None or report.observation is None:
-        return []
-    return [probe.model_dump() for probe in report.observation.probes]
 
 
 def _plan(subject: Subject) -> dict[str, str]:

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -40,11 +40,13 @@ MAX_WIDTH = 2**13  # columns of a value
 
 OPERATIONS: dict[str, Callable[..., Any]] = {
     "dense": lambda x, W, b: x @ W.T + b,
+    "constant": lambda x, v: np.tile(v, (len(x), 1)),
+    "columns": lambda x, columns: x[:, list(columns)],
     "concat": lambda *x: np.concatenate(x, axis=1),
-    "add": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "div": np.divide,
+    "add": lambda x, v: x + v,
+    "sub": lambda x, v: x - v,
+    "mul": lambda x, v: x * v,
+    "div": lambda x, v: x / v,
     "phi": ndtr,
     "round32": lambda x: x.astype(np.float32).astype(np.float64),
     "relu": lambda x: np.maximum(x, 0.0),
@@ -72,21 +74,18 @@ class ProgramStep:
     op: str  # one of those in the module's first lines
     inputs: tuple[int, ...]  # the values that it reads, by their numbers
     width: int  # columns of its value
-    # W and b, or v, by these names
-    arrays: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
-    # other parameters by name, such as low and high
-    numbers: Mapping[str, float] = field(default_factory=dict)
-    columns: tuple[int, ...] = ()  # the columns that `columns` takes
+    parameters: Mapping[
+        str, Any
+    ]  # arrays, numbers, or a tuple of columns, by the operation's names
 
     def compute(self, values: list[Array]) -> Array:
         """Its value `[B, width]`, from all earlier values."""
-        operands = [values[i] for i in self.inputs]
-        operands += [array.astype(np.float64) for array in self.arrays.values()]
-        if self.op == "constant":
-            return np.tile(operands[0], (len(values[0]), 1))
-        if self.op == "columns":
-            return np.asarray(operands[0][:, list(self.columns)])
-        return np.asarray(OPERATIONS[self.op](*operands, **self.numbers))
+        operands = [values[i] for i in self.inputs or (0,)]
+        parameters = {
+            name: value.astype(np.float64) if isinstance(value, np.ndarray) else value
+            for name, value in self.parameters.items()
+        }
+        return np.asarray(OPERATIONS[self.op](*operands, **parameters))
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,14 +110,18 @@ class NetworkProgram:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON data, arrays as text."""
-        steps = []
-        for step in self.steps:
-            data: dict[str, Any] = {"op": step.op, "in": list(step.inputs), "width": step.width}
-            data |= {name: encoded(array) for name, array in step.arrays.items()}
-            data |= dict(step.numbers)
-            if step.columns:
-                data["columns"] = list(step.columns)
-            steps.append(data)
+        steps = [
+            {
+                "op": step.op,
+                "in": step.inputs,
+                "width": step.width,
+                **{
+                    name: encoded(value) if isinstance(value, np.ndarray) else value
+                    for name, value in step.parameters.items()
+                },
+            }
+            for step in self.steps
+        ]
         return {"inputs": self.inputs, "steps": steps}
 
 
@@ -141,7 +144,7 @@ class ProgramBuilder:
 
     def dense(self, x: int, W: npt.NDArray[Any], b: npt.NDArray[Any]) -> int:
         """x Wᵀ + b of weights `[out, in]` and `[out]`."""
-        return self._add("dense", (x,), len(b), arrays={"W": W, "b": b})
+        return self._add("dense", (x,), len(b), W=W, b=b)
 
     def layers(self, x: int, layers: tuple[Layer, ...]) -> int:
         """Φ(W x + b) of each layer: a Deep Uniform Network (METHOD, section 1)."""
@@ -151,7 +154,7 @@ class ProgramBuilder:
 
     def constant(self, v: npt.NDArray[Any]) -> int:
         """The same row in every row."""
-        return self._add("constant", (), len(v), arrays={"v": v})
+        return self._add("constant", (), len(v), v=v)
 
     def columns(self, x: int, columns: tuple[int, ...]) -> int:
         """Some columns of a value; the value itself where they are all, in order."""
@@ -174,11 +177,11 @@ class ProgramBuilder:
             raise ValueError(f"{op} of widths {widths}")
         if isinstance(right, int):
             return self._add(op, (left, right), max(widths))
-        return self._add(op, (left,), max(widths), arrays={"v": right})
+        return self._add(op, (left,), max(widths), v=right)
 
     def unary(self, op: str, x: int, **numbers: float) -> int:
         """A function of each entry, or of each row."""
-        return self._add(op, (x,), self.width(x), numbers=numbers)
+        return self._add(op, (x,), self.width(x), **numbers)
 
     def affine(self, x: int, scale: float, shift: float) -> int:
         """x scale + shift."""
@@ -189,36 +192,21 @@ class ProgramBuilder:
         numbers = [x]
         for step in program.steps:
             inputs = tuple(numbers[i] for i in step.inputs)
-            numbers.append(
-                self._add(
-                    step.op, inputs, step.width,
-                    arrays=step.arrays, numbers=step.numbers, columns=step.columns,
-                )
-            )  # fmt: skip
+            numbers.append(self._add(step.op, inputs, step.width, **step.parameters))
         return numbers[-1]
 
     def build(self) -> NetworkProgram:
         """The program; its output is the newest value."""
         return NetworkProgram(self.inputs, tuple(self._steps))
 
-    def _add(
-        self,
-        op: str,
-        inputs: tuple[int, ...],
-        width: int,
-        *,
-        arrays: Mapping[str, npt.NDArray[Any]] | None = None,
-        numbers: Mapping[str, float] | None = None,
-        columns: tuple[int, ...] = (),
-    ) -> int:
-        arrays = {} if arrays is None else arrays
-        self._weights += sum(array.size for array in arrays.values())
+    def _add(self, op: str, inputs: tuple[int, ...], width: int, **parameters: Any) -> int:
+        self._weights += sum(np.size(v) for v in parameters.values() if isinstance(v, np.ndarray))
         if width > MAX_WIDTH or self._weights > MAX_WEIGHTS:
             raise ResourceLimitError(
                 f"{self._what}: has more than {MAX_WEIGHTS:,} weights, or a layer of more than "
                 f"{MAX_WIDTH:,} units: too large for a page. Use `sme evaluate` or `sme diagnose`."
             )
-        self._steps.append(ProgramStep(op, inputs, width, arrays, numbers or {}, columns))
+        self._steps.append(ProgramStep(op, inputs, width, parameters))
         return self.last
 
 

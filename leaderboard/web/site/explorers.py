@@ -11,7 +11,7 @@ from leaderboard.artefact.network import network_of
 from sme_registry import SMESpec
 from sme_registry.diagnosis import load_policy
 from sme_registry.errors import OptionError, PolicyError, ResourceLimitError
-from sme_registry.explorer import STATIC, explorer_page, refuse_large
+from sme_registry.explorer import STATIC, check_size, explorer_page
 
 __all__ = ["STATIC", "can_show", "explorer"]
 
@@ -25,7 +25,7 @@ _UNKNOWN = (
 def can_show(spec: SMESpec) -> bool:
     """Whether a task is small enough for a page."""
     try:
-        refuse_large(spec)
+        check_size(spec)
     except (OptionError, ResourceLimitError):
         return False
     return True
