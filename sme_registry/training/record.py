@@ -36,7 +36,6 @@ from pydantic import (
 
 from sme_registry.envs.episodes import Episode, EpisodeSafety
 from sme_registry.errors import OptionError
-from sme_registry.evaluation.models import saved_sb3
 from sme_registry.io import read_json, to_json, versions, write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
 from sme_registry.spec.document import Integer, Real, StrictModel, without_empty
@@ -321,14 +320,6 @@ class Snapshots:
         digits = max(2, len(str(count - 1)))
         self.initial = folder / "initial.zip"
         self.visits = [folder / f"visit-{visit:0{digits}}.zip" for visit in range(count)]
-
-    def write_initial(self, model: Any) -> None:
-        """Write a model of Stable-Baselines3 before training; OptionError if that fails."""
-        write_atomically(self.initial, saved_sb3(model))
-
-    def write(self, visit: int, model: Any) -> None:
-        """Write the model at the end of a visit; OptionError if that fails."""
-        write_atomically(self.visits[visit], saved_sb3(model))
 
 
 class VisitEnds:

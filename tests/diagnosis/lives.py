@@ -5,8 +5,10 @@ import numpy as np
 from sme_registry import SMESpec, StreamSpec
 from sme_registry.diagnosis import StreamSubject, diagnose
 from sme_registry.evaluation import dynamic_regret, evaluate_stream, resolve_protocol
+from sme_registry.evaluation.models import saved_sb3
 from sme_registry.evaluation.networks import Perceptron
 from sme_registry.evaluation.references import reference_policy
+from sme_registry.io import write_atomically
 from sme_registry.training import RunRecord
 from sme_registry.training.models import new_sb3_model
 from sme_registry.training.record import SNAPSHOTS, Snapshots
@@ -70,9 +72,9 @@ def write_run(folder, stream, uses):
     visits = stream.cycles * len(stream.phases)
     models = [model_of(uses, stream, seed) for seed in range(visits + 1)]
     kept = Snapshots(folder / SNAPSHOTS, stream)
-    kept.write_initial(models[visits])
+    write_atomically(kept.initial, saved_sb3(models[visits]))
     for visit in range(visits):
-        kept.write(visit, models[visit])
+        write_atomically(kept.visits[visit], saved_sb3(models[visit]))
     report = report_of(
         models[:visits], stream, [0.5] * visits, initial=models[visits], action_range="symmetric"
     )

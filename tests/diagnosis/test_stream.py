@@ -29,6 +29,7 @@ from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.evaluation import StreamReport, evaluate, fresh_per_phase
 from sme_registry.evaluation.models import saved_sb3
 from sme_registry.evaluation.networks import Perceptron
+from sme_registry.io import write_atomically
 from sme_registry.spec import EvaluationProtocol, StudyFile, StudyPlan
 from sme_registry.spec.study import Cell
 from sme_registry.studies import run_study
@@ -447,9 +448,9 @@ def test_a_cell_is_diagnosed_with_its_fresh_agents(tmp_path):
         report = evaluate(policy, each.spec, PROTOCOL)
         write_cell(tmp_path, each, report, regret, model_of("jax:PPO", each.spec))
     kept = Snapshots(tmp_path / "models" / key, TWO)
-    kept.write_initial(model_of("jax:PPO", TWO, 9))
+    write_atomically(kept.initial, saved_sb3(model_of("jax:PPO", TWO, 9)))
     for visit in range(2):
-        kept.write(visit, model_of("jax:PPO", TWO, visit))
+        write_atomically(kept.visits[visit], saved_sb3(model_of("jax:PPO", TWO, visit)))
     result = good("diagnose", tmp_path, "--cell", key[:12], "--states", "64", "--json")
     found = StreamDiagnosis.from_dict(json.loads(result.stdout))
     assert [phase.fresh_online_regret for phase in found.phases] == [0.5, 0.3]
@@ -488,7 +489,8 @@ def test_a_life_that_is_a_fresh_agent_itself_is_not_compared_with_itself(tmp_pat
     model = model_of("jax:PPO", stream)
     report = report_of([HALF], stream, [0.5])
     key = write_cell(tmp_path, cell_of(stream), report, 0.5, model)
-    Snapshots(tmp_path / "models" / key, stream).write(0, model)
+    snapshots = Snapshots(tmp_path / "models" / key, stream)
+    write_atomically(snapshots.visits[0], saved_sb3(model))
     (phase,) = diagnose(load_cell(tmp_path, key), states=64).phases
     assert (phase.fresh_online_regret, phase.fresh_normalised_regret) == (None, None)
     assert phase.fresh_network is None

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from sme_registry.datasets import DatasetRecipe, collect, train_offline
+from sme_registry.envs.schedule import Schedule
 from sme_registry.errors import OptionError, PolicyError, SpecError
 from sme_registry.evaluation import (
     EvaluationReport,
@@ -32,7 +33,6 @@ from sme_registry.evaluation import (
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import write_atomically
-from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.study import Cell
 from sme_registry.studies.engine.programs import Lanes, run_lanes
 from sme_registry.studies.engine.result import (
@@ -46,7 +46,7 @@ from sme_registry.studies.engine.result import (
     Timing,
     life_report,
 )
-from sme_registry.task import Task, materialize, materialize_stream
+from sme_registry.task import materialize, materialize_stream
 from sme_registry.training.algorithms import check_hyperparameters, find, one_thread, quiet
 from sme_registry.training.functions import FunctionLearner
 from sme_registry.training.learn import Watch
@@ -178,8 +178,10 @@ class _Evaluations(Watch):
         models: Path | None = None,
     ) -> None:
         self.cell, self._progress, self._learner = cell, progress, learner
-        self._tasks = _TasksInForce(cell.document)
-        agents = () if cell.spec.team is None else self._tasks.after(0).names
+        stream = cell.stream
+        tasks = (materialize(cell.spec),) if stream is None else materialize_stream(stream)
+        self._schedule = Schedule(cell.document, tasks)
+        agents = () if cell.spec.team is None else tasks[0].names
         self.record = Record((cell,), 1, time.thread_time, agents)
         self._begun = time.thread_time()
         self._life = None if cell.stream is None else _Life(cell, self.record, learner, models)
@@ -234,7 +236,12 @@ class _Evaluations(Watch):
         cell, k = self.cell, self.record.evaluated
         number = k + cell.evaluations - len(self.record.due)  # a function has only the last
         states = start_states(cell.seed, number, cell.evaluation_episodes, cell.spec.state_dim)
-        done = rollouts(self._tasks.shown_to(policy, steps), self._tasks.after(steps), states)
+        # On the task of the last step, or that of the first.
+        segment, stream = self._schedule.segment(max(steps - 1, 0)), cell.stream
+        if stream is not None and stream.observes_phase:
+            assert isinstance(policy, Policy)  # streams have no teams
+            policy = policy.in_phase(int(self._schedule.phases[segment]), stream.observed_phases)
+        done = rollouts(policy, self._schedule.tasks[segment], states)
         row = (
             steps,
             float(done.episode_return.mean()),
@@ -262,31 +269,6 @@ class _Evaluations(Watch):
         total = time.thread_time() - self._begun
         timing = record.timing(steps, 0.0, environment=seconds, total=total)
         return record.result(0, steps, report, timing)
-
-
-class _TasksInForce:
-    """The task of a cell, or those of its stream, by the steps that were taken."""
-
-    def __init__(self, document: SMESpec | StreamSpec) -> None:
-        self._stream: StreamSpec | None = None
-        if isinstance(document, StreamSpec):
-            self._stream, self._tasks = document, materialize_stream(document)
-        else:
-            self._tasks = (materialize(document),)
-
-    def after(self, steps: int) -> Task:
-        """The task on which the last of so many steps was taken, or the first will be."""
-        return self._tasks[self._piece(steps)]
-
-    def shown_to(self, policy: Any, steps: int) -> Any:
-        """The policy of that task's observations, with the phase if the agent observes it."""
-        stream = self._stream
-        if stream is None or not stream.observes_phase:
-            return policy
-        return policy.in_phase(stream.pieces[self._piece(steps)].phase, stream.observed_phases)
-
-    def _piece(self, steps: int) -> int:
-        return 0 if self._stream is None else self._stream.piece_at(max(steps - 1, 0))
 
 
 class _Life:
