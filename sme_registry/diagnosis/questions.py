@@ -69,7 +69,7 @@ SOLVED: dict[str, Answer] = {"solved": "no"}
 """Of every "why" question about a task."""
 
 OPEN_REASONS: dict[str, Answer] = {"learnt_little": "cannot tell", "few_updates": "cannot tell"}
-"""Of every "why" question, in place of a reason that says yes."""
+"""Of every question about a cause, in place of a reason that says yes."""
 
 COMPARISON_REASONS: dict[str, Answer] = {
     "field_raises_regret": "cannot tell",
@@ -177,6 +177,7 @@ class Question(NamedTuple, Generic[C]):
     rule: Callable[[C], Decision]
     reasons: dict[str, Answer]
     needs: str = ""  # the field of `Measurements` without which it is not asked
+    is_cause: bool = False  # whether "yes" names a cause, which a run can leave open
 
     def decide(self, case: C) -> Decision:
         """What the rule decides, with its reason by name."""
@@ -188,12 +189,18 @@ class Question(NamedTuple, Generic[C]):
 
 
 def add_to(
-    questions: dict[str, Question[C]], kind: Kind, needs: str = "", **reasons: Answer
+    questions: dict[str, Question[C]],
+    kind: Kind,
+    needs: str = "",
+    *,
+    is_cause: bool = False,
+    **reasons: Answer,
 ) -> Callable[[Callable[[C], Decision]], Callable[[C], Decision]]:
     """Decorate a rule: add the question of its name, with the answer that each reason gives."""
 
     def add(rule: Callable[[C], Decision]) -> Callable[[C], Decision]:
-        questions[rule.__name__.removeprefix("_")] = Question(kind, rule, reasons, needs)
+        name = rule.__name__.removeprefix("_")
+        questions[name] = Question(kind, rule, reasons, needs, is_cause)
         return rule
 
     return add
@@ -214,7 +221,7 @@ def _verdict(name: str, question: Question[C], case: C, thresholds: Mapping[str,
         own = question.decide(case)
         own_answer = answers[own.reason]
         doubt = None
-        if question.kind == "why" and own_answer == "yes" and own.reason not in _EXPERIMENTS:
+        if question.is_cause and own_answer == "yes" and own.reason not in _EXPERIMENTS:
             doubt = _doubt(case)
         other = _comparison(case, name, own, own_answer, is_open=doubt is not None) or doubt
         decision = own if other is None else other.instead_of(own, own_answer)

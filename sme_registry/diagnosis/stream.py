@@ -21,7 +21,7 @@ import numpy as np
 
 from sme_registry.diagnosis import measure
 from sme_registry.diagnosis.behaviour import network_state
-from sme_registry.diagnosis.document import Answer, Diagnosis, Part, label, table
+from sme_registry.diagnosis.document import Diagnosis, Part, label, table
 from sme_registry.diagnosis.measurements import (
     NetworkState,
     PhaseDiagnosis,
@@ -82,12 +82,12 @@ class StreamDiagnosis(Diagnosis):
                 str(visit.phase),
                 _number(visit.online_regret),
                 _number(visit.normalised_regret),
-                *_network(visit.network),
+                *_cells(visit.network),
             )
             for visit in self.visits
         ]
         if self.initial_network is not None:
-            visits.insert(0, ("initial", "", "", "", *_network(self.initial_network)))
+            visits.insert(0, ("initial", "", "", "", *_cells(self.initial_network)))
         yield Part("Visits", columns, visits)
         phases: dict[str, Callable[[PhaseDiagnosis], str]] = {
             "phase": lambda phase: str(phase.phase),
@@ -109,7 +109,7 @@ _LEGEND = (
 )
 
 
-def _network(network: NetworkState | None) -> tuple[str, ...]:
+def _cells(network: NetworkState | None) -> tuple[str, ...]:
     if network is None:
         return ("–", "–", "–")
     return (
@@ -159,7 +159,7 @@ class StreamCase(Case):
 STREAM_QUESTIONS: dict[str, Question[StreamCase]] = {}
 """Questions about a life, in order."""
 _where = partial(add_to, STREAM_QUESTIONS, "where")
-_why = partial(add_to, STREAM_QUESTIONS, "why")
+_why = partial(add_to, STREAM_QUESTIONS, "why", is_cause=True)
 
 
 def outcome_of(best: float, final: float) -> PhaseOutcome:
@@ -343,7 +343,7 @@ def _against_fresh(visits: Sequence[VisitDiagnosis], fresh: Sequence[float]) -> 
     return Decision(reason, evidence, ("difference",), 1.0 - alone / max(own, 1e-12))
 
 
-_UNKNOWN: dict[str, Answer] = {"network_unknown": "cannot tell", "one_visit": "cannot tell"}
+_network = partial(_why, network_unknown="cannot tell", one_visit="cannot tell")
 
 
 def _change(case: StreamCase, quantity: str) -> dict[str, Any]:
@@ -368,7 +368,7 @@ def _change(case: StreamCase, quantity: str) -> dict[str, Any]:
     }
 
 
-@_why(**_UNKNOWN, units_became_inactive="yes", inactive_from_the_start="yes", units_active="no")
+@_network(units_became_inactive="yes", inactive_from_the_start="yes", units_active="no")
 def _dormant_units(case: StreamCase) -> Decision:
     """Whether hidden units stopped responding to the state."""
     change, network = _change(case, "inactive_units"), case.visits[-1].network
@@ -382,24 +382,25 @@ def _dormant_units(case: StreamCase) -> Decision:
     return Decision(reason, evidence, ("inactive_rise", "inactive_share"))
 
 
-@_why(rank_collapsed="yes", rank_kept="no", **_UNKNOWN)
+@_network(rank_collapsed="yes", rank_kept="no")
 def _rank_collapse(case: StreamCase) -> Decision:
     """Whether the last hidden layer represents fewer directions."""
     change, network = _change(case, "effective_rank"), case.visits[-1].network
     if network is None or "reason" in change:
         return Decision(change["reason"], {})
     collapsed = change["last"] <= _T["rank_ratio"] * change["other"]
-    return Decision(collapsed, change | {"units": network.hidden[-1]}, ("rank_ratio",))
+    evidence = change | {"units": network.hidden[-1]}
+    return Decision("rank_collapsed" if collapsed else "rank_kept", evidence, ("rank_ratio",))
 
 
-@_why(weights_grew="yes", weights_steady="no", **_UNKNOWN)
+@_network(weights_grew="yes", weights_steady="no")
 def _weight_growth(case: StreamCase) -> Decision:
     """Whether weights became so large that steps of the optimiser change little."""
     change = _change(case, "weight_norm")
     if "reason" in change:
         return Decision(change["reason"], {})
     grew = change["last"] >= _T["weight_ratio"] * change["other"]
-    return Decision(grew, change, ("weight_ratio",))
+    return Decision("weights_grew" if grew else "weights_steady", change, ("weight_ratio",))
 
 
 _MOST_STATES = 2048  # in which networks are measured; more would not change the numbers

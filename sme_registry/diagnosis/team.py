@@ -25,6 +25,7 @@ from sme_registry.diagnosis import behaviour, measure
 from sme_registry.diagnosis.document import Diagnosis, Level, Part, Verdict, table, words
 from sme_registry.diagnosis.measurements import LINEAR, POLICY, Measurements, Score
 from sme_registry.diagnosis.questions import (
+    OPEN_REASONS,
     THRESHOLDS,
     Case,
     Decision,
@@ -141,7 +142,10 @@ _LEGEND = (
 )
 
 TEAM_THRESHOLDS = {
-    **{name: THRESHOLDS[name] for name in ("solved", "difference", "on_policy_ratio")},
+    **{
+        name: THRESHOLDS[name]
+        for name in ("solved", "difference", "on_policy_ratio", *OPEN_REASONS)
+    },
     "blame_ratio": 1.5,  # of an agent's share of the regret to its share of the channels
     "one_suffices": 0.5,  # share of the team's regret that correcting one agent removes, at least
     "termination_rate": 0.5,  # share of episodes that one agent ends, at least
@@ -223,7 +227,7 @@ def _unequal_agents(case: TeamCase) -> Decision:
     )
 
 
-@_question(optimum_harder="yes", optimum_not_harder="no", agents_alike="no")
+@_question(is_cause=True, optimum_harder="yes", optimum_not_harder="no", agents_alike="no")
 def _harder_optimum(case: TeamCase) -> Decision:
     """Whether the worst agent's π* is harder: further from what a linear policy attains."""
     worst = case.worst

@@ -21,7 +21,7 @@ from sme_registry.diagnosis.where import distractors_of, limits_of
 
 WHY: dict[str, Question[TaskCase]] = {}
 """Questions about training, in order."""
-_question = partial(add_to, WHY, "why")
+_question = partial(add_to, WHY, "why", is_cause=True)
 _T = THRESHOLDS | SAFETY_THRESHOLDS
 
 _DETERMINISTIC_SD = 1e-6

@@ -14,8 +14,9 @@ from sme_registry.diagnosis import (
     load_policy,
     load_run,
 )
-from sme_registry.diagnosis.measurements import POLICY
-from sme_registry.diagnosis.team import TEAM_QUESTIONS, TEAM_THRESHOLDS
+from sme_registry.diagnosis.measurements import LINEAR, POLICY
+from sme_registry.diagnosis.questions import answer_all
+from sme_registry.diagnosis.team import TEAM_QUESTIONS, TEAM_THRESHOLDS, TeamCase
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.spec import StudyFile, StudyPlan
@@ -152,6 +153,26 @@ def test_an_agent_with_a_harder_optimum_is_distinguished(one_fails):
     assert easy.answer == "no"
     regrets = [each.evidence["linear_normalised_regret"] for each in (easy, verdict)]
     assert regrets[0] < regrets[1]
+
+
+@pytest.mark.parametrize(
+    ("updates", "learnt", "answer"),
+    [(20, 0.79, "yes"), (19, 0.79, "cannot tell"), (None, 0.8, "cannot tell")],
+)
+def test_a_harder_optimum_is_a_cause_only_of_a_team_that_has_learnt(
+    one_fails, updates, learnt, answer
+):
+    *others, driver = one_fails.agents
+    linear = driver.measurements.uniform[LINEAR].model_copy(update={"normalised_regret": 0.9})
+    uniform = {**driver.measurements.uniform, LINEAR: linear}
+    measurements = driver.measurements.model_copy(update={"uniform": uniform})
+    agents = [*others, driver.model_copy(update={"measurements": measurements})]
+    visited = one_fails.visited.model_copy(update={"normalised_regret": learnt})
+    case = TeamCase(agents, SPEC, visited, updates=updates)
+    verdicts = {v.question: v for v in answer_all(TEAM_QUESTIONS, case, TEAM_THRESHOLDS)}
+    verdict = verdicts["harder_optimum"]
+    assert verdict.answer == answer
+    assert "Its optimal policy is harder to learn." in verdict.sentence("team.jinja")
 
 
 def test_an_agent_that_fails_only_where_the_team_takes_it():
