@@ -17,8 +17,8 @@ from pettingzoo import AECEnv
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
+from sme_registry.compiled.arrays import Observation
 from sme_registry.envs.team import SMETeamEnv
-from sme_registry.envs.types import Observation
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.spec import SpecLike
 

@@ -17,8 +17,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled.notice import compiling
-from sme_registry.compiled.values import (
+from sme_registry.compiled.arrays import (
     ACCUMULATED_REWARD,
     COST,
     HAS_MORE,
@@ -38,6 +37,7 @@ from sme_registry.compiled.values import (
     SIMILARITY,
     STEP_REWARD,
 )
+from sme_registry.compiled.notice import compiling
 from sme_registry.io import choice, is_installed, require_packages
 from sme_registry.task import Task, observe, step
 from sme_registry.task.draw import Array, Layer
@@ -78,7 +78,7 @@ class Engine:
     Attributes:
       backend: "numba" or "numpy".
       new_buffer: makes the buffer of a single environment at t = 0, to pass to its steps, and two
-        views of it: the entries of `compiled.values` `[LANE_STATE + S]`, and those behind them
+        views of it: the entries of `compiled.arrays` `[LANE_STATE + S]`, and those behind them
         `[MORE_OWN + 2 + m]`, none without `safety` and `observation`.
       step_float32: one step of one environment, for float32 actions.
       step_float64: the same for float64 actions.

@@ -12,7 +12,7 @@ A task travels as one flat float64 array, because each array argument costs a ca
     inputs, L, observed channels [inputs], for each layer  in, out, W transposed [in, out], b [out].
 A single lane's own numbers follow it in the same array where the task is small (another 40 ns), and
 stand alone where it is not, so that lanes can share it:
-    t, the values of the last step [5] (of `compiled.values`; r_cum is among them), s [S],
+    t, the values of the last step [5] (of `compiled.arrays`; r_cum is among them), s [S],
     room for two layers [2 × widest].
 
 Numba's disk cache does not know a function's flags: never compile one of these a second way.
@@ -26,8 +26,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import boolean, float32, float64, int64, njit, types, void
 
-from sme_registry.compiled.normal_cdf import cell_of, in_cell, normal_cdf
-from sme_registry.compiled.values import (
+from sme_registry.compiled.arrays import (
     ACCUMULATED_REWARD,
     LANE_STATE,
     LANE_T,
@@ -37,6 +36,7 @@ from sme_registry.compiled.values import (
     SIMILARITY,
     STEP_REWARD,
 )
+from sme_registry.compiled.normal_cdf import cell_of, in_cell, normal_cdf
 from sme_registry.task import Task
 from sme_registry.task.draw import Layer
 
@@ -518,7 +518,7 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, values,
       moved: `[S, B]`, written: the next states.
       observation: `[B, S + 1 + n]`, written: s, t/T, and each agent's r_cum/k.
       optimal: `[B, A]`, written: π* of the states acted in.
-      values: `[5, n, B]`, written: the rows of `compiled.values`.
+      values: `[5, n, B]`, written: the rows of `compiled.arrays`.
       ends: `[2, B]`, written: terminated, truncated.
 
     Returns:

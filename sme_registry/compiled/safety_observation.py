@@ -15,20 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import float32, float64, njit, types, uint64, void
 
-from sme_registry.compiled.kernels import (
-    BLOCK_NUMBERS,
-    LANE_FLOAT32,
-    LANE_FLOAT64,
-    PACKED_LANE_FLOAT32,
-    PACKED_LANE_FLOAT64,
-    block_layers,
-    clipped,
-    lane_layers,
-    lane_step,
-    layer_parts,
-    reward_of,
-)
-from sme_registry.compiled.values import (
+from sme_registry.compiled.arrays import (
     COST,
     HAS_MORE,
     LANE_STATE,
@@ -41,6 +28,19 @@ from sme_registry.compiled.values import (
     OWN_KEY,
     SAFE_REGRET,
     STEP_REWARD,
+)
+from sme_registry.compiled.kernels import (
+    BLOCK_NUMBERS,
+    LANE_FLOAT32,
+    LANE_FLOAT64,
+    PACKED_LANE_FLOAT32,
+    PACKED_LANE_FLOAT64,
+    block_layers,
+    clipped,
+    lane_layers,
+    lane_step,
+    layer_parts,
+    reward_of,
 )
 from sme_registry.task import Task
 from sme_registry.task.streams import FIRST_MIX, GOLDEN, SECOND_MIX

@@ -25,18 +25,21 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled.values import (
+from sme_registry.compiled.arrays import (
     COST,
     REGRET,
     REWARD,
     SAFE_REGRET,
     SIMILARITY,
     STEP_REWARD,
+    Array,
+    Indices,
+    Mask,
+    Observation,
 )
 from sme_registry.datasets.recipe import DatasetRecipe
 from sme_registry.datasets.transitions import Transitions
 from sme_registry.envs.batch import Batch
-from sme_registry.envs.types import Array, Indices, Mask, Observation
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import Policy, TeamPolicy, as_policy
 from sme_registry.evaluation.regions import expansion
@@ -205,7 +208,7 @@ class Rows(NamedTuple):
     next_observation: Observation
     action: npt.NDArray[np.float32]  # `[M, A]`
     optimal: Array  # `[M, A]`
-    values: Array  # `[M, 5, n]` the rows of `compiled.values`; with `safety` 7
+    values: Array  # `[M, 5, n]` the rows of `compiled.arrays`; with `safety` 7
     limits: Array  # `[M, 2, A]` the limits and the safe action; without `safety` `[M, 2, 0]`
     distractors: Array  # `[M, m]`
     next_distractors: Array

@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import stdtrit
 
-from sme_registry.compiled.values import REWARD, SIMILARITY
+from sme_registry.compiled.arrays import REWARD, SIMILARITY, Array, Observation
 from sme_registry.datasets.collect import (
     BehaviourEpisodes,
     BehaviourPolicy,
@@ -41,7 +41,6 @@ from sme_registry.datasets.record import EpisodeScores, PolicyScore, ReferenceSc
 from sme_registry.datasets.transitions import Transitions
 from sme_registry.envs.arguments import initial_states
 from sme_registry.envs.batch import Batch
-from sme_registry.envs.types import Array, Observation
 from sme_registry.errors import OptionError, SpecError, StateError
 from sme_registry.evaluation import as_policy
 from sme_registry.evaluation.rollouts import LANES, play

@@ -19,6 +19,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from sme_registry.compiled.arrays import Array, Mask, Observation
 from sme_registry.datasets.collect import ReportProgress, collect
 from sme_registry.datasets.minari_format import (
     DATA,
@@ -34,7 +35,6 @@ from sme_registry.datasets.recipe import DatasetRecipe, parse_behaviour
 from sme_registry.datasets.record import KEY, DatasetRecord, Seeds
 from sme_registry.datasets.scores import reference_scores
 from sme_registry.datasets.transitions import Columns, Transitions
-from sme_registry.envs.types import Array, Mask, Observation
 from sme_registry.errors import (
     DigestMismatchError,
     MalformedDocumentError,

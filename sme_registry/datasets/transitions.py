@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sme_registry.compiled.arrays import Array, Mask, Observation
 from sme_registry.datasets.recipe import DatasetRecipe
-from sme_registry.envs.types import Array, Mask, Observation
 from sme_registry.errors import FingerprintMismatchError
 from sme_registry.evaluation.regions import expansion
 from sme_registry.task import Task

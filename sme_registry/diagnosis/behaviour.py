@@ -32,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.compiled import engine
-from sme_registry.compiled.values import REWARD, STEP_REWARD
+from sme_registry.compiled.arrays import REWARD, STEP_REWARD, Mask, Observation
 from sme_registry.diagnosis.measure import MAX_NUMBERS
 from sme_registry.diagnosis.measurements import (
     LINEAR,
@@ -46,7 +46,6 @@ from sme_registry.diagnosis.measurements import (
 )
 from sme_registry.envs import arguments
 from sme_registry.envs.batch import Batch
-from sme_registry.envs.types import Mask, Observation
 from sme_registry.evaluation import Policy, references
 from sme_registry.evaluation.networks import Perceptron
 from sme_registry.evaluation.regions import States

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sme_registry.compiled import engine
+from sme_registry.compiled.arrays import Observation
 from sme_registry.diagnosis.measurements import (
     LINEAR,
     POLICY,
@@ -35,7 +36,6 @@ from sme_registry.diagnosis.measurements import (
     TimeDependence,
     Violations,
 )
-from sme_registry.envs.types import Observation
 from sme_registry.evaluation import Policy, SafetyReport, SafetyScore, references, regions
 from sme_registry.evaluation.measure import TOLERANCE, SafetyStats
 from sme_registry.evaluation.regions import States, Uniform

@@ -19,6 +19,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from sme_registry.compiled.arrays import Observation
 from sme_registry.diagnosis import measure
 from sme_registry.diagnosis.behaviour import network_state
 from sme_registry.diagnosis.document import Diagnosis, Part, label, table
@@ -38,7 +39,6 @@ from sme_registry.diagnosis.questions import (
     answer_all,
 )
 from sme_registry.diagnosis.subject import StreamSubject
-from sme_registry.envs.types import Observation
 from sme_registry.evaluation import regions
 from sme_registry.evaluation.networks import Perceptron
 from sme_registry.io.markup import fixed, percent

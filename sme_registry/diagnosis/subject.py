@@ -19,8 +19,8 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 from pydantic import JsonValue
 
+from sme_registry.compiled.arrays import Observation
 from sme_registry.diagnosis.behaviour import Log, exploration
-from sme_registry.envs.types import Observation
 from sme_registry.errors import OptionError, SMEError, SpecError, UnknownNameError
 from sme_registry.evaluation import (
     EvaluationReport,

@@ -21,6 +21,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from sme_registry.compiled.arrays import Observation
 from sme_registry.diagnosis import behaviour, measure
 from sme_registry.diagnosis.document import Diagnosis, Level, Part, Verdict, table, words
 from sme_registry.diagnosis.measurements import LINEAR, POLICY, Measurements, Score
@@ -38,7 +39,6 @@ from sme_registry.diagnosis.subject import Subject
 from sme_registry.diagnosis.task import TaskDiagnosis, level, thresholds_of
 from sme_registry.diagnosis.where import WHERE
 from sme_registry.diagnosis.why import WHY
-from sme_registry.envs.types import Observation
 from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.evaluation import Policy, TeamPolicy
 from sme_registry.io.markup import fixed, percent

@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.envs.types import Array, Mask
+from sme_registry.compiled.arrays import Array, Mask
 from sme_registry.errors import (
     ActionError,
     OptionError,

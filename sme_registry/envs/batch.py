@@ -18,18 +18,21 @@ import numpy.typing as npt
 from gymnasium.utils import seeding
 
 from sme_registry.compiled import Engine, engine
-from sme_registry.compiled.engine import StepMany, draw
-from sme_registry.compiled.values import (
+from sme_registry.compiled.arrays import (
     OWN_DISTRACTORS,
     OWN_DRAWN,
     OWN_KEY,
     ROWS,
     ROWS_WITH_SAFETY,
+    Array,
+    Indices,
+    Mask,
+    Observation,
 )
+from sme_registry.compiled.engine import StepMany, draw
 from sme_registry.envs import infos
 from sme_registry.envs.arguments import not_finite_error
 from sme_registry.envs.schedule import Schedule
-from sme_registry.envs.types import Array, Indices, Mask, Observation
 from sme_registry.errors import ActionError
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.task import Task, observe
@@ -49,7 +52,7 @@ class BatchStep(NamedTuple):
       observation: `[B, S + 1 + n]` float32: s, t/T, and each agent's r_cum/k. Of a stream that
         shows its phase, one-hot behind them. With `observation`, M(s, d) `[S + m]` in place of s.
       optimal: `[B, A]` π* of the states acted in, in the unit range.
-      values: `[5, n, B]` the rows of `compiled.values`: similarity, step reward, regret, reward,
+      values: `[5, n, B]` the rows of `compiled.arrays`: similarity, step reward, regret, reward,
         and r_cum after a payout; with `safety` also cost and safe regret.
       terminated: `[B]`.
       truncated: `[B]`.
@@ -169,7 +172,7 @@ class Distractors:
 
     Attributes:
       own: `[2 + m, B]` each environment's key, numbers drawn, and distractors; see
-        `compiled.values`.
+        `compiled.arrays`.
     """
 
     def __init__(self, count: int, num_envs: int) -> None:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.envs.types import Array
+from sme_registry.compiled.arrays import Array
 from sme_registry.errors import OptionError
 from sme_registry.spec import SMESpec
 

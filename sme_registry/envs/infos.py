@@ -14,16 +14,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled.values import (
+from sme_registry.compiled.arrays import (
     ACCUMULATED_REWARD,
     COST,
     REGRET,
     SAFE_REGRET,
     SIMILARITY,
     STEP_REWARD,
+    Array,
+    Indices,
+    Mask,
 )
 from sme_registry.envs.arguments import from_unit
-from sme_registry.envs.types import Array, Indices, Mask
 from sme_registry.spec import SMESpec
 
 if TYPE_CHECKING:

@@ -17,10 +17,10 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
+from sme_registry.compiled.arrays import Array
 from sme_registry.envs import arguments, infos
 from sme_registry.envs.base import TaskMixin
 from sme_registry.envs.batch import Batch, BatchStep
-from sme_registry.envs.types import Array
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.io import integer_in, require_packages
 from sme_registry.spec import SMESpec

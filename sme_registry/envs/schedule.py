@@ -10,8 +10,8 @@ from typing import Any, cast
 
 import numpy as np
 
+from sme_registry.compiled.arrays import Indices, Observation
 from sme_registry.envs import arguments
-from sme_registry.envs.types import Indices, Observation
 from sme_registry.spec import SMESpec, SpecLike, StreamLike, StreamSpec
 from sme_registry.spec.resolve import Resolved, resolve
 from sme_registry.task import Task

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.compiled import engine
-from sme_registry.compiled.values import (
+from sme_registry.compiled.arrays import (
     ACCUMULATED_REWARD,
     HAS_MORE,
     LANE_STATE,
@@ -19,13 +19,16 @@ from sme_registry.compiled.values import (
     MORE_COST,
     MORE_OWN,
     MORE_SAFE_REGRET,
+    Action,
+    Array,
+    Indices,
+    Observation,
 )
 from sme_registry.envs import arguments, infos
 from sme_registry.envs.base import GymnasiumMixin, check_outer_time_limit, html_card
 from sme_registry.envs.batch import Distractors
 from sme_registry.envs.rendering import RENDER_MODES, RenderMixin
 from sme_registry.envs.schedule import Schedule
-from sme_registry.envs.types import Action, Array, Indices, Observation
 from sme_registry.errors import EpisodeError
 from sme_registry.spec import ActionRange, SMESpec, SpecLike, StreamLike, StreamSpec
 from sme_registry.spec.catalogue import title

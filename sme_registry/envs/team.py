@@ -26,12 +26,11 @@ import numpy as np
 import numpy.typing as npt
 from pettingzoo import ParallelEnv
 
-from sme_registry.compiled.values import REWARD, ROWS
+from sme_registry.compiled.arrays import REWARD, ROWS, Array, Indices, Observation
 from sme_registry.envs import arguments, infos
 from sme_registry.envs.base import html_card
 from sme_registry.envs.batch import Batch, BatchStep
 from sme_registry.envs.rendering import RENDER_MODES, RenderMixin
-from sme_registry.envs.types import Array, Indices, Observation
 from sme_registry.errors import ActionError, EpisodeError, OptionError, did_you_mean
 from sme_registry.spec import ActionRange, SpecLike
 from sme_registry.spec.catalogue import title

@@ -11,13 +11,12 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from sme_registry.compiled.values import REWARD
+from sme_registry.compiled.arrays import REWARD, Array, Indices, Mask, Observation
 from sme_registry.envs import arguments, infos
 from sme_registry.envs.base import GymnasiumMixin, check_time_limit, html_card
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.rendering import METADATA, Frame, batch_renderer
 from sme_registry.envs.schedule import Schedule
-from sme_registry.envs.types import Array, Indices, Mask, Observation
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.io import choice, integer_in
 from sme_registry.spec import ActionRange, SMESpec, SpecLike, StreamLike, StreamSpec

@@ -37,8 +37,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.compiled import engine
+from sme_registry.compiled.arrays import Observation
 from sme_registry.compiled.engine import network
-from sme_registry.envs.types import Observation
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation import references
 from sme_registry.evaluation.policies import Policy, TeamPolicy

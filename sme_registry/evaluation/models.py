@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sme_registry.envs.types import Observation
+from sme_registry.compiled.arrays import Observation
 from sme_registry.errors import MissingDependencyError, PolicyError, did_you_mean
 from sme_registry.io import import_object, is_installed, require_packages
 from sme_registry.spec import ACTION_RANGES, ActionRange

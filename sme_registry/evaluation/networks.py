@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.envs.types import Observation
+from sme_registry.compiled.arrays import Observation
 from sme_registry.errors import OptionError, PolicyError, SMEError
 from sme_registry.io import parse_json, to_json, write_atomically
 

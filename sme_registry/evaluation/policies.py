@@ -22,9 +22,9 @@ from typing import Any, ClassVar, Literal, NamedTuple, cast
 
 import numpy as np
 
+from sme_registry.compiled.arrays import Array, Observation
 from sme_registry.envs import arguments
 from sme_registry.envs.team import shared_observation_of
-from sme_registry.envs.types import Array, Observation
 from sme_registry.errors import (
     ActionError,
     OptionError,

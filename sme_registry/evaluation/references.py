@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from sme_registry.compiled import engine
-from sme_registry.envs.types import Observation
+from sme_registry.compiled.arrays import Observation
 from sme_registry.errors import SpecError
 from sme_registry.spec import SMESpec
 from sme_registry.task import materialize

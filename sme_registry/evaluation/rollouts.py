@@ -12,10 +12,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled.values import REGRET, REWARD, SIMILARITY
+from sme_registry.compiled.arrays import (
+    REGRET,
+    REWARD,
+    SIMILARITY,
+    Array,
+    Indices,
+    Mask,
+    Observation,
+)
 from sme_registry.envs.arguments import initial_states, single_agent
 from sme_registry.envs.batch import Batch, BatchStep
-from sme_registry.envs.types import Array, Indices, Mask, Observation
 from sme_registry.evaluation.policies import Policy, TeamPolicy
 from sme_registry.task import Task, streams
 

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from sme_registry.compiled import Engine, engine
-from sme_registry.envs.types import Observation
+from sme_registry.compiled.arrays import Observation
 from sme_registry.evaluation.evaluate import resolve_protocol, versions_behind
 from sme_registry.evaluation.measure import OnBatch, final_specs, same_draw
 from sme_registry.evaluation.policies import Policy, check_count, prefixed_errors, stream_policy

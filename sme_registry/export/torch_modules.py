@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sme_registry.envs.types import Observation
+from sme_registry.compiled.arrays import Observation
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation.models import Interface, device_of, evaluating
 from sme_registry.export.network import INPUT, OPSET, OUTPUT, Network

@@ -15,11 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from sme_registry.compiled.values import (
-    REWARD,
-    ROWS,
-    ROWS_WITH_SAFETY,
-)
+from sme_registry.compiled.arrays import REWARD, ROWS, ROWS_WITH_SAFETY, Array, Mask, Observation
 from sme_registry.envs import SMEEnv, arguments, infos
 from sme_registry.envs.base import html_card, renamed_by_content
 from sme_registry.envs.batch import Batch
@@ -27,7 +23,6 @@ from sme_registry.envs.episodes import Episode, Episodes, info_of_lanes
 from sme_registry.envs.rendering import METADATA, Frame, batch_renderer
 from sme_registry.envs.schedule import Schedule
 from sme_registry.envs.team import shared_action_dim, shared_observation, shared_observation_dim
-from sme_registry.envs.types import Array, Mask, Observation
 from sme_registry.envs.vector import EnvView
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.io import integer_in

@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from sme_registry.compiled.arrays import Action, Array, Mask, Observation
 from sme_registry.envs import arguments
-from sme_registry.envs.types import Action, Array, Mask, Observation
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.seasons.client import PATIENCE, Instance, TicketLike
 from sme_registry.seasons.wire import Float32, StepsAnswer

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sme_registry.envs.types import Observation
+from sme_registry.compiled.arrays import Observation
 from sme_registry.sb3 import LanesVecEnv
 from sme_registry.sb3.vec_env import StepResult
 from sme_registry.seasons.client import PATIENCE, Instance, TicketLike

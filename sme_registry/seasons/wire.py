@@ -49,7 +49,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from sme_registry.envs.types import Mask, Observation
+from sme_registry.compiled.arrays import Mask, Observation
 from sme_registry.errors import ActionError, OptionError, WireError
 from sme_registry.io import integer_in, read_json, require_packages, to_json
 from sme_registry.io.files import atomic_file, unwritable

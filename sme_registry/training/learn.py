@@ -15,8 +15,8 @@ from typing import Any, Protocol
 import numpy as np
 from rich.console import Console
 
+from sme_registry.compiled.arrays import Array
 from sme_registry.envs.episodes import Episode, Episodes
-from sme_registry.envs.types import Array
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation import (
     EvaluationReport,

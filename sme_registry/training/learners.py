@@ -22,8 +22,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 
+from sme_registry.compiled.arrays import Array
 from sme_registry.envs.episodes import Episode, Episodes
-from sme_registry.envs.types import Array
 from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation import Perceptron, Policy, TeamPolicy
 from sme_registry.evaluation.models import saved_sb3, torch_policy

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sme_registry.compiled.values import LANE_STATE, LANE_VALUES, REWARD
+from sme_registry.compiled.arrays import LANE_STATE, LANE_VALUES, REWARD
 
 
 @dataclass

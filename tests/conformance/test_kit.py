@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sme_registry import SMESpec
-from sme_registry.compiled.values import ACCUMULATED_REWARD, LANE_VALUES
+from sme_registry.compiled.arrays import ACCUMULATED_REWARD, LANE_VALUES
 from sme_registry.envs import SMEEnv, SMEVectorEnv
 from sme_registry.envs.team import SMETeamEnv
 from sme_registry.testing import ConformanceError, check_env, check_team

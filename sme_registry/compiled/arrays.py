@@ -1,4 +1,4 @@
-"""Where a step's numbers are: rows of a batch's `values`, and entries of a single environment.
+"""The arrays of environments: their types, and where a step's numbers are in them.
 
 `values` `[5, n, B]` is what one step of a batch computes for n agents in B environments; with
 `safety` there are two more rows. A single environment is one buffer: t, the five values of its last
@@ -7,6 +7,26 @@ numbers behind them: two values of its last step, and its own distractors.
 """
 
 from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+Array: TypeAlias = npt.NDArray[np.float64]
+"""States, joint actions of the unit range, rewards."""
+
+Observation: TypeAlias = npt.NDArray[np.float32]
+"""Observations, each entry in [0, 1]."""
+
+Action: TypeAlias = npt.NDArray[np.floating[Any]]
+"""Actions of an agent, in its environment's range."""
+
+Mask: TypeAlias = npt.NDArray[np.bool_]
+"""`[B]` which environments."""
+
+Indices: TypeAlias = npt.NDArray[np.int64]
+"""Indices of environments, or a count for each of them."""
 
 SIMILARITY, STEP_REWARD, REGRET, REWARD, ACCUMULATED_REWARD = range(5)
 ROWS = 5
