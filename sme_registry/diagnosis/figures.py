@@ -117,7 +117,7 @@ def _bars(
 
 def _shares(axes: Axes, shares: Mapping[str, float], text: str, colours: Any = COLOURS[0]) -> None:
     """A bar along each line, with its value as text behind it."""
-    bars = axes.barh(list(shares), list(shares.values()), 0.65, color=colours)
+    bars = axes.barh(list(shares), list(shares.values()), 0.6, color=colours)
     axes.bar_label(bars, [text.format(share) for share in shares.values()], padding=3, fontsize=8)
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
