@@ -161,8 +161,8 @@ class TestEstimate:
     def test_without_results_it_is_between_a_quick_core_and_a_slow_one(self):
         by_algorithm = {cell.algorithm: cell.cell for cell in ABLATIONS.plan.cells[:3]}
         ppo, td3 = (Estimator().seconds(by_algorithm[name]) for name in ("PPO", "TD3"))
-        assert 60 < ppo.low < 80 < 130 < ppo.high < 180
-        assert 1200 < td3.low < 1250 < 2100 < td3.high < 2200
+        assert 60 < ppo.low < 80 < 120 < ppo.high < 180
+        assert 1200 < td3.low < 1250 < 2400 < td3.high < 2500
 
     def test_a_deep_task_takes_longer_to_judge(self):
         cells = {cell.class_name: cell.cell for cell in ABLATIONS.plan.cells}
@@ -183,9 +183,6 @@ class TestEstimate:
         assert estimator.seconds(ABLATIONS.plan.cells[0].cell) == Estimator().seconds(
             ABLATIONS.plan.cells[0].cell
         )
-        estimator = Estimator([slow])
-        estimator.observe(slow, 600.0)  # by the clock, on cores that are shared
-        assert estimator.seconds(many).low > 500
 
 
 class TestCommands:

@@ -1,4 +1,4 @@
-"""How long a study will take, and plans that fit the time available.
+"""How long cells take, which of a plan run now, and plans with other budgets.
 
 A cell takes, in seconds of one core, with P its steps (times the agents of a team), E its
 evaluations, T the horizon, N the states of its evaluation in and out of distribution, L the layers
@@ -6,10 +6,10 @@ of the optimal policy:
 
     start + P · step + E · T · batch step + N · (state + layer · (L − 1))
 
-A life in a stream takes the last term for each of its tasks at the end. In JAX it is a lane of a
-program of ten on a CPU, and a batch step takes more for each layer, too. Once cells have finished,
-the sum after `start` is multiplied by the median ratio of their measured to their estimated
-seconds, over cells of the same algorithm and setting, or else of the same algorithm.
+A life in a stream takes the last term for each of its tasks. `step` is the algorithm's, all others
+are the same; the ten runs of a program of JAX share the start and the evaluations. Where cells of
+the algorithm have finished, the sum after `start` is multiplied by the median ratio of their
+measured to their estimated seconds.
 
 Budgets and algorithms are part of a cell's content, so a plan with others is another plan with its
 own digest and name. The selection of the cells to run now is not: `selected` works on any plan.
@@ -22,41 +22,37 @@ import math
 import statistics
 import time
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple, cast
 
 from sme_registry.errors import OptionError, SMEError, UnknownNameError, did_you_mean
 from sme_registry.io import choice
-from sme_registry.spec import Cell, PlannedCell, SMESpec, StudyAlgorithm, StudyFile, StudyPlan
+from sme_registry.spec import Cell, PlannedCell, StudyAlgorithm, StudyFile, StudyPlan
 from sme_registry.spec.study import in_jax, parse_uses
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.training.algorithms import AGENTS, find, is_on_policy, parameters_of
 from sme_registry.training.functions import source_of
 
-# Seconds of one training step with default hyperparameters: on a fast core, and the slowest
-# measured. Other algorithms may be as fast as PPO or as slow as SAC.
+# Seconds of one training step with default hyperparameters on a fast core.
 SECONDS_PER_STEP = {
-    "PPO": (0.0006, 0.0013),
-    "A2C": (0.0006, 0.0013),
-    "TD3": (0.012, 0.021),
-    "DDPG": (0.012, 0.021),
-    "SAC": (0.013, 0.024),
-    "jax:PPO": (0.00002, 0.00006),
-    "jax:TD3": (0.006, 0.014),
-    "jax:SAC": (0.005, 0.013),
-    "offline:bc": (0.0015, 0.0030),
-    "offline:iql": (0.006, 0.0110),
+    "PPO": 0.0006,
+    "A2C": 0.0006,
+    "TD3": 0.012,
+    "DDPG": 0.012,
+    "SAC": 0.013,
+    "jax:PPO": 0.00002,
+    "jax:TD3": 0.006,
+    "jax:SAC": 0.005,
+    "offline:bc": 0.0015,
+    "offline:iql": 0.006,
 }
-_UNKNOWN = (SECONDS_PER_STEP["PPO"][0], SECONDS_PER_STEP["SAC"][1])
-_BATCH_STEP = (0.00006, 0.0005)  # one step of all episodes of an evaluation, which run as a batch
-_STATE = (1.5e-6, 3e-6)
-_LAYER = (1e-6, 3e-6)  # of π*, which is evaluated in every state
-_START = (1.5, 4.0)  # a process and its imports
-_START_IN_JAX = (0.4, 2.0)  # a tenth of them, and of compiling
-_BATCH_STEP_IN_JAX = (5e-7, 2e-6)
-_BATCH_LAYER_IN_JAX = (3.6e-6, 1.2e-5)
-_SHARE_FOR_A_PACE = 0.02  # of a job, before its pace is measured
+_FASTEST, _SLOWEST = SECONDS_PER_STEP["PPO"], SECONDS_PER_STEP["SAC"]  # of any other algorithm
+_START = 1.5  # a process and its imports
+_BATCH_STEP = 6e-5  # one step of all episodes of an evaluation, which run as a batch
+_STATE, _LAYER = 1.5e-6, 1e-6  # a state, and a layer of π* in it
+_RUNS_IN_JAX = 10
+_SLOW_CORE = 2.0  # times the seconds of a fast one
 _LONGEST_NAME = 64
 _KINDS: dict[str, Callable[[PlannedCell], str]] = {
     "class": lambda planned: planned.class_name,
@@ -65,42 +61,46 @@ _KINDS: dict[str, Callable[[PlannedCell], str]] = {
 
 
 class Span(NamedTuple):
-    """Bounds in seconds; equal if they come from finished cells."""
+    """Bounds in seconds, of a fast core and a slow one; equal if they come from finished cells."""
 
     low: float
     high: float
 
 
 class Estimator:
-    """Estimates the seconds of cells; improves as cells finish."""
+    """Estimates the seconds of cells on one core, from those that have finished."""
 
     def __init__(self, finished: Iterable[CellResult] = ()) -> None:
-        self._ratios: dict[Hashable, list[float]] = defaultdict(list)
+        ratios = defaultdict(list)
         for result in finished:
-            self.observe(result)
-
-    def observe(self, result: CellResult, seconds: float | None = None) -> None:
-        """Learn from a finished cell, and from its wall time in seconds if that was measured."""
-        expected = _work(result.cell).low
-        if expected > 0 and result.timing.total > 0:
-            took = max(result.timing.total, (seconds or 0.0) - _start(result.cell).low)
-            ratio = took / expected
-            self._ratios[result.cell.uses].append(ratio)
-            self._ratios[result.cell.uses, _setting(result.cell)].append(ratio)
+            expected = _work(result.cell, _FASTEST)
+            if expected > 0:
+                ratios[result.cell.uses].append(result.timing.total / expected)
+        self._ratios = {uses: statistics.median(of_cells) for uses, of_cells in ratios.items()}
 
     def knows(self, cell: Cell) -> bool:
         """Whether a cell of the same algorithm has finished."""
-        return bool(self._ratios.get(cell.uses))
+        return cell.uses in self._ratios
 
     def seconds(self, cell: Cell) -> Span:
-        """Estimate the cell on one core."""
-        work = _work(cell)
-        ratios = self._ratios.get((cell.uses, _setting(cell))) or self._ratios.get(cell.uses)
-        start = _start(cell)
-        if ratios:
-            seconds = start.low + work.low * statistics.median(ratios)
-            return Span(seconds, seconds)
-        return Span(start.low + work.low, start.high + work.high)
+        """Estimate a cell."""
+        start = _START / _RUNS_IN_JAX if in_jax(cell.uses) else _START
+        low, high = _work(cell, _FASTEST), _SLOW_CORE * _work(cell, _SLOWEST)
+        if cell.uses in self._ratios:
+            low = high = low * self._ratios[cell.uses]
+        return Span(start + low, start + high)
+
+
+def _work(cell: Cell, otherwise: float) -> float:
+    """A cell's seconds by the table without its start; `otherwise` is an unknown step's."""
+    kind, name = parse_uses(cell.uses)
+    agents = 1 if cell.spec.team is None else len(cell.spec.team.agents)
+    transitions = 0 if kind == "reference" else cell.steps * agents
+    step = SECONDS_PER_STEP.get(name if kind == "independent" else cell.uses, otherwise)
+    curve = cell.evaluations * cell.spec.horizon * _BATCH_STEP
+    states = cell.protocol.states_per_region * len(cell.protocol.edges)
+    report = sum(_STATE + _LAYER * (spec.complexity - 1) for spec in cell.specs) * states
+    return transitions * step + curve / (_RUNS_IN_JAX if kind == "jax" else 1) + report
 
 
 def makespan(seconds: Sequence[float], workers: int) -> float:
@@ -111,81 +111,46 @@ def makespan(seconds: Sequence[float], workers: int) -> float:
     return max(free, default=0.0)
 
 
-class Paces:
-    """How far the running jobs of a study are, and how long all of it takes."""
+class _Reported(NamedTuple):
+    """When a job first reported, what share of its steps it had done then, and has done now."""
+
+    since: float
+    before: float
+    share: float
+
+
+class Pace:
+    """How long all of a study takes, by the seconds that its work so far took."""
 
     def __init__(
         self, finished: Iterable[CellResult], one_at_a_time: Callable[[Cell], bool]
     ) -> None:
         self._estimator, self._one_at_a_time = Estimator(finished), one_at_a_time
-        self._shares: dict[str, float] = {}  # of a running cell's steps, done
-        # Of each job, the first report after it last compiled: time, share, compilations.
-        self._first_reports: dict[str, tuple[float, float, int]] = {}
-        self._paces: dict[str, float] = {}  # measured by estimated seconds, of each algorithm
+        self._reported: dict[str, _Reported] = {}  # by a job's first cell
+        self._measured: dict[str, tuple[float, float]] = {}  # a job's seconds, and as estimated
 
-    def observe(self, result: CellResult, seconds: float) -> None:
-        """Learn from a finished cell and its share of its job's wall time."""
-        self._estimator.observe(result, seconds)
-
-    def report(self, cells: Sequence[Cell], share: float, compilations: int) -> None:
+    def report(self, cells: Sequence[Cell], share: float) -> None:
         """The cells of a job have done this share of their steps."""
-        first, now = cells[0], time.monotonic()
-        then, before, compiled = self._first_reports.get(first.digest, (now, share, -1))
-        if compilations != compiled:
-            then, before = now, share
-            self._first_reports[first.digest] = (now, share, compilations)
-        if share - before >= _SHARE_FOR_A_PACE:  # a program may go on from far beyond its start
-            measured = (now - then) / (share - before) / len(cells)
-            self._paces[first.uses] = 2 * measured / sum(self._estimator.seconds(first))
-        self._shares |= {cell.digest: share for cell in cells}
+        key, now = cells[0].digest, time.monotonic()
+        first = self._reported.get(key, _Reported(now, share, share))
+        self._reported[key] = first._replace(share=share)
+        done = (share - first.before) * sum(map(self._seconds, cells))
+        self._measured[key] = now - first.since, done
 
     def seconds_left(self, jobs: Iterable[Sequence[Cell]], workers: int) -> float:
         """Seconds to the end of the cells of running jobs and of those that wait."""
+        took, estimated = (sum(values[i] for values in self._measured.values()) for i in (0, 1))
+        pace = took / estimated if estimated else 1.0
         seconds: dict[bool, list[float]] = {True: [], False: []}  # one at a time; others
         for cells in jobs:
-            rests = (self._seconds(c) * (1 - self._shares.get(c.digest, 0.0)) for c in cells)
-            seconds[self._one_at_a_time(cells[0])].append(sum(rests))
+            reported = self._reported.get(cells[0].digest)
+            left = 1.0 if reported is None else 1.0 - reported.share
+            rest = pace * left * sum(map(self._seconds, cells))
+            seconds[self._one_at_a_time(cells[0])].append(rest)
         return max(sum(seconds[True]), makespan(seconds[False], workers))
 
     def _seconds(self, cell: Cell) -> float:
-        """A whole cell's; before one of its algorithm has finished, by the pace of running ones."""
-        low, high = self._estimator.seconds(cell)
-        pace = 1.0 if self._estimator.knows(cell) else self._paces.get(cell.uses, 1.0)
-        return pace * (low + high) / 2
-
-
-def _work(cell: Cell) -> Span:
-    """A cell's seconds by the table, without its start."""
-    kind, name = parse_uses(cell.uses)
-    transitions = 0 if kind == "reference" else cell.steps * _agents(cell.spec)
-    states = cell.protocol.states_per_region * len(cell.protocol.edges)
-    step = SECONDS_PER_STEP.get(name if kind == "independent" else cell.uses, _UNKNOWN)
-
-    inner = [spec.complexity - 1 for spec in cell.specs]
-    layers = sum(inner) / len(inner)
-
-    def bound(i: int) -> float:
-        training = transitions * step[i]
-        batch_step = _BATCH_STEP[i]
-        if in_jax(cell.uses):
-            batch_step = _BATCH_STEP_IN_JAX[i] + _BATCH_LAYER_IN_JAX[i] * layers
-        curve = cell.evaluations * cell.spec.horizon * batch_step
-        return training + curve + states * len(inner) * (_STATE[i] + _LAYER[i] * layers)
-
-    return Span(bound(0), bound(1))
-
-
-def _start(cell: Cell) -> Span:
-    return Span(*(_START_IN_JAX if in_jax(cell.uses) else _START))
-
-
-def _agents(spec: SMESpec) -> int:
-    """How many transitions a step gives."""
-    return 1 if spec.team is None else len(spec.team.agents)
-
-
-def _setting(cell: Cell) -> Hashable:
-    return tuple(spec.model_copy(update={"seed": 0}) for spec in cell.specs)
+        return sum(self._estimator.seconds(cell)) / 2
 
 
 def scaled(

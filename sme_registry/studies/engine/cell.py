@@ -143,7 +143,7 @@ def _run_function(
 def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> CellResult:
     """Run a cell that uses JAX as the only lane of a program."""
 
-    def report(done: int, total: int, compilations: int = 0, note: str = "", /) -> None:
+    def report(done: int, total: int, note: str = "", /) -> None:
         progress(done, total)
 
     ((entry, model, snapshots),) = run_lanes((cell,), Lanes(1), report, model_path is not None)

@@ -109,12 +109,12 @@ def _throttled(report: Report) -> Report:
     """Pass on a report if the last one is some time ago, at the end, and with a note."""
     last = 0.0
 
-    def throttled(done: int, total: int, compilations: int = 0, note: str = "", /) -> None:
+    def throttled(done: int, total: int, note: str = "", /) -> None:
         nonlocal last
         now = time.monotonic()
         if now - last >= _SECONDS_BETWEEN_REPORTS or done >= total or note:
             last = now
-            report(done, total, compilations, note)
+            report(done, total, note)
 
     return throttled
 
@@ -230,7 +230,6 @@ class _Steps(NamedTuple):
 
     done: int
     total: int
-    compilations: int
     note: str
 
 

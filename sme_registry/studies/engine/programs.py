@@ -99,7 +99,7 @@ class Job:
 class Report(Protocol):
     """What a job calls while it runs."""
 
-    def __call__(self, done: int, total: int, compilations: int = 0, note: str = "", /) -> None:
+    def __call__(self, done: int, total: int, note: str = "", /) -> None:
         """Report how far a job is."""
 
 
@@ -414,14 +414,12 @@ class _ProgramRun:
         self._record.spend(EVALUATION)
 
     def _after_piece(self) -> None:
-        from sme_registry.jax.device import compilations
-
         self._note_failures()
         if time.monotonic() - self._last_state >= SECONDS_BETWEEN_STATES:
             self._save()
             self._last_state = time.monotonic()
         steps = self._cell.steps
-        self._progress(min(self._program.steps, steps), steps, compilations())
+        self._progress(min(self._program.steps, steps), steps)
 
     def _note_failures(self) -> None:
         failed_at = self._record.arrays["failed_at"]
@@ -474,7 +472,7 @@ class _ProgramRun:
             check_forms(records, own)
             self._program.restore(_named(arrays, _PROGRAM))
         except OptionError as error:
-            self._progress(0, self._cell.steps, 0, f"starts again, without {state}: {error}")
+            self._progress(0, self._cell.steps, f"starts again, without {state}: {error}")
             return
         self._weights = weights
         self._record.restore({n: a for n, a in records.items() if n not in weights})

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
-import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -18,7 +17,7 @@ from sme_registry.io import Lock, integer_in
 from sme_registry.io.terminal import Progress, duration
 from sme_registry.spec import Cell, PlannedCell, StudyFile, StudyPlan
 from sme_registry.spec.study import in_jax
-from sme_registry.studies.engine.budget import Paces, first_places, selected, with_sources
+from sme_registry.studies.engine.budget import Pace, first_places, selected, with_sources
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.executors import (
     Executor,
@@ -55,13 +54,13 @@ def run_study(
     """Run the cells of a plan that have no result in the folder, and return their state.
 
     Each result is written as soon as its cell ends. If this process ends early, for any reason, the
-    same call continues. Cells that another process is running are waited for at the end.
+    same call continues. Cells that another process is running are waited for at the end. The plan
+    becomes the folder's, and results of earlier plans stay.
 
-    Cells that use `jax:…` run together, as lanes of one program, in any executor: on a CPU a
-    program on each core, on another device one at a time.
+    Cells that use `jax:…` run together in one program, in any executor: on a CPU a program on each
+    core, on another device one at a time.
 
     Args:
-      plan_file: the plan; it becomes the folder's, and results of earlier plans stay.
       executor: "processes", one for each cell; "in-process"; "ray"; or an `Executor`.
       jobs: cells or programs at once; None for one per core, of this machine or of the cluster.
       ray: "local", or the address of a Ray cluster.
@@ -94,7 +93,7 @@ def run_study(
     with_jax = run is run_cell and any(in_jax(cell.cell.uses) for cell in planned.values())
     programs = _programs(plan_file.plan, device, lanes, on_ray=on_ray) if with_jax else None
     if not with_jax:
-        _refuse_without_jax(device=device, lanes=lanes)
+        _check_no_jax_options(device=device, lanes=lanes)
     runs_on = _executor(executor, jobs, ray, run, keep_models)
     ledger = Ledger(folder)
     earlier_plan = ledger.plan_file()
@@ -105,11 +104,12 @@ def run_study(
         ledger.write_plan(plan_file)
     if queue.finished < len(planned):
         ledger.write_request(plan_file, only)
-    study = _StudyRun(plan_file, planned, queue, runs_on, console, progress)
+    title = f"study {plan_file.versioned_name}"
+    study = _StudyRun(title, planned, queue, runs_on, console, progress)
     ledger.warn = study.say
-    study.announce(earlier_plan)
-    if keep_models:
-        study.announce_missing_models(ledger)
+    study.announce()
+    for notice in _notices(ledger, earlier_plan, plan_file, queue, keep_models):
+        study.say(notice)
     try:
         study.run()
     except KeyboardInterrupt:
@@ -134,7 +134,7 @@ def _check(plan: StudyPlan, planned: Collection[PlannedCell], console: Console |
         find(cell.cell.uses).check_task(cell.cell.document)
 
 
-def _refuse_without_jax(**options: Any) -> None:
+def _check_no_jax_options(**options: Any) -> None:
     """Raise OptionError if an option is given that is for agents in JAX alone."""
     for name, value in options.items():
         if value is not None:
@@ -182,20 +182,10 @@ def _check_room(programs: Programs, queue: Queue, workers: int) -> None:
 
 
 class _RunningCell(NamedTuple):
-    """A cell that runs: its lock, when its job started, and the job."""
+    """A cell that runs: its lock and its job."""
 
     lock: Lock
-    started: float
     job: Job
-
-
-class EndedCell(NamedTuple):
-    """A cell that has been written, with its job, and whether that has ended."""
-
-    entry: CellResult | CellFailure
-    seconds: float  # of the job, for each of its cells
-    job: Job
-    last: bool
 
 
 class Queue:
@@ -203,8 +193,8 @@ class Queue:
 
     Any number of runs may share a folder at once, on one machine or on several that share it: the
     lock of a cell decides who runs it, and its result file says that it is done. Cells are claimed
-    when a worker is free: one, or as many as a program has lanes, so that the others are left to
-    other runs.
+    when a worker is free: one, or as many as a program has runs, so that the others are left to
+    other processes.
     """
 
     def __init__(
@@ -232,25 +222,23 @@ class Queue:
         programs = self._programs
         return programs is not None and programs.one_at_a_time and in_jax(cell.uses)
 
-    def unfinished(self) -> list[Sequence[Cell]]:
-        """The cells of each running job, and each waiting one alone."""
-        jobs = {id(running.job): running.job.cells for running in self._running.values()}
-        return [*jobs.values(), *((planned.cell,) for planned in self.waiting.values())]
+    @property
+    def running(self) -> list[Job]:
+        """The jobs with cells that have not ended."""
+        return list({id(running.job): running.job for running in self._running.values()}.values())
 
-    def jobs(self) -> Iterator[Job | EndedCell | None]:
+    def jobs(self) -> Iterator[Job | None]:
         """Jobs of locked cells; None while no cell is available.
 
-        Before them come cells that could not be written when they ended, and now were. The folder
-        may not be writable: running cells are then left to finish, since there may be space again,
-        and their outcomes are kept in memory until they are written.
+        The folder may not be writable: running cells are then left to finish, since there may be
+        space again, and their outcomes are kept in memory until they are written, before new jobs.
         """
         while self.waiting or self._unwritten:
             job = None
             try:
                 for outcome in list(self._unwritten):
-                    ended = self.write(outcome)
+                    self.write(outcome)
                     self._unwritten.remove(outcome)
-                    yield ended
                 job = self._next_job()
             except OptionError:
                 if len(self._running) == len(self._unwritten):
@@ -261,20 +249,19 @@ class Queue:
         """Keep an outcome that could not be written."""
         self._unwritten.append(outcome)
 
-    def write(self, outcome: Outcome) -> EndedCell:
+    def write(self, outcome: Outcome) -> None:
         """Write how a cell ended, and release its lock; OptionError if it cannot be written."""
         entry, key = outcome.entry, outcome.entry.key
         if isinstance(entry, CellFailure) and key in self._failures:
             attempts = self._failures[key].attempts + 1
             entry = entry.model_copy(update={"attempts": attempts})
         self._ledger.write(entry, outcome.model, outcome.snapshots)
-        lock, started, job = self._running.pop(key)
+        lock, job = self._running.pop(key)
         lock.release()
         self._count(entry)
-        last = not any(cell.digest in self._running for cell in job.cells)
-        if last and job.lanes is not None and job.lanes.state is not None:
+        ended = not any(cell.digest in self._running for cell in job.cells)
+        if ended and job.lanes is not None and job.lanes.state is not None:
             self._ledger.remove_states(job.lanes.state)
-        return EndedCell(entry, (time.monotonic() - started) / len(job.cells), job, last)
 
     def release(self) -> None:
         """Release the locks of all cells that run."""
@@ -287,7 +274,7 @@ class Queue:
 
     def _next_job(self) -> Job | None:
         """Claim the next cells that still have to run; None if there are none to claim now."""
-        occupied = any(self.one_at_a_time(c) for r in self._running.values() for c in r.job.cells)
+        occupied = any(self.one_at_a_time(cell) for job in self.running for cell in job.cells)
         for key, planned in list(self.waiting.items()):
             if occupied and self.one_at_a_time(planned.cell):
                 continue
@@ -305,10 +292,10 @@ class Queue:
         """Claim a cell and the others of its program: those of a saved state, or the next ones."""
         if self._ledger.is_running(first):
             return None
-        alone = self._ledger.claim_lock()
-        if alone is None:
+        claiming = self._ledger.claim_lock()
+        if claiming is None:
             return None
-        with alone, contextlib.ExitStack() as stack:  # releases all of them if one raises
+        with claiming, contextlib.ExitStack() as stack:  # releases all of them if one raises
             cells, locks = list[Cell](), list[Lock]()
             program = programs.program(self._planned[first].cell)
             saved = self._ledger.state_of(first, program.made_with)
@@ -329,7 +316,7 @@ class Queue:
         return self._started(Job(tuple(cells), program), locks)
 
     def _candidates(self, programs: Programs, first: str, saved: SavedState | None) -> list[str]:
-        """The waiting cells that may be lanes of the program of the first one, which leads."""
+        """The waiting cells that may be runs of the program of the first one, which leads."""
         group = programs.group(self._planned[first].cell)
         others = self.waiting if saved is None else saved.keys
         return [first] + [
@@ -345,18 +332,15 @@ class Queue:
         lock = self._ledger.lock(key)
         if lock is None:
             return None
-        try:
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(lock)
             self._ledger.set_aside(key)
             result, failure = self._ledger.result(key), self._ledger.failure(key)
-        except BaseException:
-            lock.release()
-            raise
-        earlier = self._failures.get(key)
-        attempts = earlier.attempts if earlier else 0
-        failed_since = failure is not None and failure.attempts > attempts
-        if result is None and not failed_since:
-            return lock
-        lock.release()
+            earlier = self._failures.get(key)
+            attempts = earlier.attempts if earlier else 0
+            if result is None and (failure is None or failure.attempts <= attempts):
+                stack.pop_all()
+                return lock
         del self.waiting[key]
         entry = result or failure
         assert entry is not None
@@ -364,10 +348,9 @@ class Queue:
         return None
 
     def _started(self, job: Job, locks: Sequence[Lock]) -> Job:
-        now = time.monotonic()
         for cell, lock in zip(job.cells, locks, strict=True):
             del self.waiting[cell.digest]
-            self._running[cell.digest] = _RunningCell(lock, now, job)
+            self._running[cell.digest] = _RunningCell(lock, job)
         return job
 
 
@@ -376,17 +359,17 @@ class _StudyRun:
 
     def __init__(
         self,
-        file: StudyFile,
-        planned: dict[str, PlannedCell],
+        title: str,
+        planned: Mapping[str, PlannedCell],
         queue: Queue,
         executor: Executor,
         console: Console,
         progress: bool,
     ) -> None:
-        self._file, self._planned, self._queue, self._executor = file, planned, queue, executor
-        self._paces = Paces(queue.results.values(), queue.one_at_a_time)
+        self._title, self._planned, self._queue, self._executor = title, planned, queue, executor
+        self._pace = Pace(queue.results.values(), queue.one_at_a_time)
         self._progress = Progress(
-            f"study {file.versioned_name}",
+            title,
             len(planned),
             done=queue.finished,
             console=console,
@@ -395,7 +378,7 @@ class _StudyRun:
             enabled=progress,
         )
         self.say = self._progress.message
-        self._shown = queue.finished, queue.failed
+        self._shown: dict[str, Job] = {}  # running jobs, by name
 
     def run(self) -> None:
         """Run every waiting cell."""
@@ -406,27 +389,28 @@ class _StudyRun:
             try:
                 with contextlib.closing(outcomes):  # ends running cells before their locks go
                     for outcome in outcomes:
-                        self._handle(outcome)
+                        self._write(outcome)
+                        self._show()
             finally:
                 self._queue.release()
 
-    def _jobs(self) -> Iterator[Job | None]:
-        for item in self._queue.jobs():
-            if isinstance(item, EndedCell):
-                self._show(item)
-                continue
-            if item is not None:
-                self._progress.start_part(self._name(item), "compiling" if item.lanes else "")
-            if self._shown != (self._queue.finished, self._queue.failed):  # by another run
-                self._show()
-            yield item
+    def seconds_left(self) -> float:
+        """Seconds to the end, as estimated now."""
+        waiting = ((planned.cell,) for planned in self._queue.waiting.values())
+        running = (job.cells for job in self._queue.running)
+        return self._pace.seconds_left([*running, *waiting], self._executor.workers)
 
-    def _handle(self, outcome: Outcome) -> None:
+    def _jobs(self) -> Iterator[Job | None]:
+        for job in self._queue.jobs():
+            self._show()
+            yield job
+
+    def _write(self, outcome: Outcome) -> None:
         entry = outcome.entry
         if isinstance(entry, CellFailure):
             self.say(f"failed: {label(self._planned[entry.key])}: {entry.error}")
         try:
-            self._show(self._queue.write(outcome))
+            self._queue.write(outcome)
         except OptionError as error:
             self._queue.keep(outcome)
             self.say(
@@ -434,84 +418,79 @@ class _StudyRun:
                 "memory, and are lost only if this process ends before it can write them."
             )
 
-    def _report(
-        self, job: Job, done: int, total: int, compilations: int = 0, note: str = ""
-    ) -> None:
+    def _report(self, job: Job, done: int, total: int, note: str = "") -> None:
         if note:
             self.say(f"{self._name(job)}: {note}")
             return
         share = done / total if total else 1.0
-        self._paces.report(job.cells, share, compilations)
+        self._pace.report(job.cells, share)
         state = f"{done:,} of {total:,} steps" if done < total else "evaluating"
         self._progress.update_part(self._name(job), share, state)
 
-    def _show(self, ended: EndedCell | None = None) -> None:
-        if ended is not None and isinstance(ended.entry, CellResult):
-            self._paces.observe(ended.entry, ended.seconds)
-        if ended is not None and ended.last:
-            self._progress.end_part(self._name(ended.job))
-        self._shown = finished, failed = self._queue.finished, self._queue.failed
-        self._progress.update(finished, f"{failed} failed" if failed else "")
+    def _show(self) -> None:
+        """Show which jobs run, also those that another process has finished."""
+        running = {self._name(job): job for job in self._queue.running}
+        for name in self._shown.keys() - running.keys():
+            self._progress.end_part(name)
+        for name, job in running.items():
+            if name not in self._shown:
+                self._progress.start_part(name, "compiling" if job.lanes else "")
+        self._shown = running
+        failed = self._queue.failed
+        self._progress.update(self._queue.finished, f"{failed} failed" if failed else "")
 
-    def seconds_left(self) -> float:
-        """Seconds to the end, as estimated now."""
-        return self._paces.seconds_left(self._queue.unfinished(), self._executor.workers)
-
-    def _name(self, job: Job) -> str:
-        """What people call a job: `PPO on k-25, run 3`, or `…, and 9 more`."""
-        first, *others = (label(self._planned[cell.digest]) for cell in job.cells)
-        return f"{first}, and {len(others)} more" if others else first
-
-    def announce(self, earlier_plan: StudyFile | None) -> None:
+    def announce(self) -> None:
         """Print what is done, what is reused, and what will run."""
-        queue, say = self._queue, self.say
-        if earlier_plan is not None and earlier_plan.digest != self._file.digest:
-            say(
-                f"The folder's plan was {earlier_plan.versioned_name} "
-                f"({earlier_plan.digest[:19]}…) and is now {self._file.versioned_name} "
-                f"({self._file.digest[:19]}…). Results of cells in both plans are reused; the "
-                "others stay in the folder."
-            )
-        parts = [f"{len(self._planned):,} cells"]
+        queue, cells = self._queue, len(self._planned)
+        parts = [f"{cells:,} cells"]
         if queue.finished:
             parts.append(f"{queue.finished:,} finished before and reused")
-        skipped = len(self._planned) - queue.finished - len(queue.waiting)
+        skipped = cells - queue.finished - len(queue.waiting)
         if skipped:
             parts.append(f"{skipped:,} failed before (--retry runs them again)")
         parts.append(f"{len(queue.waiting):,} to run")
         if queue.waiting:
             parts.append(f"{self._executor.workers} at once")
             parts.append(f"about {duration(self.seconds_left())}")
-        say(f"study {self._file.versioned_name}: {' · '.join(parts)}")
-        self._announce_other_versions()
+        self.say(f"{self._title}: {' · '.join(parts)}")
 
-    def _announce_other_versions(self) -> None:
-        installed = functools.cache(versions_for)
-        count, differences = 0, set[str]()
-        for result in self._queue.results.values():
-            now = installed(result.cell.uses)
-            different = {
-                f"{package} {version} (installed: {now[package]})"
-                for package, version in result.versions.items()
-                if now.get(package, version) != version
-            }
-            count, differences = count + bool(different), differences | different
-        if count:
-            self.say(
-                f"{count:,} of the reused results come from other package versions: "
-                f"{', '.join(sorted(differences))}. For results of one set of versions, run the "
-                "plan in a new folder."
-            )
+    def _name(self, job: Job) -> str:
+        """What people call a job: `PPO on k-25, run 3`, or `…, and 9 more`."""
+        first, *others = (label(self._planned[cell.digest]) for cell in job.cells)
+        return f"{first}, and {len(others)} more" if others else first
 
-    def announce_missing_models(self, ledger: Ledger) -> None:
-        """Say how many finished cells will stay without a model."""
-        missing = sum(
-            # Only a cell that learnt by acting leaves a model.
-            result.online_regret is not None and not ledger.model_path(result.key).exists()
-            for result in self._queue.results.values()
+
+def _notices(
+    ledger: Ledger, earlier: StudyFile | None, file: StudyFile, queue: Queue, keep_models: bool
+) -> Iterator[str]:
+    """What a reader of the results should know before the run."""
+    if earlier is not None and earlier.digest != file.digest:
+        yield (
+            f"The folder's plan was {earlier.versioned_name} ({earlier.digest[:19]}…) and is now "
+            f"{file.versioned_name} ({file.digest[:19]}…). Results of cells in both plans are "
+            "reused; the others stay in the folder."
         )
-        if missing:
-            self.say(
-                f"{missing:,} of the finished cells have no model and are not run again. To get "
-                "their models, run the plan in a new folder."
-            )
+    installed = functools.cache(versions_for)
+    others, differences, without_model = 0, set[str](), 0
+    for result in queue.results.values():
+        now = installed(result.cell.uses)
+        different = {
+            f"{package} {version} (installed: {now[package]})"
+            for package, version in result.versions.items()
+            if now.get(package, version) != version
+        }
+        others, differences = others + bool(different), differences | different
+        # Only a cell that learnt by acting leaves a model.
+        learnt = result.online_regret is not None
+        without_model += learnt and not ledger.model_path(result.key).exists()
+    if others:
+        yield (
+            f"{others:,} of the reused results come from other package versions: "
+            f"{', '.join(sorted(differences))}. For results of one set of versions, run the plan "
+            "in a new folder."
+        )
+    if keep_models and without_model:
+        yield (
+            f"{without_model:,} of the finished cells have no model and are not run again. To get "
+            "their models, run the plan in a new folder."
+        )

@@ -212,20 +212,15 @@ def test_the_time_left_does_not_count_compiling_as_the_speed_of_training(tmp_pat
     class Reporting(Refusing):
         def map(self, jobs, progress):
             first = next(jobs)
-            for now[0], done, compilations in (
-                (60.0, 100, 1),
-                (120.0, 200, 2),  # it compiled again
-                (121.0, 300, 2),
-                (122.0, 400, 2),
-            ):
-                progress(first, done, 1000, compilations)
+            for now[0], done in ((60.0, 100), (61.0, 200), (62.0, 300)):
+                progress(first, done, 1000)
                 seconds_left.append(progress.__self__.seconds_left())
             yield from (failed(cell, "refused", "") for cell in first.cells)
 
     only = ["algorithm=PPO", "class=delayed"]
     run_study(file, tmp_path, executor=Reporting(), device="cpu", only=only, progress=False)
-    assert seconds_left[0] == pytest.approx(seconds_left[1] * 9 / 8)  # both from a table
-    assert seconds_left[2:] == pytest.approx([7.0, 6.0])
+    assert seconds_left[0] < 100.0  # from a table, not 540 s
+    assert seconds_left[1:] == pytest.approx([8.0, 7.0])
 
 
 def test_programs_on_ray_run_on_cpus_alone(tmp_path):
