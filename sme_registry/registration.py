@@ -86,9 +86,8 @@ def register(spec: SMESpec | StreamSpec, name: str) -> str:
     """
     from sme_registry.envs.base import argument_of
     from sme_registry.spec import SMESpec
-    from sme_registry.spec.catalogue import NAMESPACE, SYMMETRIC
-    from sme_registry.spec.resolve import as_document, registered
-    from sme_registry.task.streams import DYNAMICS_VERSION
+    from sme_registry.spec.catalogue import NAMESPACE, SYMMETRIC, as_document, registered
+    from sme_registry.task.draw import DYNAMICS_VERSION
 
     document = as_document(spec)
     short = str(name).removeprefix(f"{NAMESPACE}/").removesuffix(f"-v{DYNAMICS_VERSION}")
@@ -120,7 +119,7 @@ def register(spec: SMESpec | StreamSpec, name: str) -> str:
 
 
 def _document_of(name: str) -> SMESpec | StreamSpec:
-    from sme_registry.spec.resolve import resolve
+    from sme_registry.spec.catalogue import resolve
 
     return resolve(name).document
 
@@ -175,26 +174,21 @@ def save(
       >>> sme_registry.load(path) == spec
       True
     """
-    from sme_registry.spec import EnvFile, StreamFile, StreamSpec
-    from sme_registry.spec.resolve import as_document
-    from sme_registry.task import materialize, materialize_together
-    from sme_registry.task.fingerprint import fingerprint_of
+    from sme_registry.spec.catalogue import as_document, file_of
+    from sme_registry.task import materialize_together
+    from sme_registry.task.loading import fingerprint_of
 
-    fields: dict[str, Any] = {
-        "name": Path(path).stem.removesuffix("-v1") if name is None else name,
-        "description": description,
-        "tags": tags,
-    }
-    saved = as_document(spec)
-    if isinstance(saved, StreamSpec):
-        tasks = materialize_together(saved, [phase.spec for phase in saved.phases])
-        prints = [fingerprint_of(task).to_dict() for task in tasks]
-        document = {"stream": saved.to_dict(), "digest": saved.digest, "fingerprints": prints}
-        StreamFile.from_dict(fields | document, str(path)).write(path)
-        return Path(path)
-    fingerprint = fingerprint_of(materialize(saved)).to_dict()
-    document = {"spec": saved.to_dict(), "digest": saved.digest, "fingerprint": fingerprint}
-    EnvFile.from_dict(fields | document, str(path)).write(path)
+    document = as_document(spec)
+    fingerprints = [fingerprint_of(task) for task in materialize_together(document.specs)]
+    file = file_of(
+        document,
+        fingerprints,
+        str(path),
+        name=Path(path).stem.removesuffix("-v1") if name is None else name,
+        description=description,
+        tags=tags,
+    )
+    file.write(path)
     return Path(path)
 
 

@@ -33,7 +33,7 @@ from sme_registry.task import (
     Task,
     load,
     materialize,
-    materialize_stream,
+    materialize_segments,
     observe,
     step,
 )
@@ -110,7 +110,7 @@ def check_stream(
       >>> check_stream(sme_registry.StreamSpec(phases=phases))
     """
     stream = load(stream, StreamSpec)
-    _check_environments(Schedule(stream, materialize_stream(stream)), single, vector, seed)
+    _check_environments(Schedule(stream, materialize_segments(stream)), single, vector, seed)
 
 
 def check_team(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: int = 0) -> None:

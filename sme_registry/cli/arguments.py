@@ -31,12 +31,7 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
-from sme_registry.spec.catalogue import Envelope
-from sme_registry.spec.resolve import (
-    check_not_bare,
-    is_path,
-    resolve,
-)
+from sme_registry.spec.catalogue import Envelope, is_path, resolve
 
 TaskName = Annotated[
     str,
@@ -97,7 +92,6 @@ def read_any(path: str | os.PathLike[str]) -> Envelope:
     for kind in KINDS.values():
         if isinstance(data, dict) and kind.content in data:
             return kind.from_dict(data, os.fspath(path))
-    check_not_bare(data, os.fspath(path))
     contents = ", ".join(repr(kind.content) for kind in KINDS.values())
     raise MalformedDocumentError(f"{os.fspath(path)}: must be an object with one of {contents}.")
 

@@ -69,16 +69,14 @@ def _files(path: Path) -> list[Path]:
 
 
 def _check(path: Path) -> dict[str, Any]:
-    from sme_registry.task import materialize, materialize_stream
+    from sme_registry.task import materialize_segments
 
     result: dict[str, Any] = {"path": str(path), "valid": False, "kind": None, "error": None}
     try:
         file = read_any(path)
         result |= {"kind": kind_of(file), "name": file.versioned_name, "digest": file.digest}
-        if isinstance(file, EnvFile):
-            materialize(file.spec, file.fingerprint)
-        elif isinstance(file, StreamFile):
-            materialize_stream(file.stream, file.fingerprints)
+        if isinstance(file, EnvFile | StreamFile):
+            materialize_segments(*file.published)
         elif isinstance(file, SuiteFile):
             _ = file.suite.instances, file.suite.stream_instances
         elif isinstance(file, StudyFile):
@@ -132,13 +130,13 @@ def certify(
 
 def _tasks(name: str) -> list[tuple[str, SMESpec]]:
     """The label and spec of each task that a name stands for."""
-    from sme_registry.task import materialize, materialize_stream
+    from sme_registry.task import materialize_segments
 
     document = find_any(name)
     if isinstance(document, SMESpec):
         return [(name, document)]
     if isinstance(document, EnvFile):
-        materialize(document.spec, document.fingerprint)
+        materialize_segments(*document.published)
         return [(name, document.spec)]
     if isinstance(document, SuiteFile):
         tasks = [
@@ -155,7 +153,7 @@ def _tasks(name: str) -> list[tuple[str, SMESpec]]:
     if isinstance(document, StreamSpec):
         return _phases(name, document)
     if isinstance(document, StreamFile):
-        materialize_stream(document.stream, document.fingerprints)
+        materialize_segments(*document.published)
         return _phases(document.name, document.stream)
     assert isinstance(document, ProtocolFile | StudyFile)
     kind = "protocol" if isinstance(document, ProtocolFile) else "study"

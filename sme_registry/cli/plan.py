@@ -42,7 +42,7 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
-from sme_registry.spec.resolve import is_path
+from sme_registry.spec.catalogue import is_path
 from sme_registry.spec.study import parse_uses, sweep
 from sme_registry.task import load
 

@@ -28,8 +28,7 @@ from sme_registry.spec import (
     cards,
     catalogue,
 )
-from sme_registry.spec.catalogue import Envelope
-from sme_registry.spec.resolve import known
+from sme_registry.spec.catalogue import Envelope, known
 from sme_registry.spec.suite import EvaluationProtocol
 
 Kind = enum.StrEnum("Kind", ["env", "stream", "suite", "protocol", "study"])
@@ -284,7 +283,7 @@ def _show_task(document: SMESpec | EnvFile, json: bool) -> None:
 
 def _facts(spec: SMESpec) -> dict[str, Any]:
     """What follows from a spec without drawing its task."""
-    from sme_registry.task.memory import parameter_bytes
+    from sme_registry.task.loading import parameter_bytes
 
     env_id = _env_id(spec)
     symmetric = spec.team is None and "/sha256-" not in env_id

@@ -40,8 +40,7 @@ from sme_registry.compiled.arrays import (
 from sme_registry.compiled.notice import compiling
 from sme_registry.io import choice, is_installed, require_packages
 from sme_registry.task import Task, observe, step
-from sme_registry.task.draw import Array, Layer
-from sme_registry.task.streams import counted
+from sme_registry.task.draw import Array, Layer, counted
 from sme_registry.task.task import through
 
 Backend = Literal["numba", "numpy"]

@@ -43,7 +43,7 @@ from sme_registry.compiled.kernels import (
     reward_of,
 )
 from sme_registry.task import Task
-from sme_registry.task.streams import FIRST_MIX, GOLDEN, SECOND_MIX
+from sme_registry.task.draw import FIRST_MIX, GOLDEN, SECOND_MIX
 
 _DYNAMICS = None, "noise", "autonomous", "driven"
 _NOISE, _AUTONOMOUS = 1, 2
@@ -90,7 +90,7 @@ def _mixed(z):  # type: ignore[no-untyped-def]
 
 @njit(inline="always", error_model="numpy")
 def _uniform(start, place):  # type: ignore[no-untyped-def]
-    """The number at a place of the stream of mix(key) = start; see `streams.counted`."""
+    """The number at a place of the stream of mix(key) = start; see `draw.counted`."""
     return (float64(_mixed(start + GOLDEN * place) >> _U12) + 0.5) * 2.0**-52
 
 

@@ -46,8 +46,8 @@ from sme_registry.evaluation.regions import expansion
 from sme_registry.evaluation.rollouts import play
 from sme_registry.spec import SMESpec
 from sme_registry.task import Task, draw
-from sme_registry.task.memory import check_limit
-from sme_registry.task.streams import bit_generator, to_uniform
+from sme_registry.task.draw import bit_generator, to_uniform
+from sme_registry.task.loading import check_memory
 
 ReportProgress = Callable[[int, int], None]
 
@@ -246,7 +246,7 @@ def collect(
     if spec.safety is not None:
         row += 16 * A + 16
     with_distractors = f", {m} distractors" if m else ""
-    check_limit(
+    check_memory(
         3 * recipe.transitions * row,
         f"transitions={recipe.transitions}: a data set of state_dim={S}, action_dim={A}"
         f"{with_distractors}",

@@ -36,7 +36,7 @@ from sme_registry.datasets.storage import SealedDataset
 from sme_registry.datasets.transitions import Transitions
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation.networks import OfflineLayer
-from sme_registry.task import streams
+from sme_registry.task import draw
 
 CRITICS = 2
 _LOW, _HIGH = -5.0, 2.0  # of log σ
@@ -202,7 +202,7 @@ class OfflineLearner:
         batch_size: int,
         seed: int,
     ) -> None:
-        initial, shuffles = (streams.raw_bits(seed, "offline/learner", 2) >> np.uint64(1)).tolist()
+        initial, shuffles = (draw.raw_bits(seed, "offline/learner", 2) >> np.uint64(1)).tolist()
         dims = data.observations.shape[1], data.actions.shape[1]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(initial)

@@ -52,7 +52,7 @@ from sme_registry.evaluation.regions import States
 from sme_registry.evaluation.rollouts import play
 from sme_registry.io import require_packages
 from sme_registry.statistics import smoothed
-from sme_registry.task import Task, streams
+from sme_registry.task import Task, draw
 from sme_registry.task.draw import Array
 from sme_registry.training.algorithms import one_thread, quiet
 
@@ -128,7 +128,7 @@ def rollout(
     n, agents = len(initial_states), len(task.owned)
     batch = Batch(task, n)
     if task.spec.distractors:
-        for lane, word in enumerate(streams.bit_generator(seed, "diagnosis/lanes").random_raw(n)):
+        for lane, word in enumerate(draw.bit_generator(seed, "diagnosis/lanes").random_raw(n)):
             batch.seed(lane, int(word))
     batch.begin(np.arange(n), batch.observe(), initial_states)
 
@@ -170,7 +170,7 @@ def episodes_of(
     """Whole episodes of the policy and of references, from the same initial states."""
     S, T = task.spec.state_dim, task.spec.horizon
     n = max(8, min(episodes, MAX_NUMBERS // (T * (S + 8))))
-    starts = streams.uniform(seed, "diagnosis/starts", n * S).reshape(n, S)
+    starts = draw.uniform(seed, "diagnosis/starts", n * S).reshape(n, S)
     runs = {POLICY: rollout(act, task, starts, seed)}
     for name, reference in _reference_actions(task, fitted, n, seed).items():
         runs[name] = rollout(reference, task, starts, seed, sees_state=True)
@@ -207,12 +207,12 @@ def _reference_actions(
 ) -> dict[str, Callable[[Observation], Array]]:
     """The references as functions of states `[n, S]`."""
     A = task.spec.action_dim
-    bits = streams.bit_generator(seed, "diagnosis/random_action")
+    bits = draw.bit_generator(seed, "diagnosis/random_action")
     return {
         LINEAR: fitted.linear,
         "best_constant": lambda s: np.tile(fitted.constant, (n, 1)),
         "constant_half": lambda s: np.full((n, A), 0.5),
-        "uniform_random": lambda s: streams.to_uniform(bits.random_raw(n * A)).reshape(n, A),
+        "uniform_random": lambda s: draw.to_uniform(bits.random_raw(n * A)).reshape(n, A),
     }
 
 
@@ -368,8 +368,8 @@ def _fit(
 def _pairs(task: Task, count: int, seed: int, stream: str) -> tuple[Observation, Observation]:
     """Observations of uniform states at random times, and the optimal actions, float32."""
     S, m = task.spec.state_dim, task.spec.distractors
-    u = streams.uniform(seed, stream, count * (S + 1)).reshape(count, S + 1)
-    d = streams.uniform(seed, f"{stream}/distractors", count * m).reshape(count, m)
+    u = draw.uniform(seed, stream, count * (S + 1)).reshape(count, S + 1)
+    d = draw.uniform(seed, f"{stream}/distractors", count * m).reshape(count, m)
     drawn = States(u[:, :S].astype(np.float32), d, u[:, S])
     observation = drawn.observation(drawn.seen(task), task.spec.horizon)
     optimal = engine(task).optimal_action(drawn.s.astype(np.float64))

@@ -40,8 +40,8 @@ from sme_registry.evaluation import Policy, SafetyReport, SafetyScore, reference
 from sme_registry.evaluation.measure import TOLERANCE, SafetyStats
 from sme_registry.evaluation.regions import States, Uniform
 from sme_registry.spec import EvaluationProtocol, SMESpec
-from sme_registry.task import Task, streams
-from sme_registry.task.draw import Array
+from sme_registry.task import Task
+from sme_registry.task.draw import Array, gaussian, uniform
 
 MAX_NUMBERS = 2**23  # of states, distractors and actions held at once: 64 MiB as float64
 _BOUND = 0.01  # an action this close to 0 or 1 is saturated
@@ -84,7 +84,7 @@ def clipped_actions(policy: Policy, observation: Observation) -> Array:
 def fit_references(task: Task, states: int, seed: int) -> references.References:
     """Fit the references on uniform states that no measurement uses."""
     count = min(4 * affordable(task, states), references.fit_states(task.spec))
-    s = streams.uniform(seed, "diagnosis/fit", count * task.spec.state_dim).reshape(count, -1)
+    s = uniform(seed, "diagnosis/fit", count * task.spec.state_dim).reshape(count, -1)
     agents = zip(task.observed, task.owned, strict=True)
     return references.fit(s, engine(task).optimal_action(s), agents)
 
@@ -109,7 +109,7 @@ def sample(
     observation = drawn.observation(drawn.seen(task), task.spec.horizon)
     s = drawn.s.astype(np.float64)
     optimal = engine(task).optimal_action(s)
-    random = streams.uniform(seed, f"diagnosis/{region}/random", optimal.size)
+    random = uniform(seed, f"diagnosis/{region}/random", optimal.size)
     actions = fitted.actions(s, optimal, random.reshape(optimal.shape))
     return Sample(drawn, observation, s, clipped_actions(policy, observation), optimal, actions)
 
@@ -296,7 +296,7 @@ def _sensitivity(policy: Policy, task: Task, states: Sample, seed: int) -> float
     """RMS change of a over RMS change of a*, for small steps of the state."""
     few = affordable(task, 2048)
     s = states.s[:few]
-    directions = streams.gaussian(seed, "diagnosis/directions", s.size).reshape(s.shape)
+    directions = gaussian(seed, "diagnosis/directions", s.size).reshape(s.shape)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     moved = (s + _STEP * directions).astype(np.float32)
     optimal_change = engine(task).optimal_action(moved.astype(np.float64)) - states.optimal[:few]

@@ -14,7 +14,7 @@ from sme_registry.errors import WrapperError
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.catalogue import NAMESPACE
 from sme_registry.task import Task
-from sme_registry.task.streams import DYNAMICS_VERSION
+from sme_registry.task.draw import DYNAMICS_VERSION
 
 _STATUS = {"created": "not begun", "running": "running", "ended": "ended"}
 

@@ -36,7 +36,7 @@ from sme_registry.envs.schedule import Schedule
 from sme_registry.errors import ActionError
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.task import Task, observe
-from sme_registry.task.memory import check_limit
+from sme_registry.task.loading import check_memory
 
 _FLOAT64 = np.dtype(np.float64)
 _AHEAD = 16  # states drawn at once for an environment
@@ -233,7 +233,7 @@ class Batch:
         spec, n = self.task.spec, len(self.task.policies)
         S, A, m = spec.state_dim, spec.action_dim, spec.distractors
         phases = self.schedule.stream.observed_phases if self.schedule.stream is not None else 0
-        check_limit(
+        check_memory(
             num_envs * 8 * (5 * (S + m) + 12 * A + 20 * n + 54 + 3 * phases),
             f"num_envs={num_envs}: a batch this large",
             "Use fewer environments.",

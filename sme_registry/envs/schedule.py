@@ -13,11 +13,8 @@ import numpy as np
 from sme_registry.compiled.arrays import Indices, Observation
 from sme_registry.envs import arguments
 from sme_registry.spec import SMESpec, SpecLike, StreamLike, StreamSpec
-from sme_registry.spec.resolve import Resolved, resolve
-from sme_registry.task import Task
-from sme_registry.task.loading import draw_published
-
-NEVER = int(np.iinfo(np.int64).max)
+from sme_registry.spec.catalogue import Resolved, resolve
+from sme_registry.task import Task, materialize_segments
 
 
 class Schedule:
@@ -35,13 +32,10 @@ class Schedule:
     def __init__(self, document: SMESpec | StreamSpec, tasks: Sequence[Task]) -> None:
         self.document, self.tasks = document, tuple(tasks)
         self.stream = document if isinstance(document, StreamSpec) else None
-        self.phases = np.zeros(1, np.int64)
+        self.phases = np.array([segment.phase for segment in document.segments])
         self.k = np.array([task.spec.k for task in tasks])
-        self.switches_within = False
-        if self.stream is not None:
-            self.phases = np.array([piece.phase for piece in self.stream.pieces])
-            self.switches_within = self.stream.switch == "step"
-            self._times = self.stream.schedule
+        self.switches_within = document.switch == "step"
+        self._times = document.times
 
     @classmethod
     def of(cls, task: Task) -> Schedule:
@@ -64,7 +58,7 @@ class Schedule:
         arguments.check_overrides(environment, resolved.document, overrides)
         if overrides:
             resolved = Resolved(cast("SMESpec", resolved.document).derive(**overrides))
-        tasks = draw_published(resolved)
+        tasks = materialize_segments(*resolved)
         arguments.single_agent(tasks[0])
         return cls(resolved.document, tasks)
 
@@ -77,16 +71,15 @@ class Schedule:
 
     def segment(self, lifetime: int) -> int:
         """The segment in force after so many environment steps; the last one at the end."""
-        return 0 if self.stream is None else self._times.piece_at(lifetime)
+        return self._times.segment_at(lifetime)
 
     def next_switch(self, lifetime: int) -> int:
         """The lifetime at which that segment is over; NEVER in the last one of the life."""
-        switch = None if self.stream is None else self._times.next_switch(lifetime)
-        return NEVER if switch is None else switch
+        return self._times.next_switch(lifetime)
 
     def shown(self, phase: int | Indices) -> Observation:
         """What an observation in a phase ends with, `[…, P]`: its one-hot, or (P = 0) nothing."""
-        if self.stream is None or not self.stream.observes_phase:
+        if not self.document.observed_phases:
             return np.empty((*np.shape(phase), 0), np.float32)
-        one_hot: Observation = np.eye(len(self.stream.phases), dtype=np.float32)[phase]
+        one_hot: Observation = np.eye(self.document.observed_phases, dtype=np.float32)[phase]
         return one_hot

@@ -38,9 +38,9 @@ from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import integer_in
 from sme_registry.spec import Integer, Real, StreamLike, StreamSpec, TupleOf
+from sme_registry.spec.catalogue import resolve
 from sme_registry.spec.document import StrictModel
-from sme_registry.spec.resolve import resolve
-from sme_registry.task import load, materialize_stream
+from sme_registry.task import load, materialize_segments
 from sme_registry.task.draw import Array
 
 _POINTS = 400  # of the curve; more would not be visible in a figure
@@ -366,19 +366,19 @@ def expected_regret(
     integer_in("episodes", episodes, 1)
     integer_in("seed", seed, 0)
     policies = _policies(life, stream, action_range, algorithm)
-    steps = np.diff([*(piece.start for piece in stream.pieces), stream.cycle_steps])
-    of_phase = [[i for i, one in enumerate(stream.pieces) if one.phase == j] for j in range(P)]
+    steps = np.diff([*(piece.start for piece in stream.segments), stream.cycle_steps])
+    of_phase = [[i for i, one in enumerate(stream.segments) if one.phase == j] for j in range(P)]
     parts = [(entry, piece) for v, entry in enumerate(life) for piece in of_phase[v % P]]
 
     # A policy acts once in each piece, in however many cycles.
     acts = dict.fromkeys((id(entry), piece) for entry, piece in parts if id(entry) in policies)
-    tasks = materialize_stream(stream) if acts else ()
+    tasks = materialize_segments(stream) if acts else ()
     means: dict[tuple[int, int], float] = {}
     for which, piece in acts:
         states = start_states(seed, piece, _share(episodes, steps, piece), stream.state_dim)
         policy = policies[which]
         if stream.observes_phase:
-            policy = policy.in_phase(stream.pieces[piece].phase, P)
+            policy = policy.in_phase(stream.segments[piece].phase, P)
         ran = rollouts(policy, tasks[piece], states)
         means[which, piece] = ran.per_step(ran.regret)
         if progress is not None:

@@ -61,8 +61,8 @@ from sme_registry.evaluation.report import (
 )
 from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
 from sme_registry.task import Task, materialize
+from sme_registry.task.certificate import held_out_r2
 from sme_registry.task.draw import Array
-from sme_registry.task.linear_map import held_out_r2
 
 WHOLE = ""
 """The scope of all action channels, among the agents' names."""
@@ -468,4 +468,4 @@ def same_draw(spec: SMESpec) -> str:
 
 def final_specs(stream: StreamSpec) -> tuple[SMESpec, ...]:
     """The task of each phase at its end: of a drifting one the spec of its last piece."""
-    return tuple({piece.phase: piece.spec for piece in stream.pieces}.values())
+    return tuple({segment.phase: segment.spec for segment in stream.segments}.values())

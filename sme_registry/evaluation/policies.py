@@ -38,7 +38,6 @@ from sme_registry.evaluation.networks import OfflinePolicy, Perceptron
 from sme_registry.evaluation.references import POLICIES, reference_policy
 from sme_registry.io import choice, import_object
 from sme_registry.spec import ACTION_RANGES, ActionRange, AgentSpec, SMESpec, StreamSpec
-from sme_registry.task import draw
 
 
 @dataclass(frozen=True)
@@ -158,7 +157,7 @@ class TeamPolicy:
 
     def check_team(self, spec: SMESpec) -> None:
         prepared = [(member.agent, member.action_dim) for member in self.members]
-        if prepared != [(agent.name, agent.action_dim) for agent in draw.agents(spec)]:
+        if prepared != [(agent.name, agent.action_dim) for agent in spec.agents]:
             raise PolicyError(
                 f"policy {self.name!r}: it acts for the agents "
                 f"{', '.join(f'{agent} ({dim} channels)' for agent, dim in prepared)}, and this "
@@ -250,7 +249,7 @@ def interface_of(spec: SMESpec, observed_phases: int = 0) -> Interface:
             A,
             f"state_dim={S}, action_dim={A}{distractors}{observed}",
         )
-    agents = draw.agents(spec)
+    agents = spec.agents
     observation_dim = spec.state_dim + 2 + len(agents)
     action_dim = max(agent.action_dim for agent in agents)
     return Interface(
@@ -379,7 +378,7 @@ def _team_policy(
     policy: Any, spec: SMESpec, action_range: ActionRange | None, name: str | None
 ) -> TeamPolicy:
     """A team policy from a policy for each agent, by name, or from one that all agents share."""
-    agents, channels = draw.agents(spec), draw.observed_channels(spec)
+    agents, channels = spec.agents, spec.observed_channels
     own = isinstance(policy, Mapping)
     if own:
         _check_names(policy, [agent.name for agent in agents])

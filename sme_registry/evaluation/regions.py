@@ -29,9 +29,8 @@ import numpy.typing as npt
 
 from sme_registry.errors import OptionError
 from sme_registry.spec import EvaluationProtocol, SMESpec
-from sme_registry.task import Task, draw
-from sme_registry.task.draw import Array
-from sme_registry.task.streams import bit_generator, to_uniform
+from sme_registry.task import Task
+from sme_registry.task.draw import Array, bit_generator, to_uniform
 
 Observations = npt.NDArray[np.float32]
 
@@ -45,7 +44,7 @@ def region_name(region: int) -> str:
 
 def batch_rows(spec: SMESpec) -> int:
     """How many states are in memory at once; fewer if a state is large."""
-    others = len(draw.agents(spec)) - 1
+    others = len(spec.agents) - 1
     width = spec.state_dim + spec.distractors + spec.action_dim + spec.hidden_width + others
     return max(1, min(BATCH_ROWS, BATCH_NUMBERS // width))
 

@@ -24,7 +24,7 @@ from sme_registry.compiled.arrays import (
 from sme_registry.envs.arguments import initial_states, single_agent
 from sme_registry.envs.batch import Batch, BatchStep
 from sme_registry.evaluation.policies import Policy, TeamPolicy
-from sme_registry.task import Task, streams
+from sme_registry.task import Task, draw
 
 LANES = 4096
 """Most episodes in parallel, so that memory does not grow with their number."""
@@ -95,7 +95,7 @@ class Rollouts(NamedTuple):
 def start_states(seed: int, evaluation: int, episodes: int, state_dim: int) -> Array:
     """The initial states of an evaluation's episodes, from a random stream of their own."""
     stream = f"rollouts/{evaluation}/initial_state"
-    return streams.uniform(seed, stream, episodes * state_dim).reshape(episodes, state_dim)
+    return draw.uniform(seed, stream, episodes * state_dim).reshape(episodes, state_dim)
 
 
 def rollouts(

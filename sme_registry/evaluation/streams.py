@@ -177,7 +177,7 @@ def stream_regrets(
 ) -> tuple[Array, Engine]:
     """The normalised regret of each actor on each of its phases, in every region."""
     specs = final_specs(stream)
-    tasks = materialize_together(stream, specs)
+    tasks = materialize_together(specs)
     keys = [same_draw(spec) for spec in specs]
     oracles = {key: engine(task) for key, task in zip(keys, tasks, strict=True)}
     N, P, K = len(actors), len(specs), len(protocol.edges)

@@ -37,8 +37,9 @@ from sme_registry.io import read_json, write_atomically
 from sme_registry.io.markup import environment
 from sme_registry.spec import SMESpec, catalogue
 from sme_registry.statistics import smoothed
-from sme_registry.task import Task, materialize, memory, streams
+from sme_registry.task import Task, draw, materialize
 from sme_registry.task.draw import Array
+from sme_registry.task.loading import parameter_bytes
 from sme_registry.training import EXPLORER, short_name
 from sme_registry.training.learn import EVALUATION
 from sme_registry.version import __version__
@@ -214,7 +215,7 @@ def check_size(spec: SMESpec) -> None:
             f"state_dim={spec.state_dim}: with {inputs} inputs, and a page has a slider for each: "
             f"must be at most {MAX_INPUTS}. Use `sme evaluate` or `sme diagnose`."
         )
-    weights = memory.parameter_bytes(spec) // 8
+    weights = parameter_bytes(spec) // 8
     if weights > MAX_WEIGHTS:
         raise ResourceLimitError(
             f"complexity={spec.complexity}, hidden_width={spec.hidden_width}, "
@@ -300,7 +301,7 @@ def _episode(
     if T > _MAX_HORIZON:
         return None
     n = max(1, min(episodes, MAX_NUMBERS // (T * (S + A + 8))))
-    starts = streams.uniform(seed, "explorer/starts", n * S).reshape(n, S)
+    starts = draw.uniform(seed, "explorer/starts", n * S).reshape(n, S)
 
     def steps(act: Callable[[Any], Any], *, sees_state: bool = False) -> tuple[Array, Any]:
         runs = rollout(act, task, starts, seed, sees_state=sees_state)

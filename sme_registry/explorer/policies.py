@@ -22,7 +22,7 @@ from sme_registry.explorer.program import OPERATIONS, NetworkProgram, ProgramBui
 from sme_registry.export.torch_modules import traced
 from sme_registry.io import is_installed
 from sme_registry.spec import SMESpec
-from sme_registry.task import streams
+from sme_registry.task import draw
 from sme_registry.task.draw import Array
 
 TOLERANCE = 1e-5  # of an action in [0, 1]; a policy's own float32 sums move it by 1e-6
@@ -57,7 +57,7 @@ def policy_program(policy: Policy | TeamPolicy, spec: SMESpec) -> NetworkProgram
 def probe_points(spec: SMESpec) -> Array:
     """Points to compare in, the second half of them in the cube of twice the side."""
     n = point_width(spec)
-    x = streams.uniform(0, "explorer/probes", _PROBES * n).reshape(_PROBES, n)
+    x = draw.uniform(0, "explorer/probes", _PROBES * n).reshape(_PROBES, n)
     x[_PROBES // 2 :] = 2.0 * x[_PROBES // 2 :] - 0.5
     return x
 

@@ -20,7 +20,7 @@ import numpy as np
 from sme_registry.errors import OptionError, SpecError
 from sme_registry.jax.task import Shape, TaskParams, stacked_params
 from sme_registry.spec import SMESpec, StreamSpec
-from sme_registry.task import Task, load_task, materialize_stream
+from sme_registry.task import Task, materialize_segments
 
 Lane = SMESpec | StreamSpec
 """What a lane lives through: one task, or a stream of them."""
@@ -37,33 +37,33 @@ class Lives:
         _check_alike(lanes)
         first = lanes[0]
         self._stream = first if isinstance(first, StreamSpec) else None
+        self._times, self._segments = first.times, first.segments
         if self._stream is not None:
             check_switches(self._stream)
-        self.phases = 0 if self._stream is None else self._stream.observed_phases
-        drawn = {lane: _tasks(lane) for lane in lanes}
-        pieces = [*zip(*(drawn[lane] for lane in lanes), strict=True)]
-        specs = {task.spec for tasks in pieces for task in tasks}
+        self.phases = first.observed_phases
+        self._at_once = first.switch == "step"
+        drawn = {lane: materialize_segments(lane) for lane in lanes}
+        segments = [*zip(*(drawn[lane] for lane in lanes), strict=True)]
+        specs = {task.spec for tasks in segments for task in tasks}
         self.separable = all(spec.k == 1 and spec.D == 0 for spec in specs)
-        shapes = _shapes(pieces, shape)
+        shapes = _shapes(segments, shape)
         stacked = {
             tasks: jax.device_put(stacked_params(tasks, shapes[_is_deep(tasks)]), device)
-            for tasks in dict.fromkeys(pieces)
+            for tasks in dict.fromkeys(segments)
         }
-        self._params = [self._in_phase(i, stacked[tasks]) for i, tasks in enumerate(pieces)]
+        self._params = [self._in_phase(i, stacked[tasks]) for i, tasks in enumerate(segments)]
 
     def at(self, lifetime: int) -> TaskParams:
         """The tasks on which the next step is taken."""
-        return self._params[self._stream.piece_at(lifetime) if self._stream else 0]
+        return self._params[self._times.segment_at(lifetime)]
 
     def until(self, lifetime: int, limit: int) -> int:
         """The step before which these tasks are left, at most `limit`."""
-        switch = self._stream.next_switch(lifetime) if self._stream else None
-        return limit if switch is None else min(limit, switch)
+        return min(limit, self._times.next_switch(lifetime))
 
     def phase_after(self, lifetime: int) -> jax.Array:
         """The one-hot `[lanes, P]` in the last observation of an episode that ends there."""
-        at_once = self._stream is not None and self._stream.switch == "step"
-        return self.at(lifetime if at_once else lifetime - 1).phase
+        return self.at(lifetime if self._at_once else lifetime - 1).phase
 
     def visit_ends(self, after: int) -> Iterator[tuple[int, int]]:
         """See `StreamSpec.visit_ends`; without a stream there are none."""
@@ -76,17 +76,17 @@ class Lives:
             return None
         return self._stream.visits - 1, self._stream.steps
 
-    def _in_phase(self, piece: int, params: TaskParams) -> TaskParams:
-        if self._stream is None or not self.phases:
+    def _in_phase(self, segment: int, params: TaskParams) -> TaskParams:
+        if not self.phases:
             return params
         shown = np.zeros((len(params.W), self.phases), np.float32)
-        shown[:, self._stream.pieces[piece].phase] = 1.0
+        shown[:, self._segments[segment].phase] = 1.0
         return params._replace(phase=jax.device_put(shown, params.W.device))
 
 
 def check_switches(stream: StreamSpec) -> None:
     """Raise SpecError unless every episode ends where a phase is left, or phases switch at once."""
-    if stream.switch == "step" or stream.next_switch(0) is None:
+    if stream.switch == "step" or len(stream.segments) * stream.cycles == 1:
         return
     otherwise = 'Use an algorithm of Stable-Baselines3, such as PPO, or choose switch="step".'
     for index, phase in enumerate(stream.phases):
@@ -95,7 +95,7 @@ def check_switches(stream: StreamSpec) -> None:
                 f"phases.{index}.spec: D={phase.spec.D}: must be 0, since agents in JAX leave a "
                 f"phase where all lanes end an episode. {otherwise}"
             )
-    starts = [(piece.phase, piece.start) for piece in stream.pieces]
+    starts = [(segment.phase, segment.start) for segment in stream.segments]
     for index, step in [*starts, (len(stream.phases) - 1, stream.cycle_steps)]:
         if step % stream.horizon:
             raise SpecError(
@@ -122,23 +122,19 @@ def _switches(lane: Lane) -> Any:
     return lane.switches if isinstance(lane, StreamSpec) else None
 
 
-def _tasks(lane: Lane) -> tuple[Task, ...]:
-    return materialize_stream(lane) if isinstance(lane, StreamSpec) else (load_task(lane),)
-
-
 def _is_deep(tasks: Sequence[Task]) -> bool:
     return tasks[0].spec.complexity > 1
 
 
-def _shapes(pieces: Sequence[Sequence[Task]], shape: Shape | None) -> dict[bool, Shape | None]:
+def _shapes(segments: Sequence[Sequence[Task]], shape: Shape | None) -> dict[bool, Shape | None]:
     """To which tasks of several layers (True) and of one layer (False) are padded."""
-    if len(pieces) == 1:
-        return {_is_deep(pieces[0]): shape}
+    if len(segments) == 1:
+        return {_is_deep(segments[0]): shape}
     if shape is not None:
         return {True: shape, False: shape._replace(complexity=1, hidden_width=0)}
     return {
         deep: Shape.covering(
-            Shape.of(task.spec) for tasks in pieces if _is_deep(tasks) is deep for task in tasks
+            Shape.of(task.spec) for tasks in segments if _is_deep(tasks) is deep for task in tasks
         )
-        for deep in {_is_deep(tasks) for tasks in pieces}
+        for deep in {_is_deep(tasks) for tasks in segments}
     }

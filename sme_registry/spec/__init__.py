@@ -1,6 +1,5 @@
 """Documents: specs, suites, protocols and plans, frozen and hashed, and their files."""
 
-from sme_registry.spec import resolve as resolve  # what finds documents by name
 from sme_registry.spec.catalogue import (
     EnvFile,
     Fingerprint,
@@ -26,13 +25,13 @@ from sme_registry.spec.sme_spec import (
     AgentSpec,
     ObservationSpec,
     SafetySpec,
+    Segment,
     Setting,
     SMESpec,
     SpecLike,
     TeamSpec,
-    as_spec,
 )
-from sme_registry.spec.stream import Drift, Phase, Piece, StreamLike, StreamSpec, as_stream
+from sme_registry.spec.stream import Drift, Phase, StreamLike, StreamSpec
 from sme_registry.spec.study import Cell, PlannedCell, StudyAlgorithm, StudyPlan
 from sme_registry.spec.suite import EvaluationProtocol, ProtocolLike, StreamClass, Suite, SuiteClass
 
@@ -51,7 +50,6 @@ __all__ = [
     "Name",
     "ObservationSpec",
     "Phase",
-    "Piece",
     "PlannedCell",
     "ProtocolFile",
     "ProtocolLike",
@@ -59,6 +57,7 @@ __all__ = [
     "SMESpec",
     "SafetySpec",
     "SchemaVersion",
+    "Segment",
     "Setting",
     "SpecLike",
     "StreamClass",
@@ -74,7 +73,5 @@ __all__ = [
     "SuiteFile",
     "TeamSpec",
     "TupleOf",
-    "as_spec",
-    "as_stream",
     "matching",
 ]

@@ -1,8 +1,8 @@
-"""Files, and the catalogue: the files under `specs/`, by name, with no other list of them.
+"""Files, the catalogue, and from a name (an id, a path, a digest) to its `SMESpec` or `StreamSpec`.
 
 A file is a document in an envelope of name, version, description, tags and digest. The digest is of
 the document alone, so renaming a file or describing it better changes nothing; a file with another
-digest is refused.
+digest is refused. The catalogue is the files under `specs/`, with no other list of them.
 """
 
 from __future__ import annotations
@@ -10,15 +10,30 @@ from __future__ import annotations
 import functools
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Generic, NamedTuple, Self, TypeVar, cast, overload
 
 from pydantic import Field, model_validator
 
-from sme_registry.errors import DigestMismatchError, SpecError, UnknownNameError, did_you_mean
+from sme_registry.errors import (
+    DigestMismatchError,
+    MalformedDocumentError,
+    SpecError,
+    StreamError,
+    UnknownNameError,
+    did_you_mean,
+)
 from sme_registry.io import read_json, to_json, write_atomically
-from sme_registry.spec.document import Digest, Integer, Name, StrictModel
+from sme_registry.spec.document import (
+    Digest,
+    Integer,
+    Name,
+    NamedDocument,
+    StrictModel,
+    finders,
+    short_repr,
+)
 from sme_registry.spec.sme_spec import SMESpec
 from sme_registry.spec.stream import StreamSpec
 from sme_registry.spec.study import StudyPlan
@@ -59,7 +74,7 @@ class Envelope(StrictModel):
       digest: of the document alone; a file with another one is refused.
     """
 
-    # The field that holds the document.
+    # The field that holds the document, and what the document is called.
     content: ClassVar[str]
     # How to write a changed document, or a bare one, as a file; `{source}` is its path.
     remedy: ClassVar[str] = (
@@ -84,15 +99,8 @@ class Envelope(StrictModel):
         """Validate plain data; another digest than the document's is a `DigestMismatchError`."""
         name = source or cls.__name__
         remedy = cls.remedy.format(source=name, kind=cls.__name__, content=cls.content)
-        document: Any = cls.model_fields[cls.content].annotation
-        if isinstance(data, dict) and data and "digest" not in data:
-            is_bare_document = data.keys() <= document.model_fields.keys()
-            if is_bare_document or cls.content in data:
-                raise SpecError(
-                    f"{name}: digest: missing: must be the digest of the {cls.content}. To add "
-                    f"it, {remedy}."
-                )
-        _check_kind(cls, data, name)
+        if isinstance(data, dict) and data:
+            _check_is_file(cls, data, name, remedy)
         envelope = super().from_dict(data, source)
         expected = getattr(envelope, cls.content).digest
         if envelope.digest != expected:
@@ -127,6 +135,11 @@ class EnvFile(Envelope):
     spec: SMESpec
     fingerprint: Fingerprint
 
+    @property
+    def published(self) -> Resolved[SMESpec]:
+        """The task, with its fingerprint."""
+        return Resolved(self.spec, (self.fingerprint,))
+
 
 class StreamFile(Envelope):
     """A stream's file: `specs/streams/*.json`, or what `sme_registry.save` writes.
@@ -150,6 +163,11 @@ class StreamFile(Envelope):
                 f"{len(self.stream.phases)} phases. Take the file again from its source."
             )
         return self
+
+    @property
+    def published(self) -> Resolved[StreamSpec]:
+        """The stream, with the fingerprint of each phase."""
+        return Resolved(self.stream, self.fingerprints)
 
 
 class SuiteFile(Envelope):
@@ -197,14 +215,20 @@ class ProtocolFile(Envelope):
     protocol: EvaluationProtocol
 
 
-def _check_kind(kind: type[Envelope], data: Any, source: str) -> None:
-    """Say that a file is a suite, say, and not a task, rather than which fields it lacks."""
-    words = {"spec": "task", "plan": "study plan"}
-    if isinstance(data, dict) and kind.content not in data:
-        for other in Envelope.__subclasses__():
-            if other.content in data:
-                actual, expected = (words.get(each.content, each.content) for each in (other, kind))
-                raise SpecError(f"{source}: is the file of a {actual}, not of a {expected}.")
+def _check_is_file(kind: type[Envelope], data: dict[str, Any], source: str, remedy: str) -> None:
+    """Say that data is a bare document, or the file of another kind, not which fields it lacks."""
+    document: Any = kind.model_fields[kind.content].annotation
+    is_bare = data.keys() <= document.model_fields.keys()
+    if "digest" not in data and (is_bare or kind.content in data):
+        raise MalformedDocumentError(
+            f"{source}: {'is a bare ' + kind.content + ': ' if is_bare else ''}digest: missing: "
+            f"must be the digest of the {kind.content}. To add it, {remedy}."
+        )
+    others = [other for other in Envelope.__subclasses__() if other.content in data]
+    if others and kind.content not in data:
+        words = {"spec": "task", "plan": "study plan"}
+        actual, expected = (words.get(one.content, one.content) for one in (others[0], kind))
+        raise SpecError(f"{source}: is the file of a {actual}, not of a {expected}.")
 
 
 NAMESPACE = "SME"
@@ -270,23 +294,21 @@ def entries(kind: type[_E]) -> list[_E]:
 
 def find(kind: type[_E], name: str, others: Iterable[str] = ()) -> _E:
     """The file of a name, with or without its version (then the newest)."""
-    known = names(kind)
-    if name in known:
-        return cast(_E, _read(kind, spec_folder() / _FOLDERS[kind] / f"{name}.json"))
-    versions = [
-        (int(match[1]), full)
-        for full in known
-        if (match := _VERSION.search(full)) and full[: match.start()] == name
-    ]
-    if versions:
-        return find(kind, max(versions)[1])
-    known += others
+    if newest := _newest(kind, name):
+        return cast(_E, _read(kind, spec_folder() / _FOLDERS[kind] / f"{newest}.json"))
+    known = [*names(kind), *others]
     short = [_VERSION.sub("", full) for full in known]
     raise UnknownNameError(
         f"{name!r}: no {kind.content} has this name."
         + (did_you_mean(name, known) or did_you_mean(name, short))
         + " `sme list` shows the names."
     )
+
+
+def _newest(kind: type[Envelope], name: str) -> str:
+    """The newest version of a name, or the version that it states; empty if there is none."""
+    versions = [full for full in names(kind) if name in (full, _VERSION.sub("", full))]
+    return max(versions, key=lambda full: int(full.rpartition("-v")[2]), default="")
 
 
 def unique_name(document: SMESpec | StreamSpec) -> str:
@@ -333,3 +355,156 @@ def released() -> Iterator[tuple[str, str, str]]:
         content_name = file["digest"].replace(":", "-")[: len("sha256-") + 12]
         kind = "stream" if "stream" in file else "team" if file["spec"]["team"] else "spec"
         yield kind, path.stem, content_name
+
+
+_HEX_DIGITS = 12  # fewest digits that name a document
+_D = TypeVar("_D", bound=NamedDocument)
+_FILES: dict[type[NamedDocument], Any] = {SMESpec: EnvFile, StreamSpec: StreamFile}
+
+registered: dict[str, SMESpec | StreamSpec] = {}
+"""What is registered in this process, by id; see `registration.register`."""
+
+
+class Resolved(NamedTuple, Generic[_D]):
+    """A spec or a stream, and what its file publishes about the numbers drawn from it.
+
+    Attributes:
+      document: the spec or stream.
+      fingerprints: of the spec, or of each phase's spec; empty where there is no file.
+    """
+
+    document: _D
+    fingerprints: tuple[Fingerprint, ...] = ()
+
+
+@overload
+def resolve(name: Any, kind: type[_D]) -> Resolved[_D]: ...
+@overload
+def resolve(name: Any, kind: None = None) -> Resolved[SMESpec | StreamSpec]: ...
+def resolve(name: Any, kind: Any = None) -> Any:
+    """What a name stands for; with a `kind`, `SMESpec` or `StreamSpec`, no other. Draws nothing.
+
+    A name is a document or its fields; an id (`SME/Default-v1`, `Default`, `StreamSwitch5`); a name
+    by content; a digest or a prefix of 12 digits or more that only one known document has; or the
+    path of a file. A stream in place of a spec is a `StreamError`.
+    """
+    if not isinstance(name, str | os.PathLike):
+        return Resolved(as_document(name, kind))
+    if isinstance(name, os.PathLike) or is_path(name):
+        data = read_json(name)
+        is_stream = isinstance(data, dict) and StreamFile.content in data
+        in_file = StreamFile if kind is StreamSpec or is_stream else EnvFile
+        file: Any = in_file.from_dict(data, str(name))
+        document, fingerprints = file.published
+        resolved = Resolved(document.named(file.name), fingerprints)
+    else:
+        short = name.removeprefix("sme_registry:").removeprefix(f"{NAMESPACE}/")
+        resolved = _of_name(short, kind)
+    _check_kind(resolved.document, str(name), kind)
+    return resolved
+
+
+def _check_kind(document: SMESpec | StreamSpec, name: Any, kind: Any) -> None:
+    """Raise StreamError on a stream where a task is needed."""
+    if kind is SMESpec and isinstance(document, StreamSpec):
+        raise StreamError(
+            f"{short_repr(name)}: is a stream, and this needs a single task. Use that of a phase, "
+            "in Python `sme_registry.load(STREAM).phases[0].spec`, for the command line saved as a "
+            "file. Whole streams are for `sme train`, `sme_registry.make` and "
+            "`sme_registry.evaluation.evaluate_stream`."
+        )
+
+
+finders[SMESpec] = lambda name: resolve(name, SMESpec).document
+finders[StreamSpec] = lambda name: resolve(name, StreamSpec).document
+
+
+def file_of(
+    document: SMESpec | StreamSpec, fingerprints: Sequence[Fingerprint], source: str, **fields: Any
+) -> EnvFile | StreamFile:
+    """The file of a document with the fingerprint of each of its specs; errors name `source`."""
+    kind: Any = _FILES[type(document)]
+    numbers = [fingerprint.to_dict() for fingerprint in fingerprints]
+    fields |= {kind.content: document.to_dict(), "digest": document.digest}
+    fields |= {"fingerprint": numbers[0]} if kind is EnvFile else {"fingerprints": numbers}
+    return cast("EnvFile | StreamFile", kind.from_dict(fields, source))
+
+
+def as_document(value: Any, kind: Any = None) -> Any:
+    """A spec or a stream from itself or from its fields; with a `kind`, no other."""
+    is_stream = isinstance(value, StreamSpec) or (isinstance(value, dict) and "phases" in value)
+    model: type[SMESpec | StreamSpec] = StreamSpec if is_stream or kind is StreamSpec else SMESpec
+    if not isinstance(value, dict | model):
+        article = "an" if model is SMESpec else "a"
+        raise SpecError(
+            f"{short_repr(value)}: must be {article} {model.__name__} or a mapping of its fields."
+        )
+    document = model.from_dict(value) if isinstance(value, dict) else value
+    _check_kind(document, value, kind)
+    return document
+
+
+def known(kind: type[NamedDocument]) -> dict[str, Resolved[Any]]:
+    """Digest → document: of the catalogue, registered here, and of the suites' instances."""
+    documents = {file.digest: file.published for file in entries(_FILES[kind])}
+    for document in registered.values():
+        if isinstance(document, kind):
+            documents.setdefault(document.digest, Resolved(document))
+    return _instances(kind) | documents
+
+
+@functools.cache
+def _instances(kind: type[NamedDocument]) -> dict[str, Resolved[Any]]:
+    """Of the catalogue's suites, by digest."""
+    suites = [file.suite for file in entries(SuiteFile)]
+    documents = (
+        document
+        for suite in suites
+        for document in (suite.instances if kind is SMESpec else suite.stream_instances)
+    )
+    return {document.digest: Resolved(document) for document in documents}
+
+
+def is_path(name: str) -> bool:
+    """Whether text is the path of a file rather than a name."""
+    return name.endswith(".json") or (os.sep in name and Path(name).is_file())
+
+
+def _of_name(short: str, kind: Any) -> Resolved[Any]:
+    """The document of a name; the error about an unknown one is about tasks, or about the kind."""
+    kinds = (StreamSpec,) if kind is StreamSpec else (SMESpec, StreamSpec)
+    if short.startswith(("sha256:", "sha256-")):
+        return _of_digest(short, kinds)
+    for env_id, document in registered.items():
+        is_named = f"{NAMESPACE}/{short}" in (env_id, _VERSION.sub("", env_id))
+        if is_named and isinstance(document, kinds):
+            return Resolved(document)
+    for one in kinds:
+        name = short.removeprefix(STREAM) if one is StreamSpec else short
+        if newest := _newest(_FILES[one], name):
+            return cast(Resolved[Any], find(_FILES[one], newest).published)
+    task = _VERSION.sub("", short).removesuffix(SYMMETRIC)
+    if task != _VERSION.sub("", short):
+        raise UnknownNameError(
+            f"{short!r}: stands for environments of the task {task!r} with actions in [−1, 1], not "
+            f"for a task. Use {task!r}, and action_range='symmetric' where actions are meant."
+        )
+    others = [env_id.removeprefix(f"{NAMESPACE}/") for env_id in registered] + names(StreamFile)
+    return cast(Resolved[Any], find(_FILES[kinds[0]], short, others).published)  # raises
+
+
+def _of_digest(name: str, kinds: tuple[type[NamedDocument], ...]) -> Resolved[Any]:
+    """The only known document whose digest begins with the digits of `sha256:…`, of any version."""
+    digits, _, version = name[len("sha256:") :].lower().partition("-v")
+    if len(digits) < _HEX_DIGITS:
+        raise UnknownNameError(f"{name!r}: give at least {_HEX_DIGITS} hex digits of the digest.")
+    if version in ("", *(str(file.version) for file in entries(EnvFile))):
+        for kind in kinds:
+            matches = [r for d, r in known(kind).items() if d.startswith(f"sha256:{digits}")]
+            if len(matches) == 1:
+                return matches[0]
+    raise UnknownNameError(
+        f"{name!r}: no task in the catalogue or its suites has this digest, or several have. "
+        "A digest cannot be turned back into a spec: load its file instead. On the tasks of a "
+        "suite's file: `sme study new plan.json --suite FILE -a PPO`."
+    )

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 import os
 import re
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias, get_args
+from bisect import bisect_right
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeAlias, get_args
 
 from pydantic import (
     Field,
@@ -342,6 +343,21 @@ class Setting(Document):
         return self.state_dim + self.distractors + 2
 
     @property
+    def agents(self) -> tuple[AgentSpec, ...]:
+        """The agents; without a team one, `agent_0`, that owns and observes everything."""
+        if self.team is not None:
+            return self.team.agents
+        return (AgentSpec(name="agent_0", action_dim=self.action_dim),)
+
+    @property
+    def observed_channels(self) -> tuple[tuple[int, ...], ...]:
+        """The state channels that each agent observes."""
+        everything = tuple(range(self.state_dim))
+        return tuple(
+            everything if agent.observes == "all" else agent.observes for agent in self.agents
+        )
+
+    @property
     def extended(self) -> bool:
         """Whether a step does more than METHOD's section 1: `safety` or `observation` is set."""
         return self.safety is not None or self.observation is not None
@@ -350,6 +366,52 @@ class Setting(Document):
     def distractors(self) -> int:
         """m, 0 without `observation`."""
         return 0 if self.observation is None else self.observation.distractors
+
+
+NEVER = 2**63 - 1
+"""Later than every environment step; the largest int64."""
+
+
+class Segment(NamedTuple):
+    """A part of a cycle in which one spec is in force.
+
+    Attributes:
+      phase: the index of its phase; 0 where there are none.
+      spec: the spec.
+      start: environment steps of the cycle before it.
+    """
+
+    phase: int
+    spec: SMESpec
+    start: int
+
+
+class SegmentTimes(NamedTuple):
+    """Which segment is in force after how many environment steps.
+
+    Attributes:
+      starts: environment steps of a cycle before each segment.
+      cycle_steps: environment steps of one cycle.
+      cycles: how often the segments are gone through.
+    """
+
+    starts: list[int]
+    cycle_steps: int
+    cycles: int
+
+    def segment_at(self, lifetime: int) -> int:
+        """The index of the segment in force after so many steps; at the end the last one."""
+        if lifetime >= self.cycles * self.cycle_steps:
+            return len(self.starts) - 1
+        return bisect_right(self.starts, lifetime % self.cycle_steps) - 1
+
+    def next_switch(self, lifetime: int) -> int:
+        """The lifetime at which that segment is over; NEVER in the last one of the life."""
+        cycle, inside = divmod(lifetime, self.cycle_steps)
+        after = bisect_right(self.starts, inside)
+        end = self.starts[after] if after < len(self.starts) else self.cycle_steps
+        switch = cycle * self.cycle_steps + end
+        return switch if switch < self.cycles * self.cycle_steps else NEVER
 
 
 class SMESpec(Setting, NamedDocument):
@@ -372,7 +434,22 @@ class SMESpec(Setting, NamedDocument):
       sme_registry.errors.SpecError: SMESpec: hidden_width=0: must be in [1, 4096]. ...
     """
 
+    # A task is a stream of one segment that is never over: it answers what a stream is asked.
+    times: ClassVar[SegmentTimes] = SegmentTimes([0], NEVER, 1)
+    switch: ClassVar[Literal["episode", "step"]] = "episode"
+    observed_phases: ClassVar[int] = 0
+
     seed: Seed = 0
+
+    @property
+    def specs(self) -> tuple[SMESpec, ...]:
+        """This spec alone."""
+        return (self,)
+
+    @property
+    def segments(self) -> tuple[Segment, ...]:
+        """Its only segment."""
+        return (Segment(0, self, 0),)
 
     def _repr_html_(self) -> str:
         """A card for notebooks: symbols, values and meanings, the digest, and what is changed."""

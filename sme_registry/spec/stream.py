@@ -1,7 +1,7 @@
 """`StreamSpec`: tasks in order, each for a number of environment steps; METHOD, section 7.
 
-A stream is piecewise constant: in each *piece* one spec is in force, so optimum and regret are
-exact. A phase is one piece, or n short ones whose `rotation` moves in equal increments (drift).
+A stream is piecewise constant: in each *segment* one spec is in force, so optimum and regret are
+exact. A phase is one segment, or n short ones whose `rotation` moves in equal increments (drift).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from bisect import bisect_right
 from collections.abc import Iterator
 from functools import lru_cache
 from itertools import accumulate
-from typing import Annotated, Any, Literal, NamedTuple, Self, TypeAlias
+from typing import Annotated, Any, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
@@ -27,9 +27,9 @@ from sme_registry.spec.document import (
     find_named,
     short_repr,
 )
-from sme_registry.spec.sme_spec import FULL_TURN, MAX_SEED, SMESpec
+from sme_registry.spec.sme_spec import FULL_TURN, MAX_SEED, Segment, SegmentTimes, SMESpec
 
-MAX_PIECES = 10_000  # of one cycle
+MAX_SEGMENTS = 10_000  # of one cycle
 MAX_VISITS = 1_000  # of a life that is evaluated
 BETWEEN_DRAWS = 10**6  # of the seeds of a stream, so that its draws have no task in common
 _SHARED = ("state_dim", "action_dim", "horizon")
@@ -40,12 +40,12 @@ class Drift(StrictModel):
 
     Attributes:
       rotation: the angle θ towards which it moves, radians; 2π is a full turn from 0.
-      increments: n. Piece i of n has the angle θ₀ + i (θ − θ₀)/n, so that the first piece is the
+      increments: n. Segment i of n has the angle θ₀ + i (θ − θ₀)/n, so that the first one is the
         phase's own spec, and the next phase may go on at θ.
     """
 
     rotation: Annotated[Real, Field(ge=0, le=FULL_TURN)]
-    increments: Annotated[Integer, Field(ge=2, le=MAX_PIECES)]
+    increments: Annotated[Integer, Field(ge=2, le=MAX_SEGMENTS)]
 
 
 class Phase(StrictModel):
@@ -105,48 +105,6 @@ class Phase(StrictModel):
         return self
 
 
-class Piece(NamedTuple):
-    """A part of a cycle in which one spec is in force.
-
-    Attributes:
-      phase: the index of its phase.
-      spec: the spec.
-      start: environment steps of the cycle before it.
-    """
-
-    phase: int
-    spec: SMESpec
-    start: int
-
-
-class SegmentTimes(NamedTuple):
-    """Which piece is in force after how many environment steps.
-
-    Attributes:
-      starts: environment steps of a cycle before each piece.
-      cycle_steps: environment steps of one cycle.
-      cycles: how often the pieces are gone through.
-    """
-
-    starts: list[int]
-    cycle_steps: int
-    cycles: int
-
-    def piece_at(self, lifetime: int) -> int:
-        """The index of the piece in force; see `StreamSpec.piece_at`."""
-        if lifetime >= self.cycles * self.cycle_steps:
-            return len(self.starts) - 1
-        return bisect_right(self.starts, lifetime % self.cycle_steps) - 1
-
-    def next_switch(self, lifetime: int) -> int | None:
-        """The lifetime at which that piece is over; see `StreamSpec.next_switch`."""
-        cycle, inside = divmod(lifetime, self.cycle_steps)
-        after = bisect_right(self.starts, inside)
-        end = self.starts[after] if after < len(self.starts) else self.cycle_steps
-        switch = cycle * self.cycle_steps + end
-        return switch if switch < self.cycles * self.cycle_steps else None
-
-
 class StreamSpec(NamedDocument):
     """Phases in order, gone through `cycles` times.
 
@@ -197,11 +155,11 @@ class StreamSpec(NamedDocument):
                         f"phases.0 and phases.{index}: their specs have {field}={one} and {other}: "
                         "must be equal, since one agent lives through both. Change one of them."
                     )
-        pieces = sum(phase.drift.increments if phase.drift else 1 for phase in self.phases)
-        if pieces > MAX_PIECES:
+        segments = sum(phase.drift.increments if phase.drift else 1 for phase in self.phases)
+        if segments > MAX_SEGMENTS:
             raise ValueError(
-                f"phases: have {pieces:,} pieces together: must be at most {MAX_PIECES:,}. Use "
-                "fewer increments."
+                f"phases: have {segments:,} segments: must be at most {MAX_SEGMENTS:,}. Use fewer "
+                "increments."
             )
         return self
 
@@ -246,34 +204,32 @@ class StreamSpec(NamedDocument):
         return self.cycles * self.cycle_steps
 
     @property
-    def pieces(self) -> tuple[Piece, ...]:
-        """The pieces of one cycle, in order."""
-        return _pieces(self.phases)[0]
+    def specs(self) -> tuple[SMESpec, ...]:
+        """The spec of each phase, as it begins."""
+        return tuple(phase.spec for phase in self.phases)
 
     @property
-    def schedule(self) -> SegmentTimes:
-        """`piece_at` and `next_switch`, without the cost of finding the pieces at each call."""
-        return SegmentTimes(_pieces(self.phases)[1], self.cycle_steps, self.cycles)
+    def segments(self) -> tuple[Segment, ...]:
+        """The segments of one cycle, in order."""
+        return _segments(self.phases)
+
+    @property
+    def times(self) -> SegmentTimes:
+        """Which of them is in force after how many environment steps."""
+        starts = [segment.start for segment in self.segments]
+        return SegmentTimes(starts, self.cycle_steps, self.cycles)
 
     @property
     def switches(self) -> tuple[Any, ...]:
         """When its tasks change, and how: equal for all draws of a stream, whatever its tasks."""
-        pieces = tuple((piece.phase, piece.start) for piece in self.pieces)
-        return pieces, self.cycle_steps, self.cycles, self.switch, self.observes_phase
+        segments = tuple((segment.phase, segment.start) for segment in self.segments)
+        return segments, self.cycle_steps, self.cycles, self.switch, self.observes_phase
 
     def _repr_html_(self) -> str:
         """A card for notebooks: the phases, and how their tasks differ."""
         from sme_registry.spec import cards
 
         return cards.html(self)
-
-    def piece_at(self, lifetime: int) -> int:
-        """The index of the piece in force after so many environment steps; at the end the last."""
-        return self.schedule.piece_at(lifetime)
-
-    def next_switch(self, lifetime: int) -> int | None:
-        """The lifetime at which the piece in force is over; None in the last piece of the life."""
-        return self.schedule.next_switch(lifetime)
 
     def visit_ends(self, after: int = 0) -> Iterator[tuple[int, int]]:
         """Visits of phases that end later than a lifetime: the index of each, and its end.
@@ -353,19 +309,17 @@ def _moved(seed: int | str, by: int) -> int | str:
 
 
 @lru_cache(maxsize=32)
-def _pieces(phases: tuple[Phase, ...]) -> tuple[tuple[Piece, ...], list[int]]:
-    """The pieces of a cycle, and where each begins."""
+def _segments(phases: tuple[Phase, ...]) -> tuple[Segment, ...]:
     begins = accumulate((phase.steps for phase in phases), initial=0)
-    pieces = tuple(
-        Piece(index, spec, begin + offset)
+    return tuple(
+        Segment(index, spec, begin + offset)
         for index, (phase, begin) in enumerate(zip(phases, begins, strict=False))
-        for spec, offset in _pieces_of(phase)
+        for spec, offset in _segments_of(phase)
     )
-    return pieces, [piece.start for piece in pieces]
 
 
-def _pieces_of(phase: Phase) -> list[tuple[SMESpec, int]]:
-    """The specs of a phase's pieces, and the steps of the phase before each."""
+def _segments_of(phase: Phase) -> list[tuple[SMESpec, int]]:
+    """The specs of a phase's segments, and the steps of the phase before each."""
     if phase.drift is None:
         return [(phase.spec, 0)]
     n, begin = phase.drift.increments, phase.spec.rotation

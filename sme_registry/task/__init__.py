@@ -5,7 +5,7 @@ from sme_registry.task.loading import (
     load,
     load_task,
     materialize,
-    materialize_stream,
+    materialize_segments,
     materialize_together,
 )
 from sme_registry.task.task import Step, Task, observe, step
@@ -17,7 +17,7 @@ __all__ = [
     "load",
     "load_task",
     "materialize",
-    "materialize_stream",
+    "materialize_segments",
     "materialize_together",
     "observe",
     "step",

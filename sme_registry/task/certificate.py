@@ -43,11 +43,8 @@ from scipy.special import ndtr
 
 from sme_registry.io import integer_in
 from sme_registry.spec import SpecLike
-from sme_registry.task import memory
-from sme_registry.task.draw import Array, Layer
-from sme_registry.task.linear_map import held_out_r2
-from sme_registry.task.loading import load_task
-from sme_registry.task.streams import uniform
+from sme_registry.task.draw import Array, Layer, uniform
+from sme_registry.task.loading import check_memory, load_task
 from sme_registry.task.task import Task, through
 
 if TYPE_CHECKING:
@@ -211,7 +208,7 @@ def certify(task: Task | SpecLike, *, seed: int = 0) -> Certificate:
     lanes = max(256, min(_LANES, 2**24 // (S * A)))
     states = max(2_000, min(_STATES, 2**26 // (S + m + task.spec.hidden_width)))
     distractors = f", distractors={m}" if m else ""
-    memory.check_limit(
+    check_memory(
         48 * max(lanes, states) * (S + A + m + task.spec.hidden_width),
         f"Certifying a task of state_dim={S}, action_dim={A}{distractors}",
         "Certify a task of the same kind with fewer channels.",
@@ -588,3 +585,15 @@ def _distinct(values: Array) -> float:
     """The smallest share of distinct values along the first axis."""
     ranked = np.sort(values, axis=0)
     return float((1 + (np.diff(ranked, axis=0) > 0).sum(axis=0)).min()) / len(values)
+
+
+def held_out_r2(h: Array, y: Array) -> Array:
+    """How much of each column of y `[n, c]` an affine map recovers from h `[n, H]`: R² `[c]`.
+
+    1 − Σ (y − ŷ)² / Σ (y − ȳ)² of the held-out half; ŷ is fitted to the other half.
+    """
+    half = len(h) // 2
+    design = np.concatenate([h, np.ones((len(h), 1))], axis=1)
+    solution = np.linalg.lstsq(design[:half], y[:half])[0]
+    missed = ((design[half:] @ solution - y[half:]) ** 2).sum(axis=0)
+    return np.asarray(1.0 - missed / ((y[half:] - y[half:].mean(axis=0)) ** 2).sum(axis=0))

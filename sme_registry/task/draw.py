@@ -1,20 +1,84 @@
 """From a spec's seed to the numbers of a task: W, b, and the layers of each optimal policy.
 
 Source: METHOD, section 1. `S` state_dim, `A` action_dim, `L` complexity, `H` hidden_width.
+
+stream(seed, name) = Philox4x64-10 keyed by the first 128 bits of SHA-256("sme-v1/" seed "/" name).
+A stream depends on its seed and its name alone, so a new layer or agent changes no other stream.
+NumPy guarantees the raw bits of a bit generator, but not the numbers of its `Generator`.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtri
 
-from sme_registry.spec import AgentSpec, SMESpec
-from sme_registry.task.streams import gaussian, raw_bits, uniform
+from sme_registry.spec import SMESpec
 
 Array = npt.NDArray[np.float64]
+Bits = npt.NDArray[np.uint64]
+
+DYNAMICS_VERSION = 1
+
+
+def bit_generator(seed: int | str, name: str) -> np.random.Philox:
+    label = f"sme-v{DYNAMICS_VERSION}/{seed}/{name}"
+    key = int.from_bytes(hashlib.sha256(label.encode()).digest()[:16], "little")
+    return np.random.Philox(key=key)
+
+
+def raw_bits(seed: int | str, name: str, count: int) -> Bits:
+    """The first `count` 64-bit words of a stream."""
+    return bit_generator(seed, name).random_raw(count)
+
+
+def to_uniform(bits: Bits) -> Array:
+    """64-bit words as uniform numbers in the open interval (0, 1), of the same shape.
+
+    u = (⌊bits / 2¹²⌋ + ½) · 2⁻⁵², which is exact, symmetric about ½ and never 0 or 1.
+    """
+    return ((bits >> np.uint64(12)).astype(np.float64) + 0.5) * 2.0**-52
+
+
+def uniform(seed: int | str, name: str, count: int) -> Array:
+    return to_uniform(raw_bits(seed, name, count))
+
+
+def gaussian(seed: int | str, name: str, count: int) -> Array:
+    """Standard normal numbers of a stream, `[count]`: Φ⁻¹ of its uniform numbers."""
+    return np.asarray(ndtri(uniform(seed, name, count)))
+
+
+# SplitMix64's constants.
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+FIRST_MIX = np.uint64(0xBF58476D1CE4E5B9)
+SECOND_MIX = np.uint64(0x94D049BB133111EB)
+
+
+def counted(key: Bits, first: Bits, count: int) -> Array:
+    """Uniform numbers `[n, count]` in (0, 1) of counter-based streams, for environments.
+
+    Of each stream from place `first` `[n]` on, 1 at the beginning: the word at place n is
+    SplitMix64's n-th from the seed mix(`key`). Any place can be computed alone, by machine code as
+    well, so that an environment's only state is the place.
+    Source: Steele, Lea & Flood (2014), Fast splittable pseudorandom number generators.
+    """
+    with np.errstate(over="ignore"):  # arithmetic is modulo 2⁶⁴
+        places = first[:, None] + np.arange(count, dtype=np.uint64)
+        start = mixed_bits(key)[:, None]
+        return to_uniform(mixed_bits(np.add(start, places * GOLDEN, dtype=np.uint64)))
+
+
+def mixed_bits(z: Bits) -> Bits:
+    """SplitMix64's bijection of 64-bit words; a changed bit changes half of all bits."""
+    z = (z ^ (z >> np.uint64(30))) * FIRST_MIX
+    z = (z ^ (z >> np.uint64(27))) * SECOND_MIX
+    return z ^ (z >> np.uint64(31))
+
 
 GRID_BITS = 29  # 29 bits of W times 24 of a float32 action fit the 53 of a float64
 
@@ -64,7 +128,7 @@ def optimal_policies(spec: SMESpec, stream: str = "policy") -> tuple[tuple[Layer
     return tuple(
         _optimal_policy(spec, f"{stream}/{index}", observed, agent.action_dim)
         for index, (agent, observed) in enumerate(
-            zip(agents(spec), observed_channels(spec), strict=True)
+            zip(spec.agents, spec.observed_channels, strict=True)
         )
     )
 
@@ -104,20 +168,6 @@ def mixing_layers(spec: SMESpec) -> tuple[Layer, ...]:
         math.sqrt(12.0) * _haar(spec.seed, f"observation/mixing/{i}", n, n) for i in range(depth)
     ]
     return tuple(Layer(W, -0.5 * W.sum(axis=1)) for W in matrices)
-
-
-def agents(spec: SMESpec) -> tuple[AgentSpec, ...]:
-    """The agents of a spec; without a team, one that owns and observes everything."""
-    if spec.team is not None:
-        return spec.team.agents
-    return (AgentSpec(name="agent_0", action_dim=spec.action_dim),)
-
-
-def observed_channels(spec: SMESpec) -> tuple[tuple[int, ...], ...]:
-    everything = tuple(range(spec.state_dim))
-    return tuple(
-        everything if agent.observes == "all" else tuple(agent.observes) for agent in agents(spec)
-    )
 
 
 def _optimal_policy(

@@ -1,22 +1,27 @@
 """From a name or a spec to a drawn task: `load`, `load_task`, `materialize`; and of streams.
 
-A digest fixes a spec but not the drawn numbers, so a file also publishes a fingerprint of them.
-It is checked where the file is named: `load` and `load_task` draw the task and compare. A spec
+A digest fixes a spec, but random streams and LAPACK may differ between machines and versions. So a
+file also publishes a fingerprint: π*(s), T(s, a) and the like at three fixed probes. `load` and
+`load_task` draw the task that a file names, and refuse one that differs by more than 1e-6. A spec
 alone has no published numbers, so `materialize(spec)` checks only a fingerprint passed to it.
+
+A task too large for the memory is refused before it is drawn.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar, overload
 
-from sme_registry.errors import FingerprintMismatchError
-from sme_registry.spec import Fingerprint, SMESpec, SpecLike, StreamSpec, as_spec
+import numpy as np
+
+from sme_registry.errors import FingerprintMismatchError, OptionError, ResourceLimitError
+from sme_registry.spec import Fingerprint, SMESpec, SpecLike, StreamSpec
+from sme_registry.spec.catalogue import as_document, resolve
 from sme_registry.spec.document import NamedDocument
-from sme_registry.spec.resolve import Resolved, resolve
-from sme_registry.task import draw, memory
-from sme_registry.task.fingerprint import check_fingerprint
+from sme_registry.task import draw
 from sme_registry.task.task import Task
 
 _D = TypeVar("_D", bound=NamedDocument)
@@ -35,15 +40,15 @@ def materialize(spec: SMESpec, fingerprint: Fingerprint | None = None) -> Task:
       >>> float(task.regret(s, task.optimal_action(s)))
       0.0
     """
-    spec = as_spec(spec)
-    sizes = ("state_dim", "action_dim", "complexity", "hidden_width")
-    named = [*sizes, "distractors"] if spec.distractors else sizes
-    memory.check_limit(
-        memory.peak_bytes(spec),
-        f"A task of {', '.join(f'{size}={getattr(spec, size)}' for size in named)}",
+    spec = as_document(spec, SMESpec)
+    sizes = ["state_dim", "action_dim", "complexity", "hidden_width"]
+    sizes += ["distractors"] if spec.distractors else []
+    check_memory(
+        peak_bytes(spec),
+        f"A task of {', '.join(f'{size}={getattr(spec, size)}' for size in sizes)}",
         "Make one of these smaller.",
     )
-    small = memory.parameter_bytes(spec) <= _CACHED_BYTES
+    small = parameter_bytes(spec) <= _CACHED_BYTES
     task = _draw_cached(spec) if small else _draw(spec)
     if fingerprint is not None:
         check_fingerprint(fingerprint, task)
@@ -69,7 +74,7 @@ def load(name: Any, kind: Any = None) -> Any:
     """
     resolved = resolve(name, kind)
     if resolved.fingerprints:
-        draw_published(resolved)
+        materialize_segments(resolved.document, resolved.fingerprints)
     return resolved.document
 
 
@@ -84,56 +89,49 @@ def load_task(task: SpecLike, **overrides: Any) -> Task:
       (2, 8)
     """
     resolved = resolve(task, SMESpec)
-    if overrides:
-        return materialize(resolved.document.derive(**overrides))
-    return draw_published(resolved)[0]
+    fingerprints = () if overrides else resolved.fingerprints
+    return materialize(resolved.document.derive(**overrides), *fingerprints)
 
 
-def draw_published(resolved: Resolved[Any]) -> tuple[Task, ...]:
-    """The task of a spec, or those of a stream's pieces, with its file's published numbers."""
-    if isinstance(resolved.document, StreamSpec):
-        return materialize_stream(resolved.document, resolved.fingerprints)
-    return (materialize(resolved.document, *resolved.fingerprints),)
-
-
-def materialize_stream(
-    stream: StreamSpec, fingerprints: tuple[Fingerprint, ...] = ()
+def materialize_segments(
+    document: SMESpec | StreamSpec, fingerprints: Sequence[Fingerprint] = ()
 ) -> tuple[Task, ...]:
-    """Draw the task of each piece of a cycle; pieces with equal specs share one.
+    """Draw the task of each segment of a cycle; a spec has one. Equal specs share a task.
+
+    With `fingerprints`, of the spec or of each phase's, other numbers are a
+    `FingerprintMismatchError`.
 
     Examples:
-      >>> from sme_registry.task import load, materialize_stream
-      >>> tasks = materialize_stream(load("Switch5"))
+      >>> from sme_registry.task import load, materialize_segments
+      >>> tasks = materialize_segments(load("Switch5"))
       >>> len(tasks)
       5
     """
-    tasks = materialize_together(stream, [piece.spec for piece in stream.pieces])
+    tasks = materialize_together([segment.spec for segment in document.segments])
     drawn = {task.spec: task for task in tasks}
-    for index, (phase, published) in enumerate(zip(stream.phases, fingerprints, strict=False)):
-        try:
-            check_fingerprint(published, drawn[phase.spec])
-        except FingerprintMismatchError as error:
-            raise FingerprintMismatchError(f"phases.{index}: {error}") from None
+    for index, (spec, published) in enumerate(zip(document.specs, fingerprints, strict=False)):
+        where = f"phases.{index}: " if isinstance(document, StreamSpec) else ""
+        check_fingerprint(published, drawn[spec], where)
     return tasks
 
 
-def materialize_together(stream: StreamSpec, specs: Sequence[SMESpec]) -> tuple[Task, ...]:
-    """Draw the tasks of some specs of a stream; equal specs share one.
+def materialize_together(specs: Sequence[SMESpec]) -> tuple[Task, ...]:
+    """Draw the tasks of some specs, all of which must fit in memory; equal specs share one.
 
     Examples:
-      >>> from sme_registry.task import load, materialize_together
-      >>> stream = load("Switch5")
-      >>> first, again = materialize_together(stream, [stream.phases[0].spec] * 2)
+      >>> from sme_registry import SMESpec
+      >>> from sme_registry.task import materialize_together
+      >>> first, again = materialize_together([SMESpec(seed=1), SMESpec(seed=1)])
       >>> first is again
       True
     """
     different = dict.fromkeys(specs)
-    held = sum(map(memory.parameter_bytes, different))
-    memory.check_limit(
-        held + max(map(memory.peak_bytes, different)),
-        f"A stream of {len(stream.phases)} phases with {len(different)} different tasks",
-        "Use fewer phases or increments, or smaller tasks.",
-    )
+    if len(different) > 1:
+        check_memory(
+            sum(map(parameter_bytes, different)) + max(map(peak_bytes, different)),
+            f"{len(different)} different tasks together",
+            "Use fewer phases or increments, or smaller tasks.",
+        )
     drawn = {spec: materialize(spec) for spec in different}
     return tuple(drawn[spec] for spec in specs)
 
@@ -144,7 +142,7 @@ def _draw(spec: SMESpec) -> Task:
         draw.transition_matrix(spec),
         draw.transition_offset(spec),
         draw.optimal_policies(spec),
-        draw.observed_channels(spec),
+        spec.observed_channels,
         draw.limiting_network(spec),
         draw.distractor_transition(spec),
         draw.mixing_layers(spec),
@@ -155,3 +153,123 @@ def _draw(spec: SMESpec) -> Task:
 
 
 _draw_cached = functools.lru_cache(maxsize=64)(_draw)
+
+
+_TOLERANCE = 1e-6
+_DECIMALS = 12
+_GOLDEN = 0.6180339887498949
+
+
+def fingerprint_of(task: Task) -> Fingerprint:
+    """A task's numbers at three fixed probes; the last state is outside the cube."""
+    widths = task.spec.state_dim, task.spec.action_dim, task.spec.distractors
+    p = np.arange(1, 4)[:, None]
+    states, actions, distractors = (
+        np.modf(_GOLDEN * (p + 3 * i) * np.arange(1, width + 1))[0]
+        for i, width in enumerate(widths)
+    )
+    states[-1] = 0.5 + 1.5 * (states[-1] - 0.5)
+    numbers = {
+        "optimal_action": task.optimal_action(states),
+        "next_state": task.transition(states, actions),
+    }
+    if task.limiting:
+        numbers["limit"] = task.limit(states)
+    if task.distractor_transition is not None:
+        numbers["next_distractors"] = task.distractor_step(distractors, actions)
+    if task.mixing:
+        numbers["seen"] = task.seen(states, distractors)
+    return Fingerprint(**{name: np.round(x, _DECIMALS).tolist() for name, x in numbers.items()})
+
+
+def check_fingerprint(published: Fingerprint, task: Task, where: str = "") -> None:
+    """Raise FingerprintMismatchError where a task differs from a published fingerprint."""
+    for (field, here), (_, rows) in zip(fingerprint_of(task), published, strict=True):
+        if difference := _difference(here, rows):
+            raise FingerprintMismatchError(
+                f"{where}fingerprint.{field}: {difference} (allowed {_TOLERANCE:g}): the task "
+                f"drawn on this machine is not the published one of {task.spec.digest[:19]}…. If "
+                "the file was edited, take it again from its source. If not, this machine's NumPy "
+                "or SciPy draws other numbers: install the versions in constraints.txt."
+            )
+
+
+def _difference(here: Any, published: Any) -> str:
+    """In what two numbers of fingerprints differ; empty if they do not."""
+    if here is None and published is None:
+        return ""
+    if published is None:
+        return "is missing"
+    if here is None:
+        return "is present, but this task has no such numbers"
+    if [len(row) for row in here] != [len(row) for row in published]:
+        return "has another shape"
+    distance = float(np.abs(np.subtract(here, published)).max())
+    return "" if distance <= _TOLERANCE else f"differs by {distance:.3g}"
+
+
+_LIMIT_VARIABLE = "SME_MEMORY_LIMIT_GIB"
+_DEFAULT_LIMIT_GIB = 4.0
+_WORKSPACE = 10  # of the largest matrix: raw bits, W's integers, normals, Q, R, LAPACK's copies
+
+
+def parameter_bytes(spec: SMESpec) -> int:
+    """The bytes of a task's arrays once it is drawn, float64."""
+    return 8 * sum(count * out * (inputs + 1) for inputs, out, count in _shapes(spec))
+
+
+def peak_bytes(spec: SMESpec) -> int:
+    """An upper estimate of the bytes needed while a task is drawn."""
+    largest = max(out * inputs for inputs, out, count in _shapes(spec) if count)
+    if spec.rotation:
+        largest = max(largest, max(map(len, spec.observed_channels)) ** 2)
+    return parameter_bytes(spec) + 8 * _WORKSPACE * largest
+
+
+def check_memory(needed: int, what: str, remedy: str) -> None:
+    """Raise ResourceLimitError, with both sizes, if `needed` bytes exceed the limit.
+
+    The limit is 4 GiB, or the value of the environment variable SME_MEMORY_LIMIT_GIB.
+    """
+    text = os.environ.get(_LIMIT_VARIABLE, str(_DEFAULT_LIMIT_GIB))
+    try:
+        limit = float(text)
+    except ValueError:
+        limit = -1.0
+    if not 0 < limit < 2**40:
+        raise OptionError(
+            f"{_LIMIT_VARIABLE}={text!r}: must be a positive number of GiB, such as 16."
+        )
+    gib = needed / 2**30
+    if gib > limit:
+        size = f"{gib:.1f}" if gib >= 10 else f"{gib:.3g}"
+        raise ResourceLimitError(
+            f"{what} would need {size} GiB of memory; the limit is {limit:.3g} GiB. {remedy} If "
+            f"the machine has the memory, set {_LIMIT_VARIABLE} above {size}."
+        )
+
+
+def _shapes(spec: SMESpec) -> Iterator[tuple[int, int, int]]:
+    """`(inputs, outputs, how many)` of every matrix of a task, without a list of its layers."""
+    yield spec.action_dim, spec.state_dim, 1  # W and b of the transition
+    for agent in spec.agents:
+        observed = spec.state_dim if agent.observes == "all" else len(agent.observes)
+        yield from _network_shapes(spec, observed, agent.action_dim)
+    if spec.safety is not None:
+        yield from _network_shapes(spec, spec.state_dim, spec.action_dim)
+    if spec.observation is not None:
+        yield spec.action_dim, spec.distractors, int(spec.observation.dynamics != "noise")
+        mixed = spec.state_dim + spec.distractors
+        depth = spec.observation.mixing_depth or int(spec.observation.mixing != "none")
+        yield mixed, mixed, depth
+
+
+def _network_shapes(spec: SMESpec, inputs: int, outputs: int) -> Iterator[tuple[int, int, int]]:
+    """The same of a network of the spec's complexity and width."""
+    H, inner = spec.hidden_width, spec.complexity - 1
+    if inner == 0:
+        yield inputs, outputs, 1
+    else:
+        yield inputs, H, 1
+        yield H, H, inner - 1
+        yield H, outputs, 1

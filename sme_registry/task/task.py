@@ -46,7 +46,6 @@ from scipy.special import ndtr, ndtri
 
 from sme_registry.errors import ActionError, SpecError, StateError
 from sme_registry.spec import SMESpec
-from sme_registry.task import draw
 from sme_registry.task.draw import Array, Layer
 
 _LARGEST = 1e300  # beyond it W s could overflow, and π* be NaN
@@ -102,12 +101,12 @@ class Task:
     @property
     def names(self) -> tuple[str, ...]:
         """The agents, in the order of the channels that they own; one without a team."""
-        return tuple(agent.name for agent in draw.agents(self.spec))
+        return tuple(agent.name for agent in self.spec.agents)
 
     @property
     def owned(self) -> tuple[slice, ...]:
         """The action channels that each agent owns."""
-        widths = [agent.action_dim for agent in draw.agents(self.spec)]
+        widths = [agent.action_dim for agent in self.spec.agents]
         ends = accumulate(widths)
         return tuple(slice(end - width, end) for width, end in zip(widths, ends, strict=True))
 

@@ -270,7 +270,9 @@ class RunLog(Watch):
         """The phase of a stream, and the mean regret of the last episodes."""
         notes, stream, recent = [], self._record.stream, self.episodes[-_RECENT:]
         if stream is not None:
-            notes.append(f"phase {stream.pieces[stream.piece_at(self._sums.steps)].phase}")
+            notes.append(
+                f"phase {stream.segments[stream.times.segment_at(self._sums.steps)].phase}"
+            )
         if recent:
             regret = np.mean([episode.regret for episode in recent])
             whose = "team's mean regret" if self._agents else "mean regret"

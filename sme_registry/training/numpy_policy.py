@@ -23,7 +23,7 @@ from sme_registry.evaluation import Policy, TeamPolicy, as_policy
 from sme_registry.evaluation.models import torch_policy
 from sme_registry.evaluation.networks import Layer, Perceptron
 from sme_registry.spec import SMESpec, StreamSpec
-from sme_registry.task import streams
+from sme_registry.task import draw
 
 _PROBES = 16
 _TOLERANCE = 1e-5  # of an action; another order of the same sums moves it by 1e-6
@@ -75,7 +75,7 @@ def _fast(policy: Policy, model: Any, observation_dim: int) -> Policy:
     perceptron = _perceptron(torch_policy(model))
     if perceptron is None:
         return policy
-    probes = streams.uniform(0, "actor/probes", _PROBES * observation_dim)
+    probes = draw.uniform(0, "actor/probes", _PROBES * observation_dim)
     observations = probes.reshape(_PROBES, -1).astype(np.float32)
     expected, actions = policy.act(observations), perceptron(observations)
     # A subclass may do more than its layers say. NaN counts as a difference.

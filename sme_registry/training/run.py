@@ -48,7 +48,7 @@ from sme_registry.spec import (
     catalogue,
 )
 from sme_registry.spec.study import INDEPENDENT, parse_uses
-from sme_registry.task import load, materialize, materialize_stream
+from sme_registry.task import load, materialize_segments
 from sme_registry.training.algorithms import (
     check_hyperparameters,
     default_algorithm,
@@ -191,10 +191,7 @@ def train(
     )
     with quiet():
         plan = _with_algorithm(plan, algorithm, agents, num_envs, hyperparameters or {}, device)
-    if plan.stream is not None:  # both fail before the folder is created
-        materialize_stream(plan.stream)
-    else:
-        materialize(plan.spec)
+    materialize_segments(plan.document)  # fails before the folder is created
     folder = Path(folder)
     record = _new_or_continued(folder, plan, resume=resume, force=force)
     with quiet(), one_thread() if _uses_torch(record) else contextlib.nullcontext():

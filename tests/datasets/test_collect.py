@@ -19,7 +19,7 @@ from sme_registry.errors import (
 from sme_registry.evaluation.regions import expansion
 from sme_registry.spec import SMESpec
 from sme_registry.task import materialize
-from sme_registry.task.streams import uniform
+from sme_registry.task.draw import uniform
 
 TEAM = {"agents": [{"action_dim": 1, "observes": [0, 2]}, {"action_dim": 3}]}
 TASKS = {

@@ -108,10 +108,10 @@ def test_evaluations_are_evenly_spaced_and_the_last_is_of_the_policy_returned(tr
 
 def by_hand(result, evaluation):
     """Every step's r̃ and R of three episodes, from the task's own equations."""
-    from sme_registry.task import streams
+    from sme_registry.task import draw
 
     task = materialize(TINY)
-    s = streams.uniform(0, f"rollouts/{evaluation}/initial_state", 6).reshape(3, 2)
+    s = draw.uniform(0, f"rollouts/{evaluation}/initial_state", 6).reshape(3, 2)
     similarities, rewards = [], []
     for t in range(TINY.horizon):
         clock = np.full((3, 1), t / TINY.horizon)

@@ -12,7 +12,7 @@ from sme_registry import SMESpec, StreamSpec, testing
 from sme_registry.envs import SMEEnv, SMEVectorEnv
 from sme_registry.envs.team import SMETeamEnv
 from sme_registry.errors import OptionError, SpecError, StateError
-from sme_registry.task.streams import counted
+from sme_registry.task.draw import counted
 from tests.strategies import specs
 
 SPECS = {

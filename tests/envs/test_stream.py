@@ -97,7 +97,7 @@ def test_a_phase_is_left_at_once_however_far_away_the_switch_is():
     for spec in (stream("step", D=0.0), StreamSpec(phases=phases, switch="step")):
         env, steps = SMEEnv(spec), spec.steps + 20
         env.reset(seed=0)
-        expected = [(i + 1, spec.pieces[spec.piece_at(i)].phase) for i in range(steps)]
+        expected = [(i + 1, spec.segments[spec.times.segment_at(i)].phase) for i in range(steps)]
         assert phases_seen(env, steps) == expected
 
 

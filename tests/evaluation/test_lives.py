@@ -66,7 +66,7 @@ def played(env, policies, seed):
     visit, ended = 0, False
     for lifetime in range(stream.steps):
         if ended or stream.switch == "step":
-            phase = stream.pieces[stream.piece_at(lifetime)].phase
+            phase = stream.segments[stream.times.segment_at(lifetime)].phase
             visit = lifetime // stream.cycle_steps * len(stream.phases) + phase
         action = policies[visit](observation[None])[0].astype(np.float32)
         observation, _, terminated, truncated, info = env.step(action)

@@ -9,7 +9,7 @@ from sme_registry.evaluation import Perceptron, regions
 from sme_registry.evaluation.measure import probe_layers
 from sme_registry.evaluation.regions import expansion
 from sme_registry.spec import EvaluationProtocol
-from sme_registry.task.linear_map import held_out_r2
+from sme_registry.task.certificate import held_out_r2
 from tests.evaluation.kinds import DISTRACTED as SPEC
 from tests.evaluation.kinds import DISTRACTORS as M
 from tests.evaluation.kinds import distracted

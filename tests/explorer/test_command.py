@@ -14,7 +14,7 @@ from sme_registry.evaluation.models import saved_sb3
 from sme_registry.evaluation.rollouts import rollouts
 from sme_registry.explorer import FILE, facts, run_report, write_explorer
 from sme_registry.explorer.page import json_in_html
-from sme_registry.task import streams
+from sme_registry.task import draw
 from sme_registry.training import Episode, RunRecord
 from sme_registry.training.record import EpisodeLog
 from tests.commands import good, refused
@@ -117,7 +117,7 @@ def test_a_run_has_its_learning_curve_and_its_evaluation(tmp_path):
 def test_the_regret_over_the_episode_is_that_of_rollouts():
     subject = load_policy(fitted(SPEC), SPEC)
     over_time = facts(SPEC, subject, episodes=16)["episode"]
-    starts = streams.uniform(0, "explorer/starts", 16 * 3).reshape(16, 3)
+    starts = draw.uniform(0, "explorer/starts", 16 * 3).reshape(16, 3)
     runs = rollouts(subject.policy, materialize(SPEC), starts)
     assert sum(over_time["mean"]) / SPEC.horizon == pytest.approx(runs.regret.mean(), abs=1e-5)
     ended = load("Survival50", SMESpec)

@@ -21,7 +21,7 @@ from sme_registry.jax.ppo import PPO, PPOProgram
 from sme_registry.jax.program import StepLog
 from sme_registry.jax.td3 import TD3, TD3Program
 from sme_registry.spec import StreamSpec
-from sme_registry.task import materialize_stream, observe, step
+from sme_registry.task import materialize_segments, observe, step
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
@@ -105,16 +105,16 @@ def lived(algorithm, *lanes):
 def test_every_step_of_a_life_is_that_of_numpy_under_the_task_in_force(algorithm, stream):
     """From its observation on; also what is observed at a switch, and where an episode ends."""
     life = lived(algorithm, stream, stream)
-    tasks, at_once = materialize_stream(stream), stream.switch == "step"
+    tasks, at_once = materialize_segments(stream), stream.switch == "step"
     one_hot = np.eye(len(stream.phases), dtype=np.float32)
     for lane in range(2):
         t, waiting, most = np.zeros(1, np.int64), np.zeros((1, 1)), 0.0
         for n in range(BUDGET):
-            piece, following = stream.piece_at(n), stream.piece_at(n + 1)
+            piece, following = stream.times.segment_at(n), stream.times.segment_at(n + 1)
             task, s = tasks[piece], life.observation[n, lane, :3].astype(float)[None]
             seen = observe(task.spec, s, t, waiting)[0]
             most = max(most, waiting[0, 0] / task.spec.k)
-            phase = one_hot[stream.pieces[piece].phase]
+            phase = one_hot[stream.segments[piece].phase]
             np.testing.assert_allclose(life.observation[n, lane], [*seen, *phase], atol=1e-6)
             action = (life.action[n, lane].clip(-1, 1).astype(float)[None] + 1) / 2
             one = step(task, s, t, waiting, action)
@@ -129,7 +129,7 @@ def test_every_step_of_a_life_is_that_of_numpy_under_the_task_in_force(algorithm
             last, goes_on = following if at_once else piece, not any(ends)
             if ends[1] or (goes_on and algorithm == "TD3"):  # others are no target of an update
                 seen = observe(tasks[last].spec, one.state, t, waiting)[0]
-                phase = one_hot[stream.pieces[last].phase]
+                phase = one_hot[stream.segments[last].phase]
                 np.testing.assert_allclose(
                     life.next_observation[n, lane],
                     [*seen, *phase], atol=1e-6,

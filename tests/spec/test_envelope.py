@@ -24,8 +24,7 @@ from sme_registry.spec import (
     catalogue,
 )
 from sme_registry.task import load, load_task, materialize
-from sme_registry.task.fingerprint import check_fingerprint, fingerprint_of
-from sme_registry.task.loading import _draw_cached
+from sme_registry.task.loading import _draw_cached, check_fingerprint, fingerprint_of
 from tests.strategies import specs
 
 

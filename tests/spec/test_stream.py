@@ -1,4 +1,4 @@
-"""Streams: what is valid, what is equal, which piece is in force, and files of streams."""
+"""Streams: what is valid, what is equal, which segment is in force, and files of streams."""
 
 import copy
 import json
@@ -23,7 +23,8 @@ from sme_registry.errors import (
     UnknownNameError,
 )
 from sme_registry.spec import SMESpec, StreamFile, StreamSpec, catalogue
-from sme_registry.task import materialize, materialize_stream
+from sme_registry.spec.sme_spec import NEVER
+from sme_registry.task import materialize, materialize_segments
 
 SMALL = {"state_dim": 4, "action_dim": 2}
 DRIFT = {"rotation": 1.0, "increments": 4}
@@ -67,26 +68,26 @@ def test_streams_are_equal_exactly_where_their_digests_are(one, other):
     ):
         assert twin == one
         assert hash(twin) == hash(one)
-        assert twin.pieces == one.pieces
+        assert twin.segments == one.segments
 
 
 @given(streams(), st.data())
-def test_the_piece_in_force_is_the_one_whose_steps_include_the_lifetime(spec, data):
+def test_the_segment_in_force_is_the_one_whose_steps_include_the_lifetime(spec, data):
     in_force = [
         index
-        for index, (piece, after) in enumerate(
-            pairwise([*spec.pieces, spec.pieces[-1]._replace(start=spec.cycle_steps)])
+        for index, (segment, after) in enumerate(
+            pairwise([*spec.segments, spec.segments[-1]._replace(start=spec.cycle_steps)])
         )
-        for _ in range(after.start - piece.start)
+        for _ in range(after.start - segment.start)
     ] * spec.cycles
     assert len(in_force) == spec.steps
     lifetime = data.draw(st.integers(0, spec.steps + 10))
-    expected = in_force[lifetime] if lifetime < spec.steps else len(spec.pieces) - 1
-    assert spec.piece_at(lifetime) == expected
-    switch = spec.next_switch(lifetime)
+    expected = in_force[lifetime] if lifetime < spec.steps else len(spec.segments) - 1
+    assert spec.times.segment_at(lifetime) == expected
+    switch = spec.times.next_switch(lifetime)
     later = range(lifetime + 1, spec.steps)
-    boundaries = [i for i in later if (i % spec.cycle_steps) in {p.start for p in spec.pieces}]
-    assert switch == (boundaries[0] if boundaries else None)
+    boundaries = [i for i in later if (i % spec.cycle_steps) in {p.start for p in spec.segments}]
+    assert switch == (boundaries[0] if boundaries else NEVER)
 
 
 @given(streams())
@@ -95,7 +96,7 @@ def test_visits_end_where_their_phases_do(spec):
     assert [visit for visit, _ in spec.visit_ends()] == [*range(spec.visits)]
     for visit, (begin, end) in enumerate(pairwise([0, *ends])):
         for lifetime in (begin, end - 1):
-            assert spec.pieces[spec.piece_at(lifetime)].phase == visit % len(spec.phases)
+            assert spec.segments[spec.times.segment_at(lifetime)].phase == visit % len(spec.phases)
             assert next(spec.visit_ends(lifetime)) == (visit, end)
     assert ends[-1] == spec.steps
     assert [*spec.visit_ends(spec.steps)] == []
@@ -120,14 +121,14 @@ def test_a_number_of_no_draw_is_refused():
 
 def test_a_drift_is_short_phases_in_equal_increments_of_the_angle():
     spec = stream(phase(10), phase(102, {"rotation": 2 * math.pi, "increments": 4}, rotation=1.0))
-    one, *drifting = spec.pieces
+    one, *drifting = spec.segments
     assert (one.phase, one.start, one.spec.rotation) == (0, 0, 0.0)
-    assert [piece.start for piece in drifting] == [10, 35, 61, 86]
-    angles = [piece.spec.rotation for piece in drifting]
+    assert [segment.start for segment in drifting] == [10, 35, 61, 86]
+    angles = [segment.spec.rotation for segment in drifting]
     np.testing.assert_allclose(angles, 1.0 + np.arange(4) / 4 * (2 * math.pi - 1.0), rtol=1e-15)
     assert drifting[0].spec == spec.phases[1].spec
     over = stream(phase(4, {"rotation": 0.0, "increments": 4}, rotation=6.0))
-    assert all(0 <= piece.spec.rotation < 2 * math.pi for piece in over.pieces)
+    assert all(0 <= segment.spec.rotation < 2 * math.pi for segment in over.segments)
 
 
 ZEROS = "sha256:" + "0" * 64
@@ -153,7 +154,7 @@ ZEROS = "sha256:" + "0" * 64
         ([{"digest": ZEROS, "steps": 1}], "phases.0.spec: 'sha256:000"),
         ([{**phase(1), "stps": 1}], "phases.0.stps=1: unknown field. Did you mean"),
         ({"phases": [phase(1)], "swich": "step"}, "swich='step': unknown field. Did you mean"),
-        ([phase(20_000, {"rotation": 1.0, "increments": 9_999})] * 2, "19,998 pieces"),
+        ([phase(20_000, {"rotation": 1.0, "increments": 9_999})] * 2, "19,998 segments"),
     ],
 )
 def test_a_bad_stream_is_refused_with_the_phase_that_is_wrong(fields, message):
@@ -212,17 +213,17 @@ def test_a_changed_file_is_refused_with_the_phase_that_differs(tmp_path):
             sme_registry.load(path)
 
 
-def test_pieces_of_equal_specs_share_a_task_and_all_must_fit_in_memory_together(monkeypatch):
-    one, two, again = materialize_stream(
+def test_segments_of_equal_specs_share_a_task_and_all_must_fit_in_memory_together(monkeypatch):
+    one, two, again = materialize_segments(
         stream(phase(5, seed=1), phase(5, seed=2), phase(5, seed=1))
     )
     assert one is again
     assert one.spec != two.spec
     np.testing.assert_array_equal(one.W, materialize(one.spec).W)
     monkeypatch.setenv("SME_MEMORY_LIMIT_GIB", "0.001")
-    assert len(materialize_stream(stream(phase(1, complexity=3)))) == 1
-    with pytest.raises(ResourceLimitError, match="40 phases with 40 different tasks"):
-        materialize_stream(stream(*(phase(1, seed=seed, complexity=3) for seed in range(40))))
+    assert len(materialize_segments(stream(phase(1, complexity=3)))) == 1
+    with pytest.raises(ResourceLimitError, match="40 different tasks together"):
+        materialize_segments(stream(*(phase(1, seed=seed, complexity=3) for seed in range(40))))
 
 
 def test_released_streams_draw_their_published_numbers():

@@ -12,7 +12,7 @@ from scipy.special import ndtri
 import sme_registry
 from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.spec import SMESpec
-from sme_registry.task import draw, materialize, memory, streams
+from sme_registry.task import draw, loading, materialize
 from sme_registry.task.loading import _draw
 from tests.strategies import specs
 
@@ -44,37 +44,33 @@ def test_rows_sum_to_one_at_every_width(state_dim):
 
 def test_the_transition_matrix_is_the_normalised_uniform_draw_to_the_grid():
     spec = SMESpec(state_dim=50, action_dim=20, seed=3)
-    bits = streams.raw_bits(3, "transition/W", 1000).reshape(20, 50)
+    bits = draw.raw_bits(3, "transition/W", 1000).reshape(20, 50)
     uniform = bits.astype(np.float64) / 2.0**64
     expected = uniform / uniform.sum(axis=1, keepdims=True)
     np.testing.assert_allclose(materialize(spec).W, expected, rtol=0, atol=1.01 / GRID)
 
 
 def test_uniform_numbers_are_uniform_and_never_zero_or_one():
-    u = streams.uniform(0, "any", 100_000)
+    u = draw.uniform(0, "any", 100_000)
     assert stats.kstest(u, "uniform").pvalue > 0.01
     assert u.min() > 0.0
     assert u.max() < 1.0
     extremes = np.array([0, 2**64 - 1], np.uint64)
-    assert streams.to_uniform(extremes)[0] > 0.0
-    assert streams.to_uniform(extremes)[1] < 1.0
+    assert draw.to_uniform(extremes)[0] > 0.0
+    assert draw.to_uniform(extremes)[1] < 1.0
 
 
 def test_normal_numbers_are_the_inverse_normal_of_the_uniform_ones():
-    z = streams.gaussian(0, "any", 100_000)
-    np.testing.assert_array_equal(z, ndtri(streams.uniform(0, "any", 100_000)))
+    z = draw.gaussian(0, "any", 100_000)
+    np.testing.assert_array_equal(z, ndtri(draw.uniform(0, "any", 100_000)))
     assert stats.kstest(z, "norm").pvalue > 0.01
 
 
 def test_streams_of_other_names_and_seeds_are_other_numbers_and_a_longer_draw_goes_on():
     names = ["transition/W", "transition/b", "policy/0/output", "policy/0/inner/0"]
-    numbers = {
-        streams.raw_bits(seed, name, 1)[0] for seed in (0, 1, "0x0", "0x1") for name in names
-    }
+    numbers = {draw.raw_bits(seed, name, 1)[0] for seed in (0, 1, "0x0", "0x1") for name in names}
     assert len(numbers) == 16
-    np.testing.assert_array_equal(
-        streams.raw_bits(5, "any", 1000)[:10], streams.raw_bits(5, "any", 10)
-    )
+    np.testing.assert_array_equal(draw.raw_bits(5, "any", 1000)[:10], draw.raw_bits(5, "any", 10))
 
 
 @given(specs())
@@ -108,7 +104,7 @@ def test_orthogonal_matrices_are_haar_distributed_in_sign():
 
 def test_a_haar_matrix_reproduces_its_gaussian_with_a_positive_triangle():
     Q = draw._haar(7, "haar", 9, 4)
-    R = Q.T @ streams.gaussian(7, "haar", 36).reshape(9, 4)
+    R = Q.T @ draw.gaussian(7, "haar", 36).reshape(9, 4)
     assert (np.diag(R) > 0).all()
     np.testing.assert_allclose(np.tril(R, -1), 0.0, atol=1e-13)
 
@@ -184,20 +180,20 @@ def test_counted_numbers_are_those_of_splitmix64_whatever_is_drawn_with_them():
     # Published for the seed 1234567: https://rosettacode.org/wiki/Pseudo-random_numbers/Splitmix64
     published = [6457827717110365317, 3203168211198807973, 9817491932198370423]
     with np.errstate(over="ignore"):
-        places = np.uint64(1234567) + streams.GOLDEN * np.arange(1, 4, dtype=np.uint64)
-    assert streams.mixed_bits(places).tolist() == published
+        places = np.uint64(1234567) + draw.GOLDEN * np.arange(1, 4, dtype=np.uint64)
+    assert draw.mixed_bits(places).tolist() == published
     keys, first = np.array([5, 2**52 - 1, 0], np.uint64), np.array([1, 900, 7], np.uint64)
-    together = streams.counted(keys, first, 40)
+    together = draw.counted(keys, first, 40)
     assert ((together > 0) & (together < 1)).all()
     for row, key, place in zip(together, keys, first, strict=True):
         for i in (0, 17, 39):
-            alone = streams.counted(key[None], (place + np.uint64(i))[None], 1)
+            alone = draw.counted(key[None], (place + np.uint64(i))[None], 1)
             assert alone.item() == row[i]
 
 
 def test_counted_numbers_are_uniform_within_and_between_streams():
     keys = np.arange(2000, dtype=np.uint64)
-    u = streams.counted(keys, np.ones(2000, np.uint64), 50)
+    u = draw.counted(keys, np.ones(2000, np.uint64), 50)
     for axis in (0, 1):
         error = 5 / np.sqrt(12 * u.shape[axis])
         assert np.abs(u.mean(axis=axis) - 0.5).max() < error
@@ -227,7 +223,7 @@ def test_a_task_that_cannot_fit_is_refused_and_nothing_is_allocated(spec):
     finally:
         tracemalloc.stop()
     message = str(caught.value)
-    gib = memory.peak_bytes(spec) / 2**30
+    gib = loading.peak_bytes(spec) / 2**30
     assert gib > 4
     assert f"would need {gib:.1f} GiB" in message
     assert f"set SME_MEMORY_LIMIT_GIB above {gib:.1f}." in message
@@ -269,10 +265,10 @@ def test_the_estimate_is_above_what_a_draw_takes_and_not_by_far(fields):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     slack = 2**16  # Python's own objects
-    assert peak <= memory.peak_bytes(spec) + slack
-    assert memory.peak_bytes(spec) <= 8 * (peak + slack)
+    assert peak <= loading.peak_bytes(spec) + slack
+    assert loading.peak_bytes(spec) <= 8 * (peak + slack)
     held = sum(array.nbytes for array in task.arrays)
-    assert memory.parameter_bytes(spec) == held
+    assert loading.parameter_bytes(spec) == held
 
 
 def test_the_limit_can_be_set_higher_and_lower(monkeypatch):
@@ -282,10 +278,13 @@ def test_the_limit_can_be_set_higher_and_lower(monkeypatch):
         materialize(spec)
     monkeypatch.setenv("SME_MEMORY_LIMIT_GIB", "0.01")
     assert materialize(spec).W.shape == (100, 100)
-    monkeypatch.setenv("SME_MEMORY_LIMIT_GIB", "16")
-    assert memory.limit_bytes() == 16 * 2**30
+    for limit in ("16", "4"):
+        monkeypatch.setenv("SME_MEMORY_LIMIT_GIB", limit)
+        with pytest.raises(ResourceLimitError, match=f"the limit is {limit} GiB"):
+            loading.check_memory(int(float(limit) * 2**30) + 1, "It", "")
+        loading.check_memory(int(limit) * 2**30, "It", "")
     monkeypatch.delenv("SME_MEMORY_LIMIT_GIB")
-    assert memory.limit_bytes() == 4 * 2**30
+    loading.check_memory(4 * 2**30, "It", "")
 
 
 def test_a_limit_that_is_no_positive_number_is_refused(monkeypatch):

@@ -46,7 +46,7 @@ from sme_registry.studies.engine.result import (
     Timing,
     life_report,
 )
-from sme_registry.task import materialize, materialize_stream
+from sme_registry.task import materialize, materialize_segments
 from sme_registry.training.algorithms import check_hyperparameters, find, one_thread, quiet
 from sme_registry.training.functions import FunctionLearner
 from sme_registry.training.learn import Watch
@@ -178,8 +178,7 @@ class _Evaluations(Watch):
         models: Path | None = None,
     ) -> None:
         self.cell, self._progress, self._learner = cell, progress, learner
-        stream = cell.stream
-        tasks = (materialize(cell.spec),) if stream is None else materialize_stream(stream)
+        tasks = materialize_segments(cell.document)
         self._schedule = Schedule(cell.document, tasks)
         agents = () if cell.spec.team is None else tasks[0].names
         self.record = Record((cell,), 1, time.thread_time, agents)
