@@ -92,6 +92,8 @@ def read_any(path: str | os.PathLike[str]) -> Envelope:
     for kind in KINDS.values():
         if isinstance(data, dict) and kind.content in data:
             return kind.from_dict(data, os.fspath(path))
+    if isinstance(data, dict) and data.keys() <= SMESpec.model_fields.keys():
+        return EnvFile.from_dict(data, os.fspath(path))  # says that it is a bare spec
     contents = ", ".join(repr(kind.content) for kind in KINDS.values())
     raise MalformedDocumentError(f"{os.fspath(path)}: must be an object with one of {contents}.")
 
