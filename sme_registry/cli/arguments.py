@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+import inspect
 import os
-from collections.abc import Iterable
+import typing
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import typer
 from rich.markup import escape
 
+from sme_registry import explorer
+from sme_registry.diagnosis import load_run
 from sme_registry.envs.arguments import another_stream
 from sme_registry.errors import (
     MalformedDocumentError,
@@ -165,6 +171,53 @@ def check_document_path(path: Path, *, force: bool) -> None:
     check_new(path, force=force)
 
 
+def with_options(options: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the fields of a dataclass as options; it receives them as `options`."""
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        hints = typing.get_type_hints(command, include_extras=True)
+        types = typing.get_type_hints(options, include_extras=True)
+        fields = [
+            inspect.Parameter(
+                field.name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=field.default,
+                annotation=types[field.name],
+            )
+            for field in dataclasses.fields(options)
+        ]
+        parameters: list[inspect.Parameter] = []
+        for name, parameter in inspect.signature(command).parameters.items():
+            if name == "options":
+                parameters += fields
+            else:
+                kind = inspect.Parameter.KEYWORD_ONLY
+                parameters.append(parameter.replace(annotation=hints[name], kind=kind))
+
+        @functools.wraps(command)
+        def with_fields(**values: Any) -> None:
+            chosen = {field.name: values.pop(field.name) for field in fields}
+            command(options=options(**chosen), **values)
+
+        with_fields.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        with_fields.__annotations__ = {p.name: p.annotation for p in parameters}
+        return with_fields
+
+    return decorate
+
+
+def only_with(context: typer.Context, names: Iterable[str], reason: str) -> None:
+    """Check that none of these parameters is given, since they belong to something else."""
+    parameters = {parameter.name: parameter for parameter in context.command.params}
+    for name in names:
+        origin = context.get_parameter_source(name)
+        # By name: newer versions of Typer include their own Click.
+        if origin is not None and origin.name == "COMMANDLINE":
+            shown = parameters[name].metavar or name.upper()
+            options = [text for text in parameters[name].opts if text.startswith("--")]
+            raise OptionError(f"{options[0] if options else shown}: {reason}.")
+
+
 def can_draw() -> bool:
     """Whether figures can be drawn; prints a warning if not."""
     if is_installed("matplotlib"):
@@ -181,9 +234,6 @@ def write_run_explorer(folder: Path) -> list[Path]:
 
     Where it cannot, that is printed: the run is complete without.
     """
-    from sme_registry import explorer
-    from sme_registry.diagnosis import load_run
-
     try:
         path, report = folder / explorer.FILE, explorer.run_report(folder)
         return [explorer.write_explorer(path, load_run(folder), report=report)]
@@ -216,3 +266,8 @@ def print_written(paths: Iterable[Path]) -> None:
     """List the files that were written, on standard error."""
     for path in paths:
         err().print(f"wrote {escape(str(path))}", soft_wrap=True)
+
+
+def unique(values: Iterable[str]) -> list[str]:
+    """The different values, in order of appearance."""
+    return list(dict.fromkeys(values))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -23,15 +23,24 @@ from sme_registry.cli.arguments import (
     changes,
     print_training,
 )
+from sme_registry.datasets import (
+    Dataset,
+    list_datasets,
+    make_dataset,
+    open_dataset,
+    replay,
+    train_offline,
+    train_sealed,
+)
+from sme_registry.datasets.offline import check_algorithm
+from sme_registry.datasets.record import PolicyScore
+from sme_registry.datasets.storage import check_location, datasets_folder
 from sme_registry.errors import OptionError, SMEError
+from sme_registry.io import check_new
 from sme_registry.io.tables import Table
 from sme_registry.io.terminal import Progress, err, failure, out, print_json, print_pairs
 from sme_registry.spec import catalogue
-
-if TYPE_CHECKING:
-    from sme_registry.datasets import Dataset
-    from sme_registry.datasets.record import PolicyScore
-
+from sme_registry.task import materialize
 
 _DEFAULT = "MINARI_DATASETS_PATH, or ~/.minari/datasets"
 
@@ -103,8 +112,6 @@ def make(
 
       sme dataset make Plane1 --nu 0.25 --coverage -0.2 --name sme/inner-v0 --out data
     """
-    from sme_registry.datasets import make_dataset
-
     spec = load(task, SMESpec).derive(**changes(set_))
     with Progress("collecting", transitions, unit="transitions", console=err()) as progress:
         dataset = make_dataset(
@@ -154,9 +161,6 @@ def list_(folder: DatasetsFolder = None, json: Json = False) -> None:
 
       sme dataset list --datasets data --json
     """
-    from sme_registry.datasets import list_datasets
-    from sme_registry.datasets.storage import datasets_folder
-
     datasets, broken = list_datasets(folder)
     if json:
         print_json([_summary(dataset) for dataset in datasets])
@@ -182,8 +186,6 @@ def show(name: Name, folder: DatasetsFolder = None, json: Json = False) -> None:
 
       sme dataset show data/sme/inner-v0 --json
     """
-    from sme_registry.datasets import open_dataset
-
     _print(open_dataset(name, folder), json)
 
 
@@ -201,10 +203,6 @@ def validate(
 
       sme dataset validate data/sme/inner-v0
     """
-    from sme_registry.datasets import open_dataset, replay
-    from sme_registry.datasets.storage import check_location
-    from sme_registry.task import materialize
-
     results: list[dict[str, Any]] = []
     for name in sets:
         result: dict[str, Any] = {"set": name, "valid": True, "error": None}
@@ -351,9 +349,6 @@ def train(
 
       sme evaluate runs/Default-v1-nu50-seed7-v0-iql-seed0/policy.npz Default
     """
-    from sme_registry.datasets import open_dataset, train_offline
-    from sme_registry.datasets.offline import check_algorithm
-
     algorithm, _ = check_algorithm(algorithm)
     opened = open_dataset(dataset, folder)
     if out_folder is None:
@@ -399,9 +394,6 @@ def sealed(
 
       sme offline sealed autumn/datasets/sealed/autumn/deep-0-v0 -o deep-0.npz
     """
-    from sme_registry.datasets import train_sealed
-    from sme_registry.io import check_new
-
     check_new(out_file, force=force)
     title = f"training {algorithm.upper()}"
     with Progress(title, max(1, steps), console=err()) as progress:

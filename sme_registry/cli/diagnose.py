@@ -1,15 +1,16 @@
-"""`sme diagnose`: locate a policy's regret, and find likely causes."""
+"""`sme diagnose` and `sme explore`: where the regret of a policy is, and what causes it."""
 
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.markup import escape
 
-from sme_registry import SMESpec, load
+from sme_registry import diagnosis, explorer
 from sme_registry.cli.arguments import (
     ActionRange,
     Force,
@@ -19,18 +20,97 @@ from sme_registry.cli.arguments import (
     can_draw,
     changes,
     print_written,
+    with_options,
 )
-from sme_registry.errors import OptionError
-from sme_registry.io import check_new, to_json, write_atomically
+from sme_registry.diagnosis import AnySubject
+from sme_registry.diagnosis.figures import draw
+from sme_registry.errors import OptionError, UnknownNameError
+from sme_registry.io import check_new, integer_in, to_json, write_atomically
 from sme_registry.io.terminal import err, out, print_json
-from sme_registry.spec import EnvFile, catalogue
-
-if TYPE_CHECKING:
-    from sme_registry.diagnosis import AnySubject
+from sme_registry.spec import EnvFile, SMESpec, catalogue
+from sme_registry.task import load
 
 _JSON, _PAGE = "diagnosis.json", "diagnosis.md"
+_POLICY_FILES = (".zip", ".onnx", ".npz")
 
 
+@dataclass(frozen=True, kw_only=True)
+class SubjectOptions:
+    """Options that say what the argument of a command is: a run, a cell, a policy or a task."""
+
+    task: Annotated[
+        str | None,
+        typer.Option(
+            "--task",
+            "-t",
+            help="The argument is a policy, for this task.",
+            autocompletion=catalogue.completion(EnvFile),
+        ),
+    ] = None
+    cell: Annotated[
+        str | None,
+        typer.Option(help="The argument is a study's folder; the start of a cell's key."),
+    ] = None
+    log: Annotated[
+        Path | None,
+        typer.Option(help="With --task, the episodes.csv of the policy's training."),
+    ] = None
+    action_range: ActionRange = None
+    set_: SpecChanges = None
+
+    def check(self, what: str) -> None:
+        """Check that no option of a policy is given where there is none."""
+        if self.task is not None:
+            if self.cell is not None:
+                raise OptionError("--cell: names a cell of a study, --task a policy's task.")
+        elif self.action_range is not None:
+            raise OptionError("--action-range: needs a policy with --task; a run records its own.")
+        elif self.log is not None:
+            raise OptionError("--log: is the log of a policy with --task; a run has its own.")
+        elif self.set_ and (self.cell is not None or Path(what).is_dir()):
+            raise OptionError("--set: changes a task; a run has its own. Leave it out.")
+
+    def subject(self, what: str) -> AnySubject:
+        """The policy on a task, the cell of a study, or the run."""
+        if self.task is not None:
+            spec = load(self.task, SMESpec).derive(**changes(self.set_))
+            name = what if os.sep not in what else None
+            return diagnosis.load_policy(
+                what, spec, action_range=self.action_range, name=name, log=self.log
+            )
+        if self.cell is not None:
+            return diagnosis.load_cell(what, self.cell)
+        if not Path(what).is_dir():
+            raise OptionError(
+                f"{what!r}: is not a folder. Give a folder of `sme train`; for a policy, add the "
+                "task that it is for, such as --task Default."
+            )
+        return diagnosis.load_run(what)
+
+    def subject_or_task(self, what: str) -> AnySubject | SMESpec:
+        """The same, or a task by its name, path or digest."""
+        given = self.task is not None or self.cell is not None or Path(what).is_dir()
+        if given or what.endswith(_POLICY_FILES):
+            return self.subject(what)
+        try:
+            return load(what, SMESpec).derive(**changes(self.set_))
+        except UnknownNameError as error:
+            if ":" not in what or what.startswith("sha256:"):
+                raise
+            raise OptionError(f"{error} For a policy, add its task: --task Default.") from None
+
+    def other(self, what: str, against: str) -> AnySubject:
+        """What --against names: like the argument, or a cell as STUDY:KEY or by its key."""
+        if self.task is None and not Path(against).exists():
+            study, colon, key = against.rpartition(":")
+            if colon:
+                return diagnosis.load_cell(study, key)
+            if self.cell is not None:
+                return diagnosis.load_cell(what, against)
+        return replace(self, cell=None, log=None).subject(against)
+
+
+@with_options(SubjectOptions)
 def diagnose(
     run: Annotated[
         str,
@@ -39,18 +119,7 @@ def diagnose(
             help="A folder of `sme train`; with --cell, of a study; with --task, any policy.",
         ),
     ],
-    task: Annotated[
-        str | None,
-        typer.Option(
-            "--task",
-            "-t",
-            help="RUN is a policy, for this task.",
-            autocompletion=catalogue.completion(EnvFile),
-        ),
-    ] = None,
-    cell: Annotated[
-        str | None, typer.Option(help="RUN is a study's folder; the start of a cell's key.")
-    ] = None,
+    options: SubjectOptions,
     against: Annotated[
         str | None,
         typer.Option(
@@ -66,13 +135,7 @@ def diagnose(
             help="Fit a network of the same layers to the optimal actions; takes under a minute.",
         ),
     ] = False,
-    log: Annotated[
-        Path | None,
-        typer.Option(help="With --task, the episodes.csv of the policy's training."),
-    ] = None,
     out_folder: Out = None,
-    action_range: ActionRange = None,
-    set_: SpecChanges = None,
     states: Annotated[int, typer.Option(help="Uniform states to evaluate in.")] = 8192,
     episodes: Annotated[int, typer.Option(help="Episodes to evaluate.")] = 64,
     seed: Annotated[int, typer.Option(help="Seed of these states and start states.")] = 0,
@@ -117,22 +180,13 @@ def diagnose(
 
       sme diagnose runs/Switch5-PPO-seed0 --out runs/Switch5-PPO-seed0/diagnosis
     """
-    from sme_registry import diagnosis
-
     if out_folder is not None:
         check_new(out_folder / _JSON, force=force)
-    if set_ and task is None:
-        raise OptionError("--set: changes the task of a policy. Add --task.")
-    check_policy_options(task, action_range, log)
-    subject = _subject(run, task, cell, set_, action_range, log)
-    other = None
-    if against is not None:
-        other = _other_cell(run, task, cell, against) or _subject(
-            against, task, None, set_, action_range
-        )
+    options.check(run)
+    subject = options.subject(run)
     result = diagnosis.diagnose(
         subject,
-        against=other,
+        against=None if against is None else options.other(run, against),
         probe_capacity=probe_capacity,
         states=states,
         episodes=episodes,
@@ -146,11 +200,7 @@ def diagnose(
             out().print(part)
     if out_folder is None:
         return
-    figures: tuple[Path, ...] = ()
-    if can_draw():
-        from sme_registry.diagnosis.figures import draw
-
-        figures = draw(result, out_folder, subject)
+    figures = draw(result, out_folder, subject) if can_draw() else ()
     names = [path.name for path in figures if path.suffix == ".png"]
     text = result.markdown(names, details=all_)
     # The data last, so that the other files exist once it does.
@@ -159,62 +209,104 @@ def diagnose(
     print_written([*figures, written, data])
 
 
-def _subject(
-    run: str,
-    task: str | None,
-    cell: str | None,
-    set_: list[str] | None,
-    action_range: str | None,
-    log: Path | None = None,
-) -> AnySubject:
-    """The run, cell or policy that the arguments name."""
-    is_policy = Path(run).is_file() or ":" in run or os.sep not in run
-    if task is None and cell is None and is_policy and not Path(run).is_dir():
-        raise OptionError(
-            f"run={run!r}: is not a folder. Give a folder of `sme train`; for a policy, add the "
-            "task it is for, such as --task Default."
-        )
-    name = run if os.sep not in run else None
-    return load_subject(run, task, cell, set_, action_range, log, name)
+@with_options(SubjectOptions)
+def explore(
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="WHAT",
+            help="A folder of `sme train`; a task, by name, path or digest; with --task, any "
+            "policy; with --cell, a study.",
+            autocompletion=catalogue.completion(EnvFile),
+        ),
+    ],
+    options: SubjectOptions,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="The .html file. Default explorer.html in a run's folder, else "
+            "NAME-explorer.html here.",
+        ),
+    ] = None,
+    channels: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="I,J",
+            help="Two channels over which to sample a policy whose network is unknown; default "
+            "1,2. Repeatable.",
+        ),
+    ] = None,
+    episodes: Annotated[int, typer.Option(help="Episodes for the regret over time.")] = 64,
+    seed: Annotated[int, typer.Option(help="Seed of their start states.")] = 0,
+    open_: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
+    force: Force = False,
+) -> None:
+    """Write one HTML file that shows regret in any state, in and beyond the training cube.
+
+    A map shows the regret over any two channels, with a slider for each of the others; beside it
+    the optimal and the chosen action, the regret over an episode and, of a run, its learning curve,
+    its evaluation and what its layers keep. The file carries the networks and computes them in the
+    browser: it needs no network connection and no installation.
+
+    Networks are known of Stable-Baselines3's models with MlpPolicy, of our agents in JAX, of
+    offline policies (.npz), and of PyTorch modules and ONNX files of feed-forward layers. Any other
+    policy is sampled over the channels of --channels, and the other sliders are off.
+
+    Of a task alone, the page shows the optimal policy, and the regret of a linear and of a constant
+    policy. Loading a model's .zip can run code: use only files whose author you trust.
+
+    Examples:
+
+      sme explore runs/demo --open
+
+      sme explore Complexity10
+
+      sme explore actor.onnx --task Default
+
+      sme explore mypolicy:act --task Complexity10 --channels 1,2 --channels 3,7
+
+      sme explore runs/smoke --cell 3f2a91c4 --out cell.html
+    """
+    integer_in("--episodes", episodes, 1, 10_000)
+    pairs = [_channels(text) for text in channels or ()]
+    options.check(what)
+    target = _target(what, options, out, force=force)
+    subject = options.subject_or_task(what)
+    is_run = not isinstance(subject, SMESpec) and options.task is None
+    written = explorer.write_explorer(
+        target,
+        subject,
+        report=explorer.run_report(what, options.cell) if is_run else None,
+        channels=pairs,
+        episodes=episodes,
+        seed=seed,
+    )
+    print_written([written])
+    if open_:
+        typer.launch(written.absolute().as_uri())
 
 
-def check_policy_options(task: str | None, action_range: str | None, log: Path | None) -> None:
-    """Refuse options of a policy where there is none."""
-    if task is None and action_range is not None:
-        raise OptionError("--action-range: applies to a policy with --task; a run records its own.")
-    if task is None and log is not None:
-        raise OptionError("--log: is the log of a policy with --task; a run has its own.")
-
-
-def load_subject(
-    what: str,
-    task: str | None,
-    cell: str | None,
-    set_: list[str] | None,
-    action_range: str | None,
-    log: Path | None,
-    name: str | None = None,
-) -> AnySubject:
-    """A policy on a task, a cell of a study or a run; `name` is of the policy."""
-    from sme_registry import diagnosis
-
-    if cell is not None and task is not None:
-        raise OptionError("--cell: names a cell of a study, --task a policy's task. Give one.")
-    if task is not None:
-        spec = load(task, SMESpec).derive(**changes(set_))
-        return diagnosis.load_policy(what, spec, action_range=action_range, name=name, log=log)
+def _target(what: str, options: SubjectOptions, out: Path | None, *, force: bool) -> Path:
+    """The file to write; that in a run's folder follows from the run and may be replaced."""
+    task, cell = options.task, options.cell
+    if out is not None:
+        if out.suffix != ".html":
+            raise OptionError(f"--out {out}: must end in .html.")
+        return check_new(out, force=force)
+    if task is None and cell is None and Path(what).is_dir():
+        return Path(what) / explorer.FILE
+    name = Path(what).name if os.sep in what or what.endswith(_POLICY_FILES) else what
+    label = "".join(c if c.isalnum() or c in "-_" else "-" for c in name.removesuffix(".json"))
     if cell is not None:
-        return diagnosis.load_cell(what, cell)
-    return diagnosis.load_run(what)
+        label += f"-{cell[:12]}"
+    return check_new(Path(f"{label}-explorer.html"), force=force)
 
 
-def _other_cell(run: str, task: str | None, cell: str | None, against: str) -> AnySubject | None:
-    """The cell that --against names, as STUDY:KEY or as a key of the same study; else None."""
-    from sme_registry import diagnosis
-
-    if task is not None or Path(against).exists():
-        return None
-    study, colon, key = against.rpartition(":")
-    if colon:
-        return diagnosis.load_cell(study, key)
-    return None if cell is None else diagnosis.load_cell(run, against)
+def _channels(text: str) -> tuple[int, int]:
+    """Two channels, as text `I,J`."""
+    parts = text.split(",")
+    if len(parts) != 2 or not all(part.strip().isdecimal() for part in parts):
+        raise OptionError(f"--channels {text}: must be two channels, such as --channels 1,2.")
+    return int(parts[0]), int(parts[1])

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import typer
 
+from sme_registry import evaluation
 from sme_registry.cli.arguments import (
     ActionRange,
     Force,
@@ -18,22 +17,27 @@ from sme_registry.cli.arguments import (
     can_draw,
     changed,
     changes,
+    only_with,
     print_tables,
     print_written,
 )
 from sme_registry.errors import OptionError
+from sme_registry.evaluation import EvaluationReport, Policy, StreamReport, TeamPolicy
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.io import check_new
 from sme_registry.io.terminal import Progress, err, print_json
+from sme_registry.plots.files import write_evaluation, write_stream
+from sme_registry.plots.streams import FILE as STREAM
 from sme_registry.spec import (
     EnvFile,
     EvaluationProtocol,
-    SMESpec,
     StreamFile,
     StreamSpec,
     catalogue,
 )
 from sme_registry.task import load
+
+_EVALUATION = "evaluation.json"
 
 
 def _complete_policy(incomplete: str) -> list[str]:
@@ -41,6 +45,7 @@ def _complete_policy(incomplete: str) -> list[str]:
 
 
 def evaluate(
+    context: typer.Context,
     policies: Annotated[
         list[str],
         typer.Argument(
@@ -119,23 +124,33 @@ def evaluate(
       sme evaluate runs/life/snapshots/visit-*.zip Switch5 --initial runs/life/snapshots/initial.zip
     """
     document = changed(load(task), task, changes(set_))
-    given = _Policies(policies, initial, fresh, action_range, algorithm)
-    _check_number(given, task, document)
-    from sme_registry import evaluation
-    from sme_registry.plots.streams import FILE
-
     resolved = evaluation.resolve_protocol(protocol)
-    name = FILE if isinstance(document, StreamSpec) else "evaluation.json"
-    target = None if out_folder is None else out_folder / name
+    is_stream = isinstance(document, StreamSpec)
+    target = None if out_folder is None else out_folder / (STREAM if is_stream else _EVALUATION)
     if target is not None:
         check_new(target, force=force)
+    options = {"action_range": action_range, "algorithm": algorithm}
+    report: EvaluationReport | StreamReport
+    policy: Policy | TeamPolicy | None = None
     if isinstance(document, StreamSpec):
-        report, draw = _on_stream(given, document, resolved)
+        report = _on_stream(policies, document, resolved, options, initial, fresh)
     else:
-        report, draw = _on_task(given, document, resolved)
+        only_with(context, ("initial", "fresh"), f"is for streams, and {task!r} is a task")
+        if len(policies) > 1:
+            raise OptionError(
+                f"{' '.join(policies):.80}: are {len(policies)} policies: must be one for the task "
+                f"{task!r}. Only a stream needs one for each visit."
+            )
+        policy = evaluation.as_policy(policies[0], document, **options)
+        with _progress(resolved) as progress:
+            report = evaluation.evaluate(policy, document, resolved, progress=progress.update_of)
     files = []
     if target is not None:
-        files = [report.write(target), *(draw(target.parent) if can_draw() else ())]
+        files.append(report.write(target))
+        if can_draw() and isinstance(report, StreamReport):
+            files += write_stream(report, target.parent)
+        elif can_draw():
+            files += write_evaluation(report, target.parent, policy)
     if json:
         print_json(report.to_dict())
     else:
@@ -143,90 +158,43 @@ def evaluate(
     print_written(files)
 
 
-# A report, and what draws its figures into a folder.
-_Evaluated = tuple[Any, Callable[[Path], list[Path]]]
-
-
-class _Policies(NamedTuple):
-    """The policies, as the command line has them; `initial` and `fresh` only of a stream."""
-
-    policies: list[str]
-    initial: str | None
-    fresh: list[str] | None
-    action_range: str | None
-    algorithm: str | None
-
-    def options(self) -> dict[str, Any]:
-        """How their files are read."""
-        return {"action_range": self.action_range, "algorithm": self.algorithm}
-
-
-def _check_number(given: _Policies, task: str, document: SMESpec | StreamSpec) -> None:
-    number = len(given.policies)
-    if isinstance(document, StreamSpec):
-        document.check_visits()
-        if number not in (1, document.visits):
-            raise OptionError(
-                f"{number} policies: must be one for the whole life, or {document.visits}, one at "
-                "the end of each visit."
-            )
-        return
-    if number > 1:
-        raise OptionError(
-            f"{' '.join(given.policies):.80}: are {number} policies: must be one for the task "
-            f"{task!r}. Only a stream needs one for each visit."
-        )
-    for option, value in (("--initial", given.initial), ("--fresh", given.fresh)):
-        if value:
-            raise OptionError(f"{option}: is for streams, and {task!r} is a task. Leave it out.")
-
-
 def _progress(protocol: EvaluationProtocol) -> Progress:
     states = protocol.states_per_region * len(protocol.edges)
     return Progress("evaluating", states, unit="states", console=err())
 
 
-def _on_task(given: _Policies, spec: SMESpec, protocol: EvaluationProtocol) -> _Evaluated:
-    from sme_registry import evaluation
-
-    policy = evaluation.as_policy(given.policies[0], spec, **given.options())
-    with _progress(protocol) as progress:
-        report = evaluation.evaluate(policy, spec, protocol, progress=progress.update_of)
-
-    def draw(folder: Path) -> list[Path]:
-        from sme_registry.plots.files import write_evaluation
-
-        return write_evaluation(report, folder, policy)
-
-    return report, draw
-
-
-def _on_stream(given: _Policies, stream: StreamSpec, protocol: EvaluationProtocol) -> _Evaluated:
-    from sme_registry import evaluation
-
-    policies: list[Any] = [*given.policies]
+def _on_stream(
+    files: list[str],
+    stream: StreamSpec,
+    protocol: EvaluationProtocol,
+    options: dict[str, Any],
+    initial: str | None,
+    fresh: list[str] | None,
+) -> StreamReport:
+    """The report of the policies at the ends of visits, or of one for the whole life."""
+    stream.check_visits()
+    if len(files) not in (1, stream.visits):
+        raise OptionError(
+            f"{len(files)} policies: must be one for the whole life, or {stream.visits}, one at "
+            "the end of each visit."
+        )
+    policies: list[Any] = [*files]
     learns = len(policies) > 1
     if not learns:
         task, phases = stream.phases[0].spec, stream.observed_phases
-        policy = evaluation.as_policy(policies[0], task, observed_phases=phases, **given.options())
+        policy = evaluation.as_policy(files[0], task, observed_phases=phases, **options)
         policies = [policy] * stream.visits
     with _progress(protocol) as progress:
         report = evaluation.evaluate_stream(
             policies,
             stream,
             protocol,
-            initial=given.initial,
-            fresh=given.fresh,
+            initial=initial,
+            fresh=fresh,
             progress=progress.update_of,
-            **given.options(),
+            **options,
         )
     report = report.with_reference_regret(evaluation.reference_regret(stream))
     if not learns:
         report = report.with_dynamic_regret(evaluation.expected_regret(policies, stream))
-
-    def draw(folder: Path) -> list[Path]:
-        from sme_registry.plots.files import write_stream
-
-        return write_stream(report, folder)
-
-    return report, draw
+    return report

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-import functools
-import inspect
 import typing
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,9 +18,13 @@ from sme_registry.cli.arguments import (
     check_document_path,
     find_file,
     json_or_text,
+    only_with,
+    unique,
+    with_options,
 )
 from sme_registry.cli.show import number_of_cells, study_table, summary
 from sme_registry.errors import MissingDependencyError, OptionError, SMEError
+from sme_registry.evaluation import resolve_protocol
 from sme_registry.io import integer_in, parse_json, read_json
 from sme_registry.io.tables import Table
 from sme_registry.io.terminal import duration_range, err, out, print_json
@@ -44,7 +45,26 @@ from sme_registry.spec import (
 )
 from sme_registry.spec.catalogue import is_path
 from sme_registry.spec.study import parse_uses, sweep
+from sme_registry.studies.engine.budget import (
+    Estimator,
+    Span,
+    makespan,
+    scaled,
+    selected,
+    uneven_rollouts,
+    with_agents,
+    with_sources,
+)
+from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.engine.programs import available_cores
 from sme_registry.task import load
+from sme_registry.training.algorithms import (
+    check_algorithm,
+    code_notice,
+    find,
+    folder_name,
+    nested_hyperparameters,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,8 +171,6 @@ class PlanOptions(ClassOptions):
 
     def plan(self, source: str) -> StudyPlan:
         """The plan that the options describe; errors name `source`."""
-        from sme_registry.evaluation import resolve_protocol
-
         fields = {
             **self.members(),
             "algorithms": self._algorithms(),
@@ -169,8 +187,6 @@ class PlanOptions(ClassOptions):
         """Each `[NAME=]USES` with each action range."""
         if not self.algorithm:
             raise OptionError("--algorithm: is required, such as --algorithm PPO.")
-        from sme_registry.training.algorithms import nested_hyperparameters
-
         ranges = self.action_range or ["symmetric"]
         uses_of: list[tuple[str, str]] = []
         for text in self.algorithm:
@@ -207,45 +223,8 @@ def sweep_axes(texts: typing.Iterable[str]) -> dict[str, list[Any]]:
     return axes
 
 
-def with_options(options: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the fields of a dataclass as options; it receives them as `options`."""
-
-    def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        hints = typing.get_type_hints(command, include_extras=True)
-        types = typing.get_type_hints(options, include_extras=True)
-        fields = [
-            inspect.Parameter(
-                field.name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=field.default,
-                annotation=types[field.name],
-            )
-            for field in dataclasses.fields(options)
-        ]
-        parameters: list[inspect.Parameter] = []
-        for name, parameter in inspect.signature(command).parameters.items():
-            if name == "options":
-                parameters += fields
-            else:
-                kind = inspect.Parameter.KEYWORD_ONLY
-                parameters.append(parameter.replace(annotation=hints[name], kind=kind))
-
-        @functools.wraps(command)
-        def with_fields(**values: Any) -> None:
-            chosen = {field.name: values.pop(field.name) for field in fields}
-            command(options=options(**chosen), **values)
-
-        with_fields.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        with_fields.__annotations__ = {each.name: each.annotation for each in parameters}
-        return with_fields
-
-    return decorate
-
-
 def _short_name(uses: str) -> str:
     """The name of an algorithm in a plan: `TQC`, `linear`, `jax-PPO`, `independent PPO`."""
-    from sme_registry.training.algorithms import folder_name
-
     kind, name = parse_uses(uses)
     if kind == "independent":
         return f"independent {_short_name(name)}"
@@ -350,10 +329,6 @@ def plan(
 
       sme study plan smoke --folder runs/smoke --json
     """
-    from sme_registry.studies.engine.budget import Estimator, Span, makespan, selected, with_sources
-    from sme_registry.studies.engine.ledger import Ledger
-    from sme_registry.studies.engine.programs import available_cores
-
     if plan is None:
         _list_plans(json)
         return
@@ -452,8 +427,6 @@ def scaled_plan(
     agents: str | None = None,
 ) -> StudyFile:
     """A plan with the budgets of `--steps`, `--seeds` and `--evaluations`, and `--agents`."""
-    from sme_registry.studies.engine.budget import scaled, with_agents
-
     budgets: dict[str, int] = {}
     for text in steps or ():
         name, _, number = text.rpartition("=")
@@ -471,8 +444,6 @@ def scaled_plan(
 
 def check_algorithms(algorithms: Iterable[StudyAlgorithm], errors: type[SMEError]) -> None:
     """Check a plan's algorithms; warn about those that cannot be found here by such an error."""
-    from sme_registry.training.algorithms import check_algorithm, code_notice, find
-
     algorithms = list(algorithms)
     if notice := code_notice(algorithm.uses for algorithm in algorithms):
         err().print(escape(notice), soft_wrap=True)
@@ -491,8 +462,6 @@ def check_algorithms(algorithms: Iterable[StudyAlgorithm], errors: type[SMEError
 
 def warn_of_uneven_rollouts(plan: StudyPlan) -> None:
     """Print which rollouts do not end where the phases of streams do."""
-    from sme_registry.studies.engine.budget import uneven_rollouts
-
     for uneven in uneven_rollouts(plan):
         err().print(
             f"[yellow]uneven rollouts:[/] {escape(uneven.algorithm)} on "
@@ -503,11 +472,6 @@ def warn_of_uneven_rollouts(plan: StudyPlan) -> None:
             "divides it.",
             soft_wrap=True,
         )
-
-
-def unique(values: Iterable[str]) -> list[str]:
-    """The different values, in order of appearance."""
-    return list(dict.fromkeys(values))
 
 
 _ALLOWED_WITH_FROM = ("path", "name", "description", "source", "force")
@@ -565,7 +529,9 @@ def new(
         data = {"plan": options.plan(str(path)).to_dict()}
         file = StudyFile.with_digest(data, str(path), **default_name | about)
     else:
-        _refuse_other_options(context)
+        others = [option for option in context.params if option not in _ALLOWED_WITH_FROM]
+        reason = "the plan of --from already sets it. Change it in that file, or leave out --from"
+        only_with(context, others, reason)
         data = read_json(source) if is_path(source) else find_file(StudyFile, source).to_dict()
         named = isinstance(data, dict) and "name" in data
         file = StudyFile.with_digest(data, source, **({} if named else default_name) | about)
@@ -575,15 +541,3 @@ def new(
     file.write(path)
     out().print(f"{escape(str(path))}  {file.digest}", soft_wrap=True)
     err().print(f"[dim]To see its runs and times: sme study plan {escape(str(path))}[/]")
-
-
-def _refuse_other_options(context: typer.Context) -> None:
-    """Check that no option is given that the plan of --from already sets."""
-    for option in context.params:
-        origin = context.get_parameter_source(option)
-        # By name: newer versions of Typer include their own Click.
-        if option not in _ALLOWED_WITH_FROM and origin is not None and origin.name == "COMMANDLINE":
-            raise OptionError(
-                f"--{option.replace('_', '-')}: the plan of --from already sets it. Change it in "
-                "that file, or leave out --from."
-            )

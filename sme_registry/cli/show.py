@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from rich.markup import escape
 
 from sme_registry.cli.arguments import KINDS, Json, find_any, kind_of, print_tables
+from sme_registry.envs.base import content_id
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.io.tables import Table
 from sme_registry.io.terminal import out, print_json, print_pairs
@@ -30,6 +31,7 @@ from sme_registry.spec import (
 )
 from sme_registry.spec.catalogue import Envelope, known
 from sme_registry.spec.suite import EvaluationProtocol
+from sme_registry.task.loading import parameter_bytes
 
 Kind = enum.StrEnum("Kind", ["env", "stream", "suite", "protocol", "study"])
 
@@ -283,8 +285,6 @@ def _show_task(document: SMESpec | EnvFile, json: bool) -> None:
 
 def _facts(spec: SMESpec) -> dict[str, Any]:
     """What follows from a spec without drawing its task."""
-    from sme_registry.task.loading import parameter_bytes
-
     env_id = _env_id(spec)
     symmetric = spec.team is None and "/sha256-" not in env_id
     facts: dict[str, Any] = {
@@ -306,8 +306,6 @@ def _facts(spec: SMESpec) -> dict[str, Any]:
 
 def _env_id(spec: SMESpec) -> str:
     """The environment's id: its released name, or its name by content."""
-    from sme_registry.envs.base import content_id
-
     name = catalogue.unique_name(spec)
     return content_id(spec) if name == spec.content_name else f"{catalogue.NAMESPACE}/{name}"
 

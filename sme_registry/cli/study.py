@@ -6,12 +6,12 @@ import enum
 import re
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.markup import escape
 
-from sme_registry.cli.arguments import Json, Out, find_file
+from sme_registry.cli.arguments import Json, Out, find_file, unique, with_options
 from sme_registry.cli.plan import (
     Agents,
     Evaluations,
@@ -23,17 +23,22 @@ from sme_registry.cli.plan import (
     new,
     plan,
     scaled_plan,
-    unique,
-    with_options,
 )
 from sme_registry.errors import OptionError
 from sme_registry.io.tables import Table
 from sme_registry.io.terminal import duration_range, err, out, print_json
 from sme_registry.spec import StudyFile, catalogue
-
-if TYPE_CHECKING:
-    from sme_registry.studies.engine.ledger import CellStatus, State, StudyStatus
-
+from sme_registry.studies.engine.ledger import (
+    STATES,
+    CellStatus,
+    Ledger,
+    State,
+    StudyStatus,
+    label,
+    study_status,
+)
+from sme_registry.studies.engine.programs import available_cores
+from sme_registry.studies.engine.runner import run_study
 
 _FAILURES_SHOWN = 20
 ExecutorName = enum.StrEnum("ExecutorName", ["processes", "in-process", "ray"])
@@ -131,8 +136,6 @@ def run(
 
       sme study run paper-ablations -f runs/all --ray 10.0.0.1:6379
     """
-    from sme_registry.studies.engine.runner import run_study
-
     if ray is not None and executor not in (None, "ray"):
         raise OptionError(f"--ray {ray}: contradicts --executor {executor}. Leave one out.")
     status = run_study(
@@ -177,7 +180,6 @@ def status(
 
       sme study status runs/all --only "class=k-*" --json
     """
-    from sme_registry.studies.engine.ledger import study_status
 
     def scale(file: StudyFile) -> StudyFile:
         return scaled_plan(file, steps, seeds, evaluations)
@@ -234,9 +236,6 @@ def print_status(status: StudyStatus, json: bool) -> None:
     if json:
         print_json(status.to_dict())
         return
-    from sme_registry.studies.engine.ledger import STATES
-    from sme_registry.studies.engine.programs import available_cores
-
     algorithms = unique(cell.planned.algorithm for cell in status.places)
     title = f"[bold]{status.file.versioned_name}[/] in {escape(str(status.folder))}"
     columns = {"class": "name", **{escape(name): "number" for name in algorithms}}
@@ -268,8 +267,6 @@ def print_status(status: StudyStatus, json: bool) -> None:
 
 
 def _print_failure(status: StudyStatus, cell: CellStatus) -> None:
-    from sme_registry.studies.engine.ledger import Ledger, label
-
     failure = cell.failure
     if failure is None:
         return
@@ -376,7 +373,7 @@ def sweep(
 
       sme study sweep -t Default --sweep k=1,5 --sweep D=0,0.25 -a PPO -a reference:linear -f runs/2
     """
-    from sme_registry.studies import run_study, write_report
+    from sme_registry.studies import write_report
 
     if not options.sweep:
         raise OptionError("--sweep: is required, such as --sweep k=1,2,5,10.")
