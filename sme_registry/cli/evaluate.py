@@ -129,7 +129,7 @@ def evaluate(
     target = None if out_folder is None else out_folder / (STREAM if is_stream else _EVALUATION)
     if target is not None:
         check_new(target, force=force)
-    options = {"action_range": action_range, "algorithm": algorithm}
+    options: dict[str, Any] = {"action_range": action_range, "algorithm": algorithm}
     report: EvaluationReport | StreamReport
     policy: Policy | TeamPolicy | None = None
     if isinstance(document, StreamSpec):
@@ -147,9 +147,9 @@ def evaluate(
     files = []
     if target is not None:
         files.append(report.write(target))
-        if can_draw() and isinstance(report, StreamReport):
+        if isinstance(report, StreamReport) and can_draw():
             files += write_stream(report, target.parent)
-        elif can_draw():
+        elif isinstance(report, EvaluationReport) and can_draw():
             files += write_evaluation(report, target.parent, policy)
     if json:
         print_json(report.to_dict())

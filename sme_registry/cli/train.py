@@ -299,8 +299,8 @@ def _train_suite(
     suite = file.suite
     if not suite.classes:
         only_with(context, ("steps",), "is that of each stream here. Leave it out")
-    members = [*suite.classes, *suite.streams]
-    uses = options.uses(members[0].instances[0])
+    first = suite.classes[0].instances[0] if suite.classes else suite.streams[0].stream
+    uses = options.uses(first)
     folder = options.folder(file.name, uses)
     algorithm = {
         "name": training.short_name(uses),
