@@ -13,6 +13,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -120,6 +121,7 @@ class Analysis:
     cells: Mapping[str, CellResult]
     errors: Mapping[str, str]
     requested_cells: Collection[str] | None
+    models: Mapping[str, Path]
     bootstrap: Bootstrap
     classes: Mapping[str, ClassInfo]
     streams: Mapping[str, StreamInfo]

@@ -121,8 +121,7 @@ def write_comparison(
       ['.csv', '.json', '.pdf', '.png', '.tex']
     """
     from sme_registry.plots.style import WRITTEN
-    from sme_registry.studies.report.figures.comparisons import draw_differences
-    from sme_registry.studies.report.figures.curves import draw_class_curves
+    from sme_registry.studies.report.figures import draw, draw_class_curves, draw_differences
 
     check_writable(Path(out) / "differences.csv")
     table = compare(folder, first, second, metrics)
@@ -132,9 +131,9 @@ def write_comparison(
     }
     contents |= {f"{each.name}.tex": each.latex() for each in comparison_tables(table)}
     analysis = _analysis(folder, first, second)
-    for draw in (draw_differences, draw_class_curves):
-        for picture in draw(analysis, WRITTEN):
-            contents |= {f"{picture.name}.{each}": picture.files[each] for each in WRITTEN}
+    pictures, _ = draw((draw_differences, draw_class_curves), analysis, WRITTEN)
+    for picture in pictures:
+        contents |= {f"{picture.name}.{each}": picture.files[each] for each in WRITTEN}
     return [write_atomically(Path(out) / name, content) for name, content in contents.items()]
 
 

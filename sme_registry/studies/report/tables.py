@@ -45,6 +45,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -105,6 +106,7 @@ def analyse(
     errors: Mapping[str, str] | None = None,
     *,
     requested: Collection[str] | None = None,
+    models: Mapping[str, Path] | None = None,
     draws: int = statistics.DRAWS,
 ) -> Analysis:
     """Every table of a study; equal for equal results.
@@ -113,6 +115,7 @@ def analyse(
       finished: results by the digests of their cells; cells outside the plan are ignored.
       errors: of failed runs, by the digests of their cells.
       requested: digests of the cells that count as missing without a result; None for all.
+      models: kept by the study, by the digests of their cells.
       draws: bootstrap samples of each interval.
     """
     plan = file.plan
@@ -127,6 +130,7 @@ def analyse(
         cells={key: finished[key] for key in (*runs.key, *keys)},
         errors=errors or {},
         requested_cells=requested,
+        models=models or {},
         bootstrap=Bootstrap(file.digest, draws),
         classes=classes,
         streams=stream_infos(plan),

@@ -34,7 +34,8 @@ from sme_registry.spec import StudyFile
 from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.ledger import REPORT, Ledger, requested, run_label
 from sme_registry.studies.report.analysis import Analysis
-from sme_registry.studies.report.figures import Picture, draw_figures
+from sme_registry.studies.report.figures import draw_figures
+from sme_registry.studies.report.figures.panels import Picture
 from sme_registry.studies.report.findings import findings
 from sme_registry.studies.report.frames import records
 from sme_registry.studies.report.sentences import THRESHOLDS
@@ -111,22 +112,19 @@ def write_report(
     check_writable(target / "index.html")
     failures = {key: failure.error for key, failure in ledger.failures(keys).items()}
     models = {key: path for key in results if (path := ledger.model_path(key)).exists()}
-    analysis = analyse(file, results, failures, requested=requested(ledger, file))
+    analysis = analyse(file, results, failures, requested=requested(ledger, file), models=models)
     pages = explorers_of(ledger, file, models) if explorers else []
-    contents = _contents(analysis, models, formats, pages)
+    contents = _contents(analysis, formats, pages)
     return [write_atomically(target / name, content) for name, content in contents.items()]
 
 
 def _contents(
-    analysis: Analysis,
-    models: Mapping[str, Path],
-    formats: Sequence[str],
-    explorers: Sequence[Explorer],
+    analysis: Analysis, formats: Sequence[str], explorers: Sequence[Explorer]
 ) -> dict[str, str | bytes]:
     """The contents of each file, by its name in the report."""
     tables = text_tables(analysis)
     figure_formats = [_FIGURE_FORMATS[name] for name in formats if name in _FIGURE_FORMATS]
-    figures, absent = draw_figures(analysis, figure_formats, models) if figure_formats else ([], [])
+    figures, absent = draw_figures(analysis, figure_formats) if figure_formats else ([], [])
     contents: dict[str, str | bytes] = {}
     if "html" in formats:
         found = findings(analysis)

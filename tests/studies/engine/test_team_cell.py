@@ -92,11 +92,11 @@ def test_the_frames_have_columns_of_each_agent(mixed):
 
 def test_the_report_has_a_table_and_a_figure_of_the_agents(mixed):
     pytest.importorskip("matplotlib")
-    from sme_registry.studies.report.figures.comparisons import draw_agents
+    from sme_registry.studies.report.figures import draw, draw_agents
 
     analysis = analysed(mixed)
     tables = {table.name: table.frame for table in text_tables(analysis)}
     assert list(tables["agents-wd-regret"].agent) == AGENTS
     assert "agents" in csv_tables(analysis)
-    (picture,) = draw_agents(analysis, ("svg",))
+    ((picture,), _) = draw([draw_agents], analysis, ("svg",))
     assert b"team, agent_1" in picture.files["svg"]

@@ -10,8 +10,8 @@ from tests.studies.finished import analysed, with_tables
 
 pytest.importorskip("matplotlib")
 
-from sme_registry.studies.report.figures import curves, draw_figures, panels
-from sme_registry.studies.report.figures.maps import draw_regions
+from sme_registry.studies.report import figures
+from sme_registry.studies.report.figures import draw_figures
 from sme_registry.studies.report.figures.panels import Scale, spacing
 from tests.geometry import assert_readable
 from tests.studies.report.test_report import FIGURES
@@ -38,7 +38,7 @@ def with_algorithms(analysis, names):
     )
 
 
-def test_figures_of_eight_algorithms_with_long_names_are_readable_and_whole(analysis, drawn):
+def test_figures_of_eight_algorithms_with_long_names_are_readable_and_whole(analysis):
     levels = analysis.tables[
         "levels"
     ].copy()  # the worst is in the last panel, and far above the others
@@ -46,10 +46,10 @@ def test_figures_of_eight_algorithms_with_long_names_are_readable_and_whole(anal
     levels.loc[worst, ["iqm", "low", "high"]] = 1.7, 1.5, 1.9
     names = [f"PPO (learning_rate = 0.000{i}, n_steps = 256)" for i in range(1, 9)]
     many = with_algorithms(with_tables(analysis, levels=levels), names)
-    pictures, _ = draw_figures(many, ("png",), {})
+    pictures, _ = draw_figures(many, ())
     assert {picture.name for picture in pictures} == FIGURES
-    figures = dict(zip([picture.name for picture in pictures], drawn, strict=True))
-    for name, figure in figures.items():
+    by_name = {picture.name: picture.figure for picture in pictures}
+    for name, figure in by_name.items():
         assert_readable(figure)
         for axes in figure.axes:
             (left, right), (bottom, top) = sorted(axes.get_xlim()), sorted(axes.get_ylim())
@@ -58,15 +58,17 @@ def test_figures_of_eight_algorithms_with_long_names_are_readable_and_whole(anal
                     for x, y in line.get_xydata():
                         assert left <= x <= right, name
                         assert bottom <= y <= top, name
-    assert {axes.get_ylim()[0] for axes in figures["wd-regret"].axes} == {0.0}
+    assert {axes.get_ylim()[0] for axes in by_name["wd-regret"].axes} == {0.0}
 
 
-def test_a_heat_map_has_one_scale_that_covers_its_values_and_prints_them(analysis, drawn):
+def test_a_heat_map_has_one_scale_that_covers_its_values_and_prints_them(analysis):
     regions = analysis.tables["regions"].assign(
         similarity=np.linspace(0.91, 0.96, len(analysis.tables["regions"]))
     )
-    draw_regions(with_tables(analysis, regions=regions), ("png",))
-    (figure,) = drawn
+    ((picture,), _) = figures.draw(
+        [figures.draw_regions], with_tables(analysis, regions=regions), ()
+    )
+    figure = picture.figure
     maps = [axes for axes in figure.axes if axes.images]
     assert len(maps) == len(analysis.algorithms)
     assert {axes.images[0].get_clim() for axes in maps} == {(0.9, 1.0)}
@@ -75,36 +77,37 @@ def test_a_heat_map_has_one_scale_that_covers_its_values_and_prints_them(analysi
     assert any("colours from 0.90 to 1.00" in axes.get_xlabel() for axes in figure.axes)
 
 
-def test_curves_and_levels_near_1_have_headroom(analysis, drawn):
+def test_curves_and_levels_near_1_have_headroom(analysis):
     rows = analysis.tables["learning_curves"]
     names = ["q25", "median", "q75"]
     squeezed = rows.assign(**{name: 0.98 + 0.02 * (rows[name] % 1.0) for name in names})
     squeezed.loc[squeezed.index[::3], "q75"] = 1.0
     levels = analysis.tables["levels"].assign(iqm=0.999, linear=0.999, low=0.99, high=1.0)
     unlearnt = with_tables(analysis, learning_curves=squeezed, levels=levels)
-    (picture,) = curves.draw_class_curves(unlearnt, ["png"])
+    drawings = [figures.draw_class_curves, figures.draw_regret]
+    (picture, *levels), _ = figures.draw(drawings, unlearnt, ())
     assert "each a running median over 2 evaluations" in picture.caption
-    ((low, high),) = {axes.get_ylim() for axes in drawn[0].axes if axes.get_visible()}
+    ((low, high),) = {axes.get_ylim() for axes in picture.figure.axes if axes.get_visible()}
     assert 0.9 < low < 0.98
     assert high - 1.0 > 0.03 * (high - low)
-    assert len(list(curves.draw_regret(unlearnt, ["png"]))) == 2
-    shown = [axes for figure in drawn[1:] for axes in figure.axes if axes.get_visible()]
+    assert len(levels) == 2
+    shown = [axes for level in levels for axes in level.figure.axes if axes.get_visible()]
     for low, high in {axes.get_ylim() for axes in shown}:
         assert low == 0.0
         assert high - 1.0 > 0.03
 
 
 def test_levels_of_one_state_dimension_are_comparable(analysis):
-    assert "not comparable" in panels.epsilon_remark(analysis)
-    alike = with_tables(
-        analysis, results=analysis.tables["results"][analysis.tables["results"].state_dim == 8]
-    )
-    assert panels.epsilon_remark(alike) == ""
+    results = analysis.tables["results"]
+    alike = with_tables(analysis, results=results[results.state_dim == 8])
+    for tables, remarked in ((analysis, True), (alike, False)):
+        ((picture,), _) = figures.draw([figures.draw_regions], tables, ())
+        assert ("not comparable" in picture.caption) == remarked
 
 
-def test_an_axis_with_a_single_class_has_no_figure(finished, drawn):
+def test_an_axis_with_a_single_class_has_no_figure(finished):
     two = analysed(finished, lambda planned: planned.class_name not in ("default", "k-25"))
-    pictures = curves.draw_learning_curves(two, ["png"])
+    pictures, _ = figures.draw([figures.draw_learning_curves], two, ())
     assert [picture.name for picture in pictures] == ["learning-curves-k"]
 
 

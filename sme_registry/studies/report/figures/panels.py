@@ -1,4 +1,4 @@
-"""What the figures share: a grid of panels, the look of each algorithm, marks, and the scale.
+"""What the figures share: panels, the look of each algorithm, marks with intervals, and scales.
 
 Values v₁ < … < vₙ are drawn on a logarithmic scale if all are above 0, n ≥ 3, and their logarithms
 are spaced more evenly than they are themselves: cv(log vᵢ₊₁ − log vᵢ) < cv(vᵢ₊₁ − vᵢ), with cv the
@@ -8,158 +8,74 @@ standard deviation over the mean. So 1, 2, 5, 10 and 2, 4, 8 are, and 0.25, 0.5,
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import pandas as pd
 
-from sme_registry.evaluation.tables import NOT_COMPARABLE
 from sme_registry.plots.style import (
     COLOURS,
     GREY,
     MARKERS,
     REFERENCE_DASHES,
-    drawing,
+    draw_band,
     legend_below,
     literal,
+    new_figure,
     wrapped,
 )
-from sme_registry.studies.report.analysis import Analysis
+from sme_registry.studies.report.analysis import ENOUGH_RUNS, Analysis
 from sme_registry.studies.report.classes import is_numeric
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_LABELS = 2.4  # inches of the names of rows
+Item = TypeVar("Item")
+Look = Mapping[str, Any]
+"""How an algorithm, a class or a reference is drawn, as arguments of `plot`."""
+
+FEW = f"Hollow: fewer than {ENOUGH_RUNS}"
+INDICATION = "so that the interval is an indication only."
 WIDTH = 7.2  # inches: of a page, so that 9 points stay 9 points
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (8, 2)))
-HEADINGS = {"wd_regret": "within distribution (WD)", "ood_regret": "out of distribution (OOD)"}
+_LABELS = 2.4  # inches of the names of rows
+_LINE = 0.17  # inches: the height of a line of text
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A drawn figure."""
+    """A figure of a report; `files` are its bytes, by format."""
 
     name: str
     title: str
     caption: str
-    files: Mapping[str, bytes]
-    is_map: bool = False
-
-
-class Look(NamedTuple):
-    """How an algorithm, a class or a reference is drawn."""
-
-    colour: Any
-    marker: str
-    dash: Any
-
-    @property
-    def line(self) -> dict[str, Any]:
-        """As arguments of `plot`, for a line with marks."""
-        return {"color": self.colour, "marker": self.marker, "linestyle": self.dash}
-
-    @property
-    def points(self) -> dict[str, Any]:
-        """As arguments of `plot`, for marks alone."""
-        return self.line | {"linestyle": "none"}
-
-
-LINEAR = Look(GREY, "", REFERENCE_DASHES["linear_least_squares"])
-CONSTANT = Look(GREY, "", REFERENCE_DASHES["constant_half"])
-
-
-class Grid(NamedTuple):
-    """Panels in reading order."""
-
     figure: Figure
-    files: dict[str, bytes]
-    stacks: Any
-    across: int
-
-    @property
-    def panels(self) -> list[Axes]:
-        """The lowest axes of each panel: its only one, unless panels are stacks."""
-        return list(self.stacks[:, -1])
-
-    def label_rows(self, label: str, row: int = -1) -> None:
-        """Label the y axis of the first panel in each row of the grid."""
-        for stack in self.stacks[:: self.across]:
-            stack[row].set_ylabel(label)
-
-    def label_columns(self, label: str) -> None:
-        """Label the x axis of the lowest panel in each column of the grid, and of no other."""
-        for index, axes in enumerate(self.panels):
-            lowest = index + self.across >= len(self.panels)
-            axes.tick_params(labelbottom=lowest)
-            axes.set_xlabel(label if lowest else "")
+    is_map: bool = False
+    files: Mapping[str, bytes] = field(default_factory=dict)
 
 
-@contextmanager
-def panel_grid(
-    panels: int,
-    formats: Sequence[str],
-    heights: tuple[float, float],
-    *,
-    width: float = WIDTH,
-    most_across: int = 3,
-    stack: int = 1,
-    share_x: bool = False,
-) -> Iterator[Grid]:
-    """A figure of panels with a common y axis; its files are complete after the block."""
-    across = min(most_across, panels)
-    down = math.ceil(panels / across)
-    with drawing((width, heights[0] + down * heights[1]), formats) as (figure, files):
-        grid = figure.subplots(stack * down, across, squeeze=False)
-        stacks = np.concatenate([block.T for block in np.split(grid, down)])
-        for unused in stacks[panels:].ravel():
-            unused.set_visible(False)
-        for index, panel in enumerate(stacks[:panels]):
-            for row, axes in enumerate(panel):
-                if index:
-                    axes.sharey(stacks[0][row])
-                if row < stack - 1:
-                    axes.sharex(panel[-1])
-                    axes.tick_params(labelbottom=False)
-                axes.tick_params(labelleft=index % across == 0)
-            if share_x and index:
-                panel[-1].sharex(stacks[0][-1])
-        yield Grid(figure, files, stacks[:panels], across)
-        _wrap_titles(figure, stacks[:panels], width / across, down)
+Drawn = Iterator[Picture | str]
+"""Pictures, or sentences that say why there is none."""
 
 
-def _wrap_titles(figure: Figure, stacks: Any, width: float, down: int) -> None:
-    """Wrap titles and x labels to the width of a panel in inches; the figure grows with them."""
-    grown = 0
-    for texts in (
-        [stack[0].title for stack in stacks],
-        [stack[-1].xaxis.label for stack in stacks],
-    ):
-        more = 0
-        for each in texts:
-            lines = str(each.get_text()).splitlines()
-            each.set_text("\n".join(wrapped(line, 0.9 * width) for line in lines))
-            more = max(more, each.get_text().count("\n") + 1 - max(1, len(lines)))
-        grown += more
-    figure.set_figheight(figure.get_figheight() + 0.17 * grown * down)
+def new_look(colour: Any, marker: str = "", dash: Any = "-") -> Look:
+    return {"color": colour, "marker": marker, "linestyle": dash}
 
 
-def epsilon_remark(analysis: Analysis) -> str:
-    """For captions with levels ε of several runs; "" where all have one state dimension."""
-    return f" {NOT_COMPARABLE}" if len(analysis.state_dims) > 1 else ""
+LINEAR = new_look(GREY, dash=REFERENCE_DASHES["linear_least_squares"])
+CONSTANT = new_look(GREY, dash=REFERENCE_DASHES["constant_half"])
 
 
-def looks(analysis: Analysis) -> dict[str, Look]:
+def looks_of(analysis: Analysis) -> dict[str, Look]:
     """The look of each algorithm: colours for those that learn, grey for references."""
-    result = numbered_looks(analysis.learners)
-    references = [name for name in analysis.algorithms if name not in result]
+    looks = numbered_looks(analysis.learners)
+    references = [name for name in analysis.algorithms if name not in looks]
     for i, name in enumerate(references):
-        result[name] = Look(GREY, "x+12"[i % 4], DASHES[1 + i % 4])
-    return result
+        looks[name] = new_look(GREY, "x+12"[i % 4], DASHES[1 + i % 4])
+    return looks
 
 
 def numbered_looks(
@@ -167,9 +83,80 @@ def numbered_looks(
 ) -> dict[str, Look]:
     """A look for each name, in order; each list is taken from its beginning again after its end."""
     return {
-        name: Look(colours[i % len(colours)], MARKERS[i % len(MARKERS)], dashes[i % len(dashes)])
+        name: new_look(
+            colours[i % len(colours)], MARKERS[i % len(MARKERS)], dashes[i % len(dashes)]
+        )
         for i, name in enumerate(names)
     }
+
+
+def panel_grid(
+    items: Iterable[tuple[str, Item]],
+    draw: Callable[[Axes, Item], Any],
+    heights: tuple[float, float],
+    *,
+    x: str = "",
+    y: str = "",
+    looks: Mapping[str, Look] | None = None,
+    width: float = WIDTH,
+    across: int = 3,
+    share_x: bool = False,
+    share_y: bool | Literal["col"] = True,
+    title_pad: float | None = None,
+) -> Figure:
+    """A figure with a titled panel for each item, and a legend of the looks below them.
+
+    `heights` are those of a row of panels and of the rest. The labels `x` and `y` are outside
+    alone; without them `draw` labels the axes of its panel.
+    """
+    titles, values = zip(*items, strict=True)
+    across = min(across, len(values))
+    down = math.ceil(len(values) / across)
+    figure = new_figure((width, heights[0] + down * heights[1]))
+    grid = figure.subplots(down, across, squeeze=False, sharex=share_x, sharey=share_y).ravel()
+    for unused in grid[len(values) :]:
+        unused.set_visible(False)
+    lines = 1
+    for index, (axes, title, value) in enumerate(zip(grid, titles, values, strict=False)):
+        draw(axes, value)
+        lowest = index + across >= len(values)
+        if share_x:
+            axes.tick_params(labelbottom=lowest)
+        if x:
+            axes.set_xlabel(x if lowest else "")
+        if y:
+            axes.set_ylabel("" if index % across else y)
+        if title:
+            text = wrapped(literal(title), 0.9 * width / across)
+            axes.set_title(text, fontsize=9, pad=title_pad)
+            lines = max(lines, 1 + text.count("\n"))
+    figure.set_figheight(figure.get_figheight() + _LINE * (lines - 1) * down)
+    if looks:
+        legend(figure, looks)
+    return figure
+
+
+def by(rows: pd.DataFrame, column: str) -> list[tuple[str, pd.DataFrame]]:
+    """Each value of a column and its rows, as items of panels."""
+    return [(str(name), group) for name, group in rows.groupby(column, sort=False)]
+
+
+def legend(figure: Figure, looks: Mapping[str, Look], across: int = 6) -> None:
+    """The legend below a figure, with at most `across` entries in a row."""
+    first = figure.axes[0]
+    handles = [
+        first.plot([], [], label=literal(name), markersize=4.5, linewidth=1.4, **look)[0]
+        for name, look in looks.items()
+    ]
+    legend_below(figure, handles, across)
+
+
+def colour_bar(figure: Figure, image: Any, label: str, ticks: Any = None) -> None:
+    """The scale of the colours of all panels, below them."""
+    panels = [axes for axes in figure.axes if axes.get_visible()]
+    place: Any = {"location": "bottom", "shrink": 0.5, "aspect": 40, "pad": 0.02}
+    bar = figure.colorbar(image, ax=panels, label=label, ticks=ticks, **place)
+    bar.outline.set_visible(False)
 
 
 def side_by_side(looks: Mapping[str, Look], spread: float) -> Iterator[tuple[str, Look, float]]:
@@ -182,119 +169,121 @@ def marks(
     axes: Axes,
     rows: pd.DataFrame,
     value: str,
-    at: pd.Series,
-    filled: pd.Series,
+    at: Any,
     look: Look,
     *,
     upright: bool = False,
     joined: bool = False,
 ) -> None:
-    """The column `value` along x, or y if `upright`, with its intervals from `low` to `high`."""
+    """Marks of the column `value` along x, or y if `upright`, with intervals from `low` to `high`.
+
+    They are hollow where the column `enough` is false.
+    """
+    x, y = (at, rows[value]) if upright else (rows[value], at)
+    colour, known = look["color"], rows.low.notna()
     if joined:
-        axes.plot(at, rows[value], color=look.colour, linewidth=1.1, linestyle=look.dash, alpha=0.7)
-    style = look.points | {"markersize": 4.5, "markeredgewidth": 1.1, "zorder": 3}
-    for x, y, low, high, is_filled in zip(
-        at, rows[value], rows.low, rows.high, filled, strict=True
-    ):
-        point, ends = ((x, y), ((x, x), (low, high)))
-        if not upright:
-            point, ends = point[::-1], ends[::-1]
-        if not math.isnan(low):
-            axes.plot(*ends, color=look.colour, linewidth=1.4)
-        axes.plot(*point, markerfacecolor=look.colour if is_filled else "white", **style)
+        axes.plot(x, y, **{**look, "marker": ""}, linewidth=1.1, alpha=0.7)
+    if known.any():
+        draw_interval = axes.vlines if upright else axes.hlines
+        draw_interval(at[known], rows.low[known], rows.high[known], color=colour, linewidth=1.4)
+    style = {**look, "linestyle": "none", "markersize": 4.5, "markeredgewidth": 1.1}
+    for selected, face in ((rows.enough, colour), (~rows.enough, "white")):
+        axes.plot(x[selected], y[selected], markerfacecolor=face, **style, zorder=3)
 
 
-def marks_by_algorithm(
-    axes: Axes,
-    rows: pd.DataFrame,
-    value: str,
-    at: pd.Series,
-    filled: pd.Series,
-    looks: Mapping[str, Look],
-    *,
-    spread: float = 0.7,
-    **options: bool,
+def draw_lines(
+    axes: Axes, rows: pd.DataFrame, by: str, looks: Mapping[str, Look], x: str = "step"
 ) -> None:
-    """`marks` of each algorithm, next to one another around each place."""
-    for name, look, shift in side_by_side(looks, spread):
-        selected = rows.algorithm == name
-        marks(axes, rows[selected], value, at[selected] + shift, filled[selected], look, **options)
+    """The median and quartiles of each algorithm or class along x; markers do not coincide."""
+    for index, (name, look) in enumerate(looks.items()):
+        curve = rows[rows[by] == name]
+        if not curve.empty:
+            every = max(1, len(curve) // 6)
+            columns = curve[[x, "q25", "median", "q75"]]
+            line_with_band(axes, columns, look, (index * every // len(looks), every))
 
 
-def legend(figure: Figure, looks: Mapping[str, Look], across: int = 6) -> None:
-    """The legend below a figure, with at most `across` entries in a row."""
-    handles = [
-        figure.axes[0].plot(
-            [], [], label=literal(name), markersize=4.5, linewidth=1.4, **look.line
-        )[0]
-        for name, look in looks.items()
-    ]  # fmt: skip
-    legend_below(figure, handles, across)
+def line_with_band(axes: Axes, curve: pd.DataFrame, look: Look, markevery: tuple[int, int]) -> None:
+    """The columns of a curve are x, the lower end of the band, the line, and the upper end."""
+    x, low, middle, high = (curve[name] for name in curve)
+    draw_band(axes, x, low, high, look["color"])
+    axes.plot(x, middle, **look, linewidth=1.6, markersize=4, markevery=markevery)
+
+
+def curves_caption(rows: pd.DataFrame) -> str:
+    """What the lines and bands of these rows of `learning_curves` are."""
+    window = rows.window.max()
+    smoothed = f", each a running median over {window} evaluations" if window > 1 else ""
+    return f"Median over runs, with the interquartile range as a band{smoothed}."
+
+
+def step_text(value: float, _: Any) -> str:
+    """A number of steps as a tick: `20k`."""
+    return f"{value / 1000:g}k" if value >= 10_000 else f"{value:g}"
+
+
+def tick_steps(axes: Axes) -> None:
+    """Few ticks of steps, from 0."""
+    axes.set_xlim(left=0)
+    axes.locator_params(axis="x", nbins=4)
+    axes.xaxis.set_major_formatter(step_text)
 
 
 class Column(NamedTuple):
-    """A panel of a figure whose rows of marks have names.
+    """A panel of rows of marks: the rows' metric, labels, a line at the neutral value, limits."""
 
-    `rows` has, beside the marks, the columns `place` (the row's name) and `enough` (filled marks).
-    """
-
-    rows: pd.DataFrame
+    metric: str
     label: str
     title: str = ""
     neutral: float | None = None
-    ticks: int | None = None
     limits: tuple[float, float] | None = None
 
 
 def mark_rows(
-    columns: Sequence[Column],
+    rows: pd.DataFrame,
     value: str,
+    columns: Sequence[Column],
     places: Mapping[str, float],
     looks: Mapping[str, Look],
-    formats: Sequence[str],
     *,
-    alike: int = 0,
-    most_across: int = 3,
-    shaded: bool = True,
-) -> Mapping[str, bytes]:
-    """A figure with a named row of marks at the height of each place; its first panels share x.
+    share_x: bool = False,
+) -> Figure:
+    """A figure with a named row of marks at the height of each place, and a panel for each column.
 
-    `alike` is how many do. There is a legend if algorithms have names.
+    `rows` has, beside the marks, the column `place`.
     """
-    height = 1.3 + (0.09 * len(looks) + 0.12) * max(4.0, max(places.values()) + 1)
-    with panel_grid(len(columns), formats, (0.0, height), most_across=most_across) as grid:
-        for axes in grid.panels[1:alike]:
-            axes.sharex(grid.panels[0])
-        for axes, column in zip(grid.panels, columns, strict=True):
-            at, filled = column.rows.place.map(places), column.rows.enough
-            marks_by_algorithm(axes, column.rows, value, at, filled, looks)
-            if column.neutral is not None:
-                axes.axvline(column.neutral, color="black", linewidth=0.9, zorder=1.5)
-            if column.limits is not None:
-                axes.set_xlim(*column.limits)
-            axes.set_title(column.title, fontsize=9)
-            axes.set_xlabel(column.label)
-            if column.ticks is not None:
-                axes.locator_params(axis="x", nbins=column.ticks)
-        _name_rows(grid, places, shaded=shaded)
-        if [*looks] != [""]:
-            legend(grid.figure, looks)
-    return grid.files
 
-
-def _name_rows(grid: Grid, places: Mapping[str, float], *, shaded: bool) -> None:
-    """Rows of marks from top to bottom, on light bands instead of grid lines."""
-    for axes in grid.panels:
+    def draw(axes: Axes, column: Column) -> None:
+        of_metric = rows[rows.metric == column.metric]
+        at = of_metric.place.map(places)
+        for name, look, shift in side_by_side(looks, 0.7):
+            selected = of_metric.algorithm == name
+            marks(axes, of_metric[selected], value, at[selected] + shift, look)
+        if column.neutral is not None:
+            axes.axvline(column.neutral, color="black", linewidth=0.9, zorder=1.5)
+        for y in places.values():
+            axes.axhspan(y - 0.42, y + 0.42, color="#f4f4f4", zorder=0.5, linewidth=0)
         axes.grid(visible=False, axis="y")
         axes.tick_params(axis="y", length=0)
-        for y in places.values() if shaded else ():
-            axes.axhspan(y - 0.42, y + 0.42, color="#f4f4f4", zorder=0.5, linewidth=0)
-    first = grid.panels[0]
+        axes.locator_params(axis="x", nbins=5)
+        lines = column.label.splitlines()
+        axes.set_xlabel("\n".join(wrapped(line, 0.9 * WIDTH / len(columns)) for line in lines))
+        if column.limits is not None:
+            axes.set_xlim(*column.limits)
+
+    highest = max(places.values())
     labels = [wrapped(literal(name), _LABELS) for name in places]
-    first.set_yticks([*places.values()], labels, fontsize=8)
     more = max(label.count("\n") for label in labels)
-    grid.figure.set_figheight(grid.figure.get_figheight() + 0.13 * more * len(labels))
-    first.set_ylim(max(places.values()) + 0.6, -0.6)
+    height = 1.6 + (0.09 * len(looks) + 0.12) * max(4.0, highest + 1) + 0.13 * more * len(labels)
+    items = [(column.title, column) for column in columns]
+    named = looks if [*looks] != [""] else None
+    figure = panel_grid(
+        items, draw, (0.0, height), looks=named, across=len(columns), share_x=share_x
+    )
+    first = figure.axes[0]
+    first.set_yticks([*places.values()], labels, fontsize=8)
+    first.set_ylim(highest + 0.6, -0.6)
+    return figure
 
 
 Spacing = Literal["linear", "log", "nominal"]
@@ -307,6 +296,12 @@ def spacing(values: Sequence[Any]) -> Spacing:
     if len(values) < 3 or values[0] <= 0:
         return "linear"
     return "log" if _variation(np.log(values)) < _variation(np.asarray(values)) else "linear"
+
+
+def _variation(values: Any) -> float:
+    """The coefficient of variation of the distances between values; dimensionless."""
+    distances = np.diff(values)
+    return float(distances.std() / distances.mean())
 
 
 @dataclass(frozen=True)
@@ -330,19 +325,13 @@ class Scale:
         distance = np.diff(self.at).min() if len(self.at) > 1 else 1.0
         return x + shift * distance
 
-    def apply(self, axes: Any, labels: Sequence[str]) -> None:
+    def apply(self, axes: Axes, labels: Sequence[str]) -> None:
         """Give an axes this scale, with a tick at each class."""
         if self.spacing == "log":
             axes.set_xscale("log")
             axes.minorticks_off()
-        crowded = len(labels) > 7 or max(map(len, labels)) > 12 or self.spacing == "nominal"
-        long = crowded and max(map(len, labels)) > 4
-        turned = {"rotation": 30, "ha": "right", "fontsize": 8} if long else {}
-        axes.set_xticks(self.at, labels, **turned)
+        longest = max(map(len, labels))
+        crowded = len(labels) > 7 or longest > 12 or self.spacing == "nominal"
+        turned: Any = {"rotation": 30, "ha": "right", "fontsize": 8}
+        axes.set_xticks(self.at, labels, **(turned if crowded and longest > 4 else {}))
         axes.set_xlim(self.shifted(self.at[0], -0.5), self.shifted(self.at[-1], 0.5))
-
-
-def _variation(values: Any) -> float:
-    """The coefficient of variation of the distances between values; dimensionless."""
-    distances = np.diff(values)
-    return float(distances.std() / distances.mean())
