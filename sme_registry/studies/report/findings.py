@@ -6,35 +6,35 @@ which does not mean that there is no effect.
 
     section      tasks, comparison, caveats, offline, streams, stream_changes, stream_caveats
     algorithm, class_name    what it is about; "" where it is about several
-    question, verdict        together they choose the sentence, see `sentences`
+    question, verdict        what was asked, and the answer
     value, low, high, runs   the number it rests on, its interval, and its runs, pairs or lives
     sentence     for people
 """
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import pandas as pd
 
-from sme_registry.io.markup import conjunction, plural, signed
+from sme_registry.io.markup import conjunction, fixed, plural, signed
 from sme_registry.studies.report.analysis import ENOUGH_RUNS, Analysis
-from sme_registry.studies.report.classes import ALL, AXES, SEVERAL
+from sme_registry.studies.report.classes import ALL, SEVERAL, axis_label
 from sme_registry.studies.report.frames import frame
 from sme_registry.studies.report.life_findings import stream_findings
 from sme_registry.studies.report.sentences import (
     THRESHOLDS,
     Found,
-    between,
+    Rows,
     change_text,
     ends_text,
     few_runs,
     finding,
     missing_runs,
-    numbers_of,
 )
 from sme_registry.studies.report.tables import OFFLINE_INTERVAL, training_data
 
@@ -44,14 +44,12 @@ COLUMNS = (
 )
 _WD, _OOD = "wd_regret", "ood_regret"
 _CHANCE = 0.05  # share of 95 % intervals that exclude 0 without an effect
-_NEAR = THRESHOLDS["near"]
-
-Rows = Sequence[Any]  # of a table, as named tuples
+_UNLEARNT, _NEAR = THRESHOLDS["unlearnt"], THRESHOLDS["near"]
 
 
 def findings(analysis: Analysis) -> pd.DataFrame:
     """The findings of a study, from its tables."""
-    parts: list[Iterable[dict[str, Any]]] = []
+    parts: list[Found] = []
     if analysis.classes:
         parts += [_tasks(analysis), _comparison(analysis), _caveats(analysis)]
     if not analysis.tables["offline"].empty:
@@ -61,109 +59,150 @@ def findings(analysis: Analysis) -> pd.DataFrame:
     return frame([row for part in parts for row in part], COLUMNS)
 
 
+# Single tasks
+
+
 def _tasks(analysis: Analysis) -> Found:
     """Which property of the task breaks each learner, and how sure that is."""
+    levels = analysis.tables["levels"]
     for name in analysis.learners:
+        about = functools.partial(finding, "tasks", algorithm=name)
         contrasts = _contrasts(analysis, name, _WD)
         if not contrasts:
-            yield finding("tasks", "contrasts", "none", algorithm=name, first=analysis.base)
+            yield about(
+                "contrasts", "none",
+                f"{name} has no contrasts yet: no run on the first class, {analysis.base}, has a "
+                "run of the same number on another class.",
+            )  # fmt: skip
             continue
-        base = _level(analysis, analysis.base, name)
-        if base is not None and base.iqm >= THRESHOLDS["unlearnt"]:
-            yield finding("tasks", "first class", "unlearnt", algorithm=name, value=base.iqm)
+        rows = levels[(levels.algorithm == name) & (levels.metric == _WD)]
+        of_class = {row.class_name: row for row in rows.itertuples()}
+        base = of_class.get(analysis.base)
+        if base is not None and base.iqm >= _UNLEARNT:
+            yield about(
+                "first class", "unlearnt",
+                f"{name} has learnt almost nothing on the first class: its WD regret there is "
+                f"{fixed(base.iqm)}, and the constant action's is 1. What was not learnt cannot "
+                "break, so the contrasts need a longer budget.",
+                value=base.iqm,
+            )  # fmt: skip
         worst = _largest(c for c in contrasts if c.verdict == "worse")
         if worst is None:
-            yield from _no_worst(name, contrasts)
-        else:
-            yield from _worst(analysis, name, contrasts, worst)
+            yield from _no_worst(about, name, contrasts)
+            continue
+        yield from _worst(about, name, contrasts, worst)
+        at = of_class.get(worst.class_name)
+        yield from _position(about, worst, at)
+        if base is not None and at is not None and at.linear - base.linear > THRESHOLDS["hurt"]:
+            text = f"The linear policy had {fixed(base.linear)} on the first class, so the optimum "
+            text += "itself is harder to fit."
+            place = {"class_name": worst.class_name, "value": at.linear}
+            yield about("linear policy", "harder_to_fit", text, **place)
+        yield from _other_axes(about, contrasts, worst)
+        yield from _outside(about, _contrasts(analysis, name, _OOD), worst)
 
 
-def _no_worst(name: str, contrasts: Rows) -> Found:
+def _no_worst(about: Any, name: str, contrasts: Rows) -> Found:
     """What is known of a learner that no class was shown to make worse."""
-    yield finding("tasks", "worst", "none_shown", algorithm=name)
-    yield from _others(name, "better", [c for c in contrasts if c.verdict == "better"])
+    yield about(
+        "worst", "none_shown",
+        f"No class was shown to make {name} worse within distribution. That does not show that "
+        "none does.",
+    )  # fmt: skip
+    better = [c for c in contrasts if c.verdict == "better"]
+    if better:
+        text = f"Its WD regret is lower than on the first class with {_listed(better)}."
+        yield about("other axes", "better", text)
     highest = max((c.high for c in contrasts if not math.isnan(c.high)), default=None)
     if highest is not None:
-        yield finding("tasks", "highest", "open", algorithm=name, value=highest)
+        text = f"The highest end of an interval is {signed(highest)}."
+        yield about("highest", "open", text, value=highest)
     single = _largest(c for c in contrasts if math.isnan(c.high))
     if single is not None:
-        at = {"class_name": single.class_name, "value": single.change}
-        yield finding("tasks", "single", "open", algorithm=name, **at)
-
-
-def _worst(analysis: Analysis, name: str, contrasts: Rows, worst: Any) -> Found:
-    """The largest change for the worse, its certainty, and the other changes."""
-    numbers = {"algorithm": name, **numbers_of(worst)}
-    larger = _of_each_axis(c for c in contrasts if c.change > worst.change)
-    severity = _severity(worst.change)
-    yield finding(
-        "tasks", "worst", severity, **numbers, base=worst.base, level=worst.level,
-        most="" if larger else " most", comma="" if larger else ",", property=_property(worst),
-        change=change_text(worst),
-    )  # fmt: skip
-    if larger:
-        yield finding("tasks", "larger", "open", algorithm=name, listed=_listed(larger))
-    rivals = _of_each_axis(c for c in contrasts if c.axis != worst.axis and not c.high < worst.low)
-    axes = {c.axis for c in contrasts}
-    yield finding(
-        "tasks", "certainty", _certainty(worst, rivals, axes), **numbers, listed=_listed(rivals),
-        pairs=plural(worst.pairs, "pair"), enough=ENOUGH_RUNS,
-    )  # fmt: skip
-    yield from _position(analysis, name, worst)
-    worse = _of_each_axis(c for c in contrasts if c.verdict == "worse" and c.axis != worst.axis)
-    yield from _others(name, "worse", [c for c in worse if c.enough_pairs])
-    yield from _others(name, "indication", [c for c in worse if not c.enough_pairs])
-    still_open = [c for c in _of_each_axis(contrasts) if c.verdict != "worse" and c not in larger]
-    yield from _others(name, "open", still_open)
-    outside = _contrasts(analysis, name, _OOD)
-    far = _largest(c for c in outside if c.verdict == "worse")
-    if far is not None:
-        larger = _of_each_axis(c for c in outside if c.change > far.change)
-        yield finding(
-            "tasks", "out of distribution", "worse", algorithm=name, **numbers_of(far),
-            property="the same property" if far.axis == worst.axis else _property(far),
-            costs="costs" if larger else "costs most", listed=_listed([far]),
-        )  # fmt: skip
-        if larger:
-            yield finding("tasks", "larger", "open", algorithm=name, listed=_listed(larger))
-
-
-def _others(name: str, verdict: str, contrasts: Rows) -> Found:
-    if contrasts:
-        yield finding("tasks", "other axes", verdict, algorithm=name, listed=_listed(contrasts))
-
-
-def _severity(change: float) -> str:
-    if change >= THRESHOLDS["broken"]:
-        return "broken"
-    return "hurt" if change >= THRESHOLDS["hurt"] else "slightly_hurt"
-
-
-def _certainty(worst: Any, rivals: Rows, axes: set[str]) -> str:
-    """Whether the intervals of other axes allow a larger change, if there are others."""
-    if not worst.enough_pairs:
-        return "indication"
-    if rivals:
-        return "rivals"
-    return "only_axis" if len(axes) == 1 else "certain"
-
-
-def _position(analysis: Analysis, name: str, worst: Any) -> Found:
-    """Where the worst level is among the constant's, which is 1, and the linear policy's."""
-    at, base = _level(analysis, worst.class_name, name), _level(analysis, analysis.base, name)
-    linear = math.nan if at is None else at.linear
-    about = {"algorithm": name, "class_name": worst.class_name, "value": worst.level}
-    if worst.level > 2.0 - THRESHOLDS["unlearnt"]:
-        yield finding("tasks", "position", "worse_than_constant", **about)
-    elif worst.level >= THRESHOLDS["unlearnt"]:
-        yield finding("tasks", "position", "like_constant", **about)
-    elif not math.isnan(linear):
-        verdict = "worse_than_linear" if worst.level > linear else "better_than_linear"
-        yield finding("tasks", "position", verdict, **about, linear=linear)
-    if base is not None and linear - base.linear > THRESHOLDS["hurt"]:
-        yield finding(
-            "tasks", "linear policy", "harder_to_fit", **about | {"value": linear}, base=base.linear
+        text = (
+            "A single pair of runs has no interval; the largest change of such a pair is "
+            f"{signed(single.change)} ({single.class_name})."
         )
+        yield about("single", "open", text, class_name=single.class_name, value=single.change)
+
+
+def _worst(about: Any, name: str, contrasts: Rows, worst: Any) -> Found:
+    """The largest change for the worse, and its certainty."""
+    larger = _of_each_axis(c for c in contrasts if c.change > worst.change)
+    size = [worst.change >= THRESHOLDS["broken"], worst.change >= THRESHOLDS["hurt"], True]
+    severity = ("broken", "hurt", "slightly_hurt")[size.index(True)]
+    is_hurt = severity.replace("_", " ") + ("" if larger else " most")
+    text = (
+        f"{name} is {is_hurt} by {_property(worst)}: on {worst.class_name} its WD regret rises "
+        f"from {fixed(worst.base)} to {fixed(worst.level)}, by {change_text(worst)}."
+    )
+    yield about("worst", severity, text, worst)
+    yield from _larger(about, larger)
+    rivals = _of_each_axis(c for c in contrasts if c.axis != worst.axis and not c.high < worst.low)
+    verdict = "certain"
+    text = f"It is the worst of the axes varied here: its interval begins at {signed(worst.low)}, "
+    text += "above the end of every other axis."
+    if not worst.enough_pairs:
+        verdict = "indication"
+        text = f"This is an indication, not a finding: it rests on {plural(worst.pairs, 'pair')} "
+        text += f"of runs, and {ENOUGH_RUNS} would be enough."
+    elif rivals:
+        verdict, text = "rivals", "The interval shows that it hurts, but not that it hurts most: "
+        text += f"the intervals allow a larger change by {_listed(rivals)}."
+    elif len({c.axis for c in contrasts}) == 1:
+        verdict, text = "only_axis", "The interval shows that it hurts; no other axis was varied."
+    yield about("certainty", verdict, text, worst)
+
+
+def _larger(about: Any, larger: Rows) -> Found:
+    if larger:
+        yield about("larger", "open", f"Larger still, but not certain: {_listed(larger)}.")
+
+
+def _position(about: Any, worst: Any, at: Any) -> Found:
+    """Where the worst level is among the constant's, which is 1, and the linear policy's."""
+    level, linear = worst.level, math.nan if at is None else at.linear
+    constant, than = "the constant action ½, which has 1", "worse" if level > linear else "better"
+    if level > 2.0 - _UNLEARNT:
+        verdict, text = "worse_than_constant", f"worse than {constant}"
+    elif level >= _UNLEARNT:
+        verdict, text = "like_constant", f"about as good as {constant}"
+    elif math.isnan(linear):
+        return
+    else:
+        verdict = f"{than}_than_linear"
+        text = f"better than {constant}, and {than} than the linear policy fitted to the optimum, "
+        text += f"which has {fixed(linear)}"
+    text = f"At {fixed(level)} it is {text}."
+    yield about("position", verdict, text, class_name=worst.class_name, value=level)
+
+
+def _other_axes(about: Any, contrasts: Rows, worst: Any) -> Found:
+    worse = _of_each_axis(c for c in contrasts if c.verdict == "worse" and c.axis != worst.axis)
+    still_open = [
+        c for c in _of_each_axis(contrasts) if c.verdict != "worse" and c.change <= worst.change
+    ]
+    certain, few = ([c for c in worse if c.enough_pairs == enough] for enough in (True, False))
+    if certain:
+        yield about("other axes", "worse", f"Also worse by {_listed(certain)}.")
+    if few:
+        text = f"There are indications that it is made worse by {_listed(few)}."
+        yield about("other axes", "indication", text)
+    if still_open:
+        text = f"Not shown to make it worse: {_listed(still_open)}."
+        yield about("other axes", "open", f"{text} A wide interval means too few runs.")
+
+
+def _outside(about: Any, contrasts: Rows, worst: Any) -> Found:
+    """The largest change for the worse out of distribution."""
+    far = _largest(c for c in contrasts if c.verdict == "worse")
+    if far is not None:
+        larger = _of_each_axis(c for c in contrasts if c.change > far.change)
+        what = "the same property" if far.axis == worst.axis else _property(far)
+        costs = "costs" if larger else "costs most"
+        text = f"Out of distribution, {what} {costs}: {_listed([far])}."
+        yield about("out of distribution", "worse", text, far)
+        yield from _larger(about, larger)
 
 
 def _comparison(analysis: Analysis) -> Found:
@@ -175,20 +214,23 @@ def _comparison(analysis: Analysis) -> Found:
     steps = {row.algorithm: of_all[row.algorithm] for row in compared}
     if len(set(steps.values())) > 1:
         listed = ", ".join(f"{name} {count:,}" for name, count in steps.items())
-        yield finding("comparison", "training steps", "differ", listed=listed)
+        yield finding("comparison", "training steps", "differ", f"Training steps differ: {listed}.")
     data = training_data(analysis.runs)
     for shared in dict.fromkeys(data[row.algorithm] for row in compared):
         alike = [row for row in compared if data[row.algorithm] == shared]
-        if len(alike) > 1:
-            best = max(alike, key=lambda row: row.value)
-            nu, transitions = shared or (math.nan, 0)
-            of_data = f" of those with {transitions:,} transitions of ν = {nu:g},"
-            yield finding(
-                "comparison", "best", "best", algorithm=best.algorithm, value=best.value,
-                low=best.low, high=best.high, runs=best.fewest_runs, interval=ends_text(best),
-                classes=plural(best.classes, "class", "classes"), data=of_data if shared else "",
-            )  # fmt: skip
-            yield from _rivals(analysis, best.algorithm, {row.algorithm for row in alike})
+        if len(alike) < 2:
+            continue
+        best = max(alike, key=lambda row: row.value)
+        nu, transitions = shared or (math.nan, 0)
+        of_data = f" of those with {transitions:,} transitions of ν = {nu:g}," if shared else ""
+        yield finding(
+            "comparison", "best", "best",
+            f"Over the {plural(best.classes, 'class', 'classes')} on which all have runs,{of_data} "
+            f"{best.algorithm} is best within distribution: {fixed(best.value)}{ends_text(best)}, "
+            "where 1 is the optimum and 0 the constant ½.",
+            best, class_name="",
+        )  # fmt: skip
+        yield from _rivals(analysis, best.algorithm, {row.algorithm for row in alike})
 
 
 def _rivals(analysis: Analysis, best: str, among: set[str]) -> Found:
@@ -196,55 +238,84 @@ def _rivals(analysis: Analysis, best: str, among: set[str]) -> Found:
     for row in rows[(rows.group == ALL) & (rows.metric == _WD)].itertuples():
         if best not in (row.first, row.second) or not {row.first, row.second} <= among:
             continue
-        numbers = {"value": row.probability, "low": row.low, "high": row.high}
+        value, low, high, other = row.probability, row.low, row.high, row.second
         if row.second == best:
-            ends = {"low": 1.0 - row.high, "high": 1.0 - row.low}
-            numbers = {"value": 1.0 - row.probability, **ends}
-        verdict = "open"
-        if numbers["low"] > THRESHOLDS["probability"]:
-            verdict = "better" if row.fewest_runs >= ENOUGH_RUNS else "indication"
+            value, low, high, other = 1.0 - value, 1.0 - high, 1.0 - low, row.first
+        verdict, end = "open", ", so either may be better."
+        if low > THRESHOLDS["probability"]:
+            enough = row.fewest_runs >= ENOUGH_RUNS
+            verdict = "better" if enough else "indication"
+            end = "." if enough else ", an indication from few runs."
+        numbers = {"value": value, "low": low, "high": high, "runs": row.fewest_runs}
+        text = f"One of its runs beats one of {other} with probability {fixed(value)}"
+        interval = "" if math.isnan(low) else f" ({fixed(low)} to {fixed(high)})"
         yield finding(
-            "comparison", "rival", verdict, algorithm=best, runs=row.fewest_runs, **numbers,
-            other=row.first if row.second == best else row.second, interval=between(**numbers),
-        )  # fmt: skip
+            "comparison", "rival", verdict, f"{text}{interval}{end}", algorithm=best, **numbers
+        )
 
 
 def _caveats(analysis: Analysis) -> Found:
     """What limits all findings on single tasks."""
     rows, missing = analysis.tables["contrasts"], analysis.tables["missing"]
     rows = rows[rows.algorithm.isin(analysis.learners)]
-    planned, failed = len(analysis.runs) + len(missing), int((missing.error != "").sum())
-    yield from missing_runs("caveats", len(missing), planned, failed)
-    if not rows.empty and rows.pairs.min() < ENOUGH_RUNS:
-        yield few_runs("caveats", int(rows.pairs.min()), "pair of runs", "pairs of runs")
+    failed = int((missing.error != "").sum())
+    yield from missing_runs("caveats", len(missing), len(analysis.runs) + len(missing), failed)
+    if not rows.empty:
+        yield from few_runs("caveats", rows.pairs.min(), "pair of runs", "pairs of runs")
     intervals = int(((rows.metric == _WD) & rows.low.notna()).sum())
     if intervals > 1:
         value = max(1, round(_CHANCE * intervals))
-        yield finding("caveats", "chance", "expected", value=value, intervals=intervals)
-    init = {name: info.setting["policy_init"] for name, info in analysis.classes.items()}
-    other = [
-        name for name, info in analysis.classes.items()
-        if info.axis != "policy_init" and init[name] != init[analysis.base]
-    ]  # fmt: skip
+        yield finding(
+            "caveats", "chance", "expected",
+            f"There are {intervals} contrasts within distribution, each with its own interval. If "
+            f"nothing had an effect, about {value} of them would exclude 0 by chance.",
+            value=value,
+        )  # fmt: skip
+    classes = analysis.classes.values()
+    init = analysis.classes[analysis.base].setting["policy_init"]
+    other = [c.name for c in classes if init != c.setting["policy_init"] != c.axis]
+    other = [name for name in other if analysis.classes[name].axis != "policy_init"]
     if other:
-        yield finding("caveats", "policy_init", "differs", listed=conjunction(other))
+        yield finding(
+            "caveats", "policy_init", "differs",
+            f"The policy_init of {conjunction(other)} also differs from the first class’s, as deep "
+            "tasks require. The contrasts include its effect.",
+        )  # fmt: skip
+
+
+# Learning from data
 
 
 def _offline(analysis: Analysis) -> Found:
     """Whether each learner reaches or surpasses the policy that made its data."""
+    about = functools.partial(finding, "offline")
     rows = list(analysis.tables["offline"].itertuples())
     data = training_data(analysis.runs)
     example, nu = next((name, source[0]) for name, source in data.items() if source)
-    yield finding("offline", "example", "nu", algorithm=example, value=nu)
+    yield about(
+        "example", "nu",
+        f"An algorithm here is a learner with its data: {example} learnt from data of ν = {nu:g}. "
+        "The behaviour policy that makes the data takes (1 − α) a* + α ã, where α is drawn from "
+        "U(0, ν) at each step and ã is the action of a second network.",
+        algorithm=example, value=nu,
+    )  # fmt: skip
     yield _behaviour(rows)
     for name in dict.fromkeys(row.learner for row in rows):
-        yield from _learner(analysis, name, [row for row in rows if row.learner == name])
+        of_learner = [row for row in rows if row.learner == name]
+        yield _imitation(name, of_learner)
+        yield from _improvement(name, of_learner)
+        yield from _depth(analysis, name, of_learner)
     few, most = min(row.runs for row in rows), max(row.runs for row in rows)
-    yield finding(
-        "offline", "offline runs", "few" if few < ENOUGH_RUNS else "enough", runs=few,
-        count=(f"{few} to " if few < most else "") + plural(most, "run"), near=_NEAR,
-        enough=ENOUGH_RUNS, interval_runs=OFFLINE_INTERVAL,
-    )  # fmt: skip
+    verdict = "few" if few < ENOUGH_RUNS else "enough"
+    text = (
+        "Each result rests on its own interval, and one in twenty intervals excludes 0 by chance."
+    )
+    if few < ENOUGH_RUNS:
+        text = f"With fewer than {ENOUGH_RUNS} runs a result is an indication at most, and with "
+        text += f"fewer than {OFFLINE_INTERVAL} it has no interval."
+    count = (f"{few} to " if few < most else "") + plural(most, "run")
+    text = f"Each learner has {count} per class and ν. “Close” means within {_NEAR} of r̃. {text}"
+    yield about("offline runs", verdict, text, runs=few)
 
 
 def _behaviour(rows: Rows) -> dict[str, Any]:
@@ -252,22 +323,44 @@ def _behaviour(rows: Rows) -> dict[str, Any]:
     places = list({(row.class_name, row.nu): row for row in reversed(rows)}.values())[::-1]
     off = [row.behaviour_similarity - (1.0 - row.nu / 6.0) for row in places]
     far = [row for row, difference in zip(places, off, strict=True) if abs(difference) > _NEAR]
-    worst = max(range(len(off)), key=lambda i: abs(off[i]))
-    return finding(
-        "offline", "behaviour", "far" if far else "near", value=off[worst],
-        where=_at(places[worst]), near=len(places) - len(far), count=len(places),
-        places=_places(far),
-    )  # fmt: skip
+    value, worst = max(zip(off, places, strict=True), key=lambda pair: abs(pair[0]))
+    verdict, text = "near", "everywhere."
+    if far:
+        verdict, text = "far", (
+            f"in {len(places) - len(far)} of {len(places)} cases, but not at {_places(far)}. A "
+            "single second network may be closer to the optimum, or further away, than "
+            "independent uniform actions are."
+        )  # fmt: skip
+    text = f"The behaviour policies are close to 1 − ν/6 {text}"
+    largest = f"The largest difference is {signed(value, 3)} ({_at(worst)})."
+    return finding("offline", "behaviour", verdict, f"{text} {largest}", value=value)
 
 
-def _learner(analysis: Analysis, name: str, rows: Rows) -> Found:
+def _imitation(name: str, rows: Rows) -> dict[str, Any]:
     near = [row for row in rows if abs(row.improvement) <= _NEAR]
-    verdict = "near_at_some" if near else "near_at_none"
     farthest = max(rows, key=lambda row: abs(row.improvement))
-    yield finding(
-        "offline", "imitation", "imitates" if len(near) == len(rows) else verdict, algorithm=name,
-        **numbers_of(farthest), places=_places(near), where=_at(farthest),
+    verdict, text = "near_at_none", f"{name} is close to the behaviour policy nowhere."
+    if len(near) == len(rows):
+        verdict = "imitates"
+        text = f"{name} imitates: its mean is close to the behaviour policy's everywhere."
+    elif near:
+        verdict = "near_at_some"
+        text = f"{name} is close to the behaviour policy at {_places(near)}."
+    largest = f"The largest difference is {signed(farthest.improvement, 3)} ({_at(farthest)})."
+    return finding(
+        "offline", "imitation", verdict, f"{text} {largest}", farthest,
+        algorithm=name, value=farthest.improvement,
     )  # fmt: skip
+
+
+def _improvement(name: str, rows: Rows) -> Found:
+    """Where a learner surpasses its data, and where it falls behind them."""
+    hint, few = "A single run, which is only a hint, is", "There are indications (all of few runs)"
+    begins = {
+        "above": "It surpasses", "above_few": f"{few} that it surpasses",
+        "below": "It falls behind", "below_few": f"{few} that it falls behind",
+        "single_above": f"{hint} above",
+    }  # fmt: skip
     by_verdict: dict[str, list[Any]] = {}
     for row in rows:
         if row.runs > 1:
@@ -275,47 +368,53 @@ def _learner(analysis: Analysis, name: str, rows: Rows) -> Found:
         elif row.improvement > _NEAR:
             by_verdict.setdefault("single_above", []).append(row)
     if not by_verdict.keys() & {"above", "above_few"}:
-        yield finding("offline", "improvement", "none", algorithm=name)
+        text = "It was not shown to surpass its data at any ν."
+        yield finding("offline", "improvement", "none", text, algorithm=name)
     for verdict, places in by_verdict.items():
         low, high = (signed(f(row.improvement for row in places), 3) for f in (min, max))
-        yield finding(
-            "offline", "improvement", verdict, algorithm=name, places=_places(places),
-            by=low if low == high else f"{low} to {high}",
-        )  # fmt: skip
-    yield from _depth(analysis, name, rows)
+        by = low if low == high else f"{low} to {high}"
+        text = f"Whether it is above or below its data is open at {_places(places)}."
+        if verdict in begins:
+            text = f"{begins[verdict]} its data at {_places(places)}, by {by}."
+        yield finding("offline", "improvement", verdict, text, algorithm=name)
 
 
 def _depth(analysis: Analysis, name: str, rows: Rows) -> Found:
     """Whether a learner collapses on the deepest class, if classes differ in depth."""
     classes = dict.fromkeys(analysis.tables["offline"].class_name)
-    depth = {each: float(analysis.classes[each].setting["complexity"]) for each in classes}
+    depth = {c: float(analysis.classes[c].setting["complexity"]) for c in classes}
     if len(set(depth.values())) < 2:
         return
-    deepest = max(depth, key=lambda each: depth[each])
+    deepest = max(depth, key=lambda name: depth[name])
+    about = functools.partial(finding, "offline", "depth", algorithm=name, class_name=deepest)
     rows = [row for row in rows if row.class_name == deepest]
-    about = {"algorithm": name, "class_name": deepest}
     if not rows:
-        yield finding("offline", "depth", "no_runs", **about)
+        yield about("no_runs", f"{name} has no finished run on the deepest class, {deepest}.")
         return
+    collapse, reasons = THRESHOLDS["collapse"], []
     constant = [row for row in rows if row.similarity <= row.constant_similarity + _NEAR]
-    below = [
-        row for row in rows
-        if row.improvement <= -THRESHOLDS["collapse"] and row not in constant
-    ]  # fmt: skip
-    lowest = min(rows, key=lambda row: row.improvement)
-    how = [f"at ν = {_nus(constant)} it is at most {_NEAR} better than the constant ½"] * bool(
-        constant
-    ) + [
-        f"at ν = {_nus(below)} it is better than the constant ½, but {THRESHOLDS['collapse']} or "
-        "more below its data"
-    ] * bool(below)
-    few = any(row.runs < ENOUGH_RUNS for row in (*constant, *below))
-    yield finding(
-        "offline", "depth", "collapses" if how else "holds", **about, value=lowest.improvement,
-        runs=sum(row.runs for row in rows), nus=plural(len(rows), "value"),
-        count=plural(sum(row.runs for row in rows), "run"), near=_NEAR, where=_at(lowest),
-        how=", and ".join(how), few=" With so few runs this is an indication." * few,
-    )  # fmt: skip
+    below = [row for row in rows if row.improvement <= -collapse and row not in constant]
+    if constant:
+        reasons.append(f"at ν = {_nus(constant)} it is at most {_NEAR} better than the constant ½")
+    if below:
+        text = "it is better than the constant ½, but"
+        reasons.append(f"at ν = {_nus(below)} {text} {collapse} or more below its data")
+    lowest, runs = min(rows, key=lambda row: row.improvement), sum(row.runs for row in rows)
+    verdict, does, text = "collapses", "collapses", f"{', and '.join(reasons)}."
+    if any(row.runs < ENOUGH_RUNS for row in (*constant, *below)):
+        text += " With so few runs this is an indication."
+    if not reasons:
+        verdict, does = "holds", "does not collapse"
+        text = f"its mean is more than {_NEAR} above that of the constant ½ everywhere; compared "
+        text += (
+            f"with its data, it is {signed(lowest.improvement, 3)} at the lowest ({_at(lowest)})."
+        )
+    of = f"{plural(len(rows), 'value')} of ν, {plural(runs, 'run')}"
+    text = f"{name} {does} on the deepest class, {deepest} ({of}): {text}"
+    yield about(verdict, text, value=lowest.improvement, runs=runs)
+
+
+# Words
 
 
 def _contrasts(analysis: Analysis, algorithm: str, metric: str) -> Rows:
@@ -324,13 +423,6 @@ def _contrasts(analysis: Analysis, algorithm: str, metric: str) -> Rows:
     rows = rows[(rows.algorithm == algorithm) & (rows.metric == metric)]
     setting = rows.class_name.map({name: c.label for name, c in analysis.classes.items()})
     return list(rows.assign(setting=setting).itertuples())
-
-
-def _level(analysis: Analysis, class_name: str, algorithm: str) -> Any | None:
-    """The row of an algorithm's WD regret on a class."""
-    rows = analysis.tables["levels"]
-    place = (rows.class_name == class_name) & (rows.algorithm == algorithm) & (rows.metric == _WD)
-    return next(rows[place].itertuples(), None)
 
 
 def _largest(contrasts: Iterable[Any]) -> Any | None:
@@ -347,11 +439,9 @@ def _of_each_axis(contrasts: Iterable[Any]) -> Rows:
 
 def _property(contrast: Any) -> str:
     """What differs between the classes of a contrast: `reward interval k`."""
-    if contrast.axis in AXES:
-        return AXES[contrast.axis][1]
     if contrast.axis == SEVERAL:
         return f"several axes at once ({contrast.setting})"
-    return contrast.axis or f"the class {contrast.class_name}"
+    return axis_label(contrast.axis) or f"the class {contrast.class_name}"
 
 
 def _listed(contrasts: Rows) -> str:

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import math
 from typing import Any
 
-from sme_registry.io.markup import fixed, plural
-from sme_registry.studies.report.analysis import ENOUGH_RUNS, Analysis
+from sme_registry.io.markup import fixed, plural, signed
+from sme_registry.studies.report.analysis import ENOUGH_RUNS, Analysis, by_place
 from sme_registry.studies.report.classes import TASKS
 from sme_registry.studies.report.lives import WITHIN
 from sme_registry.studies.report.sentences import (
     THRESHOLDS,
     Found,
-    between,
+    Rows,
     change_text,
-    ends_text,
     few_runs,
     finding,
+    indication,
     lives_text,
     missing_runs,
-    numbers_of,
+    side,
 )
 
+_UNLEARNT = THRESHOLDS["unlearnt"]
 _CONTRASTED = {
     "forgetting": "forgetting",
     "plasticity_ratio": "the plasticity ratio",
@@ -29,73 +31,83 @@ _CONTRASTED = {
     "learning_transfer": "learning transfer",
 }
 
-Rows = Sequence[Any]  # of a table, as named tuples
-
 
 def stream_findings(analysis: Analysis) -> Found:
     """What is found in each stream, what its relatedness changes, and what limits that."""
-    yield from _lives(analysis)
+    yield from _streams(analysis)
     yield from _changes(analysis)
     yield from _caveats(analysis)
 
 
-def _lives(analysis: Analysis) -> Found:
+def _streams(analysis: Analysis) -> Found:
+    """What is forgotten, is plasticity lost, and what transfers, in each stream."""
     rows = analysis.tables["stream_metrics"]
-    rows = rows[rows.region == WITHIN]
+    of_place = by_place(rows[rows.region == WITHIN])
     for name, info in analysis.streams.items():
-        lives: dict[str, dict[str, Any]] = {}
-        for row in rows[rows.class_name == name].itertuples():
-            lives.setdefault(row.algorithm, {})[row.metric] = row
+        lives = {
+            algorithm: {row.metric: row for row in of_life.itertuples()}
+            for (class_name, algorithm), of_life in of_place.items()
+            if class_name == name
+        }
         if not lives:
             continue
         metrics = [of_life["forgetting"] for of_life in lives.values() if "forgetting" in of_life]
         metrics.sort(key=lambda row: row.iqm, reverse=True)
-        unlearnt = [
-            of_life["visited_regret"].iqm >= THRESHOLDS["unlearnt"] for of_life in lives.values()
-        ]
-        yield from _forgets(analysis, name, metrics, unlearnt=all(unlearnt))
-        order = [row.algorithm for row in metrics] or list(lives)
-        for algorithm in order:
-            yield from _life(analysis, lives[algorithm], single_visit=info.stream.visits == 1)
+        learnt = any(of_life["visited_regret"].iqm < _UNLEARNT for of_life in lives.values())
+        yield from _forgets(analysis, name, metrics, learnt=learnt)
+        for algorithm in [row.algorithm for row in metrics] or list(lives):
+            yield from _life(lives[algorithm], single_visit=info.stream.visits == 1)
         incomplete = sum(
             life.planned.class_name == name and life.fresh_agents < len(life.planned.cell.fresh)
             for life in analysis.lives
         )
         if incomplete:
-            have = plural(incomplete, "life has", "lives have")
             yield finding(
-                "streams", "fresh agents", "missing", class_name=name, value=incomplete, lives=have
-            )
+                "streams", "fresh agents", "missing",
+                f"{plural(incomplete, 'life has', 'lives have')} not all of their fresh agents "
+                "yet: no number on plasticity or learning transfer includes them.",
+                class_name=name, value=incomplete,
+            )  # fmt: skip
 
 
-def _forgets(analysis: Analysis, name: str, metrics: Rows, *, unlearnt: bool) -> Found:
+def _forgets(analysis: Analysis, name: str, metrics: Rows, *, learnt: bool) -> Found:
     """Whether any agent forgets in a stream, and whether one forgets most."""
     if not metrics:
-        yield finding("streams", "forgets", "single_visit", class_name=name)
+        text = f"In {name} each life has a single visit, so there is nothing to forget."
+        yield finding("streams", "forgets", "single_visit", text, class_name=name)
         return
-    verdict, first = _forgetting(metrics, unlearnt=unlearnt)
-    rivals = list(_rivals_in(analysis, name, metrics))
+    verdict, first = _forgetting(metrics, learnt=learnt)
+    rivals = list(_forgets_more(analysis, name, metrics))
     certain = first is metrics[0] and rivals and all(r["verdict"] == "more" for r in rivals)
-    yield finding(
-        "streams", "forgets", verdict, **numbers_of(first), most=" most" if certain else "",
-        interval=lives_text(first),
-    )  # fmt: skip
+    forgets = f"{first.algorithm} forgets{' most' if certain else ''}: at the end of the life, "
+    value = f"{fixed(first.iqm)}{lives_text(first)}"
+    below = f"performance on earlier phases is {fixed(first.iqm)} below its best{lives_text(first)}"
+    sentences = {
+        "forgets": f"{forgets}{below}.",
+        "indication": f"there are indications that {forgets}{below}.",
+        "none": f"no algorithm forgets: the largest value, that of {first.algorithm}, is {value}.",
+        "unlearnt": "no algorithm has learnt enough to forget: each has learnt almost nothing in "
+        "its visits.",
+        "open": "no algorithm was shown to forget, and none was shown not to. The largest value is "
+        f"that of {first.algorithm}, {value}.",
+    }
+    yield finding("streams", "forgets", verdict, f"In {name}, {sentences[verdict]}", first)
     if verdict in ("forgets", "indication"):
-        if first is not metrics[0]:
-            about = numbers_of(metrics[0])
-            yield finding(
-                "streams", "largest forgetting", "open", **about, interval=lives_text(metrics[0])
-            )
+        most = metrics[0]
+        if first is not most:
+            value = f"{fixed(most.iqm)}{lives_text(most)}"
+            text = f"The largest value, that of {most.algorithm}, is open: {value}."
+            yield finding("streams", "largest forgetting", "open", text, most)
         yield from rivals
 
 
-def _forgetting(metrics: Rows, *, unlearnt: bool) -> tuple[str, Any]:
+def _forgetting(metrics: Rows, *, learnt: bool) -> tuple[str, Any]:
     """The verdict on a stream, and the agent of which its sentence speaks."""
     above = [row for row in metrics if row.low > 0.0]
     if above:
         certain = [row for row in above if row.runs >= ENOUGH_RUNS]
         return ("forgets", certain[0]) if certain else ("indication", above[0])
-    if unlearnt:
+    if not learnt:
         return "unlearnt", metrics[0]
     # Shown for each of them: the whole interval is not above 0.
     none = all(
@@ -105,62 +117,77 @@ def _forgetting(metrics: Rows, *, unlearnt: bool) -> tuple[str, Any]:
     return "none" if none else "open", metrics[0]
 
 
-def _rivals_in(analysis: Analysis, name: str, metrics: Rows) -> Found:
+def _forgets_more(analysis: Analysis, name: str, metrics: Rows) -> Found:
     """The paired differences of the agent that forgets most from each other one."""
     rows = analysis.tables["stream_differences"]
     rows = rows[(rows.class_name == name) & (rows.metric == "forgetting")]
-    most = metrics[0].algorithm
-    for other in metrics[1:]:
-        for row in rows.itertuples():
-            if {row.first, row.second} != {most, other.algorithm}:
-                continue
-            numbers = {"value": row.difference, "low": row.low, "high": row.high}
-            if row.first != most:
-                numbers = {"value": -row.difference, "low": -row.high, "high": -row.low}
-            enough = "more" if row.enough_pairs else "indication"
-            yield finding(
-                "streams", "forgets more", enough if numbers["low"] > 0.0 else "open",
-                algorithm=most, class_name=name, runs=row.pairs, **numbers, other=other.algorithm,
-                interval=between(**numbers),
-            )  # fmt: skip
+    most, *others = (row.algorithm for row in metrics)
+    pairs = {frozenset((row.first, row.second)): row for row in rows.itertuples()}
+    for other in others:
+        row = pairs.get(frozenset((most, other)))
+        if row is None:
+            continue
+        value, low, high = row.difference, row.low, row.high
+        if row.first != most:
+            value, low, high = -value, -high, -low
+        verdict, begin = "open", f"{most}’s value is the largest, but {other} may forget more: the"
+        if low > 0.0:
+            verdict, begin = "more", f"{most} forgets more than {other}: the"
+            if not row.enough_pairs:
+                verdict = "indication"
+                begin = f"There are indications of few pairs that {begin}"
+        interval = "" if math.isnan(low) else f" ({fixed(low)} to {fixed(high)})"
+        yield finding(
+            "streams", "forgets more", verdict, f"{begin} difference is {signed(value)}{interval}.",
+            row, algorithm=most, value=value, low=low, high=high,
+        )  # fmt: skip
 
 
-def _life(analysis: Analysis, metrics: dict[str, Any], *, single_visit: bool) -> Found:
+def _life(metrics: dict[str, Any], *, single_visit: bool) -> Found:
     """What one agent learns, forgets and transfers in a stream."""
     visited = metrics["visited_regret"]
-    about = {"algorithm": visited.algorithm, "class_name": visited.class_name}
-    unlearnt = visited.iqm >= THRESHOLDS["unlearnt"]
-    yield finding(
-        "streams", "life", "unlearnt" if unlearnt else "learnt", **numbers_of(visited),
-        lives=plural(visited.runs, "life", "lives"),
-    )  # fmt: skip
-    for key, neutral in (("forgetting", 0.0), ("plasticity_ratio", 1.0), ("forward_transfer", 0.0)):
-        question, row = key.replace("_ratio", "").replace("_", " "), metrics.get(key)
-        if row is not None:
-            verdict = "above" if row.low > neutral else "below" if row.high < neutral else "open"
-            yield finding(
-                "streams", question, verdict, **numbers_of(row), interval=lives_text(row),
-                few="" if row.runs >= ENOUGH_RUNS else " (an indication)",
-                than_fresh=_than_fresh(analysis, row) if neutral else "",
-            )  # fmt: skip
-        elif neutral:
-            verdict = "single_visit" if single_visit else "unknown"
-            yield finding("streams", question, verdict, **about)
-
-
-def _than_fresh(analysis: Analysis, row: Any) -> str:
-    """How the regret of a life compares with that of fresh agents, over visits and in the last."""
-    visits = analysis.tables["stream_visit_metrics"]
-    at = (visits.class_name == row.class_name) & (visits.algorithm == row.algorithm)
-    visits = visits[at & (visits.region == WITHIN)]
-    last = visits[(visits.visit == visits.visit.max()) & (visits.metric == "plasticity_ratio")]
+    name, unlearnt = visited.algorithm, visited.iqm >= _UNLEARNT
+    about = functools.partial(finding, "streams", algorithm=name, class_name=visited.class_name)
     text = (
-        ": after a visit other than the first, its regret on the phase is "
-        f"{fixed(row.iqm)} times a fresh agent’s{lives_text(row)}"
+        f"{name} ({plural(visited.runs, 'life', 'lives')}): at the end of a visit its normalised "
+        f"regret on the phase is {fixed(visited.iqm)}."
     )
-    for each in last.itertuples():
-        text += f", and {fixed(each.iqm)} times in the last visit{ends_text(each)}"
-    return text
+    if unlearnt:
+        text += (
+            " It has learnt almost nothing, so it has little to forget and hardly any plasticity "
+            "to lose."
+        )
+    yield about("life", "unlearnt" if unlearnt else "learnt", text, visited)
+    if (row := metrics.get("forgetting")) is not None:
+        text = f"Forgetting of {name}: {fixed(row.iqm)}{lives_text(row)}."
+        yield about("forgetting", side(row, 0.0), text, row)
+    if (row := metrics.get("plasticity_ratio")) is not None:
+        verdict, few = side(row, 1.0), indication(row)
+        sentences = {
+            "above": f"{name} loses plasticity{few}",
+            "below": f"{name} learns more than a fresh agent{few}",
+            "open": f"for {name} no loss of plasticity was shown, and none excluded",
+        }
+        text = (
+            f"Plasticity: {sentences[verdict]}: after a visit other than the first, its regret on "
+            f"the phase is {fixed(row.iqm)} times a fresh agent’s{lives_text(row)}."
+        )
+        yield about("plasticity", verdict, text, row)
+    elif single_visit:
+        text = "Plasticity: a life of one visit is a fresh agent itself."
+        yield about("plasticity", "single_visit", text)
+    else:
+        text = f"Plasticity: that of {name} is unknown, since no life has all of its fresh agents."
+        yield about("plasticity", "unknown", text)
+    if (row := metrics.get("forward_transfer")) is not None:
+        verdict, before = side(row, 0.0), "than before training on phases before their first visit"
+        sentences = {
+            "above": f"{name} is better {before}{indication(row)}",
+            "below": f"{name} is worse {before}{indication(row)}",
+            "open": f"Whether {name} is better or worse {before} is open",
+        }
+        text = f"{sentences[verdict]}: forward transfer is {signed(row.iqm)}{lives_text(row)}."
+        yield about("forward transfer", verdict, text, row)
 
 
 def _changes(analysis: Analysis) -> Found:
@@ -170,18 +197,23 @@ def _changes(analysis: Analysis) -> Found:
     base = analysis.streams[analysis.stream_base]
     for name, of_class in rows.groupby("class_name", sort=False):
         info = analysis.streams[name]
-        related = info.related and not base.related and info.stream.kinds == base.stream.kinds
-        yield finding(
-            "stream_changes", "relatedness", "related" if related else "other", class_name=name,
-            first=base.name,
-        )  # fmt: skip
-        for row in of_class.itertuples():
-            few = "" if row.enough_pairs or row.verdict == "open" else "_few"
-            change = f"{fixed(row.base)} → {fixed(row.level)}, by {change_text(row)}"
-            yield finding(
-                "stream_changes", "change", row.verdict + few, algorithm=row.algorithm,
-                **numbers_of(row), metric=_CONTRASTED[row.metric], change=change,
+        verdict, text = "other", f"{name} differs from {base.name} in its tasks alone."
+        if info.related and not base.related and info.stream.kinds == base.stream.kinds:
+            verdict, text = "related", (
+                f"The streams differ in their tasks alone. The phases of {name} are rotations of "
+                f"one task, those of {base.name} are not, so the changes from {base.name} are "
+                "those that relatedness makes."
             )  # fmt: skip
+        yield finding("stream_changes", "relatedness", verdict, text, class_name=name)
+        for row in of_class.itertuples():
+            verdict, text = row.verdict, row.verdict
+            if row.verdict == "open":
+                text = "open, since the interval contains 0 or is unknown"
+            elif not row.enough_pairs:
+                verdict, text = f"{row.verdict}_few", f"{row.verdict}, an indication from few pairs"
+            change = f"{fixed(row.base)} → {fixed(row.level)}, by {change_text(row)}"
+            text = f"{row.algorithm}: {_CONTRASTED[row.metric]} is {text}, {change}."
+            yield finding("stream_changes", "change", verdict, text, row)
 
 
 def _caveats(analysis: Analysis) -> Found:
@@ -191,7 +223,11 @@ def _caveats(analysis: Analysis) -> Found:
     absent = analysis.missing_in_streams
     yield from missing_runs("stream_caveats", absent, finished + absent, failed)
     places = lives[lives.region == WITHIN].groupby(["class_name", "algorithm"])
-    if len(places) and places.size().min() < ENOUGH_RUNS:
-        yield few_runs("stream_caveats", int(places.size().min()), "life", "lives")
+    if len(places):
+        yield from few_runs("stream_caveats", int(places.size().min()), "life", "lives")
     if (places.stream_digest.nunique() < places.size()).any():
-        yield finding("stream_caveats", "draws", "repeat")
+        yield finding(
+            "stream_caveats", "draws", "repeat",
+            "Several lives of an algorithm share a draw of their stream. They are not independent "
+            "draws of the tasks, so the intervals are too narrow for other draws.",
+        )  # fmt: skip

@@ -9,7 +9,6 @@ import pytest
 
 from sme_registry.studies.report.analysis import ENOUGH_RUNS, change_verdict
 from sme_registry.studies.report.findings import findings
-from sme_registry.studies.report.sentences import SENTENCES, sentence
 from tests.studies.finished import analysed, with_tables
 
 pytest.importorskip("matplotlib")
@@ -147,16 +146,6 @@ def test_different_training_steps_are_reported(analysis):
     runs.loc[runs.algorithm == "Alpha", "steps"] = 4000
     steps = found(dataclasses.replace(analysis, runs=runs))["training steps"]
     assert steps.sentence == "Training steps differ: Alpha 4,000, Beta 40."
-
-
-def test_every_verdict_has_a_whole_sentence():
-    numbers = dict.fromkeys(("value", "low", "high", "base", "level", "linear"), 0.5)
-    for question, verdicts in SENTENCES.items():
-        for verdict, template in verdicts.items():
-            words = dict.fromkeys(re.findall(r"\{(\w+)", template), "") | numbers
-            text = sentence({"question": question, "verdict": verdict, **words})
-            assert text.endswith(".")
-            assert "{" not in text
 
 
 def text_of(analysis, *reasons):
