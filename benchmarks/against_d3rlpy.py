@@ -24,12 +24,12 @@ with warnings.catch_warnings():
 from sme_registry import SMESpec, materialize
 from sme_registry.datasets import DatasetRecipe, to_d3rlpy
 from sme_registry.datasets.collect import collect
-from sme_registry.datasets.learners import BC, IQL, Minibatch
-from sme_registry.datasets.recipe import parse_behaviour
-from sme_registry.datasets.record import (
+from sme_registry.datasets.documents import (
     BCHyperparameters,
     IQLHyperparameters,
+    parse_behaviour,
 )
+from sme_registry.datasets.learners import BC, IQL, Minibatch
 
 SEEN, ACTED, ROWS = 10, 4, 256
 

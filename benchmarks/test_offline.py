@@ -18,8 +18,8 @@ import torch
 from sme_registry import SMESpec, materialize
 from sme_registry.datasets import DatasetRecipe, Transitions, to_d3rlpy
 from sme_registry.datasets.collect import collect
+from sme_registry.datasets.documents import BCHyperparameters, IQLHyperparameters
 from sme_registry.datasets.learners import BC, IQL, minibatches
-from sme_registry.datasets.record import BCHyperparameters, IQLHyperparameters
 
 SPEC, BATCH = SMESpec(), 256
 STEPS = 20

@@ -32,8 +32,7 @@ from sme_registry.datasets import (
     train_offline,
     train_sealed,
 )
-from sme_registry.datasets.offline import check_algorithm
-from sme_registry.datasets.record import PolicyScore
+from sme_registry.datasets.documents import PolicyScore, check_algorithm
 from sme_registry.datasets.storage import check_location, datasets_folder
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.io import check_new

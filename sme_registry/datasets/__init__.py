@@ -9,15 +9,15 @@ Importing this module does not import PyTorch.
 """
 
 from sme_registry.datasets.collect import collect
-from sme_registry.datasets.offline import OfflineResult, train_offline, train_sealed
-from sme_registry.datasets.recipe import Behaviour, DatasetRecipe
-from sme_registry.datasets.record import (
+from sme_registry.datasets.documents import (
     BCHyperparameters,
+    Behaviour,
+    DatasetRecipe,
     DatasetRecord,
     IQLHyperparameters,
     OfflineRecord,
 )
-from sme_registry.datasets.scores import ExactReturn, exact_return, positions
+from sme_registry.datasets.offline import OfflineResult, train_offline, train_sealed
 from sme_registry.datasets.storage import (
     Dataset,
     SealedDataset,
@@ -25,7 +25,14 @@ from sme_registry.datasets.storage import (
     make_dataset,
     open_dataset,
 )
-from sme_registry.datasets.transitions import Transitions, replay, to_d3rlpy
+from sme_registry.datasets.transitions import (
+    ExactReturn,
+    Transitions,
+    exact_return,
+    positions,
+    replay,
+    to_d3rlpy,
+)
 from sme_registry.evaluation import OfflinePolicy
 
 __all__ = [

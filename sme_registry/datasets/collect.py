@@ -1,4 +1,4 @@
-"""`collect`: generate the `Transitions` of a recipe, many episodes at once.
+"""`collect`: generate the `Transitions` of a recipe, many episodes at once, and score its policies.
 
     mixture of ν:  a = (1 − α) π*(s) + α ã(s),   α ~ U(0, ν), one draw for each step
     random:        a ~ U([0, 1]^A)
@@ -9,9 +9,9 @@ one for each agent, on what it observes), drawn from the data's seed; one α mix
 
 Episode e of a behaviour does not depend on what runs next to it: its start, each α and its actions
 come from its own part of named streams, and π* and ã are evaluated by the compiled step, whose bits
-do not depend on the number of lanes. A user's policy is called in blocks of one size, so that its
+do not depend on the size of a batch. A user's policy is called in blocks of one size, so that its
 network always multiplies matrices of the same shape. A data set is the first N rows of episodes
-0, 1, 2, …. `B` lanes, `S` state_dim, `A` action_dim, `n` agents, `m` distractors, T horizon.
+0, 1, 2, …. `B` environments, `S` state_dim, `A` action_dim, `n` agents, `m` distractors, T horizon.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -34,11 +34,15 @@ from sme_registry.compiled.arrays import (
     STEP_REWARD,
     Array,
     Indices,
-    Mask,
     Observation,
 )
-from sme_registry.datasets.recipe import DatasetRecipe
-from sme_registry.datasets.transitions import Transitions
+from sme_registry.datasets.documents import (
+    DatasetRecipe,
+    EpisodeScores,
+    PolicyScore,
+    ReferenceScores,
+)
+from sme_registry.datasets.transitions import Arrays, Transitions
 from sme_registry.envs.batch import Batch
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import Policy, TeamPolicy, as_policy
@@ -51,101 +55,88 @@ from sme_registry.task.loading import check_memory
 
 ReportProgress = Callable[[int, int], None]
 
-NOISE_STREAM = "dataset/noise"
 _AHEAD = 64  # steps whose random numbers an episode reads at once
 _BLOCK = 64  # observations in one call of a user's policy
+_ENVS = 512
+_MAX_STEPS = 10**8  # of the environment; a sub-cube that needs more is too small
+_SCORED_EPISODES, _MAX_SCORED_STEPS = 100, 10**5  # of one policy; the steps are over its episodes
 
 
 def noise_task(task: Task, seed: int | str) -> Task:
     """The task whose optimal policy is ã: of the same shape, drawn from the data's seed."""
-    policies = draw.optimal_policies(task.spec.derive(seed=seed), NOISE_STREAM)
+    policies = draw.optimal_policies(task.spec.derive(seed=seed), "dataset/noise")
     return replace(task, policies=policies)
 
 
-class OptimalPolicy:
-    """π* as a function from states `[B, S]` to `[B, A]`, with the same bits in any batch."""
+def _optimal_policy(task: Task, num_envs: int) -> Callable[[Array], Array]:
+    """π* from states `[B, S]` to `[B, A]`, with the same bits in any batch.
 
-    def __init__(self, task: Task, lanes: int) -> None:
-        # The same π* without limits and distractors, which take time.
-        spec = task.spec.derive(safety=None, observation=None)
-        plain = replace(task, spec=spec, limiting=(), distractor_transition=None, mixing=())
-        self._batch = Batch(plain, lanes, reuse=True)
-        self._lanes = np.arange(lanes)
-        self._observation = self._batch.observe()
-        self._no_action = np.zeros((lanes, task.spec.action_dim))
-
-    def __call__(self, s: Array) -> Array:
-        """π*(s); the next call but one overwrites it."""
-        self._batch.begin(self._lanes, self._observation, s)
-        return self._batch.advance(self._no_action).optimal
-
-
-class EpisodeStream:
-    """Uniform numbers of a named stream, `width` a step, a separate part of it for each episode.
-
-    Episode e reads from word 4 · 2¹²⁸ e onwards, so its numbers do not depend on its lane or on the
-    other episodes. Each lane reads those of `ahead` steps at once.
+    The next call but one overwrites its actions.
     """
+    # The same π* without limits and distractors, which take time.
+    spec = task.spec.derive(safety=None, observation=None)
+    plain = replace(task, spec=spec, limiting=(), distractor_transition=None, mixing=())
+    batch, envs = Batch(plain, num_envs, reuse=True), np.arange(num_envs)
+    observation, no_action = batch.observe(), np.zeros((num_envs, spec.action_dim))
 
-    def __init__(
-        self, seed: int | str, name: str, lanes: int, width: int, ahead: int = _AHEAD
-    ) -> None:
-        self._seed, self._name = seed, name
-        self._generators: list[np.random.Philox | None] = [None] * lanes
-        self._drawn = np.zeros((lanes, ahead, width))
-        self._used = np.full(lanes, ahead)
-        self._lanes = np.arange(lanes)
+    def act(s: Array) -> Array:
+        batch.begin(envs, observation, s)
+        return batch.advance(no_action).optimal
 
-    def begin(self, lane: int, episode: int) -> None:
-        generator = bit_generator(self._seed, self._name)
-        generator.advance(episode << 128)
-        self._generators[lane] = generator
-        self._used[lane] = self._drawn.shape[1]
+    return act
 
-    def next(self, lanes: npt.NDArray[np.int64] | None = None) -> Array:
-        """The next numbers of these lanes (None: all), `[len(lanes), width]` in (0, 1)."""
-        lanes = self._lanes if lanes is None else lanes
-        _, ahead, width = self._drawn.shape
-        for lane in lanes[self._used[lanes] == ahead].tolist():
-            generator = self._generators[lane]
-            assert generator is not None  # `begin` comes first
-            self._drawn[lane] = to_uniform(generator.random_raw(ahead * width)).reshape(ahead, -1)
-            self._used[lane] = 0
-        numbers: Array = self._drawn[lanes, self._used[lanes]]
-        self._used[lanes] += 1
-        return numbers
+
+def episode_numbers(
+    seed: int | str, name: str, episode: int, width: int, ahead: int = _AHEAD
+) -> Iterator[Array]:
+    """Uniform numbers `[width]` in (0, 1) for each step of an episode, without end.
+
+    Episode e reads a named stream from word 4 · 2¹²⁸ e onwards, `ahead` steps at once.
+    """
+    generator = bit_generator(seed, name)
+    generator.advance(episode << 128)
+    while True:
+        yield from to_uniform(generator.random_raw(ahead * width)).reshape(ahead, width)
+
+
+class EpisodeNumbers:
+    """The numbers of a stream's present episodes, one in each environment of a batch."""
+
+    def __init__(self, seed: int | str, name: str, num_envs: int, width: int) -> None:
+        self._stream, self._width = (seed, name), width
+        self._numbers: list[Iterator[Array]] = [iter(())] * num_envs
+
+    def begin(self, env: int, episode: int) -> None:
+        self._numbers[env] = episode_numbers(*self._stream, episode, self._width)
+
+    def next(self) -> Array:
+        """Those of the next step, `[B, width]`."""
+        return np.concatenate([next(one) for one in self._numbers]).reshape(-1, self._width)
 
 
 @dataclass(frozen=True)
 class BehaviourPolicy:
-    """A policy that acts in all lanes: actions `[B, A]` for states `[B, S]` and joint observations.
-
-    `stream` has the random numbers that it uses; it is None if the policy is deterministic.
-    """
+    """Actions `[B, A]` for states `[B, S]` and joint observations `[B, O]` of a batch."""
 
     act: Callable[[Array, Observation], Array]
-    stream: EpisodeStream | None = None
-
-    def begin(self, lane: int, episode: int) -> None:
-        if self.stream is not None:
-            self.stream.begin(lane, episode)
+    numbers: EpisodeNumbers | None = None  # that it uses; None if it is deterministic
 
 
 def behaviour_policy(
     recipe: DatasetRecipe,
     index: int,
     task: Task,
-    lanes: int,
+    num_envs: int,
     policy: Any = None,
     stream: str = "dataset",
 ) -> BehaviourPolicy:
     """The policy of a recipe's behaviour with this index; `policy` is the user's, for its kind."""
     behaviour, name = recipe.behaviours[index], f"{stream}/{index}"
     if behaviour.nu is not None:
-        return _mixture(task, recipe.seed, behaviour.nu, name, lanes)
+        return _mixture(task, recipe.seed, behaviour.nu, f"{name}/alpha", num_envs)
     if behaviour.kind == "random":
-        actions = EpisodeStream(recipe.seed, f"{name}/action", lanes, task.spec.action_dim)
-        return BehaviourPolicy(lambda s, observation: actions.next(), actions)
+        numbers = EpisodeNumbers(recipe.seed, f"{name}/action", num_envs, task.spec.action_dim)
+        return BehaviourPolicy(lambda s, observation: numbers.next(), numbers)
     prepared = as_policy(
         policy, recipe.spec, action_range=behaviour.action_range, name=behaviour.policy
     )
@@ -157,31 +148,31 @@ def constant_policy(task: Task) -> BehaviourPolicy:
     return BehaviourPolicy(lambda s, observation: np.full((len(s), task.spec.action_dim), 0.5))
 
 
-def _mixture(task: Task, seed: int | str, nu: float, name: str, lanes: int) -> BehaviourPolicy:
-    optimal = OptimalPolicy(task, lanes)
-    noise = OptimalPolicy(noise_task(task, seed), lanes) if nu > 0.0 else None
-    stream = EpisodeStream(seed, f"{name}/alpha", lanes, 1)
+def _mixture(task: Task, seed: int | str, nu: float, name: str, num_envs: int) -> BehaviourPolicy:
+    optimal = _optimal_policy(task, num_envs)
+    if nu == 0.0:
+        return BehaviourPolicy(lambda s, observation: optimal(s))
+    noise = _optimal_policy(noise_task(task, seed), num_envs)
+    numbers = EpisodeNumbers(seed, name, num_envs, 1)
 
     def act(s: Array, observation: Observation) -> Array:
-        if noise is None:
-            return optimal(s)
-        alpha = nu * stream.next()
+        alpha = nu * numbers.next()
         return (1.0 - alpha) * optimal(s) + alpha * noise(s)
 
-    return BehaviourPolicy(act, stream)
+    return BehaviourPolicy(act, numbers)
 
 
 def _actions(policy: Policy | TeamPolicy, observation: Observation) -> Array:
-    """A user's actions `[B, A]` for joint observations, clipped as the environment clips them."""
+    """A user's actions `[B, A]` for joint observations."""
     if isinstance(policy, Policy):
-        return np.clip(_in_blocks(policy, observation), 0.0, 1.0)
+        return _in_blocks(policy, observation)
     shared = observation.shape[1] - len(policy.members)  # s and t/T; then each agent's r_cum/k
     joint = []
     for agent, member in enumerate(policy.members):
         single = observation[:, [*range(shared), shared + agent]]
         acted = _in_blocks(member.policy, member.observe(single))
         joint.append(acted[:, : member.action_dim])
-    return np.clip(np.concatenate(joint, axis=1), 0.0, 1.0)
+    return np.concatenate(joint, axis=1)
 
 
 def _in_blocks(policy: Callable[[Observation], Array], observation: Observation) -> Array:
@@ -193,41 +184,18 @@ def _in_blocks(policy: Callable[[Observation], Array], observation: Observation)
     return np.concatenate(blocks)[:rows]
 
 
-_LANES = 512
-_MAX_STEPS = 10**8  # of the environment; a sub-cube that needs more is too small
-
-
-class Rows(NamedTuple):
-    """`M` transitions as arrays."""
-
-    episode: npt.NDArray[np.int64]  # `[M]` index of the episode of its behaviour
-    t: npt.NDArray[np.int64]  # `[M]` steps of the episode before this one
-    state: Array  # `[M, S]`
-    next_state: Array
-    observation: Observation  # `[M, S + m + 1 + n]`
-    next_observation: Observation
-    action: npt.NDArray[np.float32]  # `[M, A]`
-    optimal: Array  # `[M, A]`
-    values: Array  # `[M, 5, n]` the rows of `compiled.arrays`; with `safety` 7
-    limits: Array  # `[M, 2, A]` the limits and the safe action; without `safety` `[M, 2, 0]`
-    distractors: Array  # `[M, m]`
-    next_distractors: Array
-    terminated: Mask  # `[M]` as the task ends episodes
-    truncated: Mask
-
-
 def collect(
     recipe: DatasetRecipe,
     task: Task,
     policies: dict[int, Any] | None = None,
     *,
-    lanes: int | None = None,
+    num_envs: int | None = None,
     progress: ReportProgress | None = None,
 ) -> Transitions:
     """Generate the transitions of a recipe, one behaviour after another.
 
     `task` is the recipe's, materialised; `policies` are the user's by the index of their behaviour.
-    `lanes` episodes run at once (at most 512 by default); the numbers do not depend on it.
+    `num_envs` episodes run at once (at most 512 by default); the numbers do not depend on it.
     `progress` is called after each step with the transitions collected and their total.
 
     Examples:
@@ -245,98 +213,119 @@ def collect(
     row = 24 * (S + m) + 12 * A + 48 * n + 64
     if spec.safety is not None:
         row += 16 * A + 16
-    with_distractors = f", {m} distractors" if m else ""
     check_memory(
         3 * recipe.transitions * row,
-        f"transitions={recipe.transitions}: a data set of state_dim={S}, action_dim={A}"
-        f"{with_distractors}",
+        f"transitions={recipe.transitions}: a data set of this task",
         "Collect fewer, or several data sets with different seeds.",
     )
     kept_share = max(1e-300, (1.0 + (recipe.coverage or 0.0)) ** S)  # of uniform states
-    done = 0
-    parts = []
+    parts, total = [], 0
     for index, share in enumerate(recipe.shares):
         expected = share / kept_share
         if expected > _MAX_STEPS and recipe.coverage:
             raise _too_small(recipe, f"{share:,} transitions need about {expected:.1g} steps")
-        num_lanes = lanes or min(_LANES, math.ceil(expected / spec.horizon))
-        policy = behaviour_policy(recipe, index, task, num_lanes, (policies or {}).get(index))
+        envs = num_envs or min(_ENVS, math.ceil(expected / spec.horizon))
+        policy = behaviour_policy(recipe, index, task, envs, (policies or {}).get(index))
 
-        def report(count: int, before: int = done) -> None:
+        def report(count: int, before: int = total) -> None:
             if progress is not None:
                 progress(before + count, recipe.transitions)
 
-        starts = EpisodeStream(recipe.seed, f"dataset/{index}/start", num_lanes, S, ahead=1)
-        steps = BehaviourEpisodes(task, policy, starts, num_lanes).rows()
-        parts.append(_first_rows(steps, recipe, share, max(10**6, 20 * expected), report))
-        done += share
-    return _concatenate(parts, spec)
+        episodes = _Episodes(task, policy, recipe.seed, f"dataset/{index}/start", envs)
+        patience = max(10**6, 20 * expected)
+        parts.append(_first_rows(episodes.rows(), recipe, share, patience, report))
+        total += share
+    return _join(parts, spec)
 
 
-class BehaviourEpisodes:
-    """Episodes 0, 1, 2, … of a behaviour in a batch, each in the first lane that is free.
+class _Episodes:
+    """Episodes 0, 1, 2, … of a policy in a batch, each in the first environment that is free.
 
-    The first numbers of an episode in `starts` are its initial state, which determines its
+    The first numbers of an episode in the stream are its initial state, which determines its
     distractors, too.
     """
 
     def __init__(
-        self, task: Task, policy: BehaviourPolicy, starts: EpisodeStream, lanes: int
+        self, task: Task, policy: BehaviourPolicy, seed: int | str, stream: str, num_envs: int
     ) -> None:
-        self._policy, self._starts, self._numbers = policy, starts, itertools.count()
-        self.batch = Batch(task, lanes)
-        self.episode, self.t = np.zeros((2, lanes), np.int64)
-        self.begin(np.arange(lanes), self.batch.observe())
+        self._policy, self._stream, self._unused = policy, (seed, stream), itertools.count()
+        self.batch = Batch(task, num_envs)
+        self.episode, self.t = np.zeros((2, num_envs), np.int64)
+        self.begin(np.arange(num_envs), self.batch.observe())
 
-    def begin(self, lanes: Indices, observation: Observation) -> None:
-        """Begin the next episodes in these lanes."""
-        for lane in lanes.tolist():
-            number = self.episode[lane] = next(self._numbers)
-            self._starts.begin(lane, number)
-            self._policy.begin(lane, number)
-        self.t[lanes] = 0
-        initial = self._starts.next(lanes)
-        self.batch.seed_by_states(lanes, initial)
-        self.batch.begin(lanes, observation, initial)
+    def begin(self, envs: Indices, observation: Observation) -> None:
+        """Begin the next episodes in these environments."""
+        S, initial = self.batch.task.spec.state_dim, []
+        for env in envs.tolist():
+            episode = self.episode[env] = next(self._unused)
+            initial.append(next(episode_numbers(*self._stream, episode, S, ahead=1)))
+            if self._policy.numbers is not None:
+                self._policy.numbers.begin(env, episode)
+        self.t[envs] = 0
+        states = np.array(initial)
+        self.batch.seed_by_states(envs, states)
+        self.batch.begin(envs, observation, states)
 
     def act(self, s: Array, observation: Observation) -> npt.NDArray[np.float32]:
         """The behaviour's actions, exactly as the data set stores them: float32 in [0, 1]."""
         return np.clip(self._policy.act(s, observation), 0.0, 1.0).astype(np.float32)
 
-    def rows(self) -> Iterator[Rows]:
-        """Steps of all lanes without end, whose arrays are valid until the next one."""
+    def rows(self) -> Iterator[Arrays]:
+        """The steps of all environments without end, as columns that are valid until the next."""
         for step in play(self.batch, self.act, self.begin):
-            done = step.result
-            yield Rows(
-                self.episode, self.t, step.state, self.batch.state, step.observation,
-                done.observation, step.action, done.optimal, done.values.transpose(2, 0, 1),
-                done.limits.transpose(1, 0, 2), step.distractors, self.batch.distractors,
-                done.terminated, done.truncated,
-            )  # fmt: skip
+            result = step.result
+            yield {
+                "episode": self.episode,
+                "t": self.t,
+                "truncated": result.truncated,
+                "values": result.values.transpose(2, 0, 1),  # `[B, 5, n]`; with safety 7
+                "limits": result.limits.transpose(1, 0, 2),  # `[B, 2, A]`: also safe actions
+                "states": step.state,
+                "next_states": self.batch.state,
+                "observations": step.observation,
+                "next_observations": result.observation,
+                "actions": step.action,
+                "optimal_actions": result.optimal,
+                "terminations": result.terminated,
+                "distractors": step.distractors,
+                "next_distractors": self.batch.distractors,
+            }
             self.t += 1
 
 
 def _first_rows(
-    steps: Iterator[Rows],
+    steps: Iterator[Arrays],
     recipe: DatasetRecipe,
-    rows: int,
+    wanted: int,
     patience: float,
     progress: Callable[[int], None],
-) -> Rows:
-    """The first `rows` transitions by episode and step whose states are in the sub-cube."""
-    collected, taken, coverage = _Collected(rows), 0, recipe.coverage
+) -> Arrays:
+    """The first transitions by episode and step whose states are in the sub-cube."""
+    parts: list[Arrays] = []
+    rows_of = np.zeros(1024, np.int64)  # by episode
+    count = taken = 0
     for step in steps:
-        lanes = len(step.t)
-        kept = np.ones(lanes, bool) if coverage is None else expansion(step.state) <= coverage
-        collected.add(Rows._make(column[kept] for column in step))
-        taken += lanes
-        progress(min(rows, collected.count))
-        running = step.episode[~(step.terminated | step.truncated)]
-        if collected.complete(int(running.min(initial=step.episode.max() + 1))):
+        episode, coverage = step["episode"], recipe.coverage
+        kept = np.ones(len(episode), bool)
+        if coverage is not None:
+            kept = expansion(step["states"]) <= coverage
+        parts.append({name: column[kept] for name, column in step.items()})
+        if episode.max() >= len(rows_of):
+            rows_of = np.pad(rows_of, (0, int(episode.max())))
+        rows_of[episode[kept]] += 1
+        count += int(kept.sum())
+        taken += len(kept)
+        progress(min(wanted, count))
+        # No later episode than the first running one can contribute a wanted row.
+        running = episode[~(step["terminations"] | step["truncated"])]
+        first = int(running.min(initial=episode.max() + 1))
+        if count >= wanted and rows_of[: first + 1].sum() >= wanted:
             break
-        if taken > patience and collected.count < rows:
-            raise _too_small(recipe, f"{taken:,} steps gave {collected.count:,} transitions")
-    return collected.rows()
+        if taken > patience and count < wanted:
+            raise _too_small(recipe, f"{taken:,} steps gave {count:,} transitions")
+    rows = _concatenate(parts)
+    order = np.lexsort((rows["t"], rows["episode"]))[:wanted]
+    return {name: column[order] for name, column in rows.items()}
 
 
 def _too_small(recipe: DatasetRecipe, reason: str) -> OptionError:
@@ -346,79 +335,134 @@ def _too_small(recipe: DatasetRecipe, reason: str) -> OptionError:
     )
 
 
-class _Collected:
-    def __init__(self, wanted: int) -> None:
-        self._wanted = wanted
-        self._parts: list[Rows] = []
-        self._rows_of = np.zeros(1024, np.int64)  # by episode
-        self._first_running, self._settled = 0, 0
-        self.count = 0
-
-    def add(self, rows: Rows) -> None:
-        self._parts.append(rows)
-        last = int(rows.episode.max(initial=0))
-        if last >= len(self._rows_of):
-            self._rows_of = np.pad(self._rows_of, (0, last))
-        self._rows_of[rows.episode] += 1
-        self.count += len(rows.t)
-
-    def complete(self, first_running: int) -> bool:
-        """Whether no later episode than the first running one can contribute a wanted row."""
-        self._settled += int(self._rows_of[self._first_running : first_running].sum())
-        self._first_running = first_running
-        running = int(self._rows_of[first_running : first_running + 1].sum())
-        return self._settled + running >= self._wanted
-
-    def rows(self) -> Rows:
-        episode = np.concatenate([part.episode for part in self._parts])
-        t = np.concatenate([part.t for part in self._parts])
-        first = np.lexsort((t, episode))[: self._wanted]
-        return Rows._make(
-            np.concatenate(columns)[first] for columns in zip(*self._parts, strict=True)
-        )
+def _concatenate(parts: list[Arrays]) -> Arrays:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _concatenate(parts: list[Rows], spec: SMESpec) -> Transitions:
+def _join(parts: list[Arrays], spec: SMESpec) -> Transitions:
     """The rows of all behaviours as one data set, its trajectories numbered from 0."""
-    rows = Rows._make(np.concatenate(columns) for columns in zip(*parts, strict=True))
-    component = np.repeat(np.arange(len(parts)), [len(part.t) for part in parts])
+    columns = _concatenate(parts)
+    episode, t = columns.pop("episode"), columns.pop("t")
+    values, limits = columns.pop("values"), columns.pop("limits")
+    del columns["truncated"]
+    component = np.repeat(np.arange(len(parts)), [len(part["t"]) for part in parts])
     # A trajectory ends where the next row is not its next step.
-    ends = np.ones(len(rows.t), bool)
-    ends[:-1] = (
-        (component[1:] != component[:-1])
-        | (rows.episode[1:] != rows.episode[:-1])
-        | (rows.t[1:] != rows.t[:-1] + 1)
-    )
-    team = spec.team is not None
+    ends = np.ones(len(t), bool)
+    ends[:-1] = (np.diff(component) != 0) | (np.diff(episode) != 0) | (np.diff(t) != 1)
 
     def of_row(row: int) -> Array:
-        values = rows.values[:, row]
-        return values.copy() if team else values[:, 0].copy()
+        """`[N]`; of a team `[N, n]`."""
+        agents = values[:, row]
+        return agents.copy() if spec.team is not None else agents[:, 0].copy()
 
-    reward = rows.values[:, REWARD]
-    extension: dict[str, Array] = {}
     if spec.safety is not None:
-        limits, safe_actions = np.moveaxis(rows.limits, 1, 0)
-        extension |= {"costs": of_row(COST), "safe_regrets": of_row(SAFE_REGRET)}
-        extension |= {"limits": limits.copy(), "safe_actions": safe_actions.copy()}
-    if spec.distractors:
-        extension["distractors"] = rows.distractors
-        extension["next_distractors"] = rows.next_distractors
+        columns |= {"costs": of_row(COST), "safe_regrets": of_row(SAFE_REGRET)}
+        columns |= {"limits": limits[:, 0].copy(), "safe_actions": limits[:, 1].copy()}
+    if not spec.distractors:
+        del columns["distractors"], columns["next_distractors"]
+    if spec.team is not None:
+        columns["agent_rewards"] = of_row(REWARD)
     return Transitions(
-        observations=rows.observation,
-        actions=rows.action,
-        rewards=reward.mean(axis=1),
-        next_observations=rows.next_observation,
-        terminations=rows.terminated,
-        timeouts=ends & ~rows.terminated,
-        optimal_actions=rows.optimal,
+        **columns,
+        rewards=values[:, REWARD].mean(axis=1),
+        timeouts=ends & ~columns["terminations"],
         regrets=of_row(REGRET),
         similarities=of_row(SIMILARITY),
         step_rewards=of_row(STEP_REWARD),
-        states=rows.state,
-        next_states=rows.next_state,
-        episodes=np.concatenate([[0], np.cumsum(ends)[:-1]]).astype(np.int64),
-        components=component.astype(np.int64),
-        agent_rewards=reward.copy() if team else None,
-        **extension,
+        episodes=np.cumsum(ends) - ends,
+        components=component,
+    )
+
+
+def reference_scores(
+    recipe: DatasetRecipe,
+    task: Task,
+    transitions: Transitions,
+    policies: dict[int, Any] | None = None,
+) -> ReferenceScores:
+    """The scores of a data set's behaviour, of the constant ½ and of the optimum.
+
+    In the data set's own states they are exact, because π* is known there. By rollouts they are
+    means over whole episodes with their own starts, with standard errors; the optimum's return is
+    T. Numbers of a team are means over its agents. `policies` as in `collect`.
+    """
+    stream, T = "dataset/reference", recipe.spec.horizon
+    count = min(_SCORED_EPISODES, _MAX_SCORED_STEPS // T)
+
+    def rollouts(policy: BehaviourPolicy, index: int) -> EpisodeScores | None:
+        if count == 0:
+            return None
+        return _scores(*whole_episodes(task, policy, recipe.seed, f"{stream}/{index}/start", count))
+
+    behaviours = []
+    for index in range(len(recipe.behaviours)):
+        rows, user = transitions.components == index, (policies or {}).get(index)
+        policy = behaviour_policy(recipe, index, task, max(1, count), user, stream)
+        similarity, step_reward = transitions.similarities[rows], transitions.step_rewards[rows]
+        behaviours.append(_score(similarity, step_reward, rollouts(policy, index)))
+    optimum = EpisodeScores(episodes=0, mean_return=float(T), standard_error=0.0, similarity=1.0)
+    return ReferenceScores(
+        constant=_score(*_constant_values(task, transitions), rollouts(constant_policy(task), 0)),
+        behaviour=_score(
+            transitions.similarities, transitions.step_rewards, _weighted(recipe, behaviours)
+        ),
+        behaviours=tuple(behaviours),
+        optimum=PolicyScore(similarity=1.0, step_reward=1.0, rollouts=optimum),
+    )
+
+
+def _score(similarity: Array, step_reward: Array, rollouts: EpisodeScores | None) -> PolicyScore:
+    means = {"similarity": similarity.mean(), "step_reward": step_reward.mean()}
+    return PolicyScore(**means, rollouts=rollouts)
+
+
+def _constant_values(task: Task, transitions: Transitions) -> tuple[Array, Array]:
+    """r̃ and r of a = ½ on the data set's states."""
+    optimal = transitions.optimal_actions
+    similarity = task.similarities_of(np.full_like(optimal, 0.5), optimal)
+    rewarded = similarity
+    if task.pays_the_team:  # the mean over all channels, of which agents own unequal numbers
+        channels = np.array([owned.stop - owned.start for owned in task.owned])
+        rewarded = (similarity @ channels) / task.spec.action_dim
+    return similarity, task.reward_of(rewarded)
+
+
+def whole_episodes(
+    task: Task, policy: BehaviourPolicy, seed: int | str, stream: str, count: int
+) -> tuple[Array, Array, Array]:
+    """Return, sum of r̃ and steps `[count]` of the first episodes; means over agents."""
+    episodes, sums = _Episodes(task, policy, seed, stream, count), np.zeros((3, count))
+    for step in play(episodes.batch, episodes.act):
+        similarity, reward = step.result.values[[SIMILARITY, REWARD]].mean(axis=1)
+        sums += step.running * np.stack([reward, similarity, np.ones(count)])
+    returns, similarities, steps = sums
+    return returns, similarities, steps
+
+
+def _scores(returns: Array, similarities: Array, steps: Array) -> EpisodeScores:
+    count = len(returns)
+    return EpisodeScores(
+        episodes=count,
+        mean_return=returns.mean(),
+        standard_error=returns.std(ddof=1) / math.sqrt(count) if count > 1 else 0.0,
+        similarity=min(1.0, similarities.sum() / steps.sum()),
+    )
+
+
+def _weighted(recipe: DatasetRecipe, scores: list[PolicyScore]) -> EpisodeScores | None:
+    """The mean over behaviours by their weights; None if they have no episodes."""
+    if len(scores) == 1:
+        return scores[0].rollouts
+    pairs = [
+        (behaviour.weight, score.rollouts)
+        for behaviour, score in zip(recipe.behaviours, scores, strict=True)
+        if score.rollouts is not None
+    ]
+    if not pairs:
+        return None
+    return EpisodeScores(
+        episodes=sum(score.episodes for _, score in pairs),
+        mean_return=math.fsum(w * score.mean_return for w, score in pairs),
+        standard_error=math.sqrt(math.fsum((w * s.standard_error) ** 2 for w, s in pairs)),
+        similarity=min(1.0, math.fsum(w * score.similarity for w, score in pairs)),
     )

@@ -25,13 +25,13 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sme_registry.datasets.record import BCHyperparameters, Hyperparameters, IQLHyperparameters
+from sme_registry.datasets.documents import BCHyperparameters, Hyperparameters, IQLHyperparameters
 from sme_registry.datasets.storage import SealedDataset
 from sme_registry.datasets.transitions import Transitions
 from sme_registry.errors import PolicyError
@@ -58,9 +58,7 @@ class Networks(ABC):
     """Networks, and one optimiser of all their losses; the policy's u is tanh of the actor."""
 
     actor: nn.Sequential
-
-    def _optimise(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
-        self._adam = torch.optim.Adam(parameters, lr=learning_rate, fused=True)
+    _adam: torch.optim.Adam
 
     @abstractmethod
     def losses(self, batch: Minibatch) -> dict[str, Tensor]:
@@ -73,6 +71,10 @@ class Networks(ABC):
         sum(losses.values(), torch.zeros(())).backward()  # type: ignore[no-untyped-call]
         self._adam.step()
         return losses
+
+
+def _adam(parameters: Iterable[Tensor], learning_rate: float) -> torch.optim.Adam:
+    return torch.optim.Adam(parameters, lr=learning_rate, fused=True)
 
 
 def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
@@ -125,7 +127,7 @@ class BC(Networks):
         self, observation_dim: int, action_dim: int, hyperparameters: BCHyperparameters
     ) -> None:
         self.actor = mlp(observation_dim, hyperparameters.hidden, action_dim)
-        self._optimise(self.actor.parameters(), hyperparameters.learning_rate)
+        self._adam = _adam(self.actor.parameters(), hyperparameters.learning_rate)
 
     def losses(self, batch: Minibatch) -> dict[str, Tensor]:
         """The loss, `actor`: mean squared error in u, four times that in a."""
@@ -153,7 +155,7 @@ class IQL(Networks):
         self.value = mlp(observation_dim, hidden, 1)
         trained = [self.actor, self.critics, self.value]
         parameters = [parameter for network in trained for parameter in network.parameters()]
-        self._optimise([*parameters, self.spread], hyperparameters.learning_rate)
+        self._adam = _adam([*parameters, self.spread], hyperparameters.learning_rate)
         self._critic_parameters: list[Tensor] = list(self.critics.parameters())
         self._target_parameters: list[Tensor] = list(self.targets.parameters())
 
@@ -190,9 +192,8 @@ class IQL(Networks):
 class OfflineLearner:
     """A policy that learns from the rows of a data set by gradient steps, on one thread.
 
-    The seed is that of initial weights and shuffles; PyTorch's own number of threads and global
-    generator are unchanged. `steps`, `cpu_seconds` and the `losses` of the last batch are of all
-    steps so far.
+    `about` is of the policy; its seed is that of initial weights and shuffles. PyTorch's own number
+    of threads and global generator are unchanged. `steps` and `cpu_seconds` are of all so far.
     """
 
     def __init__(
@@ -200,9 +201,11 @@ class OfflineLearner:
         hyperparameters: Hyperparameters,
         data: Transitions | SealedDataset,
         batch_size: int,
-        seed: int,
+        about: dict[str, Any],
     ) -> None:
-        initial, shuffles = (draw.raw_bits(seed, "offline/learner", 2) >> np.uint64(1)).tolist()
+        self.hyperparameters, self.about = hyperparameters, about
+        bits = draw.raw_bits(about["seed"], "offline/learner", 2)
+        initial, shuffles = (bits >> np.uint64(1)).tolist()
         dims = data.observations.shape[1], data.actions.shape[1]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(initial)

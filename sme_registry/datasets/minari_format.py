@@ -1,4 +1,4 @@
-"""Minari's HDF5 layout of a data set: its arrays as a file, and the file's metadata.
+"""Minari's layout of a data set: its columns as an HDF5 file, and the file's metadata.
 
 An episode of T steps holds `observations` `[T + 1, O]`, `infos/state` `[T + 1, S]` and, where the
 task has distractors, `infos/distractors` `[T + 1, m]`, whose last rows follow the last step. Minari
@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
@@ -22,16 +21,14 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.datasets.record import KEY, DatasetRecord
-from sme_registry.datasets.transitions import Transitions
+from sme_registry.datasets.documents import KEY, DatasetRecord
+from sme_registry.datasets.transitions import Arrays, Transitions
+from sme_registry.errors import MalformedDocumentError
 from sme_registry.io import require_packages
 from sme_registry.registration import env_spec
 
-DATA, METADATA, NAMESPACE_METADATA = "main_data.hdf5", "metadata.json", "namespace_metadata.json"
-
-Arrays = Mapping[str, npt.NDArray[Any]]
-
-_VISIBLE = {  # what an agent sees: type and number of dimensions
+DATA, METADATA = "main_data.hdf5", "metadata.json"
+VISIBLE = {  # what an agent sees: type and number of dimensions
     "observations": (np.float32, 2),
     "actions": (np.float32, 2),
     "rewards": (np.float64, 1),
@@ -56,7 +53,6 @@ _REQUIRED = {field.name for field in fields(Transitions) if field.default is MIS
 
 
 def require_minari() -> None:
-    """Raise MissingDependencyError if Minari or h5py is not installed; imports neither."""
     require_packages("data sets", {"minari": "Minari", "h5py": "h5py"}, "offline")
 
 
@@ -67,17 +63,15 @@ def minari_dataset(data_folder: Path) -> Any:
     return minari.MinariDataset(data_folder)
 
 
-def ends_of(columns: Arrays) -> list[int]:
+def _ends(columns: Arrays) -> list[int]:
     """The index after the last row of each episode."""
     ended = columns["terminations"] | columns["truncations"]
     ends: list[int] = (np.flatnonzero(ended) + 1).tolist()
     return ends
 
 
-def metadata_of(
-    dataset_id: str, columns: Arrays, size_bytes: int, record: DatasetRecord | None
-) -> dict[str, Any]:
-    """Minari's metadata of a data set; without a record, nothing in them is about the task."""
+def metadata_of(dataset_id: str, columns: Arrays, size_bytes: int) -> dict[str, Any]:
+    """Minari's metadata of a data set; nothing in them is about the task."""
     import minari
     from minari.serialization import serialize_space
 
@@ -85,8 +79,8 @@ def metadata_of(
         gymnasium.spaces.Box(0.0, 1.0, columns[name].shape[1:], np.float32)
         for name in ("observations", "actions")
     )
-    metadata = {
-        "total_episodes": len(ends_of(columns)),
+    return {
+        "total_episodes": len(_ends(columns)),
         "total_steps": len(columns["rewards"]),
         "data_format": "hdf5",
         "jpeg_encoding": False,
@@ -96,10 +90,9 @@ def metadata_of(
         "minari_version": minari.__version__,
         "dataset_size": round(size_bytes / 1e6, 1),
     }
-    return metadata if record is None else metadata | _about_task(record)
 
 
-def _about_task(record: DatasetRecord) -> dict[str, Any]:
+def about_task(record: DatasetRecord) -> dict[str, Any]:
     recipe, scores = record.recipe, record.scores
     metadata: dict[str, Any] = {
         "algorithm_name": " + ".join(
@@ -128,29 +121,12 @@ def to_hdf5(columns: Arrays) -> bytes:
     """The content of `main_data.hdf5` with these columns; the same arrays give the same bytes.
 
     Built in memory, so that a full disk fails one write instead of HDF5 in the middle of its work.
-    h5py's low-level interface takes half the time: short episodes are many tiny objects.
     """
     import h5py
 
-    types: dict[Any, Any] = {}
-    shapes: dict[tuple[int, ...], Any] = {}
-    plain = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    plain.set_obj_track_times(False)
-
-    def put(group: Any, name: str, *parts: npt.NDArray[Any]) -> None:
-        array = np.ascontiguousarray(np.concatenate(parts))
-        if array.dtype not in types:
-            types[array.dtype] = h5py.h5t.py_create(array.dtype, logical=True)
-        if array.shape not in shapes:
-            shapes[array.shape] = h5py.h5s.create_simple(array.shape)
-        dataset = h5py.h5d.create(
-            group, name.encode(), types[array.dtype], shapes[array.shape], plain
-        )
-        dataset.write(h5py.h5s.ALL, h5py.h5s.ALL, array)
-
     infos = {info: pair for info, pair in _INFOS.items() if pair[0] in columns}
     with h5py.File("memory", "w", driver="core", backing_store=False, block_size=2**22) as file:
-        for number, (first, end) in enumerate(itertools.pairwise([0, *ends_of(columns)])):
+        for number, (first, end) in enumerate(itertools.pairwise([0, *_ends(columns)])):
             rows, last = slice(first, end), slice(end - 1, end)
             episode = file.create_group(f"episode_{number}")
             episode.attrs["id"] = number
@@ -158,22 +134,34 @@ def to_hdf5(columns: Arrays) -> bytes:
             if "components" in columns:
                 episode.attrs["behaviour"] = int(columns["components"][first])
             seen = columns["observations"][rows], columns["next_observations"][last]
-            put(episode.id, "observations", *seen)
+            episode.create_dataset("observations", data=np.concatenate(seen))
             for name in ("actions", "rewards", "terminations", "truncations"):
-                put(episode.id, name, columns[name][rows])
-            group = episode.create_group("infos").id
+                episode.create_dataset(name, data=columns[name][rows])
+            group = episode.create_group("infos")
             for info, (before, after) in infos.items():
-                put(group, info, columns[before][rows], columns[after][last])
+                stored = columns[before][rows], columns[after][last]
+                group.create_dataset(info, data=np.concatenate(stored))
         file.flush()
         return bytes(file.id.get_file_image())
 
 
-def read_hdf5(path: Path, *, visible: bool = False) -> dict[str, npt.NDArray[Any]]:
-    """The columns of a `main_data.hdf5`, or only those that an agent sees.
+def read_columns(folder: Path, *, visible: bool) -> Arrays:
+    """The columns of a data set, or only those that an agent sees.
 
-    The file may be a stranger's: it is read only as far as it is what `to_hdf5` writes. Otherwise,
-    or where h5py cannot read it, an OSError, KeyError, ValueError, RuntimeError or MemoryError.
+    The file may be a stranger's: it is read only as far as it is what `to_hdf5` writes.
     """
+    require_minari()
+    path = folder / "data" / DATA
+    try:
+        return _read_hdf5(path, visible)
+    except (OSError, KeyError, ValueError, RuntimeError, MemoryError) as error:
+        raise MalformedDocumentError(
+            f"{path}: cannot be read: {str(error).strip(chr(39))}. Download the data set again, or "
+            "generate it again (--force)."
+        ) from None
+
+
+def _read_hdf5(path: Path, visible: bool) -> Arrays:
     import h5py
 
     if not path.is_file():  # a pipe would be waited for
@@ -182,10 +170,8 @@ def read_hdf5(path: Path, *, visible: bool = False) -> dict[str, npt.NDArray[Any
         source = _Source(path)
         episodes = []
         for number in range(len(file)):
-            name = f"episode_{number}"
-            _refuse_link(file.id, name)
-            group = h5py.h5g.open(file.id, name.encode())
-            columns = _visible_columns(source, group, name)
+            group = source.member(file, f"episode_{number}")
+            columns = _visible_columns(source, group)
             if not visible:
                 columns |= _hidden_columns(source, group)
                 columns["episodes"] = np.full(len(columns["rewards"]), number, np.int64)
@@ -195,41 +181,30 @@ def read_hdf5(path: Path, *, visible: bool = False) -> dict[str, npt.NDArray[Any
     return {name: np.concatenate([part[name] for part in episodes]) for name in episodes[0]}
 
 
-def _visible_columns(source: _Source, group: Any, episode: str) -> dict[str, npt.NDArray[Any]]:
+def _visible_columns(source: _Source, group: Any) -> Arrays:
     observations = source.array(group, "observations")
     columns = {"observations": observations[:-1], "next_observations": observations[1:]}
-    columns |= {name: source.array(group, name) for name in _VISIBLE if name not in columns}
+    columns |= {name: source.array(group, name) for name in VISIBLE if name not in columns}
     steps = len(columns["rewards"])
-    for name, (dtype, ndim) in _VISIBLE.items():
+    for name, (dtype, ndim) in VISIBLE.items():
         column = columns[name]
         if column.dtype != dtype or column.ndim != ndim or len(column) != steps:
             raise ValueError(
-                f"{episode}: its {name} are {column.dtype} of shape {column.shape}: must be "
+                f"{group.name}: its {name} are {column.dtype} of shape {column.shape}: must be "
                 f"{np.dtype(dtype)} in {ndim} dimensions, of {steps} steps"
             )
-    return {name: columns[name] for name in _VISIBLE}
-
-
-def _hidden_columns(source: _Source, group: Any) -> dict[str, npt.NDArray[Any]]:
-    import h5py
-
-    infos = h5py.h5g.open(group, b"infos")
-    columns = {}
-    for info, (before, after) in _INFOS.items():
-        if before in _REQUIRED or info.encode() in infos:
-            column = source.array(infos, info)
-            columns[after] = column[1:]
-            columns[before] = column[:-1]  # last, for those of which `after` has no meaning
-    behaviour = h5py.Group(group).attrs["behaviour"]
-    columns["components"] = np.full(len(columns["states"]), behaviour, np.int64)
     return columns
 
 
-def _refuse_link(group: Any, name: str) -> None:
-    import h5py
-
-    if group.links.get_info(name.encode()).type != h5py.h5l.TYPE_HARD:  # may lead to other files
-        raise ValueError(f"{name}: is a link")
+def _hidden_columns(source: _Source, group: Any) -> Arrays:
+    infos, columns = source.member(group, "infos"), {}
+    for info, (before, after) in _INFOS.items():
+        if before in _REQUIRED or info in infos:
+            column = source.array(infos, info)
+            columns[after] = column[1:]
+            columns[before] = column[:-1]  # last, for those of which `after` has no meaning
+    columns["components"] = np.full(len(columns["states"]), group.attrs["behaviour"], np.int64)
+    return columns
 
 
 class _Source:
@@ -242,11 +217,18 @@ class _Source:
     def __init__(self, path: Path) -> None:
         self._left = path.stat().st_size
 
+    def member(self, group: Any, name: str) -> Any:
+        """What a group holds under a name."""
+        import h5py
+
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):  # to another file
+            raise ValueError(f"{name}: is a link")
+        return group[name]
+
     def array(self, group: Any, name: str) -> npt.NDArray[Any]:
         import h5py
 
-        _refuse_link(group, name)
-        stored = h5py.h5d.open(group, name.encode())
+        stored = self.member(group, name).id
         plan, dtype, shape = stored.get_create_plist(), stored.dtype, stored.shape
         size = math.prod(shape) * dtype.itemsize
         self._left -= size

@@ -18,25 +18,23 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sme_registry.datasets.record import (
-    ALGORITHMS,
+from sme_registry.datasets.documents import (
     BehaviourQuality,
-    Hyperparameters,
     OfflineEvaluation,
     OfflineRecord,
+    check_algorithm,
 )
 from sme_registry.datasets.storage import Dataset, SealedDataset, open_dataset
 from sme_registry.datasets.transitions import Transitions
-from sme_registry.errors import OptionError, SpecError, UnknownNameError
+from sme_registry.errors import OptionError, SpecError
 from sme_registry.evaluation import EvaluationReport, evaluate, resolve_protocol
 from sme_registry.evaluation.networks import OfflinePolicy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import (
-    choice,
     claim_folder,
     integer_in,
     is_installed,
@@ -54,11 +52,8 @@ if TYPE_CHECKING:
 
 RECORD, POLICY, EVALUATION = "offline.json", "policy.npz", "evaluation.json"
 _FILES = (RECORD, POLICY, EVALUATION, *plot_files.FILES)
-_ABOUT = ("algorithm", "seed", "steps", "dataset_digest", "spec_digest")  # in the policy's file
 _PACKAGES = ("gymnasium", "numpy", "scipy", "numba", "stable_baselines3", "torch")
 
-EPISODES = 10  # METHOD, section 4
-MAX_STEPS = 10**9
 _CHECKED_ROWS = 64
 _TOLERANCE = 1e-6  # of π* between machines, as for fingerprints
 
@@ -83,7 +78,7 @@ def train_offline(
     batch_size: int = 256,
     seed: int = 0,
     evaluations: int = 20,
-    episodes: int = EPISODES,
+    episodes: int = 10,
     hyperparameters: Mapping[str, Any] | None = None,
     spec: SpecLike | None = None,
     protocol: ProtocolLike | None = None,
@@ -127,51 +122,29 @@ def train_offline(
       >>> result.record.steps
       10
     """
-    settings = _check_settings(algorithm, hyperparameters, steps, seed)
-    evaluations = integer_in("evaluations", evaluations, 1, settings.steps)
-    episodes = integer_in("episodes", episodes, 1, 4096)
     transitions, spec, dataset = _load(data, spec)
     if protocol is None:
         protocol = "paper-v1" if dataset is None else dataset.recipe.protocol
     protocol = resolve_protocol(protocol)
     task = materialize(spec)
     _check_task(transitions, task)
-    learner = settings.learner(transitions, batch_size)
+    learner = _learner(transitions, algorithm, hyperparameters, steps, batch_size, seed)
+    evaluations = integer_in("evaluations", evaluations, 1, steps)
+    episodes = integer_in("episodes", episodes, 1, 4096)
     target = None if folder is None else claim_folder(folder, _FILES, force=force)
 
-    similarities = transitions.similarities
-    fields: dict[str, Any] = {
-        "algorithm": settings.algorithm,
-        "hyperparameters": settings.hyperparameters.to_dict(),
-        "seed": settings.seed,
-        "steps": settings.steps,
-        "batch_size": int(batch_size),
-        "episodes": episodes,
-        "dataset": None if dataset is None else dataset.id,
-        "recipe_digest": None if dataset is None else dataset.record.recipe_digest,
-        "dataset_digest": transitions.digest,
-        "transitions": len(transitions),
-        "spec": task.spec,
-        "spec_digest": task.spec.digest,
-        "behaviour": BehaviourQuality(
-            similarity=similarities.mean(),
-            similarity_sd=similarities.std(),
-            step_reward=transitions.step_rewards.mean(),
-        ),
-    }
-    about = {name: fields[name] for name in _ABOUT}
+    about = {**learner.about, "spec_digest": task.spec.digest}
     start, start_cpu = time.perf_counter(), time.process_time()
     played: list[OfflineEvaluation] = []
 
     def report(step: int) -> None:
         if progress is not None:
-            note = f"r̃ {played[-1].similarity:.3f}" if played else ""
-            progress(step, settings.steps, note)
+            progress(step, steps, f"r̃ {played[-1].similarity:.3f}" if played else "")
 
     for index in range(evaluations):
-        learner.advance(round(settings.steps * (index + 1) / evaluations), report)
+        learner.advance(round(steps * (index + 1) / evaluations), report)
         policy = OfflinePolicy(learner.layers, about)
-        states = start_states(settings.seed, index, episodes, task.spec.state_dim)
+        states = start_states(seed, index, episodes, task.spec.state_dim)
         result = rollouts(policy, task, states)
         played.append(
             OfflineEvaluation(
@@ -184,14 +157,26 @@ def train_offline(
         )
         report(learner.steps)
     record = OfflineRecord(
-        **fields,
+        **about,
+        hyperparameters=learner.hyperparameters.to_dict(),
+        batch_size=batch_size,
+        episodes=episodes,
+        dataset=None if dataset is None else dataset.id,
+        recipe_digest=None if dataset is None else dataset.record.recipe_digest,
+        transitions=len(transitions),
+        spec=task.spec,
+        behaviour=BehaviourQuality(
+            similarity=transitions.similarities.mean(),
+            similarity_sd=transitions.similarities.std(),
+            step_reward=transitions.step_rewards.mean(),
+        ),
         evaluations=tuple(played),
         wall_seconds=round(time.perf_counter() - start, 3),
         cpu_seconds=round(time.process_time() - start_cpu, 3),
-        cpu_ms_per_step=round(1e3 * learner.cpu_seconds / settings.steps, 4),
+        cpu_ms_per_step=round(1e3 * learner.cpu_seconds / steps, 4),
         versions=versions(_PACKAGES),
     )
-    evaluated = evaluate(policy, spec, protocol, name=settings.algorithm.upper())
+    evaluated = evaluate(policy, spec, protocol, name=record.algorithm.upper())
     if target is not None:
         (target / RECORD).unlink(missing_ok=True)
         policy.save(target / POLICY)
@@ -230,79 +215,56 @@ def train_sealed(
       >>> policy(data.observations[:2]).shape
       (2, 4)
     """
-    settings = _check_settings(algorithm, hyperparameters, steps, seed)
     rows = data if isinstance(data, SealedDataset) else SealedDataset.read(data)
-    learner = settings.learner(rows, batch_size)
+    learner = _learner(rows, algorithm, hyperparameters, steps, batch_size, seed)
 
     def report(step: int) -> None:
         if progress is not None:
-            progress(step, settings.steps)
+            progress(step, steps)
 
-    learner.advance(settings.steps, report)
-    report(settings.steps)
+    learner.advance(steps, report)
+    report(steps)
+    return OfflinePolicy(learner.layers, learner.about)
+
+
+def _learner(
+    rows: Transitions | SealedDataset,
+    algorithm: str,
+    hyperparameters: Mapping[str, Any] | None,
+    steps: int,
+    batch_size: int,
+    seed: int,
+) -> OfflineLearner:
+    algorithm, checked = check_algorithm(algorithm, hyperparameters)
     about = {
-        "algorithm": settings.algorithm,
-        "seed": settings.seed,
-        "steps": settings.steps,
+        "algorithm": algorithm,
+        "seed": integer_in("seed", seed, 0, 2**53 - 1),
+        "steps": integer_in("steps", steps, 1, 10**9),
         "dataset_digest": rows.digest,
     }
-    return OfflinePolicy(learner.layers, about)
-
-
-class _Settings(NamedTuple):
-    """What a training needs to know besides its data."""
-
-    algorithm: str
-    hyperparameters: Hyperparameters
-    steps: int
-    seed: int
-
-    def learner(self, rows: Transitions | SealedDataset, batch_size: int) -> OfflineLearner:
-        batch_size = integer_in(
-            "batch_size", batch_size, 1, len(rows), advice="The data set has no more rows."
-        )
-        from sme_registry.datasets.learners import OfflineLearner
-
-        return OfflineLearner(self.hyperparameters, rows, batch_size, self.seed)
-
-
-def _check_settings(
-    algorithm: str, hyperparameters: Mapping[str, Any] | None, steps: int, seed: int
-) -> _Settings:
-    settings = _Settings(
-        *check_algorithm(algorithm, hyperparameters),
-        steps=integer_in("steps", steps, 1, MAX_STEPS),
-        seed=integer_in("seed", seed, 0, 2**53 - 1),
-    )
+    advice = "The data set has no more rows."
+    batch_size = integer_in("batch_size", batch_size, 1, len(rows), advice=advice)
     require_packages("offline training", {"torch": "PyTorch"}, "offline")
-    return settings
+    from sme_registry.datasets.learners import OfflineLearner
 
-
-def check_algorithm(
-    name: str, changes: Mapping[str, Any] | None = None
-) -> tuple[str, Hyperparameters]:
-    """An algorithm, whose case does not matter, and its hyperparameters with some changes."""
-    name = choice("algorithm", str(name).lower(), ALGORITHMS, error=UnknownNameError)
-    plain = dict(changes) if isinstance(changes, Mapping) else changes or {}
-    return name, ALGORITHMS[name].from_dict(plain, "hyperparameters")
+    return OfflineLearner(checked, rows, batch_size, about)
 
 
 def _load(data: Any, spec: SpecLike | None) -> tuple[Transitions, SMESpec, Dataset | None]:
     """The rows of a training, the spec of their task, and their data set unless they are arrays."""
-    dataset = None
     if isinstance(data, Transitions):
         if spec is None:
             raise OptionError("spec=None: is required with arrays. Give the spec of their task.")
-        spec = load(spec, SMESpec)
+        transitions, dataset, spec = data, None, load(spec, SMESpec)
     elif isinstance(data, Dataset | str | os.PathLike):
         dataset = data if isinstance(data, Dataset) else open_dataset(data)
         record = dataset.record
-        if spec is not None and (digest := load(spec, SMESpec).digest) != record.spec_digest:
+        if spec is not None and load(spec, SMESpec).digest != record.spec_digest:
             raise OptionError(
-                f"spec={digest[:19]}…: the data set's task is {record.spec_digest[:19]}…. Leave it "
+                f"spec={spec!r:.60}: the data set's task is {record.spec_digest[:19]}…. Leave it "
                 "out."
             )
-        spec = record.recipe.spec.named(record.task)
+        transitions, spec = dataset.transitions(), record.recipe.spec.named(record.task)
     else:
         raise OptionError(
             f"data={data!r:.60}: must be a data set, its id, its path, or its Transitions."
@@ -313,29 +275,28 @@ def _load(data: Any, spec: SpecLike | None) -> tuple[Transitions, SMESpec, Datas
             "observations cannot be executed by the individual agents. Train on a single-agent "
             "data set."
         )
-    return data if dataset is None else dataset.transitions(), spec, dataset
+    return transitions, spec, dataset
 
 
 def _check_task(transitions: Transitions, task: Task) -> None:
     """Raise OptionError unless arrays are finite and of this task."""
-    S, A, m = task.spec.state_dim, task.spec.action_dim, task.spec.distractors
-    seen, with_distractors = task.spec.observation_dim, f", {m} distractors" if m else ""
-    if len(transitions) == 0:
+    rows, columns = len(transitions), transitions.columns()
+    if rows == 0:
         raise OptionError("transitions=0: must be at least 1. Give a data set with rows.")
-    for name, width in (("observations", seen), ("actions", A), ("next_observations", seen)):
-        shape = getattr(transitions, name).shape
-        if shape != (len(transitions), width):
+    widths = {"observations": task.spec.observation_dim, "actions": task.spec.action_dim}
+    for name, width in {**widths, "next_observations": widths["observations"]}.items():
+        if columns[name].shape != (rows, width):
             raise OptionError(
-                f"{name} of shape {shape}: must be ({len(transitions)}, {width}) for state_dim={S},"
-                f" action_dim={A}{with_distractors}. Give the spec of the data set."
+                f"{name} of shape {columns[name].shape}: must be ({rows}, {width}) for this task. "
+                "Give the spec of the data set."
             )
-    for name in ("observations", "actions", "next_observations", "rewards", "states"):
-        if not np.isfinite(getattr(transitions, name)).all():
+    for name, column in columns.items():
+        if not np.isfinite(column).all():
             raise OptionError(f"{name}: contains NaN or infinity. Give finite numbers.")
-    rows = np.linspace(0, len(transitions) - 1, min(_CHECKED_ROWS, len(transitions))).astype(int)
-    optimal = task.optimal_action(transitions.states[rows])
-    difference = np.abs(optimal - transitions.optimal_actions[rows]).max()
-    if not difference <= _TOLERANCE:
+    some = np.linspace(0, rows - 1, min(_CHECKED_ROWS, rows)).astype(int)
+    optimal = task.optimal_action(transitions.states[some])
+    difference = np.abs(optimal - transitions.optimal_actions[some]).max()
+    if difference > _TOLERANCE:
         raise OptionError(
             f"spec={task.spec.digest[:19]}…: is not the task of the data set: the optimal actions "
             f"differ by up to {difference:.2g}. Give the spec of the data set."

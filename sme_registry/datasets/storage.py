@@ -1,6 +1,6 @@
 """Data sets on disk, in Minari's folders: written completely or not at all, and checked on reading.
 
-    <folder>/<namespace>/<name>-v<N>/data/main_data.hdf5   the arrays, see `minari_format`
+    <folder>/<namespace>/<name>-v<N>/data/main_data.hdf5   the arrays
                                           metadata.json    Minari's, with `DatasetRecord` as "sme"
 
 The folder is MINARI_DATASETS_PATH, else ~/.minari/datasets, unless another one is passed. A sealed
@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -20,21 +20,26 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.compiled.arrays import Array, Mask, Observation
-from sme_registry.datasets.collect import ReportProgress, collect
+from sme_registry.datasets.collect import ReportProgress, collect, reference_scores
+from sme_registry.datasets.documents import (
+    KEY,
+    DatasetRecipe,
+    DatasetRecord,
+    Seeds,
+    parse_behaviour,
+)
 from sme_registry.datasets.minari_format import (
     DATA,
     METADATA,
-    NAMESPACE_METADATA,
+    VISIBLE,
+    about_task,
     metadata_of,
     minari_dataset,
-    read_hdf5,
+    read_columns,
     require_minari,
     to_hdf5,
 )
-from sme_registry.datasets.recipe import DatasetRecipe, parse_behaviour
-from sme_registry.datasets.record import KEY, DatasetRecord, Seeds
-from sme_registry.datasets.scores import reference_scores
-from sme_registry.datasets.transitions import Columns, Transitions
+from sme_registry.datasets.transitions import Arrays, Columns, Transitions
 from sme_registry.errors import (
     DigestMismatchError,
     MalformedDocumentError,
@@ -58,7 +63,7 @@ from sme_registry.io import (
 from sme_registry.spec import ACTION_RANGES, ProtocolLike, SMESpec, SpecLike, catalogue
 from sme_registry.task import load, materialize
 
-NAMESPACE = "sme"
+_NAMESPACE = "namespace_metadata.json"
 _ID = re.compile(r"([A-Za-z0-9_-]+/)*[A-Za-z0-9_-]+-v[0-9]+")
 _PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "h5py", "minari")
 _ROUNDING = 1e-6
@@ -81,10 +86,12 @@ class Dataset:
 
     @property
     def recipe(self) -> DatasetRecipe:
+        """What it was generated from."""
         return self.record.recipe
 
     @property
     def size_bytes(self) -> int:
+        """Of its files."""
         return sum(file.stat().st_size for file in (self.path / "data").iterdir())
 
     def minari(self) -> Any:
@@ -93,17 +100,15 @@ class Dataset:
 
     def transitions(self) -> Transitions:
         """All transitions as aligned arrays, bit for bit as they were written."""
-        columns = _read_columns(
-            self.path, "Download the data set again, or generate it again (--force)."
-        )
+        columns = read_columns(self.path, visible=False)
         timeouts = columns.pop("truncations") & ~columns["terminations"]
         transitions = Transitions(**columns, timeouts=timeouts)
         if transitions.digest != self.record.arrays_digest:
             raise DigestMismatchError(
-                f"{self.path / 'data' / DATA}: its arrays have {transitions.digest[:19]}…: must be "
-                f"{self.record.arrays_digest[:19]}…, as generated. They were changed or extended. "
-                "Download the data set again, generate it again (--force), or read it with Minari, "
-                "which does not check digests."
+                f"{self.path / 'data' / DATA}: its arrays have {transitions.digest[:19]}…: must "
+                f"be {self.record.arrays_digest[:19]}…, as generated. They were changed or "
+                "extended. Download the data set again, generate it again (--force), or read it "
+                "with Minari, which does not check digests."
             )
         return transitions
 
@@ -135,12 +140,12 @@ class SealedDataset(Columns):
     def collect(cls, recipe: DatasetRecipe, progress: ReportProgress | None = None) -> Self:
         """Generate the transitions of a recipe of mixtures."""
         rows = collect(recipe, materialize(recipe.spec), progress=progress)
-        return cls(**{field.name: getattr(rows, field.name) for field in fields(cls)})
+        return cls(**{name: getattr(rows, name) for name in VISIBLE})
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Self:
         """Read a data set's folder, which contains `data/`."""
-        return cls(**_read_columns(Path(path), "Download the data set again.", visible=True))
+        return cls(**read_columns(Path(path), visible=True))
 
     def agrees_with(self, other: Self) -> bool:
         """Whether the other has the same transitions, up to what machines round differently.
@@ -254,7 +259,6 @@ def make_dataset(
         arrays_digest=arrays.digest,
         versions=versions(_PACKAGES),
     )
-    _check_target(root / dataset_id, root, recipe, force)  # written by others in the meantime
     columns = {**arrays.columns(), "truncations": arrays.truncations}
     return Dataset(dataset_id, _write(dataset_id, root, columns, record, force=force), record)
 
@@ -272,7 +276,7 @@ def _default_id(recipe: DatasetRecipe) -> str:
     else:
         acting = "policy-" + re.sub("[^A-Za-z0-9]", "_", behaviour.label)
     side = "" if not recipe.coverage else f"-side{_hundredths(1.0 + recipe.coverage)}"
-    return f"{NAMESPACE}/{title}-{acting}{side}-seed{recipe.seed}-v0"
+    return f"sme/{title}-{acting}{side}-seed{recipe.seed}-v0"
 
 
 def _hundredths(value: float) -> str:
@@ -293,12 +297,12 @@ def check_id(dataset_id: str) -> str:
     return dataset_id
 
 
-def _check_target(target: Path, folder: Path, recipe: DatasetRecipe, force: bool) -> None:
+def _check_target(target: Path, root: Path, recipe: DatasetRecipe, force: bool) -> None:
     """Check that a data set may be written to a path in the root of all data sets."""
-    for parent in target.relative_to(folder).parents:
-        if parent != Path() and (folder / parent / "data").exists():
+    for parent in target.relative_to(root).parents[:-1]:
+        if (root / parent / "data").exists():
             raise OptionError(
-                f"name: {folder / parent} is a data set, and Minari lists none inside another. "
+                f"name: {root / parent} is a data set, and Minari lists none inside another. "
                 "Give another namespace."
             )
     check_writable(target)
@@ -310,10 +314,10 @@ def _check_target(target: Path, folder: Path, recipe: DatasetRecipe, force: bool
             "or --force to replace it (in Python, force=True)."
         )
     try:
-        replaceable = KEY in _read_metadata(target)
+        is_ours = KEY in _read_metadata(target)
     except SMEError:
-        replaceable = False
-    if not replaceable:
+        is_ours = False
+    if not is_ours:
         raise NameTakenError(
             f"{target} already exists and is not a data set of this package, so it is not "
             "replaced. Give another --name or --out, or remove it yourself."
@@ -328,47 +332,34 @@ def _comparison(target: Path, recipe: DatasetRecipe) -> str:
         return ""
     if existing.digest != recipe.digest:
         return f", with another recipe: {'; '.join(existing.differences(recipe))}"
-    if any(
-        behaviour.kind == "policy" and behaviour.sha256 is None for behaviour in existing.behaviours
-    ):
+    if any(one.kind == "policy" and one.sha256 is None for one in existing.behaviours):
         return ", with the same recipe (a policy without a file is compared by its name)"
     return " and is the same data set"
 
 
 def _write(
     dataset_id: str,
-    folder: Path,
-    columns: dict[str, npt.NDArray[Any]],
+    root: Path,
+    columns: Arrays,
     record: DatasetRecord | None = None,
     *,
     force: bool = False,
 ) -> Path:
     """Write the files of a data set; with `force` an old one remains until then."""
-    target = folder / dataset_id
+    target = root / dataset_id
     content = to_hdf5(columns)
-    metadata = metadata_of(dataset_id, columns, len(content), record)
+    metadata = metadata_of(dataset_id, columns, len(content))
+    if record is not None:
+        metadata |= about_task(record)
     with build_folder(target, force=force) as building:
-        for namespace in target.relative_to(folder).parents[:-1]:
-            path = folder / namespace / NAMESPACE_METADATA  # by which Minari recognises it
+        for namespace in target.relative_to(root).parents[:-1]:
+            path = root / namespace / _NAMESPACE  # by which Minari recognises it
             if not path.exists():
                 write_atomically(path, "{}")
         (building / "data").mkdir()
         (building / "data" / DATA).write_bytes(content)
         (building / "data" / METADATA).write_bytes(to_json(metadata).encode())
     return target
-
-
-def _read_columns(
-    folder: Path, remedy: str, *, visible: bool = False
-) -> dict[str, npt.NDArray[Any]]:
-    require_minari()
-    path = folder / "data" / DATA
-    try:
-        return read_hdf5(path, visible=visible)
-    except (OSError, KeyError, ValueError, RuntimeError, MemoryError) as error:
-        raise MalformedDocumentError(
-            f"{path}: cannot be read: {str(error).strip(chr(39))}. {remedy}"
-        ) from None
 
 
 def datasets_folder(folder: str | os.PathLike[str] | None = None) -> Path:

@@ -1,34 +1,52 @@
-"""`Transitions`: a data set as aligned NumPy arrays, one row (s, a, R, s') for each transition.
+"""`Transitions`: a data set as aligned arrays, and what is known exactly about them and from them.
 
 `N` transitions, `S` state_dim, `A` action_dim, `n` agents (1 without a team), `m` distractors (0
-without `observation`), `O` = S + m + 1 + n entries of an observation. Rows of one trajectory are
-contiguous and in order.
+without `observation`), `O` = S + m + 1 + n entries of an observation, T horizon. Rows of one
+trajectory are contiguous and in order. `replay` checks each row against its task, by definition.
 
-`replay` checks each of them against its task, from the definition.
+Off-policy evaluation estimates from data what a policy would earn. Here the task is known and its
+transitions are deterministic, so `exact_return` computes it, from any of `M` states:
+
+    G(s, t, r_cum) = Σ_i γ^i R_{t+1+i}     from the step after t to the end of the episode; γ = 1
+                                           for the undiscounted return
+
+R is the reward as paid, so r_cum, k, r_min, D and the horizon all matter. Exact means up to
+rounding: the transition doubles differences at each step, so two policies whose actions differ in
+the last bit of float32 are in different states after some 25 steps, and a network rounds
+differently in batches of another size.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import stdtrit
 
-from sme_registry.compiled.arrays import Array, Mask, Observation
-from sme_registry.datasets.recipe import DatasetRecipe
-from sme_registry.errors import FingerprintMismatchError
+from sme_registry.compiled.arrays import Array, Indices, Mask, Observation
+from sme_registry.datasets.documents import DatasetRecipe
+from sme_registry.envs.arguments import initial_states, to_unit
+from sme_registry.envs.batch import Batch
+from sme_registry.errors import FingerprintMismatchError, OptionError, SpecError, StateError
+from sme_registry.evaluation import as_policy
 from sme_registry.evaluation.regions import expansion
-from sme_registry.task import Task
+from sme_registry.evaluation.rollouts import LANES
+from sme_registry.evaluation.rollouts import rollouts as run_rollouts
+from sme_registry.io import integer_in, number_in
+from sme_registry.spec import SMESpec, SpecLike
+from sme_registry.task import Step, Task, load_task, step
 
-Indices = npt.NDArray[np.int64]
+Arrays = dict[str, npt.NDArray[Any]]
 
 TOLERANCE = 1e-12
 # Of r_cum/k of a trajectory that begins within an episode, and of what a mixing shows: both are
 # stored as float32.
 _ROUNDED = 1e-6
-_BLOCK = 4096
+_CONFIDENCE = 0.95
 
 
 class Columns:
@@ -170,101 +188,81 @@ def replay(transitions: Transitions, recipe: DatasetRecipe, task: Task) -> None:
       >>> data = open_dataset("sme/Default-v1-nu50-seed0-v0", "data")
       >>> replay(data.transitions(), data.recipe, sme_registry.materialize(data.recipe.spec))
     """
-    spec, n = recipe.spec, len(task.policies)
-    S, T, N = spec.state_dim, spec.horizon, len(transitions)
-    a = transitions.actions.astype(np.float64)
-    optimal = np.concatenate(
-        [task.policy(transitions.states[first : first + _BLOCK]) for first in range(0, N, _BLOCK)]
-    )
-    similarity = task.similarities_of(a, optimal)
-    rewarded = similarity
-    if task.pays_the_team:
-        rewarded = np.broadcast_to(task.similarity_of(a, optimal)[:, None], similarity.shape)
-    step_reward = task.reward_of(rewarded)
-
-    _same("next_states", transitions.next_states, task.transition(transitions.states, a))
-    _same("optimal_actions", transitions.optimal_actions, optimal, TOLERANCE)
-    _same("similarities", transitions.similarities.reshape(N, n), similarity, TOLERANCE)
-    _same("step_rewards", transitions.step_rewards.reshape(N, n), step_reward, TOLERANCE)
-    _same("regrets", transitions.regrets.reshape(N, n), 1.0 - step_reward, TOLERANCE)
-    terminated = np.asarray((step_reward < spec.D).any(axis=1))
-    _same("terminations", transitions.terminations, terminated)
-
-    if spec.safety is not None:
-        _replay_safety(transitions, task, a, optimal, step_reward[:, 0])
-    if spec.distractors:
-        _replay_distractors(transitions, task, a)
-
-    width, rounded = S + spec.distractors, _ROUNDED if task.mixing else 0.0
-    t = np.rint(transitions.observations[:, width].astype(np.float64) * T).astype(np.int64)
-    columns = transitions.columns()
-    for which, step in (("", t), ("next_", t + 1)):
-        name = f"{which}observations"
-        shown = task.seen(columns[f"{which}states"], columns.get(f"{which}distractors"))
-        _same(name, columns[name][:, :width], shown.astype(np.float32), rounded)
-        _same(name, columns[name][:, width], (step / T).astype(np.float32))
-
-    ends = transitions.terminations | transitions.timeouts
-    inner = np.flatnonzero(~ends)
-    if not ends[-1]:
-        raise _mismatch("timeouts", N - 1, "the last row must end its trajectory")
-    for after in ("states", "observations", "distractors"):
-        if after in columns:
-            before = f"next_{after}"
-            _same(before, columns[before][inner], columns[after][inner + 1])
-    _same("timeouts", ends | (t + 1 < T), np.ones(N, bool))
+    spec, columns = recipe.spec, transitions.columns()
+    clock = transitions.observations[:, spec.state_dim + spec.distractors].astype(np.float64)
+    t = np.rint(clock * spec.horizon).astype(np.int64)
+    ends, always = transitions.terminations | transitions.timeouts, np.ones(len(t), bool)
+    _same("timeouts", ends[-1:], always[-1:], first=len(t) - 1)
+    _same("timeouts", ends | (t + 1 < spec.horizon), always)
     _same("episodes", transitions.episodes, np.cumsum(ends) - ends)
     if recipe.coverage is not None:
-        _same("states", expansion(transitions.states) <= recipe.coverage, np.ones(N, bool))
-
-    rewards = transitions.rewards[:, None]
+        _same("states", expansion(transitions.states) <= recipe.coverage, always)
+    inner = np.flatnonzero(~ends)
+    for name in ("states", "observations", "distractors"):
+        if name in columns:
+            _same(f"next_{name}", columns[f"next_{name}"][inner], columns[name][inner + 1])
     if transitions.agent_rewards is not None:
-        rewards = transitions.agent_rewards
-        _same("rewards", transitions.rewards, rewards.mean(axis=1), TOLERANCE)
-    expected, tolerance = _rewards(transitions, step_reward, t, spec.k, T)
-    _same("rewards", rewards, expected, tolerance)
+        _same("rewards", transitions.rewards, transitions.agent_rewards.mean(axis=1), TOLERANCE)
+    for name, (expected, tolerance) in _expected(columns, task, t, transitions.ends).items():
+        stored = columns[name].reshape(len(t), -1)
+        _same(name, stored[:, : expected.shape[1]], expected, tolerance)
 
 
-def _replay_safety(
-    transitions: Transitions, task: Task, a: Array, optimal: Array, step_reward: Array
-) -> None:
-    columns = transitions.columns()
-    limit = task.limit(transitions.states)
-    safe_regret = task.safe_reward_of(optimal, limit) - step_reward
-    _same("limits", columns["limits"], limit, TOLERANCE)
-    _same("safe_actions", columns["safe_actions"], np.minimum(optimal, limit), TOLERANCE)
-    _same("costs", columns["costs"], task.cost_of(a, limit), TOLERANCE)
-    _same("safe_regrets", columns["safe_regrets"], safe_regret, TOLERANCE)
+def _expected(
+    columns: Arrays, task: Task, t: Indices, ends: Indices
+) -> dict[str, tuple[npt.NDArray[Any], float | Array]]:
+    """What a task gives for the rows of a data set, `[N, …]`, and with which tolerance."""
+    spec, s, a = task.spec, columns["states"], columns["actions"].astype(np.float64)
+    result = _steps(task, columns["observations"], s, t, a, ends)
+    step_reward, optimal = result.step_reward, result.optimal_action
+    starts = np.repeat(t[[0, *ends[:-1]]], np.diff(ends, prepend=0))
+    of_reward = spec.k * np.where(starts == 0, TOLERANCE, _ROUNDED)[:, None]
+    expected: dict[str, tuple[npt.NDArray[Any], float | Array]] = {
+        "next_states": (result.state, 0.0),
+        "optimal_actions": (optimal, TOLERANCE),
+        "similarities": (result.similarity, TOLERANCE),
+        "step_rewards": (step_reward, TOLERANCE),
+        "regrets": (1.0 - step_reward, TOLERANCE),
+        "terminations": (result.terminated[:, None], 0.0),
+        "rewards" if spec.team is None else "agent_rewards": (result.reward, of_reward),
+    }
+    for which, time in (("", t), ("next_", t + 1)):
+        seen = task.seen(columns[f"{which}states"], columns.get(f"{which}distractors"))
+        seen = np.concatenate([seen, (time / spec.horizon)[:, None]], axis=1).astype(np.float32)
+        expected[f"{which}observations"] = seen, _ROUNDED if task.mixing else 0.0
+    if spec.safety is not None:
+        limit = task.limit(s)
+        safe_reward = task.safe_reward_of(optimal, limit)[:, None]
+        expected |= {
+            "limits": (limit, TOLERANCE),
+            "safe_actions": (np.minimum(optimal, limit), TOLERANCE),
+            "costs": (task.cost_of(a, limit)[:, None], TOLERANCE),
+            "safe_regrets": (safe_reward - step_reward, TOLERANCE),
+        }
+    if spec.distractors:
+        d, moved = columns["distractors"], columns["next_distractors"]
+        expected["distractors"] = np.clip(d, 0.0, 1.0), 0.0
+        is_driven = spec.observation is not None and spec.observation.dynamics == "driven"
+        moved = task.distractor_step(d, a) if is_driven else np.clip(moved, 0.0, 1.0)
+        expected["next_distractors"] = moved, 0.0
+    return expected
 
 
-def _replay_distractors(transitions: Transitions, task: Task, a: Array) -> None:
-    columns, spec = transitions.columns(), task.spec
-    for name in ("distractors", "next_distractors"):
-        d = columns[name]
-        _same(name, (d >= 0.0) & (d <= 1.0), np.ones(d.shape, bool))
-    if spec.observation is not None and spec.observation.dynamics == "driven":
-        moved = task.distractor_step(columns["distractors"], a)
-        _same("next_distractors", columns["next_distractors"], moved)
-
-
-def _rewards(
-    transitions: Transitions, step_reward: Array, t: npt.NDArray[np.int64], k: int, horizon: int
-) -> tuple[Array, Array]:
-    """R of each row and agent `[N, n]`, and its tolerance `[N, 1]`."""
-    starts = np.concatenate([[0], transitions.ends[:-1]])
-    lengths = np.diff([*starts, len(t)])
-    n = step_reward.shape[1]
-    accumulated = transitions.observations[starts, -n:].astype(np.float64) * k
-    tolerance = k * np.where(np.repeat(t[starts], lengths) == 0, TOLERANCE, _ROUNDED)
-    reward = np.empty_like(step_reward)
-    for step in range(int(lengths.max())):  # all trajectories at once
-        running = np.flatnonzero(lengths > step)
-        rows = starts[running] + step
-        total = accumulated[running] + step_reward[rows]
-        paid = (((t[rows] + 1) % k == 0) | (t[rows] + 1 >= horizon))[:, None]
-        reward[rows] = np.where(paid, total, 0.0)
-        accumulated[running] = np.where(paid, 0.0, total)
-    return reward, tolerance[:, None]
+def _steps(
+    task: Task, observations: Observation, s: Array, t: Indices, a: Array, ends: Indices
+) -> Step:
+    """The rows of a data set as steps of the task, of all trajectories at once."""
+    starts, lengths = np.array([0, *ends[:-1]]), np.diff(ends, prepend=0)
+    accumulated = observations[starts, -len(task.policies) :].astype(np.float64) * task.spec.k
+    rows, results = [], []
+    for number in range(int(lengths.max())):
+        running = lengths > number
+        rows.append(starts[running] + number)
+        result = step(task, s[rows[-1]], t[rows[-1]], accumulated[running], a[rows[-1]])
+        accumulated[running] = result.accumulated_reward
+        results.append(result)
+    order = np.argsort(np.concatenate(rows))
+    return Step._make(np.concatenate(column)[order] for column in zip(*results, strict=True))
 
 
 def _same(
@@ -272,17 +270,204 @@ def _same(
     values: npt.NDArray[Any],
     expected: npt.NDArray[Any],
     tolerance: float | Array = 0.0,
+    first: int = 0,
 ) -> None:
     difference = np.abs(values.astype(np.float64) - expected.astype(np.float64))
     wrong = ~(difference <= tolerance)
     if wrong.any():
         row = int(np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1))[0])
-        raise _mismatch(name, row, f"off by {np.max(difference[row]):.3g}")
+        raise FingerprintMismatchError(
+            f"{name}, row {first + row}: off by {np.max(difference[row]):.3g}: the data set "
+            "differs from its task as materialised on this machine. If the file was edited, "
+            "download the data set again. Otherwise NumPy or SciPy compute other numbers here: "
+            "install the versions recorded in the data set."
+        )
 
 
-def _mismatch(name: str, row: int, reason: str) -> FingerprintMismatchError:
-    return FingerprintMismatchError(
-        f"{name}, row {row}: {reason}: the data set differs from its task as materialised on this "
-        "machine. If the file was edited, download the data set again. Otherwise NumPy or SciPy "
-        "compute other numbers here: install the versions recorded in the data set."
+class ReturnEstimate(NamedTuple):
+    """A mean and its 95 % interval, each a number or `[M]`; an exact value has zero width."""
+
+    mean: Any
+    low: Any
+    high: Any
+
+
+@dataclass(frozen=True, eq=False)
+class ExactReturn:
+    """The returns of a policy from `M` states.
+
+    `undiscounted` and, with γ, `discounted` have a mean, low and high of `[M]` each; `lengths`
+    `[M]` are the mean steps to the end of the episode, `similarity` `[M]` the mean r̃ over them,
+    and `rollouts` the episodes from each state.
+    """
+
+    undiscounted: ReturnEstimate
+    discounted: ReturnEstimate
+    lengths: Array
+    similarity: Array
+    gamma: float
+    rollouts: int
+
+    def over_states(self) -> tuple[ReturnEstimate, ReturnEstimate]:
+        """The mean over all states, undiscounted and discounted, with its interval.
+
+        The interval assumes that the states are independent draws from a distribution. For rows of
+        the same trajectories it is too narrow.
+        """
+        if len(self.lengths) < 2:
+            raise OptionError("states: an interval over states requires at least 2 of them.")
+        return _interval(self.undiscounted.mean), _interval(self.discounted.mean)
+
+
+def exact_return(
+    policy: Any,
+    spec: SpecLike,
+    *,
+    states: npt.ArrayLike,
+    t: npt.ArrayLike = 0,
+    r_cum: npt.ArrayLike = 0.0,
+    actions: npt.ArrayLike | None = None,
+    gamma: float = 0.99,
+    rollouts: int = 1,
+    action_range: str | None = None,
+) -> ExactReturn:
+    """Run a policy from `M` states of a single-agent task to the end of the episode.
+
+    Args:
+      policy: anything that `evaluate` accepts: a callable `[B, O] → [B, A]`, a model, or the
+        path of one.
+      spec: a spec, its fields, an id, a digest or a path.
+      states: `[M, S]` in [0, 1]; `Transitions.states` are exact, its observations are rounded.
+      t: `[M]` or one number, steps completed before, in [0, T).
+      r_cum: `[M]` or one number, the rewards since the last payout, in [0, t mod k].
+      actions: `[M, A]` in [0, 1], executed in the first step instead of the policy's. The return
+        is then Q(s, a) instead of V(s).
+      gamma: γ in [0, 1] of the discounted return.
+      rollouts: episodes from each state: 1 for a deterministic policy, whose return is exact; more
+        for a stochastic one, whose mean gets a 95 % interval (Student's t). On a task with
+        distractors also more than 1: each episode draws them anew, at its start too.
+      action_range: of the policy's actions; None takes its own, and "unit" for a callable.
+
+    Examples:
+      >>> from sme_registry.datasets import exact_return, open_dataset, positions
+      >>> data = open_dataset("sme/Default-v1-nu50-seed0-v0", "data")
+      >>> where = positions(data.transitions(), data.recipe.spec, [0, 90])
+      >>> result = exact_return("optimal", data.recipe.spec, **where)
+      >>> result.undiscounted.mean.round(3).tolist()
+      [100.0, 10.0]
+    """
+    task = load_task(spec)
+    if task.spec.team is not None:
+        raise SpecError("team: must be null here. Give a single-agent task.")
+    gamma = number_in("gamma", gamma, 0.0, 1.0)
+    rollouts = integer_in("rollouts", rollouts, 1, 10**6)
+    checked_policy = as_policy(policy, task.spec, action_range=action_range)
+    s, steps, accumulated = _starts(task.spec, states, t, r_cum)
+    first = None if actions is None else _first_actions(actions, (len(s), task.spec.action_dim))
+    if rollouts == 1:
+        _check_deterministic(checked_policy, task, s, steps, accumulated)
+    results = [
+        run_rollouts(
+            checked_policy, task, s, t=steps, r_cum=accumulated, actions=first, gamma=gamma,
+            seed=seed,
+        )
+        for seed in range(rollouts)
+    ]  # fmt: skip
+    lengths = np.stack([result.length for result in results])
+    similarities = [result.similarity for result in results]
+    return ExactReturn(
+        undiscounted=_interval(np.stack([result.episode_return for result in results])),
+        discounted=_interval(np.stack([result.discounted_return for result in results])),
+        lengths=lengths.mean(axis=0),
+        similarity=np.average(similarities, axis=0, weights=lengths),
+        gamma=gamma,
+        rollouts=rollouts,
     )
+
+
+def positions(
+    transitions: Transitions, spec: SMESpec, rows: npt.ArrayLike | None = None
+) -> dict[str, Any]:
+    """The states, times and accumulated rewards of rows of a data set, for `exact_return`.
+
+    `rows` are indices or a mask; None for all. `states` `[M, S]` and `t` `[M]` are exact, `r_cum`
+    `[M]` is as an observation stores it, to a relative precision of 6e-8.
+
+    Examples:
+      >>> from sme_registry.datasets import open_dataset, positions
+      >>> data = open_dataset("sme/Default-v1-nu50-seed0-v0", "data")
+      >>> positions(data.transitions(), data.recipe.spec, [0, 10])["t"].tolist()
+      [0, 10]
+    """
+    chosen = slice(None) if rows is None else np.asarray(rows)
+    observed = transitions.observations[chosen].astype(np.float64)
+    t = np.rint(observed[:, -2] * spec.horizon).astype(np.int64)
+    r_cum = np.minimum(observed[:, -1] * spec.k, t % spec.k)
+    return {"states": transitions.states[chosen], "t": t, "r_cum": r_cum}
+
+
+def _starts(
+    spec: SMESpec, states: npt.ArrayLike, t: npt.ArrayLike, r_cum: npt.ArrayLike
+) -> tuple[Array, Indices, Array]:
+    """Checked states, times and accumulated rewards."""
+    T, M = spec.horizon, len(states) if isinstance(states, np.ndarray | list | tuple) else 0
+    s = initial_states(states, (max(1, M), spec.state_dim), "states")
+    steps, accumulated = _column("t", t, len(s)), _column("r_cum", r_cum, len(s))
+    wrong = (steps != np.rint(steps)) | (steps < 0) | (steps >= T)
+    if wrong.any():
+        raise StateError(f"t={steps[wrong][0]:g}: must be an integer in [0, {T}).")
+    since = steps % spec.k
+    wrong = (accumulated < 0) | (accumulated > since + _ROUNDED)
+    if wrong.any():
+        raise StateError(
+            f"r_cum={accumulated[wrong][0]:g}: must be in [0, {since[wrong][0]:g}] at "
+            f"t={steps[wrong][0]:g}, the number of steps since the last payout (k={spec.k})."
+        )
+    return s, steps.astype(np.int64), accumulated
+
+
+def _first_actions(actions: npt.ArrayLike, shape: tuple[int, int]) -> Array:
+    array = to_unit(actions, shape, rescaled=False)
+    if not ((array >= 0) & (array <= 1)).all():
+        raise OptionError("actions: must be finite numbers in [0, 1]. Clip them.")
+    return array
+
+
+def _column(name: str, value: npt.ArrayLike, rows: int) -> Array:
+    try:
+        column = np.broadcast_to(np.asarray(value, np.float64), (rows,))
+    except (TypeError, ValueError):
+        raise StateError(
+            f"{name}={value!r:.60}: must be one number, or an array of shape ({rows},)."
+        ) from None
+    if not np.isfinite(column).all():
+        raise StateError(f"{name}: contains NaN or infinity. Give finite numbers.")
+    return column.copy()
+
+
+def _check_deterministic(
+    policy: Callable[[Observation], npt.ArrayLike], task: Task, s: Array, t: Indices, r_cum: Array
+) -> None:
+    """Raise if the return of one episode from a state is not the only one that it can have."""
+    batch = Batch(task, min(len(s), LANES))
+    batch.place(s[:LANES], t[:LANES], r_cum[:LANES, None])
+    reason = ""
+    if task.spec.distractors:
+        reason = f"the task has {task.spec.distractors} distractors, which are drawn at random"
+    elif not np.array_equal(policy(batch.observe()), policy(batch.observe())):
+        reason = "the policy is stochastic"
+    if reason:
+        raise OptionError(
+            f"rollouts=1: {reason}, so the return of one episode is not exact. Give rollouts=30 or "
+            "more for a mean with its interval."
+        )
+
+
+def _interval(samples: Array) -> ReturnEstimate:
+    """Mean over the first axis and its Student's t interval; of one sample, the sample."""
+    count, mean = len(samples), samples.mean(axis=0)
+    if count == 1:
+        return ReturnEstimate(mean, mean, mean)
+    error = samples.std(axis=0, ddof=1) / np.sqrt(count)
+    half = stdtrit(count - 1, 0.5 + _CONFIDENCE / 2) * error
+    return ReturnEstimate(mean, mean - half, mean + half)

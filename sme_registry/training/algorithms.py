@@ -32,7 +32,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from sme_registry.datasets import offline, record
+from sme_registry.datasets import documents
 from sme_registry.envs.arguments import check_has_limits
 from sme_registry.errors import OptionError, SpecError, UnknownNameError, did_you_mean
 from sme_registry.evaluation.references import POLICIES
@@ -139,7 +139,7 @@ LEARNERS: dict[str, Entry] = {
         *(Entry("sb3", name, "stable_baselines3") for name in _OF_SB3),
         *(Entry("sb3", name, "sme_registry.sb3", needs_limits=True) for name in _OF_OURS),
         *(Entry("jax", name) for name in ("PPO", "TD3", "SAC")),
-        *(Entry("offline", name) for name in record.ALGORITHMS),
+        *(Entry("offline", name) for name in documents.ALGORITHMS),
         *(Entry("reference", name) for name in POLICIES),
     )
 }
@@ -412,7 +412,7 @@ def check_hyperparameters(
         )
     if entry.kind == "offline":
         own = {name: hyperparameters[name] for name in hyperparameters if name not in OF_DATA_SET}
-        offline.check_algorithm(entry.name, own)
+        documents.check_algorithm(entry.name, own)
     elif entry.kind == "train":
         names = _names(entry.load(field), ("env", "steps", "seed"))
         _refuse_names(field, uses, hyperparameters, names, others)

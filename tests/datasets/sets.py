@@ -3,7 +3,7 @@
 from sme_registry import SMESpec, materialize
 from sme_registry.datasets import DatasetRecipe
 from sme_registry.datasets.collect import collect
-from sme_registry.datasets.recipe import parse_behaviour
+from sme_registry.datasets.documents import parse_behaviour
 
 TINY = SMESpec(state_dim=2, action_dim=2, horizon=20, seed=5)
 

@@ -7,9 +7,14 @@ import pytest
 
 import sme_registry
 from sme_registry.datasets import DatasetRecipe, to_d3rlpy
-from sme_registry.datasets.collect import EpisodeStream, collect, constant_policy
-from sme_registry.datasets.recipe import parse_behaviour
-from sme_registry.datasets.scores import reference_scores, whole_episodes
+from sme_registry.datasets.collect import (
+    collect,
+    constant_policy,
+    episode_numbers,
+    reference_scores,
+    whole_episodes,
+)
+from sme_registry.datasets.documents import parse_behaviour
 from sme_registry.spec import SMESpec
 from sme_registry.task import materialize
 
@@ -121,14 +126,11 @@ def test_the_optimums_return_is_the_horizon(fields):
 
 def test_the_returns_are_those_of_single_environments():
     task = materialize(SMESpec(k=3, D=0.02))
-    starts = EpisodeStream(4, "start", 20, 8, ahead=1)
-    returns, similarities, steps = whole_episodes(task, constant_policy(task), starts, 20)
+    returns, similarities, steps = whole_episodes(task, constant_policy(task), 4, "start", 20)
     assert len(set(steps)) > 3  # they end at different steps
-    again = EpisodeStream(4, "start", 1, 8, ahead=1)
     env = sme_registry.make(task.spec)
     for episode in range(20):
-        again.begin(0, episode)
-        env.reset(options={"state": again.next()[0]})
+        env.reset(options={"state": next(episode_numbers(4, "start", episode, 8))})
         total, similarity, count, ended = 0.0, 0.0, 0, False
         while not ended:
             _, reward, terminated, truncated, info = env.step(np.full(4, 0.5, np.float32))

@@ -9,7 +9,7 @@ from scipy.stats import kstest
 import sme_registry
 from sme_registry.datasets import DatasetRecipe, replay
 from sme_registry.datasets.collect import collect, noise_task
-from sme_registry.datasets.recipe import parse_behaviour
+from sme_registry.datasets.documents import parse_behaviour
 from sme_registry.errors import (
     FingerprintMismatchError,
     OptionError,
@@ -56,17 +56,17 @@ def recipe(spec=None, acting=((0.5, 1.0),), **fields):
     return DatasetRecipe.from_dict({**plain, **fields})
 
 
-def collected(of, lanes=None, policies=None):
-    return collect(of, materialize(of.spec), policies, lanes=lanes)
+def collected(of, num_envs=None, policies=None):
+    return collect(of, materialize(of.spec), policies, num_envs=num_envs)
 
 
 @pytest.mark.parametrize("number", range(len(TASKS)), ids=list(TASKS))
-def test_every_transition_is_that_of_the_task_whatever_the_number_of_lanes(number):
+def test_every_transition_is_that_of_the_task_whatever_the_size_of_the_batch(number):
     fields = list(TASKS.values())[number]
     of = recipe(fields, HALVES, coverage=-0.15 if number % 2 else None, seed=3)
     data = collected(of)
-    for lanes in (1, 7):
-        assert collected(of, lanes).digest == data.digest
+    for num_envs in (1, 7):
+        assert collected(of, num_envs).digest == data.digest
     replay(data, of, materialize(of.spec))
 
 
@@ -239,7 +239,7 @@ def test_a_data_set_larger_than_memory_is_rejected():
         collected(recipe(transitions=10**9))
 
 
-def test_a_users_policy_gives_the_same_bits_for_any_number_of_lanes():
+def test_a_users_policy_gives_the_same_bits_for_any_size_of_the_batch():
     torch = pytest.importorskip("torch")
     torch.manual_seed(0)
     net = torch.nn.Sequential(torch.nn.Linear(10, 64), torch.nn.Tanh(), torch.nn.Linear(64, 4))
@@ -250,8 +250,8 @@ def test_a_users_policy_gives_the_same_bits_for_any_number_of_lanes():
 
     of = recipe({"horizon": 10}, acting=[(act, 1.0)], transitions=150)
     data = collected(of, policies={0: act})
-    for lanes in (1, 100):
-        assert collected(of, lanes, {0: act}).digest == data.digest
+    for num_envs in (1, 100):
+        assert collected(of, num_envs, {0: act}).digest == data.digest
     replay(data, of, materialize(of.spec))
     np.testing.assert_allclose(data.actions, np.clip(act(data.observations), 0, 1), atol=1e-6)
 

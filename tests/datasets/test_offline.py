@@ -77,9 +77,9 @@ def test_learners_see_what_the_agent_saw_and_the_report_has_its_cost():
     assert one.policy.observation_dim == 7
     assert one.report.safety is not None
     assert one.report.observation is not None
-    with pytest.raises(OptionError, match=r"\(600, 4\) for state_dim=2, action_dim=2\."):
+    with pytest.raises(OptionError, match=r"must be \(600, 4\) for this task\."):
         short(data, spec=TINY)
-    with pytest.raises(OptionError, match=r"\(600, 7\) for .*, action_dim=2, 3 distractors\."):
+    with pytest.raises(OptionError, match=r"must be \(600, 7\) for this task\."):
         short(transitions_of(), spec=spec)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sme_registry.datasets import DatasetRecipe
-from sme_registry.datasets.recipe import parse_behaviour
+from sme_registry.datasets.documents import parse_behaviour
 from sme_registry.errors import PolicyError, SMEError, SpecError
 
 FIELDS = {"spec": {}, "behaviours": [{"kind": "mixture", "nu": 0.5}]}
@@ -45,10 +45,12 @@ def test_differences_name_fields_with_both_values():
     ]
 
 
-def test_differences_of_behaviours_name_their_index_or_number():
+def test_differences_of_behaviours_name_their_index():
     halves = recipe(behaviours=weights(0.5, 0.5))
     assert halves.differences(recipe(behaviours=weights(0.5, 0.25, 0.25))) == [
-        "behaviours of 2 entries, requested 3"
+        "behaviours.1.weight 0.5, requested 0.25",
+        "behaviours.2.kind None, requested 'random'",
+        "behaviours.2.weight None, requested 0.25",
     ]
     assert halves.differences(recipe(behaviours=weights(0.25, 0.75))) == [
         "behaviours.0.weight 0.5, requested 0.25",

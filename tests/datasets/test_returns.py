@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from sme_registry import SMESpec, make, materialize
-from sme_registry.datasets import DatasetRecipe
+from sme_registry.datasets import DatasetRecipe, exact_return, positions
 from sme_registry.datasets.collect import collect
-from sme_registry.datasets.recipe import parse_behaviour
-from sme_registry.datasets.scores import exact_return, positions
-from sme_registry.errors import OptionError, PolicyError, SpecError, StateError
+from sme_registry.datasets.documents import parse_behaviour
+from sme_registry.errors import ActionError, OptionError, PolicyError, SpecError, StateError
 
 SPEC = SMESpec(state_dim=3, action_dim=2, horizon=30, seed=4)
 STATES = np.random.default_rng(0).random((5, 3))
@@ -182,8 +181,8 @@ def test_the_interval_of_random_actions_contains_their_mean(source):
         ({"t": [1, 2]}, StateError, r"t=\[1, 2\]: .* of shape \(5,\)"),
         ({"t": np.nan}, StateError, "t: contains NaN"),
         ({"r_cum": 0.1}, StateError, r"r_cum=0.1: must be in \[0, 0\] at t=0"),
-        ({"actions": STATES}, OptionError, r"must be \(5, 2\)"),
-        ({"actions": np.full((5, 2), 1.5)}, OptionError, "each in"),
+        ({"actions": STATES}, ActionError, r"must be of shape \(5, 2\)"),
+        ({"actions": np.full((5, 2), 1.5)}, OptionError, "in .0, 1."),
         ({"gamma": 1.1}, OptionError, "gamma=1.1"),
         ({"spec": "Team2"}, SpecError, "team"),
         ({"policy": lambda o: o}, PolicyError, "policy"),

@@ -1,0 +1,442 @@
+"""The documents of data sets and offline training: what they are made from, and what they leave.
+
+On one machine the same recipe gives the same bits of every array. On another machine it gives the
+same numbers as far as NumPy, SciPy and LAPACK agree, as for the tasks themselves.
+
+| hyperparameter | BC | IQL | source of the default |
+|---|---|---|---|
+| hidden layers, ReLU | 256, 256 | 256, 256 in each network | IQL's paper; d3rlpy |
+| Adam's learning rate | 1e-3 | 3e-4 for actor, critics and value | d3rlpy's BC; IQL's paper |
+| discount γ | – | 0.99 | IQL's paper |
+| expectile τ | – | 0.7 | METHOD, section 4; IQL's paper on locomotion |
+| inverse temperature β | – | 3.0, weights at most 100 | IQL's paper on locomotion |
+| soft update of the target critics | – | 0.005 each step | IQL's paper |
+
+IQL's paper (see `learners`) also decays the actor's learning rate by a cosine; neither d3rlpy nor
+this package does.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from sme_registry.errors import PolicyError, SpecError, UnknownNameError
+from sme_registry.io import choice, read_json, sha256_of
+from sme_registry.spec import (
+    Digest,
+    Document,
+    EvaluationProtocol,
+    Integer,
+    Real,
+    SchemaVersion,
+    SMESpec,
+    StrictModel,
+    TupleOf,
+)
+from sme_registry.spec.document import check_digest, plain_number, short_repr
+from sme_registry.spec.sme_spec import Seed
+
+KEY = "sme"  # of the record in Minari's metadata
+_TOLERANCE = 1e-9  # of the sum of weights: ten times 0.1 is not 1 in floating point
+
+
+class Behaviour(StrictModel):
+    """A policy that collects part of a data set, and its share of the transitions.
+
+    A mixture acts by a = (1 − α) π*(s) + α ã(s), with one α ~ U(0, ν) for each step and ã another
+    DUN of the same shape as π*; ν = 0 is the optimum, 1 the worst. A random policy acts by
+    a ~ U([0, 1]^A).
+
+    Attributes:
+      kind: a mixture of the optimum, a user's policy, or random actions.
+      weight: its share of the transitions.
+      nu: ν of a mixture, from the optimum (0) to the worst (1); null for the other kinds.
+      policy: the name of a user's deterministic policy; null for the other kinds.
+      sha256: digest of that policy's file; null for a function, which only its author can run.
+      action_range: of that policy's actions, if it differs from the policy's own.
+    """
+
+    kind: Literal["mixture", "policy", "random"]
+    weight: Annotated[Real, Field(gt=0, le=1)] = 1.0
+    nu: Annotated[Real | None, Field(ge=0, le=1)] = None
+    policy: Annotated[str, Field(min_length=1, max_length=200)] | None = None
+    sha256: Digest | None = None
+    action_range: Literal["unit", "symmetric"] | None = None
+
+    @model_validator(mode="after")
+    def _fields_of_its_kind(self) -> Self:
+        if (self.kind == "mixture") != (self.nu is not None):
+            raise ValueError(
+                f"nu={self.nu}: must be a number in [0, 1] for kind='mixture' and null otherwise, "
+                f"and kind={self.kind!r}."
+            )
+        if (self.kind == "policy") != (self.policy is not None):
+            raise ValueError(
+                f"policy={self.policy!r}: must be a name for kind='policy' and null otherwise, "
+                f"and kind={self.kind!r}."
+            )
+        if self.kind != "policy" and (self.sha256 is not None or self.action_range is not None):
+            raise ValueError(
+                "sha256, action_range: must be null unless kind='policy'. Leave them out."
+            )
+        return self
+
+    @property
+    def label(self) -> str:
+        """Its label in tables: `ν = 0.5`, `random`, or the policy's name."""
+        return f"ν = {self.nu:g}" if self.nu is not None else self.policy or self.kind
+
+
+class DatasetRecipe(Document):
+    """The task, behaviour policies, size, coverage and seed of a data set.
+
+    With coverage ε it keeps only transitions from states in X_ε = {s : ‖s − ½‖_∞ ≤ (1 + ε)/2}; null
+    keeps all, as 0 does. Starts, each α and ã have a named stream of the seed each.
+
+    Attributes:
+      spec: the task.
+      behaviours: the policies that collect it, one after another; their weights add up to 1.
+      transitions: N, rows of the data set.
+      seed: of the data, not the task: an integer or, where nobody may guess it, hexadecimal text.
+      coverage: ε of the sub-cube of states that are kept; null keeps all.
+      protocol: of the evaluation of policies that learn from the data set.
+    """
+
+    schema_version: SchemaVersion = 1
+    spec: SMESpec
+    behaviours: Annotated[TupleOf[Behaviour], Field(min_length=1, max_length=64)]
+    transitions: Annotated[Integer, Field(ge=1, le=10**9)] = 50_000
+    seed: Seed = 0
+    coverage: Annotated[Real | None, Field(gt=-1, le=0)] = None
+    protocol: EvaluationProtocol = EvaluationProtocol()
+
+    @model_validator(mode="after")
+    def _weights_add_up(self) -> Self:
+        total = math.fsum(behaviour.weight for behaviour in self.behaviours)
+        if abs(total - 1.0) > _TOLERANCE:
+            raise ValueError(
+                f"weight: {' + '.join(f'{b.weight:g}' for b in self.behaviours)} = {total:.10g}: "
+                "must add up to 1. Change one of the weights."
+            )
+        for behaviour, share in zip(self.behaviours, self.shares, strict=True):
+            if share == 0:
+                raise ValueError(
+                    f"weight={behaviour.weight:g}: gives less than one of {self.transitions} "
+                    "transitions. Use more transitions, or remove the behaviour."
+                )
+        return self
+
+    @property
+    def shares(self) -> tuple[int, ...]:
+        """The number of transitions of each behaviour."""
+        weights = itertools.accumulate(behaviour.weight for behaviour in self.behaviours)
+        boundaries = [0, *(round(self.transitions * min(w, 1.0)) for w in weights)]
+        boundaries[-1] = self.transitions
+        return tuple(high - low for low, high in itertools.pairwise(boundaries))
+
+    @property
+    def expected_similarity(self) -> float | None:
+        """Mean r̃ for independent and uniform a* and ã; None if a policy is the user's.
+
+        1 − ν/6 of a mixture, since E α = ν/2 and E |ã − a*| = 1/3; 1 − 1/3 of random actions.
+        """
+        if any(behaviour.kind == "policy" for behaviour in self.behaviours):
+            return None
+        return math.fsum(
+            b.weight * (1.0 - (1.0 / 3.0 if b.nu is None else b.nu / 6.0)) for b in self.behaviours
+        )
+
+    def differences(self, other: DatasetRecipe) -> list[str]:
+        """The fields in which another recipe differs, such as `spec.complexity 1, requested 2`."""
+        ours, theirs = _leaves(self.to_dict()), _leaves(other.to_dict())
+        return [
+            f"{path} {short_repr(ours.get(path))}, requested {short_repr(theirs.get(path))}"
+            for path in {**ours, **theirs}
+            if ours.get(path) != theirs.get(path)
+        ]
+
+
+def _leaves(plain: Any, path: str = "") -> dict[str, Any]:
+    """The values in plain data by their paths, such as `behaviours.0.nu`."""
+    if not isinstance(plain, dict | list):
+        return {path: plain}
+    leaves: dict[str, Any] = {}
+    for name, value in plain.items() if isinstance(plain, dict) else enumerate(plain):
+        leaves |= _leaves(value, f"{path}.{name}".lstrip("."))
+    return leaves
+
+
+def parse_behaviour(policy: Any, weight: float = 1.0, action_range: str | None = None) -> Behaviour:
+    """The behaviour for a policy as `make_dataset` accepts it."""
+    fields: dict[str, Any] = {"kind": "policy", "weight": weight, "action_range": action_range}
+    if type(number := plain_number(policy)) in (int, float):
+        fields = {"kind": "mixture", "weight": weight, "nu": float(number)}
+    elif isinstance(policy, str) and policy == "random":
+        fields = {"kind": "random", "weight": weight}
+    elif isinstance(policy, str | os.PathLike):
+        path = Path(policy)
+        fields |= {"policy": path.stem, "sha256": _policy_digest(path)}
+    elif callable(policy) or hasattr(policy, "predict"):
+        name = getattr(policy, "__name__", type(policy).__name__)
+        fields["policy"] = "policy" if name == "<lambda>" else name
+    else:
+        raise SpecError(
+            f"behaviour={short_repr(policy)}: must be ν in [0, 1], 'random', a callable, a "
+            "Stable-Baselines3 model, or the path of a .zip or .onnx file."
+        )
+    return Behaviour.from_dict(fields, "behaviour")
+
+
+def _policy_digest(path: Path) -> str:
+    try:
+        return sha256_of(path.read_bytes())
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise PolicyError(
+            f"{path}: cannot be read: {reason}. Give the path of a saved model (.zip or .onnx)."
+        ) from None
+
+
+_Share = Annotated[Real, Field(ge=0, le=1)]
+
+
+class EpisodeScores(StrictModel):
+    """Whole episodes of a policy; 0 of them if the values are exact without rollouts.
+
+    Attributes:
+      mean_return: mean sum of rewards, in [0, T].
+      standard_error: of that mean, over episodes.
+      similarity: mean r̃ over all steps.
+    """
+
+    episodes: Integer
+    mean_return: Real
+    standard_error: Real
+    similarity: _Share
+
+
+class PolicyScore(StrictModel):
+    """The scores of one policy.
+
+    Attributes:
+      similarity: mean r̃ over the data set's states.
+      step_reward: mean r over them.
+      rollouts: null if the horizon is too long for whole episodes.
+    """
+
+    similarity: _Share
+    step_reward: _Share
+    rollouts: EpisodeScores | None
+
+
+class ReferenceScores(StrictModel):
+    """The scores of a = ½, of the behaviour, of each of its policies on its rows, and of π*."""
+
+    constant: PolicyScore
+    behaviour: PolicyScore
+    behaviours: TupleOf[PolicyScore]
+    optimum: PolicyScore
+
+
+class Seeds(StrictModel):
+    """Seeds of the task and of the data (starts, α, ã and random actions)."""
+
+    task: Seed
+    data: Seed
+
+
+class DatasetRecord(StrictModel):
+    """Provenance, reference scores and digests of a data set.
+
+    Attributes:
+      schema_version: version of the record's format.
+      recipe: all that the data set was generated from.
+      recipe_digest, spec_digest, protocol_digest: of the recipe, its task and its protocol.
+      task: what the task's file calls it.
+      seeds: of the task and of the data.
+      nu: ν if a single mixture acted; null for other or several behaviours.
+      trajectories: E, the number of Minari episodes.
+      scores: of reference policies on the data set.
+      arrays_digest: see `Transitions.digest`.
+      versions: of Python and the packages that the numbers depend on.
+    """
+
+    schema_version: Literal[1] = 1
+    recipe: DatasetRecipe
+    recipe_digest: Digest
+    spec_digest: Digest
+    task: str = ""
+    protocol_digest: Digest
+    seeds: Seeds
+    nu: float | None
+    trajectories: Annotated[Integer, Field(ge=1)]
+    scores: ReferenceScores
+    arrays_digest: Digest
+    versions: dict[str, str]
+
+    @classmethod
+    def from_dict(cls, data: Any, source: str = "") -> Self:
+        """Validate plain data, and the digests of its documents; errors call it `source`."""
+        version = data.get("schema_version") if isinstance(data, dict) else None
+        if type(version) is int and version != 1:
+            age = "an older" if version < 1 else "a newer"
+            raise SpecError(
+                f"{source}: {KEY}.schema_version={version}: must be 1. The data set was written by "
+                f"{age} version of this package. Read it with that version or with Minari, or "
+                "generate it again from its recipe."
+            )
+        record = super().from_dict(data, f"{source}: {KEY}")
+        recipe, remedy = record.recipe, "Download the data set again, or generate it again."
+        check_digest(record.recipe_digest, recipe, f"{source}: {KEY}.recipe_digest", remedy)
+        check_digest(record.spec_digest, recipe.spec, f"{source}: {KEY}.spec_digest", remedy)
+        check_digest(
+            record.protocol_digest, recipe.protocol, f"{source}: {KEY}.protocol_digest", remedy
+        )
+        return record
+
+
+_Width = Annotated[Integer, Field(ge=1, le=4096)]
+_Widths = Annotated[tuple[_Width, ...], Field(strict=False, min_length=1, max_length=8)]
+_Rate = Annotated[Real, Field(gt=0, le=1)]
+
+
+class BCHyperparameters(StrictModel):
+    """Hyperparameters of behaviour cloning.
+
+    Attributes:
+      hidden: widths of the policy's hidden layers.
+      learning_rate: of Adam.
+    """
+
+    hidden: _Widths = (256, 256)
+    learning_rate: _Rate = 1e-3
+
+
+class IQLHyperparameters(StrictModel):
+    """Hyperparameters of implicit Q-learning.
+
+    Attributes:
+      hidden: widths of the hidden layers of policy, critics and value function.
+      learning_rate: of Adam, for all networks.
+      discount: γ.
+      expectile: τ of the value function; ½ gives the mean, values near 1 the maximum.
+      inverse_temperature: β; 0 gives behaviour cloning.
+      max_weight: upper limit of exp(β advantage).
+      target_rate: ρ of the soft update of the target critics in each step.
+    """
+
+    hidden: _Widths = (256, 256)
+    learning_rate: _Rate = 3e-4
+    discount: Annotated[Real, Field(ge=0, lt=1)] = 0.99
+    expectile: Annotated[Real, Field(gt=0, lt=1)] = 0.7
+    inverse_temperature: Annotated[Real, Field(ge=0, le=1000)] = 3.0
+    max_weight: Annotated[Real, Field(gt=0, le=1e6)] = 100.0
+    target_rate: _Rate = 0.005
+
+
+Hyperparameters = BCHyperparameters | IQLHyperparameters
+ALGORITHMS: dict[str, type[Hyperparameters]] = {"bc": BCHyperparameters, "iql": IQLHyperparameters}
+
+
+def check_algorithm(
+    name: str, changes: Mapping[str, Any] | None = None
+) -> tuple[str, Hyperparameters]:
+    """An algorithm, whose case does not matter, and its hyperparameters with some changes."""
+    name = choice("algorithm", str(name).lower(), ALGORITHMS, error=UnknownNameError)
+    plain = dict(changes) if isinstance(changes, Mapping) else changes or {}
+    return name, ALGORITHMS[name].from_dict(plain, "hyperparameters")
+
+
+class OfflineEvaluation(StrictModel):
+    """Episodes of the policy in the task, played during training.
+
+    Attributes:
+      step: gradient steps before it.
+      similarity, similarity_sd: mean and standard deviation of r̃ over all steps of all episodes.
+      episode_return: mean over the episodes.
+      losses: terms of the loss of the last batch, by name.
+    """
+
+    step: Integer
+    similarity: Real
+    similarity_sd: Real
+    episode_return: Real
+    losses: dict[str, Real]
+
+
+class BehaviourQuality(StrictModel):
+    """Exact statistics of the data set's transitions: of r̃, and the mean r."""
+
+    similarity: Real
+    similarity_sd: Real
+    step_reward: Real
+
+
+class OfflineRecord(StrictModel):
+    """The arguments, data, evaluations and cost of an offline training.
+
+    Attributes:
+      schema_version: version of the record's format.
+      algorithm: behaviour cloning or implicit Q-learning.
+      hyperparameters: all of them, as used.
+      seed: of initial weights, shuffles, and starts of the evaluation episodes.
+      steps: of the gradient.
+      batch_size: transitions in each.
+      episodes: of each evaluation.
+      dataset: id of the data set; null if only its arrays were passed.
+      dataset_digest: of its arrays.
+      recipe_digest: the recipe's; null if only the arrays were passed.
+      transitions: N, the size of the data set.
+      spec, spec_digest: the task, and its digest.
+      behaviour: of the data set's transitions.
+      evaluations: in order; last, the policy's.
+      wall_seconds, cpu_seconds: time of the training and its evaluations.
+      cpu_ms_per_step: of a gradient step, without evaluations.
+      versions: of Python and the packages that the numbers depend on.
+    """
+
+    schema_version: Literal[1] = 1
+    algorithm: Literal["bc", "iql"]
+    hyperparameters: dict[str, Any]
+    seed: Integer
+    steps: Integer
+    batch_size: Integer
+    episodes: Integer
+    dataset: str | None
+    dataset_digest: str
+    recipe_digest: str | None
+    transitions: Integer
+    spec: SMESpec
+    spec_digest: str
+    behaviour: BehaviourQuality
+    evaluations: Annotated[TupleOf[OfflineEvaluation], Field(min_length=1)]
+    wall_seconds: Real
+    cpu_seconds: Real
+    cpu_ms_per_step: Real
+    versions: dict[str, str]
+
+    @property
+    def similarity(self) -> float:
+        """Mean r̃ of the final policy's episodes."""
+        return self.evaluations[-1].similarity
+
+    @property
+    def improvement(self) -> float:
+        """The final policy's similarity minus the behaviour's."""
+        return self.similarity - self.behaviour.similarity
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> OfflineRecord:
+        """Read `offline.json`."""
+        record = cls.from_dict(read_json(path), str(path))
+        check_digest(
+            record.spec_digest, record.spec, f"{os.fspath(path)}: spec_digest", "Train again."
+        )
+        return record
