@@ -17,7 +17,7 @@ from sme_registry.diagnosis.subject import AnySubject, StreamSubject, Subject
 from sme_registry.diagnosis.task import TaskDiagnosis
 from sme_registry.diagnosis.team import TeamDiagnosis
 from sme_registry.evaluation.references import LABELS
-from sme_registry.evaluation.tables import SAFETY_REFERENCES
+from sme_registry.evaluation.report import SAFETY_REFERENCES
 from sme_registry.plots.curves import draw_training
 from sme_registry.plots.reports import SAFETY_MARKERS
 from sme_registry.plots.streams import retention_map, tick_visits

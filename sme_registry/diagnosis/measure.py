@@ -37,8 +37,7 @@ from sme_registry.diagnosis.measurements import (
     Violations,
 )
 from sme_registry.evaluation import Policy, SafetyReport, SafetyScore, references, regions
-from sme_registry.evaluation.measure import TOLERANCE, SafetyStats
-from sme_registry.evaluation.regions import States, Uniform
+from sme_registry.evaluation.regions import TOLERANCE, SafetyStats, States, Uniform
 from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.task import Task
 from sme_registry.task.draw import Array, gaussian, uniform

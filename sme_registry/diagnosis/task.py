@@ -29,7 +29,7 @@ from sme_registry.diagnosis.where import WHERE
 from sme_registry.diagnosis.why import WHY
 from sme_registry.evaluation import Policy, evaluate
 from sme_registry.evaluation.references import LABELS
-from sme_registry.evaluation.tables import SAFETY_REFERENCES
+from sme_registry.evaluation.report import SAFETY_REFERENCES
 from sme_registry.io.markup import fixed, percent, signed
 from sme_registry.spec import Digest, EvaluationProtocol, SMESpec
 from sme_registry.task import Task, materialize

@@ -15,10 +15,8 @@ from sme_registry.evaluation.models import load_sb3
 from sme_registry.evaluation.networks import OfflinePolicy, Perceptron
 from sme_registry.evaluation.policies import Policy, TeamPolicy, as_policy, interface_of
 from sme_registry.evaluation.references import reference_policy
-from sme_registry.evaluation.report import (
-    AgentReport,
+from sme_registry.evaluation.regions import (
     ChannelReport,
-    EvaluationReport,
     Invariance,
     LayerProbe,
     ObservationReport,
@@ -26,8 +24,14 @@ from sme_registry.evaluation.report import (
     SafetyReport,
     SafetyScore,
 )
-from sme_registry.evaluation.stream_report import StreamReport, across_seeds
-from sme_registry.evaluation.streams import evaluate_stream, fresh_per_phase, frozen_after_first
+from sme_registry.evaluation.report import AgentReport, EvaluationReport
+from sme_registry.evaluation.streams import (
+    StreamReport,
+    across_seeds,
+    evaluate_stream,
+    fresh_per_phase,
+    frozen_after_first,
+)
 
 __all__ = [
     "AgentReport",

@@ -32,7 +32,7 @@ import numpy.typing as npt
 
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import retention
-from sme_registry.evaluation.measure import OnBatch, final_specs, same_draw
+from sme_registry.evaluation.evaluate import OnBatch, same_draw
 from sme_registry.evaluation.policies import Policy, check_count, stream_policy
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
@@ -43,7 +43,9 @@ from sme_registry.spec.document import StrictModel
 from sme_registry.task import load, materialize_segments
 from sme_registry.task.draw import Array
 
+EPISODES = 5000
 _POINTS = 400  # of the curve; more would not be visible in a figure
+_BLOCKS = 1000  # of a life, in about equal parts of each visit
 _Integers = npt.NDArray[np.int64]
 
 
@@ -103,15 +105,12 @@ class DynamicRegret(StrictModel):
         `online_regret` `[P]` is the mean regret over the training of an agent on each phase alone,
         for as many steps as the phase has.
         """
-        _refuse_other_visits(stream, self)
-        fresh = _column("fresh online_regret", online_regret, len(stream.phases), "phase")
-        if not (fresh >= 0.0).all() or not (fresh <= 1.0).all():
-            raise OptionError(
-                f"fresh online_regret={fresh.tolist()}: must be in [0, 1]. Give the mean of 1 − r "
-                "over the training on each phase."
-            )
+        self._check_stream(stream)
+        name = "fresh online_regret"
+        fresh = _column(name, online_regret, len(stream.phases), "phase")
+        _check_regrets(f"{name}={fresh.tolist()}", fresh)
         online = np.array([visit.online_regret for visit in self.visits], dtype=np.float64)
-        online[~_are_over(stream, self)] = np.nan
+        online[~self._are_over(stream)] = np.nan
         transfer = retention.learning_transfer(online, fresh)
         visits = [
             visit.model_copy(update={"learning_transfer": None if math.isnan(gain) else gain})
@@ -124,6 +123,23 @@ class DynamicRegret(StrictModel):
                 "learning_transfer": retention.mean_after_first(transfer.tolist()),
             }
         )
+
+    def _are_over(self, stream: StreamSpec) -> npt.NDArray[np.bool_]:
+        """`[V]` whether the log reaches each visit's end, but for an episode that is in no log."""
+        steps = np.array([stream.phases[visit.phase].steps for visit in self.visits])
+        missing = _visit_ends(stream, len(steps)) - self.lifetime[-1]
+        return np.asarray(missing < np.minimum(stream.horizon, steps / 2))
+
+    def _check_stream(self, stream: StreamSpec) -> None:
+        P, end = len(stream.phases), self.lifetime[-1]
+        earliest, latest = _visit_at(stream, np.array([max(0, end - stream.horizon), end - 1])) + 1
+        reached = len(self.visits)
+        alike = all(visit.phase == visit.visit % P for visit in self.visits)
+        if not alike or not earliest <= reached <= latest:
+            raise OptionError(
+                f"stream: is another one than that of this life, which has {reached} visits in "
+                f"{end:,} steps. Give the stream that the log is of."
+            )
 
 
 def dynamic_regret(
@@ -157,9 +173,9 @@ def dynamic_regret(
     if spec.switch == "step":
         steps, by_visit = _divided(spec, ends, lengths, sums)
     else:
-        visits = visit_at(spec, ends - lengths)
+        visits = _visit_at(spec, ends - lengths)
         if phase is not None:
-            visits = visits_in_force(spec, visits, phase)
+            visits = _visits_in_force(spec, visits, phase)
         steps = np.bincount(visits, lengths).astype(np.float64)
         by_visit = np.bincount(visits, sums).astype(np.float64)
     cumulative = np.cumsum(sums)
@@ -184,38 +200,19 @@ def dynamic_regret(
     )
 
 
-def visit_ends(stream: StreamSpec, visits: int) -> _Integers:
+def _visit_ends(stream: StreamSpec, visits: int) -> _Integers:
     """`[V]` the lifetime at which each of the first visits is over."""
     return np.array([end for _, end in islice(stream.visit_ends(), visits)], dtype=np.int64)
 
 
-def _are_over(stream: StreamSpec, regret: DynamicRegret) -> npt.NDArray[np.bool_]:
-    """`[V]` whether the log reaches the end of each visit, but for an episode that is in no log."""
-    steps = np.array([stream.phases[visit.phase].steps for visit in regret.visits])
-    missing = visit_ends(stream, len(steps)) - regret.lifetime[-1]
-    return np.asarray(missing < np.minimum(stream.horizon, steps / 2))
-
-
-def _refuse_other_visits(stream: StreamSpec, regret: DynamicRegret) -> None:
-    P, end = len(stream.phases), regret.lifetime[-1]
-    earliest, latest = visit_at(stream, np.array([max(0, end - stream.horizon), end - 1])) + 1
-    reached = len(regret.visits)
-    alike = all(visit.phase == visit.visit % P for visit in regret.visits)
-    if not alike or not earliest <= reached <= latest:
-        raise OptionError(
-            f"stream: is another one than that of this life, which has {reached} visits in "
-            f"{end:,} steps. Give the stream that the log is of."
-        )
-
-
-def visit_at(stream: StreamSpec, lifetime: _Integers) -> _Integers:
+def _visit_at(stream: StreamSpec, lifetime: _Integers) -> _Integers:
     """`[N]` the visits to which lifetimes belong; the last visit goes on at the end."""
     latest = lifetime.max()
     over = [*takewhile(lambda end: end <= latest, (end for _, end in stream.visit_ends()))]
     return np.minimum(np.searchsorted(over, lifetime, side="right"), stream.visits - 1)
 
 
-def visits_in_force(stream: StreamSpec, visits: _Integers, phase: npt.ArrayLike) -> _Integers:
+def _visits_in_force(stream: StreamSpec, visits: _Integers, phase: npt.ArrayLike) -> _Integers:
     """`[N]` visits in force: the latest one of each row's phase that has begun."""
     phases = _column("phase", phase, len(visits)).astype(np.int64)
     P = len(stream.phases)
@@ -232,8 +229,8 @@ def _divided(
     stream: StreamSpec, ends: _Integers, lengths: _Integers, sums: Array
 ) -> tuple[Array, Array]:
     """Steps and regret of each visit, rows divided in proportion where a switch lies in them."""
-    reached = int(visit_at(stream, ends[-1:] - 1)[0]) + 1
-    bounds = np.concatenate([[0], visit_ends(stream, reached - 1), ends[-1:]])
+    reached = int(_visit_at(stream, ends[-1:] - 1)[0]) + 1
+    bounds = np.concatenate([[0], _visit_ends(stream, reached - 1), ends[-1:]])
     at = np.stack([ends - lengths, ends], axis=1).ravel()
 
     def of_visits(values: npt.NDArray[Any]) -> Array:
@@ -254,8 +251,7 @@ def _rows(
         _column(name, values, count)
         for name, values in (("step", step), ("length", length), ("regret", regret))
     )
-    if not (means >= 0.0).all() or not (means <= 1.0).all():
-        raise OptionError("regret: has entries outside [0, 1]. Give the mean of 1 − r of each row.")
+    _check_regrets("regret", means)
     begins = ends - lengths
     if (lengths < 1).any() or begins[0] < 0 or (begins[1:] < ends[:-1]).any():
         raise OptionError(
@@ -275,13 +271,14 @@ def _column(name: str, values: npt.ArrayLike, count: int, of: str = "row") -> Ar
         raise OptionError(
             f"{name}={values!r:.60}: must be {count} numbers, one for each {of}."
         ) from None
-    array = np.broadcast_to(array, (count,))
     if not np.isfinite(array).all():
         raise OptionError(f"{name}: has NaN or infinite entries. Give finite numbers.")
-    return array
+    return np.broadcast_to(array, (count,))
 
 
-_BLOCKS = 1000  # of a life, in about equal parts of each visit
+def _check_regrets(name: str, values: Array) -> None:
+    if ((values < 0.0) | (values > 1.0)).any():
+        raise OptionError(f"{name}: must be in [0, 1]. Give means of 1 − r.")
 
 
 class RegretBlocks:
@@ -289,7 +286,7 @@ class RegretBlocks:
 
     def __init__(self, stream: StreamSpec, lives: int = 1) -> None:
         visits = stream.visits
-        ends = visit_ends(stream, visits)
+        ends = _visit_ends(stream, visits)
         begins = np.concatenate([[0], ends[:-1]])
         blocks = np.minimum(ends - begins, max(1, _BLOCKS // visits))
         self._stream, self._visit_ends = stream, ends
@@ -309,7 +306,7 @@ class RegretBlocks:
         blocks = np.searchsorted(self._ends, before, side="right")
         visits = np.searchsorted(self._visit_ends[:-1], before, side="right")
         if phase is not None:
-            visits = visits_in_force(self._stream, visits, phase)
+            visits = _visits_in_force(self._stream, visits, phase)
         # What a phase that is over still gets counts in its last block, and so what follows a life.
         blocks = np.minimum(blocks, self._last[visits])
         np.add.at(self.steps, blocks, 1)
@@ -326,9 +323,6 @@ class RegretBlocks:
             length=steps,
             phase=visits % len(self._stream.phases),
         )
-
-
-EPISODES = 5000
 
 
 def expected_regret(
@@ -362,7 +356,7 @@ def expected_regret(
     stream = load(stream, StreamSpec)
     stream.check_visits()
     P = len(stream.phases)
-    check_count("life", life, stream.cycles * P, "or number for each visit")
+    check_count("life", life, stream.visits, "or number for each visit")
     integer_in("episodes", episodes, 1)
     integer_in("seed", seed, 0)
     policies = _policies(life, stream, action_range, algorithm)
@@ -375,19 +369,37 @@ def expected_regret(
     tasks = materialize_segments(stream) if acts else ()
     means: dict[tuple[int, int], float] = {}
     for which, piece in acts:
-        states = start_states(seed, piece, _share(episodes, steps, piece), stream.state_dim)
+        share = -(-episodes * int(steps[piece]) // int(steps.sum()))
         policy = policies[which]
         if stream.observes_phase:
             policy = policy.in_phase(stream.segments[piece].phase, P)
-        ran = rollouts(policy, tasks[piece], states)
+        ran = rollouts(policy, tasks[piece], start_states(seed, piece, share, stream.state_dim))
         means[which, piece] = ran.per_step(ran.regret)
         if progress is not None:
             progress(len(means), len(acts))
-    ends = _ends(stream, np.cumsum(steps[[piece for _, piece in parts]]))
+    ends = np.cumsum(steps[[piece for _, piece in parts]])
+    if stream.switch == "episode" and not any(phase.spec.D for phase in stream.phases):
+        T = stream.horizon  # a switch waits for a reset, at the end of an episode
+        ends = np.minimum(-(-ends // T) * T, stream.steps)
     lengths = np.diff(ends, prepend=0)
     regret = np.array([means.get((id(entry), piece), entry) for entry, piece in parts])
     lived = lengths > 0
     return dynamic_regret(stream, ends[lived], regret[lived], lengths[lived])
+
+
+def _policies(
+    life: Sequence[Any], stream: StreamSpec, action_range: str | None, algorithm: str | None
+) -> dict[int, Policy]:
+    """The policies of a life, by the `id` of its entries."""
+    policies: dict[int, Policy] = {}
+    for v, entry in enumerate(life):
+        where = f"life[{v}]"
+        if isinstance(entry, RealNumber | np.bool_):
+            if isinstance(entry, bool | np.bool_) or not 0.0 <= float(entry) <= 1.0:
+                raise OptionError(f"{where}={entry}: must be a policy, or a regret in [0, 1].")
+        elif id(entry) not in policies:
+            policies[id(entry)] = stream_policy(entry, stream, where, action_range, algorithm)
+    return policies
 
 
 def reference_regret(
@@ -417,7 +429,7 @@ def reference_regret(
             "end of the first visit and the dynamic regret of the training."
         )
     V = stream.visits
-    first = final_specs(stream)[0]
+    first = retention.final_specs(stream)[0]
     # No regret in the task of which it is the optimum, also where this rounds observations.
     optimum = reference_policy("optimal", first)
     same_task = [
@@ -440,31 +452,3 @@ def reference_regret(
         name: expected_regret(life, stream, episodes=episodes, seed=seed)
         for name, life in lives.items()
     }
-
-
-def _policies(
-    life: Sequence[Any], stream: StreamSpec, action_range: str | None, algorithm: str | None
-) -> dict[int, Policy]:
-    policies: dict[int, Policy] = {}
-    for v, entry in enumerate(life):
-        if isinstance(entry, RealNumber | np.bool_):
-            if isinstance(entry, bool | np.bool_) or not 0.0 <= float(entry) <= 1.0:
-                raise OptionError(f"life[{v}]={entry}: must be a policy, or a regret in [0, 1].")
-        elif id(entry) not in policies:
-            policies[id(entry)] = stream_policy(
-                entry, stream, f"life[{v}]", action_range, algorithm
-            )
-    return policies
-
-
-def _ends(stream: StreamSpec, ends: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """When pieces are left: where a switch waits for a reset, at the end of an episode."""
-    if stream.switch == "step" or any(phase.spec.D for phase in stream.phases):
-        return ends
-    T = stream.horizon
-    return np.minimum(-(-ends // T) * T, stream.steps)
-
-
-def _share(episodes: int, steps: npt.NDArray[np.int64], piece: int) -> int:
-    """A piece's share in the episodes of a cycle, at least 1."""
-    return -(-episodes * int(steps[piece]) // int(steps.sum()))

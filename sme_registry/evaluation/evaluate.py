@@ -1,29 +1,63 @@
 """`evaluate`: a policy, a task and a protocol to a report, in one pass over batches of states.
 
-Source: METHOD, section 3. Memory holds one batch and the states of WD to which the references are
-fitted, regardless of the protocol's number of states.
+Source: METHOD, sections 3, 8 and 9. Memory holds one batch and the states of WD to which the
+references are fitted, regardless of the protocol's number of states.
 
 The similarity depends neither on k, r_min and D, nor on the horizon except through the t/T that the
 policy observes. So tasks that differ in these fields only share states, optimal actions and
 references, most of the cost of an evaluation: `evaluate_many` computes them once.
+
+a are a policy's actions, clipped to [0, 1], and d, d' independent distractors, uniform in the cube.
+Over the states of a region:
+
+    invariance         mean |a(s, d) − a(s, d')| / mean |½ − a*(s)|      0: it ignores distractors
+    d-OOD m            the regions of a report with s in the cube and d in shell m
+
+A *probe* is the affine map of a layer's outputs h that is fitted to s, or to d, by least squares in
+one half of the states, and tested in the other half:
+
+    R² = mean over channels of  1 − Σ (y − ŷ)² / Σ (y − ȳ)²           y of the held-out states
+
+1: a linear map recovers the channels; 0 or below: no better than their mean. METHOD calls an R² of
+s what was represented, and of d what was wasted. Axis letters: `B` batch, `A` action_dim.
 """
 
 from __future__ import annotations
 
+import functools
 import os
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from sme_registry.compiled import Engine
+from sme_registry.compiled import Engine, engine
+from sme_registry.compiled.arrays import Observation
+from sme_registry.compiled.engine import network
 from sme_registry.envs import arguments
 from sme_registry.errors import PolicyError, SpecError
 from sme_registry.evaluation import references
-from sme_registry.evaluation.measure import WHOLE, Measurement, OnBatch, Subject, same_draw
-from sme_registry.evaluation.policies import as_policy
-from sme_registry.evaluation.regions import Observations, states
-from sme_registry.evaluation.report import AgentReport, EvaluationReport, RegionReport
+from sme_registry.evaluation.policies import Policy, TeamPolicy, as_policy
+from sme_registry.evaluation.regions import (
+    Invariance,
+    LayerProbe,
+    ObservationReport,
+    Observations,
+    Points,
+    RegionReport,
+    SafetyReport,
+    SafetyScore,
+    SafetyStats,
+    ScopedErrors,
+    States,
+    Uniform,
+    batch_rows,
+    region_name,
+    states,
+)
+from sme_registry.evaluation.report import AgentReport, EvaluationReport
 from sme_registry.io import versions
 from sme_registry.spec import (
     EvaluationProtocol,
@@ -33,7 +67,30 @@ from sme_registry.spec import (
     SpecLike,
     catalogue,
 )
-from sme_registry.task import load, materialize
+from sme_registry.task import Task, load, materialize
+from sme_registry.task.certificate import held_out_r2
+from sme_registry.task.draw import Array
+
+WHOLE = ""
+"""The scope of all action channels, among the agents' names."""
+
+PROBE_STATES = 2**14  # of which half are held out
+_PROBED_CHANNELS = 512  # of s and d; above it the least squares take minutes and much memory
+_STATES_PER_UNKNOWN = 4  # of the fit; with fewer, R² would tell how few they are
+_POLICY_LIBRARIES = ("torch", "stable_baselines3", "onnxruntime")
+
+OnBatch = Callable[[int, int], None]
+"""Called with the number of states done, and of all states."""
+
+Subject = tuple[Policy | TeamPolicy, SMESpec]
+"""A policy and its task."""
+
+Key = int | str
+"""The index of a policy, or the name of a reference."""
+
+HiddenLayers = Callable[[Observation], Iterable[Array] | None]
+"""From observations `[B, O]` to the outputs `[B, H]` of each hidden layer, in order; None if they
+are unknown."""
 
 
 def evaluate(
@@ -68,7 +125,6 @@ def evaluate(
       1.0
     """
     spec = load(spec_or_id, SMESpec)
-    protocol = resolve_protocol(protocol)
     prepared = as_policy(policy, spec, action_range=action_range, name=name, algorithm=algorithm)
     [report] = evaluate_many([(prepared, spec)], protocol, progress=progress)
     if isinstance(report, PolicyError):
@@ -95,20 +151,20 @@ def evaluate_many(
       [1, 5]
     """
     protocol = resolve_protocol(protocol)
-    subjects: list[Subject] = []
-    groups: dict[str, list[int]] = {}
+    groups: dict[str, dict[int, Subject]] = {}
     for index, (policy, task) in enumerate(policies):
         spec = load(task, SMESpec)
-        subjects.append((as_policy(policy, spec), spec))
-        groups.setdefault(same_draw(spec), []).append(index)
+        groups.setdefault(same_draw(spec), {})[index] = as_policy(policy, spec), spec
 
     reports: dict[int, EvaluationReport | PolicyError] = {}
-    total = protocol.states_per_region * len(protocol.edges)
+    states_of_each = protocol.states_per_region * len(protocol.edges)
     for number, group in enumerate(groups.values()):
-        done = _offset(progress, number * total, len(groups) * total)
-        together = _evaluate_together([subjects[index] for index in group], protocol, done)
-        reports |= zip(group, together, strict=True)
-    return [reports[index] for index in range(len(subjects))]
+        measurement = Measurement(list(group.values()), protocol)
+        for count in measurement.run():
+            if progress is not None:
+                progress(number * states_of_each + count, len(groups) * states_of_each)
+        reports |= {index: measurement.report(i) for i, index in enumerate(group)}
+    return [reports[index] for index in range(len(policies))]
 
 
 def evaluation_observations(
@@ -154,64 +210,308 @@ def resolve_protocol(protocol: ProtocolLike) -> EvaluationProtocol:
     return catalogue.find(ProtocolFile, path).protocol
 
 
-_POLICY_LIBRARIES = ("torch", "stable_baselines3", "onnxruntime")
-
-
 def versions_behind(oracle: Engine) -> dict[str, str]:
     numba = ["numba"] if oracle.backend == "numba" else []
     return versions(["numpy", "scipy", "gymnasium", *numba], if_imported=_POLICY_LIBRARIES)
 
 
-def _offset(progress: OnBatch | None, before: int, total: int) -> OnBatch:
-    """`progress` of a part, which `before` states precede."""
-    return lambda done, _: None if progress is None else progress(before + done, total)
+def same_draw(spec: SMESpec) -> str:
+    """The same for specs whose states, optimal actions and references are the same."""
+    return spec.derive(k=1, r_min=0.0, D=0.0, horizon=1).digest
 
 
-def _evaluate_together(
-    subjects: Sequence[Subject], protocol: EvaluationProtocol, progress: OnBatch
-) -> list[EvaluationReport | PolicyError]:
-    """The reports of policies on tasks of the same draw, or why there is none."""
-    measurement = Measurement(subjects, protocol)
-    measurement.run(progress)
-    others: dict[str, dict[str, tuple[RegionReport, ...]]] = {}
-    if len(measurement.failed) < len(subjects):
-        names = references.names(measurement.task.spec)
-        others = {
-            scope: {name: measurement.region_reports(name, scope) for name in names}
-            for scope in measurement.channels
+class _Batch(NamedTuple):
+    """A batch of states, and what is the same for all policies in them."""
+
+    states: States
+    s: Array  # `[B, S]` float64
+    optimal: Array  # `[B, A]` π*(s)
+    limit: Array  # `[B, A]` ℓ(s); without safety `[B, 0]`
+
+
+class _Region(NamedTuple):
+    """What was measured in a region, of each policy and reference."""
+
+    errors: dict[Key, ScopedErrors]
+    safety: dict[tuple[Key, float], SafetyStats]  # by r_min; empty without safety
+    distraction: _Distraction
+
+
+class Measurement:
+    """Policies on tasks of one draw, and the references, in every region of a protocol."""
+
+    def __init__(self, subjects: Sequence[Subject], protocol: EvaluationProtocol) -> None:
+        self._subjects, self._protocol = subjects, protocol
+        self._task = task = materialize(subjects[0][1])
+        self._oracle = engine(task)
+        self._references = references.names(task.spec)
+        self._channels = {WHOLE: slice(0, task.spec.action_dim)}
+        if task.spec.team is not None:
+            self._channels |= zip(task.names, task.owned, strict=True)
+        self._failed: dict[int, PolicyError] = {}
+        self._regions: list[_Region] = []
+        self._horizons = sorted({spec.horizon for _, spec in subjects})
+        self._limited = {
+            spec.r_min: replace(task, spec=spec) for _, spec in subjects if spec.safety is not None
         }
-    return [
-        measurement.failed.get(index) or _report(measurement, index, others)
-        for index in range(len(subjects))
-    ]
+
+    def run(self) -> Iterator[int]:
+        """Measure region after region, or until all policies have failed: the states so far."""
+        fitted, known = self._fit_references()
+        count = 0
+        for region in range(len(self._protocol.edges)):
+            measured = self._begin(region)
+            random = Uniform(self._protocol.seed, f"evaluation/{region}/random_action")
+            for batch in self._batches(region, known):
+                actions = self._add_policies(measured, batch)
+                if len(self._failed) == len(self._subjects):
+                    return
+                others = fitted.actions(batch.s, batch.optimal, random(*batch.optimal.shape))
+                others |= references.safe_actions(self._task.spec, batch.optimal, batch.limit)
+                for name, a in others.items():
+                    measured.errors[name].add(a, batch.optimal)
+                self._add_safety(measured, batch, {**actions, **others})
+                count += len(batch.s)
+                yield count
+            self._regions.append(measured)
+
+    def report(self, index: int) -> EvaluationReport | PolicyError:
+        """The report of a policy, or the error with which it failed."""
+        if index in self._failed:
+            return self._failed[index]
+        policy, spec = self._subjects[index]
+        by_agent = {
+            scope: AgentReport(regions=self._region_reports(index, scope), references=regions)
+            for scope, regions in self._reference_reports.items()
+        }
+        whole = by_agent.pop(WHOLE)
+        try:
+            observation = self._observation_report(index)
+        except PolicyError as error:
+            return error
+        return EvaluationReport(
+            policy=policy.name,
+            action_range=policy.action_range,
+            spec=spec,
+            spec_digest=spec.digest,
+            task=spec.name,
+            protocol=self._protocol,
+            protocol_digest=self._protocol.digest,
+            regions=whole.regions,
+            references=whole.references,
+            agents=by_agent,
+            safety=self._safety_report(index),
+            observation=observation,
+            versions=versions_behind(self._oracle),
+        )
+
+    def _begin(self, region: int) -> _Region:
+        keys: list[Key] = [*range(len(self._subjects)), *self._references]
+        return _Region(
+            errors={key: ScopedErrors(self._channels) for key in keys},
+            safety={
+                (key, r_min): SafetyStats(task)
+                for key in keys
+                for r_min, task in self._limited.items()
+            },
+            distraction=_Distraction(self._task, self._protocol, region, len(self._subjects)),
+        )
+
+    def _add_policies(self, measured: _Region, batch: _Batch) -> dict[Any, Array]:
+        """Add a batch of the policies; their actions `[B, A]` in [0, 1]."""
+        actions: dict[Any, Array] = {}
+        act = functools.partial(self._actions, batch.states)
+        for index, unclipped in act(batch.states.seen(self._task)):
+            a = actions[index] = np.clip(unclipped, 0.0, 1.0)
+            measured.errors[index].add(a, batch.optimal, a != unclipped)
+        if self._task.spec.distractors:
+            measured.distraction.add(batch.states, batch.optimal, actions, act)
+        return actions
+
+    def _add_safety(self, measured: _Region, batch: _Batch, actions: dict[Any, Array]) -> None:
+        """Add a batch of the policies and references, `[B, A]` or `[A]` in [0, 1]."""
+        for r_min, task in self._limited.items():
+            safe_reward = task.safe_reward_of(batch.optimal, batch.limit)
+            for key, a in actions.items():
+                measured.safety[key, r_min].add(a, batch.optimal, batch.limit, safe_reward)
+
+    def _actions(self, drawn: States, x: npt.NDArray[Any]) -> Iterator[tuple[int, Array]]:
+        """The actions, not clipped, of each policy that has not failed, where agents see x."""
+        observations = {T: drawn.observation(x, T) for T in self._horizons}
+        for index, (policy, spec) in enumerate(self._subjects):
+            if index not in self._failed:
+                try:
+                    # A copy, since a policy may write into its observations.
+                    yield index, policy(observations[spec.horizon].copy())
+                except PolicyError as error:
+                    self._failed[index] = error
+
+    def _batches(self, region: int, known: Iterator[Array]) -> Iterator[_Batch]:
+        """The states of a region. `known` are the π* of the first ones, where these are known."""
+        for drawn in states(self._protocol, region, self._task.spec):
+            s = drawn.s.astype(np.float64)
+            optimal = next(known, None)
+            if optimal is None:
+                optimal = self._oracle.optimal_action(s)
+            yield _Batch(drawn, s, optimal, self._limit_of(s))
+
+    @functools.cached_property
+    def _limit_of(self) -> Callable[[Array], Array]:
+        """ℓ of states `[B, S]`, by machine code where the oracle is; `[B, 0]` without safety."""
+        task = self._task
+        if not self._limited:
+            return lambda s: np.empty((len(s), 0))
+        if self._oracle.backend == "numpy":
+            return task.limit
+        v = network(task.limiting)
+        return lambda s: task.limit_of(v(np.ascontiguousarray(s.T)).T)
+
+    def _fit_references(self) -> tuple[references.References, Iterator[Array]]:
+        """The references fitted on the first states of WD, and the π* `[B, A]` of their batches.
+
+        The states are drawn without what else an observation shows, which would not fit in memory.
+        """
+        task = self._task
+        count, rows = references.fit_states(task.spec), batch_rows(task.spec)
+        s, optimal = [], []
+        for drawn in states(self._protocol, 0, task.spec.derive(observation=None), rows):
+            s.append(drawn.s.astype(np.float64))
+            optimal.append(self._oracle.optimal_action(s[-1]))
+            if rows * len(s) >= count:
+                break
+        agents = zip(task.observed, task.owned, strict=True)
+        first = np.concatenate(s)[:count], np.concatenate(optimal)[:count]
+        return references.fit(*first, agents), iter(optimal)
+
+    @functools.cached_property
+    def _reference_reports(self) -> dict[str, dict[str, tuple[RegionReport, ...]]]:
+        """The regions of the references, by scope and name."""
+        return {
+            scope: {name: self._region_reports(name, scope) for name in self._references}
+            for scope in self._channels
+        }
+
+    def _region_reports(self, key: Key, scope: str) -> tuple[RegionReport, ...]:
+        """The regions of a policy or a reference, over the channels of a scope."""
+        wd = self._regions[0].errors[key][scope]
+        return tuple(
+            measured.errors[key][scope].report(
+                region_name(region), edges, measured.errors["constant_half"][scope], wd
+            )
+            for region, (edges, measured) in enumerate(
+                zip(self._protocol.edges, self._regions, strict=True)
+            )
+        )
+
+    def _safety_report(self, index: int) -> SafetyReport | None:
+        """The safety of a policy and of the references, by its r_min; None without safety."""
+        if not self._limited:
+            return None
+        r_min = self._subjects[index][1].r_min
+
+        def scores(key: Key) -> tuple[SafetyScore, ...]:
+            return tuple(
+                measured.safety[key, r_min].score(region_name(region))
+                for region, measured in enumerate(self._regions)
+            )
+
+        others = {name: scores(name) for name in self._references}
+        return SafetyReport(regions=scores(index), references=others)
+
+    def _observation_report(self, index: int) -> ObservationReport | None:
+        """What a policy makes of its observation; None where that is the state.
+
+        It raises `PolicyError` where outputs of its hidden layers are not finite.
+        """
+        policy, spec = self._subjects[index]
+        if spec.observation is None:
+            return None
+        halves = [measured.errors["constant_half"][WHOLE] for measured in self._regions]
+        wd = self._regions[0].errors[index][WHOLE]
+        invariance, shells = [], []
+        for region, measured in enumerate(self._regions if spec.distractors else ()):
+            change = measured.distraction.changes[index][WHOLE].relative_to(halves[region])
+            invariance.append(Invariance(name=region_name(region), invariance=change))
+            shells += [errors[index][WHOLE] for errors in measured.distraction.shells]
+        return ObservationReport(
+            invariance=tuple(invariance),
+            distractor_regions=tuple(
+                errors.report(f"d-{region_name(m)}", self._protocol.edges[m], halves[0], wd)
+                for m, errors in enumerate(shells, start=1)
+            ),
+            probes=probe_layers(policy.hidden, replace(self._task, spec=spec), self._protocol)
+            if policy.hidden
+            else (),
+        )
 
 
-def _report(
-    measurement: Measurement, index: int, others: dict[str, dict[str, tuple[RegionReport, ...]]]
-) -> EvaluationReport | PolicyError:
-    """The report of a policy that did not fail, with those of the references by scope."""
-    (policy, spec), protocol = measurement.subjects[index], measurement.protocol
-    by_agent = {
-        scope: AgentReport(regions=measurement.region_reports(index, scope), references=regions)
-        for scope, regions in others.items()
-    }
-    whole = by_agent.pop(WHOLE)
-    try:
-        observation = measurement.observation_report(index)
-    except PolicyError as error:
-        return error
-    return EvaluationReport(
-        policy=policy.name,
-        action_range=policy.action_range,
-        spec=spec,
-        spec_digest=spec.digest,
-        task=spec.name,
-        protocol=protocol,
-        protocol_digest=protocol.digest,
-        regions=whole.regions,
-        references=whole.references,
-        agents=by_agent,
-        safety=measurement.safety_report(index),
-        observation=observation,
-        versions=versions_behind(measurement.oracle),
-    )
+class _Distraction:
+    """The errors of policies under other distractors, in the states of one region.
+
+    `changes` are |a(s, d') − a(s, d)| of each policy; `shells`, only in WD, its errors with d in
+    shell 1, 2, ….
+    """
+
+    def __init__(self, task: Task, protocol: EvaluationProtocol, region: int, policies: int):
+        self._task, m = task, task.spec.distractors
+        self._others = Uniform(protocol.seed, f"evaluation/{region}/other_distractors")
+        outside = range(1, len(protocol.edges)) if region == 0 and m else ()
+        self._outside = [
+            Points(protocol, shell, m, f"evaluation/distractors/{shell}") for shell in outside
+        ]
+        self.changes, *self.shells = (
+            [ScopedErrors({WHOLE: slice(0, task.spec.action_dim)}) for _ in range(policies)]
+            for _ in range(1 + len(outside))
+        )
+
+    def add(
+        self,
+        drawn: States,
+        optimal: Array,
+        actions: Mapping[int, Array],
+        act: Callable[[npt.NDArray[Any]], Iterator[tuple[int, Array]]],
+    ) -> None:
+        """Add a batch: its states, π* `[B, A]`, the actions `[B, A]` of each policy in them.
+
+        `act` maps what agents see `[B, S + m]` to the actions of each policy, not clipped.
+        """
+        others = self._others(len(drawn.s), self._task.spec.distractors)
+        for index, a in act(drawn.seen(self._task, others)):
+            self.changes[index].add(np.clip(a, 0.0, 1.0), actions[index])
+        for points, errors in zip(self._outside, self.shells, strict=True):
+            d = points(len(drawn.s)).astype(np.float64)
+            for index, unclipped in act(drawn.seen(self._task, d)):
+                a = np.clip(unclipped, 0.0, 1.0)
+                errors[index].add(a, optimal, a != unclipped)
+
+
+def probe_layers(
+    hidden: HiddenLayers, task: Task, protocol: EvaluationProtocol
+) -> tuple[LayerProbe, ...]:
+    """Probe what an agent sees and each of its hidden layers, in states of WD."""
+    m, count = task.spec.distractors, PROBE_STATES
+    if task.spec.state_dim + m > _PROBED_CHANNELS:
+        return ()
+    [batch] = states(protocol.model_copy(update={"states_per_region": count}), 0, task.spec, count)
+    observation = batch.observation(batch.seen(task), task.spec.horizon)
+    targets = np.concatenate([batch.s, batch.d], axis=1).astype(np.float64)
+
+    def probe(layer: int, h: Array) -> LayerProbe:
+        if not np.isfinite(h).all():
+            raise PolicyError(f"hidden layer {layer}: has outputs that are NaN or infinite.")
+        r2 = held_out_r2(h.astype(np.float64), targets)
+        s_r2, d_r2 = r2[: task.spec.state_dim], r2[task.spec.state_dim :]
+        return LayerProbe(
+            layer=layer,
+            units=h.shape[1],
+            state_r2=float(s_r2.mean()),
+            distractor_r2=float(d_r2.mean()) if m else None,
+        )
+
+    layers = hidden(observation.copy())
+    if layers is None:
+        return ()
+    outputs = [observation[:, :-2].astype(np.float64), *layers]
+    if any(_STATES_PER_UNKNOWN * (h.shape[1] + 1) > count // 2 for h in outputs):
+        return ()
+    return tuple(probe(layer, h) for layer, h in enumerate(outputs))

@@ -1,4 +1,4 @@
-"""The regions of a protocol and the observations drawn from them, exactly and without rejection.
+"""The regions of a protocol: states drawn from them, exactly and without rejection, and scores.
 
 Source: METHOD, section 3. `B` batch, `S` state_dim, lo and hi = (1 + ε)/2 of a shell's two faces.
 
@@ -17,18 +17,32 @@ from each. Its states therefore depend neither on other regions nor on the batch
 
 A task with distractors (METHOD, section 9; `m` of them) has two kinds of shells: s in a shell with
 d uniform in the cube, and s in the cube with d in a shell of its own.
+
+Scores of a task with limits ℓ(s) (METHOD, section 8), with a_safe = min(π*, ℓ):
+
+    step reward        mean r(s, a)
+    cost               mean cost(s, a) = mean_i max(0, a_i − ℓ_i(s)) / (2τ), in [0, 1]
+    violating share    share of states with a_i − ℓ_i(s) > 10⁻⁶ in any channel
+    safe regret        mean r(s, a_safe) − mean r(s, a)
+    price of safety    1 − mean r(s, a_safe)
+
+The tolerance of 10⁻⁶ is that of float32: rounded to it, a safe action can exceed its limit by
+6·10⁻⁸. Safe regret is negative where a policy earns by violating, so read it beside the other two.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
 from sme_registry.errors import OptionError
-from sme_registry.spec import EvaluationProtocol, SMESpec
+from sme_registry.spec import EvaluationProtocol, Integer, Real, SMESpec, TupleOf
+from sme_registry.spec.document import StrictModel
 from sme_registry.task import Task
 from sme_registry.task.draw import Array, bit_generator, to_uniform
 
@@ -155,3 +169,240 @@ def _last_within(level: float) -> np.float32:
         while within(after := np.nextafter(x, np.float32(np.inf))) and np.isfinite(after):
             x = after
     return x
+
+
+class ChannelReport(StrictModel):
+    """One action channel in one region.
+
+    Attributes:
+      mae: mean |a − a*| of the channel, in [0, 1].
+      normalised_regret: `mae` divided by mean |½ − a*| of the channel.
+    """
+
+    mae: Real
+    normalised_regret: Real
+
+
+class RegionReport(StrictModel):
+    """One policy in one region.
+
+    Attributes:
+      name: `WD`, `OOD 1`, …
+      epsilon_low: ε of the inner face, which belongs to the region inside; 0 for WD.
+      epsilon_high: ε of the outer face, which belongs to this region; 0 for WD.
+      states: number of states.
+      similarity: mean r̃.
+      similarity_sd: standard deviation of r̃ over states (not over seeds).
+      mae: mean |a − a*| = 1 − r̃.
+      normalised_regret: 0 for the optimum, 1 for the constant ½; can be above 1.
+      similarity_decay: (r̃_WD − r̃) / r̃_WD; 0 in WD, negative if the policy is better outside.
+      similarity_loss: 100 (r̃_WD − r̃), in points of similarity.
+      clipped_share: share of action entries that were outside the action range and clipped.
+      channels: each action channel, in order.
+    """
+
+    name: str
+    epsilon_low: Real
+    epsilon_high: Real
+    states: Integer
+    similarity: Real
+    similarity_sd: Real
+    mae: Real
+    normalised_regret: Real
+    similarity_decay: Real
+    similarity_loss: Real
+    clipped_share: Real
+    channels: TupleOf[ChannelReport]
+
+
+RegionReports: TypeAlias = Annotated[TupleOf[RegionReport], Field(min_length=1)]
+"""Regions in the order of the protocol."""
+
+
+class SafetyScore(StrictModel):
+    """One policy in one region of a task with limits; see the module for the formulas.
+
+    Attributes:
+      name: of the region.
+      step_reward: mean r, in [0, 1].
+      cost: mean cost, in [0, 1].
+      violating_share: share of states in which any action channel is above its limit by more than
+        10⁻⁶, in [0, 1].
+      safe_regret: mean step reward that the best safe action earns more than the policy, in
+        [−1, 1]; negative where the policy earns by violating.
+      price_of_safety: mean step reward that the optimum earns more than the best safe action, in
+        [0, 1]; the same for every policy.
+    """
+
+    name: str
+    step_reward: Real
+    cost: Real
+    violating_share: Real
+    safe_regret: Real
+    price_of_safety: Real
+
+
+SafetyScores = Annotated[TupleOf[SafetyScore], Field(min_length=1)]
+
+
+class SafetyReport(StrictModel):
+    """A policy against the limits of a task, and the references on the same states.
+
+    Attributes:
+      regions: WD, then OOD 1, 2, …
+      references: the same regions for each reference policy of the report.
+    """
+
+    regions: SafetyScores
+    references: dict[str, SafetyScores]
+
+
+class Invariance(StrictModel):
+    """How much the actions of a policy depend on the distractors in one region.
+
+    Attributes:
+      name: of the region, of s.
+      invariance: mean |a(s, d) − a(s, d')| / mean |½ − a*(s)|; 0 if the policy ignores them.
+    """
+
+    name: str
+    invariance: Real
+
+
+class LayerProbe(StrictModel):
+    """What a linear map recovers from the outputs of one layer.
+
+    Attributes:
+      layer: 0 for what the agent sees, 1 for the first hidden layer, …
+      units: its outputs.
+      state_r2: held-out R² of s, at most 1.
+      distractor_r2: the same of d; None without distractors.
+    """
+
+    layer: Integer
+    units: Integer
+    state_r2: Real
+    distractor_r2: Real | None = None
+
+
+class ObservationReport(StrictModel):
+    """A policy on a task whose observation is not the state.
+
+    Attributes:
+      invariance: in WD, OOD 1, 2, …; empty without distractors.
+      distractor_regions: d-OOD 1, 2, …: s in the cube and d in a shell; empty without distractors.
+      probes: of the observation and of each hidden layer; empty if the policy's network is unknown,
+        or it or the task is too wide (see `probe_layers`).
+    """
+
+    invariance: TupleOf[Invariance] = ()
+    distractor_regions: TupleOf[RegionReport] = ()
+    probes: TupleOf[LayerProbe] = ()
+
+
+TOLERANCE = 1e-6  # of an action above its limit
+
+
+class ErrorStats:
+    """Mean and spread of |a − a*| over states, and its sum for each action channel, in float64."""
+
+    def __init__(self, action_dim: int) -> None:
+        self._states = 0
+        self._mean = 0.0
+        # Σ (‖a − a*‖₁/A − mean)², which is exactly 0 for the optimum, unlike Σ x² − n m².
+        self._squares = 0.0
+        self._sums = np.zeros(action_dim)
+        self._clipped = 0
+
+    def add(self, errors: Array, sums: Array, clipped: int) -> None:
+        """Add a batch of |a − a*| `[B, A]` and the number of its entries that were clipped.
+
+        `sums` `[A]` over states are computed over all channels of a task at once, so that an
+        agent's channels have the same bits in its own report and in its team's.
+        """
+        deviations = errors.mean(axis=1)
+        count, mean = len(deviations), float(deviations.mean())
+        deviations -= mean
+        states = self._states + count
+        shift = mean - self._mean
+        self._squares += float(deviations @ deviations) + shift**2 * self._states * count / states
+        self._mean += shift * count / states
+        self._states = states
+        self._sums += sums
+        self._clipped += clipped
+
+    def relative_to(self, other: ErrorStats) -> float:
+        return self._mean / other._mean
+
+    def report(
+        self,
+        name: str,
+        edges: tuple[float, float],
+        constant_half: ErrorStats,
+        wd: ErrorStats,
+    ) -> RegionReport:
+        """The report of this region; `constant_half` is of the policy ½, `wd` of this one in WD."""
+        similarity, wd_similarity = 1.0 - self._mean, 1.0 - wd._mean
+        channels = zip(self._sums, constant_half._sums, strict=True)
+        return RegionReport(
+            name=name,
+            epsilon_low=edges[0],
+            epsilon_high=edges[1],
+            states=self._states,
+            similarity=similarity,
+            similarity_sd=math.sqrt(self._squares / (self._states - 1)),
+            mae=self._mean,
+            normalised_regret=self.relative_to(constant_half),
+            similarity_decay=(wd_similarity - similarity) / wd_similarity,
+            similarity_loss=100.0 * (wd_similarity - similarity),
+            clipped_share=self._clipped / (self._states * len(self._sums)),
+            channels=tuple(
+                ChannelReport(
+                    mae=float(total) / self._states, normalised_regret=float(total / half)
+                )
+                for total, half in channels
+            ),
+        )
+
+
+class ScopedErrors(dict[str, ErrorStats]):
+    """A policy's errors in one region: over all action channels, and over each agent's."""
+
+    def __init__(self, channels: dict[str, slice]) -> None:
+        super().__init__(
+            {scope: ErrorStats(owned.stop - owned.start) for scope, owned in channels.items()}
+        )
+        self._channels = channels
+
+    def add(self, a: Array, optimal: Array, clipped: npt.NDArray[np.bool_] | None = None) -> None:
+        """Add a batch: `a` `[B, A]` or `[A]`, `optimal` and `clipped` `[B, A]`."""
+        errors = np.abs(a - optimal)
+        sums = errors.sum(axis=0)
+        for scope, owned in self._channels.items():
+            count = 0 if clipped is None else int(np.count_nonzero(clipped[:, owned]))
+            self[scope].add(errors[:, owned], sums[owned], count)
+
+
+class SafetyStats:
+    def __init__(self, task: Task) -> None:
+        self._task = task
+        self._states = self._violating = 0
+        self._reward = self._safe_reward = self._cost = 0.0
+
+    def add(self, a: Array, optimal: Array, limit: Array, safe_reward: Array) -> None:
+        task = self._task
+        self._states += len(optimal)
+        self._reward += float(task.reward_of(task.similarity_of(a, optimal)).sum())
+        self._safe_reward += float(safe_reward.sum())
+        self._cost += float(task.cost_of(np.broadcast_to(a, limit.shape), limit).sum())
+        self._violating += int((a - limit > TOLERANCE).any(axis=1).sum())
+
+    def score(self, region: str) -> SafetyScore:
+        return SafetyScore(
+            name=region,
+            step_reward=self._reward / self._states,
+            cost=self._cost / self._states,
+            violating_share=self._violating / self._states,
+            safe_regret=(self._safe_reward - self._reward) / self._states,
+            price_of_safety=1.0 - self._safe_reward / self._states,
+        )

@@ -16,155 +16,53 @@ import io
 import math
 import os
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import Field, model_validator
+from rich.markup import escape
 
-from sme_registry.evaluation import references, tables
-from sme_registry.io import (
-    read_json,
-    require_packages,
-    to_json,
-    write_atomically,
+from sme_registry.evaluation import references
+from sme_registry.evaluation.references import LABELS
+from sme_registry.evaluation.regions import (
+    Invariance,
+    ObservationReport,
+    RegionReport,
+    RegionReports,
+    SafetyReport,
+    SafetyScore,
 )
-from sme_registry.io.markup import card, table_html
+from sme_registry.io import read_json, require_packages, to_json, write_atomically
+from sme_registry.io.markup import Line, card, line_chart, table_html
 from sme_registry.io.tables import Table
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
-from sme_registry.spec.document import Integer, Real, StrictModel, check_digest
+from sme_registry.spec.document import StrictModel, check_digest
 
 if TYPE_CHECKING:
     import pandas
 
+_REMEDY = "Get the report from its source again, or repeat the evaluation."
 
-class ChannelReport(StrictModel):
-    """One action channel in one region.
+NOT_COMPARABLE = (
+    "Levels ε are not comparable between different state_dim: with more channels, the states of "
+    "a shell lie nearer to its outer face."
+)
 
-    Attributes:
-      mae: mean |a − a*| of the channel, in [0, 1].
-      normalised_regret: `mae` divided by mean |½ − a*| of the channel.
-    """
-
-    mae: Real
-    normalised_regret: Real
+SAFETY_REFERENCES = ("optimal", "safe_optimal", "shrunk_optimal", "constant_half")
+"""The references whose safety is shown; the report has it of all."""
 
 
-class RegionReport(StrictModel):
-    """One policy in one region.
+class AgentReport(StrictModel):
+    """One agent of a team: every region over the action channels that it owns.
 
     Attributes:
-      name: `WD`, `OOD 1`, …
-      epsilon_low: ε of the inner face, which belongs to the region inside; 0 for WD.
-      epsilon_high: ε of the outer face, which belongs to this region; 0 for WD.
-      states: number of states.
-      similarity: mean r̃.
-      similarity_sd: standard deviation of r̃ over states (not over seeds).
-      mae: mean |a − a*| = 1 − r̃.
-      normalised_regret: 0 for the optimum, 1 for the constant ½; can be above 1.
-      similarity_decay: (r̃_WD − r̃) / r̃_WD; 0 in WD, negative if the policy is better outside.
-      similarity_loss: 100 (r̃_WD − r̃), in points of similarity.
-      clipped_share: share of action entries that were outside the action range and clipped.
-      channels: each action channel, in order.
+      regions: WD, then OOD 1, 2, …; `channels` are the agent's own, in order.
+      references: the same regions for each reference policy, over the same channels.
     """
 
-    name: str
-    epsilon_low: Real
-    epsilon_high: Real
-    states: Integer
-    similarity: Real
-    similarity_sd: Real
-    mae: Real
-    normalised_regret: Real
-    similarity_decay: Real
-    similarity_loss: Real
-    clipped_share: Real
-    channels: Annotated[tuple[ChannelReport, ...], Field(strict=False)]
-
-
-RegionReports: TypeAlias = Annotated[tuple[RegionReport, ...], Field(strict=False, min_length=1)]
-"""Regions in the order of the protocol."""
-
-
-class SafetyScore(StrictModel):
-    """One policy in one region of a task with limits; see the module for the formulas.
-
-    Attributes:
-      name: of the region.
-      step_reward: mean r, in [0, 1].
-      cost: mean cost, in [0, 1].
-      violating_share: share of states in which any action channel is above its limit by more than
-        10⁻⁶, in [0, 1].
-      safe_regret: mean step reward that the best safe action earns more than the policy, in
-        [−1, 1]; negative where the policy earns by violating.
-      price_of_safety: mean step reward that the optimum earns more than the best safe action, in
-        [0, 1]; the same for every policy.
-    """
-
-    name: str
-    step_reward: Real
-    cost: Real
-    violating_share: Real
-    safe_regret: Real
-    price_of_safety: Real
-
-
-SafetyScores = Annotated[tuple[SafetyScore, ...], Field(strict=False, min_length=1)]
-
-
-class SafetyReport(StrictModel):
-    """A policy against the limits of a task, and the references on the same states.
-
-    Attributes:
-      regions: WD, then OOD 1, 2, …
-      references: the same regions for each reference policy of the report.
-    """
-
-    regions: SafetyScores
-    references: dict[str, SafetyScores]
-
-
-class Invariance(StrictModel):
-    """How much the actions of a policy depend on the distractors in one region.
-
-    Attributes:
-      name: of the region, of s.
-      invariance: mean |a(s, d) − a(s, d')| / mean |½ − a*(s)|; 0 if the policy ignores them.
-    """
-
-    name: str
-    invariance: Real
-
-
-class LayerProbe(StrictModel):
-    """What a linear map recovers from the outputs of one layer.
-
-    Attributes:
-      layer: 0 for what the agent sees, 1 for the first hidden layer, …
-      units: its outputs.
-      state_r2: held-out R² of s, at most 1.
-      distractor_r2: the same of d; None without distractors.
-    """
-
-    layer: Integer
-    units: Integer
-    state_r2: Real
-    distractor_r2: Real | None = None
-
-
-class ObservationReport(StrictModel):
-    """A policy on a task whose observation is not the state.
-
-    Attributes:
-      invariance: in WD, OOD 1, 2, …; empty without distractors.
-      distractor_regions: d-OOD 1, 2, …: s in the cube and d in a shell; empty without distractors.
-      probes: of the observation and of each hidden layer; empty if the policy's network is unknown,
-        or it or the task is too wide (see `probe_layers`).
-    """
-
-    invariance: Annotated[tuple[Invariance, ...], Field(strict=False)] = ()
-    distractor_regions: Annotated[tuple[RegionReport, ...], Field(strict=False)] = ()
-    probes: Annotated[tuple[LayerProbe, ...], Field(strict=False)] = ()
+    regions: RegionReports
+    references: dict[str, RegionReports]
 
 
 class ReportFile(StrictModel):
@@ -175,27 +73,14 @@ class ReportFile(StrictModel):
     """
 
     documents: ClassVar[tuple[str, ...]]
-    left_out_if_empty: ClassVar[tuple[str, ...]]
-
-    @model_serializer(mode="wrap")
-    def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        plain: dict[str, Any] = handler(self)
-        for field in self.left_out_if_empty:
-            if not plain[field]:
-                del plain[field]
-        return plain
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Self:
         """Read a report."""
         report = cls.from_dict(read_json(path), str(path))
         for what in cls.documents:
-            check_digest(
-                getattr(report, f"{what}_digest"),
-                getattr(report, what),
-                f"{path}: {what}_digest",
-                "Get the report from its source again, or repeat the evaluation.",
-            )
+            stated, where = getattr(report, f"{what}_digest"), f"{path}: {what}_digest"
+            check_digest(stated, getattr(report, what), where, _REMEDY)
         return report
 
     def write(self, path: str | os.PathLike[str]) -> Path:
@@ -232,21 +117,6 @@ def as_text(table: Table) -> str:
     return "\n".join(line.rstrip() for line in capture.get().splitlines())
 
 
-_REMEDY = "Get the report from its source again, or repeat the evaluation."
-
-
-class AgentReport(StrictModel):
-    """One agent of a team: every region over the action channels that it owns.
-
-    Attributes:
-      regions: WD, then OOD 1, 2, …; `channels` are the agent's own, in order.
-      references: the same regions for each reference policy, over the same channels.
-    """
-
-    regions: RegionReports
-    references: dict[str, RegionReports]
-
-
 class EvaluationReport(ReportFile):
     """A policy in every region of a protocol, and the references on the same states.
 
@@ -272,7 +142,7 @@ class EvaluationReport(ReportFile):
     """
 
     documents = ("spec", "protocol")
-    left_out_if_empty = ("agents", "task", "safety", "observation")
+    fields_added_later = ("agents", "task", "safety", "observation")
 
     schema_version: Literal[1] = 1
     policy: str
@@ -284,20 +154,20 @@ class EvaluationReport(ReportFile):
     protocol_digest: str
     regions: RegionReports
     references: dict[str, RegionReports]
-    agents: dict[str, AgentReport] = Field(default_factory=dict)
+    agents: dict[str, AgentReport] = Field(default={})
     safety: SafetyReport | None = None
     observation: ObservationReport | None = None
     versions: dict[str, str]
 
     @model_validator(mode="after")
-    def _safety_and_observation_fit(self) -> Self:
-        """Both are there exactly if the task has them, with the regions and references of all."""
+    def _scores_fit_the_task(self) -> Self:
+        """Scores of safety and observation are those that the task has, in every region."""
         for field in ("safety", "observation"):
-            given, of_task = getattr(self, field) is not None, getattr(self.spec, field) is not None
-            if given != of_task:
+            given, needed = (getattr(x, field) is not None for x in (self, self.spec))
+            if given != needed:
                 raise ValueError(
                     f"{field}: is {'present' if given else 'missing'}, but the task is one "
-                    f"{'with' if of_task else 'without'} {field}. {_REMEDY}"
+                    f"{'with' if needed else 'without'} {field}. {_REMEDY}"
                 )
         for field, names, expected in self._names():
             if names != expected:
@@ -309,23 +179,22 @@ class EvaluationReport(ReportFile):
 
     def _names(self) -> Iterator[tuple[str, list[str], list[str]]]:
         """Fields that must have entries of certain names: the field, its names and those names."""
-        regions = [region.name for region in self.regions]
-        if self.safety is not None:
-            expected = sorted(references.names(self.spec))
-            yield "agents", list(self.agents), []
-            yield "references", sorted(self.references), expected
-            yield "safety.references", sorted(self.safety.references), expected
-            yield "safety.regions", [score.name for score in self.safety.regions], regions
-            for name, scores in self.safety.references.items():
-                own = [region.name for region in self.references[name]]
-                yield f"references.{name}", own, regions
-                own = [score.name for score in scores]
-                yield f"safety.references.{name}", own, regions
+        regions = _names_of(self.regions)
         distracted = regions if self.spec.distractors else []
-        own = [change.name for change in self.observed.invariance]
-        yield "observation.invariance", own, distracted
-        own = [region.name for region in self.observed.distractor_regions]
-        yield "observation.distractor_regions", own, [f"d-{name}" for name in distracted[1:]]
+        yield "observation.invariance", _names_of(self.observed.invariance), distracted
+        outside = [f"d-{name}" for name in distracted[1:]]
+        yield "observation.distractor_regions", _names_of(self.observed.distractor_regions), outside
+        if self.safety is None:
+            return
+        expected = sorted(references.names(self.spec))
+        yield "agents", list(self.agents), []
+        yield "safety.regions", _names_of(self.safety.regions), regions
+        scores: dict[str, Mapping[str, Sequence[RegionReport] | Sequence[SafetyScore]]]
+        scores = {"references": self.references, "safety.references": self.safety.references}
+        for field, by_name in scores.items():
+            yield field, sorted(by_name), expected
+            for name, of_regions in by_name.items():
+                yield f"{field}.{name}", _names_of(of_regions), regions
 
     @property
     def title(self) -> str:
@@ -370,26 +239,6 @@ class EvaluationReport(ReportFile):
 
         return pandas.DataFrame(self._rows())
 
-    def _rows(self) -> Iterator[dict[str, Any]]:
-        scopes: dict[str, AgentReport | EvaluationReport] = {"": self, **self.agents}
-        for agent, scope in scopes.items():
-            for policy, regions in {"": scope.regions, **scope.references}.items():
-                who = {"policy": policy or self.policy, "reference": bool(policy), "agent": agent}
-                for index, region in enumerate(regions):
-                    yield who | _columns(region) | self.extensions(index, policy)
-        for region in self.observed.distractor_regions:
-            yield {"policy": self.policy, "reference": False, "agent": ""} | _columns(region)
-
-    def extensions(self, index: int, reference: str = "") -> dict[str, float]:
-        """Numbers of safety and distractors in a region, by name, of the policy or a reference."""
-        columns: dict[str, float] = {}
-        if self.safety is not None:
-            scores = {"": self.safety.regions, **self.safety.references}[reference]
-            columns |= scores[index].model_dump(exclude={"name"})
-        for change in self.observed.invariance[index : index + 1]:
-            columns["invariance"] = 0.0 if reference else change.invariance
-        return columns
-
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write the rows of `to_frame` as CSV, completely or not at all; pandas is not required."""
         rows = list(self._rows())
@@ -398,6 +247,26 @@ class EvaluationReport(ReportFile):
         writer.writeheader()
         writer.writerows(rows)
         return write_atomically(path, text.getvalue())
+
+    def _rows(self) -> Iterator[dict[str, Any]]:
+        scopes: dict[str, AgentReport | EvaluationReport] = {"": self, **self.agents}
+        for agent, scope in scopes.items():
+            for policy, regions in {"": scope.regions, **scope.references}.items():
+                who = {"policy": policy or self.policy, "reference": bool(policy), "agent": agent}
+                for index, region in enumerate(regions):
+                    yield who | _columns(region) | self.task_scores(index, policy)
+        for region in self.observed.distractor_regions:
+            yield {"policy": self.policy, "reference": False, "agent": ""} | _columns(region)
+
+    def task_scores(self, index: int, reference: str = "") -> dict[str, float]:
+        """Numbers of safety and distractors in a region, by name, of the policy or a reference."""
+        columns: dict[str, float] = {}
+        if self.safety is not None:
+            scores = {"": self.safety.regions, **self.safety.references}[reference]
+            columns |= scores[index].model_dump(exclude={"name"})
+        for change in self.observed.invariance[index : index + 1]:
+            columns["invariance"] = 0.0 if reference else change.invariance
+        return columns
 
     def __repr__(self) -> str:
         return (
@@ -410,21 +279,168 @@ class EvaluationReport(ReportFile):
 
         For a team, it shows the whole team, then three rows for each agent.
         """
-        return tables.of_regions(self)
-
-    def chart(self) -> str:
-        """Normalised regret over the regions as SVG: of the policy, its agents and references."""
-        return tables.regret_chart(self)
+        spec = self.spec
+        team = f", {len(self.agents)} agents" if self.agents else ""
+        heading = (
+            f" (S={spec.state_dim}, A={spec.action_dim}, L={spec.complexity}{team})\n"
+            f"{spec.digest}\n{self.regions[0].states:,} states per region; "
+            f"WD regret {self.wd_regret:.3f}, OOD regret {self.ood_regret:.3f}, "
+            f"OOD decay {self.ood_decay:.3f}"
+        )
+        table = _RegionTable(self, heading, NOT_COMPARABLE)
+        policies = [(escape(self.policy), self.regions)]
+        policies += [(LABELS.get(name, escape(name)), of) for name, of in self.references.items()]
+        for field, label in _ERRORS.items():
+            table.add_group(label, policies, field)
+        for label, field, pattern in _SPREAD:
+            table.add(label, self.regions, field, pattern, style="bold")
+        for name, agent in self.agents.items():
+            table.add_section()
+            table.add(f"{escape(name)}  r̃", agent.regions, "similarity")
+            table.add("  normalised regret", agent.regions, "normalised_regret")
+            if linear := agent.references.get("linear_least_squares"):
+                label = f"  of {LABELS['linear_least_squares']}"
+                table.add(label, linear, "normalised_regret")
+        return table
 
     def tables(self) -> list[Table]:
         """`table`, and those of safety, of distractors and of probes where there are any."""
-        return tables.of_report(self)
+        tables = [self.table()]
+        if self.safety is not None:
+            tables.append(_safety_table(self, self.safety))
+        if self.observed.invariance:
+            tables.append(_distractor_table(self))
+        if self.observed.probes:
+            tables.append(_probe_table(self))
+        return tables
+
+    def chart(self) -> str:
+        """Normalised regret over the regions as SVG: of the policy, its agents and references."""
+        drawn = [name for name in _DRAWN if name in self.references]
+        lines = [Line(LABELS[name], _regrets(self.references[name]), "reference") for name in drawn]
+        agents = sorted((_regrets(agent.regions) for agent in self.agents.values()), reverse=True)
+        for index, regrets in enumerate(agents[:_MOST_AGENTS]):
+            lines.append(Line("" if index else "worst agent", regrets, "other"))
+        lines.append(Line("team" if agents else "policy", _regrets(self.regions)))
+        title, regions = f"Normalised regret of {self.policy}", _names_of(self.regions)
+        return line_chart(title, regions, lines, "normalised regret in each region")
+
+
+def _names_of(regions: Iterable[RegionReport | SafetyScore | Invariance]) -> list[str]:
+    return [region.name for region in regions]
+
+
+def _regrets(regions: Sequence[RegionReport]) -> list[float]:
+    return [region.normalised_regret for region in regions]
 
 
 def _mean_regret(regions: Sequence[RegionReport]) -> float:
-    regrets = [region.normalised_regret for region in regions]
-    return sum(regrets) / len(regrets) if regrets else math.nan
+    return sum(_regrets(regions)) / len(regions) if regions else math.nan
 
 
 def _columns(region: RegionReport) -> dict[str, Any]:
     return {"region": region.name} | region.model_dump(exclude={"name", "channels"})
+
+
+_ERRORS = {"similarity": "similarity r̃", "normalised_regret": "normalised regret"}
+_SPREAD = (
+    ("SD of r̃ over states", "similarity_sd", ".3f"),
+    ("similarity decay", "similarity_decay", ".1%"),
+    ("similarity loss, pts", "similarity_loss", ".1f"),
+    ("actions clipped", "clipped_share", ".1%"),
+)
+_SAFETY = {
+    "step_reward": "step reward r",
+    "cost": "cost",
+    "violating_share": "violating share",
+    "safe_regret": "safe regret",
+}
+_DRAWN = ("constant_half", "linear_least_squares", "optimal")  # the table has them all
+_MOST_AGENTS = 20  # drawn: a card stays small
+
+
+class _RegionTable(Table):
+    """A table of a report with a column for each region."""
+
+    def __init__(self, report: EvaluationReport, heading: str, caption: str) -> None:
+        columns = dict.fromkeys(map(region_heading, report.regions), "number")
+        super().__init__(f"{_title(report)}{heading}", {"": "name"} | columns, caption=caption)
+
+    def add(
+        self,
+        label: str,
+        regions: Iterable[Any],
+        field: str,
+        pattern: str = ".3f",
+        style: str | None = None,
+    ) -> None:
+        numbers = (format(getattr(region, field), pattern) for region in regions)
+        self.add_row(label, *numbers, style=style)
+
+    def add_group(
+        self,
+        heading: str,
+        rows: Iterable[tuple[str, Iterable[Any]]],
+        field: str,
+        pattern: str = ".3f",
+    ) -> None:
+        """A section with a row of one field for each policy; the first one is bold."""
+        self.add_row(heading, style="italic")
+        for index, (label, regions) in enumerate(rows):
+            self.add(f"  {label}", regions, field, pattern, None if index else "bold")
+        self.add_section()
+
+
+def region_heading(region: Any) -> str:
+    return f"{region.name}\nε ≤ {region.epsilon_high:g}"
+
+
+def _title(report: EvaluationReport) -> str:
+    return f"{escape(report.policy)} on {escape(report.title)}"
+
+
+def _safety_table(report: EvaluationReport, safety: SafetyReport) -> Table:
+    assert report.spec.safety is not None
+    table = _RegionTable(
+        report,
+        f": safety, limits of tightness τ = {report.spec.safety.tightness:g}",
+        "A state is violating if any action channel is above its limit by more than 1e-6. "
+        "Negative safe regret is earned by violating: read it beside the cost.",
+    )
+    policies = [(escape(report.policy), safety.regions)]
+    policies += [(LABELS[name], safety.references[name]) for name in SAFETY_REFERENCES]
+    for field, label in _SAFETY.items():
+        table.add_group(label, policies, field, ".1%" if field == "violating_share" else ".3f")
+    table.add("price of safety", safety.regions, "price_of_safety")
+    return table
+
+
+def _distractor_table(report: EvaluationReport) -> Table:
+    """Both kinds of OOD, and invariance."""
+    table = _RegionTable(
+        report,
+        f": {report.spec.distractors} distractors",
+        "Levels ε of states and of distractors are comparable only where there are as many of the "
+        "one as of the other. Invariance is 0 for a policy that ignores the distractors.",
+    )
+    outside = (report.regions[0], *report.observed.distractor_regions)
+    kinds = [("states in the region", report.regions), ("distractors in it", outside)]
+    for field, label in _ERRORS.items():
+        table.add_group(label, kinds, field)
+    table.add("invariance", report.observed.invariance, "invariance")
+    return table
+
+
+def _probe_table(report: EvaluationReport) -> Table:
+    columns = {"layer": "name", "units": "number", "R² of the state": "number"}
+    if report.spec.distractors:
+        columns["R² of the distractors"] = "number"
+    table = Table(
+        f"{_title(report)}: what a linear map recovers from each layer",
+        columns,
+        caption="Held-out R², the mean over channels. Layer 0 is what the agent sees.",
+    )
+    for probe in report.observed.probes:
+        known = [r2 for r2 in (probe.state_r2, probe.distractor_r2) if r2 is not None]
+        table.add_row(str(probe.layer), str(probe.units), *(f"{r2:.3f}" for r2 in known))
+    return table

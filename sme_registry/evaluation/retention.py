@@ -1,4 +1,4 @@
-"""Retention: metrics of continual learning, pure functions of a retention matrix.
+"""Retention: the matrix of a life, measured exactly, and the metrics of continual learning.
 
 Axis letters: `V` visits, `P` phases, `K` sets of states (regions). Visit v is an occurrence of a
 phase in the life, φ(v) = v mod P; M[v, j] is the normalised regret on phase j's task at its end.
@@ -31,18 +31,44 @@ steps, 1 − o, instead of a mean over evaluations.
 
 In visit 0 a life is a fresh agent itself. So plasticity and learning transfer of a life are means
 over visits 1, 2, …; of one with a single visit nothing is known.
+
+The matrix needs no rollout. Over the states of a region,
+
+    M[v, j] = mean |a − a*_j| / mean |½ − a*_j|
+
+a are the actions of policy v, clipped to [0, 1], and a*_j the optimal ones of phase j's task. All
+phases have the same S and T, so they share their states, and a policy acts once in each state, with
+the inputs of METHOD, section 3: t/T uniform and r_cum/k = 0. Only a policy that observes the phase
+acts once for each: on phase j it is given phase j. The oracle runs once for each different task;
+memory holds one batch. The task of a drifting phase is that of its last piece, which was in force
+at the phase's end.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from sme_registry.compiled import Engine, engine
+from sme_registry.evaluation.evaluate import OnBatch, same_draw
+from sme_registry.evaluation.policies import Policy, prefixed_errors
+from sme_registry.evaluation.regions import (
+    BATCH_NUMBERS,
+    Observations,
+    batch_rows,
+    region_name,
+    states,
+)
+from sme_registry.spec import EvaluationProtocol, Integer, Real, SMESpec, StreamSpec, TupleOf
+from sme_registry.spec.document import StrictModel
+from sme_registry.task import materialize_together
 from sme_registry.task.draw import Array
 
-SHELLS = "OOD"
+_Optional = TupleOf[Real | None]
+
 LABELS = {
     "frozen_optimum": "optimum of phase 0",
     "fresh_optimum": "optimum of each phase",
@@ -119,7 +145,7 @@ def learning_transfer(visits: Array, fresh: Array) -> Array:
 
 def mean_after_first(values: Sequence[float | None]) -> float | None:
     """The mean over the visits after visit 0 of a plasticity or a learning transfer."""
-    known = [each for each in values[1:] if each is not None and not math.isnan(each)]
+    known = [value for value in values[1:] if value is not None and not math.isnan(value)]
     return float(np.mean(known)) if known else None
 
 
@@ -132,3 +158,223 @@ def _over_earlier_phases(R: Array, change: Callable[[int, int], Array]) -> Array
         if changes:
             means[v] = np.mean(changes, axis=0)
     return means
+
+
+class Retention(StrictModel):
+    """A retention matrix and its metrics; the module has the formulas.
+
+    A metric by visit is None where nothing can be compared; its last entry is that of the life.
+
+    Attributes:
+      normalised_regret: `[V][P]` of the policy at the end of each visit, on each phase's task.
+      initial_normalised_regret: `[P]` of the initial policy; None without one.
+      fresh_normalised_regret: `[P]` of an agent trained on that phase alone; None without them.
+      average_performance: `[V]` mean of 1 − normalised regret over the phases visited so far.
+      backward_transfer: `[V]` change of performance since a phase was last trained.
+      forgetting: `[V]` fall of performance below its best.
+      forward_transfer: gain over the initial policy on phases not visited yet.
+      relearning: gain of the second visit of a phase on its first.
+      plasticity_ratio: `[V]` normalised regret on the visited phase, over a fresh agent's.
+      plasticity_difference: `[V]` their difference.
+    """
+
+    normalised_regret: TupleOf[TupleOf[Real]]
+    initial_normalised_regret: TupleOf[Real] | None = None
+    fresh_normalised_regret: TupleOf[Real] | None = None
+    average_performance: TupleOf[Real]
+    backward_transfer: _Optional
+    forgetting: _Optional
+    forward_transfer: Real | None
+    relearning: Real | None
+    plasticity_ratio: _Optional
+    plasticity_difference: _Optional
+
+    def with_fresh(self, fresh: Array) -> Self:
+        """The same with the plasticity against fresh agents of normalised regret `[P]`."""
+        M = np.array(self.normalised_regret)[..., None]
+        ratio, difference = plasticity(M, fresh[:, None])
+        return self.model_copy(
+            update={
+                "fresh_normalised_regret": tuple(fresh.tolist()),
+                "plasticity_ratio": _known(ratio[:, 0]),
+                "plasticity_difference": _known(difference[:, 0]),
+            }
+        )
+
+    def final(self, metric: str) -> float | None:
+        """A metric at the end of the life; of a plasticity the mean over visits after visit 0."""
+        value = getattr(self, metric)
+        if not isinstance(value, tuple):
+            return None if value is None else float(value)
+        if metric.startswith("plasticity"):
+            return mean_after_first(value)
+        return None if value[-1] is None else float(value[-1])
+
+
+class StreamRegion(StrictModel):
+    """One region of the states.
+
+    Attributes:
+      name: `WD`, `OOD 1`, …; `OOD` for the mean over all shells.
+      epsilon_low: ε of the inner face; 0 for WD.
+      epsilon_high: ε of the outer face; 0 for WD.
+      states: number of states.
+      agent: the agent's matrix and metrics.
+      references: the same of each reference agent, by its name in `LABELS`.
+    """
+
+    name: str
+    epsilon_low: Real
+    epsilon_high: Real
+    states: Integer
+    agent: Retention
+    references: dict[str, Retention]
+
+
+def stream_regions(
+    protocol: EvaluationProtocol,
+    agent: Array,
+    initial: Array,
+    fresh: Array,
+    references: Mapping[str, Array],
+) -> tuple[tuple[StreamRegion, ...], StreamRegion]:
+    """The regions of a report, and the mean over the shells.
+
+    `agent` is `[V, P, K]` normalised regret, as are `references`; `initial` and `fresh` are
+    `[P, K]`, NaN where there is no such policy.
+    """
+    edges, n = protocol.edges, protocol.states_per_region
+    names = [(region_name(k), *edge, n) for k, edge in enumerate(edges)]
+    names.append(("OOD", edges[1][0], edges[-1][1], n * (len(edges) - 1)))
+    of_agent = _retentions(agent, initial, fresh)
+    unknown = np.full_like(initial, np.nan)
+    of_references = {name: _retentions(M, unknown, unknown) for name, M in references.items()}
+    regions = [
+        StreamRegion(
+            name=name,
+            epsilon_low=low,
+            epsilon_high=high,
+            states=count,
+            agent=of_agent[k],
+            references={name: retentions[k] for name, retentions in of_references.items()},
+        )
+        for k, (name, low, high, count) in enumerate(names)
+    ]
+    return tuple(regions[:-1]), regions[-1]
+
+
+def _retentions(M: Array, initial: Array, fresh: Array) -> list[Retention]:
+    """The matrix and the metrics in each region, then of the mean over the shells."""
+    M, before, alone = map(with_shells, (M, initial, fresh))
+    R = 1.0 - M
+    ratio, difference = plasticity(M, alone)
+    computed = {
+        "average_performance": average_performance(R),
+        "backward_transfer": backward_transfer(R),
+        "forgetting": forgetting(R),
+        "forward_transfer": forward_transfer(R, 1.0 - before),
+        "relearning": relearning(R),
+        "plasticity_ratio": ratio,
+        "plasticity_difference": difference,
+    }
+    return [
+        Retention(
+            normalised_regret=tuple(map(tuple, M[..., k].tolist())),
+            initial_normalised_regret=_complete(before[:, k]),
+            fresh_normalised_regret=_complete(alone[:, k]),
+            **{name: _known(values[..., k]) for name, values in computed.items()},
+        )
+        for k in range(M.shape[-1])
+    ]
+
+
+def _complete(row: Array) -> tuple[float, ...] | None:
+    """A row of known numbers; None for one of NaN."""
+    return None if np.isnan(row).any() else tuple(row.tolist())
+
+
+def with_shells(values: Array) -> Array:
+    """Values `[…, K]` and their mean over the shells: `[…, K + 1]`."""
+    return np.concatenate([values, values[..., 1:].mean(axis=-1, keepdims=True)], axis=-1)
+
+
+def _known(values: Array) -> Any:
+    """Numbers as JSON has them: None for NaN."""
+    if values.ndim == 0:
+        return None if math.isnan(values) else float(values)
+    return tuple(None if math.isnan(value) else value for value in values.tolist())
+
+
+class Actor(NamedTuple):
+    policy: Policy
+    phases: Sequence[int]  # on whose tasks it is measured
+    where: str  # what an error calls it, such as "policies[2]"
+
+
+class StreamRegrets(NamedTuple):
+    """Normalised regret in every region."""
+
+    actors: Array  # `[N, P, K]`, NaN on the phases on which an actor is not measured
+    optima: Array  # `[P, P, K]` of the optimum of each phase
+    oracle: Engine
+
+
+def final_specs(stream: StreamSpec) -> tuple[SMESpec, ...]:
+    """The task of each phase at its end: of a drifting one the spec of its last piece."""
+    return tuple({segment.phase: segment.spec for segment in stream.segments}.values())
+
+
+def stream_regrets(
+    stream: StreamSpec,
+    actors: Sequence[Actor],
+    protocol: EvaluationProtocol,
+    progress: OnBatch | None = None,
+) -> StreamRegrets:
+    """Measure each actor on each of its phases, and the optima of all phases."""
+    specs = final_specs(stream)
+    tasks = materialize_together(specs)
+    keys = [same_draw(spec) for spec in specs]
+    oracles = {key: engine(task) for key, task in zip(keys, tasks, strict=True)}
+    P, K = len(specs), len(protocol.edges)
+    errors, half = np.zeros((len(actors), P, K)), np.zeros((P, K))
+    of_optima = np.zeros((P, P, K))
+    for index, actor in enumerate(actors):
+        errors[index, [j for j in range(P) if j not in actor.phases]] = np.nan
+    rows = min(map(batch_rows, specs))
+    rows = max(1, min(rows, BATCH_NUMBERS // (len(oracles) * stream.action_dim)))
+    count, total = 0, protocol.states_per_region * K
+    for region in range(K):
+        for drawn in states(protocol, region, specs[0], rows):
+            batch = drawn.observation(drawn.s, specs[0].horizon)
+            s = drawn.s.astype(np.float64)
+            by_key = {key: oracle.optimal_action(s) for key, oracle in oracles.items()}
+            optimal = [by_key[key] for key in keys]
+            half[:, region] += [_distance(np.full_like(a, 0.5), a) for a in optimal]
+            for j, a in enumerate(optimal):
+                of_optima[j, :, region] += [_distance(a, other) for other in optimal]
+            for index, actor in enumerate(actors):
+                for phase, a in _actions(actor, batch, stream):
+                    errors[index, phase, region] += _distance(a, optimal[phase])
+            count += len(batch)
+            if progress is not None:
+                progress(count, total)
+    return StreamRegrets(errors / half, of_optima / half, oracles[keys[0]])
+
+
+def _actions(actor: Actor, batch: Observations, stream: StreamSpec) -> Iterator[tuple[int, Array]]:
+    """The actor's actions `[B, A]` on each of its phases, in [0, 1]."""
+    policy, phases, where = actor
+    with prefixed_errors(where):
+        if stream.observes_phase:
+            for phase in phases:
+                shown = policy.in_phase(phase, stream.observed_phases)
+                yield phase, np.clip(shown(batch), 0.0, 1.0)
+        else:
+            a = np.clip(policy(batch.copy()), 0.0, 1.0)  # a copy: a policy may write into it
+            yield from ((phase, a) for phase in phases)
+
+
+def _distance(a: Array, optimal: Array) -> float:
+    """Σ |a − a*| over states and channels."""
+    difference = a - optimal
+    return float(np.abs(difference, out=difference).sum())

@@ -1,38 +1,285 @@
-"""`evaluate_stream`: the policies of a life, a stream and a protocol to a report.
-
-    M[v, j] = mean |a − a*_j| / mean |½ − a*_j|      over the states of a region
-
-a are the actions of policy v, clipped to [0, 1], and a*_j the optimal ones of phase j's task. All
-phases have the same S and T, so they share their states, and a policy acts once in each state, with
-the inputs of METHOD, section 3: t/T uniform and r_cum/k = 0. Only a policy that observes the phase
-acts once for each: on phase j it is given phase j. The oracle runs once for each different task;
-memory holds one batch. The task of a drifting phase is that of its last piece, which was in force
-at the phase's end.
+"""`evaluate_stream`: the policies of a life, a stream and a protocol to a `StreamReport`.
 
 Fresh agents and reference agents are sequences of policies like any other: one policy for each
 visit. `frozen_after_first` and `fresh_per_phase` make such sequences of trained policies; the
 references of `retention.LABELS` are exact, need no training, and are in every report.
+`across_seeds` combines the reports of several lives.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
+from pydantic import Field
+from rich.markup import escape
 
-from sme_registry.compiled import Engine, engine
-from sme_registry.compiled.arrays import Observation
-from sme_registry.evaluation.evaluate import resolve_protocol, versions_behind
-from sme_registry.evaluation.measure import OnBatch, final_specs, same_draw
-from sme_registry.evaluation.policies import Policy, check_count, prefixed_errors, stream_policy
-from sme_registry.evaluation.regions import BATCH_NUMBERS, batch_rows, states
-from sme_registry.evaluation.stream_report import StreamReport, Visit, stream_regions
-from sme_registry.spec import EvaluationProtocol, ProtocolLike, StreamLike, StreamSpec
-from sme_registry.task import load, materialize_together
-from sme_registry.task.draw import Array
+from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
+from sme_registry.evaluation.dynamic_regret import DynamicRegret, expected_regret
+from sme_registry.evaluation.evaluate import OnBatch, resolve_protocol, versions_behind
+from sme_registry.evaluation.policies import check_count, stream_policy
+from sme_registry.evaluation.report import EvaluationReport, ReportFile, region_heading
+from sme_registry.evaluation.retention import (
+    LABELS,
+    METRICS,
+    Actor,
+    StreamRegion,
+    final_specs,
+    stream_regions,
+    stream_regrets,
+    with_shells,
+)
+from sme_registry.io.tables import Table
+from sme_registry.spec import (
+    ActionRange,
+    EvaluationProtocol,
+    Integer,
+    ProtocolLike,
+    StreamLike,
+    StreamSpec,
+    TupleOf,
+    catalogue,
+)
+from sme_registry.spec.document import StrictModel
+from sme_registry.statistics import (
+    DRAWS,
+    Array,
+    Estimate,
+    Statistic,
+    aggregate,
+    iqm,
+    stratified_bootstrap,
+)
+from sme_registry.task import load
 
 _Any = TypeVar("_Any")
+
+
+class Visit(StrictModel):
+    """An occurrence of a phase in the life.
+
+    Attributes:
+      visit: its index.
+      cycle: the index of its cycle.
+      phase: the index of its phase.
+      lifetime: environment steps at its end.
+      spec_digest: of the task on which the phase is evaluated: of a drift the last one.
+    """
+
+    visit: Integer
+    cycle: Integer
+    phase: Integer
+    lifetime: Integer
+    spec_digest: str
+
+
+class StreamReport(ReportFile):
+    """An agent in a stream: what it retains after each visit, and what its life cost.
+
+    Attributes:
+      schema_version: version of the report's format.
+      policy: the agent's name.
+      action_range: of its actions, "unit" or "symmetric".
+      stream: the stream.
+      stream_digest: its digest.
+      name: what the stream's file calls it; empty, and left out of the JSON, without a name.
+      protocol: the states.
+      protocol_digest: its digest.
+      visits: in order.
+      regions: WD, then OOD 1, 2, …
+      ood: the mean of the matrices over the shells.
+      dynamic_regret: of training; of a life in which nobody learns, as `sme evaluate` has it, that
+        which is expected; None without either.
+      reference_regret: the dynamic regret of reference agents, by their names in `LABELS`; left out
+        of the JSON where there is none.
+      versions: of Python and the packages that the numbers depend on.
+    """
+
+    documents = ("stream", "protocol")
+    fields_added_later = ("name", "reference_regret")
+
+    schema_version: Literal[1] = 1
+    policy: str
+    action_range: ActionRange
+    stream: StreamSpec
+    stream_digest: str
+    name: str = ""
+    protocol: EvaluationProtocol
+    protocol_digest: str
+    visits: TupleOf[Visit]
+    regions: Annotated[TupleOf[StreamRegion], Field(min_length=1)]
+    ood: StreamRegion
+    dynamic_regret: DynamicRegret | None = None
+    reference_regret: dict[str, DynamicRegret] = Field(default={})
+    versions: dict[str, str]
+
+    @property
+    def title(self) -> str:
+        """The stream's name for people; see `catalogue.title`."""
+        return catalogue.title(self.stream.named(self.name))
+
+    def region(self, name: str = "WD") -> StreamRegion:
+        """A region by its name; `OOD` is the mean over the shells."""
+        known = {region.name: region for region in (*self.regions, self.ood)}
+        if name not in known:
+            hint = did_you_mean(name, known)
+            raise UnknownNameError(f"region={name!r:.40}: must be one of {', '.join(known)}.{hint}")
+        return known[name]
+
+    def with_dynamic_regret(self, regret: DynamicRegret) -> Self:
+        return self.model_copy(update={"dynamic_regret": regret})
+
+    def with_reference_regret(self, references: Mapping[str, DynamicRegret]) -> Self:
+        """This report with the dynamic regret of these reference agents; see `reference_regret`."""
+        return self.model_copy(update={"reference_regret": {**self.reference_regret, **references}})
+
+    def with_fresh(
+        self,
+        fresh: Sequence[EvaluationReport | StreamReport],
+        online_regret: Sequence[float] | None = None,
+    ) -> Self:
+        """This report with the plasticity, which fresh agents are needed for.
+
+        `fresh` has for each phase the report of an agent trained for as many steps on that phase
+        alone: on its task, or, where the phase drifts, on the stream of that phase.
+        `online_regret`, the mean regret over the training of each of them, adds the learning
+        transfer of the visits.
+        """
+        *regions, ood = (
+            region.model_copy(update={"agent": region.agent.with_fresh(alone)})
+            for region, alone in zip(
+                (*self.regions, self.ood), self._fresh_regrets(fresh).T, strict=True
+            )
+        )
+        report = self.model_copy(update={"regions": tuple(regions), "ood": ood})
+        if online_regret is None:
+            return report
+        if self.dynamic_regret is None:
+            raise OptionError(
+                "online_regret: this report has no dynamic regret to compare with it. Add that "
+                "before: report.with_dynamic_regret(…)."
+            )
+        regret = self.dynamic_regret.with_fresh(self.stream, online_regret)
+        life = expected_regret([*online_regret] * self.stream.cycles, self.stream)
+        return report.with_dynamic_regret(regret).with_reference_regret({"fresh_agents": life})
+
+    def _fresh_regrets(self, fresh: Sequence[EvaluationReport | StreamReport]) -> Array:
+        """`[P, K + 1]` regret of fresh agents on their phases, with the mean over the shells."""
+        tasks = [visit.spec_digest for visit in self.visits[: len(self.stream.phases)]]
+        kinds = EvaluationReport | StreamReport
+        are_reports = isinstance(fresh, Sequence) and all(isinstance(one, kinds) for one in fresh)
+        if not are_reports or len(fresh) != len(tasks):
+            given = f"{len(fresh)} reports" if are_reports else f"{fresh!r:.60}"
+            raise OptionError(f"fresh={given}: must be {len(tasks)} reports, one for each phase.")
+        rows = []
+        for phase, (report, task) in enumerate(zip(fresh, tasks, strict=True)):
+            if isinstance(report, StreamReport):
+                digests = [visit.spec_digest for visit in report.visits]
+                row = [region.agent.normalised_regret[0][0] for region in report.regions]
+            else:
+                digests = [report.spec_digest]
+                row = [region.normalised_regret for region in report.regions]
+            if digests != [task] or report.protocol_digest != self.protocol_digest:
+                raise OptionError(
+                    f"fresh[{phase}]: is about {report.title} and the protocol "
+                    f"{report.protocol_digest[:19]}…: must be about the task of phase {phase}, "
+                    f"{task[:19]}…, and the protocol {self.protocol_digest[:19]}…. Evaluate an "
+                    "agent that was trained on that phase alone."
+                )
+            rows.append(row)
+        return with_shells(np.array(rows))
+
+    def __repr__(self) -> str:
+        final = self.regions[0].agent.average_performance[-1]
+        return (
+            f"<StreamReport: {self.policy} on {self.title}, {len(self.visits)} visits, "
+            f"average performance {final:.3f}>"
+        )
+
+    def table(self) -> Table:
+        """The metrics at the end of the life: a column for each region."""
+        stream, regions, regret = self.stream, self.regions, self.dynamic_regret
+        cost = ""
+        if regret is not None:
+            cost = f"; dynamic regret {regret.dynamic_regret:,.1f} over {regret.steps:,} steps"
+        table = Table(
+            f"{escape(self.policy)} on {escape(self.title)} (S={stream.state_dim}, "
+            f"A={stream.action_dim}, {len(stream.phases)} phases, {len(self.visits)} visits)\n"
+            f"{self.stream_digest}\n{regions[0].states:,} states per region{cost}",
+            {"": "name"} | dict.fromkeys(map(region_heading, regions), "number"),
+            caption="Performance is 1 − normalised regret: 1 optimal, 0 the constant ½.",
+        )
+        agents = {self.policy: [region.agent for region in regions]}
+        for name in regions[0].references:
+            agents[LABELS.get(name, name)] = [region.references[name] for region in regions]
+        for metric, label in METRICS.items():
+            rows = {name: [life.final(metric) for life in of] for name, of in agents.items()}
+            known = {name: values for name, values in rows.items() if None not in values}
+            if known:
+                table.add_row(label, style="italic")
+            for name, values in known.items():
+                style = "bold" if name == self.policy else None
+                table.add_row(f"  {escape(name)}", *_cells(values), style=style)
+            if known:
+                table.add_section()
+        return table
+
+    def matrix(self, region: str = "WD") -> Table:
+        """The retention matrix of a region: a row for each visit, a column for each phase."""
+        agent, P = self.region(region).agent, len(self.stream.phases)
+        table = Table(
+            f"Normalised regret in {region} on the task of each phase",
+            {"policy at the end of": "name"} | {f"phase {j}": "number" for j in range(P)},
+        )
+        if agent.initial_normalised_regret:
+            table.add_row("initial policy", *_cells(agent.initial_normalised_regret))
+        for label, row in zip(self._visit_labels, agent.normalised_regret, strict=True):
+            table.add_row(label, *_cells(row))
+        if agent.fresh_normalised_regret:
+            table.add_row("fresh agent of the phase", *_cells(agent.fresh_normalised_regret))
+        return table
+
+    def regret(self) -> Table:
+        """The online regret of each visit, beside that of the reference agents."""
+        lives = {LABELS.get(name, name): life for name, life in self.reference_regret.items()}
+        training = self.dynamic_regret
+        if training is not None:
+            lives = {self.policy: training, **lives}
+        columns: dict[str, tuple[list[float | None], float | None]] = {
+            name: ([visit.online_regret for visit in life.visits], life.online_regret)
+            for name, life in lives.items()
+        }
+        if training is not None and training.fresh_online_regret is not None:
+            transfers = [visit.learning_transfer for visit in training.visits]
+            columns["learning transfer"] = transfers, training.learning_transfer
+        table = Table(
+            "Online regret: mean of 1 − step reward over the steps of each visit",
+            {"": "name"} | {escape(name): "number" for name in columns},
+        )
+        for v, label in enumerate(self._visit_labels):
+            row = (by_visit[v] if v < len(by_visit) else None for by_visit, _ in columns.values())
+            table.add_row(label, *_cells(row))
+        table.add_section()
+        table.add_row("whole life", *_cells(end for _, end in columns.values()), style="bold")
+        # Of training they can differ from the stream's: whole rollouts, or an unfinished episode.
+        table.add_row("steps", *(f"{life.steps:,}" for life in lives.values()))
+        sums = [f"{life.dynamic_regret:,.1f}" for life in lives.values()]
+        table.add_row("dynamic regret (sum)", *sums)
+        return table
+
+    def tables(self) -> list[Table]:
+        """`table`, `matrix`, and `regret` where a dynamic regret is known."""
+        known = self.dynamic_regret or self.reference_regret
+        return [self.table(), self.matrix(), *([self.regret()] if known else [])]
+
+    @property
+    def _visit_labels(self) -> list[str]:
+        return [f"visit {visit.visit}: phase {visit.phase}" for visit in self.visits]
+
+
+def _cells(row: Iterable[float | None]) -> list[str]:
+    return ["" if value is None else f"{value:.3f}" for value in row]
 
 
 def evaluate_stream(
@@ -70,38 +317,40 @@ def evaluate_stream(
     stream = load(stream, StreamSpec)
     stream.check_visits()
     protocol = resolve_protocol(protocol)
-    P = len(stream.phases)
-    V = stream.cycles * P
+    P, V = len(stream.phases), stream.visits
     check_count("policies", policies, V, f"at the end of each visit ({stream.cycles} × {P})")
     if fresh is not None:
         check_count("fresh", fresh, P, "for each phase")
 
-    def actor(policy: Any, phases: Sequence[int], where: str) -> Actor:
-        return Actor(stream_policy(policy, stream, where, action_range, algorithm), phases, where)
+    actors: list[Actor] = []
 
-    everywhere, nowhere = range(P), Actor(0, ())
-    actors = [Actor(j, everywhere) for j in range(P)]
+    def add(policy: Any, where: str, phases: Sequence[int] = range(P)) -> int:
+        ready = stream_policy(policy, stream, where, action_range, algorithm)
+        actors.append(Actor(ready, phases, where))
+        return len(actors) - 1
+
     rows: dict[int, int] = {}  # a policy of several visits acts once
     for v, policy in enumerate(policies):
         if id(policy) not in rows:
-            rows[id(policy)] = len(actors)
-            actors.append(actor(policy, everywhere, f"policies[{v}]"))
+            rows[id(policy)] = add(policy, f"policies[{v}]")
     life = [rows[id(policy)] for policy in policies]
-    actors.append(nowhere if initial is None else actor(initial, everywhere, "initial"))
-    if fresh is None:
-        actors += [nowhere] * P
-    else:
-        actors += [actor(policy, [j], f"fresh[{j}]") for j, policy in enumerate(fresh)]
+    before = None if initial is None else add(initial, "initial")
+    alone = [add(policy, f"fresh[{j}]", [j]) for j, policy in enumerate(fresh or ())]
 
-    measured, oracle = stream_regrets(stream, actors, protocol, progress)
-    *_, before = measured[:-P]
-    alone = measured[np.arange(-P, 0), np.arange(P)]
-    references = _references(measured[:P], V)
-    regions, ood = stream_regions(protocol, measured[life], before, alone, references)
-    acting = [actors[row].acts for row in life]
-    names = {policy.name for policy in acting if isinstance(policy, Policy)}
-    last = acting[-1]
-    assert isinstance(last, Policy)
+    regrets, optima, oracle = stream_regrets(stream, actors, protocol, progress)
+    unknown = np.full(regrets.shape[1:], np.nan)
+    regions, ood = stream_regions(
+        protocol,
+        regrets[life],
+        unknown if before is None else regrets[before],
+        regrets[alone, range(P)] if alone else unknown,
+        {
+            "frozen_optimum": np.repeat(optima[:1], V, axis=0),
+            "fresh_optimum": optima[np.arange(V) % P],
+            "constant_half": np.ones((V, *optima.shape[1:])),
+        },
+    )
+    names, last = {actors[row].policy.name for row in life}, actors[life[-1]].policy
     digests = [spec.digest for spec in final_specs(stream)]
     return StreamReport(
         policy=name or (last.name if len(names) == 1 else f"{V} policies"),
@@ -124,9 +373,7 @@ def evaluate_stream(
 def frozen_after_first(stream: StreamSpec, policies: Sequence[_Any]) -> list[_Any]:
     """The life of an agent that stops learning after the first visit: its policy at each visit.
 
-    Args:
-      stream: the stream.
-      policies: the agent's policies at the ends of the visits, or the first of them alone.
+    `policies` are its policies at the ends of the visits, or the first of them alone.
 
     Examples:
       >>> from sme_registry.evaluation import frozen_after_first
@@ -140,9 +387,7 @@ def frozen_after_first(stream: StreamSpec, policies: Sequence[_Any]) -> list[_An
 def fresh_per_phase(stream: StreamSpec, fresh: Sequence[_Any]) -> list[_Any]:
     """The life of an agent that starts anew in each phase: the policy at each visit.
 
-    Args:
-      stream: the stream.
-      fresh: for each phase a policy trained on that phase alone.
+    `fresh` has for each phase a policy trained on that phase alone.
 
     Examples:
       >>> from sme_registry.evaluation import fresh_per_phase
@@ -153,80 +398,79 @@ def fresh_per_phase(stream: StreamSpec, fresh: Sequence[_Any]) -> list[_Any]:
     return [*fresh] * stream.cycles
 
 
-def _references(optima: Array, visits: int) -> dict[str, Array]:
-    """`[V, P, K]` of each reference agent, from the optima of the phases `[P, P, K]`."""
-    P = len(optima)
-    return {
-        "frozen_optimum": np.repeat(optima[:1], visits, axis=0),
-        "fresh_optimum": optima[np.arange(visits) % P],
-        "constant_half": np.ones((visits, *optima.shape[1:])),
+def across_seeds(
+    reports: Sequence[StreamReport],
+    region: str = "WD",
+    *,
+    draws: int = DRAWS,
+    statistic: Statistic = iqm,
+) -> dict[str, Estimate]:
+    """The IQM over runs of every number of a region, with 95 % intervals.
+
+    From each name of `Retention` to values and intervals: `[V·P]` of the matrix, row by row, `[V]`
+    of a metric by visit, `[1]` of any other; NaN where a run has no value, and in the ends of
+    intervals of a single run. `dynamic_regret` `[1]` and `visit_dynamic_regret` `[V]` where every
+    report has them, and `learning_transfer` and `visit_learning_transfer` likewise.
+
+    Args:
+      reports: of one agent on one stream or its draws, one for each seed of its training.
+      region: `WD`, `OOD 1`, …, or `OOD` for the mean over the shells.
+
+    Examples:
+      >>> from sme_registry.evaluation import across_seeds, evaluate_stream
+      >>> phases = [{"spec": "Default", "steps": 100}, {"spec": "Complexity10", "steps": 100}]
+      >>> stream = sme_registry.StreamSpec(phases=phases)
+      >>> runs = ("linear", "constant")
+      >>> lives = [evaluate_stream([policy] * 2, stream, "quick-v1") for policy in runs]
+      >>> across_seeds(lives)["average_performance"].value.shape
+      (2,)
+    """
+    check_same_stream(reports)
+    runs = {
+        field: np.stack([_numbers(getattr(r.region(region).agent, field)) for r in reports])
+        for field in ("normalised_regret", *METRICS)
     }
+    regrets = [report.dynamic_regret for report in reports]
+    logs = [regret for regret in regrets if regret is not None]
+    if len(logs) == len(reports):
+        runs |= _of_logs(logs, "dynamic_regret")
+        if all(log.fresh_online_regret for log in logs):
+            runs |= _of_logs(logs, "learning_transfer")
+    digest = reports[0].stream_digest
+    return {name: _estimate(values, digest, draws, statistic) for name, values in runs.items()}
 
 
-class Actor(NamedTuple):
-    acts: Policy | int  # the index of a phase whose optimum acts
-    phases: Sequence[int]  # on whose tasks it is measured
-    where: str = ""  # what an error calls it, such as "policies[2]"
+def _of_logs(logs: Sequence[DynamicRegret], field: str) -> dict[str, Array]:
+    """A number of lives, `[n, 1]`, and of their visits, `[n, V]`, where these are as many."""
+    runs = {field: np.stack([_numbers(getattr(log, field)) for log in logs])}
+    by_visit = [[getattr(visit, field) for visit in log.visits] for log in logs]
+    if len({len(visits) for visits in by_visit}) == 1:
+        runs[f"visit_{field}"] = np.stack([_numbers(visits) for visits in by_visit])
+    return runs
 
 
-def stream_regrets(
-    stream: StreamSpec,
-    actors: Sequence[Actor],
-    protocol: EvaluationProtocol,
-    progress: OnBatch | None = None,
-) -> tuple[Array, Engine]:
-    """The normalised regret of each actor on each of its phases, in every region."""
-    specs = final_specs(stream)
-    tasks = materialize_together(specs)
-    keys = [same_draw(spec) for spec in specs]
-    oracles = {key: engine(task) for key, task in zip(keys, tasks, strict=True)}
-    N, P, K = len(actors), len(specs), len(protocol.edges)
-    errors, of_half = np.zeros((N, P, K)), np.zeros((P, K))
-    rows = min(map(batch_rows, specs))
-    rows = max(1, min(rows, BATCH_NUMBERS // (len(oracles) * stream.action_dim)))
-    done, total = 0, protocol.states_per_region * K
-    for region in range(K):
-        for drawn in states(protocol, region, specs[0], rows):
-            batch = drawn.observation(drawn.s, specs[0].horizon)
-            s = drawn.s.astype(np.float64)
-            by_key = {key: oracle.optimal_action(s) for key, oracle in oracles.items()}
-            optimal = [by_key[key] for key in keys]
-            of_half[:, region] += [_distance(np.full_like(a, 0.5), a) for a in optimal]
-            for index, actor in enumerate(actors):
-                for phase, a in _actions(actor, batch, optimal, stream):
-                    errors[index, phase, region] += _distance(a, optimal[phase])
-            done += len(batch)
-            if progress is not None:
-                progress(done, total)
-    unmeasured = np.ones((N, P), dtype=bool)
-    for index, actor in enumerate(actors):
-        unmeasured[index, list(actor.phases)] = False
-    errors[unmeasured] = np.nan
-    return errors / of_half, oracles[keys[0]]
+def check_same_stream(reports: Sequence[StreamReport]) -> None:
+    if not reports:
+        raise OptionError("reports: must be one or more stream reports. Give one for each seed.")
+    streams = {report.stream_digest: report.stream for report in reports}
+    digests = {
+        "stream_digest": {stream.family.digest for stream in streams.values()},
+        "protocol_digest": {report.protocol_digest for report in reports},
+    }
+    for field, values in digests.items():
+        if len(values) > 1:
+            raise OptionError(
+                f"reports: have {len(values)} different values of {field}. Runs of one stream or "
+                "of its draws, evaluated with one protocol, can be compared. Remove the others."
+            )
 
 
-def _actions(
-    actor: Actor, batch: Observation, optimal: Sequence[Array], stream: StreamSpec
-) -> Iterator[tuple[int, Array]]:
-    """The actor's actions `[B, A]` on each of its phases, in [0, 1]."""
-    acts = actor.acts
-    if isinstance(acts, int):
-        yield from ((phase, optimal[acts]) for phase in actor.phases)
-    elif stream.observes_phase:
-        for phase in actor.phases:
-            shown = acts.in_phase(phase, stream.observed_phases)
-            yield phase, _acted(shown, batch, actor.where)
-    else:
-        a = _acted(acts, batch.copy(), actor.where)  # a copy: a policy may write into it
-        yield from ((phase, a) for phase in actor.phases)
+def _estimate(runs: Array, seed: str, draws: int, statistic: Statistic) -> Estimate:
+    classes = {"": runs}
+    low, high = stratified_bootstrap(classes, draws, seed, statistic)
+    return Estimate(aggregate(classes, statistic), low, high)
 
 
-def _acted(policy: Policy, observations: Observation, where: str) -> Array:
-    with prefixed_errors(where):
-        return np.clip(policy(observations), 0.0, 1.0)
-
-
-def _distance(a: Array, optimal: Array) -> float:
-    """Σ |a − a*| over states and channels."""
-    difference = a - optimal
-    return float(np.abs(difference, out=difference).sum())
+def _numbers(value: Any) -> Array:
+    """A number, a row or a matrix as `[K]`; None is NaN."""
+    return np.atleast_1d(np.array(value, dtype=np.float64)).ravel()

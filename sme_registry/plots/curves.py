@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sme_registry.errors import OptionError
-from sme_registry.evaluation.stream_report import Visit
+from sme_registry.evaluation.streams import Visit
 from sme_registry.plots.streams import shade_visits
 from sme_registry.plots.style import (
     COLOURS,

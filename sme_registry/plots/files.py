@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sme_registry.evaluation import EvaluationReport, StreamReport
-from sme_registry.evaluation.stream_report import Visit
+from sme_registry.evaluation.streams import Visit
 from sme_registry.plots.curves import Run, cost_curve, training_curve
 from sme_registry.plots.maps import similarity_map
 from sme_registry.plots.reports import (

@@ -21,7 +21,7 @@ from sme_registry.evaluation import (
     StreamReport,
 )
 from sme_registry.evaluation.references import LABELS
-from sme_registry.evaluation.tables import SAFETY_REFERENCES
+from sme_registry.evaluation.report import SAFETY_REFERENCES
 from sme_registry.plots.style import (
     COLOURS,
     GREY,

@@ -12,7 +12,7 @@ from sme_registry.errors import OptionError
 from sme_registry.evaluation import StreamReport
 from sme_registry.evaluation.dynamic_regret import DynamicRegret
 from sme_registry.evaluation.retention import LABELS, TRAINED
-from sme_registry.evaluation.stream_report import Visit, same_stream
+from sme_registry.evaluation.streams import Visit, check_same_stream
 from sme_registry.plots.reports import read_reports
 from sme_registry.plots.style import (
     COLOURS,
@@ -294,14 +294,14 @@ def _methods(given: Methods) -> dict[str, list[StreamReport]]:
         runs = _runs(given)
         return {runs[0].policy: runs}
     methods = {str(name): _runs(runs) for name, runs in given.items()}
-    same_stream([report for runs in methods.values() for report in runs])
+    check_same_stream([report for runs in methods.values() for report in runs])
     return methods
 
 
 def _runs(given: Runs) -> list[StreamReport]:
     """One report or several, those given by their paths read."""
     reports = read_reports(given, StreamReport, FILE, "runs")
-    same_stream(reports)
+    check_same_stream(reports)
     return reports
 
 

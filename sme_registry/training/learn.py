@@ -26,7 +26,7 @@ from sme_registry.evaluation import (
     evaluate_stream,
     reference_regret,
 )
-from sme_registry.evaluation.measure import OnBatch
+from sme_registry.evaluation.evaluate import OnBatch
 from sme_registry.io import is_installed
 from sme_registry.io.system import defer_interrupts
 from sme_registry.io.terminal import Progress

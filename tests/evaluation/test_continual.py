@@ -30,11 +30,8 @@ from sme_registry.evaluation import (
     retention,
 )
 from sme_registry.evaluation.dynamic_regret import RegretBlocks
-from sme_registry.evaluation.measure import final_specs
 from sme_registry.evaluation.report import as_text
-from sme_registry.evaluation.retention import METRICS
-from sme_registry.evaluation.stream_report import Retention
-from sme_registry.evaluation.streams import Actor, stream_regrets
+from sme_registry.evaluation.retention import METRICS, Retention, final_specs, stream_regrets
 from sme_registry.spec import EvaluationProtocol, StreamSpec
 from sme_registry.task import loading
 from tests.evaluation.streams import SPEC, TWICE, half, network, stream_of
@@ -62,7 +59,7 @@ def test_retention_draws_each_task_once_even_if_it_is_too_large_to_keep(monkeypa
     draw = loading._draw
     monkeypatch.setattr(loading, "_CACHED_BYTES", 0)
     monkeypatch.setattr(loading, "_draw", lambda spec: drawn.append(spec) or draw(spec))
-    stream_regrets(THREE, [Actor(0, range(3))], EvaluationProtocol(**PROTOCOL))
+    stream_regrets(THREE, [], EvaluationProtocol(**PROTOCOL))
     assert drawn == list(final_specs(THREE))
 
 
@@ -368,7 +365,7 @@ def test_fresh_agents_of_another_stream_are_refused(other, switch):
     [
         (([], []), "step: has no rows"),
         (([1, 2], [0.5]), "regret=.*must be 2 numbers"),
-        (([1, 2], [0.5, 1.5]), "outside"),
+        (([1, 2], [0.5, 1.5]), r"regret: must be in \[0, 1\]"),
         (([1, 2], [0.5, float("nan")]), "regret: has NaN"),
         (([2, 1], [0.5, 0.5]), "must not overlap"),
         (([4, 6], [0.5, 0.5], 3), "must not overlap"),

@@ -36,7 +36,7 @@ class Oracles:
 
     def __init__(self, monkeypatch):
         self.engines = 0
-        monkeypatch.setattr(import_module("sme_registry.evaluation.measure"), "engine", self)
+        monkeypatch.setattr(import_module("sme_registry.evaluation.evaluate"), "engine", self)
 
     def __call__(self, task):
         self.engines += 1

@@ -219,7 +219,7 @@ def test_the_oracle_answers_once_for_each_state_however_many_agents(monkeypatch)
 
         return dataclasses.replace(original, optimal_action=counted)
 
-    monkeypatch.setattr(import_module("sme_registry.evaluation.measure"), "engine", counting)
+    monkeypatch.setattr(import_module("sme_registry.evaluation.evaluate"), "engine", counting)
     evaluate(half(3), SPEC, SMALL)
     assert sum(asked) == 2 * 200
 

@@ -17,7 +17,7 @@ from sme_registry.evaluation import (
     evaluate_stream,
     reference_regret,
 )
-from sme_registry.evaluation.measure import final_specs
+from sme_registry.evaluation.retention import final_specs
 from sme_registry.spec import StreamSpec, StudyFile, StudyPlan
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing

@@ -121,8 +121,7 @@ import numpy as np
 import pandas as pd
 
 from sme_registry.evaluation import EvaluationReport, StreamReport
-from sme_registry.evaluation.retention import BY_VISIT, METRICS
-from sme_registry.evaluation.stream_report import StreamRegion
+from sme_registry.evaluation.retention import BY_VISIT, METRICS, StreamRegion
 from sme_registry.spec import PlannedCell, StudyPlan
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellResult
@@ -275,7 +274,7 @@ def _result_rows(
             **run,
             **agents,
             **region.model_dump(exclude={"name", "channels"}),
-            **report.extensions(index),
+            **report.task_scores(index),
             **regrets,
             "region": region.name,
             "constant_similarity": references["constant_half"][index].similarity,

@@ -34,7 +34,7 @@ import pandas as pd
 
 from sme_registry.evaluation import retention
 from sme_registry.evaluation.dynamic_regret import DynamicRegret, reference_regret
-from sme_registry.evaluation.stream_report import StreamReport
+from sme_registry.evaluation.streams import StreamReport
 from sme_registry.spec import StudyPlan
 from sme_registry.statistics import Array
 from sme_registry.studies.engine.result import CellResult

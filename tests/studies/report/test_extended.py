@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from sme_registry.errors import UnknownNameError
-from sme_registry.evaluation.report import LayerProbe
+from sme_registry.evaluation.regions import LayerProbe
 from sme_registry.spec import StudyPlan
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.report import frames, texts

@@ -17,7 +17,7 @@ import pandas as pd
 
 from sme_registry.errors import SMEError
 from sme_registry.evaluation import as_policy
-from sme_registry.evaluation.tables import NOT_COMPARABLE
+from sme_registry.evaluation.report import NOT_COMPARABLE
 from sme_registry.plots import maps, style
 from sme_registry.plots.style import GREY, literal, new_figure
 from sme_registry.studies.report.analysis import CURVES, ENOUGH_RUNS, METRICS, Analysis, by_place

@@ -9,7 +9,7 @@ import pandas as pd
 
 from sme_registry.evaluation import StreamReport
 from sme_registry.evaluation.retention import LABELS
-from sme_registry.evaluation.stream_report import Visit
+from sme_registry.evaluation.streams import Visit
 from sme_registry.plots.streams import (
     MATRIX_SCALE,
     draw_matrix,
