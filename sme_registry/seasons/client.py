@@ -69,8 +69,7 @@ _now, _sleep = time.monotonic, time.sleep
 
 TicketLike = Ticket | str | os.PathLike[str]
 _Document = TypeVar("_Document", bound=StrictModel)
-_MAX_CHALLENGE = 2**31
-_MAX_STATUS = 2**22
+
 WITHOUT_TASK = ("constant", "constant_half", "random", "uniform_random")
 """Reference policies that are the same on each task."""
 
@@ -161,40 +160,13 @@ class Connection:
         """A new connection, through the proxy that the environment names, if there is one."""
         address = self._address
         if not address.is_https:
-            return _InOnePiece(address.host, address.port, timeout=_TIMEOUT)
+            return http.client.HTTPConnection(address.host, address.port, timeout=_TIMEOUT)
         proxy = urlsplit(getproxies().get("https", ""))
         if address.is_local or not proxy.hostname or proxy_bypass(address.host):
-            return _SecureInOnePiece(address.host, address.port, timeout=_TIMEOUT)
-        connection = _SecureInOnePiece(proxy.hostname, proxy.port, timeout=_TIMEOUT)
+            return http.client.HTTPSConnection(address.host, address.port, timeout=_TIMEOUT)
+        connection = http.client.HTTPSConnection(proxy.hostname, proxy.port, timeout=_TIMEOUT)
         connection.set_tunnel(address.host, address.port)
         return connection
-
-
-class _InOnePiece(http.client.HTTPConnection):
-    """Sends a request's head and body together: the head alone wakes the server for nothing."""
-
-    _pieces: list[bytes] | None = None
-
-    def request(self, *args: Any, **kwargs: Any) -> None:
-        if self.sock is None:
-            self.connect()
-        self._pieces = []
-        try:
-            super().request(*args, **kwargs)
-            data = b"".join(self._pieces)
-        finally:
-            self._pieces = None
-        self.send(data)
-
-    def send(self, data: Any) -> None:
-        if self._pieces is None:
-            super().send(data)
-        else:
-            self._pieces.append(data)
-
-
-class _SecureInOnePiece(_InOnePiece, http.client.HTTPSConnection):
-    """The same over TLS."""
 
 
 def _reason_in(data: bytes, status: int) -> tuple[str, str]:
@@ -213,12 +185,12 @@ class Instance:
     """A hidden task of a ticket, as its server shows it: observations, rewards and ends.
 
     Whoever holds the ticket may stop at any time and go on elsewhere: the server knows the present
-    states. But only one process at a time can step an instance. `lanes` copies are stepped
-    together; their number cannot be changed after the first step.
+    states. But only one process at a time can step an instance.
 
     Attributes:
       setting: all of the task's spec but its seed.
       budget: steps over all lanes.
+      lanes: L, copies that are stepped together; fixed after the first step.
       number: of the last steps that were taken; 0 before the first.
 
     Examples:
@@ -242,20 +214,15 @@ class Instance:
         self.setting: Setting = member.setting
         self.budget = member.budget
         self.number = 0
-        S, A = self.setting.state_dim, self.setting.action_dim
-        self._format = StepFormat(integer_in("lanes", lanes, 1, ticket.lanes), S, A)
+        self.lanes = integer_in("lanes", lanes, 1, ticket.lanes)
+        self._format = StepFormat(self.lanes, self.setting.state_dim, self.setting.action_dim)
         self._ticket, self._instance = ticket, instance
         self._taken: hashlib._Hash | None = None  # of all steps, if this process knows them
         self._connection = Connection(url, ticket.token, insecure=insecure, patience=patience)
 
     @property
-    def lanes(self) -> int:
-        """L, copies that are stepped together."""
-        return self._format.lanes
-
-    @property
     def steps_left(self) -> int:
-        """StepsAnswer of the budget that are left, over all lanes."""
+        """Steps of the budget that are left, over all lanes."""
         return self.budget - self.number * self.lanes
 
     def begin(self) -> Float32:
@@ -296,7 +263,7 @@ class Instance:
         if self._ticket.signer is not None:
             require_signatures()  # before the stepping ends for good
         self._request("POST", "finish")
-        data = self._request("GET", "challenge", most=_MAX_CHALLENGE)
+        data = self._request("GET", "challenge", most=2**31)
         return unpack_table(data, self.setting.state_dim + 2)
 
     def send_answers(self, actions: npt.NDArray[np.floating]) -> None:
@@ -321,7 +288,7 @@ class Instance:
     def status(self) -> TicketStatus:
         """The status of the whole ticket."""
         path = ticket_path(self._ticket.season, self._ticket.ticket)
-        data = self._connection.request("GET", path, most=_MAX_STATUS)
+        data = self._connection.request("GET", path, most=2**22)
         return _parse_answer(TicketStatus, data)
 
     def __enter__(self) -> Instance:
@@ -335,15 +302,15 @@ class Instance:
 
     def _journal_digest(self) -> str:
         """That of the server's journal, compared with the steps as far as they are known here."""
-        found = _parse_answer(JournalDigest, self._request("GET", "journal")).journal
-        if self._taken is not None and found != f"sha256:{self._taken.hexdigest()}":
+        digest = _parse_answer(JournalDigest, self._request("GET", "journal")).journal
+        if self._taken is not None and digest != f"sha256:{self._taken.hexdigest()}":
             raise SealedError(
                 "journal",
-                f"journal: the server's, {found[:19]}…, is not of the steps that were taken here, "
+                f"journal: the server's, {digest[:19]}…, is not of the steps that were taken here, "
                 "so it is not signed. If another process has stepped the instance, call `begin` "
                 "to accept its steps; otherwise ask the board's owner.",
             )
-        return found
+        return digest
 
     def _request(self, method: str, action: str, body: bytes = b"", *, most: int = 0) -> bytes:
         ticket = self._ticket
@@ -402,8 +369,7 @@ def prepare_policy(
             f"policy={policy!r}: follows from the task, which is hidden. Give a policy of your "
             "own, constant_half or uniform_random."
         )
-    spec = _any_spec(setting)
-    prepared = as_policy(policy, spec, action_range=action_range, algorithm=algorithm)
+    prepared = as_policy(policy, _any_spec(setting), action_range=action_range, algorithm=algorithm)
     assert isinstance(prepared, Policy)  # seasons have no teams
     return prepared
 

@@ -13,94 +13,8 @@ from sme_registry.compiled.arrays import Action, Array, Mask, Observation
 from sme_registry.envs import arguments
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.seasons.client import PATIENCE, Instance, TicketLike
-from sme_registry.seasons.wire import Float32, StepsAnswer
+from sme_registry.seasons.wire import Float32
 from sme_registry.spec import ActionRange
-
-
-class HiddenEnvs:
-    """The lanes of an instance: actions of an environment's range in, what the server shows out."""
-
-    def __init__(self, instance: Instance, action_range: ActionRange) -> None:
-        self.instance = instance
-        setting = instance.setting
-        self.action_space, self._rescaled = arguments.action_space(action_range, setting.action_dim)
-        width = setting.state_dim + 2
-        self.observation_space = gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32)
-        self._shape = instance.lanes, setting.action_dim
-        self._has_begun = False
-
-    def begin(self, seed: Any, options: dict[str, Any] | None) -> Float32:
-        """The present observations `[L, S + 2]`; no episode is cut short."""
-        arguments.checked_seed(seed)
-        if options:
-            raise OptionError(
-                f"options={options!r:.60}: must be None: the server draws the states at which "
-                "episodes begin. Leave it out."
-            )
-        observation = self.instance.begin()
-        self._has_begun = True
-        return observation
-
-    def step(self, actions: Any) -> StepsAnswer:
-        if not self._has_begun:
-            raise EpisodeError("step: the episodes have not begun. Call reset() first.")
-        unit = arguments.to_unit(actions, self._shape, self._rescaled)
-        if not np.isfinite(unit).all():
-            raise arguments.not_finite_error()
-        return self.instance.step(unit)
-
-
-class SealedEnv(gymnasium.Env[Observation, Action]):
-    """A hidden task of a ticket, stepped by the season's server.
-
-    Spaces, rewards and ends of episodes are those of `SMEEnv`; infos are empty. The server draws
-    the initial states: `seed` seeds `np_random` only. `reset` within an episode does not end it: it
-    returns the present observation, also in a new process that goes on where another one stopped.
-
-    Examples:
-      >>> from sme_registry.seasons import Instance, SealedEnv
-      >>> env = SealedEnv(Instance("https://board.example", "ticket.json"), "symmetric")
-      >>> float(env.action_space.low[0])
-      -1.0
-    """
-
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
-
-    def __init__(self, instance: Instance, action_range: ActionRange = "unit") -> None:
-        self._lanes = HiddenEnvs(instance, action_range)
-        self.action_space = cast("gymnasium.Space[Action]", self._lanes.action_space)
-        self.observation_space = self._lanes.observation_space
-        self._next: Observation | None = None  # the first of the next episode
-
-    @property
-    def instance(self) -> Instance:
-        """The hidden task: its setting, budget, challenge and answers."""
-        return self._lanes.instance
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Begin the next episode, or go on with the present one."""
-        if self._next is None or options or seed is not None:
-            [self._next] = self._lanes.begin(seed, options)
-        super().reset(seed=seed)
-        observation, self._next = self._next, None
-        return observation, {}
-
-    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One step; an action that is not finite, or not `[A]`, is never sent."""
-        if self._next is not None:
-            raise EpisodeError("step: the episode has ended. Call reset() first.")
-        steps = self._lanes.step([action])
-        terminated, truncated = bool(steps.terminated[0]), bool(steps.truncated[0])
-        observation = steps.observation[0]
-        if terminated or truncated:
-            self._next, observation = observation, steps.last_observation[0]
-        return observation, float(steps.reward[0]), terminated, truncated, {}
-
-    def close(self) -> None:
-        """Close the connection. The ticket stays valid."""
-        self.instance.close()
 
 
 class SealedVectorEnv(VectorEnv[Observation, Array, Array]):
@@ -110,6 +24,9 @@ class SealedVectorEnv(VectorEnv[Observation, Array, Array]):
     "SameStep": an ended lane's observation is the first of its next episode, and the last of the
     ended one is in `infos["final_obs"]`. Seeds and resets are as in `SealedEnv`.
 
+    Attributes:
+      instance: the hidden task: its setting, budget, challenge and answers.
+
     Examples:
       >>> from sme_registry.seasons import Instance, SealedVectorEnv
       >>> envs = SealedVectorEnv(Instance("https://board.example", "ticket.json", lanes=4))
@@ -118,33 +35,42 @@ class SealedVectorEnv(VectorEnv[Observation, Array, Array]):
     """
 
     def __init__(self, instance: Instance, action_range: ActionRange = "unit") -> None:
-        self._lanes = HiddenEnvs(instance, action_range)
+        self.instance = instance
         self.num_envs = instance.lanes
         self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
-        self.single_action_space = self._lanes.action_space
-        self.single_observation_space = self._lanes.observation_space
+        A, width = instance.setting.action_dim, instance.setting.state_dim + 2
+        self.single_action_space, self._rescaled = arguments.action_space(action_range, A)
+        self.single_observation_space = gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-
-    @property
-    def instance(self) -> Instance:
-        """The hidden task: its setting, budget, challenge and answers."""
-        return self._lanes.instance
+        self._has_begun = False
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin, or go on with the present episodes."""
-        first = seed[0] if isinstance(seed, list) else seed
-        observation = self._lanes.begin(first, options)
+        first = arguments.checked_seed(seed[0] if isinstance(seed, list) else seed)
+        if options:
+            raise OptionError(
+                f"options={options!r:.60}: must be None: the server draws the states at which "
+                "episodes begin. Leave it out."
+            )
+        observation = self.instance.begin()
+        self._has_begun = True
         super().reset(seed=first)
         return observation, {}
 
     def step(  # type: ignore[override]  # Gymnasium types all three arrays alike; ends are bool
         self, actions: Any
     ) -> tuple[Observation, Float32, Mask, Mask, dict[str, Any]]:
-        """One step of every lane; see `SealedEnv.step`."""
-        steps = self._lanes.step(actions)
+        """One step of every lane; actions that are not finite, or not `[L, A]`, are never sent."""
+        if not self._has_begun:
+            raise EpisodeError("step: the episodes have not begun. Call reset() first.")
+        shape = self.num_envs, self.instance.setting.action_dim
+        unit = arguments.to_unit(actions, shape, self._rescaled)
+        if not np.isfinite(unit).all():
+            raise arguments.not_finite_error()
+        steps = self.instance.step(unit)
         ended: Mask = steps.terminated | steps.truncated
         infos: dict[str, Any] = {}
         if ended.any():
@@ -156,6 +82,56 @@ class SealedVectorEnv(VectorEnv[Observation, Array, Array]):
         return steps.observation, steps.reward, steps.terminated, steps.truncated, infos
 
     def close_extras(self, **kwargs: Any) -> None:
+        """Close the connection. The ticket stays valid."""
+        self.instance.close()
+
+
+class SealedEnv(gymnasium.Env[Observation, Action]):
+    """A hidden task of a ticket, stepped by the season's server.
+
+    Spaces, rewards and ends of episodes are those of `SMEEnv`; infos are empty. The server draws
+    the initial states: `seed` seeds `np_random` only. `reset` within an episode does not end it: it
+    returns the present observation, also in a new process that goes on where another one stopped.
+
+    Attributes:
+      instance: the hidden task: its setting, budget, challenge and answers.
+
+    Examples:
+      >>> from sme_registry.seasons import Instance, SealedEnv
+      >>> env = SealedEnv(Instance("https://board.example", "ticket.json"), "symmetric")
+      >>> float(env.action_space.low[0])
+      -1.0
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, instance: Instance, action_range: ActionRange = "unit") -> None:
+        self.instance = instance
+        self._lane = SealedVectorEnv(instance, action_range)
+        self.action_space = cast("gymnasium.Space[Action]", self._lane.single_action_space)
+        self.observation_space = self._lane.single_observation_space
+        self._next: Observation | None = None  # the first of the next episode
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin the next episode, or go on with the present one."""
+        if self._next is None or options or seed is not None:
+            [self._next] = self._lane.reset(seed=seed, options=options)[0]
+        super().reset(seed=seed)
+        observation, self._next = self._next, None
+        return observation, {}
+
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """One step; an action that is not finite, or not `[A]`, is never sent."""
+        if self._next is not None:
+            raise EpisodeError("step: the episode has ended. Call reset() first.")
+        [observation], [reward], [terminated], [truncated], infos = self._lane.step([action])
+        if infos:
+            self._next, observation = observation, infos["final_obs"][0]
+        return observation, float(reward), bool(terminated), bool(truncated), {}
+
+    def close(self) -> None:
         """Close the connection. The ticket stays valid."""
         self.instance.close()
 

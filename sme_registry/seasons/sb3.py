@@ -17,7 +17,7 @@ from sme_registry.compiled.arrays import Observation
 from sme_registry.sb3 import LanesVecEnv
 from sme_registry.sb3.vec_env import StepResult
 from sme_registry.seasons.client import PATIENCE, Instance, TicketLike
-from sme_registry.seasons.envs import HiddenEnvs
+from sme_registry.seasons.envs import SealedVectorEnv
 from sme_registry.spec import ActionRange
 
 
@@ -43,30 +43,30 @@ class SealedVecEnv(LanesVecEnv):
         self.instance = Instance(
             url, ticket, instance, num_envs, insecure=insecure, patience=patience
         )
-        self._stepped = HiddenEnvs(self.instance, action_range)
+        self._hidden = SealedVectorEnv(self.instance, action_range)
         shared = {
             "render_mode": None, "spec": None,
-            "action_space": self._stepped.action_space,
-            "observation_space": self._stepped.observation_space,
+            "action_space": self._hidden.single_action_space,
+            "observation_space": self._hidden.single_observation_space,
         }  # fmt: skip
         super().__init__([SimpleNamespace(**shared) for _ in range(num_envs)])
 
     def reset(self) -> Observation:
         """Begin, or go on with the present episodes: observations, a row for each lane, float32."""
-        options = next(filter(None, self._options), None)
-        observation = self._stepped.begin(None, options)
+        observation, _ = self._hidden.reset(options=next(filter(None, self._options), None))
         self.reset_infos = [{} for _ in range(self.num_envs)]
         self._clear_reset_arguments()
         return observation
 
     def step_wait(self) -> StepResult:
-        steps = self._stepped.step(self._take_actions())
-        dones = steps.terminated | steps.truncated
-        cut = steps.truncated & ~steps.terminated
-        infos: list[dict[str, Any]] = [{"TimeLimit.truncated": bool(each)} for each in cut]
+        observation, reward, terminated, truncated, ended = self._hidden.step(self._take_actions())
+        infos: list[dict[str, Any]] = [
+            {"TimeLimit.truncated": bool(cut)} for cut in truncated & ~terminated
+        ]
+        dones = terminated | truncated
         for lane in np.flatnonzero(dones).tolist():
-            infos[lane]["terminal_observation"] = steps.last_observation[lane]
-        return steps.observation, steps.reward, dones, infos
+            infos[lane]["terminal_observation"] = ended["final_obs"][lane]
+        return observation, reward, dones, infos
 
     def close(self) -> None:
         """Close the connection. The ticket stays valid."""

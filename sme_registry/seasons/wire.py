@@ -79,34 +79,21 @@ _Count = Annotated[Integer, Field(ge=0)]
 
 
 class Statement(Document):
-    """What an entrant signs of one instance.
+    """What an entrant signs of one instance."""
 
-    Attributes:
-      request: id of the request for the ticket, which names the season and the key.
-      ticket, instance: their numbers.
-      answers: SHA-256 of the answers' .npy file.
-      journal: SHA-256 of the bodies of all requests for steps, in order.
-    """
-
-    request: Digest
+    request: Digest  # id of the request for the ticket, which names the season and the key
     ticket: _Count
     instance: _Count
-    answers: Digest
-    journal: Digest
+    answers: Digest  # SHA-256 of the answers' .npy file
+    journal: Digest  # SHA-256 of the bodies of all requests for steps, in order
 
 
 class Signer(Document):
-    """The key of a ticket's answers; `repr` does not show it.
+    """The key of a ticket's answers; `repr` does not show it."""
 
-    Attributes:
-      board: public key of the board.
-      request: id of the request for the ticket.
-      key: Ed25519's 32 private bytes.
-    """
-
-    board: _Hex
-    request: Digest
-    key: _Secret
+    board: _Hex  # its public key
+    request: Digest  # id of the request for the ticket
+    key: _Secret  # Ed25519's 32 private bytes
 
     def sign(self, statement: Statement) -> str:
         """The signature of a statement, 128 hex digits; requires PyNaCl."""
@@ -122,19 +109,12 @@ def require_signatures() -> None:
 
 
 class TicketClass(StrictModel):
-    """A class of the season, as far as an entrant knows it.
-
-    Attributes:
-      setting: all of a spec but its seed.
-      instances: number of hidden tasks.
-      budget: steps on each instance, over all lanes.
-      name: of the class.
-    """
+    """A class of the season, as far as an entrant knows it."""
 
     name: Name
-    setting: Setting
-    instances: Annotated[Integer, Field(ge=1)]
-    budget: Annotated[Integer, Field(ge=1)]
+    setting: Setting  # all of a spec but its seed
+    instances: Annotated[Integer, Field(ge=1)]  # number of hidden tasks
+    budget: Annotated[Integer, Field(ge=1)]  # steps on each instance, over all lanes
 
 
 def instance_name(class_name: str, instance: int) -> str:
@@ -214,45 +194,27 @@ class Ticket(StrictModel):
 
 
 class InstanceStatus(StrictModel):
-    """How far a ticket is on one of its instances.
-
-    Attributes:
-      phase: no step taken; steps are taken; no more are, and answers are expected; answered.
-      lanes: copies that are stepped together; null before `start`.
-      requests: number of the last steps that were taken.
-      used: steps of the budget that were taken, over all lanes.
-    """
+    """How far a ticket is on one of its instances."""
 
     phase: Literal["waiting", "stepping", "answering", "answered"]
-    lanes: Annotated[Integer, Field(ge=1)] | None
-    requests: _Count
-    used: _Count
+    lanes: Annotated[Integer, Field(ge=1)] | None  # null before `start`
+    requests: _Count  # number of the last steps that were taken
+    used: _Count  # steps of the budget that were taken, over all lanes
 
 
 class JournalDigest(StrictModel):
-    """The answer to a request for the digest of an instance's steps, once no more can follow.
+    """The answer to a request for the digest of an instance's steps, once no more can follow."""
 
-    Attributes:
-      journal: SHA-256 of the bodies of all requests for steps, in order.
-    """
-
-    journal: Digest
+    journal: Digest  # SHA-256 of the bodies of all requests for steps, in order
 
 
 class TicketStatus(StrictModel):
-    """The answer to a request for a ticket's status.
+    """The answer to a request for a ticket's status."""
 
-    Attributes:
-      ticket: its number in the season.
-      phase: "ended" once every instance is answered, or the deadline has passed.
-      deadline: until when answers count, in UTC.
-      instances: in the ticket's order.
-    """
-
-    ticket: _Count
-    phase: Literal["running", "ended"]
-    deadline: Annotated[str, Field(max_length=40)]
-    instances: TupleOf[InstanceStatus]
+    ticket: _Count  # its number in the season
+    phase: Literal["running", "ended"]  # ended: every instance is answered, or the deadline over
+    deadline: Annotated[str, Field(max_length=40)]  # until when answers count, in UTC
+    instances: TupleOf[InstanceStatus]  # in the ticket's order
 
 
 def tickets_path(season: str) -> str:
@@ -275,20 +237,13 @@ def bearer(token: str) -> str:
 
 
 class StepsAnswer(NamedTuple):
-    """The answer to `steps`.
+    """The answer to `steps`."""
 
-    Attributes:
-      observation: `[L, S + 2]`, of the next episode in lanes whose episode ended.
-      reward: `[L]` float32.
-      terminated, truncated: `[L]`.
-      last_observation: `[L, S + 2]` of the episode that ended; 0 in the other lanes.
-    """
-
-    observation: Observation
-    reward: Float32
-    terminated: Mask
-    truncated: Mask
-    last_observation: Observation
+    observation: Observation  # `[L, S + 2]`, of the next episode in lanes whose episode ended
+    reward: Float32  # `[L]`
+    terminated: Mask  # `[L]`
+    truncated: Mask  # `[L]`
+    last_observation: Observation  # `[L, S + 2]` of the episode that ended; 0 in the other lanes
 
 
 @dataclass(frozen=True)
@@ -312,24 +267,20 @@ class StepFormat:
         return self.state_dim + 2
 
     def pack_start(self, number: int, observation: Observation) -> bytes:
-        return _packed_number(number) + _packed(observation)
+        return _pack_numbered(number, observation)
 
     def unpack_start(self, data: bytes) -> tuple[int, Observation]:
         """The number of the last steps, and the present observations `[L, S + 2]`."""
-        expected = _NUMBER_BYTES + _FLOAT.itemsize * self.lanes * self._width
-        _check_size("start", data, expected)
-        observation = np.frombuffer(data, _FLOAT, offset=_NUMBER_BYTES)
-        return _number_in(data), _native(observation.reshape(self.lanes, -1))
+        return _unpack_numbered("start", data, self.lanes, self._width)
 
     def pack_request(self, number: int, actions: npt.NDArray[np.floating]) -> bytes:
-        return _packed_number(number) + _packed(actions)
+        return _pack_numbered(number, actions)
 
     def unpack_request(self, data: bytes) -> tuple[int, Float32]:
         """The number and the actions `[L, A]` in the body of `steps`; finite, not clipped."""
-        _check_size("steps", data, self.request_bytes)
-        actions = np.frombuffer(data, _FLOAT, offset=_NUMBER_BYTES)
+        number, actions = _unpack_numbered("steps", data, self.lanes, self.action_dim)
         _check_finite(actions)
-        return _number_in(data), _native(actions.reshape(self.lanes, -1))
+        return number, actions
 
     def pack_steps(self, steps: StepsAnswer) -> bytes:
         width = self._width
@@ -344,15 +295,13 @@ class StepFormat:
         """The answer to `steps` in these bytes, as fresh arrays."""
         _check_size("steps", data, self.answer_bytes)
         width = self._width
-        table = _native(np.frombuffer(data, _FLOAT).reshape(self.lanes, -1))
+        table = np.array(np.frombuffer(data, _FLOAT).reshape(self.lanes, -1), np.float32)
         ends = table[:, width + 1]
-        flags = np.zeros(self.lanes, np.int8)
-        for flag in (TERMINATED, TRUNCATED, TERMINATED | TRUNCATED):
-            flags[ends == flag] = flag
-        if not np.array_equal(flags, ends):
+        if not np.isin(ends, (0, 1, 2, 3)).all():
             raise WireError(
                 "steps: the ends of episodes must be 0, 1, 2 or 3. Check the server's version."
             )
+        flags = ends.astype(np.int8)
         return StepsAnswer(
             observation=table[:, :width].copy(),
             reward=table[:, width].copy(),
@@ -369,7 +318,7 @@ def pack_table(table: npt.NDArray[np.floating]) -> bytes:
     # The data begin at a multiple of 64 bytes, as the format asks.
     padding = -(len(_MAGIC) + 2 + len(text) + 1) % 64
     header = text.encode() + b" " * padding + b"\n"
-    return _MAGIC + len(header).to_bytes(2, "little") + header + _packed(table)
+    return _MAGIC + len(header).to_bytes(2, "little") + header + _pack(table)
 
 
 def table_bytes(rows: int, columns: int) -> int:
@@ -397,24 +346,21 @@ def unpack_table(data: bytes, columns: int, rows: int | None = None) -> Float32:
     _check_size("array", data, start + size + _FLOAT.itemsize * shape[0] * shape[1])
     entries = np.frombuffer(data, _FLOAT, offset=start + size)
     _check_finite(entries)
-    return _native(entries.reshape(shape))
+    return np.array(entries.reshape(shape), np.float32)  # in this machine's byte order
 
 
-def _packed(array: npt.NDArray[np.floating]) -> bytes:
+def _pack(array: npt.NDArray[np.floating]) -> bytes:
     return array.astype(_FLOAT, copy=False).tobytes()
 
 
-def _packed_number(number: int) -> bytes:
-    return number.to_bytes(_NUMBER_BYTES, "little")
+def _pack_numbered(number: int, array: npt.NDArray[np.floating]) -> bytes:
+    return number.to_bytes(_NUMBER_BYTES, "little") + _pack(array)
 
 
-def _number_in(data: bytes) -> int:
-    return int.from_bytes(data[:_NUMBER_BYTES], "little")
-
-
-def _native(array: npt.NDArray[np.floating]) -> Float32:
-    """A copy that can be written to, in this machine's byte order."""
-    return np.array(array, np.float32)
+def _unpack_numbered(what: str, data: bytes, rows: int, columns: int) -> tuple[int, Float32]:
+    _check_size(what, data, _NUMBER_BYTES + _FLOAT.itemsize * rows * columns)
+    array = np.frombuffer(data, _FLOAT, offset=_NUMBER_BYTES).reshape(rows, columns)
+    return int.from_bytes(data[:_NUMBER_BYTES], "little"), np.array(array, np.float32)
 
 
 def _check_size(what: str, data: bytes, expected: int) -> None:

@@ -2,7 +2,6 @@
 
 import http.client
 import pickle
-import socket
 import ssl
 import time
 
@@ -123,22 +122,6 @@ def test_no_step_is_lost_or_taken_twice(server, fault):
             assert np.array_equal(ours.astype(theirs.dtype), theirs)
     status = hidden.instance.status().instances[0]
     assert (status.requests, status.used) == (hidden.instance.number, 20) == (10, 20)
-
-
-def test_a_request_is_sent_in_one_piece(server, monkeypatch):
-    hidden = seasons.make(server.url, server.ticket)
-    hidden.reset()
-    sent, send = [], socket.socket.sendall
-
-    def record(self, data):
-        if data.startswith(b"POST /board"):  # not what the relay sends on
-            sent.append(data)
-        send(self, data)
-
-    monkeypatch.setattr(socket.socket, "sendall", record)
-    hidden.step(np.zeros(2))
-    [request] = sent
-    assert request.endswith(b"\r\n\r\n" + hidden.instance._format.pack_request(1, np.zeros((1, 2))))
 
 
 def test_another_process_goes_on_where_one_was_killed(server):

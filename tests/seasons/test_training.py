@@ -67,7 +67,7 @@ def test_an_episode_that_terminates_at_the_horizon_is_not_cut(server, monkeypatc
     observation = hidden.reset()
     terminated, truncated = np.array([True, False, True]), np.array([True, True, False])
     steps = StepsAnswer(observation, np.zeros(3, np.float32), terminated, truncated, observation)
-    monkeypatch.setattr(hidden._stepped, "step", lambda _: steps)
+    monkeypatch.setattr(hidden.instance, "step", lambda _: steps)
     *_, dones, infos = hidden.step(np.zeros((3, 2)))
     assert dones.all()
     assert [info["TimeLimit.truncated"] for info in infos] == [False, True, False]
