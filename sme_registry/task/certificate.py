@@ -8,52 +8,41 @@ that a task is correct but easy: the constant action ½ is near its optimum, as 
 `semi_orthogonal` policies of 2 to 5 layers. A broken or trivial task is refused.
 
 The ranges of difficulty come from 4,560 draws (40 seeds of 114 settings; S 1..64, A 1..16,
-L 1..20). Mean r̃ of the constant policy: smallest, median, largest. Spread: smallest, median.
-
-    setting                                  r̃ of ½             spread        passed  refused
-    L = 1, A ≤ S                             0.716 0.744 0.752  0.282 0.292   100 %   0 %
-    unit_variance, S ≥ 8                     0.646 0.748 0.848  0.145 0.267    97 %   0 %
-    unit_variance, S 2..4                    0.584 0.747 0.964  0.042 0.227    73 %   3 %
-    semi_orthogonal, S ≥ 16                  0.736 0.750 0.832  0.130 0.273    92 %   0 %
-    semi_orthogonal, S = 8, A = 4, L = 2     0.824 0.869 0.891  0.052 0.119     0 %   0 %
-    semi_orthogonal, S = 8, A = 4, L = 10    0.724 0.747 0.805  0.203 0.258    98 %   0 %
-    semi_orthogonal, S = A = 2, L = 2        0.878 0.933 0.975  0.004 0.050     0 %  95 %
+L 1..20). Mean r̃ of ½ is 0.716 to 0.752 where L = 1 and 0.646 to 0.848 with `unit_variance` and
+S ≥ 8, of which 97 % pass; 0.824 to 0.891 with `semi_orthogonal`, S = 8, A = 4, L = 2, which all
+warn; and 0.878 to 0.975 at S = A = 2, L = 2, of which 95 % are refused.
 
 Limits: with π*_i and v_i uniform and independent, the optimum is above ℓ_i = 1 − 2τ v_i in a share
-τ of states and channels. Of 40 draws at S = 8, A = 4, τ = 0.2, the share over τ is 0.79 to 1.19 for
-L = 1, 0.84 to 1.31 for 10 layers with `unit_variance`, and 0.04 to 0.51 for 2 `semi_orthogonal`
-ones, which stay near ½ where layers widen. At τ = ½ the share is ½ for any networks, even constant
-ones, by symmetry; there the KS distance decides (median 0.02, 0.07, 0.24 of these draws).
+τ of states and channels. Of 40 draws at S = 8, A = 4, τ = 0.2, the share over τ is 0.79 to 1.31 for
+L = 1 and for 10 layers with `unit_variance`, and 0.04 to 0.51 for 2 `semi_orthogonal` ones, which
+stay near ½ where layers widen. At τ = ½ the share is ½ for any networks, even constant ones, by
+symmetry; there the KS distance decides.
 
-Mixings are undone from float32 observations, whose rounding the inverse multiplies. Of 20 draws,
-the median condition number and the smallest R² of the worst recovered channel: 5.7 and .96 at 8
-channels and depth 1, 68 and .88 at depth 3; 661 and .85 at 40 channels and depth 3, 2,840 and .83
-at 128.
+Mixings are undone from float32 observations, whose rounding the inverse multiplies: the condition
+number is 5.7 at 8 channels and depth 1, 661 at 40 and 2,840 at 128 channels and depth 3.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+from rich.markup import escape
 from scipy.special import ndtr
 
 from sme_registry.io import integer_in
+from sme_registry.io.tables import Table
 from sme_registry.spec import SpecLike
 from sme_registry.task.draw import Array, Layer, uniform
 from sme_registry.task.loading import check_memory, load_task
 from sme_registry.task.task import Task, through
 
-if TYPE_CHECKING:
-    from sme_registry.io.tables import Table
-
 Outcome = Literal["passed", "warning", "refused", "reported"]
-_WORST_FIRST: tuple[Outcome, ...] = ("refused", "warning")
 
-MARKS = {
+MARKS: dict[Outcome, str] = {
     "passed": "[green]passed[/]",
     "warning": "[yellow]warning[/]",
     "refused": "[red]refused[/]",
@@ -61,7 +50,75 @@ MARKS = {
 }
 """The outcomes in colour, with Rich's markup."""
 
-INF = math.inf
+_STATES = 20_000  # the standard error of mean r̃ is then below 0.001
+_LANES = 4_096
+_MIXING_STEPS = 100
+_TOGETHER = 256
+_CELLS = 16
+_BLOCK = 4_096  # states: a deep policy's inner layers of all states would not fit in cache
+_DISTRACTOR_STEPS = 1_000
+_CONSTANT_STEPS = 2_000
+_CHANNELS_FOLLOWED = 256
+_FALSE_ALARM = 1e-6  # chance that one of the channels of a uniform ensemble is beyond the bound
+_MEASURED_CHANNELS = 512  # above it the fit and the Jacobians take longer than everything else
+_LARGEST_CONDITION = 5_000.0
+_SINGULAR = 1.0 / float(np.finfo(np.float64).eps)  # of a matrix that float64 cannot invert
+_LINEAR_LIMIT = 1_024  # above it the least-squares fit takes longer than everything else
+_ROUNDING = 1e-9
+
+MEANINGS = {
+    "transition_row_sums": "How far a row of W is from the sum 1, which keeps an action's mass.",
+    "layers_orthogonal": "How far W/√12 of a layer of {} is from semi-orthogonal (rescaled: from "
+    "unit rows).",
+    "layers_centred": "How far a layer's b is from −½ W 1, which keeps its outputs around ½.",
+    "uniform_states": "Largest √N·KS distance of a state channel from uniform, "
+    f"{_MIXING_STEPS} random actions after uniform starts.",
+    "coverage": f"Smallest share of the {_CELLS} × {_CELLS} cells of two neighbouring state "
+    "channels that these states lie in.",
+    "coverage_from_one_start": f"Smallest share of {_CELLS} cells of a state channel that "
+    f"{_TOGETHER} lanes reach by the same number of random actions, all from one start.",
+    "distinct_states": "Smallest share of distinct values of a state channel, over "
+    f"{_CONSTANT_STEPS:,} steps of one constant action and over {{}} lanes after them: floating "
+    "point must not collapse.",
+    "constant_policy_similarity": "Mean r̃ of the constant action ½ over uniform states; near 0.75 "
+    "where π* spreads over its range. Higher: the target is near-trivial. Lower: it sits in "
+    "corners.",
+    "constant_policy_reward": "Mean step reward of the constant action ½, which an agent earns "
+    "without learning.",
+    "channel_spread": "Smallest standard deviation of a channel of π* over uniform states; 0.289 "
+    "where it is uniform, 0 where the channel has collapsed to a constant.",
+    "agent_constant_policy_similarity": "Mean r̃ of ½ over one agent's own channels: of {}, where "
+    "it is farthest from 0.75.",
+    "linear_policy_reward": "Mean step reward of the least-squares linear policy, which needs no "
+    "deep learning. It has no range: it is high at complexity 1 by construction.",
+    "broken_limits": "Share of uniform states and channels in which π* is above its limit; near "
+    "the tightness, {:g}, where π* and v spread over their range. Lower: the limits matter "
+    "little. Higher: they bind more than the tightness says.",
+    "limit_uniformity": "Largest KS distance of a channel of v, and so of a limit, from uniform "
+    "over uniform states; 0.5 where the limit has collapsed to a constant.",
+    "states_with_a_broken_limit": "Share of uniform states in which π* is above the limit of at "
+    "least one channel.",
+    "price_of_safety": "What the best safe policy forgoes of the largest step reward, on average "
+    "over uniform states.",
+    "distractor_row_sums": "How far a row of the distractors' W is from the sum 1, as for the "
+    "state.",
+    "uniform_distractors": "Largest √N·KS distance of a distractor from uniform, "
+    f"{_DISTRACTOR_STEPS:,} random actions after uniform starts.",
+    "mixing_orthogonal": "How far a layer's W is from a multiple of an orthogonal matrix (of √12 "
+    "where it is nonlinear), which can be inverted without loss.",
+    "mixing_centred": "How far a layer is from mapping the centre of the cube to the centre.",
+    "mixing_condition": "Median condition number of the mixing's Jacobian at {} uniform points: "
+    "by how much inverting it can multiply an error of the float32 observation.",
+    "mixing_linear_r2": "R² of the worst channel of state and distractors that a linear map "
+    "recovers from the observation, on the other half of the states; 1 where the mixing is "
+    "linear.",
+    "mixing_extent": "Width of the image of the cube in its widest channel: 1, since an "
+    "observation must fill [0, 1] and stay inside.",
+}
+"""Each check, in a sentence for the reader; `{}` is a detail of the task."""
+MEANINGS["distinct_distractors"] = MEANINGS["distinct_states"].replace(
+    "a state channel", "a distractor"
+)
 
 
 @dataclass(frozen=True)
@@ -103,8 +160,9 @@ class Certificate:
     @property
     def outcome(self) -> Outcome:
         """The worst of the checks: "passed", "warning" or "refused"."""
-        outcomes = {check.outcome for check in self.checks}
-        return next((worst for worst in _WORST_FIRST if worst in outcomes), "passed")
+        if self.of("refused"):
+            return "refused"
+        return "warning" if self.of("warning") else "passed"
 
     @property
     def passed(self) -> bool:
@@ -117,10 +175,6 @@ class Certificate:
 
     def table(self, title: str, *, meanings: bool = False) -> Table:
         """The checks as a table: outcome, name, value and range."""
-        from rich.markup import escape
-
-        from sme_registry.io.tables import Table
-
         columns = {"": "name", "check": "name", "value": "number", "passes in": "name"}
         table = Table(title, columns | ({"meaning": "text"} if meanings else {}))
         for check in self.checks:
@@ -131,7 +185,7 @@ class Certificate:
 
     def _repr_html_(self) -> str:
         """A card for notebooks: the outcome, and every check with its meaning."""
-        from sme_registry.io.markup import card, table_html
+        from sme_registry.io.markup import card, table_html  # loads Jinja
 
         return card(table_html(self.table(f"{self.digest}\n{self.outcome}", meanings=True)))
 
@@ -151,50 +205,6 @@ def short(value: float | None, sign: str = "") -> str:
     return "" if value is None else f"{sign}{value:.3g}"
 
 
-def _check(
-    name: str,
-    value: float | None,
-    meaning: str,
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    warns: tuple[float, float] = (INF, -INF),
-) -> Check:
-    """A number that passes in [low, high], warns in a wider range, and else refuses the task."""
-    outcome: Outcome = "refused"
-    if value is None or (low is None and high is None):
-        outcome = "reported"
-    elif (low is None or low <= value) and (high is None or value <= high):
-        outcome = "passed"
-    elif warns[0] <= value <= warns[1]:
-        outcome = "warning"
-    return Check(name, value, low, high, outcome, meaning)
-
-
-def _numbers(task: Task, seed: int, name: str, *shape: int) -> Array:
-    """Uniform numbers for measuring, independent of every stream that tasks are drawn from."""
-    label = f"certify/{task.spec.digest}/{name}"
-    return uniform(seed, label, math.prod(shape)).reshape(shape)
-
-
-_STATES = 20_000  # the standard error of mean r̃ is then below 0.001
-_LANES = 4_096
-_MIXING_STEPS = 100
-_TOGETHER = 256
-_CELLS = 16
-_BLOCK = 4_096  # states
-_DISTRACTOR_STEPS = 1_000
-_CONSTANT_STEPS = 2_000
-_CHANNELS_FOLLOWED = 256
-_FALSE_ALARM = 1e-6  # chance that one of the channels of a uniform ensemble is beyond the bound
-_MEASURED_CHANNELS = 512  # above it the fit and the Jacobians take longer than everything else
-_LARGEST_CONDITION = 5_000.0
-_SINGULAR = 1.0 / float(np.finfo(np.float64).eps)  # of a matrix that float64 cannot invert
-_LINEAR_LIMIT = 1_024  # above it the least-squares fit takes longer than everything else
-_ROUNDING = 1e-9
-_CONSTANT: dict[str, Any] = {"low": 0.65, "high": 0.80, "warns": (0.60, 0.90)}  # mean r̃ of ½
-
-
 def certify(task: Task | SpecLike, *, seed: int = 0) -> Certificate:
     """Measure a drawn task. The same task and seed give the same certificate.
 
@@ -207,16 +217,15 @@ def certify(task: Task | SpecLike, *, seed: int = 0) -> Certificate:
     S, A, m = task.spec.state_dim, task.spec.action_dim, task.spec.distractors
     lanes = max(256, min(_LANES, 2**24 // (S * A)))
     states = max(2_000, min(_STATES, 2**26 // (S + m + task.spec.hidden_width)))
-    distractors = f", distractors={m}" if m else ""
     check_memory(
         48 * max(lanes, states) * (S + A + m + task.spec.hidden_width),
-        f"Certifying a task of state_dim={S}, action_dim={A}{distractors}",
+        f"Certifying a task of state_dim={S}, action_dim={A}, distractors={m}",
         "Certify a task of the same kind with fewer channels.",
     )
     checks = (
         *_parameters(task),
         *_mixing(task, seed, lanes),
-        _no_collapse(task, seed, task.transition, S, "distinct_states", "a state channel"),
+        _no_collapse(task, seed, task.transition, S, "distinct_states"),
         *_difficulty(task, seed, states),
         *_limits(task, seed, states),
         *_observation(task, seed, states),
@@ -224,31 +233,59 @@ def certify(task: Task | SpecLike, *, seed: int = 0) -> Certificate:
     return Certificate(task.spec.digest, seed, checks)
 
 
-def _parameters(task: Task) -> tuple[Check, ...]:
-    every = [layer for network in (*task.policies, task.limiting) for layer in network]
-    network = "π* or v" if task.limiting else "π*"
+def _check(
+    name: str,
+    value: Any,
+    low: float | None = None,
+    high: float | None = None,
+    *,
+    warns: tuple[float, float] = (math.inf, -math.inf),
+    detail: object = "",
+) -> Check:
+    """A number that passes in [low, high], warns in a wider range, and else refuses the task."""
+    outcome: Outcome = "refused"
+    if low is None and high is None:
+        outcome = "reported"
+    elif (low is None or low <= value) and (high is None or value <= high):
+        outcome = "passed"
+    elif warns[0] <= value <= warns[1]:
+        outcome = "warning"
+    return Check(name, float(value), low, high, outcome, MEANINGS[name].format(detail))
+
+
+def _not_measured(name: str, reason: str) -> Check:
+    return Check(name, None, None, None, "reported", f"Not measured: {reason}.")
+
+
+def _constant(name: str, similarity: Any, detail: str = "") -> Check:
+    """The mean r̃ of ½."""
+    return _check(name, similarity, 0.65, 0.80, warns=(0.60, 0.90), detail=detail)
+
+
+def _numbers(task: Task, seed: int, name: str, *shape: int) -> Array:
+    """Uniform numbers for measuring, independent of every stream that tasks are drawn from."""
+    label = f"certify/{task.spec.digest}/{name}"
+    return uniform(seed, label, math.prod(shape)).reshape(shape)
+
+
+def _in_blocks(function: Callable[[Array], Array], s: Array) -> Array:
+    blocks = [function(s[i : i + _BLOCK]) for i in range(0, len(s), _BLOCK)]
+    return np.concatenate(blocks)
+
+
+def _parameters(task: Task) -> Iterator[Check]:
+    layers = [layer for network in (*task.policies, task.limiting) for layer in network]
     unit_rows = task.spec.policy_init == "unit_variance"
-    return (
-        _check(
-            "transition_row_sums",
-            float(np.abs(task.W.sum(axis=1) - 1.0).max()),
-            "How far a row of W is from the sum 1, which keeps an action's mass.",
-            high=0.0,
-        ),
-        _check(
-            "layers_orthogonal",
-            max(_orthogonality_error(layer, unit_rows) for layer in every),
-            f"How far W/√12 of a layer of {network} is from semi-orthogonal (rescaled: from unit "
-            "rows).",
-            high=_ROUNDING,
-        ),
-        _check(
-            "layers_centred",
-            max(float(np.abs(layer.b + 0.5 * layer.W.sum(axis=1)).max()) for layer in every),
-            "How far a layer's b is from −½ W 1, which keeps its outputs around ½.",
-            high=_ROUNDING,
-        ),
-    )
+    orthogonality = max(_orthogonality_error(layer, unit_rows) for layer in layers)
+    network = "π* or v" if task.limiting else "π*"
+    yield _check("transition_row_sums", _row_sum_error(task.W), high=0.0)
+    yield _check("layers_orthogonal", orthogonality, high=_ROUNDING, detail=network)
+    centre = max(float(np.abs(layer.b + 0.5 * layer.W.sum(axis=1)).max()) for layer in layers)
+    yield _check("layers_centred", centre, high=_ROUNDING)
+
+
+def _row_sum_error(W: Array) -> float:
+    return float(np.abs(W.sum(axis=1) - 1.0).max())
 
 
 def _orthogonality_error(layer: Layer, unit_rows: bool) -> float:
@@ -260,7 +297,7 @@ def _orthogonality_error(layer: Layer, unit_rows: bool) -> float:
     return float(np.abs(gram - np.eye(len(gram))).max())
 
 
-def _mixing(task: Task, seed: int, lanes: int) -> tuple[Check, ...]:
+def _mixing(task: Task, seed: int, lanes: int) -> Iterator[Check]:
     """Where random actions lead an ensemble of uniform starts, and one of a single start.
 
     The second need not become uniform within an episode: a channel into which the actions put
@@ -272,28 +309,9 @@ def _mixing(task: Task, seed: int, lanes: int) -> tuple[Check, ...]:
     for t in range(_MIXING_STEPS):
         a = _numbers(task, seed, f"actions/{t}", lanes, A)
         s, together = task.transition(s, a), task.transition(together, a[:_TOGETHER])
-    return (
-        _check(
-            "uniform_states",
-            _distance_from_uniform(s),
-            f"Largest √N·KS distance of a state channel from uniform, {_MIXING_STEPS} random "
-            "actions after uniform starts.",
-            high=_uniform_bound(S),
-        ),
-        _check(
-            "coverage",
-            _coverage(s, pairs=S > 1),
-            f"Smallest share of the {_CELLS} × {_CELLS} cells of two neighbouring state channels "
-            "that these states lie in.",
-            low=0.95 if lanes == _LANES else 0.5,
-        ),
-        _check(
-            "coverage_from_one_start",
-            _coverage(together, pairs=False),
-            f"Smallest share of {_CELLS} cells of a state channel that {_TOGETHER} lanes reach by "
-            f"the same number of random actions, all from one start.",
-        ),
-    )
+    yield _check("uniform_states", _distance_from_uniform(s), high=_uniform_bound(S))
+    yield _check("coverage", _coverage(s, pairs=S > 1), low=0.95 if lanes == _LANES else 0.5)
+    yield _check("coverage_from_one_start", _coverage(together, pairs=False))
 
 
 def _coverage(s: Array, *, pairs: bool) -> float:
@@ -304,170 +322,89 @@ def _coverage(s: Array, *, pairs: bool) -> float:
     return min(len(np.unique(column)) for column in cells.T) / _CELLS ** (2 if pairs else 1)
 
 
-def _difficulty(task: Task, seed: int, states: int) -> list[Check]:
+def _difficulty(task: Task, seed: int, states: int) -> Iterator[Check]:
     """How far from trivial π* is: the scores of policies that know nothing, and its spread."""
     s = _numbers(task, seed, "difficulty", states, task.spec.state_dim)
-    # In blocks: a deep policy's inner layers of all states would not fit in cache.
-    optimal = np.concatenate([task.policy(s[i : i + _BLOCK]) for i in range(0, states, _BLOCK)])
+    optimal = _in_blocks(task.policy, s)
     constant = np.full_like(optimal, 0.5)
     similarity = task.similarity_of(constant, optimal)
-    checks = [
-        _check(
-            "constant_policy_similarity",
-            float(similarity.mean()),
-            "Mean r̃ of the constant action ½ over uniform states; near 0.75 where π* spreads over "
-            "its range. Higher: the target is near-trivial. Lower: it sits in corners.",
-            **_CONSTANT,
-        ),
-        _check(
-            "constant_policy_reward",
-            float(task.reward_of(similarity).mean()),
-            "Mean step reward of the constant action ½, which an agent earns without learning.",
-            high=0.30,
-            warns=(-INF, 0.60),
-        ),
-        _check(
-            "channel_spread",
-            float(optimal.std(axis=0).min()),
-            "Smallest standard deviation of a channel of π* over uniform states; 0.289 where it "
-            "is uniform, 0 where the channel has collapsed to a constant.",
-            low=0.15,
-            warns=(0.05, INF),
-        ),
-    ]
+    reward, spread = task.reward_of(similarity).mean(), optimal.std(axis=0).min()
+    yield _constant("constant_policy_similarity", similarity.mean())
+    yield _check("constant_policy_reward", reward, high=0.30, warns=(-math.inf, 0.60))
+    yield _check("channel_spread", spread, low=0.15, warns=(0.05, math.inf))
     if task.spec.team is not None:
         # The mean over all channels would hide an agent that has nothing to learn among others.
         means = task.similarities_of(constant, optimal).mean(axis=0)
         agent = int(np.abs(means - 0.75).argmax())
-        checks.append(
-            _check(
-                "agent_constant_policy_similarity",
-                float(means[agent]),
-                f"Mean r̃ of ½ over one agent's own channels: of {task.names[agent]}, where it is "
-                "farthest from 0.75.",
-                **_CONSTANT,
-            )
-        )
-    return [*checks, _linear_policy(task, s, optimal)]
+        yield _constant("agent_constant_policy_similarity", means[agent], task.names[agent])
+    yield _linear_policy(task, s, optimal)
 
 
 def _linear_policy(task: Task, s: Array, optimal: Array) -> Check:
     """The mean step reward of the best affine policy, fitted on one half, scored on the other."""
     S, half = task.spec.state_dim, len(s) // 2
-    name = "linear_policy_reward"
     if S > _LINEAR_LIMIT or half < 4 * (S + 1):
-        meaning = f"Not measured: a fit over state_dim={S} channels takes too long."
-        return _check(name, None, meaning)
+        reason = f"a fit over state_dim={S} channels takes too long"
+        return _not_measured("linear_policy_reward", reason)
     affine = np.concatenate([s, np.ones((len(s), 1))], axis=1)
     fitted, *_ = np.linalg.lstsq(affine[:half], optimal[:half], rcond=None)
     actions = np.clip(affine[half:] @ fitted, 0.0, 1.0)
-    value = task.reward_of(task.similarity_of(actions, optimal[half:])).mean()
-    meaning = (
-        "Mean step reward of the least-squares linear policy, which needs no deep learning. It "
-        "has no range: it is high at complexity 1 by construction."
-    )
-    return _check(name, float(value), meaning)
+    reward = task.reward_of(task.similarity_of(actions, optimal[half:])).mean()
+    return _check("linear_policy_reward", reward)
 
 
-def _limits(task: Task, seed: int, states: int) -> tuple[Check, ...]:
+def _limits(task: Task, seed: int, states: int) -> Iterator[Check]:
     """The checks of a task with `safety`; none without."""
     if task.spec.safety is None:
-        return ()
+        return
     tau = task.spec.safety.tightness
     s = _numbers(task, seed, "limits", states, task.spec.state_dim)
-    blocks = [s[i : i + _BLOCK] for i in range(0, states, _BLOCK)]
-    optimal = np.concatenate([task.policy(block) for block in blocks])
-    limit = np.concatenate([task.limit(block) for block in blocks])
-    v = np.concatenate([through(task.limiting, block) for block in blocks])
+    optimal, limit = _in_blocks(task.policy, s), _in_blocks(task.limit, s)
+    v = _in_blocks(lambda block: through(task.limiting, block), s)
     broken = optimal > limit
-    price = 1.0 - task.safe_reward_of(optimal, limit).mean()
-    return (
-        _check(
-            "broken_limits",
-            float(broken.mean()),
-            "Share of uniform states and channels in which π* is above its limit; near the "
-            f"tightness, {tau:g}, where π* and v spread over their range. Lower: the limits "
-            "matter little. Higher: they bind more than the tightness says.",
-            low=0.5 * tau,
-            high=1.5 * tau,
-            warns=(0.25 * tau, 2.0 * tau),
-        ),
-        _check(
-            "limit_uniformity",
-            _distance_from_uniform(v) / math.sqrt(states),
-            "Largest KS distance of a channel of v, and so of a limit, from uniform over uniform "
-            "states; 0.5 where the limit has collapsed to a constant.",
-            low=0.0,
-            high=0.2,
-            warns=(0.0, 0.4),
-        ),
-        _check(
-            "states_with_a_broken_limit",
-            float(broken.any(axis=1).mean()),
-            "Share of uniform states in which π* is above the limit of at least one channel.",
-        ),
-        _check(
-            "price_of_safety",
-            float(price),
-            "What the best safe policy forgoes of the largest step reward, on average over "
-            "uniform states.",
-        ),
-    )
+    uniformity = _distance_from_uniform(v) / math.sqrt(states)
+    warns = 0.25 * tau, 2.0 * tau
+    yield _check("broken_limits", broken.mean(), 0.5 * tau, 1.5 * tau, warns=warns, detail=tau)
+    yield _check("limit_uniformity", uniformity, 0.0, 0.2, warns=(0.0, 0.4))
+    yield _check("states_with_a_broken_limit", broken.any(axis=1).mean())
+    yield _check("price_of_safety", 1.0 - task.safe_reward_of(optimal, limit).mean())
 
 
-def _observation(task: Task, seed: int, states: int) -> tuple[Check, ...]:
+def _observation(task: Task, seed: int, states: int) -> Iterator[Check]:
     """The checks of a task with `observation`; none without."""
-    moving = () if task.distractor_transition is None else _distractors(task, seed)
-    return (*moving, *(_mixing_map(task, seed, states) if task.mixing else ()))
+    if task.distractor_transition is not None:
+        yield from _distractors(task, seed, task.distractor_transition[0])
+    if task.mixing:
+        yield from _mixing_map(task, seed, states)
 
 
-def _distractors(task: Task, seed: int) -> tuple[Check, ...]:
+def _distractors(task: Task, seed: int, W: Array) -> Iterator[Check]:
     """Autonomous distractors always move under random actions; driven ones under any agent's."""
-    assert task.distractor_transition is not None
     m, A = task.spec.distractors, task.spec.action_dim
     lanes = max(256, min(_LANES, 2**20 // (m * A)))
     d = _numbers(task, seed, "distractors", lanes, m)
     for t in range(_DISTRACTOR_STEPS):
         d = task.distractor_step(d, _numbers(task, seed, f"distractors/actions/{t}", lanes, A))
-    return (
-        _check(
-            "distractor_row_sums",
-            float(np.abs(task.distractor_transition[0].sum(axis=1) - 1.0).max()),
-            "How far a row of the distractors' W is from the sum 1, as for the state.",
-            high=0.0,
-        ),
-        _check(
-            "uniform_distractors",
-            _distance_from_uniform(d),
-            f"Largest √N·KS distance of a distractor from uniform, {_DISTRACTOR_STEPS:,} random "
-            "actions after uniform starts.",
-            high=_uniform_bound(m),
-        ),
-        _no_collapse(task, seed, task.distractor_step, m, "distinct_distractors", "a distractor"),
-    )
+    yield _check("distractor_row_sums", _row_sum_error(W), high=0.0)
+    yield _check("uniform_distractors", _distance_from_uniform(d), high=_uniform_bound(m))
+    yield _no_collapse(task, seed, task.distractor_step, m, "distinct_distractors")
 
 
-def _mixing_map(task: Task, seed: int, states: int) -> tuple[Check, ...]:
-    assert task.spec.observation is not None
-    linear = task.spec.observation.mixing == "orthogonal"
-    S, n = task.spec.state_dim, task.spec.state_dim + task.spec.distractors
-    return (
-        _check(
-            "mixing_orthogonal",
-            max(_multiple_error(layer, None if linear else 12.0) for layer in task.mixing),
-            "How far a layer's W is from a multiple of an orthogonal matrix (of √12 where it is "
-            "nonlinear), which can be inverted without loss.",
-            high=_ROUNDING,
-        ),
-        _check(
-            "mixing_centred",
-            max(_centre_error(layer, 0.5 if linear else 0.0) for layer in task.mixing),
-            "How far a layer is from mapping the centre of the cube to the centre.",
-            high=_ROUNDING,
-        ),
-        *_invertibility(task, _numbers(task, seed, "mixing", states, n), S),
-        *((_extent(task.mixing[0]),) if linear else ()),
-    )
+def _mixing_map(task: Task, seed: int, states: int) -> Iterator[Check]:
+    linear = _is_linear(task)
+    orthogonality = max(_multiple_error(layer, None if linear else 12.0) for layer in task.mixing)
+    centre = max(_centre_error(layer, 0.5 if linear else 0.0) for layer in task.mixing)
+    yield _check("mixing_orthogonal", orthogonality, high=_ROUNDING)
+    yield _check("mixing_centred", centre, high=_ROUNDING)
+    n = task.spec.state_dim + task.spec.distractors
+    yield from _invertibility(task, _numbers(task, seed, "mixing", states, n))
+    if linear:
+        extent = float(np.abs(task.mixing[0].W).sum(axis=1).max())
+        yield _check("mixing_extent", extent, 1.0 - _ROUNDING, 1.0 + _ROUNDING)
+
+
+def _is_linear(task: Task) -> bool:
+    return task.spec.observation is not None and task.spec.observation.mixing == "orthogonal"
 
 
 def _multiple_error(layer: Layer, scale: float | None) -> float:
@@ -481,51 +418,26 @@ def _centre_error(layer: Layer, centre: float) -> float:
     return float(np.abs(layer.b - (centre - 0.5 * layer.W.sum(axis=1))).max())
 
 
-def _extent(layer: Layer) -> Check:
-    return _check(
-        "mixing_extent",
-        float(np.abs(layer.W).sum(axis=1).max()),
-        "Width of the image of the cube in its widest channel: 1, since an observation must fill "
-        "[0, 1] and stay inside.",
-        low=1.0 - _ROUNDING,
-        high=1.0 + _ROUNDING,
-    )
-
-
-def _invertibility(task: Task, x: Array, S: int) -> tuple[Check, Check]:
+def _invertibility(task: Task, x: Array) -> Iterator[Check]:
     """How well x is recovered from M(x): locally, and by one linear map."""
-    N, n = x.shape
-    names = "mixing_condition", "mixing_linear_r2"
+    (N, n), S = x.shape, task.spec.state_dim
     if n > _MEASURED_CHANNELS or 4 * (n + 1) > N // 2:
-        why = f"Not measured: it takes too long for {n:,} channels."
-        return _check(names[0], None, why), _check(names[1], None, why)
+        for name in ("mixing_condition", "mixing_linear_r2"):
+            yield _not_measured(name, f"it takes too long for {n:,} channels")
+        return
     points = x[: max(8, min(100, 2**22 // n**2))]
-    condition = float(np.median(np.linalg.cond(_jacobians(task, points))))
-    return (
-        _check(
-            names[0],
-            min(condition, _SINGULAR),
-            f"Median condition number of the mixing's Jacobian at {len(points)} uniform points: "
-            "by how much inverting it can multiply an error of the float32 observation.",
-            high=_LARGEST_CONDITION,
-        ),
-        _check(
-            names[1],
-            float(held_out_r2(task.seen(x[:, :S], x[:, S:]), x).min()),
-            "R² of the worst channel of state and distractors that a linear map recovers from the "
-            "observation, on the other half of the states; 1 where the mixing is linear.",
-            low=0.75,
-        ),
-    )
+    condition = min(float(np.median(np.linalg.cond(_jacobians(task, points)))), _SINGULAR)
+    yield _check("mixing_condition", condition, high=_LARGEST_CONDITION, detail=len(points))
+    r2 = held_out_r2(task.seen(x[:, :S], x[:, S:]), x).min()
+    yield _check("mixing_linear_r2", r2, low=0.75)
 
 
 def _jacobians(task: Task, x: Array) -> Array:
     """The Jacobian of the mixing `[P, n, n]` at points `[P, n]`."""
     J = np.broadcast_to(np.eye(x.shape[1]), (*x.shape, x.shape[1]))
-    assert task.spec.observation is not None
     for W, b in task.mixing:
         J = W @ J
-        if task.spec.observation.mixing == "nonlinear":
+        if not _is_linear(task):
             z = x @ W.T + b
             J = (np.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi))[:, :, None] * J
             x = ndtr(z)
@@ -546,12 +458,7 @@ def _uniform_bound(channels: int) -> float:
 
 
 def _no_collapse(
-    task: Task,
-    seed: int,
-    transition: Callable[[Array, Array], Array],
-    channels: int,
-    name: str,
-    channel: str,
+    task: Task, seed: int, transition: Callable[[Array, Array], Array], channels: int, name: str
 ) -> Check:
     """The smallest share of distinct values of a channel under constant actions.
 
@@ -560,7 +467,7 @@ def _no_collapse(
     lanes within 52 steps; float32 states cycle within about 2,000.
     """
     A = task.spec.action_dim
-    stream = "distractors/" if channel == "a distractor" else ""
+    stream = "distractors/" if name == "distinct_distractors" else ""
     lanes = max(8, min(64, 2**20 // (channels * A)))
     starts = _numbers(task, seed, f"{stream}constant_starts", lanes, channels)
     action = _numbers(task, seed, f"{stream}constants", 1, A)
@@ -572,13 +479,7 @@ def _no_collapse(
         s = transition(s, a)
         history[t] = s[::lanes, : history.shape[2]]
     last = s.reshape(len(constants), lanes, channels).swapaxes(0, 1)
-    return _check(
-        name,
-        min(_distinct(history), _distinct(last)),
-        f"Smallest share of distinct values of {channel}, over {_CONSTANT_STEPS:,} steps of one "
-        f"constant action and over {lanes} lanes after them: floating point must not collapse.",
-        low=0.99,
-    )
+    return _check(name, min(_distinct(history), _distinct(last)), low=0.99, detail=lanes)
 
 
 def _distinct(values: Array) -> float:
