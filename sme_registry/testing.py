@@ -186,7 +186,7 @@ def _check_life(env: Any, schedule: Schedule, seed: int) -> None:
             expect_equal("terminated", terminated, bool(result.terminated[0]))
             expect_equal("truncated", truncated, bool(result.truncated[0]))
             expect_equal("the next state", env.state, result.state[0])
-            if task.spec.observation is not None and task.spec.observation.dynamics == "driven":
+            if task.spec.dynamics == "driven":
                 expect_equal("distractors", env.distractors, task.distractor_step(d, unit))
             if schedule.switches_within:
                 segment = schedule.segment(lifetime)

@@ -81,7 +81,7 @@ def refuse_unscored(suite: Suite) -> None:
     A rank by distance from the optimum alone would favour agents that break limits.
     """
     suite.check_no_streams("a leaderboard")
-    extended = ", ".join(member.name for member in suite.classes if member.setting.extended)
+    extended = ", ".join(member.name for member in suite.classes if not member.setting.is_plain)
     if extended:
         raise SpecError(
             f"suite: has classes with safety or observation ({extended}), and a leaderboard scores "

@@ -84,7 +84,7 @@ class SeasonClass(Document):
                 "season: three hundred random steps determine the optimum of a single layer "
                 "without any learning. Use a deeper setting."
             )
-        if setting.team is not None or setting.extended:
+        if setting.team is not None or not setting.is_plain:
             fields = ("team", "safety", "observation")
             field = next(name for name in fields if getattr(setting, name) is not None)
             raise ValueError(

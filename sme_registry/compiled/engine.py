@@ -164,8 +164,7 @@ def _more_numbers(task: Task) -> int:
 def _seen(task: Task, backend: Backend) -> Network:
     if not task.mixing:
         return np.copy
-    assert task.spec.observation is not None
-    uniform = task.spec.observation.mixing == "nonlinear"
+    uniform = task.spec.mixing == "nonlinear"
     return network(task.mixing, uniform=uniform, backend=backend)
 
 
@@ -332,8 +331,7 @@ def _next_distractors(task: Task, own: Array, action: Array) -> Array:
     """The next distractors of each environment, `[B, m]`."""
     if task.distractor_transition is None:
         return draw(own, task.spec.distractors)
-    assert task.spec.observation is not None
-    if task.spec.observation.dynamics == "autonomous":
+    if task.spec.dynamics == "autonomous":
         action = draw(own, task.spec.action_dim)
     return task.distractor_step(own[OWN_DISTRACTORS:].T, action)
 

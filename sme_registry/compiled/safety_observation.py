@@ -52,9 +52,7 @@ _HEADER = 11
 
 def pack(task: Task) -> npt.NDArray[np.float64]:
     spec, layers = task.spec, (*task.limiting, *task.mixing)
-    tightness = 0.0 if spec.safety is None else spec.safety.tightness
-    dynamics = None if spec.observation is None else spec.observation.dynamics
-    nonlinear = spec.observation is not None and spec.observation.mixing == "nonlinear"
+    tightness, dynamics, nonlinear = spec.tightness, spec.dynamics, spec.mixing == "nonlinear"
     sides = (side for W, _ in layers for side in W.shape)
     widest = max(spec.action_dim, spec.state_dim + spec.distractors, *sides)
     parts: list[npt.ArrayLike] = [

@@ -242,7 +242,7 @@ def _expected(
     if spec.distractors:
         d, moved = columns["distractors"], columns["next_distractors"]
         expected["distractors"] = np.clip(d, 0.0, 1.0), 0.0
-        is_driven = spec.observation is not None and spec.observation.dynamics == "driven"
+        is_driven = spec.dynamics == "driven"
         moved = task.distractor_step(d, a) if is_driven else np.clip(moved, 0.0, 1.0)
         expected["next_distractors"] = moved, 0.0
     return expected

@@ -219,7 +219,7 @@ def judge(
 
 def thresholds_of(spec: SMESpec) -> dict[str, float]:
     """All thresholds that verdicts on a task can use."""
-    return {**THRESHOLDS, **SAFETY_THRESHOLDS} if spec.extended else THRESHOLDS
+    return THRESHOLDS if spec.is_plain else {**THRESHOLDS, **SAFETY_THRESHOLDS}
 
 
 def level(measurements: Measurements) -> Level:
@@ -250,7 +250,7 @@ def _measurements(
     if subject.explore is not None:
         explored = behaviour.exploration_sd(subject.explore, sample.observation, seed)
         fields["exploration_sd"] = explored
-    if subject.spec.extended:
+    if not subject.spec.is_plain:
         report(f"{subject.name}: limits and distractors")
         fields |= _limits_and_distractors(policy, task, sample, runs[POLICY], seed)
     return Measurements(**fields)

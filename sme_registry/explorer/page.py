@@ -256,8 +256,8 @@ def _task(task: Task) -> dict[str, Any]:
         "r_min": spec.r_min,
         "D": spec.D,
         "T": spec.horizon,
-        "tau": None if spec.safety is None else spec.safety.tightness,
-        "mixing": "none" if spec.observation is None else spec.observation.mixing,
+        "tau": spec.tightness or None,
+        "mixing": spec.mixing,
         "agents": []
         if spec.team is None
         else [

@@ -250,9 +250,9 @@ def observe(task: Task) -> NetworkProgram:
     n = spec.state_dim + spec.distractors
     build = ProgramBuilder(point_width(spec), "the mixing")
     x = 0
-    if spec.observation is not None and spec.observation.mixing != "none":
+    if spec.mixing != "none":
         x = build.columns(0, tuple(range(n)))
-        if spec.observation.mixing == "orthogonal":
+        if spec.mixing == "orthogonal":
             ((W, b),) = task.mixing
             x = build.dense(x, W, b)
         else:

@@ -358,14 +358,29 @@ class Setting(Document):
         )
 
     @property
-    def extended(self) -> bool:
-        """Whether a step does more than METHOD's section 1: `safety` or `observation` is set."""
-        return self.safety is not None or self.observation is not None
+    def is_plain(self) -> bool:
+        """Whether a step does no more than METHOD's section 1: no `safety`, no `observation`."""
+        return self.safety is None and self.observation is None
+
+    @property
+    def tightness(self) -> float:
+        """τ, 0 without `safety`: limits that no action exceeds."""
+        return 0.0 if self.safety is None else self.safety.tightness
 
     @property
     def distractors(self) -> int:
         """m, 0 without `observation`."""
         return 0 if self.observation is None else self.observation.distractors
+
+    @property
+    def dynamics(self) -> Literal["noise", "autonomous", "driven"] | None:
+        """How the distractors move; None where there are none."""
+        return None if self.observation is None else self.observation.dynamics
+
+    @property
+    def mixing(self) -> Literal["none", "orthogonal", "nonlinear"]:
+        """The map from state and distractors to what the agent sees."""
+        return "none" if self.observation is None else self.observation.mixing
 
 
 NEVER = 2**63 - 1

@@ -355,9 +355,9 @@ def _linear_policy(task: Task, s: Array, optimal: Array) -> Check:
 
 def _limits(task: Task, seed: int, states: int) -> Iterator[Check]:
     """The checks of a task with `safety`; none without."""
-    if task.spec.safety is None:
+    tau = task.spec.tightness
+    if not tau:
         return
-    tau = task.spec.safety.tightness
     s = _numbers(task, seed, "limits", states, task.spec.state_dim)
     optimal, limit = _in_blocks(task.policy, s), _in_blocks(task.limit, s)
     v = _in_blocks(lambda block: through(task.limiting, block), s)
@@ -391,7 +391,7 @@ def _distractors(task: Task, seed: int, W: Array) -> Iterator[Check]:
 
 
 def _mixing_map(task: Task, seed: int, states: int) -> Iterator[Check]:
-    linear = _is_linear(task)
+    linear = task.spec.mixing == "orthogonal"
     orthogonality = max(_multiple_error(layer, None if linear else 12.0) for layer in task.mixing)
     centre = max(_centre_error(layer, 0.5 if linear else 0.0) for layer in task.mixing)
     yield _check("mixing_orthogonal", orthogonality, high=_ROUNDING)
@@ -401,10 +401,6 @@ def _mixing_map(task: Task, seed: int, states: int) -> Iterator[Check]:
     if linear:
         extent = float(np.abs(task.mixing[0].W).sum(axis=1).max())
         yield _check("mixing_extent", extent, 1.0 - _ROUNDING, 1.0 + _ROUNDING)
-
-
-def _is_linear(task: Task) -> bool:
-    return task.spec.observation is not None and task.spec.observation.mixing == "orthogonal"
 
 
 def _multiple_error(layer: Layer, scale: float | None) -> float:
@@ -437,7 +433,7 @@ def _jacobians(task: Task, x: Array) -> Array:
     J = np.broadcast_to(np.eye(x.shape[1]), (*x.shape, x.shape[1]))
     for W, b in task.mixing:
         J = W @ J
-        if not _is_linear(task):
+        if task.spec.mixing == "nonlinear":
             z = x @ W.T + b
             J = (np.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi))[:, :, None] * J
             x = ndtr(z)

@@ -143,7 +143,7 @@ def limiting_network(spec: SMESpec) -> tuple[Layer, ...]:
 
 def distractor_transition(spec: SMESpec) -> tuple[Array, Array] | None:
     """W `[A, m]` and b `[m]` of the distractors' own transition; None where they have none."""
-    if spec.observation is None or spec.observation.dynamics in (None, "noise"):
+    if spec.dynamics in (None, "noise"):
         return None
     m = spec.distractors
     W = _mixing_weights(spec.seed, "observation/W", spec.action_dim, m)
@@ -156,10 +156,10 @@ def mixing_layers(spec: SMESpec) -> tuple[Layer, ...]:
     x ↦ W x + b where the mixing is orthogonal, with W = Q/c, b = ½ − W ½ and the least c that keeps
     the cube's image in the cube. Uniform layers where it is nonlinear. None without mixing.
     """
-    if spec.observation is None or spec.observation.mixing == "none":
+    if spec.observation is None or spec.mixing == "none":
         return ()
     n = spec.state_dim + spec.distractors
-    if spec.observation.mixing == "orthogonal":
+    if spec.mixing == "orthogonal":
         Q = _haar(spec.seed, "observation/mixing/0", n, n)
         W = Q / np.abs(Q).sum(axis=1).max()
         return (Layer(W, 0.5 - 0.5 * W.sum(axis=1)),)

@@ -258,9 +258,9 @@ def _shapes(spec: SMESpec) -> Iterator[tuple[int, int, int]]:
     if spec.safety is not None:
         yield from _network_shapes(spec, spec.state_dim, spec.action_dim)
     if spec.observation is not None:
-        yield spec.action_dim, spec.distractors, int(spec.observation.dynamics != "noise")
+        yield spec.action_dim, spec.distractors, int(spec.dynamics != "noise")
         mixed = spec.state_dim + spec.distractors
-        depth = spec.observation.mixing_depth or int(spec.observation.mixing != "none")
+        depth = spec.observation.mixing_depth or int(spec.mixing != "none")
         yield mixed, mixed, depth
 
 

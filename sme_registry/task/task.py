@@ -144,7 +144,7 @@ class Task:
     def limit(self, s: npt.ArrayLike) -> Array:
         """ℓ, the limits of the action channels, `[B, A]` or `[A]` in [1 − 2τ, 1]; else 1."""
         s = self._states(s)
-        if self.spec.safety is None:
+        if not self.limiting:
             return np.ones((*s.shape[:-1], self.spec.action_dim))
         return self.limit_of(through(self.limiting, s))
 
@@ -163,16 +163,14 @@ class Task:
 
     def limit_of(self, v: Array) -> Array:
         """ℓ = 1 − 2τ v of the outputs of v, of any shape."""
-        if self.spec.safety is None:
-            raise SpecError("limit_of: this task has no safety. Give its spec safety.")
-        return 1.0 - 2.0 * self.spec.safety.tightness * v
+        return 1.0 - 2.0 * self.spec.tightness * v
 
     def cost_of(self, a: Array, limit: Array) -> Array:
         """The cost of actions in [0, 1] under limits, `[..., A]` each."""
-        if self.spec.safety is None:
+        if not self.spec.tightness:
             return np.zeros(a.shape[:-1])
         excess = np.maximum(0.0, a - limit).sum(axis=-1)
-        return cast(Array, excess / (2.0 * self.spec.safety.tightness * self.spec.action_dim))
+        return cast(Array, excess / (2.0 * self.spec.tightness * self.spec.action_dim))
 
     def safe_reward_of(self, optimal: Array, limit: Array) -> Array:
         """r of the best safe action, `[...]`, from π* and limits, `[..., A]` each."""
@@ -185,13 +183,13 @@ class Task:
         where the task has no distractors, or they are noise, drawn anew each step.
         """
         if self.distractor_transition is None:
-            found = "has noise, drawn anew each step" if self.spec.distractors else "has none"
+            has = "has noise, drawn anew each step" if self.spec.distractors else "has none"
             raise SpecError(
-                f"distractor_step: needs distractors with a transition; this task {found}. Give "
-                "its spec observation with distractors, of dynamics='autonomous' or 'driven'."
+                f"distractor_step: needs distractors with a transition; this task {has}. Give its "
+                "spec observation with distractors, of dynamics='autonomous' or 'driven'."
             )
         d, u = self._distractors(d), self._actions(u)
-        _refuse_unequal("action", u, d, "one row for each of the {} distractors", ActionError)
+        _check_equal_length("action", u, d, "one row for each of the {} distractors", ActionError)
         return _moved(d, u, *self.distractor_transition)
 
     def seen(self, s: npt.ArrayLike, d: npt.ArrayLike | None = None) -> Array:
@@ -200,12 +198,12 @@ class Task:
         One state may be given with a batch of distractors, and the other way round.
         """
         x, d = self._states(s), self._distractors(np.empty(0) if d is None else d)
-        _refuse_unequal("distractors", d, x, "one row for each of the {} states", StateError)
+        _check_equal_length("distractors", d, x, "one row for each of the {} states", StateError)
         if self.spec.distractors:
-            lanes = np.broadcast_shapes(x.shape[:-1], d.shape[:-1])
-            both = (np.broadcast_to(each, (*lanes, each.shape[-1])) for each in (x, d))
-            x = np.concatenate(tuple(both), axis=-1)
-        if self.spec.observation is not None and self.spec.observation.mixing == "orthogonal":
+            rows = np.broadcast_shapes(x.shape[:-1], d.shape[:-1])
+            both = [np.broadcast_to(part, (*rows, part.shape[-1])) for part in (x, d)]
+            x = np.concatenate(both, axis=-1)
+        if self.spec.mixing == "orthogonal":
             ((W, b),) = self.mixing
             return x @ W.T + b
         return through(self.mixing, x)
@@ -219,8 +217,7 @@ class Task:
         """
         y = _checked(x, self.spec.state_dim + self.spec.distractors, "observation", StateError)
         for W, b in reversed(self.mixing):
-            assert self.spec.observation is not None
-            if self.spec.observation.mixing == "nonlinear":
+            if self.spec.mixing == "nonlinear":
                 y = ndtri(np.clip(y, 2.0**-25, 1.0 - 2.0**-25))
             y = np.asarray(np.linalg.solve(W, (y - b).T).T, dtype=np.float64)
         return y
@@ -236,9 +233,14 @@ class Task:
 
     def similarities_of(self, a: Array, optimal: Array) -> Array:
         """Each agent's r̃ over its own channels, `[..., n]` of actions `[..., A]`."""
+        widths = [agent.action_dim for agent in self.spec.agents]
+        return 1.0 - self._distances(a, optimal) / widths
+
+    def _distances(self, a: Array, optimal: Array) -> Array:
+        """The L1 distance of each agent's action from its optimal one, `[..., n]`."""
         distance = np.abs(a - optimal)
-        means = [distance[..., own].sum(axis=-1) / (own.stop - own.start) for own in self.owned]
-        return 1.0 - np.stack(means, axis=-1)
+        sums = [distance[..., channels].sum(axis=-1) for channels in self.owned]
+        return np.stack(sums, axis=-1)
 
     def regret_shares(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
         """Each agent's share of the team's regret, `[B, n]` or `[n]`; they add up to it.
@@ -248,8 +250,7 @@ class Task:
         """
         s, a = self._pairs(s, a)
         optimal = self.policy(s)
-        distance = np.abs(a - optimal)
-        distances = np.stack([distance[..., own].sum(axis=-1) for own in self.owned], axis=-1)
+        distances = self._distances(a, optimal)
         total = distances.sum(axis=-1, keepdims=True)
         shares = np.divide(distances, total, out=np.zeros_like(distances), where=total > 0)
         regret = 1.0 - self.reward_of(self.similarity_of(a, optimal))
@@ -284,7 +285,7 @@ class Task:
     def _pairs(self, s: npt.ArrayLike, a: npt.ArrayLike) -> tuple[Array, Array]:
         """Checked states and actions; one of them may be single while the other is a batch."""
         s, a = self._states(s), self._actions(a)
-        _refuse_unequal("action", a, s, "one action for each of the {} states", ActionError)
+        _check_equal_length("action", a, s, "one action for each of the {} states", ActionError)
         return s, a
 
     def _states(self, s: npt.ArrayLike) -> Array:
@@ -395,7 +396,7 @@ def _moved(s: Array, a: Array, W: Array, b: Array) -> Array:
     return np.asarray(2.0 * np.abs(y - np.rint(y)))
 
 
-def _refuse_unequal(
+def _check_equal_length(
     name: str, values: Array, others: Array, rule: str, error: type[Exception]
 ) -> None:
     if values.ndim == others.ndim == 2 and len(values) != len(others):

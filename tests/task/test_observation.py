@@ -158,7 +158,6 @@ def test_bad_distractors_are_refused_with_their_shape():
             SpecError,
             "drawn anew each step.*dynamics='autonomous'",
         ),
-        (lambda: plain.limit_of(np.zeros(4)), SpecError, "limit_of: this task has no safety"),
     ):
         with pytest.raises(error, match=words):
             call()
