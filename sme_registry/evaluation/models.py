@@ -19,16 +19,18 @@ import json
 import os
 import sys
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sme_registry.compiled.arrays import Observation
-from sme_registry.errors import MissingDependencyError, PolicyError, did_you_mean
-from sme_registry.io import import_object, is_installed, require_packages
+from sme_registry.errors import PolicyError, did_you_mean
+from sme_registry.io import import_object, require_packages
 from sme_registry.spec import ACTION_RANGES, ActionRange
+
+Act = Callable[[Observation], Any]
 
 
 class Interface(NamedTuple):
@@ -50,6 +52,22 @@ class Interface(NamedTuple):
                     f"{self.description}. Evaluate it on the task that it was trained or prepared "
                     "for."
                 )
+
+
+class ModelFunctions(NamedTuple):
+    """How a model acts: fields of `Policy`."""
+
+    act: Act
+    episodes: Callable[[], Act] | None = None
+    hidden: Callable[[Observation], Iterable[Any] | None] | None = None
+
+
+# PyTorch
+
+
+def _torch() -> Any:
+    """PyTorch, if it is imported."""
+    return sys.modules.get("torch")
 
 
 def is_module(policy: Any) -> bool:
@@ -81,9 +99,12 @@ class ModulePredictor:
         return returned
 
 
-def hidden_layers(
-    act: Callable[[Observation], Any], module: Any
-) -> Callable[[Observation], list[Any] | None]:
+def of_module(module: Any) -> ModelFunctions:
+    act = ModulePredictor(module)
+    return ModelFunctions(act, hidden=_hidden_layers(act, module))
+
+
+def _hidden_layers(act: Act, module: Any) -> Callable[[Observation], list[Any] | None]:
     """The outputs of a module's hidden layers: the inputs of its linear layers but the first."""
     linear = [part for part in module.modules() if isinstance(part, _torch().nn.Linear)]
 
@@ -137,9 +158,7 @@ def without_tensor(returned: Any) -> Any:
 
 def advice_on(error: Exception) -> str:
     """A sentence on a function that failed because it expects a tensor; else empty."""
-    if _torch() is None or not isinstance(error, AttributeError | TypeError):
-        return ""
-    if "ndarray" not in str(error):
+    if _torch() is None or "ndarray" not in str(error):
         return ""
     return " Observations are NumPy arrays: `torch.as_tensor(observations)` is the tensor of them."
 
@@ -161,12 +180,34 @@ def evaluating(module: Any) -> Iterator[None]:
             part.training = training
 
 
-def _torch() -> Any:
-    """PyTorch, if it is imported."""
-    return sys.modules.get("torch")
+# Stable-Baselines3 and what has its interface
 
 
-_LOW: dict[ActionRange, float] = {"unit": 0.0, "symmetric": -1.0}
+def of_sb3(model: Any, interface: Interface) -> ModelFunctions:
+    """A model's deterministic actions; those of a plain SB3 model before they are clipped."""
+    spaces = {"observations": "observation_space", "actions": "action_space"}
+    shapes = {what: getattr(getattr(model, s, None), "shape", None) for what, s in spaces.items()}
+    interface.check("policy", **shapes)
+    normaliser = getattr(model, "get_vec_normalize_env", lambda: None)()
+    if getattr(normaliser, "norm_obs", False):
+        raise PolicyError(
+            "policy: it was trained on observations normalised by VecNormalize, which an "
+            "evaluation does not apply. Pass a callable: "
+            "lambda obs: model.predict(vec_normalize.normalize_obs(obs), deterministic=True)[0]."
+        )
+    network = torch_policy(model)
+    if network is None:
+        episodes = functools.partial(_stateful, model)
+        return ModelFunctions(lambda observations: _predicted(model, observations)[0], episodes)
+
+    def act(observations: Observation) -> Any:
+        torch = _torch()
+        with evaluating(network), torch.no_grad():
+            batch = torch.as_tensor(observations, device=network.device)
+            chosen = network._predict(batch, deterministic=True).cpu().numpy()
+        return network.unscale_action(chosen) if network.squash_output else chosen
+
+    return ModelFunctions(act, hidden=_hidden_layers(act, network))
 
 
 def torch_policy(model: Any) -> Any:
@@ -185,28 +226,8 @@ def torch_policy(model: Any) -> Any:
     return network if is_plain else None
 
 
-def predictor(model: Any) -> Callable[[Observation], Any]:
-    """A model's deterministic actions; those of a plain SB3 model before they are clipped."""
-    network = torch_policy(model)
-    if network is None:
-        return lambda observations: _predicted(model, observations)[0]
-
-    def act(observations: Observation) -> Any:
-        torch = _torch()
-        with evaluating(network), torch.no_grad():
-            batch = torch.as_tensor(observations, device=network.device)
-            chosen = network._predict(batch, deterministic=True).cpu().numpy()
-        return network.unscale_action(chosen) if network.squash_output else chosen
-
-    return act
-
-
-def episode_predictor(model: Any) -> Callable[[], Callable[[Observation], Any]] | None:
-    """Begins episodes: as `predictor`, with the model's state kept from call to call, by row."""
-    return functools.partial(_stateful, model) if torch_policy(model) is None else None
-
-
-def _stateful(model: Any) -> Callable[[Observation], Any]:
+def _stateful(model: Any) -> Act:
+    """As a model acts, with its state kept from call to call, by row."""
     state = None
 
     def act(observations: Observation) -> Any:
@@ -224,14 +245,7 @@ def _predicted(model: Any, observations: Observation, state: Any = None) -> tupl
     return (predicted[0], predicted[1]) if isinstance(predicted, tuple) else (predicted, None)
 
 
-def check_not_normalised(model: Any) -> None:
-    normaliser = getattr(model, "get_vec_normalize_env", lambda: None)()
-    if getattr(normaliser, "norm_obs", False):
-        raise PolicyError(
-            "policy: it was trained on observations normalised by VecNormalize, which an "
-            "evaluation does not apply. Pass a callable: "
-            "lambda obs: model.predict(vec_normalize.normalize_obs(obs), deterministic=True)[0]."
-        )
+_LOW: dict[ActionRange, float] = {"unit": 0.0, "symmetric": -1.0}
 
 
 def action_range_of(model: Any) -> ActionRange:
@@ -267,13 +281,12 @@ _ALGORITHMS = {
     "sbx.tqc.policies": "sbx:TQC",
 }
 # For the policy of all actor-critics, by a field that the algorithm saves; the first match decides.
+_ACTOR_CRITIC = "stable_baselines3.common.policies"
 _ACTOR_CRITICS = {
     "clip_range": "stable_baselines3:PPO",
     "cg_max_steps": "sb3_contrib:TRPO",
     "gae_lambda": "stable_baselines3:A2C",
 }
-_ACTOR_CRITIC_POLICY = "stable_baselines3.common.policies"
-_PACKAGES = {"sb3_contrib": "sb3-contrib", "sbx": "sbx-rl"}  # what `pip install` calls them
 
 
 def load_sb3(path: str | os.PathLike[str], algorithm: str | None = None) -> Any:
@@ -296,7 +309,12 @@ def load_sb3(path: str | os.PathLike[str], algorithm: str | None = None) -> Any:
     packages = {"stable_baselines3": "Stable-Baselines3", "torch": "PyTorch"}
     require_packages(f"loading {path}", packages, "train")
     name = _algorithm_of(path, fields) if algorithm is None else _full_name(algorithm)
-    model_class = _import(name, path)
+    model_class = import_object(name, "algorithm", PolicyError)
+    if not hasattr(model_class, "load"):
+        raise PolicyError(
+            f"algorithm={name!r}: must be a class with a method `load`, like those of "
+            "Stable-Baselines3."
+        )
     try:
         # Otherwise the replay buffer is allocated at its full size, though acting never uses it.
         return model_class.load(path, device="cpu", custom_objects={"buffer_size": 1})
@@ -325,8 +343,8 @@ def _algorithm_of(path: Path, fields: dict[str, Any]) -> str:
     policy_class = fields.get("policy_class")
     module = policy_class.get("__module__") if isinstance(policy_class, dict) else None
     name = _ALGORITHMS.get(str(module))
-    if module == _ACTOR_CRITIC_POLICY:
-        name = next((each for mark, each in _ACTOR_CRITICS.items() if mark in fields), None)
+    if module == _ACTOR_CRITIC:
+        name = next((name for field, name in _ACTOR_CRITICS.items() if field in fields), None)
     if name is None:
         policy = f" (its policy is of {module})" if module else ""
         raise PolicyError(
@@ -348,30 +366,9 @@ def _full_name(algorithm: str) -> str:
     return f"stable_baselines3:{algorithm.upper()}"
 
 
-def _import(name: str, path: Path) -> Any:
-    package = name.partition(":")[0].partition(".")[0]
-    if package in _PACKAGES and not is_installed(package):
-        raise MissingDependencyError(
-            f"loading {path}: it is a model of {name}, and {_PACKAGES[package]} is not installed. "
-            f"Run `pip install {_PACKAGES[package]}`."
-        )
-    if package == "stable_baselines3":
-        import stable_baselines3
-
-        return getattr(stable_baselines3, name.rpartition(":")[2])
-    model_class = import_object(name, "algorithm", PolicyError)
-    if not hasattr(model_class, "load"):
-        raise PolicyError(
-            f"algorithm={name!r}: must be a class with a method `load`, like those of "
-            "Stable-Baselines3."
-        )
-    return model_class
-
-
 def _saved_fields(path: Path) -> dict[str, Any]:
     """A saved model's fields by name. Reads JSON only and runs no code."""
-    if not path.is_file():
-        raise PolicyError(f"{path} does not exist. Give the path of a saved model (.zip).")
+    check_exists(path, "a saved model (.zip)")
     try:
         with zipfile.ZipFile(path) as archive:
             fields = json.loads(archive.read("data"))
@@ -385,14 +382,19 @@ def _saved_fields(path: Path) -> dict[str, Any]:
     return fields
 
 
+def check_exists(path: Path, what: str) -> None:
+    if not path.is_file():
+        raise PolicyError(f"{path} does not exist. Give the path of {what}.")
+
+
+# ONNX
+
 ACTION_RANGE = "action_range"  # a field of a file's metadata: "unit" or "symmetric"
 
 
-def load_onnx(path: str | os.PathLike[str], interface: Interface) -> OnnxNetwork:
+def load_onnx(path: Path, interface: Interface) -> OnnxNetwork:
     """Load an ONNX file's network, on one thread of the CPU: a function of observations."""
-    path = Path(path)
-    if not path.is_file():
-        raise PolicyError(f"{path} does not exist. Give the path of an .onnx file.")
+    check_exists(path, "an .onnx file")
     session = start_session(path)
     ends = {"input": session.get_inputs(), "output": session.get_outputs()}
     for (what, tensors), width in zip(ends.items(), interface[:2], strict=True):

@@ -24,10 +24,15 @@ import numpy.typing as npt
 
 from sme_registry.compiled.arrays import Observation
 from sme_registry.errors import OptionError, PolicyError, SMEError
-from sme_registry.io import parse_json, to_json, write_atomically
+from sme_registry.io import choice, parse_json, to_json, write_atomically
 
 Weights = npt.NDArray[np.float32]
 Layer = tuple[Weights, Weights, str]
+OfflineLayer = tuple[Weights, Weights]
+
+KIND = "sme-offline-policy"
+_MAX_LAYERS = 64
+_MAX_BYTES = 2**28
 
 
 def _silu(x: Weights, out: Weights) -> None:
@@ -66,6 +71,18 @@ def _outputs(layers: Iterable[Layer], observations: Observation) -> Iterator[Wei
         yield x
 
 
+def _check_layer(where: str, W: Weights, b: Weights, inputs: int | None) -> None:
+    """W `[in, out]` and b `[out]` fit each other and, but for the first, the layer before."""
+    fits = W.ndim == 2 and W.size > 0 and b.shape == W.shape[1:]
+    if not fits or inputs not in (None, len(W)):
+        raise PolicyError(
+            f"{where}: W has shape {W.shape} and b {b.shape}: must be ({inputs or 'in'}, out) and "
+            "(out,). Transpose the weights of PyTorch or Equinox, W.T."
+        )
+    if not (np.isfinite(W).all() and np.isfinite(b).all()):
+        raise PolicyError(f"{where}: contains NaN or infinity. Give finite numbers.")
+
+
 class Perceptron:
     """A function from observations `[B, O]` to actions `[B, A]`; deterministic.
 
@@ -94,8 +111,17 @@ class Perceptron:
             raise PolicyError("layers: must be at least one (W, b, activation).")
         self.layers: list[Layer] = []
         for index, layer in enumerate(layers):
-            width = len(self.layers[-1][1]) if self.layers else None
-            self.layers.append(_checked(index, layer, width))
+            where = f"layers[{index}]"
+            try:
+                weights, bias, activation = layer
+                W, b = (np.array(array, np.float32, order="C") for array in (weights, bias))
+            except (TypeError, ValueError) as error:
+                raise PolicyError(
+                    f"{where}: must be (W, b, activation), W and b arrays: {error}."
+                ) from None
+            choice(f"{where}: activation", activation, ACTIVATIONS, error=PolicyError)
+            _check_layer(where, W, b, len(self.layers[-1][1]) if self.layers else None)
+            self.layers.append((W, b, activation))
         self.low, self.high = low, high
 
     @property
@@ -119,39 +145,6 @@ class Perceptron:
         if self.low is None or self.high is None:
             return x
         return self.low + 0.5 * (x + 1.0) * (self.high - self.low)
-
-
-def _checked(index: int, layer: Any, width: int | None) -> Layer:
-    """A layer as float32 arrays; `width` is that of the layer before, None for the first."""
-    where = f"layers[{index}]"
-    try:
-        weights, bias, activation = layer
-        W, b = (np.array(array, np.float32, order="C") for array in (weights, bias))
-    except (TypeError, ValueError) as error:
-        raise PolicyError(
-            f"{where}: must be (W, b, activation), W and b arrays: {error}."
-        ) from None
-    if activation not in ACTIVATIONS:
-        raise PolicyError(
-            f"{where}: activation={activation!r:.40}: must be one of {', '.join(ACTIVATIONS)}."
-        )
-    fits = W.ndim == 2 and W.size > 0 and b.shape == W.shape[1:]
-    if not fits or (width is not None and len(W) != width):
-        inputs = "in" if width is None else str(width)
-        raise PolicyError(
-            f"{where}: W has shape {W.shape} and b {b.shape}: must be ({inputs}, out) and (out,). "
-            "Transpose the weights of PyTorch or Equinox, W.T."
-        )
-    if not (np.isfinite(W).all() and np.isfinite(b).all()):
-        raise PolicyError(f"{where}: contains NaN or infinity. Give finite numbers.")
-    return W, b, activation
-
-
-OfflineLayer = tuple[Weights, Weights]
-
-KIND = "sme-offline-policy"
-_MAX_LAYERS = 64
-_MAX_BYTES = 2**28
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,20 +183,20 @@ class OfflinePolicy:
                 f"observations of shape {x.shape}: must be [B, {self.observation_dim}]. Evaluate "
                 "the policy on the task it was trained for."
             )
-        *_, u = self._outputs(x)
+        *_, u = self.outputs(x)
         u += 1.0
         u *= 0.5
         return u
 
-    def hidden(self, observations: Observation) -> list[Weights]:
-        return list(self._outputs(observations))[:-1]
-
-    def _outputs(self, observations: Observation) -> Iterator[Weights]:
-        last = len(self.layers) - 1
-        activations = ["tanh" if index == last else "relu" for index in range(last + 1)]
+    def outputs(self, observations: Observation) -> Iterator[Weights]:
+        """The outputs `[B, out]` of each layer, in order; the last are not scaled to actions."""
+        activations = [*["relu"] * (len(self.layers) - 1), "tanh"]
         # Transposed views: copies would multiply in another order.
         layers = [(W.T, b, f) for (W, b), f in zip(self.layers, activations, strict=True)]
         return _outputs(layers, observations)
+
+    def hidden(self, observations: Observation) -> list[Weights]:
+        return list(self.outputs(observations))[:-1]
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the file completely or not at all; equal policies give equal bytes."""
@@ -222,42 +215,35 @@ class OfflinePolicy:
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> OfflinePolicy:
         """Read a file that `save` wrote."""
-        problem = f"{os.fspath(path)}: not a policy that `sme offline train` wrote"
         try:
-            if os.path.getsize(path) > _MAX_BYTES:
-                raise PolicyError(f"{problem}: larger than {_MAX_BYTES // 2**20} MiB.")
-            with zipfile.ZipFile(path) as members:
-                unpacked = sum(member.file_size for member in members.infolist())
-            if unpacked > _MAX_BYTES:
-                raise PolicyError(f"{problem}: larger than {_MAX_BYTES // 2**20} MiB unpacked.")
-            with np.load(path, allow_pickle=False) as stored:
-                about = parse_json(stored["about"].tobytes())
-                count = sum(name.startswith("W") for name in stored.files)
-                layers = [(stored[f"W{i}"], stored[f"b{i}"]) for i in range(count)]
+            return cls._read(path)
         except FileNotFoundError:
             raise PolicyError(
                 f"{os.fspath(path)} does not exist. Give the path of a policy (.npz)."
             ) from None
-        except PolicyError:
-            raise
         except (OSError, zipfile.BadZipFile, KeyError, ValueError, EOFError, SMEError) as error:
-            raise PolicyError(f"{problem}: {type(error).__name__}: {error}.") from None
+            raise PolicyError(
+                f"{os.fspath(path)}: not a policy that `sme offline train` wrote: {error}"
+            ) from None
+
+    @classmethod
+    def _read(cls, path: str | os.PathLike[str]) -> OfflinePolicy:
+        with zipfile.ZipFile(path) as members:
+            unpacked = sum(member.file_size for member in members.infolist())
+        if max(unpacked, os.path.getsize(path)) > _MAX_BYTES:
+            raise PolicyError(f"larger than {_MAX_BYTES // 2**20} MiB.")
+        with np.load(path, allow_pickle=False) as stored:
+            about = parse_json(stored["about"].tobytes())
+            count = sum(name.startswith("W") for name in stored.files)
+            layers = [(stored[f"W{i}"], stored[f"b{i}"]) for i in range(count)]
         if not isinstance(about, dict) or about.pop("kind", None) != KIND:
-            raise PolicyError(f"{problem}: its `about` does not name its kind.")
-        _check_layers(layers, problem)
+            raise PolicyError("its `about` does not name its kind.")
+        if not 1 <= count <= _MAX_LAYERS:
+            raise PolicyError(f"it has {count} layers.")
+        width = None
+        for index, (W, b) in enumerate(layers):
+            if W.dtype != np.float32 or b.dtype != np.float32:
+                raise PolicyError(f"layer {index}: is {W.dtype} and {b.dtype}, not float32.")
+            _check_layer(f"layer {index}, transposed", W.T, b, width)
+            width = len(b)
         return cls(layers, about)
-
-
-def _check_layers(layers: Sequence[OfflineLayer], problem: str) -> None:
-    if not 1 <= len(layers) <= _MAX_LAYERS:
-        raise PolicyError(f"{problem}: it has {len(layers)} layers.")
-    width = None
-    for index, (W, b) in enumerate(layers):
-        fits = W.ndim == 2 and W.size > 0 and b.shape == W.shape[:1]
-        if not fits or (width is not None and W.shape[1] != width):
-            raise PolicyError(f"{problem}: layer {index} has shapes {W.shape} and {b.shape}.")
-        if W.dtype != np.float32 or b.dtype != np.float32:
-            raise PolicyError(f"{problem}: layer {index} is {W.dtype} and {b.dtype}, not float32.")
-        if not (np.isfinite(W).all() and np.isfinite(b).all()):
-            raise PolicyError(f"{problem}: layer {index} has entries that are not finite.")
-        width = W.shape[0]

@@ -33,7 +33,7 @@ from sme_registry.errors import (
     did_you_mean,
 )
 from sme_registry.evaluation import models
-from sme_registry.evaluation.models import Interface, load_onnx, load_sb3
+from sme_registry.evaluation.models import Interface, ModelFunctions, load_onnx, load_sb3
 from sme_registry.evaluation.networks import OfflinePolicy, Perceptron
 from sme_registry.evaluation.references import POLICIES, reference_policy
 from sme_registry.io import choice, import_object
@@ -110,8 +110,10 @@ class Policy:
 
 
 class Member(NamedTuple):
+    """An agent of a team, with its own policy or the one that all agents share."""
+
     agent: str
-    policy: Policy  # its own, or the one that all agents share
+    policy: Policy
     observe: Callable[[Observation], Observation]  # `[B, S + 2]` to the policy's input, fresh
     action_dim: int  # a_i, entries of the policy's action that belong to this agent
 
@@ -144,7 +146,7 @@ class TeamPolicy:
         """Joint actions `[B, A]` from s, t/T and each agent's r_cum/k, `[B, S + 1 + n]`."""
         shared = joint.shape[1] - len(self.members)
         columns = [[*range(shared), shared + agent] for agent in range(len(self.members))]
-        return self._joint_actions([joint[:, own] for own in columns])
+        return self._joint_actions([joint[:, of_agent] for of_agent in columns])
 
     def _joint_actions(self, observations: Sequence[Observation]) -> Array:
         """Joint actions, from the observations `[B, S + 2]` of each agent."""
@@ -219,7 +221,8 @@ def as_policy(
         choice("action_range", action_range, ACTION_RANGES)
     range_ = cast("ActionRange | None", action_range)
     if isinstance(policy, str):
-        policy, name = _named(policy, spec), name or _display_name(policy)
+        policy, default = _named(policy, spec)
+        name = name or default
     if algorithm is not None:
         policy, name = _of_algorithm(policy, algorithm), name or Path(policy).stem
     if isinstance(policy, TeamPolicy):
@@ -263,14 +266,15 @@ def interface_of(spec: SMESpec, observed_phases: int = 0) -> Interface:
     )
 
 
-def _named(text: str, spec: SMESpec) -> Any:
-    """The policy that a text names; a path stays one."""
+def _named(text: str, spec: SMESpec) -> tuple[Any, str]:
+    """The policy that a text names, where a path stays one, and what reports call it."""
+    path = Path(text)
     if text in POLICIES:
-        return reference_policy(text, spec)
+        return reference_policy(text, spec), text
     if text.endswith(_SUFFIXES) or os.path.isfile(text):
-        return Path(text)
+        return path, path.stem
     if os.path.isdir(text):
-        return _of_agents(Path(text), spec)
+        return _of_agents(path, spec), path.stem
     if ":" not in text:
         raise UnknownNameError(
             f"policy={text!r}: must be the path of a .zip, .onnx or .npz file, module:function, or "
@@ -282,7 +286,7 @@ def _named(text: str, spec: SMESpec) -> Any:
             f"policy={text!r}: is a {type(function).__name__}: must be a function from "
             "observations to actions."
         )
-    return function
+    return function, text
 
 
 def _of_algorithm(policy: Any, algorithm: str) -> Any:
@@ -304,11 +308,6 @@ def _of_agents(folder: Path, spec: SMESpec) -> dict[str, Path]:
     return files
 
 
-def _display_name(text: str) -> str:
-    is_path = text not in POLICIES and (text.endswith(_SUFFIXES) or ":" not in text)
-    return Path(text).stem if is_path else text
-
-
 def _prepare(
     policy: Any, interface: Interface, action_range: ActionRange | None, name: str | None = None
 ) -> Policy:
@@ -318,28 +317,19 @@ def _prepare(
         return replace(
             policy, name=name or policy.name, action_range=action_range or policy.action_range
         )
-    if isinstance(policy, str | os.PathLike):
-        name = Path(policy).stem if name is None else name
+    if isinstance(policy, os.PathLike):
+        name = name or Path(policy).stem
         policy = _load(Path(policy), interface)
-    act, episodes = policy, None
-    hidden: Callable[[Observation], Iterable[Any] | None] | None = None
     if hasattr(policy, "predict"):
-        interface.check(
-            "policy",
-            observations=getattr(getattr(policy, "observation_space", None), "shape", None),
-            actions=getattr(getattr(policy, "action_space", None), "shape", None),
-        )
-        models.check_not_normalised(policy)
-        act, action_range = models.predictor(policy), action_range or models.action_range_of(policy)
-        episodes = models.episode_predictor(policy)
-        network = models.torch_policy(policy)
-        hidden = None if network is None else models.hidden_layers(act, network)
+        functions = models.of_sb3(policy, interface)
+        action_range = action_range or models.action_range_of(policy)
     elif models.is_module(policy):
-        act = models.ModulePredictor(policy)
-        hidden = models.hidden_layers(act, policy)
+        functions = models.of_module(policy)
     elif isinstance(policy, Perceptron | OfflinePolicy):
-        hidden = policy.hidden
-    elif not callable(policy):
+        functions = ModelFunctions(policy, hidden=policy.hidden)
+    elif callable(policy):
+        functions = ModelFunctions(policy)
+    else:
         raise PolicyError(
             f"policy={policy!r:.80}: must be {interface.alternatives}a callable from observations "
             f"[B, {interface.observation_dim}] to actions [B, {interface.action_dim}], a "
@@ -347,26 +337,24 @@ def _prepare(
             "module:function, or the name of a reference policy."
         )
     return Policy(
-        name or _name_of(policy),
-        action_range or getattr(policy, "action_range", None) or "unit",
-        act,
-        interface.action_dim,
-        interface.hint,
-        episodes,
-        hidden,
+        name=name or _name_of(policy),
+        action_range=action_range or getattr(policy, "action_range", None) or "unit",
+        action_dim=interface.action_dim,
+        hint=interface.hint,
+        act=functions.act,
+        episodes=functions.episodes,
+        hidden=functions.hidden,
     )
 
 
 def _load(path: Path, interface: Interface) -> Any:
     if path.suffix == ".onnx":
         return load_onnx(path, interface)
-    if path.suffix == ".npz":
-        policy = OfflinePolicy.load(path)
-        interface.check(
-            str(path), observations=(policy.observation_dim,), actions=(policy.action_dim,)
-        )
-        return policy
-    return load_sb3(path)
+    if path.suffix != ".npz":
+        return load_sb3(path)
+    policy = OfflinePolicy.load(path)
+    interface.check(str(path), observations=(policy.observation_dim,), actions=(policy.action_dim,))
+    return policy
 
 
 def _name_of(policy: Any) -> str:
@@ -379,8 +367,8 @@ def _team_policy(
 ) -> TeamPolicy:
     """A team policy from a policy for each agent, by name, or from one that all agents share."""
     agents, channels = spec.agents, spec.observed_channels
-    own = isinstance(policy, Mapping)
-    if own:
+    separate = isinstance(policy, Mapping)
+    if separate:
         _check_names(policy, [agent.name for agent in agents])
     else:
         policy = _prepare(policy, interface_of(spec), action_range, name)
@@ -389,7 +377,7 @@ def _team_policy(
         observe: Callable[[Observation], Observation]
         observe = functools.partial(shared_observation_of, index, len(agents), observed)
         prepared = policy
-        if own:
+        if separate:
             with prefixed_errors(agent.name):
                 prepared = _own_policy(policy[agent.name], agent, len(observed), spec, action_range)
             columns = [*observed, spec.state_dim, spec.state_dim + 1]
@@ -409,7 +397,7 @@ def _own_policy(
 ) -> Policy:
     """An agent's own policy, from the channels that it observes to those that it owns."""
     if isinstance(policy, str):
-        policy = _named(policy, spec)
+        policy, _ = _named(policy, spec)
     if isinstance(policy, Mapping):  # a reference policy, of all agents
         policy = policy.get(agent.name)
     text = f"{observed} observed and {agent.action_dim} owned channels"
