@@ -7,7 +7,8 @@ import functools
 import inspect
 import os
 import typing
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -24,20 +25,32 @@ from sme_registry.errors import (
     UnknownNameError,
     did_you_mean,
 )
-from sme_registry.io import check_new, install_command, is_installed, parse_json, read_json
+from sme_registry.io import (
+    check_new,
+    install_command,
+    integer_in,
+    is_installed,
+    parse_json,
+    read_json,
+)
 from sme_registry.io.tables import Table
 from sme_registry.io.terminal import err, out, print_json
 from sme_registry.spec import (
+    Document,
     EnvFile,
     ProtocolFile,
     SMESpec,
+    StreamClass,
     StreamFile,
     StreamSpec,
     StudyFile,
+    SuiteClass,
     SuiteFile,
     catalogue,
 )
 from sme_registry.spec.catalogue import Envelope, is_path, resolve
+from sme_registry.spec.study import sweep
+from sme_registry.task import load
 
 TaskName = Annotated[
     str,
@@ -204,6 +217,95 @@ def with_options(options: type) -> Callable[[Callable[..., None]], Callable[...,
         return with_fields
 
     return decorate
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClassOptions:
+    """Options of a command that describe classes of tasks and streams, each with its help."""
+
+    suite: Annotated[
+        str | None,
+        typer.Option(
+            help="A suite of classes: name or path.", autocompletion=catalogue.completion(SuiteFile)
+        ),
+    ] = None
+    task: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--task",
+            "-t",
+            help="A task, or a stream, as a class of its own. Repeatable.",
+            autocompletion=catalogue.completion(EnvFile, StreamFile),
+        ),
+    ] = None
+    sweep: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FIELD=VALUE,…",
+            help="Vary a field of the --task, such as k=1,2,5 or D=0,0.25: a "
+            "class for each value. Repeatable: each sweep is an axis of its own around the task, "
+            "not a cross product.",
+        ),
+    ] = None
+    instances: Annotated[
+        int,
+        typer.Option(
+            help="Draws of each --task: its seed and those that follow; of a stream, other tasks "
+            "for all of its phases."
+        ),
+    ] = 1
+
+    def members(self) -> dict[str, list[dict[str, Any]]]:
+        """The classes of a suite, one for each task or stream, or those of the sweeps."""
+        tasks = self.task or ()
+        if self.sweep and (self.suite is not None or len(tasks) != 1):
+            raise OptionError("--sweep: needs exactly one --task, and no --suite.")
+        if self.suite is None and not tasks:
+            raise OptionError("Give --suite or --task, such as --suite smoke or --task Default.")
+        instances = integer_in("instances", self.instances, 1, 10_000)
+        axes = sweep_axes(self.sweep or ())
+        classes: list[SuiteClass] = []
+        streams: list[StreamClass] = []
+        if self.suite is not None:
+            suite = find_file(SuiteFile, self.suite).suite
+            classes, streams = [*suite.classes], [*suite.streams]
+        for task in tasks:
+            document = load(task)
+            if isinstance(document, SMESpec):
+                classes += sweep(document, axes, name=_title(document), instances=instances)
+                continue
+            if axes:
+                raise OptionError(
+                    f"--sweep: varies a field of a task, and {task!r} is a stream. Make a stream "
+                    "for each value."
+                )
+            draws = tuple(range(instances))
+            streams.append(StreamClass(name=_title(document), stream=document, draws=draws))
+        kinds: dict[str, Sequence[Document]] = {"classes": classes, "streams": streams}
+        return {name: [each.to_dict() for each in some] for name, some in kinds.items() if some}
+
+
+def sweep_axes(texts: Iterable[str]) -> dict[str, list[Any]]:
+    """The axes of `FIELD=VALUE,…`: values are JSON, or else text, separated by commas."""
+    axes: dict[str, list[Any]] = {}
+    for text in texts:
+        field, equals, values = text.partition("=")
+        field = field.strip()
+        if not equals or not field or not values.strip():
+            raise OptionError(f"--sweep {text!r}: must be FIELD=VALUE,…, such as k=1,2,5,10.")
+        if field in axes:
+            raise OptionError(f"--sweep {text!r}: {field} is swept twice. Join their values.")
+        try:
+            axes[field] = parse_json(f"[{values}]")
+        except SMEError:
+            axes[field] = [json_or_text(value.strip()) for value in values.split(",")]
+    return axes
+
+
+def _title(document: SMESpec | StreamSpec) -> str:
+    """The name of a task's or a stream's class: its title, as a document's name."""
+    title = catalogue.title(document).rsplit("/", 1)[-1].removesuffix("-v1")
+    return title.replace(" (", "-").removesuffix(")")
 
 
 def only_with(context: typer.Context, names: Iterable[str], reason: str) -> None:

@@ -148,21 +148,16 @@ def diagnose(
 ) -> None:
     """Show where a policy's regret occurs and what most likely causes it. Takes seconds.
 
-    Where: by action channel, state region, distance out of distribution, and time in the episode.
-    Likely causes: exploration, credit assignment (k), sparse reward (r_min), capacity (L),
-    dimension, survival (D), and budget. The answer is "cannot tell" if the evidence does not
-    separate causes; --against or --probe-capacity then often help. What was found comes first, the
-    largest share of the error at the top; --all shows the rest. With --out, it also writes
-    diagnosis.json, diagnosis.md and figures.
+    What was found comes first, the largest share of the error at the top; --all shows the rest.
+    The answer is "cannot tell" if the evidence does not separate causes: exploration, credit
+    assignment (k), sparse reward (r_min), capacity (L), dimension, survival (D), budget, and on
+    such tasks limits and distractors. --against or --probe-capacity then often help.
 
-    On a task with limits or distractors, it also shows whether the policy violates the limits and
-    earns by it, and how much of its regret is owed to the distractors.
+    Of a team, it shows who is to blame for the team's regret. Of a life in a stream, it shows which
+    phases were costly, forgotten or never learnt, and whether plasticity was lost.
 
-    Of a team, it shows who is to blame for the team's regret, and where each agent's own error is.
-    Of a life in a stream, it shows which phases were costly, forgotten or never learnt, whether
-    plasticity was lost, and the state of the network after each visit.
-
-    Loading a model's .zip can run code: use only files whose author you trust.
+    With --out, it also writes diagnosis.json, diagnosis.md and figures. Loading a model's .zip can
+    run code: use only files whose author you trust.
 
     Examples:
 
@@ -245,14 +240,10 @@ def explore(
 ) -> None:
     """Write one HTML file that shows regret in any state, in and beyond the training cube.
 
-    A map shows the regret over any two channels, with a slider for each of the others; beside it
-    the optimal and the chosen action, the regret over an episode and, of a run, its learning curve,
-    its evaluation and what its layers keep. The file carries the networks and computes them in the
-    browser: it needs no network connection and no installation.
-
-    Networks are known of Stable-Baselines3's models with MlpPolicy, of our agents in JAX, of
-    offline policies (.npz), and of PyTorch modules and ONNX files of feed-forward layers. Any other
-    policy is sampled over the channels of --channels, and the other sliders are off.
+    The file carries the networks and computes them in the browser: it needs no connection and no
+    installation. Networks are known of Stable-Baselines3's models with MlpPolicy, of our agents in
+    JAX, of offline policies (.npz), and of PyTorch modules and ONNX files of feed-forward layers.
+    Any other policy is sampled over the channels of --channels, and the other sliders are off.
 
     Of a task alone, the page shows the optimal policy, and the regret of a linear and of a constant
     policy. Loading a model's .zip can run code: use only files whose author you trust.

@@ -90,22 +90,16 @@ def evaluate(
 ) -> None:
     """Evaluate a policy in and out of distribution, compared with reference policies.
 
-    With --out, it also writes evaluation.json (of a stream stream.json) and figures.
-
     A function takes observations `[B, S + 2]`, with m distractors `[B, S + m + 2]`, and returns
     actions `[B, A]`, in [0, 1] unless --action-range is symmetric; so does an .onnx network. A .zip
     of Stable-Baselines3 can run code when it is loaded: use only files whose author you trust.
 
-    For a team, give a folder with the policy of each agent, such as agent_0.zip, from the agent's
-    own observations; or the one policy that all agents share. That one is called for each agent
-    with the shared observation `[B, S + 2 + n]`: the state with unobserved channels set to 0, t/T,
-    the agent's r_cum/k, and its one-hot index. It returns `[B, C]`, C being the most channels that
-    an agent owns. The report then includes each agent.
+    For a team, give a folder with the policy of each agent, such as agent_0.zip, or the one policy
+    that all agents share. That one is called for each agent with `[B, S + 2 + n]`: the state with
+    unobserved channels set to 0, t/T, the agent's r_cum/k, and its one-hot index.
 
-    On a stream, give the policy at the end of each visit, or one policy for the whole life. That
-    one learns nothing, and its expected dynamic regret is reported as well. On a stream with a
-    single visit, a policy is taken for one that learns nothing: what its training cost is in the
-    stream.json of sme train. A reference policy, such as linear, is that of phase 0.
+    On a stream, give the policy at the end of each visit, or one policy for the whole life, which
+    learns nothing: its expected dynamic regret is reported as well.
 
     Examples:
 

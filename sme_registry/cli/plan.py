@@ -12,6 +12,7 @@ import typer
 from rich.markup import escape
 
 from sme_registry.cli.arguments import (
+    ClassOptions,
     Force,
     Json,
     Protocol,
@@ -25,26 +26,18 @@ from sme_registry.cli.arguments import (
 from sme_registry.cli.show import number_of_cells, study_table, summary
 from sme_registry.errors import MissingDependencyError, OptionError, SMEError
 from sme_registry.evaluation import resolve_protocol
-from sme_registry.io import integer_in, parse_json, read_json
+from sme_registry.io import read_json
 from sme_registry.io.tables import Table
 from sme_registry.io.terminal import duration_range, err, out, print_json
 from sme_registry.spec import (
-    Document,
-    EnvFile,
     PlannedCell,
-    SMESpec,
-    StreamClass,
-    StreamFile,
-    StreamSpec,
     StudyAlgorithm,
     StudyFile,
     StudyPlan,
-    SuiteClass,
-    SuiteFile,
     catalogue,
 )
 from sme_registry.spec.catalogue import is_path
-from sme_registry.spec.study import parse_uses, sweep
+from sme_registry.spec.study import parse_uses
 from sme_registry.studies.engine.budget import (
     Estimator,
     Span,
@@ -57,7 +50,6 @@ from sme_registry.studies.engine.budget import (
 )
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.programs import available_cores
-from sme_registry.task import load
 from sme_registry.training.algorithms import (
     check_algorithm,
     code_notice,
@@ -65,72 +57,6 @@ from sme_registry.training.algorithms import (
     folder_name,
     nested_hyperparameters,
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class ClassOptions:
-    """Options of a command that describe classes of tasks and streams, each with its help."""
-
-    suite: Annotated[
-        str | None,
-        typer.Option(
-            help="A suite of classes: name or path.", autocompletion=catalogue.completion(SuiteFile)
-        ),
-    ] = None
-    task: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--task",
-            "-t",
-            help="A task, or a stream, as a class of its own. Repeatable.",
-            autocompletion=catalogue.completion(EnvFile, StreamFile),
-        ),
-    ] = None
-    sweep: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="FIELD=VALUE,…",
-            help="Vary a field of the --task, such as k=1,2,5 or D=0,0.25: a "
-            "class for each value. Repeatable: each sweep is an axis of its own around the task, "
-            "not a cross product.",
-        ),
-    ] = None
-    instances: Annotated[
-        int,
-        typer.Option(
-            help="Draws of each --task: its seed and those that follow; of a stream, other tasks "
-            "for all of its phases."
-        ),
-    ] = 1
-
-    def members(self) -> dict[str, list[dict[str, Any]]]:
-        """The classes of a suite, one for each task or stream, or those of the sweeps."""
-        tasks = self.task or ()
-        if self.sweep and (self.suite is not None or len(tasks) != 1):
-            raise OptionError("--sweep: needs exactly one --task, and no --suite.")
-        if self.suite is None and not tasks:
-            raise OptionError("Give --suite or --task, such as --suite smoke or --task Default.")
-        instances = integer_in("instances", self.instances, 1, 10_000)
-        axes = sweep_axes(self.sweep or ())
-        classes: list[SuiteClass] = []
-        streams: list[StreamClass] = []
-        if self.suite is not None:
-            suite = find_file(SuiteFile, self.suite).suite
-            classes, streams = [*suite.classes], [*suite.streams]
-        for task in tasks:
-            document = load(task)
-            if isinstance(document, SMESpec):
-                classes += sweep(document, axes, name=_title(document), instances=instances)
-                continue
-            if axes:
-                raise OptionError(
-                    f"--sweep: varies a field of a task, and {task!r} is a stream. Make a stream "
-                    "for each value."
-                )
-            draws = tuple(range(instances))
-            streams.append(StreamClass(name=_title(document), stream=document, draws=draws))
-        kinds: dict[str, Sequence[Document]] = {"classes": classes, "streams": streams}
-        return {name: [each.to_dict() for each in some] for name, some in kinds.items() if some}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,7 +107,7 @@ class PlanOptions(ClassOptions):
         }
         plan = StudyPlan.from_dict(fields, source)
         draft = StudyFile(name="draft", digest=plan.digest, plan=plan)
-        return scaled_plan(draft, self.steps, None, None, self.agents).plan
+        return Budgets(steps=self.steps).scaled(draft, self.agents).plan
 
     def _algorithms(self) -> list[dict[str, Any]]:
         """Each `[NAME=]USES` with each action range."""
@@ -204,23 +130,6 @@ class PlanOptions(ClassOptions):
             for name, uses in uses_of
             for action_range in ranges
         ]
-
-
-def sweep_axes(texts: typing.Iterable[str]) -> dict[str, list[Any]]:
-    """The axes of `FIELD=VALUE,…`: values are JSON, or else text, separated by commas."""
-    axes: dict[str, list[Any]] = {}
-    for text in texts:
-        field, equals, values = text.partition("=")
-        field = field.strip()
-        if not equals or not field or not values.strip():
-            raise OptionError(f"--sweep {text!r}: must be FIELD=VALUE,…, such as k=1,2,5,10.")
-        if field in axes:
-            raise OptionError(f"--sweep {text!r}: {field} is swept twice. Join their values.")
-        try:
-            axes[field] = parse_json(f"[{values}]")
-        except SMEError:
-            axes[field] = [json_or_text(value.strip()) for value in values.split(",")]
-    return axes
 
 
 def _short_name(uses: str) -> str:
@@ -252,23 +161,42 @@ def _hyperparameters(
     return values
 
 
-def _title(document: SMESpec | StreamSpec) -> str:
-    """The name of a task's or a stream's class: its title, as a document's name."""
-    title = catalogue.title(document).rsplit("/", 1)[-1].removesuffix("-v1")
-    return title.replace(" (", "-").removesuffix(")")
+@dataclass(frozen=True, kw_only=True)
+class Budgets:
+    """Options of a command that change a plan's budgets; other budgets are another plan."""
+
+    steps: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--steps",
+            "-n",
+            metavar="N|ALGORITHM=N",
+            help="Steps of each training, or of one algorithm's. Repeatable.",
+        ),
+    ] = None
+    seeds: Annotated[int | None, typer.Option(help="Runs of each algorithm on each class.")] = None
+    evaluations: Annotated[int | None, typer.Option(help="Evaluations during each training.")] = (
+        None
+    )
+
+    def scaled(self, file: StudyFile, agents: str | None = None) -> StudyFile:
+        """The plan with these budgets, and with other implementations of its algorithms."""
+        budgets: dict[str, int] = {}
+        for text in self.steps or ():
+            name, _, number = text.rpartition("=")
+            if not number.replace("_", "").isdigit():
+                raise OptionError(
+                    f"--steps {text!r}: must be N or ALGORITHM=N, such as --steps PPO=100000."
+                )
+            if name in budgets:
+                raise OptionError(f"--steps {text!r}: {name or 'N'} is given twice. Remove one.")
+            budgets[name] = int(number)
+        every = budgets.pop("", None)
+        counts = {"seeds": self.seeds, "evaluations": self.evaluations}
+        file = scaled(file, steps=every, steps_of=budgets, **counts)
+        return file if agents is None else with_agents(file, agents)
 
 
-Steps = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--steps",
-        "-n",
-        metavar="N|ALGORITHM=N",
-        help="Steps of each training, or of one algorithm's. Repeatable.",
-    ),
-]
-Seeds = Annotated[int | None, typer.Option(help="Runs of each algorithm on each class.")]
-Evaluations = Annotated[int | None, typer.Option(help="Evaluations during each training.")]
 Agents = Annotated[
     str | None,
     typer.Option(
@@ -290,7 +218,9 @@ Jobs = Annotated[
 ]
 
 
+@with_options(Budgets)
 def plan(
+    options: Budgets,
     plan: Annotated[
         str | None,
         typer.Argument(
@@ -307,9 +237,6 @@ def plan(
         int | None, typer.Option(min=1, help="Also estimate for a cluster with this many cores.")
     ] = None,
     jobs: Jobs = None,
-    steps: Steps = None,
-    seeds: Seeds = None,
-    evaluations: Evaluations = None,
     agents: Agents = None,
     only: Only = None,
     json: Json = False,
@@ -332,7 +259,7 @@ def plan(
     if plan is None:
         _list_plans(json)
         return
-    file = with_sources(scaled_plan(find_file(StudyFile, plan), steps, seeds, evaluations, agents))
+    file = with_sources(options.scaled(find_file(StudyFile, plan), agents))
     planned = selected(file.plan.cells, only or ())
     cells = {cell.cell.digest: cell.cell for cell in planned}
     results = {} if folder is None else Ledger(folder).results()
@@ -417,29 +344,6 @@ def _plan_table(file: StudyFile, planned: Sequence[PlannedCell], seconds: Any) -
         rows,
         caption=f"{file.digest}\n{len(classes)} classes: {escape(', '.join(classes))}",
     )
-
-
-def scaled_plan(
-    file: StudyFile,
-    steps: list[str] | None,
-    seeds: int | None,
-    evaluations: int | None,
-    agents: str | None = None,
-) -> StudyFile:
-    """A plan with the budgets of `--steps`, `--seeds` and `--evaluations`, and `--agents`."""
-    budgets: dict[str, int] = {}
-    for text in steps or ():
-        name, _, number = text.rpartition("=")
-        if not number.replace("_", "").isdigit():
-            raise OptionError(
-                f"--steps {text!r}: must be N or ALGORITHM=N, such as --steps PPO=100000."
-            )
-        if name in budgets:
-            raise OptionError(f"--steps {text!r}: {name or 'N'} is given twice. Remove one.")
-        budgets[name] = int(number)
-    every = budgets.pop("", None)
-    file = scaled(file, steps=every, steps_of=budgets, seeds=seeds, evaluations=evaluations)
-    return file if agents is None else with_agents(file, agents)
 
 
 def check_algorithms(algorithms: Iterable[StudyAlgorithm], errors: type[SMEError]) -> None:

@@ -14,15 +14,12 @@ from rich.markup import escape
 from sme_registry.cli.arguments import Json, Out, find_file, unique, with_options
 from sme_registry.cli.plan import (
     Agents,
-    Evaluations,
+    Budgets,
     Jobs,
     Only,
     PlanOptions,
-    Seeds,
-    Steps,
     new,
     plan,
-    scaled_plan,
 )
 from sme_registry.errors import OptionError
 from sme_registry.io.tables import Table
@@ -64,6 +61,7 @@ app = typer.Typer(
 )
 
 
+@with_options(Budgets)
 def run(
     plan: Annotated[
         str,
@@ -76,6 +74,7 @@ def run(
     folder: Annotated[
         Path, typer.Option("--folder", "-f", help="The study's folder; created if necessary.")
     ],
+    options: Budgets,
     executor: Annotated[
         ExecutorName | None, typer.Option(help="Default processes; with --ray, ray.")
     ] = None,
@@ -90,9 +89,6 @@ def run(
     keep_models: Annotated[
         bool, typer.Option("--keep-models", help="Keep the models trained now, in FOLDER/models.")
     ] = False,
-    steps: Steps = None,
-    seeds: Seeds = None,
-    evaluations: Evaluations = None,
     agents: Agents = None,
     device: Annotated[
         str | None,
@@ -118,11 +114,8 @@ def run(
     reused. Failed cells are listed; --retry runs them again.
 
     With --agents jax, PPO, TD3 and SAC are ours in JAX instead of Stable-Baselines3's: other
-    algorithms, so no result of the one counts as one of the other. Cells with tasks of one shape
-    run as lanes of one program, which goes on from its state of a few minutes before after a kill.
-    On a CPU, one program runs on each core; on a GPU, one at a time.
-
-    A cluster needs this package and Ray in the same versions on every node, and no shared folder.
+    algorithms, so no result of the one counts as one of the other. A cluster needs this package and
+    Ray in the same versions on every node, and no shared folder.
 
     Examples:
 
@@ -139,7 +132,7 @@ def run(
     if ray is not None and executor not in (None, "ray"):
         raise OptionError(f"--ray {ray}: contradicts --executor {executor}. Leave one out.")
     status = run_study(
-        scaled_plan(find_file(StudyFile, plan), steps, seeds, evaluations, agents),
+        options.scaled(find_file(StudyFile, plan), agents),
         folder,
         executor=executor or ("processes" if ray is None else "ray"),
         jobs=jobs,
@@ -161,12 +154,11 @@ def run(
         raise typer.Exit(1)
 
 
+@with_options(Budgets)
 def status(
     folder: Annotated[Path, typer.Argument(help="The study's folder.")],
+    options: Budgets,
     only: Only = None,
-    steps: Steps = None,
-    seeds: Seeds = None,
-    evaluations: Evaluations = None,
     json: Json = False,
 ) -> None:
     """Show how many cells are done, running, failed and waiting, and the time left.
@@ -181,10 +173,7 @@ def status(
       sme study status runs/all --only "class=k-*" --json
     """
 
-    def scale(file: StudyFile) -> StudyFile:
-        return scaled_plan(file, steps, seeds, evaluations)
-
-    print_status(study_status(folder, only or None, scale), json)
+    print_status(study_status(folder, only or None, options.scaled), json)
 
 
 def report(

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import functools
-import inspect
-import typing
-from collections.abc import Callable
+import dataclasses
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from pydantic.fields import FieldInfo
 from rich.markup import escape
 
 from sme_registry import save
 from sme_registry.cli.arguments import (
+    ClassOptions,
     Force,
     Json,
     check_document_path,
@@ -23,7 +22,6 @@ from sme_registry.cli.arguments import (
     read_any,
     with_options,
 )
-from sme_registry.cli.plan import ClassOptions
 from sme_registry.errors import OptionError, SMEError, UnknownNameError
 from sme_registry.io import integer_in, read_json
 from sme_registry.io.markup import plural
@@ -46,70 +44,45 @@ from sme_registry.task.certificate import certify as certify_task
 _MOST_AGENTS = 2**12  # the spec allows far fewer; a list of billions would fill the memory
 _NO_OPTION = ("schema_version", "team")
 _METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", type(None): "JSON"}
-_HELP = {  # where the field's description is too short or missing
-    "k": "Reward interval: steps between payouts",
-    "r_min": "Reward threshold: step rewards at or below it are set to 0",
-    "D": "Survival threshold: an episode ends below this step reward",
-    "horizon": "T, steps of an episode",
-    "hidden_width": "H, width of the inner layers of the optimal policy",
-    "policy_init": "'semi_orthogonal', or 'unit_variance', which also suits layers that widen",
-    "rotation": "θ, radians: how far the optimal policy is rotated away from the one of θ = 0",
-    "safety": "Limits of the actions: '{\"tightness\": 0.2}'; the tightness is in (0, 0.5]",
-    "observation": "What the agent sees, such as "
-    '\'{"distractors": 32, "dynamics": "driven", "mixing": "nonlinear", "mixing_depth": 1}\'. '
-    "dynamics is noise, autonomous or driven; mixing is none, orthogonal or nonlinear; "
-    "mixing_depth is 1, 2 or 3",
-    "seed": "Seed of the draw: an integer, or hexadecimal 0x… for a sealed task",
+_FORMS = {  # what a value looks like, where the field's description does not say it
+    "policy_init": "'semi_orthogonal' or 'unit_variance'; ",
+    "safety": "'{\"tightness\": 0.2}'; ",
+    "observation": '\'{"distractors": 32, "dynamics": "driven", "mixing": "nonlinear", '
+    '"mixing_depth": 1}\', where dynamics is noise, autonomous or driven, and mixing none, '
+    "orthogonal or nonlinear; ",
+    "seed": "an integer, or hexadecimal 0x… for a sealed task; ",
 }
 
 
-def _with_field_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command an option for each field of a spec that has a single value.
-
-    The command receives the fields that were given as a dict `fields`, values as `json_or_text`
-    reads them, so that the spec itself checks them, as it does for `--set`.
-    """
-    options = {}
-    for name, field in SMESpec.model_fields.items():
-        if name not in _NO_OPTION:
-            about = _HELP.get(name) or field.description
-            default = "none" if field.default is None else field.default
-            options[name] = inspect.Parameter(
-                name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=None,
-                annotation=Annotated[
-                    str | None,
-                    typer.Option(
-                        f"--{name.replace('_', '-')}",
-                        metavar=_METAVARS[type(field.default)],
-                        help=f"{about}; default {default}.",
-                    ),
-                ],
-            )
-    hints = typing.get_type_hints(command, include_extras=True)
-    others = [
-        parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY)
-        for name, parameter in inspect.signature(command).parameters.items()
-        if name != "fields"
-    ]
-
-    @functools.wraps(command)
-    def with_fields(**values: Any) -> None:
-        texts = {name: values.pop(name) for name in options}
-        fields = {name: json_or_text(text) for name, text in texts.items() if text is not None}
-        command(fields=fields, **values)
-
-    parameters = [others[0], *options.values(), *others[1:]]
-    with_fields.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    with_fields.__annotations__ = {p.name: p.annotation for p in parameters}
-    return with_fields
+def _field_option(name: str, field: FieldInfo) -> tuple[str, Any, Any]:
+    """The option of a field, whose text `json_or_text` reads and the spec itself checks."""
+    default = "none" if field.default is None else field.default
+    meaning = (field.description or "").rstrip(".")
+    option = typer.Option(
+        f"--{name.replace('_', '-')}",
+        metavar=_METAVARS[type(field.default)],
+        help=f"{meaning[0].upper()}{meaning[1:]}; {_FORMS.get(name, '')}default {default}.",
+    )
+    return name, Annotated[str | None, option], dataclasses.field(default=None)
 
 
-@_with_field_options
+FieldOptions = dataclasses.make_dataclass(
+    "FieldOptions",
+    [
+        _field_option(name, field)
+        for name, field in SMESpec.model_fields.items()
+        if name not in _NO_OPTION
+    ],
+    frozen=True,
+    kw_only=True,
+)
+"""An option for each field of a spec that has a single value."""
+
+
+@with_options(FieldOptions)
 def new(
     path: Annotated[Path, typer.Argument(help="The file to write.", dir_okay=False)],
-    fields: dict[str, Any],
+    options: Any,
     team: Annotated[
         str | None,
         typer.Option(
@@ -163,6 +136,8 @@ def new(
       sme new team.json --agents 4 --channels-each 2 --team-reward team
     """
     check_document_path(path, force=force)
+    texts = dataclasses.asdict(options)
+    fields = {name: json_or_text(text) for name, text in texts.items() if text is not None}
     start = SMESpec() if base is None else load(base, SMESpec)
     if team is not None and agents is not None:
         raise OptionError("--agents: --team already lists the agents. Give one or the other.")
