@@ -64,20 +64,17 @@ class SubjectOptions:
             if self.cell is not None:
                 raise OptionError("--cell: names a cell of a study, --task a policy's task.")
         elif self.action_range is not None:
-            raise OptionError("--action-range: needs a policy with --task; a run records its own.")
+            raise OptionError("--action-range: applies to a policy with --task; a run has its own.")
         elif self.log is not None:
             raise OptionError("--log: is the log of a policy with --task; a run has its own.")
         elif self.set_ and (self.cell is not None or Path(what).is_dir()):
-            raise OptionError("--set: changes a task; a run has its own. Leave it out.")
+            raise OptionError("--set: changes the task of a policy. Add --task, or leave it out.")
 
     def subject(self, what: str) -> AnySubject:
         """The policy on a task, the cell of a study, or the run."""
         if self.task is not None:
             spec = load(self.task, SMESpec).derive(**changes(self.set_))
-            name = what if os.sep not in what else None
-            return diagnosis.load_policy(
-                what, spec, action_range=self.action_range, name=name, log=self.log
-            )
+            return diagnosis.load_policy(what, spec, action_range=self.action_range, log=self.log)
         if self.cell is not None:
             return diagnosis.load_cell(what, self.cell)
         if not Path(what).is_dir():
@@ -89,9 +86,12 @@ class SubjectOptions:
 
     def subject_or_task(self, what: str) -> AnySubject | SMESpec:
         """The same, or a task by its name, path or digest."""
-        given = self.task is not None or self.cell is not None or Path(what).is_dir()
-        if given or what.endswith(_POLICY_FILES):
+        if self.task is not None or self.cell is not None or Path(what).is_dir():
             return self.subject(what)
+        if what.endswith(_POLICY_FILES):
+            raise OptionError(
+                f"{what!r}: is a policy. Add the task that it is for: --task Default."
+            )
         try:
             return load(what, SMESpec).derive(**changes(self.set_))
         except UnknownNameError as error:

@@ -70,7 +70,7 @@ class PlanOptions(ClassOptions):
             "-a",
             metavar="[NAME=]USES",
             help="PPO, TD3, SAC, … of Stable-Baselines3, jax:PPO, module:function, "
-            "train:module:function, reference:linear, offline:bc, … Repeatable.",
+            "train:mine:train, reference:linear, offline:bc, … Repeatable.",
         ),
     ] = None
     steps: Annotated[
