@@ -45,22 +45,30 @@ if TYPE_CHECKING:
     from sme_registry import training as training
     from sme_registry import wrappers as wrappers
     from sme_registry.datasets import make_dataset, train_offline
-    from sme_registry.evaluation import EvaluationReport, evaluate
+    from sme_registry.diagnosis import diagnose
+    from sme_registry.evaluation import EvaluationReport, StreamReport, evaluate
     from sme_registry.export import export_onnx
     from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
+    from sme_registry.studies import compare, run_study
+    from sme_registry.studies import load as load_study
     from sme_registry.task import Task, materialize
+    from sme_registry.training import train
 
 __all__ = [
     "EvaluationProtocol",
     "EvaluationReport",
     "SMEError",
     "SMESpec",
+    "StreamReport",
     "StreamSpec",
     "Task",
+    "compare",
+    "diagnose",
     "env_spec",
     "evaluate",
     "export_onnx",
     "load",
+    "load_study",
     "make",
     "make_aec",
     "make_dataset",
@@ -68,21 +76,29 @@ __all__ = [
     "make_vec",
     "materialize",
     "register",
+    "run_study",
     "save",
+    "train",
     "train_offline",
 ]
 
 _LAZY = {
-    "EvaluationProtocol": "sme_registry.spec",
-    "EvaluationReport": "sme_registry.evaluation",
-    "SMESpec": "sme_registry.spec",
-    "StreamSpec": "sme_registry.spec",
-    "Task": "sme_registry.task",
-    "evaluate": "sme_registry.evaluation",
-    "export_onnx": "sme_registry.export",
-    "make_dataset": "sme_registry.datasets",
-    "materialize": "sme_registry.task",
-    "train_offline": "sme_registry.datasets",
+    "EvaluationProtocol": "sme_registry.spec.EvaluationProtocol",
+    "EvaluationReport": "sme_registry.evaluation.EvaluationReport",
+    "SMESpec": "sme_registry.spec.SMESpec",
+    "StreamReport": "sme_registry.evaluation.StreamReport",
+    "StreamSpec": "sme_registry.spec.StreamSpec",
+    "Task": "sme_registry.task.Task",
+    "compare": "sme_registry.studies.compare",
+    "diagnose": "sme_registry.diagnosis.diagnose",
+    "evaluate": "sme_registry.evaluation.evaluate",
+    "export_onnx": "sme_registry.export.export_onnx",
+    "load_study": "sme_registry.studies.load",
+    "make_dataset": "sme_registry.datasets.make_dataset",
+    "materialize": "sme_registry.task.materialize",
+    "run_study": "sme_registry.studies.run_study",
+    "train": "sme_registry.training.train",
+    "train_offline": "sme_registry.datasets.train_offline",
 }
 
 # Not in `__all__`: a star import would load all of them, and with them optional dependencies.
@@ -109,7 +125,8 @@ _SUBMODULES = (
 
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
-        return getattr(importlib.import_module(_LAZY[name]), name)
+        module, _, attribute = _LAZY[name].rpartition(".")
+        return getattr(importlib.import_module(module), attribute)
     if name in _SUBMODULES:
         return importlib.import_module(f"sme_registry.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
