@@ -148,34 +148,22 @@ def html_card(
     The spaces are those of a single environment, or of any agent in a team; `status` is "created",
     "running" or "ended", and None for a batch.
     """
-    from sme_registry.io.markup import card, folded, pairs_html, table_html  # loads Jinja
+    from sme_registry.io.markup import card, folded, pairs_html  # loads Jinja
     from sme_registry.spec import cards
 
     document: SMESpec | StreamSpec = env.document
-    spec = document if isinstance(document, SMESpec) else document.phases[0].spec
-    seen = cards.observation_text(spec)
-    if isinstance(document, StreamSpec) and document.observes_phase:
-        seen += ", one-hot of the phase"
-    agents = cards.agents(document) if isinstance(document, SMESpec) else []
+    seen = cards.observation_text(document)
     span = f"float32 in [{action.low.flat[0]:g}, {action.high.flat[0]:g}]"
     facts = {
         "observation": f"[{observation.shape[0]}] float32 in [0, 1]: {seen}",
         "action": f"[{action.shape[0]}] {span}",
     }
-    if agents:
+    if document.specs[0].team is not None:  # whose spaces are in the table of its agents
         facts = {"actions": span}
     facts["episode"] = f"at most {document.horizon:,} steps"
     if status is not None:
         facts["episode"] += f"; {_STATUS[status]}"
     if autoreset is not None:
         facts["autoreset"] = autoreset
-    shown = [pairs_html(repr(env), facts)]
-    if agents:
-        shown.append(table_html(cards.agents_table(agents)))
-    if isinstance(document, SMESpec):
-        summary = cards.difference(document)
-        task = [table_html(cards.task_table(document))]
-    else:
-        summary = f"Stream: {document.visits:,} visits, {document.steps:,} steps"
-        task = cards.parts(document)
-    return card(*shown, folded(summary, *task))
+    task = folded(cards.summary(document), *cards.parts(document))
+    return card(pairs_html(repr(env), facts), task)

@@ -10,6 +10,7 @@ Each field has one text, its entry under "Attributes:" in the docstring of the c
 from __future__ import annotations
 
 import inspect
+import os
 import re
 import textwrap
 from collections.abc import Callable, Iterator, Sequence, Sized
@@ -34,27 +35,26 @@ from pydantic_core import CoreSchema, ErrorDetails
 from sme_registry.errors import DigestMismatchError, SpecError, UnknownNameError, did_you_mean
 from sme_registry.io import sha256_of
 
-_MAX_REPR, _MAX_PATH, _MAX_FAULTS, _MAX_TEXT = 60, 120, 5, 2000  # of errors
+_words: dict[str, str] = {}  # of patterns
+_ENDS = ("ge", "gt", "le", "lt")
+_MAX_FAULTS, _MAX_TEXT = 5, 2000  # of errors
 _LONGEST_FIELD = 100  # characters of a field in `repr`
 _ENTRY = re.compile(r"^  (\w+(?:, \w+)*): ", re.M)  # under "Attributes:"
 
 WORDED = "$comment"
 """The keyword under which our JSON Schemas say in words what a pattern allows."""
 
-_words: dict[str, str] = {}  # of patterns
 
-
-def short_repr(value: Any) -> str:
+def short_repr(value: Any, longest: int = 60) -> str:
     """A value as an error repeats it: cut to a length that fits on a line."""
     try:
-        text = repr(value)
+        return _shortened(repr(value), longest)
     except RecursionError:
-        text = f"a {type(value).__name__} nested too deeply"
-    return _shortened(text, _MAX_REPR)
+        return f"a {type(value).__name__} nested too deeply"
 
 
-def _shortened(text: str, length: int) -> str:
-    return text if len(text) <= length else text[: length - 1] + "…"
+def _shortened(text: str, longest: int) -> str:
+    return text if len(text) <= longest else text[: longest - 1] + "…"
 
 
 def _spec_error(error: ValidationError, source: str, model: type[BaseModel]) -> SpecError:
@@ -73,28 +73,28 @@ def _spec_error(error: ValidationError, source: str, model: type[BaseModel]) -> 
 def _explain(model: type[BaseModel], line: ErrorDetails) -> str:
     """One of Pydantic's errors as `field=value: what is allowed. What to do.`"""
     location, kind = line["loc"], line["type"]
-    path = _shortened(".".join(map(str, location)), _MAX_PATH)
+    path = _shortened(".".join(map(str, location)), 120)
     value = f"{path}={short_repr(line['input'])}" if path else short_repr(line["input"])
-    siblings = _fields_at(model, location[:-1])
+    fields = _fields_at(model, location[:-1])
     if kind == "missing":
         return f"{path}: missing. Add it."
     if kind == "extra_forbidden":
-        near = did_you_mean(str(location[-1])[:_MAX_PATH], siblings)
-        return f"{value}: unknown field.{near or _known(siblings)} Rename or remove it."
+        near = did_you_mean(str(location[-1])[:120], fields)
+        known = f" Known fields: {', '.join(fields)}." if fields else ""
+        return f"{value}: unknown field.{near or known} Rename or remove it."
     if kind == "value_error":
         message = str(line["ctx"]["error"])
-        if not _fields_at(model, location):
+        of_model = isinstance(line["input"], dict | BaseModel) and _fields_at(model, location)
+        if not of_model:
             return f"{value}: {message}"
-        return f"{path}.{message}" if path else message  # of a model: names its field
-    pattern = line.get("ctx", {}).get("pattern")
-    field = siblings.get(str(location[-1])) if location else None
-    interval = "" if field is None else _interval(field)
-    if pattern in _words:
-        allowed = f"must be {_words[pattern]}"
-    elif interval and kind.startswith(("greater_than", "less_than")):
-        allowed = f"must be{interval}"
-    else:
-        allowed = re.sub("^Input should|should", "must", line["msg"], count=1) + interval
+        return f"{path}.{message}" if path else message  # which names the model's field
+    field = fields.get(str(location[-1])) if location else None
+    allowed = re.sub("^Input should|should", "must", line["msg"], count=1)
+    if kind == "string_pattern_mismatch":
+        allowed = f"must be {_words.get(line['ctx']['pattern'], allowed)}"
+    elif field is not None and (interval := _interval(field)):
+        is_bound = kind.startswith(("greater_than", "less_than"))
+        allowed = f"must be{interval}" if is_bound else allowed + interval
     if field is None or field.default is None or field.is_required():
         return f"{value}: {allowed}. Correct it."
     default = short_repr(field.get_default(call_default_factory=True, validated_data={}))
@@ -103,22 +103,15 @@ def _explain(model: type[BaseModel], line: ErrorDetails) -> str:
 
 def _interval(field: FieldInfo) -> str:
     """` in [1, 4096]`, from the limits of a number; empty where it has none."""
-    optional = [info for option in get_args(field.annotation) for info in _annotations(option)]
-    low, high = "(−∞", "∞)"
-    for entry in [*field.metadata, *(limit for info in optional for limit in info.metadata)]:
-        low = f"[{entry.ge}" if hasattr(entry, "ge") else low
-        low = f"({entry.gt}" if hasattr(entry, "gt") else low
-        high = f"{entry.le}]" if hasattr(entry, "le") else high
-        high = f"{entry.lt})" if hasattr(entry, "lt") else high
-    return "" if (low, high) == ("(−∞", "∞)") else f" in {low}, {high}"
-
-
-def _annotations(kind: Any) -> list[FieldInfo]:
-    return [entry for entry in getattr(kind, "__metadata__", ()) if isinstance(entry, FieldInfo)]
-
-
-def _known(fields: dict[str, FieldInfo]) -> str:
-    return f" Known fields: {', '.join(fields)}." if fields else ""
+    options = [entry for kind in get_args(field.annotation) for entry in get_args(kind)]
+    limits = [one for entry in options for one in getattr(entry, "metadata", ())] + field.metadata
+    ends: dict[str, Any] = {}
+    for limit in limits:
+        ends |= {name: getattr(limit, name) for name in _ENDS if hasattr(limit, name)}
+    if not ends:
+        return ""
+    lowest = f"[{ends['ge']}" if "ge" in ends else f"({ends.get('gt', '−∞')}"
+    return f" in {lowest}, " + (f"{ends['le']}]" if "le" in ends else f"{ends.get('lt', '∞')})")
 
 
 def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> dict[str, FieldInfo]:
@@ -376,6 +369,12 @@ class NamedDocument(Document):
         """`sha256-` and the first 12 hex digits of the digest: the name by content."""
         return self.digest.replace(":", "-")[: len("sha256-") + 12]
 
+    def _repr_html_(self) -> str:
+        """A card for notebooks: the fields, and what is changed from the default."""
+        from sme_registry.spec import cards  # which knows every kind of document
+
+        return cards.html(cast(Any, self))
+
     def __eq__(self, other: object) -> bool:
         """Whether all fields are equal; the name is none of them."""
         if type(other) is not type(self):
@@ -387,10 +386,12 @@ finders: dict[type[NamedDocument], Callable[[Any], NamedDocument]] = {}
 """Kind → what finds a document by its name. `resolve` fills it, which imports every kind."""
 
 
-def find_named(name: Any, kind: type[_D]) -> _D:
+def find_named(kind: type[NamedDocument], value: Any) -> Any:
     """The document of a name, without the name; ValueError, which Pydantic reports, if none."""
+    if not isinstance(value, str | os.PathLike):
+        return value
     try:
-        return cast(_D, finders[kind](name).named(""))
+        return finders[kind](value).named("")
     except (UnknownNameError, SpecError) as error:
         raise ValueError(str(error)) from None
 

@@ -22,7 +22,6 @@ from pydantic import (
     model_validator,
 )
 
-from sme_registry.errors import SpecError
 from sme_registry.spec.document import (
     WORDED,
     Document,
@@ -310,14 +309,12 @@ class Setting(Document):
     def _rotation_has_a_plane(self) -> Self:
         if not self.rotation:
             return self
-        observers = () if self.team is None else self.team.agents
-        blind = [agent.name for agent in observers if len(agent.observes) == 1]
-        if self.state_dim == 1 or blind:
-            what = f"{blind[0]} observes one" if self.state_dim > 1 else "state_dim is 1"
-            raise ValueError(
-                f"rotation={self.rotation}: must be 0, because a rotation needs two state channels "
-                f"and {what}. Leave it out, or add a channel."
-            )
+        for agent, channels in zip(self.agents, self.observed_channels, strict=True):
+            if len(channels) == 1:
+                raise ValueError(
+                    f"rotation={self.rotation}: must be 0, because a rotation needs two state "
+                    f"channels and {agent.name} observes one. Leave it out, or add a channel."
+                )
         return self
 
     @model_validator(mode="after")
@@ -466,12 +463,6 @@ class SMESpec(Setting, NamedDocument):
         """Its only segment."""
         return (Segment(0, self, 0),)
 
-    def _repr_html_(self) -> str:
-        """A card for notebooks: symbols, values and meanings, the digest, and what is changed."""
-        from sme_registry.spec import cards
-
-        return cards.html(self)
-
     def derive(self, **overrides: Any) -> SMESpec:
         """This spec with some fields changed: another task, with another digest."""
         return SMESpec.from_dict({**self.to_dict(), **overrides}) if overrides else self
@@ -479,18 +470,3 @@ class SMESpec(Setting, NamedDocument):
 
 SpecLike: TypeAlias = SMESpec | dict[str, Any] | str | os.PathLike[str]
 """A task: its spec, the spec's fields, an id, a digest or a path; see `resolve`."""
-
-
-def as_spec(value: SMESpec | dict[str, Any]) -> SMESpec:
-    """A spec from itself or from plain data.
-
-    Examples:
-      >>> from sme_registry.spec import as_spec
-      >>> as_spec({"state_dim": 16}).state_dim
-      16
-    """
-    if isinstance(value, SMESpec):
-        return value
-    if isinstance(value, dict):
-        return SMESpec.from_dict(value)
-    raise SpecError(f"{short_repr(value)}: must be an SMESpec or a mapping of its fields.")

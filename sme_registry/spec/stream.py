@@ -9,11 +9,11 @@ from __future__ import annotations
 import os
 from bisect import bisect_right
 from collections.abc import Iterator
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import accumulate
 from typing import Annotated, Any, Literal, Self, TypeAlias
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from sme_registry.errors import SpecError
 from sme_registry.io import integer_in
@@ -25,7 +25,6 @@ from sme_registry.spec.document import (
     SchemaVersion,
     StrictModel,
     find_named,
-    short_repr,
 )
 from sme_registry.spec.sme_spec import FULL_TURN, MAX_SEED, Segment, SegmentTimes, SMESpec
 
@@ -58,23 +57,17 @@ class Phase(StrictModel):
       drift: how the spec's rotation moves within the phase; None where it does not.
     """
 
-    spec: SMESpec
+    spec: Annotated[SMESpec, BeforeValidator(partial(find_named, SMESpec))]
     digest: Digest | None = None
     steps: Annotated[Integer, Field(ge=1, le=10**12)]
     drift: Drift | None = None
 
     @model_validator(mode="before")
     @classmethod
-    def _name_to_spec(cls, data: Any) -> Any:
-        if not isinstance(data, dict):
+    def _digest_names_the_spec(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or "spec" in data or "digest" not in data:
             return data
-        named = data.get("spec", data.get("digest"))
-        if not isinstance(named, str | os.PathLike):
-            return data
-        try:
-            return {**data, "spec": find_named(named, SMESpec)}
-        except ValueError as error:
-            raise ValueError(f"spec: {error}") from None
+        return {"spec": data["digest"], **data}
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
@@ -225,12 +218,6 @@ class StreamSpec(NamedDocument):
         segments = tuple((segment.phase, segment.start) for segment in self.segments)
         return segments, self.cycle_steps, self.cycles, self.switch, self.observes_phase
 
-    def _repr_html_(self) -> str:
-        """A card for notebooks: the phases, and how their tasks differ."""
-        from sme_registry.spec import cards
-
-        return cards.html(self)
-
     def visit_ends(self, after: int = 0) -> Iterator[tuple[int, int]]:
         """Visits of phases that end later than a lifetime: the index of each, and its end.
 
@@ -286,21 +273,6 @@ class StreamSpec(NamedDocument):
 
 StreamLike: TypeAlias = StreamSpec | dict[str, Any] | str | os.PathLike[str]
 """A stream: itself, its fields, an id, a digest, or the path of its file."""
-
-
-def as_stream(value: StreamSpec | dict[str, Any]) -> StreamSpec:
-    """A stream from itself or from plain data.
-
-    Examples:
-      >>> from sme_registry.spec import as_stream
-      >>> as_stream({"phases": [{"spec": "Default", "steps": 500}]}).steps
-      500
-    """
-    if isinstance(value, StreamSpec):
-        return value
-    if isinstance(value, dict):
-        return StreamSpec.from_dict(value)
-    raise SpecError(f"{short_repr(value)}: must be a StreamSpec or a mapping of its fields.")
 
 
 def _moved(seed: int | str, by: int) -> int | str:

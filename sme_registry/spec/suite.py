@@ -12,9 +12,10 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Sequence
+from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from sme_registry.errors import SpecError
 from sme_registry.spec.document import (
@@ -71,16 +72,11 @@ class StreamClass(Document):
     """
 
     name: Name
-    stream: StreamSpec
+    stream: Annotated[StreamSpec, BeforeValidator(partial(find_named, StreamSpec))]
     draws: Annotated[
         tuple[Annotated[Integer, Field(ge=0, lt=2**32)], ...],
         Field(min_length=1, max_length=10_000, strict=False),
     ] = (0,)
-
-    @field_validator("stream", mode="before")
-    @classmethod
-    def _name_to_stream(cls, value: Any) -> Any:
-        return find_named(value, StreamSpec) if isinstance(value, str | os.PathLike) else value
 
     @model_validator(mode="after")
     def _draws_differ(self) -> Self:
