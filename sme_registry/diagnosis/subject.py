@@ -33,7 +33,7 @@ from sme_registry.evaluation import (
 )
 from sme_registry.evaluation.networks import Perceptron
 from sme_registry.evaluation.references import reference_policy
-from sme_registry.export.network import of_offline_policy
+from sme_registry.export.networks import of_offline_policy
 from sme_registry.io import read_json
 from sme_registry.plots.streams import FILE
 from sme_registry.spec import SMESpec, StreamSpec

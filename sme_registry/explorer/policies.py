@@ -19,7 +19,7 @@ from sme_registry.errors import PolicyError, ResourceLimitError
 from sme_registry.evaluation import Perceptron, Policy, TeamPolicy
 from sme_registry.evaluation.models import ModulePredictor, OnnxNetwork
 from sme_registry.explorer.program import OPERATIONS, NetworkProgram, ProgramBuilder, point_width
-from sme_registry.export.torch_modules import traced
+from sme_registry.export.networks import traced
 from sme_registry.io import is_installed
 from sme_registry.spec import SMESpec
 from sme_registry.task import draw

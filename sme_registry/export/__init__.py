@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sme_registry.export.export import export_onnx, onnx_bytes
 
-__all__ = ["export_onnx", "onnx_bytes"]
+__all__ = ["FEED_FORWARD", "export_onnx", "onnx_bytes"]
 
 _NAMES = """
     Abs Acos Acosh Add And ArgMax ArgMin Asin Asinh Atan Atanh BatchNormalization Cast Ceil Celu

@@ -20,9 +20,15 @@ from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation import OfflinePolicy, Perceptron, load_sb3
 from sme_registry.evaluation.models import ACTION_RANGE, Interface, start_session, torch_policy
 from sme_registry.evaluation.policies import interface_of
-from sme_registry.export import FEED_FORWARD, torch_modules
-from sme_registry.export import network as arrays
-from sme_registry.export.network import INPUT, Network
+from sme_registry.export import FEED_FORWARD
+from sme_registry.export.networks import (
+    INPUT,
+    Network,
+    array_network,
+    of_offline_policy,
+    sb3_network,
+    torch_network,
+)
 from sme_registry.io import check_writable, choice, require_packages, write_atomically
 from sme_registry.spec import ACTION_RANGES, ActionRange, SMESpec, SpecLike
 from sme_registry.task import load
@@ -109,17 +115,14 @@ def onnx_bytes(
         choice("action_range", action_range, ACTION_RANGES)
     interface = None if spec is None else interface_of(load(spec, SMESpec))
     network = _network(policy, interface, action_range, vec_normalize)
-    written, width = network.to_onnx(), network.observation_dim
-    # In the simplest form that makes no difference: boards accept no tensors of computed sizes.
-    for form in ("broadcast", "folded", "as written"):
-        try:
-            data = _finished(written, width, form)
-            _refuse_difference(data, network)
-        except PolicyError as error:
-            difference = error
-        else:
-            return data
-    raise difference
+    written = network.to_onnx()
+    try:  # boards accept no tensors of computed sizes
+        data = _finished(written, network.observation_dim, folded=True)
+        _check_difference(data, network)
+    except PolicyError:
+        data = _finished(written, network.observation_dim, folded=False)
+        _check_difference(data, network)
+    return data
 
 
 def _network(
@@ -134,26 +137,26 @@ def _network(
                 "Stable-Baselines3, such as JAX or a recurrent state. Give its network as a "
                 "torch.nn.Module or its parameters as a `Perceptron`."
             )
-        return torch_modules.sb3_network(policy, interface, action_range, vec_normalize)
+        return sb3_network(policy, interface, action_range, vec_normalize)
     if vec_normalize is not None:
         raise PolicyError("vec_normalize: is for models of Stable-Baselines3. Leave it out.")
     symmetric = action_range == "symmetric"
     if isinstance(policy, OfflinePolicy):
-        policy = arrays.of_offline_policy(policy)
+        policy = of_offline_policy(policy)
     if isinstance(policy, Perceptron):
         if interface is not None:
-            widths = {
+            shapes = {
                 "observations": (policy.observation_dim,),
                 "actions": (policy.action_dim,),
             }
-            interface.check("policy", **widths)
-        return arrays.network(policy, symmetric)
+            interface.check("policy", **shapes)
+        return array_network(policy, symmetric)
     if interface is None or not callable(policy):
         raise PolicyError(
             f"policy={policy!r:.80}: must be a torch.nn.Module, a function of PyTorch tensors, a "
             "`Perceptron`, a Stable-Baselines3 model, or the path of a .zip or .npz."
         )
-    return torch_modules.network(policy, interface, symmetric)
+    return torch_network(policy, interface, symmetric)
 
 
 def _loaded(policy: Any) -> Any:
@@ -170,22 +173,21 @@ def _loaded(policy: Any) -> Any:
     )
 
 
-def _finished(data: bytes, observation_dim: int, form: str) -> bytes:
-    """The model with its action range as metadata, no unused nodes, and shapes by `form`."""
+def _finished(data: bytes, observation_dim: int, *, folded: bool) -> bytes:
+    """The model with its action range as metadata, and without unused nodes."""
     import onnx
 
     model = onnx.load_model_from_string(data)
-    if form == "broadcast":
+    if folded:
         for node in model.graph.node:
             if node.op_type == "Expand":
                 node.op_type = "Identity"
                 del node.input[1:]
-    if form != "as written":
-        fold_shapes(model, observation_dim, broadcast=form == "broadcast")
+        _fold_shapes(model, observation_dim)
     used, kept = {output.name for output in model.graph.output}, []
     for node in reversed(model.graph.node):
         if used.intersection(node.output):
-            used.update(read_by(node))
+            used.update(_read_by(node))
             kept.append(node)
     del model.graph.node[:]
     model.graph.node.extend(reversed(kept))
@@ -201,7 +203,7 @@ def _refused_by_boards(data: bytes) -> list[str]:
     return sorted({node.op_type for node in model.graph.node} - FEED_FORWARD)
 
 
-def _refuse_difference(data: bytes, network: Network) -> None:
+def _check_difference(data: bytes, network: Network) -> None:
     """Raise if the file's actions differ from the policy's, inside or outside the cube."""
     random = np.random.default_rng(0)
     inside = random.random((_CHECKED_ROWS, network.observation_dim), dtype=np.float32)
@@ -233,40 +235,39 @@ _BATCHES = 2, 3
 _SIZES = "Shape", "Size"  # of their input they read the shape alone
 
 
-def fold_shapes(model: Any, observation_dim: int, *, broadcast: bool) -> None:
+def _fold_shapes(model: Any, observation_dim: int) -> None:
     """Replace what is computed from shapes alone by the numbers that it computes, in place.
 
     PyTorch writes `x.chunk(2, -1)` and `x.view(x.shape[0], -1)` with `Shape`, and computes sizes
     from it, although only the batch size varies. Values that depend on no entry of the observations
-    are computed for two batch sizes; those that are equal become constants.
+    are computed for two batch sizes; those that are equal, or that have equal rows, become
+    constants.
     """
     import onnx
 
     nodes = list(model.graph.node)
     computed = set(_computed_from_shapes(model))
-    consumed = {
+    folded = {
         name
         for node in nodes
         if not computed.issuperset(node.output)
-        for name in read_by(node)
+        for name in _read_by(node)
         if name in computed
     }
-    consumed -= {name for node in nodes if node.op_type == "Constant" for name in node.output}
-    if not consumed:
+    folded -= {name for node in nodes if node.op_type == "Constant" for name in node.output}
+    if not folded:
         return
-    reshapes = [node for node in nodes if node.op_type == "Reshape" and node.input[1] in consumed]
-    reshaped = {node.output[0] for node in reshapes}
-    values = _values(model, observation_dim, consumed | reshaped)
-    folded = {
-        name: _constant(*(each[name] for each in values), broadcast=broadcast) for name in consumed
-    }
+    reshapes = [node for node in nodes if node.op_type == "Reshape" and node.input[1] in folded]
+    few, many = _values(model, observation_dim, folded | {node.output[0] for node in reshapes})
+    constants = {name: _constant(few[name], many[name]) for name in folded}
     for node in reshapes:
         # Sizes of its own: another reader of these may need the batch size itself.
-        sizes = _sizes(*(each[node.output[0]].shape for each in values))
-        if folded[node.input[1]] is None and sizes is not None:
-            node.input[1] = f"{node.output[0]}.sizes"
-            folded[node.input[1]] = sizes
-    constants = {name: value for name, value in folded.items() if value is not None}
+        output = node.output[0]
+        sizes = _sizes(few[output].shape, many[output].shape)
+        if constants[node.input[1]] is None and sizes is not None:
+            node.input[1] = f"{output}.sizes"
+            constants[node.input[1]] = sizes
+    constants = {name: value for name, value in constants.items() if value is not None}
     del model.graph.node[:]
     for name, value in sorted(constants.items()):
         tensor = onnx.numpy_helper.from_array(np.ascontiguousarray(value), name)
@@ -274,37 +275,37 @@ def fold_shapes(model: Any, observation_dim: int, *, broadcast: bool) -> None:
     model.graph.node.extend(node for node in nodes if constants.keys().isdisjoint(node.output))
 
 
-def read_by(node: Any) -> Iterator[str]:
+def _read_by(node: Any) -> Iterator[str]:
     """The values that a node reads, those in its branches and loops included."""
     yield from node.input
     for graph in _subgraphs(node):
         yield from (output.name for output in graph.output)
         for inner in graph.node:
-            yield from read_by(inner)
+            yield from _read_by(inner)
 
 
-def _subgraphs(node: Any) -> Iterator[Any]:
-    for attribute in node.attribute:
-        if attribute.HasField("g"):
-            yield attribute.g
-        yield from attribute.graphs
+def _subgraphs(node: Any) -> list[Any]:
+    attributes = node.attribute
+    return [part.g for part in attributes if part.HasField("g")] + [
+        graph for part in attributes for graph in part.graphs
+    ]
 
 
-def _computed_from_shapes(model: Any) -> Iterable[str]:
+def _computed_from_shapes(model: Any) -> Iterator[str]:
     """The outputs of nodes that depend on no entry of the observations, only on their shape."""
     dependent = {INPUT}
     for node in model.graph.node:
         outputs = [name for name in node.output if name]
-        reads = () if node.op_type in _SIZES else read_by(node)
+        read = () if node.op_type in ("Shape", "Size") else _read_by(node)
         # One output each: the constant that replaces it is a node of its own.
-        if len(outputs) != 1 or any(_subgraphs(node)) or dependent.intersection(reads):
+        if len(outputs) != 1 or _subgraphs(node) or dependent.intersection(read):
             dependent.update(outputs)
         else:
             yield outputs[0]
 
 
 def _values(model: Any, observation_dim: int, names: Iterable[str]) -> list[dict[str, Any]]:
-    """The values of these names for each of the batch sizes."""
+    """The values of these names for two batch sizes."""
     import onnx
 
     names = sorted(names)
@@ -314,16 +315,16 @@ def _values(model: Any, observation_dim: int, names: Iterable[str]) -> list[dict
     probe.graph.output.extend(onnx.ValueInfoProto(name=name) for name in names)
     session = start_session(probe.SerializeToString())
     random = np.random.default_rng(0)
-    batches = [random.random((rows, observation_dim), dtype=np.float32) for rows in _BATCHES]
+    batches = [random.random((rows, observation_dim), dtype=np.float32) for rows in (2, 3)]
     return [dict(zip(names, session.run(names, {INPUT: x}), strict=True)) for x in batches]
 
 
-def _constant(few: Any, many: Any, *, broadcast: bool) -> Any:
-    """The value for any batch size; None if there is no such value."""
+def _constant(few: Any, many: Any) -> Any:
+    """The value for any batch size, one row where all are equal; None if there is no such value."""
     if few.shape == many.shape:
         return few if np.array_equal(few, many) else None
     axis = _batch_axis(few.shape, many.shape)
-    if axis is None or not broadcast:
+    if axis is None:
         return None
     one = few.take([0], axis)
     return one if (few == one).all() and (many == one).all() else None

@@ -1,6 +1,8 @@
-"""PyTorch modules and functions, and models of Stable-Baselines3, as ONNX.
+"""`Network`: a policy that writes itself as ONNX, from arrays, PyTorch, or Stable-Baselines3.
 
-By PyTorch's tracing exporter: its successor needs another package and is ten times slower. Of SB3:
+A network of arrays has one Gemm and one activation for each layer, and needs no PyTorch. Modules
+and functions are traced: PyTorch's other exporter needs another package and is ten times slower.
+Of SB3:
 
     x = clip((o − mean) / √(var + ε), ±clip)    in float64, with VecNormalize
     y = the network's deterministic action
@@ -18,28 +20,115 @@ import pickle
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sme_registry.compiled.arrays import Observation
 from sme_registry.errors import PolicyError
+from sme_registry.evaluation import OfflinePolicy, Perceptron
 from sme_registry.evaluation.models import Interface, device_of, evaluating
-from sme_registry.export.network import INPUT, OPSET, OUTPUT, Network
 from sme_registry.io import require_packages
 from sme_registry.spec import ActionRange
 
 if TYPE_CHECKING:
     import torch
 
+INPUT, OUTPUT = "observations", "actions"
+_OPSET, _IR_VERSION = 17, 8
+_OPERATORS = {"relu": "Relu", "tanh": "Tanh", "sigmoid": "Sigmoid", "elu": "Elu"}
 _OTHER_LIBRARIES = "Give networks of other libraries, and linear maps, as a `Perceptron` of arrays."
 
 
-def network(policy: Any, interface: Interface, symmetric: bool) -> Network:
+class Network(NamedTuple):
+    """A policy that can be written as ONNX."""
+
+    observation_dim: int
+    act: Callable[[Observation], Any]
+    to_onnx: Callable[[], bytes]
+
+
+def of_offline_policy(policy: OfflinePolicy) -> Perceptron:
+    """The same network: ReLU between the layers, tanh scaled to [0, 1] after the last."""
+    layers = [(W.T, b, "relu") for W, b in policy.layers]
+    layers[-1] = (*layers[-1][:2], "tanh")
+    A = policy.action_dim
+    return Perceptron(layers, np.zeros(A, np.float32), np.ones(A, np.float32))
+
+
+def array_network(perceptron: Perceptron, symmetric: bool) -> Network:
+    """A perceptron whose actions are in [−1, 1] if `symmetric`, else in [0, 1]."""
+
+    def act(observations: Any) -> Any:
+        actions = perceptron(observations)
+        return (actions + 1.0) * 0.5 if symmetric else actions
+
+    return Network(perceptron.observation_dim, act, lambda: _to_onnx(perceptron, symmetric))
+
+
+def _to_onnx(perceptron: Perceptron, symmetric: bool) -> bytes:
+    from onnx import TensorProto, helper
+
+    graph = _Graph()
+    x = INPUT
+    for W, b, activation in perceptron.layers:
+        x = graph.node("Gemm", x, graph.constant(W), graph.constant(b))
+        if activation == "silu":
+            x = graph.node("Mul", x, graph.node("Sigmoid", x))
+        elif activation != "identity":
+            x = graph.node(_OPERATORS[activation], x)
+    if perceptron.low is not None and perceptron.high is not None:
+        x = graph.affine(x, 0.5 * (perceptron.high - perceptron.low), perceptron.low)
+    if symmetric:
+        x = graph.affine(x, 0.5, 0.0)
+    x = graph.node("Clip", x, graph.constant(0.0), graph.constant(1.0))
+    graph.nodes.append(helper.make_node("Identity", [x], [OUTPUT]))
+    widths = {INPUT: perceptron.observation_dim, OUTPUT: perceptron.action_dim}
+    ends = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", width])
+        for name, width in widths.items()
+    ]
+    model = helper.make_model(
+        helper.make_graph(graph.nodes, "policy", ends[:1], ends[1:], graph.constants),
+        opset_imports=[helper.make_opsetid("", _OPSET)],
+        ir_version=_IR_VERSION,
+        producer_name="sme-registry",
+    )
+    return bytes(model.SerializeToString())
+
+
+class _Graph:
+    """Nodes and constants of a graph, named by their order."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Any] = []
+        self.constants: list[Any] = []
+
+    def node(self, operator: str, *inputs: str) -> str:
+        from onnx import helper
+
+        output = f"x{len(self.nodes)}"
+        self.nodes.append(helper.make_node(operator, inputs, [output]))
+        return output
+
+    def constant(self, array: Any) -> str:
+        from onnx import numpy_helper
+
+        name = f"c{len(self.constants)}"
+        self.constants.append(numpy_helper.from_array(np.asarray(array, np.float32), name))
+        return name
+
+    def affine(self, x: str, scale: Any, low: Any) -> str:
+        """low + scale (x + 1)."""
+        x = self.node("Add", x, self.constant(1.0))
+        return self.node("Add", self.node("Mul", x, self.constant(scale)), self.constant(low))
+
+
+def torch_network(policy: Any, interface: Interface, symmetric: bool) -> Network:
     """A module or function from observations to actions in [−1, 1] if `symmetric`, else [0, 1]."""
     require_packages("exporting a function", {"torch": "PyTorch"}, "train")
-    module = _unit_policy(policy, symmetric)
-    _refuse_output(policy, module, interface)
+    module = _unit_policy(getattr(policy, "_orig_mod", policy), symmetric)  # not `torch.compile`'s
+    _check_output(policy, module, interface)
 
     def act(observations: Observation) -> Any:
         import torch
@@ -66,7 +155,7 @@ def traced(module: Any, width: int) -> bytes:
                 (rows,),
                 stream,
                 dynamo=False,
-                opset_version=OPSET,
+                opset_version=_OPSET,
                 input_names=[INPUT],
                 output_names=[OUTPUT],
                 dynamic_axes={INPUT: {0: "batch"}, OUTPUT: {0: "batch"}},
@@ -80,20 +169,21 @@ def traced(module: Any, width: int) -> bytes:
     return bytes(stream.getvalue())
 
 
-def _unit_policy(policy: Any, symmetric: bool) -> Any:
-    """The module from observations to unit actions, with the modules that the policy uses."""
+def _unit_policy(function: Callable[..., Any], symmetric: bool) -> Any:
+    """The module from observations to unit actions, with the modules that the function uses."""
     import torch
-
-    function = getattr(policy, "_orig_mod", policy)  # what `torch.compile` wraps
 
     class UnitPolicy(torch.nn.Module):
         def __init__(self) -> None:
             super().__init__()
             self.used = torch.nn.ModuleList(_modules_of(function))
 
-        def unclipped(self, x: torch.Tensor) -> torch.Tensor:
+        def returned(self, x: torch.Tensor) -> Any:
             parameter = next(self.parameters(), None)
-            y: torch.Tensor = function(x if parameter is None else x.to(parameter.dtype))
+            return function(x if parameter is None else x.to(parameter.dtype))
+
+        def unclipped(self, x: torch.Tensor) -> torch.Tensor:
+            y: torch.Tensor = self.returned(x)
             return ((y + 1.0) * 0.5 if symmetric else y).float()
 
         def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -114,27 +204,23 @@ def _modules_of(function: Callable[..., Any]) -> Iterator[torch.nn.Module]:
         values = [*function.args, *function.keywords.values()]
     else:
         owner = getattr(function, "__self__", function)
-        if isinstance(owner, torch.nn.Module):
-            yield owner
-        values = list(getattr(owner, "__dict__", {}).values())
+        values = [owner, *getattr(owner, "__dict__", {}).values()]
     if inspect.isfunction(function):
-        seen = inspect.getclosurevars(function)
-        values += [*seen.nonlocals.values(), *seen.globals.values()]
+        variables = inspect.getclosurevars(function)
+        values += [*variables.nonlocals.values(), *variables.globals.values()]
         # Methods of what it uses: `lambda o: agent.act(o)`
-        values += [each for value in values for each in getattr(value, "__dict__", {}).values()]
+        values += [part for value in values for part in getattr(value, "__dict__", {}).values()]
     yield from dict.fromkeys(value for value in values if isinstance(value, torch.nn.Module))
 
 
-def _refuse_output(policy: Any, module: Any, interface: Interface) -> None:
+def _check_output(policy: Any, module: Any, interface: Interface) -> None:
     """Raise if the policy does not map tensors to actions `[B, A]`."""
     import torch
 
     rows = torch.full((3, interface.observation_dim), 0.5, device=device_of(module))
-    function = getattr(policy, "_orig_mod", policy)
-    parameter = next(module.parameters(), None)
     with evaluating(module), torch.no_grad():
         try:
-            returned = function(rows if parameter is None else rows.to(parameter.dtype))
+            returned = module.returned(rows)
         except Exception as error:
             raise PolicyError(
                 f"policy={policy!r:.80}: fails on a PyTorch tensor {list(rows.shape)}: "
@@ -142,19 +228,16 @@ def _refuse_output(policy: Any, module: Any, interface: Interface) -> None:
                 f"[B, {interface.observation_dim}] to actions [B, {interface.action_dim}]. "
                 f"{_OTHER_LIBRARIES}"
             ) from error
-    shape = (3, interface.action_dim)
-    if isinstance(returned, torch.Tensor) and tuple(returned.shape) == shape:
-        return
+    actual = f"an object of type {type(returned).__name__}"
     if isinstance(returned, torch.Tensor):
         actual = f"a tensor {list(returned.shape)}"
-    else:
-        actual = f"an object of type {type(returned).__name__}"
-    raise PolicyError(
-        f"policy={policy!r:.80}: returns {actual} for 3 observations: must be one PyTorch tensor "
-        f"[3, {interface.action_dim}] of deterministic actions. Give a function that returns them "
-        "alone, such as `lambda o: actor(o)[0]` for a tuple or `lambda o: actor(o).mean` for a "
-        f"distribution. {_OTHER_LIBRARIES}"
-    )
+    if actual != f"a tensor [3, {interface.action_dim}]":
+        raise PolicyError(
+            f"policy={policy!r:.80}: returns {actual} for 3 observations: must be one PyTorch "
+            f"tensor [3, {interface.action_dim}] of deterministic actions. Give a function that "
+            "returns them alone, such as `lambda o: actor(o)[0]` for a tuple or "
+            f"`lambda o: actor(o).mean` for a distribution. {_OTHER_LIBRARIES}"
+        )
 
 
 def sb3_network(
@@ -165,19 +248,28 @@ def sb3_network(
 ) -> Network:
     """A model whose policy is a PyTorch module of SB3; the arguments are those of `export_onnx`."""
     network = _policy_of(model)
-    S_2, A = _widths(network)
+    spaces = {"observations": network.observation_space, "actions": network.action_space}
+    shapes = {name: space.shape for name, space in spaces.items()}
+    for name, shape in shapes.items():
+        if shape is None or len(shape) != 1:
+            raise PolicyError(
+                f"model: its {name} have shape {shape}: must be vectors. Give a model trained "
+                "on an SME."
+            )
     if interface is not None:
-        interface.check("model", observations=(S_2,), actions=(A,))
+        interface.check("model", **shapes)
     symmetric = _is_symmetric(network) if action_range is None else action_range == "symmetric"
-    normaliser = _normaliser(model, vec_normalize, S_2)
+    [width] = shapes["observations"]
+    normaliser = _normaliser(model, vec_normalize, width)
 
     def act(observations: Observation) -> Any:
         inputs = observations if normaliser is None else normaliser.normalize_obs(observations)
         actions = model.predict(inputs, deterministic=True)[0]
         return (actions + 1.0) / 2.0 if symmetric else actions
 
-    unit_model = _unit_model(network, normaliser, symmetric)
-    return Network(S_2, act, lambda: traced(unit_model, S_2))
+    function = _deterministic(network, normaliser)
+    module = _unit_policy(function, symmetric or network.squash_output)
+    return Network(width, act, lambda: traced(module, width))
 
 
 def _policy_of(model: Any) -> Any:
@@ -196,20 +288,6 @@ def _policy_of(model: Any) -> Any:
             "algorithm, such as PPOLagrangian."
         )
     return network
-
-
-def _widths(network: Any) -> tuple[int, int]:
-    """O and A, entries of the model's observations and actions."""
-    widths = []
-    for what in ("observation", "action"):
-        shape = getattr(getattr(network, f"{what}_space"), "shape", None)
-        if shape is None or len(shape) != 1:
-            raise PolicyError(
-                f"model: its {what}s have shape {shape}: must be vectors. Give a model trained "
-                "on an SME."
-            )
-        widths.append(int(shape[0]))
-    return widths[0], widths[1]
 
 
 def _is_symmetric(network: Any) -> bool:
@@ -256,42 +334,29 @@ def _normaliser(model: Any, vec_normalize: Any, width: int) -> Any:
     return normaliser
 
 
-def _unit_model(network: Any, normaliser: Any, symmetric: bool) -> torch.nn.Module:
-    """The PyTorch module from observations to unit actions."""
-    import torch
-
-    class UnitModel(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.network = network
-            if normaliser is not None:
-                deviation = np.sqrt(normaliser.obs_rms.var + normaliser.epsilon)
-                self.mean = torch.as_tensor(normaliser.obs_rms.mean, device=network.device)
-                self.deviation = torch.as_tensor(deviation, device=network.device)
-
-        def forward(self, x: torch.Tensor) -> torch.Tensor:
-            if normaliser is not None:
-                scaled = (x.double() - self.mean) / self.deviation
-                x = scaled.clamp(-normaliser.clip_obs, normaliser.clip_obs).float()
-            y = _deterministic(self.network, x)
-            if symmetric or self.network.squash_output:
-                y = (y + 1.0) * 0.5
-            return y.clamp(0.0, 1.0)
-
-    return UnitModel()
-
-
-def _deterministic(network: Any, x: torch.Tensor) -> torch.Tensor:
+def _deterministic(network: Any, normaliser: Any) -> Callable[[torch.Tensor], torch.Tensor]:
     """The network's `_predict` without distributions, whose broadcasting no board accepts."""
     import torch
     from stable_baselines3.common.policies import ActorCriticPolicy
     from stable_baselines3.sac.policies import SACPolicy
 
-    if isinstance(network, ActorCriticPolicy):
-        latent = network.mlp_extractor.forward_actor(network.pi_features_extractor(x))
-        mean: torch.Tensor = network.action_net(latent)
-        return torch.tanh(mean) if network.squash_output else mean
-    if isinstance(network, SACPolicy):
-        return torch.tanh(network.actor.get_action_dist_params(x)[0])
-    action: torch.Tensor = network._predict(x, deterministic=True)
-    return action
+    def rescaled(x: torch.Tensor) -> torch.Tensor:
+        if normaliser is None:
+            return x
+        deviation = np.sqrt(normaliser.obs_rms.var + normaliser.epsilon)
+        mean = torch.as_tensor(normaliser.obs_rms.mean, device=network.device)
+        scaled = (x.double() - mean) / torch.as_tensor(deviation, device=network.device)
+        return scaled.clamp(-normaliser.clip_obs, normaliser.clip_obs).float()
+
+    def act(observations: torch.Tensor) -> torch.Tensor:
+        x = rescaled(observations)
+        if isinstance(network, ActorCriticPolicy):
+            latent = network.mlp_extractor.forward_actor(network.pi_features_extractor(x))
+            mean: torch.Tensor = network.action_net(latent)
+            return torch.tanh(mean) if network.squash_output else mean
+        if isinstance(network, SACPolicy):
+            return torch.tanh(network.actor.get_action_dist_params(x)[0])
+        action: torch.Tensor = network._predict(x, deterministic=True)
+        return action
+
+    return act
