@@ -464,7 +464,7 @@ def test_a_decay_curve_of_tasks_with_and_without_limits_shows_what_they_share(ex
 def test_commands_write_the_figures_for_which_the_report_has_numbers(
     tmp_path, extended, report, monkeypatch
 ):
-    from sme_registry.plots.files import write_evaluation
+    from sme_registry.plots.reports import write_evaluation
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *args, **options: None)
     names = {path.stem for path in write_evaluation(extended, tmp_path / "extended")}
@@ -478,7 +478,7 @@ def test_commands_write_the_figures_for_which_the_report_has_numbers(
         (lambda report: plots.decay_curve([]), "must be one or more evaluation reports"),
         (
             lambda report: plots.decay_curve(3),
-            "reports=3: must be an EvaluationReport, the path of",
+            "reports=3: must be one or more EvaluationReports, paths of",
         ),
         (lambda report: plots.decay_curve(report, measures=["mae"]), "measures="),
         (
@@ -494,7 +494,7 @@ def test_commands_write_the_figures_for_which_the_report_has_numbers(
         ),
         (
             lambda report: plots.similarity_map(half, PLANE, epsilon=0.0),
-            r"epsilon=0.0: must be in \(0, 100\]",
+            r"epsilon=0.0: must be a finite number in",
         ),
         (
             lambda report: plots.similarity_map(half, PLANE, resolution=1),

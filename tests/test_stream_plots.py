@@ -145,7 +145,7 @@ def test_reports_are_read_from_files_and_folders(tmp_path):
     ("draw", "runs", "message"),
     [
         (plots.retention_map, [], "one or more stream reports"),
-        (plots.retention_map, 3, "runs=3: must be a StreamReport"),
+        (plots.retention_map, 3, "runs=3: must be one or more StreamReports"),
         (plots.performance_curve, ["missing.json"], "missing.json"),
         (plots.plasticity_curve, lambda: [report(0), report(0, 2)], "different values of stream"),
         (plots.plasticity_curve, plain, "has no fresh agents"),

@@ -26,8 +26,8 @@ from sme_registry.evaluation import EvaluationReport, Policy, StreamReport, Team
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.io import check_new
 from sme_registry.io.terminal import Progress, err, print_json
-from sme_registry.plots.files import write_evaluation, write_stream
-from sme_registry.plots.streams import FILE as STREAM
+from sme_registry.plots.maps import STREAM
+from sme_registry.plots.reports import write_evaluation, write_stream
 from sme_registry.spec import (
     EnvFile,
     EvaluationProtocol,

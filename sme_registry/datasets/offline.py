@@ -43,7 +43,7 @@ from sme_registry.io import (
     versions,
     write_atomically,
 )
-from sme_registry.plots import files as plot_files
+from sme_registry.plots import reports as plot_files
 from sme_registry.spec import ProtocolLike, SMESpec, SpecLike
 from sme_registry.task import Task, load, materialize
 

@@ -18,9 +18,9 @@ from sme_registry.diagnosis.task import TaskDiagnosis
 from sme_registry.diagnosis.team import TeamDiagnosis
 from sme_registry.evaluation.references import LABELS
 from sme_registry.evaluation.report import SAFETY_REFERENCES
-from sme_registry.plots.curves import draw_training
+from sme_registry.plots.curves import draw_training, tick_visits
+from sme_registry.plots.maps import retention_map
 from sme_registry.plots.reports import SAFETY_MARKERS
-from sme_registry.plots.streams import retention_map, tick_visits
 from sme_registry.plots.style import (
     COLOURS,
     GREY,
@@ -249,7 +249,7 @@ def _squared_error(figure: Figure, measured: Measurements) -> None:
 
 def _training(figure: Figure, measured: Measurements, log: Log) -> None:
     axes = figure.add_subplot()
-    draw_training(axes, log.step, log.regret, each=log.source.removesuffix("s"))
+    draw_training(axes, log.step, log.regret, unit=log.source.removesuffix("s"))
     training, episodes = measured.training, measured.on_policy
     assert training is not None  # there is a log
     for name in _REFERENCES[:3]:

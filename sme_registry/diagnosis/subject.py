@@ -35,7 +35,7 @@ from sme_registry.evaluation.networks import Perceptron
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.export.networks import of_offline_policy
 from sme_registry.io import read_json
-from sme_registry.plots.streams import FILE
+from sme_registry.plots.maps import STREAM
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.study import Cell, in_jax, parse_uses
 from sme_registry.training import RunRecord
@@ -320,11 +320,11 @@ def _model_of_cell(study: Path, stem: str, cell: Cell) -> Any:
 
 def _report_of_life(folder: Path, record: RunRecord, kept: run_files.Snapshots) -> StreamReport:
     """The report of a finished life, with all of whose models it is diagnosed."""
-    path = folder / FILE
+    path = folder / STREAM
     if not path.exists():
         raise OptionError(
-            f"run={str(folder)!r}: contains no {FILE} yet. A life in a stream is diagnosed when it "
-            "has ended. Continue it with `sme train … --resume`."
+            f"run={str(folder)!r}: contains no {STREAM} yet. A life in a stream is diagnosed when "
+            "it has ended. Continue it with `sme train … --resume`."
         )
     missing = [file.name for file in (kept.initial, *kept.visits) if not file.exists()]
     if missing:

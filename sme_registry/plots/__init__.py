@@ -6,19 +6,20 @@ legend, instead of in a new figure. `title` is above a new figure; None takes on
 `save_figure` writes any figure.
 """
 
-from sme_registry.plots.curves import cost_curve, learning_curve, training_curve
-from sme_registry.plots.maps import similarity_map
+from sme_registry.plots.curves import (
+    cost_curve,
+    dynamic_regret_curve,
+    learning_curve,
+    performance_curve,
+    plasticity_curve,
+    training_curve,
+)
+from sme_registry.plots.maps import retention_map, similarity_map
 from sme_registry.plots.reports import (
     decay_curve,
     layer_probes,
     reward_against_cost,
     sensitivity_bars,
-)
-from sme_registry.plots.streams import (
-    dynamic_regret_curve,
-    performance_curve,
-    plasticity_curve,
-    retention_map,
 )
 from sme_registry.plots.style import save_figure
 

@@ -1,9 +1,10 @@
-"""Maps of similarity: over the plane of a task, and the colours of every map."""
+"""Maps: of similarity over the plane of a task, and of retention in a stream."""
 
 from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,18 +12,28 @@ import numpy.typing as npt
 
 from sme_registry.compiled import engine
 from sme_registry.errors import OptionError
-from sme_registry.evaluation import as_policy
-from sme_registry.io import integer_in
-from sme_registry.plots.style import canvas, figure_of
+from sme_registry.evaluation import StreamReport, as_policy
+from sme_registry.evaluation.retention import Retention
+from sme_registry.evaluation.streams import check_same_stream
+from sme_registry.io import integer_in, number_in
+from sme_registry.plots.style import canvas, figure_of, read_reports
 from sme_registry.spec import ActionRange, SMESpec, SpecLike, catalogue
+from sme_registry.statistics import iqm
 from sme_registry.task import load, materialize
 from sme_registry.task.draw import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
+_LifeReport = StreamReport | str | os.PathLike[str]
+LifeReports = _LifeReport | Sequence[_LifeReport]
+
+STREAM = "stream.json"  # of a report, in the folder of a run
+MATRIX_SCALE = "normalised regret\n(0 = optimal, 1 = constant ½)"
 _STEP = 0.05  # of the ends of a colour scale
+_MOST_NUMBERS = 12  # of columns of a matrix whose cells show their values
 
 
 def similarity_map(
@@ -57,11 +68,9 @@ def similarity_map(
             "observation: must be absent for a map, because the policy sees more than the two "
             "state channels. Use a task without it."
         )
-    if not 0.0 < epsilon <= 100.0:
-        raise OptionError(f"epsilon={epsilon!r:.40}: must be in (0, 100].")
+    number_in("epsilon", epsilon, 1e-6, 100.0)
+    number_in("time", time, 0.0, 1.0)
     resolution = integer_in("resolution", resolution, 2, 2000)
-    if not 0.0 <= time <= 1.0:
-        raise OptionError(f"time={time!r:.40}: must be in [0, 1].")
     loaded = as_policy(policy, spec, action_range=action_range, name=name)
     side, similarity = similarity_on_grid(loaded, spec, epsilon, resolution, time)
     scale = colour_scale(similarity)
@@ -111,10 +120,18 @@ def draw_similarity(
         similarity, origin="lower", extent=extent, vmin=scale[0], vmax=scale[1], cmap="viridis",
         interpolation="nearest",
     )  # fmt: skip
-    # Two strokes, so that the outline is visible on dark and on light colours.
-    for colour, width in (("white", 3.0), ("black", 1.2)):
-        axes.plot([0, 1, 1, 0, 0], [0, 0, 1, 1, 0], color=colour, linewidth=width)
+    _outline(axes, 0.0, 0.0, 1.0, (3.0, 1.2))
     return image
+
+
+def _outline(
+    axes: Axes, left: float, bottom: float, side: float, widths: tuple[float, float]
+) -> None:
+    """A square of two strokes, visible on dark and on light colours."""
+    x = left + side * np.array([0.0, 1.0, 1.0, 0.0, 0.0])
+    y = bottom + side * np.array([0.0, 0.0, 1.0, 1.0, 0.0])
+    for colour, width in zip(("white", "black"), widths, strict=True):
+        axes.plot(x, y, color=colour, linewidth=width)
 
 
 def similarity_on_grid(
@@ -133,3 +150,101 @@ def similarity_on_grid(
         a = np.clip(policy(observations), 0.0, 1.0)
         rows.append(task.similarity_of(a, oracle(s)))
     return side, np.array(rows)
+
+
+def retention_map(
+    runs: LifeReports,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    region: str = "WD",
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Figure:
+    """Draw a retention matrix: normalised regret after each visit (rows) on each phase (columns).
+
+    Bright is good. The cell of the phase that was just visited is outlined. The first row is the
+    initial policy, where the reports have one.
+
+    Args:
+      runs: the report of an agent, or one for each seed: then the cells are their IQM. A report
+        may be given by its path, or by the folder that contains its stream.json.
+      region: `WD`, `OOD 1`, …, or `OOD` for the mean over the shells.
+
+    Examples:
+      >>> from sme_registry.plots import retention_map
+      >>> figure = retention_map("runs/life", "retention_map.png")
+    """
+    reports = read_lives(runs)
+    agents = [report.region(region).agent for report in reports]
+    M = iqm([agent.normalised_regret for agent in agents])
+    labels = [f"visit {visit.visit}" for visit in reports[0].visits]
+    visited: list[tuple[int, int]] = [(visit.visit, visit.phase) for visit in reports[0].visits]
+    if initial := initial_regrets(agents):
+        M = np.concatenate([iqm(initial)[None], M])
+        labels = ["initial", *labels]
+        visited = [(row + 1, column) for row, column in visited]
+    V, P = M.shape
+    size = (max(3.6, 1.9 + 0.52 * min(P, 20)), max(2.8, 1.5 + 0.32 * min(V, 30)))
+    with canvas(ax, size, path, title=lives_title(reports, title, f", {region}")) as (axes,):
+        image = draw_matrix(axes, M, visited, labels, max(1.0, float(M.max())))
+        axes.set_xlabel("evaluated on the task of phase")
+        axes.set_ylabel("policy at the end of")
+        bar = figure_of(axes).colorbar(image, ax=axes, label=MATRIX_SCALE)
+        bar.outline.set_visible(False)
+    return figure_of(axes)
+
+
+def draw_matrix(
+    axes: Axes, M: Array, visited: Sequence[tuple[int, int]], labels: Sequence[str], top: float
+) -> AxesImage:
+    """Draw a retention matrix `[V, P]` in axes, with the `visited` cells outlined.
+
+    `top` is the regret at the dark end of the colours, at least that of every cell.
+    """
+    image = axes.imshow(
+        M, vmin=0.0, vmax=top, cmap="viridis_r", aspect="auto", interpolation="nearest"
+    )
+    axes.grid(visible=False)
+    V, P = M.shape
+    if P <= _MOST_NUMBERS:
+        for row, column in np.ndindex(V, P):
+            colour = "white" if M[row, column] > 0.5 * top else "black"
+            axes.text(
+                column, row, f"{M[row, column]:.2f}", ha="center", va="center", fontsize=8,
+                color=colour,
+            )  # fmt: skip
+    for row, column in visited:
+        _outline(axes, column - 0.47, row - 0.47, 0.94, (2.4, 1.0))
+    _tick(axes.yaxis, labels)
+    _tick(axes.xaxis, [str(j) for j in range(P)])
+    return image
+
+
+def _tick(axis: Any, labels: Sequence[str]) -> None:
+    """As many of the labels as are legible."""
+    every = -(-len(labels) // 20)
+    axis.set_ticks(range(0, len(labels), every), labels[::every])
+    axis.set_tick_params(length=0)
+
+
+def read_lives(given: LifeReports) -> list[StreamReport]:
+    """One report or several of one stream, those given by their paths read."""
+    reports = read_reports(given, StreamReport, STREAM, "runs")
+    check_same_stream(reports)
+    return reports
+
+
+def initial_regrets(agents: Sequence[Retention]) -> list[tuple[float, ...]]:
+    """`[n][P]` regret of the initial policies; empty unless every agent has one."""
+    known = [a.initial_normalised_regret for a in agents if a.initial_normalised_regret]
+    return known if len(known) == len(agents) else []
+
+
+def lives_title(
+    reports: Sequence[StreamReport], title: str | None, end: str = "", *, named: bool = True
+) -> str:
+    if title is not None:
+        return title
+    who = f"{reports[0].policy} on " if named else ""
+    seeds = f", {len(reports)} seeds" if named and len(reports) > 1 else ""
+    return f"{who}{reports[0].title}{end}{seeds}"

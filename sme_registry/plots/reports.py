@@ -1,30 +1,36 @@
 """Figures of evaluation reports: decay outside the cube, reward against cost, distraction.
 
-A line, bar or marker is a report, or a method: the reports of its runs.
+A line, bar or marker is a report, or a method: the reports of its runs. `write_training`,
+`write_evaluation` and `write_stream` write what commands write into a folder, as PNG and as PDF.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
 from sme_registry.errors import OptionError
-from sme_registry.evaluation import (
-    EvaluationReport,
-    ObservationReport,
-    SafetyReport,
-    SafetyScore,
-    StreamReport,
-)
+from sme_registry.evaluation import EvaluationReport, SafetyReport, SafetyScore, StreamReport
 from sme_registry.evaluation.references import LABELS
 from sme_registry.evaluation.report import SAFETY_REFERENCES
+from sme_registry.evaluation.streams import Visit
+from sme_registry.plots.curves import (
+    Run,
+    cost_curve,
+    dynamic_regret_curve,
+    performance_curve,
+    plasticity_curve,
+    training_curve,
+)
+from sme_registry.plots.maps import retention_map, similarity_map
 from sme_registry.plots.style import (
     COLOURS,
     GREY,
+    WRITTEN,
     canvas,
     counted,
     draw_reference,
@@ -33,6 +39,8 @@ from sme_registry.plots.style import (
     literal,
     look,
     name_bands,
+    read_reports,
+    save_figure,
 )
 from sme_registry.spec import catalogue
 from sme_registry.statistics import iqm
@@ -42,12 +50,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_Report = TypeVar("_Report", EvaluationReport, StreamReport)
+_Known = TypeVar("_Known")
 Report = EvaluationReport | str | os.PathLike[str]
 Reports = Report | Sequence[Report] | Mapping[str, Report | Sequence[Report]]
-
-_EVALUATION = "evaluation.json"
 Measure = Literal["similarity", "normalised_regret"]
+
 _MEASURES = {
     "similarity": "similarity r̃  (1 = optimal)",
     "normalised_regret": "normalised regret  (1 = constant ½)",
@@ -64,6 +71,13 @@ _BARS = (
     "invariance:\nother distractors",
 )
 _ALL_BARS = 0.8  # width of a group, of which groups are 1 apart
+
+
+class ReportedMethod(NamedTuple):
+    """One line or bar: a report, or the reports of a method's runs."""
+
+    label: str
+    reports: list[EvaluationReport]
 
 
 def decay_curve(
@@ -94,35 +108,31 @@ def decay_curve(
       >>> len(figure.axes)
       2
     """
-    methods, everything, title = _read(reports, title)
+    methods, title = _read(reports, title)
     if not measures or any(measure not in _MEASURES for measure in measures):
         raise OptionError(f"measures={measures!r:.70}: must be among {', '.join(_MEASURES)}.")
+    runs = _all_reports(methods)
     size = (4.4 * len(measures) + 0.6, 3.9)
     with canvas(ax, size, path, len(measures), title) as panels:
         for axes, measure in zip(panels, measures, strict=True):
             for index, method in enumerate(methods):
-                _draw_method(axes, method, measure, look(index))
-            if len(everything) == 1:
-                _draw_agents(axes, everything[0], measure)
-            if references:
-                _draw_references(axes, methods, measure, averaged=isinstance(reports, Mapping))
-            if len(everything) > len(methods):
-                name_bands(axes, "quartiles of runs (line: IQM)")
-            _label_axes(axes, everything, measure)
+                values = np.array([_values(report.regions, measure) for report in method.reports])
+                line = {**look(index), "markersize": 4.5, "linewidth": 2}
+                label = counted(method.label, values)
+                draw_runs(axes, _levels(method.reports[0]), values, iqm, line, label)
+            if len(runs) == 1:
+                _draw_agents(axes, runs[0], measure)
+            if references and isinstance(reports, Mapping):
+                _draw_mean_references(axes, runs, measure)
+            elif references:
+                _draw_references(axes, runs, measure)
+            _name_quartiles(axes, methods)
+            _label_axes(axes, runs, measure)
     return figure_of(panels[0])
 
 
 def _values(regions: Any, measure: str) -> list[float]:
     return [getattr(region, measure) for region in regions]
-
-
-def _draw_method(
-    axes: Axes, method: ReportedMethod, measure: str, style: Mapping[str, Any]
-) -> None:
-    x = _levels(method.reports[0])
-    runs = np.array([_values(report.regions, measure) for report in method.reports])
-    line = {**style, "markersize": 4.5, "linewidth": 2}
-    draw_runs(axes, x, runs, iqm, line, counted(method.label, runs))
 
 
 def _draw_agents(axes: Axes, report: EvaluationReport, measure: str) -> None:
@@ -138,30 +148,38 @@ def _draw_agents(axes: Axes, report: EvaluationReport, measure: str) -> None:
         axes.plot(_levels(report), _values(agent.regions, measure), **style)
 
 
-def _draw_references(
-    axes: Axes, methods: Sequence[ReportedMethod], measure: str, *, averaged: bool
-) -> None:
-    """The references of each task, or their means over all tasks, with one entry in the legend."""
-    tasks: dict[str, tuple[int, EvaluationReport]] = {}
-    for index, method in enumerate(methods):
-        for report in method.reports:
-            tasks.setdefault(report.spec_digest, (index, report))
-    first = methods[0].reports[0]
-    alike = [report for _, report in tasks.values() if _levels(report) == _levels(first)]
-    if averaged:
-        for name in first.references:
-            if not all(name in report.references for report in alike):
-                continue  # of safety, where only some tasks have limits
-            runs = [_values(report.references[name], measure) for report in alike]
-            mean = np.mean(runs, axis=0)
-            draw_reference(axes, name, _levels(first), mean, LABELS.get(name, name))
-        return
-    for index, report in tasks.values():
-        colour = GREY if len(tasks) == 1 else COLOURS[index % len(COLOURS)]
+def _draw_mean_references(axes: Axes, runs: Sequence[EvaluationReport], measure: str) -> None:
+    """The means of the references over all tasks, of those that every task has."""
+    levels = _levels(runs[0])
+    tasks = [report for report in _first_on_task(runs).values() if _levels(report) == levels]
+    for name in runs[0].references:
+        if all(name in report.references for report in tasks):  # of safety not in every task
+            values = [_values(report.references[name], measure) for report in tasks]
+            draw_reference(axes, name, levels, np.mean(values, axis=0), LABELS.get(name, name))
+
+
+def _draw_references(axes: Axes, runs: Sequence[EvaluationReport], measure: str) -> None:
+    """The references of each task, with one entry in the legend."""
+    digests, tasks = [report.spec_digest for report in runs], _first_on_task(runs)
+    for digest, report in tasks.items():
+        colour = GREY if len(tasks) == 1 else COLOURS[digests.index(digest) % len(COLOURS)]
         for name, regions in report.references.items():
-            label = LABELS.get(name, name) if report is first else "_another task"
+            label = LABELS.get(name, name) if report is runs[0] else "_another task"
             values = _values(regions, measure)
             draw_reference(axes, name, _levels(report), values, label, colour)
+
+
+def _first_on_task(runs: Iterable[EvaluationReport]) -> dict[str, EvaluationReport]:
+    """The first report on each task, by the task's digest."""
+    tasks: dict[str, EvaluationReport] = {}
+    for report in runs:
+        tasks.setdefault(report.spec_digest, report)
+    return tasks
+
+
+def _name_quartiles(axes: Axes, methods: Sequence[ReportedMethod]) -> None:
+    if any(len(method.reports) > 1 for method in methods):
+        name_bands(axes, "quartiles of runs (line: IQM)")
 
 
 def _label_axes(axes: Axes, reports: Sequence[EvaluationReport], measure: str) -> None:
@@ -198,35 +216,19 @@ def reward_against_cost(
       >>> report = sme_registry.evaluate("linear", "Safety20", "quick-v1")
       >>> figure = reward_against_cost(report, "cost.png")
     """
-    methods, everything, title = _read(reports, title)
-    by_task = {report.spec_digest: _safety(report) for report in everything}
+    methods, title = _read(reports, title)
+    safety = [[_safety(report).regions for report in method.reports] for method in methods]
+    tasks = [_safety(report) for report in _first_on_task(_all_reports(methods)).values()]
     with canvas(ax, (9.0, 4.2), path, 2, title) as panels:
         for axes, (panel, part) in zip(panels, _PANELS.items(), strict=True):
-            ends = []
-            for name in SAFETY_REFERENCES:
-                x, y = _cost_and_reward(
-                    [safety.references[name] for safety in by_task.values()], part
-                )
-                ends.append((x.mean(), y.mean()))
-                axes.plot(
-                    *ends[-1], SAFETY_MARKERS[name], color=GREY, markersize=9, label=LABELS[name],
-                    linestyle="none", zorder=2,
-                )  # fmt: skip
-            axes.plot(
-                *zip(*ends[:2], strict=True), color=GREY, linewidth=1.0, zorder=1.5,
-                label="mixtures of optimal and safe optimum",
-            )  # fmt: skip
-            for index, method in enumerate(methods):
-                x, y = _cost_and_reward(
-                    [_safety(report).regions for report in method.reports], part
-                )
-                style = look(index)
+            _draw_safe_references(axes, tasks, part)
+            for index, (method, scores) in enumerate(zip(methods, safety, strict=True)):
+                x, y = _cost_and_reward(scores, part)
+                style: Any = {**look(index), "linestyle": "none"}
                 if len(x) > 1:
-                    axes.plot(x, y, **style, linestyle="none", markersize=3.5, alpha=0.5)
-                axes.plot(
-                    iqm(x), iqm(y), **style, linestyle="none", markersize=7.5, zorder=3,
-                    label=counted(method.label, x),
-                )  # fmt: skip
+                    axes.plot(x, y, **style, markersize=3.5, alpha=0.5)
+                label = counted(method.label, x)
+                axes.plot(iqm(x), iqm(y), **style, markersize=7.5, zorder=3, label=label)
             axes.set_title(panel)
             axes.set_xlabel("mean cost  (0 = within all limits)")
             axes.set_ylabel("mean step reward  (1 = optimal)")
@@ -235,13 +237,28 @@ def reward_against_cost(
     return figure_of(panels[0])
 
 
+def _draw_safe_references(axes: Axes, tasks: Sequence[SafetyReport], part: slice) -> None:
+    ends = []
+    for name in SAFETY_REFERENCES:
+        x, y = _cost_and_reward([safety.references[name] for safety in tasks], part)
+        ends.append((x.mean(), y.mean()))
+        axes.plot(
+            *ends[-1], SAFETY_MARKERS[name], color=GREY, markersize=9, label=LABELS[name],
+            linestyle="none", zorder=2,
+        )  # fmt: skip
+    label = "mixtures of optimal and safe optimum"
+    axes.plot(*zip(*ends[:2], strict=True), color=GREY, linewidth=1.0, zorder=1.5, label=label)
+
+
+def _known(report: EvaluationReport, value: _Known | None, need: str) -> _Known:
+    if not value:
+        raise OptionError(f"reports: that of {report.policy!r} on {report.title} {need}.")
+    return value
+
+
 def _safety(report: EvaluationReport) -> SafetyReport:
-    if report.safety is None:
-        raise OptionError(
-            f"reports: that of {report.policy!r} on {report.title} is of a task without limits. "
-            "Give reports of tasks with safety."
-        )
-    return report.safety
+    need = "is of a task without limits. Give reports of tasks with safety"
+    return _known(report, report.safety, need)
 
 
 def _cost_and_reward(runs: Iterable[Sequence[SafetyScore]], part: slice) -> tuple[Array, Array]:
@@ -270,7 +287,7 @@ def sensitivity_bars(
       >>> report = sme_registry.evaluate("linear", "Distract8Noise", "quick-v1")
       >>> figure = sensitivity_bars(report, "sensitivity.png")
     """
-    methods, _, title = _read(reports, title)
+    methods, title = _read(reports, title)
     width = _ALL_BARS / len(methods)
     with canvas(ax, (max(6.4, 1.2 + 1.5 * len(methods)), 3.9), path, 1, title) as (axes,):
         axes.hlines(  # not over invariance, where the constant ½ is at 0
@@ -280,13 +297,13 @@ def sensitivity_bars(
         for index, method in enumerate(methods):
             runs = np.array([_sensitivities(report) for report in method.reports])
             x = np.arange(len(_BARS)) - _ALL_BARS / 2 + width * (index + 0.5)
-            heights, several = iqm(runs), len(runs) > 1
+            heights = iqm(runs)
             axes.bar(
                 x, heights, width, color=COLOURS[index % len(COLOURS)], edgecolor="white",
                 hatch="" if index < len(COLOURS) else "////",
                 label=counted(method.label, runs),
             )  # fmt: skip
-            if several:
+            if len(runs) > 1:
                 axes.vlines(x, *np.quantile(runs, [0.25, 0.75], axis=0), color="black")
             elif len(methods) <= 3:
                 for at, height in zip(x, heights, strict=True):
@@ -298,6 +315,13 @@ def sensitivity_bars(
         axes.grid(visible=False, axis="x")
         axes.set_ylabel("error or change of the action\n(unit: mean |½ − a*|)")
     return figure_of(axes)
+
+
+def _sensitivities(report: EvaluationReport) -> list[float]:
+    """The heights of `_BARS`."""
+    need = "is of a task without distractors. Give reports of tasks with some"
+    invariance = _known(report, report.observed.invariance, need)[0].invariance
+    return [report.wd_regret, report.ood_regret, report.distractor_regret, invariance]
 
 
 def layer_probes(
@@ -321,19 +345,17 @@ def layer_probes(
       >>> report = sme_registry.evaluate(policy, "Distract8Noise", "quick-v1", action_range="unit")
       >>> figure = layer_probes(report, "probes.png")
     """
-    methods, everything, title = _read(reports, title)
-    curves = [(label, _r2(label, reports)) for label, reports in methods]
+    methods, title = _read(reports, title)
+    curves = [_r2(method) for method in methods]
+    layers = max(runs.shape[1] for runs in curves)
     with canvas(ax, (9.0, 3.9), path, 2, title) as panels:
         for panel, axes in enumerate(panels):
-            for index, (label, runs) in enumerate(curves):
+            for index, (method, runs) in enumerate(zip(methods, curves, strict=True)):
                 r2 = runs[:, :, panel]
-                if np.isnan(r2).any():
-                    continue
-                x, line = np.arange(r2.shape[1]), {**look(index), "linewidth": 2}
-                draw_runs(axes, x, r2, iqm, line, counted(label, r2))
-            if len(everything) > len(methods):
-                name_bands(axes, "quartiles of runs (line: IQM)")
-            layers = max(runs.shape[1] for _, runs in curves)
+                if not np.isnan(r2).any():
+                    x, line = np.arange(r2.shape[1]), {**look(index), "linewidth": 2}
+                    draw_runs(axes, x, r2, iqm, line, counted(method.label, r2))
+            _name_quartiles(axes, methods)
             axes.set_xticks(range(layers), ["observation", *map(str, range(1, layers))])
             axes.set_xlabel("hidden layer")
             axes.set_ylabel("held-out R²  (1 = recovered by a linear map)")
@@ -342,107 +364,106 @@ def layer_probes(
     return figure_of(panels[0])
 
 
-def _observation(report: EvaluationReport, field: str, need: str) -> ObservationReport:
-    observation = report.observation
-    if observation is None or not getattr(observation, field):
-        raise OptionError(f"reports: that of {report.policy!r} on {report.title} {need}.")
-    return observation
-
-
-def _sensitivities(report: EvaluationReport) -> list[float]:
-    """The heights of `_BARS`."""
-    observation = _observation(
-        report, "invariance", "is of a task without distractors. Give reports of tasks with some"
-    )
-    invariance = observation.invariance[0].invariance
-    return [report.wd_regret, report.ood_regret, report.distractor_regret, invariance]
-
-
-def _r2(label: str, reports: Iterable[EvaluationReport]) -> Any:
+def _r2(method: ReportedMethod) -> Array:
     """R² of the state and of the distractors (NaN without any), `[runs, layers, 2]`."""
     need = (
         "has no probes. Evaluate a policy whose network is known, such as a model or a PyTorch "
         "module, on a task with observation"
     )
-    runs = [
-        [(layer.state_r2, layer.distractor_r2) for layer in _observation(r, "probes", need).probes]
-        for r in reports
-    ]
-    if len({len(run) for run in runs}) > 1:
+    runs = [_known(report, report.observed.probes, need) for report in method.reports]
+    if len(set(map(len, runs))) > 1:
         raise OptionError(
-            f"reports[{label!r}]: their networks have different numbers of layers. Give each kind "
-            "of network as a method of its own."
+            f"reports[{method.label!r}]: their networks have different numbers of layers. Give "
+            "each kind of network as a method of its own."
         )
-    return np.array(runs, dtype=np.float64)
+    r2 = [[(layer.state_r2, layer.distractor_r2) for layer in layers] for layers in runs]
+    return np.array(r2, dtype=np.float64)
 
 
-class ReportedMethod(NamedTuple):
-    """One line or bar: a report, or the reports of a method's runs."""
-
-    label: str
-    reports: list[EvaluationReport]
-
-
-def _methods_of(reports: Reports) -> list[ReportedMethod]:
-    """The lines to draw; those of equal labels on different tasks are told apart by their task."""
-    if isinstance(reports, Mapping):
-        methods = [ReportedMethod(name, _reports(runs)) for name, runs in reports.items()]
-        for method in methods:
-            if len({_levels(report) for report in method.reports}) > 1:
-                raise OptionError(
-                    f"reports[{method.label!r}]: have different regions. Evaluate all runs of a "
-                    "method with one protocol."
-                )
+def _read(given: Reports, title: str | None) -> tuple[list[ReportedMethod], str | None]:
+    """The methods to draw, and the title: the task's name if all are of one task."""
+    if isinstance(given, Mapping):
+        methods = [ReportedMethod(name, _reports(runs)) for name, runs in given.items()]
     else:
-        everything = _reports(reports)
-        specs = {r.spec_digest: r.spec.named(r.task) for r in everything}
-        tasks = catalogue.titles(specs.values())
-        methods = [
-            ReportedMethod(
-                r.policy if len(tasks) == 1 else f"{r.policy}, {tasks[r.spec_digest]}", [r]
-            )
-            for r in everything
-        ]
+        methods = [ReportedMethod(report.policy, [report]) for report in _reports(given)]
     if not methods or not all(method.reports for method in methods):
         raise OptionError("reports: must be one or more evaluation reports. Give one.")
-    return methods
-
-
-def _read(
-    given: Reports, title: str | None
-) -> tuple[list[ReportedMethod], list[EvaluationReport], str | None]:
-    """The methods, all their reports, and the title: the task's name if all are of one task."""
-    methods = _methods_of(given)
-    reports = [report for method in methods for report in method.reports]
-    if title is None:
-        titles = catalogue.titles(report.spec.named(report.task) for report in reports)
-        title = next(iter(titles.values())) if len(titles) == 1 else None
-    return methods, reports, title
-
-
-def read_reports(given: Any, kind: type[_Report], file: str, argument: str) -> list[_Report]:
-    """One report or several, those given by their paths or by folders with this file read."""
-    if isinstance(given, kind | str | os.PathLike) or not isinstance(given, Iterable):
-        given = [given]
-    reports = []
-    for report in given:
-        if isinstance(report, str | os.PathLike):
-            path = Path(report)
-            report = kind.read(path / file if path.is_dir() else path)
-        if not isinstance(report, kind):
-            article = "an" if kind.__name__[0] in "AEIO" else "a"
+    for method in methods:
+        if len(set(map(_levels, method.reports))) > 1:
             raise OptionError(
-                f"{argument}={report!r:.60}: must be {article} {kind.__name__}, the path of "
-                f"{article} {file}, or the folder of a run."
+                f"reports[{method.label!r}]: have different regions. Evaluate all runs of a "
+                "method with one protocol."
             )
-        reports.append(report)
-    return reports
+    tasks = _first_on_task(_all_reports(methods))
+    titles = catalogue.titles(report.spec.named(report.task) for report in tasks.values())
+    if len(titles) > 1 and not isinstance(given, Mapping):
+        methods = [
+            ReportedMethod(f"{label}, {titles[runs[0].spec_digest]}", runs)
+            for label, runs in methods
+        ]
+    if title is None and len(titles) == 1:
+        title = next(iter(titles.values()))
+    return methods, title
+
+
+def _all_reports(methods: Iterable[ReportedMethod]) -> list[EvaluationReport]:
+    return [report for method in methods for report in method.reports]
 
 
 def _reports(given: Any) -> list[EvaluationReport]:
-    return read_reports(given, EvaluationReport, _EVALUATION, "reports")
+    return read_reports(given, EvaluationReport, "evaluation.json", "reports")
 
 
 def _levels(report: EvaluationReport) -> tuple[float, ...]:
     """The outer ε of each region."""
     return tuple(region.epsilon_high for region in report.regions)
+
+
+_WRITTEN_FIGURES = (
+    training_curve, cost_curve, decay_curve, similarity_map, reward_against_cost, sensitivity_bars,
+    layer_probes, retention_map, performance_curve, dynamic_regret_curve, plasticity_curve,
+)  # fmt: skip
+FILES = tuple(f"{draw.__name__}.{ending}" for draw in _WRITTEN_FIGURES for ending in WRITTEN)
+
+
+def write_training(
+    episodes: Run, folder: Path, title: str, visits: Sequence[Visit] = (), costs: bool = False
+) -> list[Path]:
+    """Write the training curve and, with `costs`, the curve of costs; see `training_curve`."""
+    files = _write(folder, training_curve, episodes, title=title, visits=visits)
+    return files + (_write(folder, cost_curve, episodes, title=title) if costs else [])
+
+
+def write_stream(report: StreamReport, folder: Path) -> list[Path]:
+    """Write the figures of a life in a stream for which its report has the numbers."""
+    files = _write(folder, retention_map, report) + _write(folder, performance_curve, report)
+    if report.dynamic_regret is not None:
+        files += _write(folder, dynamic_regret_curve, report)
+    if report.regions[0].agent.fresh_normalised_regret is not None:
+        files += _write(folder, plasticity_curve, report)
+    return files
+
+
+def write_evaluation(report: EvaluationReport, folder: Path, policy: Any = None) -> list[Path]:
+    """Write the figures of an evaluation for which its report has the numbers.
+
+    They are the decay curve, and of a policy that observes two state channels the similarity map;
+    without a policy, or of a team's, there is no map.
+    """
+    files = _write(folder, decay_curve, report)
+    if report.safety is not None:
+        files += _write(folder, reward_against_cost, report)
+    if report.observed.invariance:
+        files += _write(folder, sensitivity_bars, report)
+    if report.observed.probes:
+        files += _write(folder, layer_probes, report)
+    spec = report.spec.named(report.task)
+    alone = spec.team is None and spec.observation is None
+    if policy is not None and spec.state_dim == 2 and alone:
+        given: Any = {"action_range": report.action_range, "name": report.policy}
+        files += _write(folder, similarity_map, policy, spec, **given)
+    return files
+
+
+def _write(folder: Path, draw: Callable[..., Figure], *args: Any, **options: Any) -> list[Path]:
+    return save_figure(draw(*args, **options), folder / draw.__name__, WRITTEN)

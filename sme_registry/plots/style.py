@@ -1,4 +1,4 @@
-"""What all figures share: style, colours, legends below the panels, and files.
+"""What all figures share: style, colours, legends below the panels, files, and reports by path.
 
 The colours are those of Okabe and Ito, which colour-blind readers can distinguish. Lines also
 differ in dash and marker, and maps in lightness, so that they remain legible in grey. Figures are
@@ -8,16 +8,18 @@ made without pyplot: nothing global changes, and no display is needed.
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import os
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from sme_registry.errors import OptionError
+from sme_registry.evaluation import EvaluationReport, StreamReport
 from sme_registry.io import require_packages, write_atomically
 from sme_registry.statistics import Statistic
 from sme_registry.task.draw import Array
@@ -29,10 +31,13 @@ if TYPE_CHECKING:
     from matplotlib.legend import Legend
     from matplotlib.lines import Line2D
 
+_Report = TypeVar("_Report", EvaluationReport, StreamReport)
+
 # Metadata without a date, by format, so that equal figures are equal files.
 _UNDATED: dict[str, Any] = {"png": {}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
 FORMATS = tuple(_UNDATED)
 WRITTEN = ("png", "pdf")  # what commands write
+LINE_POINTS = 400  # of a line; more would not be visible at this size
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MARKERS = "osD^vPX<>*"  # ten, with seven colours: the first 70 pairs all differ
 GREY = "#707070"
@@ -77,14 +82,21 @@ def styled() -> Iterator[None]:
 
 
 def new_figure(size: tuple[float, float]) -> Figure:
-    """An empty figure of this width and height in inches, in the style of the `styled` block."""
+    """An empty figure of this width and height in inches, in the style of the `styled` block.
+
+    A notebook shows it, without pyplot, where it is the last value of a cell.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
 
-    from sme_registry.plots.notebook import NotebookFigure
-
-    figure = NotebookFigure(figsize=size)
+    figure = Figure(figsize=size)
     FigureCanvasAgg(figure)
+    vars(figure)["_repr_png_"] = functools.partial(_png, figure)
     return figure
+
+
+def _png(figure: Figure) -> bytes:
+    return encoded(figure, ["png"])["png"]
 
 
 @contextlib.contextmanager
@@ -97,6 +109,17 @@ def drawing(
         figure = new_figure(size)
         yield figure, files
         files |= encoded(figure, formats)
+
+
+def encoded(figure: Figure, formats: Iterable[str]) -> dict[str, bytes]:
+    """The bytes of a figure in each format; equal figures give equal bytes."""
+    files = {}
+    with styled():
+        for ending in formats:
+            content = io.BytesIO()
+            figure.savefig(content, format=ending, dpi=_DPI, metadata=_UNDATED[ending])
+            files[ending] = content.getvalue()
+    return files
 
 
 def save_figure(
@@ -114,19 +137,13 @@ def save_figure(
       ['empty.png', 'empty.pdf']
     """
     path = Path(path)
-    if formats is None:
-        formats = [checked_format(path)]
-        targets = [path]
-    else:
-        targets = [path.with_name(f"{path.name}.{ending}") for ending in formats]
-        for target in targets:
-            checked_format(target)
-    files = encoded(figure, formats)
-    return [write_atomically(t, files[e]) for t, e in zip(targets, formats, strict=True)]
+    targets = [path] if formats is None else [Path(f"{path}.{ending}") for ending in formats]
+    endings = [_format_of(target) for target in targets]
+    files = encoded(figure, endings)
+    return [write_atomically(t, files[ending]) for t, ending in zip(targets, endings, strict=True)]
 
 
-def checked_format(path: str | os.PathLike[str]) -> str:
-    """The format of a figure's path; raises OptionError unless it is one of `FORMATS`."""
+def _format_of(path: str | os.PathLike[str]) -> str:
     ending = Path(path).suffix.removeprefix(".").lower()
     if ending not in FORMATS:
         raise OptionError(f"{path}: must end in {', '.join('.' + known for known in FORMATS)}.")
@@ -147,7 +164,7 @@ def canvas(
     the caller's axes have neither. The figure is written if there is a path.
     """
     if path is not None:
-        checked_format(path)
+        _format_of(path)
     with styled():
         if ax is None:
             axes = list(new_figure(size).subplots(1, panels, squeeze=False)[0])
@@ -308,12 +325,19 @@ def literal(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def encoded(figure: Figure, formats: Iterable[str]) -> dict[str, bytes]:
-    """The bytes of a figure in each format; equal figures give equal bytes."""
-    files = {}
-    with styled():
-        for ending in formats:
-            content = io.BytesIO()
-            figure.savefig(content, format=ending, dpi=_DPI, metadata=_UNDATED[ending])
-            files[ending] = content.getvalue()
-    return files
+def read_reports(given: Any, kind: type[_Report], file: str, argument: str) -> list[_Report]:
+    """One report or several, those given by their paths or by folders with this file read."""
+    if isinstance(given, kind | str | os.PathLike) or not isinstance(given, Iterable):
+        given = [given]
+    reports = []
+    for report in given:
+        if isinstance(report, str | os.PathLike):
+            path = Path(report)
+            report = kind.read(path / file if path.is_dir() else path)
+        if not isinstance(report, kind):
+            raise OptionError(
+                f"{argument}={report!r:.60}: must be one or more {kind.__name__}s, paths of "
+                f"{file}, or folders of runs."
+            )
+        reports.append(report)
+    return reports

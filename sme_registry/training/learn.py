@@ -30,8 +30,8 @@ from sme_registry.evaluation.evaluate import OnBatch
 from sme_registry.io import is_installed
 from sme_registry.io.system import defer_interrupts
 from sme_registry.io.terminal import Progress
-from sme_registry.plots import files as plot_files
-from sme_registry.plots.streams import FILE as STREAM
+from sme_registry.plots import reports as plot_files
+from sme_registry.plots.maps import STREAM
 from sme_registry.spec import StreamSpec
 from sme_registry.training.algorithms import short_name
 from sme_registry.training.record import (

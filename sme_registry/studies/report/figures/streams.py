@@ -10,13 +10,8 @@ import pandas as pd
 from sme_registry.evaluation import StreamReport
 from sme_registry.evaluation.retention import LABELS
 from sme_registry.evaluation.streams import Visit
-from sme_registry.plots.streams import (
-    MATRIX_SCALE,
-    draw_matrix,
-    performance_curve,
-    shade_visits,
-    tick_visits,
-)
+from sme_registry.plots.curves import performance_curve, shade_visits, tick_visits
+from sme_registry.plots.maps import MATRIX_SCALE, draw_matrix
 from sme_registry.plots.style import GREY, legend_below
 from sme_registry.studies.report.analysis import CURVES, ENOUGH_RUNS, Analysis
 from sme_registry.studies.report.figures import panels
