@@ -7,10 +7,9 @@ counts. Of streams the life is the unit; each may be in another draw of its stre
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +19,7 @@ import numpy as np
 import pandas as pd
 
 from sme_registry import statistics
+from sme_registry.evaluation import retention
 from sme_registry.evaluation.dynamic_regret import DynamicRegret
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.statistics import Array, Statistic
@@ -34,16 +34,12 @@ ENOUGH_RUNS = 5
 PLACE = ["class_name", "algorithm"]
 PLACE_COLUMNS = "class_name:str algorithm:str "
 INTERVAL = "runs:int64 iqm low high"
-CONTRASTS = (
-    f"{PLACE_COLUMNS} metric:str axis:str base level change low high pairs:int64 enough_pairs:bool "
-    "verdict:str"
-)
 DIFFERENCES = (
     "first:str second:str metric:str class_name:str first_level second_level difference low high "
     "pairs:int64 instances:int64 enough_pairs:bool verdict:str"
 )
-LEARNING_CURVES = f"{PLACE_COLUMNS} measure:str step:int64 median q25 q75 runs:int64 window:int64"
 CURVES = {"episode_return": "return, % of optimum", "regret": "mean regret per step"}
+WITHIN, OUTSIDE = "WD", "OOD"
 
 
 @dataclass(frozen=True)
@@ -64,20 +60,35 @@ METRICS = (
     Metric("online_regret", "online regret", 1),
 )
 # Of tasks with safety, or with distractors: columns that runs have where the plan has such tasks.
-EXTENSION_METRICS = (
+SPECIAL_METRICS = (
     Metric("wd_cost", "WD cost", 1, 3),
     Metric("wd_safe_regret", "WD safe regret", 1),
     Metric("online_cost", "online cost", 1, 3),
     Metric("distractor_regret", "regret with distractors outside their cube", 1),
     Metric("wd_invariance", "WD invariance", 1),
 )
-REGRET_METRICS = METRICS[:2]
-AGENT_METRICS = (*REGRET_METRICS, METRICS[4])
+_LESS_IS_BETTER = ("forgetting", "plasticity_ratio", "plasticity_difference")
+RETENTION = {
+    key: Metric(key, label, 1 if key in _LESS_IS_BETTER else -1)
+    for key, label in retention.METRICS.items()
+}
+_VISITED = "regret on the visited phase"
+OF_TRAINING = (
+    Metric("learning_transfer", "learning transfer", -1),
+    Metric("online_regret", "online regret", 1, 3),
+    Metric("frozen_online_regret", f"online regret, {retention.LABELS['frozen_agent']}", 1, 3),
+)
+OF_LIVES = (Metric("visited_regret", _VISITED, 1), *RETENTION.values(), *OF_TRAINING)
+OF_VISITS = (
+    Metric("normalised_regret", _VISITED, 1),
+    *(RETENTION[key] for key in retention.BY_VISIT),
+    *OF_TRAINING,
+)
 
 
 def metrics_of(runs: pd.DataFrame) -> tuple[Metric, ...]:
     """The metrics that a study's runs have."""
-    return (*METRICS, *(metric for metric in EXTENSION_METRICS if metric.key in runs.columns))
+    return (*METRICS, *(metric for metric in SPECIAL_METRICS if metric.key in runs.columns))
 
 
 @dataclass(frozen=True)
@@ -96,10 +107,25 @@ class Bootstrap:
         """The interval over classes of `[n, 1]` runs each; NaN if any has a single run."""
         if min(map(len, classes.values())) == 1:
             return math.nan, math.nan
-        low, high = statistics.stratified_bootstrap(
-            classes, self.draws, self.seed(*place), statistic
-        )
+        seed = self.seed(*place)
+        low, high = statistics.stratified_bootstrap(classes, self.draws, seed, statistic)
         return float(low[0]), float(high[0])
+
+
+class Part(NamedTuple):
+    """The runs on single tasks, or the lives in streams with their metrics in WD: a row each."""
+
+    streams: bool
+    runs: pd.DataFrame
+    axes: Mapping[str, str]  # of each class; the first is that which others are compared with
+    algorithms: tuple[str, ...]
+    metrics: tuple[Metric, ...]
+    instance: str  # the column that says on which instance a run is
+
+    @property
+    def prefix(self) -> str:
+        """Of the names of its tables."""
+        return "stream_" if self.streams else ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,13 +134,13 @@ class Analysis:
 
     Attributes:
       cells: finished cells of the plan, by digest.
+      models: those that the study kept, by the digests of their cells.
       classes: every class of the plan, by name; the first one first. `streams` likewise.
       algorithms: those with a finished run on a single task, in the plan's order.
       learners: those of the algorithms that learn.
-      groups: classes that are compared with each other.
-      lives: the finished ones in streams; `stream_algorithms` have any.
+      lives: the finished ones in streams.
       reference_costs: (class of streams, reference) → its expected regret in each draw.
-      tables: every table by name; `tables` and `lives` document the columns.
+      tables: every table by name; the module `tables` documents the columns.
     """
 
     file: StudyFile
@@ -150,76 +176,83 @@ class Analysis:
     @property
     def stream_algorithms(self) -> tuple[str, ...]:
         present = {life.planned.algorithm for life in self.lives}
-        return tuple(each.name for each in self.plan.algorithms if each.name in present)
-
-    @functools.cached_property
-    def stream_cells(self) -> set[str]:
-        """Digests of the different cells in streams: lives, and fresh agents that lives share."""
-        return {planned.cell.digest for planned in self.plan.cells if planned.in_stream}
-
-    @property
-    def seconds(self) -> float:
-        """CPU time of all finished runs."""
-        of_streams = sum(self.cells[key].timing.total for key in sorted(self._finished_in_streams))
-        return float(self.runs.seconds.sum()) + of_streams
-
-    @property
-    def _finished_in_streams(self) -> set[str]:
-        return self.stream_cells & self.cells.keys()
-
-    @property
-    def finished(self) -> int:
-        """How many runs have finished, lives and fresh agents included."""
-        return len(self.runs) + len(self._finished_in_streams)
-
-    @property
-    def missing_in_streams(self) -> int:
-        missing = self.tables.get("stream_missing")
-        return 0 if missing is None else missing.key.nunique()
-
-    @property
-    def requested(self) -> int:
-        """How many runs have finished or are missing; `--only` may have left out others."""
-        return self.finished + len(self.tables["missing"]) + self.missing_in_streams
-
-    @property
-    def planned(self) -> int:
-        """Runs of the plan: on single tasks all, in streams those that differ."""
-        return len(self.stream_cells) + sum(not cell.in_stream for cell in self.plan.cells)
-
-    @property
-    def state_dims(self) -> list[int]:
-        """The different state dimensions of the runs, in rising order."""
-        return sorted(set(self.tables["results"].state_dim))
+        return tuple(a.name for a in self.plan.algorithms if a.name in present)
 
     @property
     def metrics(self) -> tuple[Metric, ...]:
         """The metrics of runs on single tasks."""
         return metrics_of(self.runs)
 
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """Single tasks, and streams where the plan has any."""
+        axes = {name: info.axis for name, info in self.classes.items()}
+        tasks = Part(False, self.runs, axes, self.algorithms, self.metrics, "spec_digest")
+        if not self.streams:
+            return (tasks,)
+        lives = self.tables["stream_lives"]
+        lives = lives[lives.region == WITHIN].reset_index(drop=True)
+        axes = {name: info.axis for name, info in self.streams.items()}
+        return tasks, Part(True, lives, axes, self.stream_algorithms, OF_LIVES, "stream_digest")
+
+    def state(self, key: str) -> str:
+        """Of a cell by its digest: `finished`, `failed`, `missing`, or `left out` by `--only`."""
+        if key in self.cells:
+            return "finished"
+        if key in self.errors:
+            return "failed"
+        requested = self.requested_cells is None or key in self.requested_cells
+        return "missing" if requested else "left out"
+
+    def counts(self, *, streams: bool) -> Counter[str]:
+        """How many runs are in each state; of streams those that differ: lives share others."""
+        keys = [cell.cell.digest for cell in self.plan.cells if cell.in_stream == streams]
+        return Counter(self.state(key) for key in (dict.fromkeys(keys) if streams else keys))
+
+    @property
+    def planned(self) -> int:
+        """How many runs the plan has, lives and fresh agents included."""
+        return (self.counts(streams=False) + self.counts(streams=True)).total()
+
+    @property
+    def finished(self) -> int:
+        return sum(self.counts(streams=streams)["finished"] for streams in (False, True))
+
+    @property
+    def requested(self) -> int:
+        """How many runs have finished or are missing; `--only` may have left out others."""
+        return self.planned - sum(self.counts(streams=s)["left out"] for s in (False, True))
+
+    @property
+    def seconds(self) -> float:
+        """CPU time of all finished runs."""
+        return sum(result.timing.total for result in self.cells.values())
+
 
 class Table(NamedTuple):
-    """A table of every study with single tasks or streams; of those with rows if `optional`."""
+    """A table of every study with its kind of runs; of those with rows if `optional`."""
 
     columns: str
-    make: Callable[[Analysis], Any]
-    streams: bool
+    make: Callable[..., Any]
     optional: bool
+    both: bool
 
 
 TABLES: dict[str, Table] = {}
+Make = Callable[..., Any]
 
 
 def table(
-    name: str, columns: str, *, optional: bool = False
-) -> Callable[[Callable[[Analysis], Any]], Callable[[Analysis], Any]]:
-    """Register a function that makes the rows of a table; those of streams begin with `stream_`.
+    name: str, columns: str, *, optional: bool = False, both: bool = False
+) -> Callable[[Make], Make]:
+    """Register a function of the analysis that makes the rows of a table, in order.
 
-    `columns` are as those of `frame`. A function may use the tables that are registered before it.
+    `columns` are as those of `frame`; those of tables of streams begin with `stream_`. A function
+    for `both` kinds of runs is called with a `Part` as well.
     """
 
-    def register(make: Callable[[Analysis], Any]) -> Callable[[Analysis], Any]:
-        TABLES[name] = Table(columns, make, name.startswith("stream_"), optional)
+    def register(make: Make) -> Make:
+        TABLES[name] = Table(columns, make, optional, both)
         return make
 
     return register
@@ -227,11 +260,16 @@ def table(
 
 def with_tables(analysis: Analysis) -> Analysis:
     """The analysis, with every registered table of the kinds of tasks that its plan has."""
-    for name, each in TABLES.items():
-        if analysis.streams or not each.streams:
-            rows = each.make(analysis)
-            made = isinstance(rows, pd.DataFrame)
-            analysis.tables[name] = rows if made else frame([*rows], each.columns)
+    parts = analysis.parts
+    for name, entry in TABLES.items():
+        if entry.both:
+            rows = {f"{part.prefix}{name}": entry.make(analysis, part) for part in parts}
+        else:
+            wanted = analysis.streams or not name.startswith("stream_")
+            rows = {name: entry.make(analysis)} if wanted else {}
+        for key, made in rows.items():
+            is_frame = isinstance(made, pd.DataFrame)
+            analysis.tables[key] = made if is_frame else frame([*made], entry.columns)
     return analysis
 
 
@@ -250,55 +288,20 @@ def summary(
 
     A row is the place, the values of `by`, the metric, the number of runs that have it, the
     statistic, and its 95 % interval from `fewest` runs on. `seed` is called with the place, the
-    metric and the values of `by`; metrics of one seed and the same runs are resampled together.
+    metric and the values of `by`.
     """
-    keys = [metric.key for metric in metrics]
-    for at, group in rows.groupby(list(place), sort=False):
-        wide = group.set_index(["algorithm", "run", *by])[keys]
-        wide = (
-            wide.unstack([*by]) if by else wide.set_axis(pd.MultiIndex.from_product([keys]), axis=1)
-        )
-        blocks: dict[tuple[str, bytes], list[Any]] = defaultdict(list)
-        for column in wide.columns:
-            known = wide[column].notna().to_numpy()
-            if known.any():
-                blocks[bootstrap.seed(*seed(*at, *column)), known.tobytes()].append(column)
-        estimates = {}
-        for (text, _), columns in blocks.items():
-            values = wide[columns].dropna().to_numpy(dtype=np.float64)
-            ends = np.full((2, len(columns)), np.nan)
-            if len(values) >= fewest:
-                of_all = {"": values}
-                ends[:] = statistics.stratified_bootstrap(of_all, bootstrap.draws, text, statistic)
-            for column, *numbers in zip(columns, statistic(values), *ends, strict=True):
-                estimates[column] = (len(values), *map(float, numbers))
-        places = dict.fromkeys(group[[*by]].itertuples(index=False, name=None)) or [()]
-        for column in ((key, *where) for where in places for key in keys):
-            if column in estimates:
-                yield (*at, *column[1:], column[0], *estimates[column])
-
-
-def contrasts(
-    runs: pd.DataFrame, axes: Mapping[str, str], bootstrap: Bootstrap, metrics: Sequence[Metric]
-) -> Iterator[tuple[Any, ...]]:
-    """What each class changes compared with the first one, between runs of equal number.
-
-    `axes` has the axis of every class, by name.
-    """
-    first, keys = next(iter(axes), ""), [metric.key for metric in metrics]
-    base = runs.loc[runs.class_name == first, ["algorithm", "run", *keys]]
-    pairs = runs[runs.class_name != first].merge(base, on=["algorithm", "run"], suffixes=("", "_0"))
-    for place, group in by_place(pairs).items():
-        for metric in metrics:
-            both = group[[metric.key, f"{metric.key}_0"]].dropna().to_numpy()
-            if len(both):
-                change = both[:, :1] - both[:, 1:]
-                ends = bootstrap.interval({"": change}, "contrast", *reversed(place), metric.key)
-                level, before = statistics.iqm(both)
-                middle = float(statistics.iqm(change)[0])
+    for at, of_place in rows.groupby([*place], sort=False):
+        for where, group in of_place.groupby([*by], sort=False) if by else [((), of_place)]:
+            for metric in metrics:
+                values = group[[metric.key]].dropna().to_numpy(dtype=np.float64)
+                if not len(values):
+                    continue
+                ends = math.nan, math.nan
+                if len(values) >= fewest:
+                    text = seed(*at, metric.key, *where)
+                    ends = bootstrap.interval({"": values}, *text, statistic=statistic)
                 yield (
-                    *place, metric.key, axes[place[0]], before, level, middle, *ends, len(both),
-                    len(both) >= ENOUGH_RUNS, change_verdict(middle * metric.worse, *ends),
+                    *at, *where, metric.key, len(values), float(statistic(values)[0]), *ends
                 )  # fmt: skip
 
 
@@ -349,44 +352,6 @@ def change_verdict(worsening: float, low: float, high: float) -> str:
     if not (low > 0.0 or high < 0.0):
         return "open"
     return "worse" if worsening > 0 else "better"
-
-
-def learning_curves(
-    curves: pd.DataFrame, runs: pd.DataFrame, window: Callable[[int], int]
-) -> pd.DataFrame:
-    """Median and quartiles over runs, then the running median over a window of evaluations.
-
-    `window` is the number of evaluations in it, by their number in the shortest run.
-    """
-    horizons = runs.groupby("class_name").horizon.first()
-    tables = [frame([], LEARNING_CURVES)]
-    for (class_name, algorithm), group in curves.groupby(PLACE, sort=False):
-        each = [run for _, run in group.groupby("run")]
-        P = min(map(len, each))
-        steps = np.median([run.step[:P] for run in each], axis=0).astype(int)
-        for measure in CURVES:
-            values = np.array([run[measure][:P] for run in each])
-            if measure == "episode_return":
-                values *= 100.0 / horizons[class_name]
-            quartiles = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
-            q25, median, q75 = (statistics.running_median(line, window(P)) for line in quartiles)
-            columns = {
-                "class_name": class_name, "algorithm": algorithm, "measure": measure, "step": steps,
-                "median": median, "q25": q25, "q75": q75, "runs": len(each), "window": window(P),
-            }  # fmt: skip
-            tables.append(pd.DataFrame(columns))
-    return pd.concat(tables, ignore_index=True)
-
-
-def missing_runs(analysis: Analysis, *, streams: bool) -> Iterator[tuple[Any, ...]]:
-    """Class, algorithm, run, phase, error and key of each requested cell that has not finished."""
-    requested, errors = analysis.requested_cells, analysis.errors
-    for planned in analysis.plan.cells:
-        key = planned.cell.digest
-        wanted = requested is None or key in requested or key in errors
-        if planned.in_stream == streams and key not in analysis.cells and wanted:
-            place = planned.class_name, planned.algorithm, planned.run, planned.phase
-            yield (*place, errors.get(key, ""), key)
 
 
 def by_place(rows: pd.DataFrame) -> dict[tuple[str, str], pd.DataFrame]:

@@ -36,7 +36,6 @@ class ClassInfo:
     """A class of the plan, compared with the first one.
 
     Attributes:
-      name: in the plan.
       axis: the field in which it differs from the first class, dotted within a team
         (`team.reward`) or an observation; "" for the first; `SEVERAL`. `policy_init` counts only
         if nothing else differs: deep tasks need another one.
@@ -53,7 +52,7 @@ class ClassInfo:
 
 @dataclass(frozen=True)
 class StreamInfo:
-    """A class of streams of the plan, by its first draw.
+    """A class of streams, by its first draw.
 
     Its axis is what differs from the plan's first stream: "" for itself, `TASKS` if nothing else
     differs, or `SCHEDULE`.
@@ -76,16 +75,16 @@ class Group:
     Attributes:
       name: `ALL`, or the label of an axis.
       axis: the field; "" for all classes.
-      classes: in the order of the axis' values, the plan's first class among them.
-      compared: those where every algorithm has finished runs.
-      left_out: the others that have any.
+      classes: those with runs, in the order of the axis' values, the plan's first class among them.
+      values: those of the axis, of each class; empty where they have no common axis.
+      compared: the classes where every algorithm has finished runs.
     """
 
     name: str
     axis: str
     classes: tuple[str, ...]
+    values: tuple[Any, ...]
     compared: tuple[str, ...]
-    left_out: tuple[str, ...]
 
 
 def class_infos(plan: StudyPlan) -> dict[str, ClassInfo]:
@@ -106,38 +105,33 @@ def stream_infos(plan: StudyPlan) -> dict[str, StreamInfo]:
 
 
 def groups(
-    classes: Mapping[str, ClassInfo], algorithms: Sequence[str], done: Collection[tuple[str, str]]
+    classes: Mapping[str, ClassInfo],
+    algorithms: Sequence[str],
+    finished: Collection[tuple[str, str]],
 ) -> tuple[Group, ...]:
     """All classes, then for each axis its classes together with the first one."""
     if not classes:
         return ()
     first, *others = classes.values()
-    result = []
     unnamed = [c.axis for c in others if c.axis not in ("", *AXES, SEVERAL)]
+    result = []
     for axis in dict.fromkeys(("", *AXES, *unnamed, SEVERAL)):
         members = [first, *(c for c in others if axis in ("", c.axis))]
-        values = axis_values(axis, members)
+        values = [] if axis in ("", SEVERAL) else [c.setting.get(axis) for c in members]
         if is_numeric(values):
-            members = [c for _, c in sorted(zip(values, members, strict=True), key=lambda x: x[0])]
-        present = [c.name for c in members if any((c.name, a) in done for a in algorithms)]
-        compared = [name for name in present if all((name, a) in done for a in algorithms)]
+            members.sort(key=lambda c: c.setting[axis])
+        present = [c for c in members if any((c.name, a) in finished for a in algorithms)]
         if present and (not axis or len(members) > 1):
-            name = axis_label(axis) or ALL
-            left_out = [n for n in present if n not in compared]
-            result.append(Group(name, axis, tuple(present), tuple(compared), tuple(left_out)))
+            names = tuple(c.name for c in present)
+            compared = (n for n in names if all((n, a) in finished for a in algorithms))
+            known = tuple(c.setting.get(axis) for c in present) if values else ()
+            result.append(Group(axis_label(axis) or ALL, axis, names, known, tuple(compared)))
     return tuple(result)
 
 
 def axis_label(axis: str) -> str:
     """What an axis is called: `reward interval k`."""
     return AXES[axis][1] if axis in AXES else axis
-
-
-def axis_values(axis: str, members: Sequence[ClassInfo]) -> list[Any]:
-    """The value of an axis in each class; empty if they have no common axis."""
-    if axis in ("", SEVERAL):
-        return []
-    return [member.setting.get(axis) for member in members]
 
 
 def is_numeric(values: Sequence[Any]) -> bool:
@@ -147,16 +141,19 @@ def is_numeric(values: Sequence[Any]) -> bool:
 
 def setting_label(field: str, value: Any, *, with_symbol: bool = True) -> str:
     """`k = 25`, or `25` without the symbol of the field."""
-    text = value if isinstance(value, str) else _json(value)
-    if is_numeric([value]):
-        text = f"{value:g}"
+    text = value
+    if not isinstance(value, str):
+        text = f"{value:g}" if is_numeric([value]) else _json(value)
     return f"{AXES.get(field, (field,))[0]} = {text}" if with_symbol else text
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, separators=(",", ":"), ensure_ascii=False)
 
 
 def _class_info(member: SuiteClass, first: SuiteClass) -> ClassInfo:
     setting, base = _setting(member), _setting(first)
-    plain = [name for name in AXES if name != "observation"]
-    differing = [name for name in plain if setting[name] != base[name]]
+    differing = [name for name in AXES if name != "observation" and setting[name] != base[name]]
     for field in ("observation", "team"):
         within = [n for n in dict.fromkeys((*base, *setting)) if n.partition(".")[0] == field]
         within = [name for name in within if setting.get(name) != base.get(name)]
@@ -192,11 +189,7 @@ def _flat(fields: Any, prefix: str = "") -> dict[str, Any]:
     for key, value in fields.items() if isinstance(fields, dict) else enumerate(fields):
         name = f"{prefix}{key}"
         nested = isinstance(value, dict) or (
-            isinstance(value, list) and any(isinstance(each, dict) for each in value)
+            isinstance(value, list) and any(isinstance(item, dict) for item in value)
         )
         flat |= _flat(value, f"{name}.") if nested else {name: value}
     return flat
-
-
-def _json(value: Any) -> str:
-    return json.dumps(value, separators=(",", ":"), ensure_ascii=False)

@@ -17,8 +17,8 @@ from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.report.analysis import (
     DIFFERENCES,
-    EXTENSION_METRICS,
     METRICS,
+    SPECIAL_METRICS,
     Analysis,
     Metric,
     differences,
@@ -166,7 +166,7 @@ def _check_names(first: str, second: str, known: Sequence[str]) -> None:
         raise OptionError(f"{first!r}: is given twice. Give two different algorithms.")
 
 
-def _metric(name: str, metrics: Sequence[Metric] = (*METRICS, *EXTENSION_METRICS)) -> Metric:
+def _metric(name: str, metrics: Sequence[Metric] = (*METRICS, *SPECIAL_METRICS)) -> Metric:
     known = {metric.key: metric for metric in metrics}
     if name not in known:
         raise UnknownNameError(

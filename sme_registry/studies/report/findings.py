@@ -256,10 +256,9 @@ def _rivals(analysis: Analysis, best: str, among: set[str]) -> Found:
 
 def _caveats(analysis: Analysis) -> Found:
     """What limits all findings on single tasks."""
-    rows, missing = analysis.tables["contrasts"], analysis.tables["missing"]
+    rows = analysis.tables["contrasts"]
     rows = rows[rows.algorithm.isin(analysis.learners)]
-    failed = int((missing.error != "").sum())
-    yield from missing_runs("caveats", len(missing), len(analysis.runs) + len(missing), failed)
+    yield from missing_runs("caveats", analysis.counts(streams=False))
     if not rows.empty:
         yield from few_runs("caveats", rows.pairs.min(), "pair of runs", "pairs of runs")
     intervals = int(((rows.metric == _WD) & rows.low.notna()).sum())

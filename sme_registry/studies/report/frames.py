@@ -402,7 +402,7 @@ def finished_lives(plan: StudyPlan, results: Mapping[str, CellResult]) -> list[F
     return found
 
 
-def stream_frames(lives: list[FinishedLife]) -> StreamFrames:
+def stream_frames(lives: Sequence[FinishedLife]) -> StreamFrames:
     """The frames of lives."""
     return StreamFrames(
         frame([row for life in lives for row in _life_rows(life)], _LIVES),

@@ -7,9 +7,8 @@ import math
 from typing import Any
 
 from sme_registry.io.markup import fixed, plural, signed
-from sme_registry.studies.report.analysis import ENOUGH_RUNS, Analysis, by_place
+from sme_registry.studies.report.analysis import ENOUGH_RUNS, WITHIN, Analysis, by_place
 from sme_registry.studies.report.classes import TASKS
-from sme_registry.studies.report.lives import WITHIN
 from sme_registry.studies.report.sentences import (
     THRESHOLDS,
     Found,
@@ -217,11 +216,8 @@ def _changes(analysis: Analysis) -> Found:
 
 
 def _caveats(analysis: Analysis) -> Found:
-    missing, lives = analysis.tables["stream_missing"], analysis.tables["stream_lives"]
-    failed = missing[missing.error != ""].key.nunique()
-    finished = len(analysis.stream_cells & analysis.cells.keys())
-    absent = analysis.missing_in_streams
-    yield from missing_runs("stream_caveats", absent, finished + absent, failed)
+    yield from missing_runs("stream_caveats", analysis.counts(streams=True))
+    lives = analysis.tables["stream_lives"]
     places = lives[lives.region == WITHIN].groupby(["class_name", "algorithm"])
     if len(places):
         yield from few_runs("stream_caveats", int(places.size().min()), "life", "lives")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -45,15 +46,13 @@ def finding(
     return result | columns
 
 
-def missing_runs(section: str, missing: int, planned: int, failed: int) -> Found:
+def missing_runs(section: str, counts: Counter[str]) -> Found:
+    missing = counts["missing"] + counts["failed"]
     if missing:
-        because = f", {failed:,} of them because they failed" if failed else ""
-        yield finding(
-            section, "missing runs", "missing",
-            f"{missing:,} of {plural(planned, 'run')} are missing{because}. No number includes "
-            "them; the table of runs lists them.",
-            value=missing,
-        )  # fmt: skip
+        because = f", {counts['failed']:,} of them because they failed" if counts["failed"] else ""
+        text = f"{missing:,} of {plural(counts['finished'] + missing, 'run')} are missing{because}."
+        text += " No number includes them; the table of runs lists them."
+        yield finding(section, "missing runs", "missing", text, value=missing)
 
 
 def few_runs(section: str, fewest: int, one: str, many: str) -> Found:

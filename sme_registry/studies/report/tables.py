@@ -44,6 +44,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -57,23 +58,20 @@ from sme_registry.spec.study import parse_uses
 from sme_registry.statistics import Array, Statistic
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.report.analysis import (
-    AGENT_METRICS,
-    CONTRASTS,
+    CURVES,
     DIFFERENCES,
     ENOUGH_RUNS,
     INTERVAL,
-    LEARNING_CURVES,
+    METRICS,
     PLACE,
     PLACE_COLUMNS,
-    REGRET_METRICS,
     Analysis,
     Bootstrap,
     Metric,
+    Part,
     by_place,
-    contrasts,
+    change_verdict,
     differences,
-    learning_curves,
-    missing_runs,
     summary,
     table,
     with_tables,
@@ -81,14 +79,16 @@ from sme_registry.studies.report.analysis import (
 from sme_registry.studies.report.classes import class_infos, groups, stream_infos
 from sme_registry.studies.report.frames import (
     RUN,
+    finished_lives,
     frame,
     ordered,
     place,
     runs_of,
+    stream_frames,
     study_frames,
     window,
 )
-from sme_registry.studies.report.lives import lives_of, reference_costs
+from sme_registry.studies.report.lives import reference_costs
 
 THRESHOLDS = np.linspace(0.0, 1.0, 101)
 STATISTICS: dict[str, Statistic] = {
@@ -97,6 +97,7 @@ STATISTICS: dict[str, Statistic] = {
     "optimality_gap": statistics.optimality_gap,
 }
 OFFLINE_INTERVAL = 4  # with fewer runs a mean improvement has no interval at all
+AGENT_METRICS = (*METRICS[:2], METRICS[4])
 _GROUP = "group:str metric:str "
 
 
@@ -120,7 +121,9 @@ def analyse(
     """
     plan = file.plan
     results, curves = study_frames(plan, finished)
-    runs, (lives, life_frames) = runs_of(results), lives_of(plan, finished)
+    runs = runs_of(results)
+    lives = tuple(finished_lives(plan, finished)) if plan.streams else ()
+    life_frames = stream_frames(lives)._asdict() if plan.streams else {}
     classes = class_infos(plan)
     present = [a for a in plan.algorithms if a.name in set(runs.algorithm)]
     names = tuple(algorithm.name for algorithm in present)
@@ -141,31 +144,95 @@ def analyse(
         offline_runs=offline_runs(results, plan.algorithms),
         lives=lives,
         reference_costs=reference_costs(lives),
-        tables={"results": results, "curves": curves, **life_frames},
+        tables={"results": results, "curves": curves}
+        | {f"stream_{name}": rows for name, rows in life_frames.items()},
     )
     return with_tables(analysis)
 
 
-@table("missing", f"{PLACE_COLUMNS} run:int64 error:str")
-def _missing(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
-    for class_name, algorithm, run, _, error, _ in missing_runs(analysis, streams=False):
-        yield class_name, algorithm, run, error
+@table("missing", "", both=True)
+def _missing(analysis: Analysis, part: Part) -> pd.DataFrame:
+    """Each requested run that has not finished."""
+    rows = [
+        (*place(planned).values(), planned.phase, analysis.errors.get(key, ""), key)
+        for planned in analysis.plan.cells
+        if planned.in_stream == part.streams
+        and analysis.state(key := planned.cell.digest) in ("missing", "failed")
+    ]
+    columns = f"{PLACE_COLUMNS} run:int64 phase:Int64 error:str key:str"
+    missing = frame(rows, columns)
+    return missing if part.streams else missing.drop(columns=["phase", "key"])
+
+
+@table(
+    "contrasts",
+    f"{PLACE_COLUMNS} metric:str axis:str base level change low high pairs:int64 enough_pairs:bool "
+    "verdict:str",
+    both=True,
+)
+def _contrasts(analysis: Analysis, part: Part) -> Iterator[tuple[Any, ...]]:
+    """What each class changes compared with the first one, between runs of equal number."""
+    first, keys = next(iter(part.axes), ""), [metric.key for metric in part.metrics]
+    runs = part.runs
+    base = runs.loc[runs.class_name == first, ["algorithm", "run", *keys]]
+    pairs = runs[runs.class_name != first].merge(base, on=["algorithm", "run"], suffixes=("", "_0"))
+    for (name, algorithm), group in by_place(pairs).items():
+        for metric in part.metrics:
+            both = group[[metric.key, f"{metric.key}_0"]].dropna().to_numpy()
+            if len(both):
+                change = both[:, :1] - both[:, 1:]
+                seed = "contrast", algorithm, name, metric.key
+                ends = analysis.bootstrap.interval({"": change}, *seed)
+                level, before = statistics.iqm(both)
+                middle = float(statistics.iqm(change)[0])
+                yield (
+                    name, algorithm, metric.key, part.axes[name], before, level, middle, *ends,
+                    len(both), len(both) >= ENOUGH_RUNS,
+                    change_verdict(middle * metric.worse, *ends),
+                )  # fmt: skip
+
+
+@table("differences", DIFFERENCES, both=True)
+def _differences(analysis: Analysis, part: Part) -> Iterator[tuple[Any, ...]]:
+    pairs, draws = itertools.combinations(part.algorithms, 2), analysis.bootstrap.draws
+    return differences(part.runs, pairs, part.metrics, draws, part.instance)
+
+
+@table("learning_curves", "", both=True)
+def _learning_curves(analysis: Analysis, part: Part) -> pd.DataFrame:
+    """Median and quartiles over runs, then the running median over a window of evaluations."""
+    columns = f"{PLACE_COLUMNS} measure:str step:int64 median q25 q75 runs:int64 window:int64"
+    tables = [frame([], columns)]
+    horizons = part.runs.groupby("class_name").horizon.first()
+    for (name, algorithm), group in by_place(analysis.tables[f"{part.prefix}curves"]).items():
+        runs = [run for _, run in group.groupby("run")]
+        P = min(map(len, runs))
+        width = 1 if part.streams else window(P)
+        for measure in CURVES:
+            values = np.array([run[measure][:P] for run in runs])
+            if measure == "episode_return":
+                values *= 100.0 / horizons[name]
+            quartiles = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
+            q25, median, q75 = (statistics.running_median(line, width) for line in quartiles)
+            steps = np.median([run.step[:P] for run in runs], axis=0).astype(int)
+            curve = {
+                "class_name": name, "algorithm": algorithm, "measure": measure, "step": steps,
+                "median": median, "q25": q25, "q75": q75, "runs": len(runs), "window": width,
+            }  # fmt: skip
+            tables.append(pd.DataFrame(curve))
+    return pd.concat(tables, ignore_index=True)
 
 
 @table("counts", f"{PLACE_COLUMNS} done:int64 failed:int64 planned:int64")
-def _counts(analysis: Analysis) -> pd.DataFrame:
+def _counts(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
     """How many runs of each algorithm on each class have finished and failed."""
-    missing = analysis.tables["missing"]
-    places = {*analysis.runs[RUN].itertuples(index=False, name=None)}
-    places |= {*missing[RUN].itertuples(index=False, name=None)}
-    cells = [(c.class_name, c.algorithm, c.run) for c in ordered(analysis.plan)]
-    planned = frame([cell[:2] for cell in cells if cell in places], PLACE_COLUMNS)
-    counts = planned.groupby(PLACE, sort=False).size().rename("planned").to_frame()
-    absent = missing.groupby(PLACE).size().reindex(counts.index, fill_value=0)
-    failed = missing[missing.error != ""].groupby(PLACE).size()
-    counts.insert(0, "done", counts.planned - absent)
-    counts.insert(1, "failed", failed.reindex(counts.index, fill_value=0))
-    return counts.reset_index()
+    states: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for planned in ordered(analysis.plan):
+        state = analysis.state(planned.cell.digest)
+        if not planned.in_stream and state != "left out":
+            states[planned.class_name, planned.algorithm].append(state)
+    for at, of_place in states.items():
+        yield (*at, of_place.count("finished"), of_place.count("failed"), len(of_place))
 
 
 @table("regions", "")
@@ -234,18 +301,6 @@ def _agents(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
         )  # fmt: skip
 
 
-@table("contrasts", CONTRASTS)
-def _contrasts(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
-    axes = {name: info.axis for name, info in analysis.classes.items()}
-    return contrasts(analysis.runs, axes, analysis.bootstrap, analysis.metrics)
-
-
-@table("differences", DIFFERENCES)
-def _differences(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
-    pairs = itertools.combinations(analysis.algorithms, 2)
-    return differences(analysis.runs, pairs, analysis.metrics, analysis.bootstrap.draws)
-
-
 @table(
     "aggregates",
     f"{_GROUP} algorithm:str statistic:str classes:int64 runs:int64 fewest_runs:int64 value low "
@@ -296,11 +351,6 @@ def _improvements(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
             estimate = statistics.probability_of_improvement(x, y, bootstrap.draws, seed)
             ends = (estimate.low[0], estimate.high[0]) if fewest > 1 else (math.nan, math.nan)
             yield (group, metric, first, second, len(x), fewest, estimate.value[0], *ends)
-
-
-@table("learning_curves", LEARNING_CURVES)
-def _learning_curves(analysis: Analysis) -> pd.DataFrame:
-    return learning_curves(analysis.tables["curves"], analysis.runs, window)
 
 
 @table(
@@ -402,7 +452,7 @@ def _compared(analysis: Analysis) -> Iterator[tuple[str, str, dict[str, dict[str
     """Each group and regret metric with `[n]` values 1 − regret, by algorithm and class."""
     at = by_place(analysis.runs)
     comparable = [group for group in analysis.groups if group.compared]
-    for group, metric in itertools.product(comparable, REGRET_METRICS):
+    for group, metric in itertools.product(comparable, METRICS[:2]):
         values = {
             a: {c: 1.0 - at[c, a][metric.key].to_numpy() for c in group.compared}
             for a in analysis.algorithms

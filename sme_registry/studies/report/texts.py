@@ -12,20 +12,23 @@ import pandas as pd
 from sme_registry.evaluation.retention import LABELS
 from sme_registry.io.markup import escape_latex, fixed, signed
 from sme_registry.studies.report.analysis import (
-    AGENT_METRICS,
     ENOUGH_RUNS,
+    OF_LIVES,
+    OF_TRAINING,
+    OF_VISITS,
+    OUTSIDE,
     TABLES,
+    WITHIN,
     Analysis,
     Metric,
 )
 from sme_registry.studies.report.classes import SCHEDULE
-from sme_registry.studies.report.lives import BY_VISIT, METRICS, OF_TRAINING, OUTSIDE, WITHIN
-from sme_registry.studies.report.tables import OFFLINE_INTERVAL
+from sme_registry.studies.report.tables import AGENT_METRICS, OFFLINE_INTERVAL
 
 _ABSENT = "–"
 _STATISTICS = {"iqm": "IQM", "median": "median", "optimality_gap": "optimality gap"}
 _REGIONS = {"wd_regret": "WD", "ood_regret": "OOD"}
-_OF_LIVES = {metric.key: metric for metric in (*METRICS, *BY_VISIT)}
+_OF_LIVES = {metric.key: metric for metric in (*OF_LIVES, *OF_VISITS)}
 _LABELS = {key: metric.label for key, metric in _OF_LIVES.items()}
 # The same numbers in all regions.
 _OF_TRAINING = tuple(metric.key for metric in OF_TRAINING)
@@ -311,7 +314,7 @@ def _retention_table(rows: pd.DataFrame, name: str, phases: int) -> TextTable:
         "Normalised regret within distribution on the task of each phase, of the policy before "
         f"training and at the end of each visit. IQM over lives, {_INTERVAL}.",
         rows.assign(after=after, column="phase " + rows.phase.astype(str)),
-        {"algorithm": "algorithm", "after": "policy"}, "column", _level(BY_VISIT[0]),
+        {"algorithm": "algorithm", "after": "policy"}, "column", _level(OF_VISITS[0]),
     )  # fmt: skip
 
 

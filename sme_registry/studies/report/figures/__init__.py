@@ -21,7 +21,7 @@ from sme_registry.evaluation.report import NOT_COMPARABLE
 from sme_registry.plots import maps, style
 from sme_registry.plots.style import GREY, literal, new_figure
 from sme_registry.studies.report.analysis import CURVES, ENOUGH_RUNS, METRICS, Analysis, by_place
-from sme_registry.studies.report.classes import ALL, SEVERAL, Group, axis_values, setting_label
+from sme_registry.studies.report.classes import ALL, SEVERAL, Group, setting_label
 from sme_registry.studies.report.figures import panels, streams
 from sme_registry.studies.report.figures.panels import (
     CONSTANT,
@@ -163,8 +163,7 @@ def _draw_axis(
 ) -> None:
     """The classes of one axis, in the order of its values."""
     ordered = group.axis not in ("", SEVERAL)
-    values = axis_values(group.axis, [analysis.classes[name] for name in group.classes])
-    scale = panels.Scale.of(values, len(group.classes))
+    scale = panels.Scale.of(group.values, len(group.classes))
     x = dict(zip(group.classes, scale.at, strict=True))
     levels = analysis.tables["levels"]
     levels = levels[(levels.metric == metric) & levels.class_name.isin(x)]
@@ -179,7 +178,7 @@ def _draw_axis(
         joined = ordered and scale.spacing != "nominal"
         at = scale.shifted(rows["at"], shift)
         marks(axes, rows, "iqm", at, look, upright=True, joined=joined)
-    scale.apply(axes, [literal(label) for label in _class_labels(analysis, group)])
+    scale.apply(axes, [literal(label) for label in _class_labels(group)])
     axes.grid(visible=False, axis="x")
 
 
@@ -271,7 +270,7 @@ def draw_decay(analysis: Analysis) -> Drawn:
         "the outermost shell. Below 0 a run is better outside, which an agent can be whose actions "
         "saturate before it has learnt."
     )
-    dims = analysis.state_dims
+    dims = _dims(analysis)
     if len(dims) > 1:
         caption += f" It includes runs with S = {', '.join(map(str, dims))}."
         caption += _epsilon_remark(analysis)
@@ -434,7 +433,7 @@ def _group_curves(analysis: Analysis, group: Group, rows: pd.DataFrame) -> Figur
     items = [
         (f"{name}: {label}", (name, measure)) for name in names for measure, label in CURVES.items()
     ]
-    labels = _class_labels(analysis, group, with_symbol=True)
+    labels = _class_labels(group, with_symbol=True)
     named = dict(zip(labels, looks.values(), strict=True))
     return panel_grid(items, draw_curve, (0.6, 2.2), looks=named, across=2, share_y="col")
 
@@ -545,9 +544,14 @@ def _draw_improvements(
         axes.plot(singles.nu + shift, singles.improvement, **mark, alpha=0.5, zorder=3.5)
 
 
+def _dims(analysis: Analysis) -> list[int]:
+    """The different state dimensions of the runs, in rising order."""
+    return sorted(set(analysis.tables["results"].state_dim))
+
+
 def _epsilon_remark(analysis: Analysis) -> str:
     """For captions with levels ε of several runs; "" where all have one state dimension."""
-    return f" {NOT_COMPARABLE}" if len(analysis.state_dims) > 1 else ""
+    return f" {NOT_COMPARABLE}" if len(_dims(analysis)) > 1 else ""
 
 
 def _looks(analysis: Analysis, names: Iterable[str]) -> dict[str, Look]:
@@ -583,12 +587,10 @@ def _axis_groups(analysis: Analysis) -> Sequence[Group]:
     return contrasted or analysis.groups[:1]
 
 
-def _class_labels(analysis: Analysis, group: Group, *, with_symbol: bool = False) -> list[str]:
+def _class_labels(group: Group, *, with_symbol: bool = False) -> list[str]:
     """The value of the axis in each class, `25` or `k = 25`; the class's name without an axis."""
-    values = axis_values(group.axis, [analysis.classes[name] for name in group.classes])
-    if not values:
-        return list(group.classes)
-    return [setting_label(group.axis, value, with_symbol=with_symbol) for value in values]
+    labels = [setting_label(group.axis, v, with_symbol=with_symbol) for v in group.values]
+    return labels or list(group.classes)
 
 
 TASK_FIGURES = (

@@ -13,10 +13,9 @@ from sme_registry.evaluation.streams import Visit
 from sme_registry.plots.curves import performance_curve, shade_visits, tick_visits
 from sme_registry.plots.maps import MATRIX_SCALE, draw_matrix
 from sme_registry.plots.style import GREY, legend_below
-from sme_registry.studies.report.analysis import CURVES, ENOUGH_RUNS, Analysis
+from sme_registry.studies.report.analysis import CURVES, ENOUGH_RUNS, OF_LIVES, WITHIN, Analysis
 from sme_registry.studies.report.figures import panels
 from sme_registry.studies.report.figures.panels import CONSTANT, Look, Picture, new_look, panel_grid
-from sme_registry.studies.report.lives import METRICS, WITHIN
 from sme_registry.studies.report.texts import slug
 
 if TYPE_CHECKING:
@@ -54,7 +53,7 @@ def draw_metrics(analysis: Analysis) -> Iterator[Picture]:
             f"{metric.label}\n({'less' if metric.worse > 0 else 'more'} is better)",
             neutral=1.0 if metric.key == "plasticity_ratio" else 0.0,
         )
-        for metric in METRICS
+        for metric in OF_LIVES
         if metric.key in _SHOWN and metric.key in set(rows.metric)
     ]
     rows = rows.assign(place=rows.class_name, enough=rows.runs >= ENOUGH_RUNS)
