@@ -13,25 +13,27 @@ from sme_registry.evaluation.retention import LABELS
 from sme_registry.io.markup import escape_latex, fixed, signed
 from sme_registry.studies.report.analysis import (
     ENOUGH_RUNS,
+    METRICS,
     OF_LIVES,
     OF_TRAINING,
     OF_VISITS,
     OUTSIDE,
+    SPECIAL_METRICS,
     TABLES,
     WITHIN,
     Analysis,
     Metric,
 )
 from sme_registry.studies.report.classes import SCHEDULE
-from sme_registry.studies.report.tables import AGENT_METRICS, OFFLINE_INTERVAL
+from sme_registry.studies.report.tables import OFFLINE_INTERVAL
 
 _ABSENT = "–"
 _STATISTICS = {"iqm": "IQM", "median": "median", "optimality_gap": "optimality gap"}
 _REGIONS = {"wd_regret": "WD", "ood_regret": "OOD"}
+_OF_RUNS = {metric.key: metric for metric in (*METRICS, *SPECIAL_METRICS)}
 _OF_LIVES = {metric.key: metric for metric in (*OF_LIVES, *OF_VISITS)}
 _LABELS = {key: metric.label for key, metric in _OF_LIVES.items()}
-# The same numbers in all regions.
-_OF_TRAINING = tuple(metric.key for metric in OF_TRAINING)
+_OF_TRAINING = [metric.key for metric in OF_TRAINING]  # the same numbers in all regions
 _SHOWN_BY_VISIT = ("normalised_regret", "forgetting", "plasticity_ratio", *_OF_TRAINING)
 _BY_CLASS, _BY_STREAM = {"class_name": "class"}, {"class_name": "stream"}
 _INTERVAL = "with its 95 % bootstrap interval"
@@ -92,48 +94,44 @@ def text_tables(analysis: Analysis) -> list[TextTable]:
 def _task_tables(analysis: Analysis) -> Iterator[TextTable]:
     tables, names = analysis.tables, analysis.algorithms
     yield from offline_tables(analysis)
-    for metric in analysis.metrics:
+    for metric, rows in _by_metric(tables["levels"]):
         yield _text(
             f"levels-{slug(metric.key)}", f"{_sentence(metric.label)} by class",
-            f"IQM over runs, {_INTERVAL}.",
-            _of(tables["levels"], metric), _BY_CLASS, "algorithm", _level(metric), names,
+            f"IQM over runs, {_INTERVAL}.", rows, _BY_CLASS, "algorithm", _level, names,
         )  # fmt: skip
-    layers = tables["layers"]
+    rows = tables["layers"]
     yield _text(
         "layers", "What the layers keep",
         "Held-out R² of a linear map from a layer's outputs to the state and, after the comma, to "
         "the distractors where there are any; IQM over runs, in the training cube.",
-        layers.assign(layer=layers.layer.map(str).replace("0", "observation")),
+        rows.assign(layer=rows.layer.map(str).replace("0", "observation")),
         _BY_CLASS | {"layer": "layer"}, "algorithm", _kept, names,
     )  # fmt: skip
-    for metric in AGENT_METRICS:
+    for metric, rows in _by_metric(tables["agents"]):
         yield _text(
             f"agents-{slug(metric.key)}", f"{_sentence(metric.label)} of each agent",
             f"IQM over runs, {_INTERVAL}, over the action channels that the agent owns.",
-            _of(tables["agents"], metric),
-            _BY_CLASS | {"agent": "agent"}, "algorithm", _level(metric), names,
+            rows, _BY_CLASS | {"agent": "agent"}, "algorithm", _level, names,
         )  # fmt: skip
     rows = tables["differences"]
-    for metric in analysis.metrics:
-        yield difference_table(_of(rows[rows["first"] == names[0]], metric), metric)
+    for metric, of_metric in _by_metric(rows[rows["first"] == names[0]]):
+        yield difference_table(of_metric, metric)
     setting = {name: info.label for name, info in analysis.classes.items()}
-    for metric in analysis.metrics:
-        rows = _of(tables["contrasts"], metric)
+    for metric, rows in _by_metric(tables["contrasts"]):
         yield _text(
             f"contrasts-{slug(metric.key)}",
             f"Change of {metric.label}, from the class {analysis.base}",
             f"IQM over pairs of runs, with the 95 % bootstrap interval of the change. {_MARKS}",
-            rows.assign(setting=rows.class_name.map(setting)),
-            _BY_CLASS | {"setting": "setting"}, "algorithm", _change("change", metric.digits),
-            names,
+            rows.assign(setting=rows.class_name.map(setting)), _BY_CLASS | {"setting": "setting"},
+            "algorithm", _change, names,
         )  # fmt: skip
-    rows = tables["regions"]
-    for name in names:
+    for name, rows in tables["regions"].groupby("algorithm", sort=False):
         yield _text(
             f"regions-{slug(name)}", f"Similarity r̃ of {name} by region",
             "IQM over runs; 1 is the optimum. In brackets the normalised regret: 0 for the "
             "optimum, 1 for the constant ½.",
-            rows[rows.algorithm == name], _BY_CLASS, "region", _similarity,
+            rows, _BY_CLASS, "region",
+            lambda row, _: f"{row.similarity:.3f} ({row.normalised_regret:.2f})",
         )  # fmt: skip
     yield _text(
         "aggregates", "Aggregates of 1 − normalised regret",
@@ -141,7 +139,7 @@ def _task_tables(analysis: Analysis) -> Iterator[TextTable]:
         "For the optimality gap less is better.",
         tables["aggregates"].replace({"metric": _REGIONS, "statistic": _STATISTICS}),
         {"group": "classes", "metric": "region", "statistic": "statistic"},
-        "algorithm", lambda row: _with_interval(row.value, row),
+        "algorithm", lambda row, digits: _with_interval(row.value, row, digits),
     )  # fmt: skip
     rows = tables["improvements"].replace({"metric": _REGIONS})
     yield _text(
@@ -149,12 +147,12 @@ def _task_tables(analysis: Analysis) -> Iterator[TextTable]:
         "That a run of the first algorithm beats one of the second, on a class drawn at random.",
         rows.assign(comparison=rows["first"] + " over " + rows["second"]),
         {"group": "classes", "comparison": "comparison"},
-        "metric", lambda row: _with_interval(row.probability, row),
+        "metric", lambda row, digits: _with_interval(row.probability, row, digits),
     )  # fmt: skip
     yield _text(
         "counts", "Finished runs", "Missing runs are part of no other number.",
         tables["counts"], _BY_CLASS, "algorithm",
-        lambda row: f"{row.done} of {row.planned}{_failures(row)}",
+        lambda row, _: f"{row.done} of {row.planned}{_failures(row)}",
     )  # fmt: skip
 
 
@@ -167,7 +165,7 @@ def offline_tables(analysis: Analysis) -> list[TextTable]:
         "Mean over runs ± the standard deviation over steps (its mean over runs); in brackets "
         "the number of runs, or of the behaviour policy's data sets. The constant ½ is "
         "evaluated within distribution.",
-        rows, at, "learner", lambda row: _mean(row, "similarity", row.runs),
+        rows, at, "learner", lambda row, _: _mean(row, "similarity", row.runs),
     )  # fmt: skip
     data = [*rows.drop_duplicates(["class_name", "nu"]).itertuples()]
     constant = [fixed(row.constant_similarity, 3) for row in data]
@@ -192,16 +190,16 @@ def difference_table(rows: pd.DataFrame, metric: Metric, *, levels: bool = False
     rows = rows.assign(pair=rows["first"] + " − " + rows["second"])
     pairs = list(dict.fromkeys(rows.pair))
     between = pairs[0] if len(pairs) == 1 else f"{''.join(rows['first'][:1])} minus each other"
-    name, digits = f"differences-{slug(metric.key)}", metric.digits + 1
+    name = f"differences-{slug(metric.key)}"
     note = f"IQM over pairs of runs on the same instance with the same seed, {_DIFFERENCE}"
     table = _text(
         name, f"Difference of {metric.label}, {between}",
-        " ".join([note, *difference_caveats(rows)]),
-        rows, _BY_CLASS, "pair", _change("difference", digits),
+        " ".join([note, *difference_caveats(rows)]), rows, _BY_CLASS, "pair",
+        lambda row, digits: _change(row, digits + 1),
         label=f"{name}-{slug(pairs[0])}" if levels else "",
     )  # fmt: skip
     for place, side in enumerate(("first", "second")) if levels else ():
-        texts = [fixed(value, digits) for value in rows[f"{side}_level"]]
+        texts = [fixed(value, metric.digits + 1) for value in rows[f"{side}_level"]]
         table.frame.insert(1 + place, rows[side].iloc[0], texts)
     return table
 
@@ -229,23 +227,24 @@ def _stream_tables(analysis: Analysis) -> Iterator[TextTable]:
         yield _life_table(analysis, name)
     for name, info in analysis.streams.items():
         yield _retention_table(tables["stream_matrices"], name, len(info.stream.phases))
-    for metric in (_OF_LIVES[key] for key in _SHOWN_BY_VISIT):
-        rows = _of(tables["stream_visit_metrics"], metric)
-        rows = rows[rows.region == WITHIN]
-        at = rows.visit.astype(str) + " (phase " + rows.phase.astype(str) + ")"
+    rows = tables["stream_visit_metrics"]
+    at = rows.visit.astype(str) + " (phase " + rows.phase.astype(str) + ")"
+    rows = rows.assign(at=at)[rows.region == WITHIN]
+    for key in _SHOWN_BY_VISIT:
+        end = "." if key in _OF_TRAINING else ", within distribution."
         yield _text(
-            f"stream-visits-{slug(metric.key)}", f"{_sentence(metric.label)} by visit",
-            f"IQM over lives, {_INTERVAL}"
-            + ("." if metric.key in _OF_TRAINING else ", within distribution."),
-            rows.assign(at=at), _BY_STREAM | {"at": "visit"}, "algorithm", _level(metric), names,
+            f"stream-visits-{slug(key)}", f"{_sentence(_LABELS[key])} by visit",
+            f"IQM over lives, {_INTERVAL}{end}", rows[rows.metric == key],
+            _BY_STREAM | {"at": "visit"}, "algorithm", _level, names,
         )  # fmt: skip
-    rows = tables["stream_differences"].assign(label=lambda rows: rows.metric.map(_LABELS))
+    by_metric = _BY_STREAM | {"label": "metric"}
+    rows = tables["stream_differences"]
     yield _text(
         "stream-differences", "Differences between algorithms in streams",
         "IQM over pairs of lives in the same draw of the stream with the same seed, within "
         f"distribution, {_DIFFERENCE}",
-        rows.assign(pair=rows["first"] + " − " + rows["second"]),
-        _BY_STREAM | {"label": "metric"}, "pair", _change("difference"),
+        rows.assign(label=rows.metric.map(_LABELS), pair=rows["first"] + " − " + rows["second"]),
+        by_metric, "pair", _change,
     )  # fmt: skip
     note = (
         "IQM over pairs of lives with the same number, within distribution, with the 95 % "
@@ -257,17 +256,17 @@ def _stream_tables(analysis: Analysis) -> Iterator[TextTable]:
             f" The schedule of {', '.join(others)} differs from that of {analysis.stream_base}, so "
             "the change is not one of the tasks alone."
         )
+    rows = tables["stream_contrasts"]
     yield _text(
         "stream-contrasts", f"Change from the stream {analysis.stream_base}", note,
-        tables["stream_contrasts"].assign(label=lambda rows: rows.metric.map(_LABELS)),
-        _BY_STREAM | {"label": "metric"}, "algorithm", _change("change"), names,
+        rows.assign(label=rows.metric.map(_LABELS)), by_metric, "algorithm", _change, names,
     )  # fmt: skip
     yield _text(
         "stream-counts", "Finished lives and fresh agents",
         "Lives, then the fresh agents with which their plasticity is compared. A life whose fresh "
         "agents are missing has no plasticity and no learning transfer, and all other numbers.",
         tables["stream_counts"], _BY_STREAM, "algorithm",
-        lambda row: f"{row.lives} of {row.planned_lives}, "
+        lambda row, _: f"{row.lives} of {row.planned_lives}, "
         f"{row.fresh_agents} of {row.planned_fresh_agents}{_failures(row)}",
     )  # fmt: skip
 
@@ -289,7 +288,7 @@ def _life_table(analysis: Analysis, name: str) -> TextTable:
         "fresh agent’s. The last columns are agents that need no training.",
         rows.sort_values("metric", kind="stable", key=lambda keys: keys.map(order.index)),
         {"label": "metric", "region": "region"}, "algorithm",
-        lambda row: _level(_OF_LIVES[row.metric])(row), analysis.stream_algorithms,
+        _level, analysis.stream_algorithms,
     )  # fmt: skip
     references = analysis.tables["stream_references"]
     references = references[references.class_name == name]
@@ -313,13 +312,15 @@ def _retention_table(rows: pd.DataFrame, name: str, phases: int) -> TextTable:
         f"stream-retention-{slug(name)}", f"Retention in {name}",
         "Normalised regret within distribution on the task of each phase, of the policy before "
         f"training and at the end of each visit. IQM over lives, {_INTERVAL}.",
-        rows.assign(after=after, column="phase " + rows.phase.astype(str)),
-        {"algorithm": "algorithm", "after": "policy"}, "column", _level(OF_VISITS[0]),
+        rows.assign(after=after, metric=OF_VISITS[0].key, column="phase " + rows.phase.astype(str)),
+        {"algorithm": "algorithm", "after": "policy"}, "column", _level,
     )  # fmt: skip
 
 
-def _of(rows: pd.DataFrame, metric: Metric) -> pd.DataFrame:
-    return rows[rows.metric == metric.key]
+def _by_metric(rows: pd.DataFrame) -> Iterator[tuple[Metric, pd.DataFrame]]:
+    """Each metric of runs on single tasks, in the order of reports, and its rows."""
+    for key, metric in _OF_RUNS.items():
+        yield metric, rows[rows.metric == key]
 
 
 def _text(
@@ -329,19 +330,24 @@ def _text(
     rows: pd.DataFrame,
     index: dict[str, str],
     across: str,
-    entry: Callable[[Any], str],
+    entry: Callable[[Any, int], str],
     order: Sequence[str] = (),
     label: str = "",
 ) -> TextTable:
     """A long table as text: a column for each value of `across`, in the order of the rows.
 
     `index` has the columns that name the rows, and their headings; `order` is of the new columns.
+    `entry` is called with a row and the number of digits of its metric.
     """
+    metrics = _OF_LIVES if name.startswith("stream") else _OF_RUNS
     lines: dict[tuple[Any, ...], dict[str, str]] = {}
     for row in rows.itertuples():
+        metric = metrics.get(getattr(row, "metric", ""))
         place = tuple(getattr(row, column) for column in index)
-        lines.setdefault(place, {})[getattr(row, across)] = entry(row)
-    names = [each for each in order or dict.fromkeys(rows[across]) if each in set(rows[across])]
+        digits = 2 if metric is None else metric.digits
+        lines.setdefault(place, {})[getattr(row, across)] = entry(row, digits)
+    present = dict.fromkeys(rows[across])
+    names = [column for column in order or present if column in present]
     frame = pd.DataFrame(
         [dict(zip(index.values(), place, strict=True)) | line for place, line in lines.items()],
         columns=[*index.values(), *names],
@@ -358,27 +364,20 @@ def _sentence(label: str) -> str:
     return label[0].upper() + label[1:]
 
 
-def _level(metric: Metric) -> Callable[[Any], str]:
+def _level(row: Any, digits: int) -> str:
     """The IQM of a row with its interval, and the number of runs where these are few."""
-    return lambda row: _with_interval(row.iqm, row, metric.digits) + _few(row)
+    return _with_interval(row.iqm, row, digits) + _few(row)
 
 
-def _change(column: str, digits: int | None = None) -> Callable[[Any], str]:
-    """A change with its interval; marked if the interval excludes 0 by enough pairs.
-
-    Without `digits` those of the row's metric, which is of lives.
-    """
-
-    def entry(row: Any) -> str:
-        count = "" if row.enough_pairs else " (1 pair)" if row.pairs == 1 else f" (n = {row.pairs})"
-        mark = {"worse": " *", "better": " †"}.get(row.verdict, "") if row.enough_pairs else ""
-        shown = _OF_LIVES[row.metric].digits if digits is None else digits
-        return _with_interval(getattr(row, column), row, shown, signed) + count + mark
-
-    return entry
+def _change(row: Any, digits: int) -> str:
+    """A change or difference with its interval; marked if it excludes 0 by enough pairs."""
+    value = row.change if hasattr(row, "change") else row.difference
+    count = "" if row.enough_pairs else " (1 pair)" if row.pairs == 1 else f" (n = {row.pairs})"
+    mark = {"worse": " *", "better": " †"}.get(row.verdict, "") if row.enough_pairs else ""
+    return _with_interval(value, row, digits, signed) + count + mark
 
 
-def _improvement(row: Any) -> str:
+def _improvement(row: Any, _: int) -> str:
     mark = {"above": " †", "below": " *"}.get(row.verdict, "")
     return _with_interval(row.improvement, row, 3, signed) + _few(row) + mark
 
@@ -391,13 +390,9 @@ def _failures(row: Any) -> str:
     return f", {row.failed} failed" if row.failed else ""
 
 
-def _kept(row: Any) -> str:
+def _kept(row: Any, _: int) -> str:
     kept = row.state_r2, row.distractor_r2
     return ", ".join(fixed(value) for value in kept if not math.isnan(value))
-
-
-def _similarity(row: Any) -> str:
-    return f"{row.similarity:.3f} ({row.normalised_regret:.2f})"
 
 
 def _mean(row: Any, column: str, runs: int) -> str:
