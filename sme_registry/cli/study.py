@@ -317,23 +317,23 @@ def compare(
 
       sme study compare runs/smoke PPO TD3 --json
     """
-    from sme_registry.studies.report import compare as comparison
+    from sme_registry.studies.report import write
     from sme_registry.studies.report.frames import records
     from sme_registry.studies.report.texts import difference_caveats
 
-    metrics = tuple(metric or comparison.DEFAULT_METRICS)
-    differences = comparison.compare(folder, first, second, metrics)
+    metrics = tuple(metric or write.DEFAULT_METRICS)
+    differences = write.compare(folder, first, second, metrics)
     files = []
     if out_folder is not None:
-        files = comparison.write_comparison(folder, out_folder, first, second, metrics)
+        files = write.write_comparison(folder, out_folder, first, second, metrics)
     if json:
         print_json(records(differences))
         return
-    for each in comparison.comparison_tables(differences):
+    for each in write.comparison_tables(differences):
         columns = {escape(name): "number" for name in each.frame.columns} | {"class": "name"}
         rows = (tuple(map(escape, row)) for row in each.frame.itertuples(index=False))
         out().print(Table(f"[bold]{escape(each.title)}[/]", columns, rows))
-    caveats = comparison.implementation_caveats(folder, first, second)
+    caveats = write.implementation_caveats(folder, first, second)
     for sentence in (*difference_caveats(differences), *caveats):
         out().print(escape(sentence), soft_wrap=True)
     if files:

@@ -19,9 +19,8 @@ if TYPE_CHECKING:
     from sme_registry.studies.engine.ledger import CellStatus, StudyStatus, study_status
     from sme_registry.studies.engine.result import CellResult
     from sme_registry.studies.engine.runner import run_study
-    from sme_registry.studies.report.compare import compare, write_comparison
     from sme_registry.studies.report.frames import StreamFrames, StudyFrames, load, load_streams
-    from sme_registry.studies.report.write import write_report
+    from sme_registry.studies.report.write import compare, write_comparison, write_report
 
 __all__ = [
     "CellResult",
@@ -46,14 +45,14 @@ _LAZY = {
     "StreamFrames": "studies.report.frames",
     "StudyFrames": "studies.report.frames",
     "StudyStatus": "studies.engine.ledger",
-    "compare": "studies.report.compare",
+    "compare": "studies.report.write",
     "load": "studies.report.frames",
     "load_streams": "studies.report.frames",
     "run_cell": "studies.engine.cell",
     "run_study": "studies.engine.runner",
     "study_status": "studies.engine.ledger",
     "sweep": "spec.study",
-    "write_comparison": "studies.report.compare",
+    "write_comparison": "studies.report.write",
     "write_report": "studies.report.write",
 }
 

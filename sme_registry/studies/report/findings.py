@@ -270,10 +270,12 @@ def _caveats(analysis: Analysis) -> Found:
             f"nothing had an effect, about {value} of them would exclude 0 by chance.",
             value=value,
         )  # fmt: skip
-    classes = analysis.classes.values()
-    init = analysis.classes[analysis.base].setting["policy_init"]
-    other = [c.name for c in classes if init != c.setting["policy_init"] != c.axis]
-    other = [name for name in other if analysis.classes[name].axis != "policy_init"]
+    init = {name: info.setting["policy_init"] for name, info in analysis.classes.items()}
+    other = [
+        name
+        for name, info in analysis.classes.items()
+        if info.axis != "policy_init" and init[name] != init[analysis.base]
+    ]
     if other:
         yield finding(
             "caveats", "policy_init", "differs",

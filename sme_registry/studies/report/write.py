@@ -1,4 +1,4 @@
-"""`write_report`: a study's folder to its report.
+"""`write_report`: a study's folder to its report; `compare`: two of its algorithms.
 
     REPORT/index.html           the page: findings, figures and tables in one file
     REPORT/findings.json        the findings as data
@@ -10,6 +10,8 @@
 The same results give the same files. Other files of an earlier report are kept. The page loads
 nothing: pictures are embedded, and a content security policy forbids it. Figures are drawn on
 white; on a dark page their lightness is inverted, except for maps, whose lightness carries meaning.
+
+The runs of a pair have the same instance and seed, so what instances and seeds do to both cancels.
 """
 
 from __future__ import annotations
@@ -25,23 +27,38 @@ import pandas as pd
 from markupsafe import Markup
 
 from sme_registry.diagnosis import load_cell
-from sme_registry.errors import OptionError, SMEError
+from sme_registry.errors import OptionError, SMEError, UnknownNameError, did_you_mean
 from sme_registry.explorer import explorer_page, run_report
 from sme_registry.io import check_writable, to_json, write_atomically
 from sme_registry.io.markup import environment, plural
 from sme_registry.io.terminal import duration
+from sme_registry.plots.style import WRITTEN
 from sme_registry.spec import StudyFile
 from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.ledger import REPORT, Ledger, requested, run_label
-from sme_registry.studies.report.analysis import Analysis
-from sme_registry.studies.report.figures import draw_figures
+from sme_registry.studies.report.analysis import (
+    DIFFERENCES,
+    METRICS,
+    SPECIAL_METRICS,
+    Analysis,
+    Metric,
+    differences,
+    metrics_of,
+)
+from sme_registry.studies.report.figures import (
+    draw,
+    draw_class_curves,
+    draw_differences,
+    draw_figures,
+)
 from sme_registry.studies.report.figures.panels import Picture
 from sme_registry.studies.report.findings import findings
-from sme_registry.studies.report.frames import records
+from sme_registry.studies.report.frames import StudyFrames, frame, load, records, runs_of
 from sme_registry.studies.report.sentences import THRESHOLDS
 from sme_registry.studies.report.tables import analyse
-from sme_registry.studies.report.texts import TextTable, csv_tables, text_tables
+from sme_registry.studies.report.texts import TextTable, csv_tables, difference_table, text_tables
 
+DEFAULT_METRICS = ("wd_regret", "ood_regret")  # of comparisons
 FORMATS = ("html", "png", "pdf", "csv", "latex")
 _FIGURE_FORMATS = {"html": "svg", "png": "png", "pdf": "pdf"}
 # Headings, and the beginnings of the figures' names. A section without contents is left out.
@@ -274,3 +291,127 @@ def explorers_of(ledger: Ledger, file: StudyFile, models: Mapping[str, Path]) ->
             continue
         pages[key] = Explorer(label, f"explorers/{name}.html", content)
     return list(pages.values())
+
+
+def compare(
+    study: StudyFrames | str | os.PathLike[str],
+    first: str,
+    second: str,
+    metrics: Sequence[str] = DEFAULT_METRICS,
+) -> pd.DataFrame:
+    """The paired difference first − second on each class, and its mean over all classes.
+
+    Args:
+      study: the frames of `load`, or the study's folder.
+      metrics: of "wd_regret", "ood_regret", "ood_decay", "final_return", "online_regret"; where
+        tasks have safety "wd_cost", "wd_safe_regret", "online_cost"; where they have distractors
+        "distractor_regret", "wd_invariance".
+
+    Returns:
+      One row for each metric and class, and one for "all classes": first_level and second_level,
+      IQM over the paired runs; difference, the IQM of the paired differences, with the ends low
+      and high of its 95 % bootstrap interval (NaN for a single pair); pairs; instances, the
+      different ones among the pairs; enough_pairs; and the verdict on the first algorithm: better,
+      worse, open, or indication: the interval excludes 0 but rests on fewer than 5 pairs.
+      `sme_registry.statistics` has the formulas.
+
+    Examples:
+      >>> from sme_registry import studies
+      >>> differences = studies.compare("study", "linear", "constant", ["wd_regret"])
+      >>> bool(differences["difference"].iloc[-1] < 0)
+      True
+    """
+    if not isinstance(study, StudyFrames):
+        if not Ledger(study).study_file().plan.classes:
+            raise OptionError(
+                f"folder={str(study)!r}: its plan has streams alone, and runs on single tasks are "
+                "compared. `sme study report` has the differences between algorithms in streams."
+            )
+        study = load(study)
+    finished = runs_of(study.results)
+    _check_names(first, second, list(dict.fromkeys(finished.algorithm)))
+    chosen = [_metric(name, metrics_of(finished)) for name in metrics]
+    table = frame([*differences(finished, [(first, second)], chosen)], DIFFERENCES)
+    if table.empty:
+        raise OptionError(
+            f"{first!r} and {second!r}: no class has a run of both on the same instance with the "
+            "same seed. Run more of the study's cells."
+        )
+    return table
+
+
+def comparison_tables(table: pd.DataFrame) -> list[TextTable]:
+    """The result of `compare` for people, a table for each metric."""
+    return [
+        difference_table(table[table.metric == key], _metric(key), levels=True)
+        for key in dict.fromkeys(table.metric)
+    ]
+
+
+def implementation_caveats(folder: str | os.PathLike[str], first: str, second: str) -> list[str]:
+    """A sentence if one of two algorithms runs in JAX and the other does not."""
+    uses = {a.name: a.uses for a in Ledger(folder).study_file().plan.algorithms}
+    ours, *others = sorted((first, second), key=lambda name: not in_jax(uses[name]))
+    if in_jax(uses[ours]) == in_jax(uses[others[0]]):
+        return []
+    return [
+        f"{ours} runs in JAX and {others[0]} does not: their difference is also one between "
+        "implementations."
+    ]
+
+
+def write_comparison(
+    folder: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    first: str,
+    second: str,
+    metrics: Sequence[str] = DEFAULT_METRICS,
+) -> list[Path]:
+    """Write a comparison into the folder `out`, and return the files.
+
+    They are differences.csv and .json, a .tex for each metric, and the figures `differences` and
+    `learning-curves-by-class` as PNG and PDF.
+
+    Examples:
+      >>> from sme_registry import studies
+      >>> files = studies.write_comparison("study", "compared", "linear", "constant", ["wd_regret"])
+      >>> sorted({path.suffix for path in files})
+      ['.csv', '.json', '.pdf', '.png', '.tex']
+    """
+    check_writable(Path(out) / "differences.csv")
+    table = compare(folder, first, second, metrics)
+    contents: dict[str, str | bytes] = {
+        "differences.csv": table.to_csv(index=False, lineterminator="\n"),
+        "differences.json": to_json(records(table)),
+    }
+    contents |= {f"{text.name}.tex": text.latex() for text in comparison_tables(table)}
+    ledger = Ledger(folder)
+    file = ledger.study_file()
+    algorithms = {algorithm.name: algorithm for algorithm in file.plan.algorithms}
+    both = {"algorithms": (algorithms[first], algorithms[second])}
+    plan = file.plan.model_copy(update=both)
+    results = ledger.results(cell.cell.digest for cell in plan.cells)
+    analysis = analyse(file.model_copy(update={"plan": plan}), results)
+    for picture in draw((draw_differences, draw_class_curves), analysis, WRITTEN)[0]:
+        contents |= {f"{picture.name}.{ending}": picture.files[ending] for ending in WRITTEN}
+    return [write_atomically(Path(out) / name, content) for name, content in contents.items()]
+
+
+def _check_names(first: str, second: str, known: Sequence[str]) -> None:
+    for name in (first, second):
+        if name not in known:
+            raise UnknownNameError(
+                f"{name!r}: the study has no finished run of such an algorithm."
+                f"{did_you_mean(name, known)} Its algorithms: {', '.join(known) or 'none'}."
+            )
+    if first == second:
+        raise OptionError(f"{first!r}: is given twice. Give two different algorithms.")
+
+
+def _metric(name: str, metrics: Sequence[Metric] = (*METRICS, *SPECIAL_METRICS)) -> Metric:
+    known = {metric.key: metric for metric in metrics}
+    if name not in known:
+        raise UnknownNameError(
+            f"metric={name!r}: must be one of {', '.join(known)}.{did_you_mean(name, known)}"
+        )
+    return known[name]

@@ -22,10 +22,9 @@ from sme_registry.studies.engine.executors import InProcess
 from sme_registry.studies.engine.ledger import Ledger, read_header, read_state, write_state
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.engine.runner import run_study
-from sme_registry.studies.report.compare import implementation_caveats
 from sme_registry.studies.report.findings import findings
 from sme_registry.studies.report.tables import analyse
-from sme_registry.studies.report.write import page
+from sme_registry.studies.report.write import implementation_caveats, page
 from tests.studies.cells import numbers
 
 pytest.importorskip("jax")

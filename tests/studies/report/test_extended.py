@@ -11,9 +11,9 @@ from sme_registry.spec import StudyPlan
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.report import frames, texts
 from sme_registry.studies.report.analysis import METRICS
-from sme_registry.studies.report.compare import compare
 from sme_registry.studies.report.frames import study_frames
 from sme_registry.studies.report.tables import analyse, layers
+from sme_registry.studies.report.write import compare
 from tests.studies.cells import small_file
 
 FIELDS = {
