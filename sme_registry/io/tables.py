@@ -1,8 +1,8 @@
 """Tables that stay readable at any width.
 
-No cell is cut, no word broken, no column dropped. In a narrow terminal a table first loses its
-lines, then wraps columns of text between words; where that is not enough, each row becomes a block.
-Output that is no terminal has one line per row, however long, for `grep` and `awk`.
+No cell is cut and no column dropped. In a narrow terminal Rich wraps columns of text, then a table
+loses its lines, and at last each row becomes a block. Output that is no terminal has one line per
+row, however long, for `grep` and `awk`.
 """
 
 from __future__ import annotations
@@ -20,10 +20,6 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from sme_registry.io.checks import printable
-
-_LEAST_TEXT, _MOST_LINES = 16, 4  # of a cell of text in a table
-_STYLES = ((box.HEAVY_HEAD, 1), (None, 2), (None, 1))
-"""From wide to narrow: lines, and spaces after each column (with lines, also before it)."""
 
 
 class CleanConsole(Console):
@@ -93,30 +89,36 @@ class Table:
             yield Text.from_markup(self.caption, style="dim italic", emoji=False)
 
     def _fitted(self, width: int) -> RenderResult:
-        """The widest style in which nothing wraps, else in which texts wrap, else blocks."""
-        least, most = zip(*map(self._limits, range(len(self.columns))), strict=True)
-        for needed, (lines, gap) in itertools.product((most, least), _STYLES):
-            borders = (2 * gap + 1) * len(most) + 1 if lines else gap * (len(most) - 1)
-            if sum(needed) + borders <= width:
-                yield self._drawn(lines, gap, _shared(least, most, width - borders))
-                return
-        yield from self._blocks()
+        """The table with lines or without, where no word is broken; else blocks."""
+        least, n = sum(map(self._least_width, range(len(self.columns)))), len(self.columns)
+        if least + 3 * n + 1 <= width:
+            yield self._drawn(box.HEAVY_HEAD)
+        elif least + n <= width:
+            yield self._drawn(None)
+        else:
+            yield from self._blocks()
 
-    def _limits(self, i: int) -> tuple[int, int]:
-        """The least width of a column in which its cells are readable, and its full width."""
+    def _cells(self, i: int) -> list[str]:
+        return [row.cells[i].plain for row in self.rows if row is not None]
+
+    def _least_width(self, i: int) -> int:
+        """The width of a column in which no word of its texts is broken, and no name or number."""
         heading, kind = self.columns[i]
-        cells = [row.cells[i].plain for row in self.rows if row is not None]
-        most = max(map(_width, cells), default=0)
-        least = most
+        texts = [heading, *self._cells(i)]
         if kind == "text":
-            least = min(most, max(_longest_word(cells), _LEAST_TEXT, -(-most // _MOST_LINES)))
-        return max(least, _longest_word([heading])), max(most, _width(heading))
+            texts = [word for text in texts for word in text.split()]
+        return max(map(_width, texts), default=0)
 
-    def _drawn(self, lines: box.Box | None, gap: int, widths: Sequence[int]) -> RichTable:
-        padding = (0, gap, 0, gap if lines else 0)
-        table = RichTable(box=lines, padding=padding, pad_edge=lines is not None)
-        for (heading, kind), width in zip(self.columns, widths, strict=True):
-            table.add_column(heading, justify="right" if kind == "number" else "left", width=width)
+    def _drawn(self, lines: box.Box | None) -> RichTable:
+        padding = (0, 1) if lines else (0, 1, 0, 0)
+        table = RichTable(box=lines, padding=padding, pad_edge=bool(lines))
+        for i, (heading, kind) in enumerate(self.columns):
+            table.add_column(
+                heading,
+                justify="right" if kind == "number" else "left",
+                no_wrap=kind != "text",
+                min_width=self._least_width(i),
+            )
         for row in self.rows:
             if row is not None:
                 table.add_row(*row.cells, style=row.style)
@@ -127,21 +129,21 @@ class Table:
         return table
 
     def _blocks(self) -> RenderResult:
-        """Each row as a block: its name, its numbers, its texts."""
-        kinds = [kind for _, kind in self.columns]
-        named = 1 + next((i for i, kind in enumerate(kinds) if kind != "number"), 0)
+        """Each row as a block: its name, and a line for each other cell."""
         for row in filter(None, self.rows):
-            yield Text(" ", style=f"bold {row.style}").join(filter(None, row.cells[:named]))
-            rest = list(zip(self.columns, row.cells, strict=True))[named:]
-            given = [(heading, kind, text) for (heading, kind), text in rest if text]
-            numbers = [_pair(heading, text) for heading, kind, text in given if kind == "number"]
-            texts = [_pair(heading, text) for heading, kind, text in given if kind != "number"]
-            for line in ([Text(" · ").join(numbers)] if numbers else []) + texts:
-                yield Padding(line, (0, 0, 0, 2))
+            yield Text.assemble(row.cells[0], style=f"bold {row.style}")
+            for (heading, _), text in zip(self.columns[1:], row.cells[1:], strict=True):
+                if text:
+                    name = Text(f"{' '.join(heading.split())} ", style="dim")
+                    line = Text.assemble(name, Text(", ").join(text.split("\n")))
+                    yield Padding(line, (0, 0, 0, 2))
 
     def _lines(self) -> Iterator[str]:
         """The lines of the table as plain text of full width."""
-        widths = [self._limits(i)[1] for i in range(len(self.columns))]
+        widths = [
+            max(map(_width, [heading, *self._cells(i)]))
+            for i, (heading, _) in enumerate(self.columns)
+        ]
         header = tuple(Text(heading) for heading, _ in self.columns)
         for row in (Row(header, ""), *self.rows):
             if row is None:
@@ -154,28 +156,10 @@ class Table:
                 yield "  ".join(padded).rstrip()
 
 
-def _shared(least: Sequence[int], most: Sequence[int], width: int) -> list[int]:
-    """Widths of columns between two bounds: the rest goes where most is missing."""
-    widths = list(least)
-    for _ in range(min(width, sum(most)) - sum(least)):
-        neediest = max(range(len(most)), key=lambda i: most[i] - widths[i])
-        widths[neediest] += 1
-    return widths
-
-
 def _width(text: str) -> int:
     return max(map(cell_len, text.split("\n")))
-
-
-def _longest_word(texts: Iterable[str]) -> int:
-    return max((cell_len(word) for text in texts for word in text.split()), default=0)
 
 
 def _padded(text: str, width: int, kind: str) -> str:
     space = " " * (width - cell_len(text))
     return space + text if kind == "number" else text + space
-
-
-def _pair(heading: str, text: Text) -> Text:
-    name = Text(f"{' '.join(heading.split())} ", style="dim")
-    return Text.assemble(name, Text(", ").join(text.split("\n")))
