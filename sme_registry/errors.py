@@ -123,16 +123,10 @@ class MissingDependencyError(SMEError, ImportError):
     """An optional package is required and not installed."""
 
 
-def near_misses(name: str, known: Iterable[str], count: int = 3) -> list[str]:
-    """Up to `count` known names similar to a mistyped one, best first; case is ignored."""
-    by_fold = {candidate.casefold(): candidate for candidate in known}
-    close = difflib.get_close_matches(name.casefold(), by_fold, n=count, cutoff=0.6)
-    return [by_fold[fold] for fold in close]
-
-
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """`" Did you mean 'k'?"`, or an empty string if no name is similar."""
-    close = near_misses(name, known)
+    """`" Did you mean 'k'?"`, up to three similar names; empty if there are none. Ignores case."""
+    by_fold = {candidate.casefold(): candidate for candidate in known}
+    close = difflib.get_close_matches(name.casefold(), by_fold, n=3, cutoff=0.6)
     if not close:
         return ""
-    return f" Did you mean {' or '.join(repr(candidate) for candidate in close)}?"
+    return f" Did you mean {' or '.join(repr(by_fold[fold]) for fold in close)}?"

@@ -14,7 +14,7 @@ import os
 import re
 import textwrap
 from collections.abc import Callable, Iterator, Sequence, Sized
-from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, TypeVar, cast, get_args
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, cast, get_args
 
 import rfc8785
 from pydantic import (
@@ -396,12 +396,7 @@ def find_named(kind: type[NamedDocument], value: Any) -> Any:
         raise ValueError(str(error)) from None
 
 
-class _Named(Protocol):
-    @property
-    def name(self) -> str: ...
-
-
-def check_names(field: str, members: Sequence[_Named]) -> None:
+def check_names(field: str, members: Sequence[Any]) -> None:
     """Raise ValueError, which Pydantic reports, where two members have the same name."""
     names = [member.name for member in members]
     for name in names:

@@ -10,7 +10,7 @@ with which its plasticity is compared.
 
 from __future__ import annotations
 
-import json
+import copy
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
@@ -33,6 +33,7 @@ from sme_registry.spec.stream import Phase, StreamSpec
 from sme_registry.spec.suite import (
     Classes,
     EvaluationProtocol,
+    StreamClass,
     StreamClasses,
     SuiteClass,
     check_classes,
@@ -212,8 +213,7 @@ class Cell(Document):
     @property
     def specs(self) -> tuple[SMESpec, ...]:
         """The task, or those of the stream's phases."""
-        stream = self.stream
-        return (self.spec,) if stream is None else tuple(phase.spec for phase in stream.phases)
+        return self.document.specs
 
 
 class PlannedCell(StrictModel):
@@ -283,8 +283,8 @@ class StudyPlan(Document):
         check_classes(self.classes, self.streams)
         check_names("algorithms", self.algorithms)
         for i, algorithm in enumerate(self.algorithms):
-            for member in self.classes:
-                _check_task(algorithm.uses, member.setting, f"algorithms.{i}.uses")
+            for kind in self.classes:
+                _check_task(algorithm.uses, kind.setting, f"algorithms.{i}.uses")
             if self.streams:
                 _check_stream(algorithm.uses, f"algorithms.{i}.uses")
             if not self.classes and algorithm.steps is not None:
@@ -293,9 +293,9 @@ class StudyPlan(Document):
                     "steps of their streams, and the plan has no single tasks. Leave it out, or "
                     "make streams with other steps."
                 )
-        for i, lived in enumerate(self.streams):
+        for i, member in enumerate(self.streams):
             try:
-                lived.stream.check_visits()
+                member.stream.check_visits()
             except SpecError as error:
                 raise ValueError(f"streams.{i}.stream: {error}") from None
         return self
@@ -303,14 +303,12 @@ class StudyPlan(Document):
     @property
     def cells(self) -> tuple[PlannedCell, ...]:
         """Every run: seeds outermost, so that a study that is cut short has whole comparisons."""
-        members: list[tuple[str, tuple[SMESpec | StreamSpec, ...]]] = [
-            *((member.name, member.instances) for member in self.classes),
-            *((member.name, member.instances) for member in self.streams),
-        ]
+        members: list[SuiteClass | StreamClass] = [*self.classes, *self.streams]
+        instances_of = {member.name: member.instances for member in members}
         return tuple(
             planned
             for run in range(self.seeds)
-            for name, instances in members
+            for name, instances in instances_of.items()
             for algorithm in self.algorithms
             for planned in self._runs(name, instances[run % len(instances)], algorithm, run)
         )
@@ -319,9 +317,8 @@ class StudyPlan(Document):
         self, class_name: str, document: SMESpec | StreamSpec, algorithm: StudyAlgorithm, run: int
     ) -> Iterator[PlannedCell]:
         """A run on a task; a life in a stream, and a fresh agent for each of its phases."""
-        if isinstance(document, SMESpec):
-            steps = self.steps if algorithm.steps is None else algorithm.steps
-        else:
+        steps = self.steps if algorithm.steps is None else algorithm.steps
+        if isinstance(document, StreamSpec):
             steps = document.steps
         cell = Cell(
             **_lived_in(document),
@@ -336,25 +333,20 @@ class StudyPlan(Document):
             protocol=self.protocol,
         )
         cells: list[tuple[int | None, Cell]] = [(None, cell), *enumerate(cell.fresh)]
-        for phase, each in cells:
-            yield PlannedCell(
-                class_name=class_name, algorithm=algorithm.name, run=run, phase=phase, cell=each
-            )
+        place: dict[str, Any] = {"class_name": class_name, "algorithm": algorithm.name, "run": run}
+        for phase, planned in cells:
+            yield PlannedCell(**place, phase=phase, cell=planned)
 
 
 def _lived_in(document: SMESpec | StreamSpec) -> dict[str, Any]:
     """The fields of a cell that say what its agent lives in."""
-    if isinstance(document, StreamSpec):
-        return {"spec": document.phases[0].spec, "stream": document}
-    return {"spec": document, "stream": None}
+    stream = document if isinstance(document, StreamSpec) else None
+    return {"spec": document.specs[0], "stream": stream}
 
 
 def _alone(phase: Phase) -> SMESpec | StreamSpec:
     """A phase by itself: its task, or the stream that drifts as it does."""
     return phase.spec if phase.drift is None else StreamSpec(phases=(phase,))
-
-
-_LONGEST_NAME = 64
 
 
 def sweep(
@@ -368,11 +360,11 @@ def sweep(
 
     Examples:
       >>> from sme_registry.studies import sweep
-      >>> [each.name for each in sweep(sme_registry.SMESpec(), {"k": [1, 5, 10]})]
+      >>> [member.name for member in sweep(sme_registry.SMESpec(), {"k": [1, 5, 10]})]
       ['k-1', 'k-5', 'k-10']
     """
     fields = spec.to_dict()
-    seeds = instance_seeds(fields.pop("seed"), instances)
+    seeds = _instance_seeds(fields.pop("seed"), instances)
     base = Setting.from_dict(fields)
     classes = [SuiteClass(name=name, setting=base, seeds=seeds)] if len(axes) != 1 else []
     for field, values in axes.items():
@@ -383,16 +375,15 @@ def sweep(
         ]
         if any(setting in settings[:i] for i, setting in enumerate(settings)):
             raise OptionError(f"sweep {field}: has the same value twice. Remove one.")
-        names = _class_names(field, values)
         classes += [
-            SuiteClass(name=each, setting=setting, seeds=seeds)
-            for each, setting in zip(names, settings, strict=True)
+            SuiteClass(name=class_name, setting=setting, seeds=seeds)
+            for class_name, setting in zip(_class_names(field, values), settings, strict=True)
             if not classes or setting != classes[0].setting
         ]
     return tuple(classes)
 
 
-def instance_seeds(seed: int | str, instances: int) -> tuple[int | str, ...]:
+def _instance_seeds(seed: int | str, instances: int) -> tuple[int | str, ...]:
     """The seeds of a class's instances: a task's own, and the integers that follow it."""
     if instances == 1:
         return (seed,)
@@ -416,23 +407,19 @@ def _check_axis(field: str, values: Sequence[Any]) -> None:
 
 def _with(fields: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
     """A copy of plain data with one value replaced; `path` is dotted, with places in lists."""
-    changed: dict[str, Any] = json.loads(json.dumps(fields))
-    *outer, last = path.split(".")
+    changed: dict[str, Any] = copy.deepcopy(fields)
     place: Any = changed
+    *outer, last = (int(part) if part.isdigit() else part for part in path.split("."))
     try:
         for part in outer:
-            place = place[_key(place, part)]
-        place[_key(place, last)] = value
+            place = place[part]
+        place[last] = value
     except (KeyError, IndexError, TypeError):
         raise OptionError(
             f"sweep {path}: this task has no such field. Start from a task that has it, such as a "
             "team for team.reward; an entry of a list is named by its place, from 0."
         ) from None
     return changed
-
-
-def _key(place: Any, part: str) -> int | str:
-    return int(part) if isinstance(place, list) and part.isdigit() else part
 
 
 def _class_names(field: str, values: Sequence[Any]) -> list[str]:
@@ -442,7 +429,7 @@ def _class_names(field: str, values: Sequence[Any]) -> list[str]:
     plain = all(isinstance(value, str | int | float) for value in values)
     if not plain or len(set(texts)) < len(texts) or len(stem) + max(map(len, texts)) > 60:
         texts = [str(i) for i in range(len(values))]
-    return [f"{stem[: _LONGEST_NAME - 1 - len(text)]}-{text}" for text in texts]
+    return [f"{stem[: 63 - len(text)]}-{text}" for text in texts]  # at most 64 characters
 
 
 def _text(value: Any) -> str:
