@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sme_registry.diagnosis.document import Diagnosis, Verdict
+from sme_registry.diagnosis.document import Diagnosis
+from sme_registry.diagnosis.questions import Verdict
 from sme_registry.diagnosis.stream import StreamDiagnosis, diagnose_stream
 from sme_registry.diagnosis.subject import (
     AnySubject,

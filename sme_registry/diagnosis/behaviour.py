@@ -31,9 +31,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled import engine
 from sme_registry.compiled.arrays import REWARD, STEP_REWARD, Mask, Observation
-from sme_registry.diagnosis.measure import MAX_NUMBERS
+from sme_registry.diagnosis.measure import MAX_NUMBERS, observed, states_of
 from sme_registry.diagnosis.measurements import (
     LINEAR,
     POLICY,
@@ -48,7 +47,6 @@ from sme_registry.envs import arguments
 from sme_registry.envs.batch import Batch
 from sme_registry.evaluation import Policy, references
 from sme_registry.evaluation.networks import Perceptron
-from sme_registry.evaluation.regions import States
 from sme_registry.evaluation.rollouts import play
 from sme_registry.io import require_packages
 from sme_registry.statistics import smoothed
@@ -317,25 +315,25 @@ def probe_capacity(
 
     begun = time.monotonic()
     count = max(_MIN_STATES, min(states, _MAX_STATES))
-    train = _pairs(task, count, seed, "diagnosis/told")
-    test = _pairs(task, _TEST_STATES, seed, "diagnosis/held_out")
-    constant_mae = float(np.abs(0.5 - test[1]).mean())
+    observation, exact = observed(task, states_of(task.spec, count + _TEST_STATES, seed))
+    optimal = exact.astype(np.float32)
+    constant_mae = float(np.abs(0.5 - optimal[count:]).mean())
     with _torch_seed(seed):
         module = _module(network)
-        _fit(module, *train, seed, progress)
+        _fit(module, observation[:count], optimal[:count], seed, progress)
 
-        def normalised_regret(observation: Observation, optimal: Observation) -> float:
+        def normalised_regret(states: slice) -> float:
             with torch.no_grad():
-                a = module(torch.from_numpy(observation)).numpy()
-            return float(np.abs(np.clip(a, 0.0, 1.0) - optimal).mean()) / constant_mae
+                a = module(torch.from_numpy(observation[states])).numpy()
+            return float(np.abs(np.clip(a, 0.0, 1.0) - optimal[states]).mean()) / constant_mae
 
         widths = [len(network.layers[0][0]), *(W.shape[1] for W, _, _ in network.layers)]
         return CapacityProbe(
             layers=tuple(widths),
             states=count,
             gradient_steps=GRADIENT_STEPS,
-            train_normalised_regret=normalised_regret(*(x[:_TEST_STATES] for x in train)),
-            test_normalised_regret=normalised_regret(*test),
+            train_normalised_regret=normalised_regret(slice(min(count, _TEST_STATES))),
+            test_normalised_regret=normalised_regret(slice(count, None)),
             seconds=round(time.monotonic() - begun, 2),
         )
 
@@ -365,17 +363,6 @@ def _fit(
             progress(step + 1)
 
 
-def _pairs(task: Task, count: int, seed: int, stream: str) -> tuple[Observation, Observation]:
-    """Observations of uniform states at random times, and the optimal actions, float32."""
-    S, m = task.spec.state_dim, task.spec.distractors
-    u = draw.uniform(seed, stream, count * (S + 1)).reshape(count, S + 1)
-    d = draw.uniform(seed, f"{stream}/distractors", count * m).reshape(count, m)
-    drawn = States(u[:, :S].astype(np.float32), d, u[:, S])
-    observation = drawn.observation(drawn.seen(task), task.spec.horizon)
-    optimal = engine(task).optimal_action(drawn.s.astype(np.float64))
-    return observation, optimal.astype(np.float32)
-
-
 def _module(network: Perceptron) -> Any:
     """A new network of the same layers, whose outputs are actions in the unit range."""
     from torch import nn
@@ -403,36 +390,26 @@ def _torch_seed(seed: int) -> Iterator[None]:
 
 def network_state(network: Perceptron, observations: Observation) -> NetworkState | None:
     """Measure a network in some states; None if it has no hidden layer."""
-    *hidden, _ = zip(network.outputs(observations), network.layers, strict=True)
+    *hidden, _ = network.outputs(observations)
     if not hidden:
         return None
-    outputs = [h.astype(np.float64) for h, _ in hidden]
-    stuck = [layer[2] == "tanh" for _, layer in hidden]
-    units = sum(h.shape[1] for h in outputs)
-    saturated = sum(_saturated(h) for h, tanh in zip(outputs, stuck, strict=True) if tanh)
+    dormant = saturated = 0
+    for h, (_, _, activation) in zip(hidden, network.layers, strict=False):
+        size = np.abs(h.astype(np.float64)).mean(axis=0)
+        dormant += int((size <= _DORMANT * size.mean()).sum())  # all, where all outputs are 0
+        saturated += int((size >= _SATURATED).sum()) if activation == "tanh" else 0
+    units = sum(h.shape[1] for h in hidden)
     squares = sum(float((W.astype(np.float64) ** 2).sum()) for W, _, _ in network.layers)
     return NetworkState(
-        hidden=tuple(h.shape[1] for h in outputs),
-        dormant_units=sum(map(_dormant, outputs)) / units,
+        hidden=tuple(h.shape[1] for h in hidden),
+        dormant_units=dormant / units,
         saturated_units=saturated / units,
-        effective_rank=_effective_rank(outputs[-1]),
+        effective_rank=_effective_rank(hidden[-1].astype(np.float64)),
         weight_norm=squares**0.5,
     )
-
-
-def _dormant(h: Array) -> int:
-    """How many units of a layer are dormant; all of them in a layer whose outputs are all 0."""
-    means = np.abs(h).mean(axis=0)
-    return int((means <= _DORMANT * means.mean()).sum())
-
-
-def _saturated(h: Array) -> int:
-    return int((np.abs(h).mean(axis=0) >= _SATURATED).sum())
 
 
 def _effective_rank(h: Array) -> int:
     """In [0, H]; 0 where all outputs are 0."""
     σ = np.linalg.svd(h, compute_uv=False)
-    if not σ.any():
-        return 0
-    return int((np.cumsum(σ) / σ.sum() < _RANK_SHARE).sum()) + 1
+    return int((np.cumsum(σ) < _RANK_SHARE * σ.sum()).sum()) + 1 if σ.any() else 0

@@ -13,32 +13,24 @@ from __future__ import annotations
 
 import os
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import cache
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, JsonValue
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.markup import escape
-from rich.table import Table as RichTable
 from rich.text import Text
 
+from sme_registry.diagnosis.questions import OPEN_REASONS, Verdict, label, templates, words
 from sme_registry.diagnosis.subject import AnySubject
 from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.io import read_json, versions
-from sme_registry.io.markup import environment, percent, plural
+from sme_registry.io.markup import fixed, percent, plural
 from sme_registry.io.tables import Table
 from sme_registry.spec import Integer, Real, SMESpec, StreamSpec, StrictModel, TupleOf, catalogue
 from sme_registry.spec.document import check_digest
 
-if TYPE_CHECKING:
-    from jinja2 import Environment
-
-Answer = Literal["yes", "no", "cannot tell"]
-Kind = Literal["who", "where", "why", "limits"]
 Level = Literal["solved", "better_than_linear", "worse_than_linear", "no_better_than_constant"]
-T = TypeVar("T")
 
 _ANSWERS = ("question", "answer", "evidence")  # columns of a part in words
 _HEADINGS = {
@@ -47,51 +39,8 @@ _HEADINGS = {
     "why": "Why",
     "limits": "Limits",
 }
-_INCONCLUSIVE = {"learnt_little", "few_updates"}
 _STYLES = {"yes": "bold red", "no": "green", "cannot tell": "yellow"}
 _COLUMNS, _INDENT = 80, " " * 4  # of lines in a file or a pipe
-
-
-class Verdict(StrictModel):
-    """The answer to one question, as data; `sentence` puts it in words.
-
-    Attributes:
-      question: such as "sparsity".
-      kind: "where" the error is, "why" it is there, "who" in a team makes it, or "limits".
-      answer: "cannot tell" if the evidence does not separate the causes.
-      reason: the rule's branch that decided.
-      evidence: the numbers that the branch compared or reports.
-      thresholds: those that the numbers were compared with.
-      error_share: part of the error that a "yes" explains; null if it is not measured.
-    """
-
-    question: str
-    kind: Kind
-    answer: Answer
-    reason: str
-    evidence: dict[str, JsonValue]
-    thresholds: dict[str, Real]
-    error_share: Real | None = None
-
-    def sentence(self, template: str = "task.jinja") -> str:
-        """The reason, with its evidence and thresholds, in a few sentences."""
-        arguments = self.evidence, self.thresholds
-        if "own_reason" not in self.evidence:
-            is_solved = self.kind == "why" and self.reason == "solved"
-            macro = "solved" if is_solved else self.question
-            return words(template, macro, self.reason, *arguments)
-        text = self.doubt
-        answer = self.evidence["own_answer"]
-        if answer == "cannot tell":
-            return text
-        own = words(template, self.question, self.evidence["own_reason"], *arguments)
-        return f"{text} The evidence of this run alone says {answer}: {own}"
-
-    @property
-    def doubt(self) -> str:
-        """Why the rule's own reason does not decide."""
-        macro = "inconclusive" if self.reason in _INCONCLUSIVE else "compared"
-        return words("task.jinja", macro, self.reason, self.evidence, self.thresholds)
 
 
 class Part(NamedTuple):
@@ -106,26 +55,36 @@ class Part(NamedTuple):
     def terminal(self) -> Iterator[RenderableType]:
         """Its lines, table and notes on a terminal or in a pipe."""
         if self.columns == _ANSWERS:
-            yield _Answers(self.heading, self.rows)
+            yield _Lines((self.heading, "italic", ""))
+            for question, answer, evidence in self.rows:
+                style = _STYLES[answer.partition(",")[0]]
+                yield _Lines((f"{question}: {answer}", style, ""), (evidence, "", _INDENT))
         else:
             kinds = ["name", *["number"] * (len(self.columns) - 1)]
             rows = [[escape(cell) for cell in row] for row in self.rows]
             yield Table(self.heading, dict(zip(self.columns, kinds, strict=True)), rows)
         for note in self.notes:
-            yield _Paragraph(note, style="dim italic")
+            yield _Lines((note, "dim italic", ""))
 
 
 def table(
-    heading: str,
-    rows: Iterable[T],
-    columns: Mapping[str, Callable[[T], str]],
-    notes: tuple[str, ...] = (),
-    *,
-    detail: bool = True,
+    heading: str, name: str, rows: Mapping[str, Any], fields: str, *notes: str, detail: bool = False
 ) -> Part:
-    """A part with one row for each of `rows`, and the text of its cell in each column."""
-    cells = [tuple(cell(row) for cell in columns.values()) for row in rows]
-    return Part(heading, tuple(columns), cells, notes, detail)
+    """A part with one row for each of `rows`, by its name, and a column for each of its fields."""
+    names = fields.split()
+    columns = [label(field).replace("normalised regret", "N") for field in names]
+    cells = [
+        (row_name, *(cell(getattr(row, field)) for field in names))
+        for row_name, row in rows.items()
+    ]
+    return Part(heading, (name, *columns), cells, notes, detail)
+
+
+def cell(value: float | str | None, digits: int = 3) -> str:
+    """A number or a name in a table."""
+    if value is None:
+        return "–"
+    return fixed(value, digits) if isinstance(value, float) else label(str(value))
 
 
 class Diagnosis(StrictModel):
@@ -143,7 +102,7 @@ class Diagnosis(StrictModel):
       versions: of Python and of the packages that the numbers depend on.
     """
 
-    template: ClassVar[str] = "task.jinja"  # the sentences of the verdicts
+    headline_macro: ClassVar[str] = ""
     document_field: ClassVar[str] = "spec"
     only_field: ClassVar[str] = ""  # that no other kind of diagnosis has
 
@@ -163,8 +122,9 @@ class Diagnosis(StrictModel):
     versions: dict[str, str]
 
     @classmethod
-    def about(cls, subject: AnySubject, **fields: Any) -> Self:
+    def about(cls, subject: AnySubject, verdicts: Sequence[Verdict], **fields: Any) -> Self:
         """The diagnosis of a subject, with the fields of its kind."""
+        thresholds = {k: v for verdict in verdicts for k, v in verdict.thresholds.items()}
         document: dict[str, Any] = {
             cls.document_field: subject.document,
             f"{cls.document_field}_digest": subject.document.digest,
@@ -175,6 +135,8 @@ class Diagnosis(StrictModel):
             plan=subject.plan,
             checkpoint_step=subject.checkpoint_step,
             updates=subject.updates,
+            verdicts=tuple(verdicts),
+            thresholds=thresholds,
             versions=versions(("numpy", "scipy"), if_imported=("torch", "stable_baselines3")),
             **document,
             **fields,
@@ -219,7 +181,11 @@ class Diagnosis(StrictModel):
 
     def headline(self) -> str:
         """How good the policy is."""
-        return words(self.template, "headline", self)
+        checkpoint = ""
+        if self.checkpoint_step is not None:
+            step = f"{self.checkpoint_step:,}"
+            checkpoint = f"The run is unfinished: this is its checkpoint at step {step}. "
+        return checkpoint + words(self.headline_macro, self)
 
     def parts(self) -> Iterator[Part]:
         """Findings first, then the tables of its kind; on request the other answers."""
@@ -231,12 +197,12 @@ class Diagnosis(StrictModel):
         """What only its kind of diagnosis shows, directly after the findings."""
         return iter(())
 
-    def findings(self, heading: str, verdicts: Sequence[Verdict], template: str = "") -> Part:
+    def findings(self, heading: str, verdicts: Sequence[Verdict]) -> Part:
         """The "yes" verdicts, largest share of the error first; names of the others below."""
         findings = [verdict for verdict in verdicts if verdict.answer == "yes"]
         findings.sort(key=lambda v: -1.0 if v.error_share is None else v.error_share, reverse=True)
         notes = [] if findings else ["Nothing."]
-        doubts = (verdict for verdict in verdicts if verdict.reason in _INCONCLUSIVE)
+        doubts = (verdict for verdict in verdicts if verdict.reason in OPEN_REASONS)
         notes += {verdict.reason: verdict.doubt for verdict in doubts}.values()
         for answer, text in (("cannot tell", "Cannot tell"), ("no", "Ruled out")):
             names = [label(verdict.question) for verdict in verdicts if verdict.answer == answer]
@@ -244,30 +210,19 @@ class Diagnosis(StrictModel):
                 notes.append(f"{text}: {', '.join(names)}.")
         updates = "" if self.updates is None else f", {plural(self.updates, 'update')}"
         basis = f"{plural(self.seeds, 'seed')}{updates}; %: share of the error"
-        rows = self._rows(findings, template)
-        return Part(f"{heading} ({basis})", rows=rows, notes=tuple(notes))
+        return Part(f"{heading} ({basis})", rows=_rows(findings), notes=tuple(notes))
 
-    def answers(
-        self, verdicts: Sequence[Verdict], of: str = "", template: str = ""
-    ) -> Iterator[Part]:
+    def answers(self, verdicts: Sequence[Verdict], of: str = "") -> Iterator[Part]:
         """The verdicts that are no findings, with their evidence, by kind."""
         for kind, heading in _HEADINGS.items():
             others = [v for v in verdicts if v.kind == kind and v.answer != "yes"]
             if others:
-                yield Part(f"{heading}{of}", rows=self._rows(others, template), detail=True)
-
-    def _rows(self, verdicts: Iterable[Verdict], template: str) -> list[tuple[str, ...]]:
-        rows: list[tuple[str, ...]] = []
-        for verdict in verdicts:
-            share = "" if verdict.error_share is None else f", {percent(verdict.error_share)}"
-            text = verdict.sentence(template or self.template)
-            rows.append((label(verdict.question), f"{verdict.answer}{share}", text))
-        return rows
+                yield Part(f"{heading}{of}", rows=_rows(others), detail=True)
 
     def terminal(self, *, details: bool = False) -> Iterator[RenderableType]:
         """What `sme diagnose` prints, part by part."""
         yield f"[bold]{escape(self.title)}[/]"
-        yield _Paragraph(self.headline())
+        yield _Lines((self.headline(), "", ""))
         for part in self.parts():
             if details or not part.detail:
                 yield ""
@@ -276,7 +231,7 @@ class Diagnosis(StrictModel):
     def markdown(self, figures: Sequence[str] = (), *, details: bool = False) -> str:
         """The diagnosis as a page that shows figures of the same folder."""
         parts = [part for part in self.parts() if details or not part.detail]
-        page = _templates().get_template("page.md.jinja")
+        page = templates().get_template("page.md.jinja")
         return page.render(diagnosis=self, parts=parts, figures=figures)
 
     def _repr_markdown_(self) -> str:
@@ -301,6 +256,15 @@ class Diagnosis(StrictModel):
         return diagnosis
 
 
+def _rows(verdicts: Iterable[Verdict]) -> list[tuple[str, ...]]:
+    rows: list[tuple[str, ...]] = []
+    for verdict in verdicts:
+        share = "" if verdict.error_share is None else f", {percent(verdict.error_share)}"
+        answer = f"{verdict.answer}{share}"
+        rows.append((label(verdict.question), answer, verdict.sentence()))
+    return rows
+
+
 def _main_fields(spec: SMESpec) -> str:
     fields = [f"S={spec.state_dim}", f"A={spec.action_dim}", f"L={spec.complexity}", f"k={spec.k}"]
     fields += [f"r_min={spec.r_min:g}", f"D={spec.D:g}"]
@@ -314,68 +278,23 @@ def _main_fields(spec: SMESpec) -> str:
     return ", ".join(fields)
 
 
-def label(question: str) -> str:
-    """`credit_assignment` as people read it: `credit assignment`."""
-    return question.replace("_", " ")
+class _Lines:
+    """Plain text, styled and indented, wrapped between words.
 
+    Where the output is no terminal, a word that is too long has a longer line.
+    """
 
-@cache
-def _templates() -> Environment:
-    templates = environment(Path(__file__).parent / "templates", autoescape=False)
-    templates.filters["label"] = label
-    return templates
-
-
-def words(template: str, macro: str, *arguments: Any) -> str:
-    """A macro of a template, on one line."""
-    macros: Any = _templates().get_template(template).module
-    return " ".join(getattr(macros, macro)(*arguments).split())
-
-
-class _Paragraph:
-    """Plain text, wrapped between words, in one of Rich's styles."""
-
-    def __init__(self, text: str, style: str = "") -> None:
-        self.text, self.style = text, style
+    def __init__(self, *paragraphs: tuple[str, str, str]) -> None:
+        self.paragraphs = paragraphs
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield Text(self.text, style=self.style) if console.is_terminal else _wrapped(self.text)
-
-
-class _Answers:
-    """Questions, their answers, and sentences of evidence."""
-
-    def __init__(self, title: str, rows: Sequence[tuple[str, ...]]) -> None:
-        self.title, self.rows = title, rows
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield Text(self.title, style="italic")
-        if console.is_terminal:
-            yield self._table()
-            return
-        for question, answer, evidence in self.rows:
-            yield Text(f"{question}: {answer}")
-            yield _wrapped(evidence, _INDENT)
-
-    def _table(self) -> RichTable:
-        table = RichTable(show_header=False, box=None)
-        table.add_column(style="cyan", no_wrap=True, min_width=19)
-        table.add_column(no_wrap=True)
-        table.add_column(overflow="fold")
-        for question, answer, evidence in self.rows:
-            style = _STYLES[answer.partition(",")[0]]
-            table.add_row(Text(question), Text(answer, style=style), Text(evidence))
-        return table
-
-
-def _wrapped(text: str, indent: str = "") -> Text:
-    """Lines that break between words only; a word that is too long has a longer line."""
-    lines = textwrap.wrap(
-        text,
-        _COLUMNS,
-        initial_indent=indent,
-        subsequent_indent=indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
-    return Text("\n".join(lines))
+        for text, style, indent in self.paragraphs:
+            lines = textwrap.wrap(
+                text,
+                options.max_width if console.is_terminal else _COLUMNS,
+                initial_indent=indent,
+                subsequent_indent=indent,
+                break_long_words=console.is_terminal,
+                break_on_hyphens=False,
+            )
+            yield Text("\n".join(lines), style=style)

@@ -57,7 +57,7 @@ class Sample(NamedTuple):
 
     drawn: States  # with the distractors and times that the observations show
     observation: Observation  # `[N, O]`
-    s: Array  # `[N, S]` states
+    s: Array  # `[N, S]` states, float64
     a: Array  # `[N, A]` actions of the policy, in [0, 1]
     optimal: Array  # `[N, A]` optimal actions
     references: dict[str, Array]  # `[N, A]` actions of each reference
@@ -88,11 +88,17 @@ def fit_references(task: Task, states: int, seed: int) -> references.References:
     return references.fit(s, engine(task).optimal_action(s), agents)
 
 
-def draw(spec: SMESpec, count: int, seed: int, region: int = 0) -> States:
+def states_of(spec: SMESpec, count: int, seed: int, region: int = 0) -> States:
     """So many states of a region, by default uniform in the cube."""
     protocol = EvaluationProtocol(states_per_region=count, seed=seed)
     (drawn,) = regions.states(protocol, region, spec, rows=count)
     return drawn
+
+
+def observed(task: Task, drawn: States) -> tuple[Observation, Array]:
+    """What is seen in states `[N, O]`, and the optimal actions `[N, A]`."""
+    observation = drawn.observation(drawn.seen(task), task.spec.horizon)
+    return observation, engine(task).optimal_action(drawn.s.astype(np.float64))
 
 
 def sample(
@@ -104,10 +110,9 @@ def sample(
     region: int = 0,
 ) -> Sample:
     """A region's states with the actions of the policy and of the references."""
-    drawn = draw(task.spec, count, seed, region)
-    observation = drawn.observation(drawn.seen(task), task.spec.horizon)
+    drawn = states_of(task.spec, count, seed, region)
+    observation, optimal = observed(task, drawn)
     s = drawn.s.astype(np.float64)
-    optimal = engine(task).optimal_action(s)
     random = uniform(seed, f"diagnosis/{region}/random", optimal.size)
     actions = fitted.actions(s, optimal, random.reshape(optimal.shape))
     return Sample(drawn, observation, s, clipped_actions(policy, observation), optimal, actions)
@@ -298,9 +303,9 @@ def _sensitivity(policy: Policy, task: Task, states: Sample, seed: int) -> float
     directions = gaussian(seed, "diagnosis/directions", s.size).reshape(s.shape)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     moved = (s + _STEP * directions).astype(np.float32)
-    optimal_change = engine(task).optimal_action(moved.astype(np.float64)) - states.optimal[:few]
     drawn = States(moved, states.drawn.d[:few], states.drawn.time[:few])
-    observation = drawn.observation(drawn.seen(task), task.spec.horizon)
+    observation, optimal = observed(task, drawn)
+    optimal_change = optimal - states.optimal[:few]
     change = clipped_actions(policy, observation) - states.a[:few]
     return float(np.sqrt((change**2).mean() / max(float((optimal_change**2).mean()), _TINY)))
 

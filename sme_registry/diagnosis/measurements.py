@@ -227,6 +227,11 @@ class PhaseDiagnosis(StrictModel):
     fresh_online_regret: Real | None  # of its training
     fresh_network: NetworkState | None  # at the end of its training
 
+    @property
+    def lost(self) -> float:
+        """Rise of normalised regret from its best visit to the end of the life."""
+        return self.final_normalised_regret - self.best_normalised_regret
+
 
 class Measurements(StrictModel):
     """Everything that was measured; None for what is unknown or was not measured.

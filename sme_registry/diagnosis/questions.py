@@ -9,13 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, TypeVar
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar
 
 from pydantic import JsonValue
 
-from sme_registry.diagnosis.document import Answer, Kind, Verdict
 from sme_registry.diagnosis.measurements import Measurements
+from sme_registry.io.markup import environment
 from sme_registry.spec import Real, SMESpec, StrictModel, TupleOf
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+Answer = Literal["yes", "no", "cannot tell"]
+Kind = Literal["who", "where", "why", "limits"]
 
 THRESHOLDS = {
     "solved": 0.1,  # normalised regret at most: nothing is left to explain
@@ -39,7 +47,7 @@ THRESHOLDS = {
     "gated_rewarded_share": 0.5,  # of steps that are rewarded nevertheless, at most
     "rarely_unrewarded": 0.05,  # share of steps without reward, below
     "rarely_rewarded": 0.02,  # share of steps rewarded under random actions, below
-    "termination_rate": 0.5,  # share of episodes that D terminates
+    "termination_rate": 0.5,  # share of episodes that D terminates, in a team because of one agent
     "short_episode": 0.5,  # mean length over the horizon, at most
     "constant_margin": 0.02,  # of regret below the constant action's
     "exploration_cost": 0.1,  # regret of training beyond the policy's, to be reported
@@ -52,9 +60,7 @@ THRESHOLDS = {
     "no_difference": 0.02,  # at most: the run is about as good as the other, or better
     "learnt_little": 0.8,  # normalised regret of a run, at least: it says nothing about causes
     "few_updates": 20.0,  # of the algorithm, below: likewise
-}
-
-SAFETY_THRESHOLDS = {
+    # of limits and distractors
     "rarely_violating": 0.05,  # share of states in which a limit is violated, below
     "gain": 0.01,  # of step reward by violating, at least
     "price_share": 0.5,  # the price of safety over the policy's regret, at least
@@ -62,8 +68,18 @@ SAFETY_THRESHOLDS = {
     "kept_r2": 0.5,  # held-out R² of a linear map of a layer, at least
     "owed_to_distractors": 0.05,  # normalised regret, at least
     "invariant": 0.01,  # change of actions by other distractors over mean |½ − a*|, at most
+    # of teams
+    "blame_ratio": 1.5,  # of an agent's share of the regret to its share of the channels
+    "one_suffices": 0.5,  # share of the team's regret that correcting one agent removes, at least
+    # of lives
+    "fresh_excess": 0.05,  # of a visit's online regret beyond a fresh agent's
+    "visit_excess": 0.1,  # of it beyond the mean of the other visits
+    "visits_for_trend": 4.0,  # at least, without fresh agents
+    "inactive_rise": 0.1,  # of the share of inactive units
+    "inactive_share": 0.5,  # of the units, from the start
+    "rank_ratio": 0.5,  # of the effective rank to what it is compared with, at most
+    "weight_ratio": 2.0,  # of the weight norm to what it is compared with, at least
 }
-"""Of the questions about limits and distractors."""
 
 SOLVED: dict[str, Answer] = {"solved": "no"}
 """Of every "why" question about a task."""
@@ -99,12 +115,85 @@ _FIELD_QUESTIONS = {
 }
 
 
+class Verdict(StrictModel):
+    """The answer to one question, as data; `sentence` puts it in words.
+
+    Attributes:
+      question: such as "sparsity".
+      kind: "where" the error is, "why" it is there, "who" in a team makes it, or "limits".
+      answer: "cannot tell" if the evidence does not separate the causes.
+      reason: the rule's branch that decided.
+      evidence: the numbers that the branch compared or reports.
+      thresholds: those that the numbers were compared with.
+      error_share: part of the error that a "yes" explains; null if it is not measured.
+    """
+
+    question: str
+    kind: Kind
+    answer: Answer
+    reason: str
+    evidence: dict[str, JsonValue]
+    thresholds: dict[str, Real]
+    error_share: Real | None = None
+
+    def sentence(self) -> str:
+        """The reason, with its evidence and thresholds, in a few sentences."""
+        if "own_reason" not in self.evidence:
+            return self._words(self.reason)
+        answer = self.evidence["own_answer"]
+        if answer == "cannot tell":
+            return self.doubt
+        own = self._words(str(self.evidence["own_reason"]))
+        return f"{self.doubt} The evidence of this run alone says {answer}: {own}"
+
+    @property
+    def doubt(self) -> str:
+        """Why the rule's own reason does not decide."""
+        macro = self.reason if self.reason in OPEN_REASONS else "compared"
+        return self._words(self.reason, macro)
+
+    def _words(self, reason: str, macro: str = "") -> str:
+        """What a reason says, then the numbers."""
+        if plain := words("plain", reason):
+            return plain
+        thresholds = THRESHOLDS | self.thresholds  # older documents have fewer
+        numbers = words(macro or self.question, reason, self.evidence, thresholds)
+        return f"{words('phrase', reason)} {numbers}".strip()
+
+
+def label(question: str) -> str:
+    """`credit_assignment` as people read it: `credit assignment`."""
+    return question.replace("_", " ")
+
+
+@cache
+def templates() -> Environment:
+    """The page and the sentences."""
+    folder = environment(Path(__file__).parent / "templates", autoescape=False)
+    folder.filters["label"] = label
+    return folder
+
+
+def words(macro: str, *arguments: Any) -> str:
+    """What a macro of the sentences says, on one line."""
+    return " ".join(getattr(_sentences(), macro)(*arguments).split())
+
+
+@cache
+def _sentences() -> Any:
+    return templates().get_template("sentences.jinja").module
+
+
 class Difference(StrictModel):
     """A quantity of this run and of the other run."""
 
     quantity: str  # its name
     value: Real  # of this run
     other: Real  # of the other run
+
+    @property
+    def difference(self) -> float:
+        return self.value - self.other
 
 
 class Comparison(StrictModel):
@@ -118,18 +207,12 @@ class Comparison(StrictModel):
 
 
 class Decision(NamedTuple):
-    """A rule's branch, its evidence, and the thresholds that it used."""
+    """A rule's branch and its evidence."""
 
-    reason: Any  # one of the question's; of a rule also a bool, for the first or the second of them
+    reason: Any  # one of the question's; of a rule also a bool, for the first that says yes or no
     evidence: dict[str, Any]
-    thresholds: tuple[str, ...] = ()
     error_share: float | None = None  # that a "yes" explains
-
-    def instead_of(self, own: Decision, own_answer: Answer) -> Decision:
-        """This decision in place of the rule's own, whose evidence is kept."""
-        kept = {"own_answer": own_answer, "own_reason": own.reason}
-        thresholds = dict.fromkeys((*own.thresholds, *self.thresholds))
-        return Decision(self.reason, {**own.evidence, **self.evidence, **kept}, tuple(thresholds))
+    thresholds: tuple[str, ...] = ()  # beside those of the question
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,6 +258,7 @@ class Question(NamedTuple, Generic[C]):
 
     kind: Kind
     rule: Callable[[C], Decision]
+    thresholds: tuple[str, ...]  # that the rule uses
     reasons: dict[str, Answer]
     needs: str = ""  # the field of `Measurements` without which it is not asked
     is_cause: bool = False  # whether "yes" names a cause, which a run can leave open
@@ -184,39 +268,47 @@ class Question(NamedTuple, Generic[C]):
         decision = self.rule(case)
         if isinstance(decision.reason, str):
             return decision
-        first, second, *_ = self.reasons
-        return decision._replace(reason=first if decision.reason else second)
+        answer = "yes" if decision.reason else "no"
+        first = next(reason for reason, given in self.reasons.items() if given == answer)
+        return decision._replace(reason=first)
 
 
 def add_to(
     questions: dict[str, Question[C]],
     kind: Kind,
-    needs: str = "",
     *,
+    yes: str = "",
+    no: str = "",
+    unclear: str = "",
+    thresholds: str = "",
+    needs: str = "",
     is_cause: bool = False,
-    **reasons: Answer,
 ) -> Callable[[Callable[[C], Decision]], Callable[[C], Decision]]:
-    """Decorate a rule: add the question of its name, with the answer that each reason gives."""
+    """Decorate a rule: add the question of its name, with the reasons for each answer."""
+    reasons: dict[str, Answer] = {
+        **dict.fromkeys(yes.split(), "yes"),
+        **dict.fromkeys(no.split(), "no"),
+        **dict.fromkeys(unclear.split(), "cannot tell"),
+    }
 
     def add(rule: Callable[[C], Decision]) -> Callable[[C], Decision]:
         name = rule.__name__.removeprefix("_")
-        questions[name] = Question(kind, rule, reasons, needs, is_cause)
+        used = tuple(thresholds.split())
+        questions[name] = Question(kind, rule, used, reasons, needs, is_cause)
         return rule
 
     return add
 
 
-def answer_all(
-    questions: Mapping[str, Question[C]], case: C, thresholds: Mapping[str, float]
-) -> tuple[Verdict, ...]:
+def answer_all(questions: Mapping[str, Question[C]], case: C) -> tuple[Verdict, ...]:
     """Answer every question about a case, in order."""
-    return tuple(_verdict(name, question, case, thresholds) for name, question in questions.items())
+    return tuple(_verdict(name, question, case) for name, question in questions.items())
 
 
-def _verdict(name: str, question: Question[C], case: C, thresholds: Mapping[str, float]) -> Verdict:
+def _verdict(name: str, question: Question[C], case: C) -> Verdict:
     answers = {**question.reasons, **COMPARISON_REASONS, **SOLVED, **OPEN_REASONS}
     if question.kind == "why" and case.solved:
-        decision = Decision("solved", {"normalised_regret": case.learnt}, ("solved",))
+        decision = Decision("solved", {"normalised_regret": case.learnt}, thresholds=("solved",))
     else:
         own = question.decide(case)
         own_answer = answers[own.reason]
@@ -224,15 +316,19 @@ def _verdict(name: str, question: Question[C], case: C, thresholds: Mapping[str,
         if question.is_cause and own_answer == "yes" and own.reason not in _EXPERIMENTS:
             doubt = _doubt(case)
         other = _comparison(case, name, own, own_answer, is_open=doubt is not None) or doubt
-        decision = own if other is None else other.instead_of(own, own_answer)
+        decision = own
+        if other is not None:
+            kept = {**own.evidence, "own_answer": own_answer, "own_reason": own.reason}
+            decision = other._replace(evidence=kept | other.evidence)
     answer, share = answers[decision.reason], decision.error_share
+    thresholds = dict.fromkeys((*question.thresholds, *decision.thresholds))
     return Verdict(
         question=name,
         kind=question.kind,
         answer=answer,
         reason=decision.reason,
         evidence=decision.evidence,
-        thresholds={threshold: thresholds[threshold] for threshold in decision.thresholds},
+        thresholds={threshold: THRESHOLDS[threshold] for threshold in thresholds},
         error_share=None if answer != "yes" or share is None else min(max(share, 0.0), 1.0),
     )
 
@@ -240,9 +336,9 @@ def _verdict(name: str, question: Question[C], case: C, thresholds: Mapping[str,
 def _doubt(case: Case) -> Decision | None:
     """Why the run cannot name a cause; None if it can."""
     if case.updates is not None and case.updates < THRESHOLDS["few_updates"]:
-        return Decision("few_updates", {"updates": case.updates}, ("few_updates",))
+        return Decision("few_updates", {"updates": case.updates}, thresholds=("few_updates",))
     if case.learnt >= THRESHOLDS["learnt_little"]:
-        return Decision("learnt_little", {"learnt": case.learnt}, ("learnt_little",))
+        return Decision("learnt_little", {"learnt": case.learnt}, thresholds=("learnt_little",))
     return None
 
 
@@ -276,7 +372,7 @@ def _comparison(
         "other_normalised_regret": regret.other,
     }
     thresholds = ("difference", "no_difference", "learnt_little")
-    return Decision(reason, evidence, thresholds) if decides else None
+    return Decision(reason, evidence, thresholds=thresholds) if decides else None
 
 
 def _is_harder(value: JsonValue, other_value: JsonValue) -> bool:

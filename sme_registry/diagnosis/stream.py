@@ -22,7 +22,7 @@ import numpy as np
 from sme_registry.compiled.arrays import Observation
 from sme_registry.diagnosis import measure
 from sme_registry.diagnosis.behaviour import network_state
-from sme_registry.diagnosis.document import Diagnosis, Part, label, table
+from sme_registry.diagnosis.document import Diagnosis, Part, cell, table
 from sme_registry.diagnosis.measurements import (
     NetworkState,
     PhaseDiagnosis,
@@ -30,7 +30,6 @@ from sme_registry.diagnosis.measurements import (
     VisitDiagnosis,
 )
 from sme_registry.diagnosis.questions import (
-    OPEN_REASONS,
     THRESHOLDS,
     Case,
     Decision,
@@ -41,7 +40,6 @@ from sme_registry.diagnosis.questions import (
 from sme_registry.diagnosis.subject import StreamSubject
 from sme_registry.evaluation import regions
 from sme_registry.evaluation.networks import Perceptron
-from sme_registry.io.markup import fixed, percent
 from sme_registry.spec import Digest, Real, StreamSpec, TupleOf
 
 
@@ -60,7 +58,7 @@ class StreamDiagnosis(Diagnosis):
       initial_network: before training; null if unknown.
     """
 
-    template: ClassVar[str] = "stream.jinja"
+    headline_macro: ClassVar[str] = "stream_headline"
     document_field: ClassVar[str] = "stream"
     only_field: ClassVar[str] = "phases"
 
@@ -78,10 +76,8 @@ class StreamDiagnosis(Diagnosis):
         columns = ("visit", "phase", "online regret", "N", "inactive", "rank", "weights")
         visits = [
             (
-                str(visit.visit),
-                str(visit.phase),
-                _number(visit.online_regret),
-                _number(visit.normalised_regret),
+                *(str(visit.visit), str(visit.phase)),
+                *(cell(visit.online_regret), cell(visit.normalised_regret)),
                 *_cells(visit.network),
             )
             for visit in self.visits
@@ -89,15 +85,12 @@ class StreamDiagnosis(Diagnosis):
         if self.initial_network is not None:
             visits.insert(0, ("initial", "", "", "", *_cells(self.initial_network)))
         yield Part("Visits", columns, visits)
-        phases: dict[str, Callable[[PhaseDiagnosis], str]] = {
-            "phase": lambda phase: str(phase.phase),
-            "outcome": lambda phase: label(phase.outcome),
-            "best N": lambda phase: _number(phase.best_normalised_regret),
-            "final N": lambda phase: _number(phase.final_normalised_regret),
-            "fresh N": lambda phase: _number(phase.fresh_normalised_regret),
-            "fresh online regret": lambda phase: _number(phase.fresh_online_regret),
-        }
-        yield table("Phases", self.phases, phases, _LEGEND, detail=False)
+        rows = {str(phase.phase): phase for phase in self.phases}
+        fields = (
+            "outcome best_normalised_regret final_normalised_regret fresh_normalised_regret "
+            "fresh_online_regret"
+        )
+        yield table("Phases", "phase", rows, fields, *_LEGEND)
 
 
 _LEGEND = (
@@ -111,29 +104,12 @@ _LEGEND = (
 
 def _cells(network: NetworkState | None) -> tuple[str, ...]:
     if network is None:
-        return ("–", "–", "–")
-    return (
-        percent(network.inactive_units),
-        f"{network.effective_rank} of {network.hidden[-1]}",
-        fixed(network.weight_norm, 1),
-    )
+        return ("–",) * 3
+    rank = f"{network.effective_rank} of {network.hidden[-1]}"
+    return cell(network.inactive_units), rank, cell(network.weight_norm, 1)
 
 
-def _number(value: float | None) -> str:
-    return "–" if value is None else fixed(value, 3)
-
-
-STREAM_THRESHOLDS = {
-    **{name: THRESHOLDS[name] for name in ("unlearnt", "difference", *OPEN_REASONS)},
-    "fresh_excess": 0.05,  # of a visit's online regret beyond a fresh agent's
-    "visit_excess": 0.1,  # of it beyond the mean of the other visits
-    "visits_for_trend": 4.0,  # at least, without fresh agents
-    "inactive_rise": 0.1,  # of the share of inactive units
-    "inactive_share": 0.5,  # of the units, from the start
-    "rank_ratio": 0.5,  # of the effective rank to what it is compared with, at most
-    "weight_ratio": 2.0,  # of the weight norm to what it is compared with, at least
-}
-_T = STREAM_THRESHOLDS
+_TINY = 1e-12
 
 
 @dataclass(frozen=True)
@@ -164,18 +140,16 @@ _why = partial(add_to, STREAM_QUESTIONS, "why", is_cause=True)
 
 def outcome_of(best: float, final: float) -> PhaseOutcome:
     """What became of a phase."""
-    if best >= _T["unlearnt"]:
+    if best >= THRESHOLDS["unlearnt"]:
         return "not_learnt"
-    return "forgotten" if final - best >= _T["difference"] else "retained"
+    return "forgotten" if final - best >= THRESHOLDS["difference"] else "retained"
 
 
 @_where(
-    no_training_log="cannot tell",
-    one_visit="cannot tell",
-    costlier_than_fresh="yes",
-    no_costlier_than_fresh="no",
-    some_visits_stand_out="yes",
-    visits_alike="no",
+    yes="costlier_than_fresh some_visits_stand_out",
+    no="no_costlier_than_fresh visits_alike",
+    unclear="no_training_log one_visit",
+    thresholds="fresh_excess visit_excess",
 )
 def _costly_visits(case: StreamCase) -> Decision:
     """Whether regret during some visits was higher than elsewhere."""
@@ -185,26 +159,24 @@ def _costly_visits(case: StreamCase) -> Decision:
     fresh = case.fresh("online_regret")
     if not fresh and len(known) == 1:
         return Decision("one_visit", {})
-    total = max(sum(visit.dynamic_regret or 0.0 for visit in known), 1e-12)
+    total = max(sum(visit.dynamic_regret or 0.0 for visit in known), _TINY)
     rows: list[dict[str, Any]] = [
         {
-            "visit": visit.visit,
-            "phase": visit.phase,
-            "online_regret": visit.online_regret,
+            **visit.model_dump(include={"visit", "phase", "online_regret"}),
             "other": fresh[visit.phase] if fresh else _mean_of_others(visit, known),
             "share": (visit.dynamic_regret or 0.0) / total,
         }
         for visit in known
     ]
-    threshold = "fresh_excess" if fresh else "visit_excess"
     rows.sort(key=lambda row: row["other"] - row["online_regret"])
-    costly = [row for row in rows if row["online_regret"] - row["other"] >= _T[threshold]]
+    excess = THRESHOLDS["fresh_excess" if fresh else "visit_excess"]
+    costly = [row for row in rows if row["online_regret"] - row["other"] >= excess]
     if fresh:
         reason = "costlier_than_fresh" if costly else "no_costlier_than_fresh"
     else:
         reason = "some_visits_stand_out" if costly else "visits_alike"
     evidence = {"visits": costly, "highest": rows[0]}
-    return Decision(reason, evidence, (threshold,), sum(row["share"] for row in costly))
+    return Decision(reason, evidence, sum(row["share"] for row in costly))
 
 
 def _mean_of_others(visit: VisitDiagnosis, visits: Sequence[VisitDiagnosis]) -> float:
@@ -215,30 +187,27 @@ def _mean_of_others(visit: VisitDiagnosis, visits: Sequence[VisitDiagnosis]) -> 
 
 
 @_where(
-    failed_as_fresh_agents="yes",
-    failed_unlike_fresh_agents="yes",
-    some_failed_unlike_fresh_agents="yes",
-    visits_failed="yes",
-    every_visit_learnt="no",
+    yes="failed_as_fresh_agents failed_unlike_fresh_agents some_failed_unlike_fresh_agents "
+    "visits_failed",
+    no="every_visit_learnt",
+    thresholds="unlearnt difference",
 )
 def _failure_to_learn(case: StreamCase) -> Decision:
     """Whether some visits ended without having learnt their own phase."""
     failed: list[dict[str, Any]] = [
         {
-            "visit": visit.visit,
-            "phase": visit.phase,
-            "normalised_regret": visit.normalised_regret,
+            **visit.model_dump(include={"visit", "phase", "normalised_regret"}),
             "fresh": case.phases[visit.phase].fresh_normalised_regret,
         }
         for visit in case.visits
-        if visit.normalised_regret >= _T["unlearnt"]
+        if visit.normalised_regret >= THRESHOLDS["unlearnt"]
     ]
     highest = max(visit.normalised_regret for visit in case.visits)
     evidence = {"failed": failed, "visits": len(case.visits), "highest": highest}
     if not failed:
-        return Decision("every_visit_learnt", evidence, ("unlearnt",))
+        return Decision("every_visit_learnt", evidence)
     if None in [row["fresh"] for row in failed]:
-        return Decision("visits_failed", evidence, ("unlearnt",))
+        return Decision("visits_failed", evidence)
     unlike = [row["visit"] for row in failed if _is_unlike_fresh(row)]
     if not unlike:
         reason = "failed_as_fresh_agents"
@@ -246,62 +215,50 @@ def _failure_to_learn(case: StreamCase) -> Decision:
         reason = "failed_unlike_fresh_agents"
     else:
         reason = "some_failed_unlike_fresh_agents"
-    return Decision(reason, {**evidence, "unlike_fresh": unlike}, ("unlearnt", "difference"))
+    return Decision(reason, {**evidence, "unlike_fresh": unlike})
 
 
 def _is_unlike_fresh(failed: dict[str, Any]) -> bool:
     """Whether a visit failed because of the life before it, of which visit 0 has none."""
     gap = failed["normalised_regret"] - failed["fresh"]
-    learns = failed["fresh"] < _T["unlearnt"] and gap >= _T["difference"]
+    learns = failed["fresh"] < THRESHOLDS["unlearnt"] and gap >= THRESHOLDS["difference"]
     return failed["visit"] > 0 and bool(learns)
 
 
 @_where(
-    phases_forgotten="yes",
-    phases_retained="no",
-    one_visit="cannot tell",
-    nothing_to_forget="cannot tell",
+    yes="phases_forgotten",
+    no="phases_retained",
+    unclear="one_visit nothing_to_forget",
+    thresholds="unlearnt difference",
 )
 def _forgetting(case: StreamCase) -> Decision:
     """Whether phases that were learnt are worse at the end of the life."""
     if len(case.visits) == 1:
         return Decision("one_visit", {})
     recent = case.visits[-1].phase  # retained if only because it was just visited
-    learnt = [
-        phase
-        for phase in case.phases
-        if phase.outcome == "forgotten" or (phase.outcome == "retained" and phase.phase != recent)
-    ]
-    if not learnt:
-        return Decision("nothing_to_forget", {}, ("unlearnt",))
-    learnt.sort(key=lambda phase: phase.best_normalised_regret - phase.final_normalised_regret)
+    forgotten = [phase for phase in case.phases if phase.outcome == "forgotten"]
+    retained = [p for p in case.phases if p.outcome == "retained" and p.phase != recent]
+    if not forgotten and not retained:
+        return Decision("nothing_to_forget", {})
     fields = {"phase", "best_normalised_regret", "final_normalised_regret"}
-    rows = [(phase.model_dump(include=fields), phase.outcome) for phase in learnt]
-    forgotten = [row for row, outcome in rows if outcome == "forgotten"]
+    forgotten.sort(key=lambda phase: phase.lost, reverse=True)
+    most = max([*forgotten, *retained], key=lambda phase: phase.lost)
+    evidence = {
+        "phases": [phase.model_dump(include=fields) for phase in forgotten],
+        "most": most.model_dump(include=fields),
+        "forgetting": case.forgetting,
+    }
     # The part of the error at the end of the life that was not there after each best visit.
-    lost = sum(
-        phase.final_normalised_regret - phase.best_normalised_regret
-        for phase in case.phases
-        if phase.outcome == "forgotten"
-    )
-    return Decision(
-        bool(forgotten),
-        {"phases": forgotten, "most": rows[0][0], "forgetting": case.forgetting},
-        ("difference",),
-        lost / max(sum(phase.final_normalised_regret for phase in case.phases), 1e-12),
-    )
+    final = sum(phase.final_normalised_regret for phase in case.phases)
+    lost = sum(phase.lost for phase in forgotten)
+    return Decision(bool(forgotten), evidence, lost / max(final, _TINY))
 
 
 @_why(
-    one_visit="cannot tell",
-    below_fresh_agents="yes",
-    as_fresh_agents="no",
-    fresh_agents_learnt_little="cannot tell",
-    phases_differ="cannot tell",
-    too_few_visits="cannot tell",
-    nothing_learnt="cannot tell",
-    later_visits_worse="yes",
-    later_visits_as_good="no",
+    yes="below_fresh_agents later_visits_worse",
+    no="as_fresh_agents later_visits_as_good",
+    unclear="one_visit fresh_agents_learnt_little phases_differ too_few_visits nothing_learnt",
+    thresholds="unlearnt difference visits_for_trend",
 )
 def _loss_of_plasticity(case: StreamCase) -> Decision:
     """Whether later visits learn less than fresh agents, or than earlier visits."""
@@ -314,16 +271,16 @@ def _loss_of_plasticity(case: StreamCase) -> Decision:
     # Phases are equally hard if their specs differ in the draw or rotation, and not in the steps.
     if len(case.stream.kinds) > 1 or len({phase.steps for phase in case.stream.phases}) > 1:
         return Decision("phases_differ", {})
-    if len(visits) < _T["visits_for_trend"]:
-        return Decision("too_few_visits", {"visits": len(visits)}, ("visits_for_trend",))
+    if len(visits) < THRESHOLDS["visits_for_trend"]:
+        return Decision("too_few_visits", {"visits": len(visits)})
     half = len(visits) // 2
     early, late = float(np.mean(learnt[:half])), float(np.mean(learnt[-half:]))
     evidence = {"early": early, "late": late, "visits": half}
-    if min(early, late) >= _T["unlearnt"]:
-        return Decision("nothing_learnt", evidence, ("unlearnt",))
-    worse = late - early >= _T["difference"]
+    if min(early, late) >= THRESHOLDS["unlearnt"]:
+        return Decision("nothing_learnt", evidence)
+    worse = late - early >= THRESHOLDS["difference"]
     reason = "later_visits_worse" if worse else "later_visits_as_good"
-    return Decision(reason, evidence, ("difference",), 1.0 - early / max(late, 1e-12))
+    return Decision(reason, evidence, 1.0 - early / max(late, _TINY))
 
 
 def _against_fresh(visits: Sequence[VisitDiagnosis], fresh: Sequence[float]) -> Decision:
@@ -336,71 +293,74 @@ def _against_fresh(visits: Sequence[VisitDiagnosis], fresh: Sequence[float]) -> 
         "plasticity_difference": own - alone,
         "visits": len(later),
     }
-    if alone >= _T["unlearnt"]:
-        return Decision("fresh_agents_learnt_little", evidence, ("unlearnt",))
-    below = own - alone >= _T["difference"]
+    if alone >= THRESHOLDS["unlearnt"]:
+        return Decision("fresh_agents_learnt_little", evidence)
+    below = own - alone >= THRESHOLDS["difference"]
     reason = "below_fresh_agents" if below else "as_fresh_agents"
-    return Decision(reason, evidence, ("difference",), 1.0 - alone / max(own, 1e-12))
+    return Decision(reason, evidence, 1.0 - alone / max(own, _TINY))
 
 
-_network = partial(_why, network_unknown="cannot tell", one_visit="cannot tell")
+_network = partial(_why, unclear="network_unknown one_visit")
 
 
-def _change(case: StreamCase, quantity: str) -> dict[str, Any]:
-    """A quantity of the last network, and of fresh agents' or the first visit's to compare it with.
-
-    Without a network, or without another one, it is only the reason why.
-    """
+def _compared(
+    case: StreamCase, quantity: str, reason_of: Callable[[float, float], str]
+) -> Decision:
+    """The last network's quantity, compared with fresh agents' or with the first visit's."""
     first, last = case.visits[0].network, case.visits[-1].network
     if first is None or last is None:
-        return {"reason": "network_unknown"}
-    if alone := case.fresh("network"):
-        against, others = "fresh_agents", alone
-    elif len(case.visits) > 1:
-        against, others = "first_visit", [first]
-    else:
-        return {"reason": "one_visit"}
-    return {
+        return Decision("network_unknown", {})
+    alone = case.fresh("network")
+    if not alone and len(case.visits) == 1:
+        return Decision("one_visit", {})
+    value = getattr(last, quantity)
+    other = float(np.mean([getattr(network, quantity) for network in alone or [first]]))
+    evidence = {
         "first": getattr(first, quantity),
-        "last": getattr(last, quantity),
-        "other": float(np.mean([getattr(network, quantity) for network in others])),
-        "against": against,
+        "last": value,
+        "other": other,
+        "against": "fresh_agents" if alone else "first_visit",
+        "units": last.hidden[-1],
+        **last.model_dump(include={"dormant_units", "saturated_units"}),
     }
+    return Decision(reason_of(value, other), evidence)
 
 
-@_network(units_became_inactive="yes", inactive_from_the_start="yes", units_active="no")
+@_network(
+    yes="units_became_inactive inactive_from_the_start",
+    no="units_active",
+    thresholds="inactive_rise inactive_share",
+)
 def _dormant_units(case: StreamCase) -> Decision:
     """Whether hidden units stopped responding to the state."""
-    change, network = _change(case, "inactive_units"), case.visits[-1].network
-    if network is None or "reason" in change:
-        return Decision(change["reason"], {})
-    evidence = change | network.model_dump(include={"dormant_units", "saturated_units"})
-    if change["last"] - change["other"] >= _T["inactive_rise"]:
-        return Decision("units_became_inactive", evidence, ("inactive_rise",))
-    many = min(change["last"], change["other"]) >= _T["inactive_share"]
-    reason = "inactive_from_the_start" if many else "units_active"
-    return Decision(reason, evidence, ("inactive_rise", "inactive_share"))
+
+    def reason_of(value: float, other: float) -> str:
+        if value - other >= THRESHOLDS["inactive_rise"]:
+            return "units_became_inactive"
+        many = min(value, other) >= THRESHOLDS["inactive_share"]
+        return "inactive_from_the_start" if many else "units_active"
+
+    return _compared(case, "inactive_units", reason_of)
 
 
-@_network(rank_collapsed="yes", rank_kept="no")
+@_network(yes="rank_collapsed", no="rank_kept", thresholds="rank_ratio")
 def _rank_collapse(case: StreamCase) -> Decision:
     """Whether the last hidden layer represents fewer directions."""
-    change, network = _change(case, "effective_rank"), case.visits[-1].network
-    if network is None or "reason" in change:
-        return Decision(change["reason"], {})
-    collapsed = change["last"] <= _T["rank_ratio"] * change["other"]
-    evidence = change | {"units": network.hidden[-1]}
-    return Decision("rank_collapsed" if collapsed else "rank_kept", evidence, ("rank_ratio",))
+
+    def reason_of(value: float, other: float) -> str:
+        return "rank_collapsed" if value <= THRESHOLDS["rank_ratio"] * other else "rank_kept"
+
+    return _compared(case, "effective_rank", reason_of)
 
 
-@_network(weights_grew="yes", weights_steady="no")
+@_network(yes="weights_grew", no="weights_steady", thresholds="weight_ratio")
 def _weight_growth(case: StreamCase) -> Decision:
     """Whether weights became so large that steps of the optimiser change little."""
-    change = _change(case, "weight_norm")
-    if "reason" in change:
-        return Decision(change["reason"], {})
-    grew = change["last"] >= _T["weight_ratio"] * change["other"]
-    return Decision("weights_grew" if grew else "weights_steady", change, ("weight_ratio",))
+
+    def reason_of(value: float, other: float) -> str:
+        return "weights_grew" if value >= THRESHOLDS["weight_ratio"] * other else "weights_steady"
+
+    return _compared(case, "weight_norm", reason_of)
 
 
 _MOST_STATES = 2048  # in which networks are measured; more would not change the numbers
@@ -414,7 +374,7 @@ def diagnose_stream(
     agent, regret = life.region("WD").agent, life.dynamic_regret
     report(f"{subject.name}: networks")
     spec = life.stream.phases[0].spec
-    drawn = measure.draw(spec, min(states, _MOST_STATES, regions.batch_rows(spec)), seed)
+    drawn = measure.states_of(spec, min(states, _MOST_STATES, regions.batch_rows(spec)), seed)
     observation = drawn.observation(drawn.s, spec.horizon)
     visits = tuple(_visits(subject, observation))
     phases = tuple(_phases(subject, observation))
@@ -424,11 +384,10 @@ def diagnose_stream(
         average_performance=agent.average_performance[-1],
         forgetting=agent.forgetting[-1],
         dynamic_regret=None if regret is None else regret.dynamic_regret,
-        verdicts=answer_all(STREAM_QUESTIONS, case, STREAM_THRESHOLDS),
+        verdicts=answer_all(STREAM_QUESTIONS, case),
         visits=visits,
         phases=phases,
         initial_network=_state(subject.initial_network, observation, life.stream, 0),
-        thresholds=STREAM_THRESHOLDS,
     )
 
 

@@ -11,7 +11,7 @@ of their own.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
@@ -37,15 +37,16 @@ from sme_registry.export.networks import of_offline_policy
 from sme_registry.io import read_json
 from sme_registry.plots.maps import STREAM
 from sme_registry.spec import SMESpec, StreamSpec
+from sme_registry.spec.document import check_digest
 from sme_registry.spec.study import Cell, in_jax, parse_uses
 from sme_registry.training import RunRecord
 from sme_registry.training import record as run_files
 from sme_registry.training.algorithms import find, parameters_of
 from sme_registry.training.numpy_policy import numpy_policy
-from sme_registry.training.record import CHECKPOINT, MODEL
+from sme_registry.training.record import CHECKPOINT
 
 _MIN_DIGITS = 6
-Networks = tuple[Perceptron | None, ...]  # None: of an unknown kind
+Networks = tuple[Perceptron | None, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +79,8 @@ class StreamSubject:
     name: str  # of the run
     report: StreamReport  # with the dynamic regret and fresh agents where these are known
     plan: dict[str, JsonValue] = field(default_factory=dict)
-    networks: Networks | None = None  # at the end of each visit; None if they are unknown
+    # None: of an unknown kind, or not kept
+    networks: Networks | None = None  # at the end of each visit
     initial_network: Perceptron | None = None  # before training
     fresh_networks: Networks | None = None  # of the fresh agent of each phase
     updates: int | None = None
@@ -152,7 +154,9 @@ def load_run(folder: str | Path) -> AnySubject:
     if record.stream is not None:
         kept = run_files.Snapshots(folder / run_files.SNAPSHOTS, record.stream)
         report = _report_of_life(folder, record, kept)
-        return _life(name, report, kept, record.action_range, plan, updates)
+        return StreamSubject(
+            name, report, plan, *_networks(kept, record.stream, record.action_range), None, updates
+        )
     path, checkpoint_step = _model_of_run(folder, record)
     log = folder / run_files.EPISODES
     return _subject(
@@ -196,11 +200,15 @@ def load_cell(study: str | Path, key: str) -> AnySubject:
     updates = _updates(cell.uses, cell.hyperparameters, cell.steps)
     if cell.stream is not None:
         kept = run_files.Snapshots(run_files.folder_of_cell(study, path.stem), cell.stream)
-        fresh = _fresh_networks(study, cell)
-        report = _report(result, path)
-        assert isinstance(report, StreamReport)  # of a life
-        report = _with_fresh(report, cell, path)
-        return _life(name, report, kept, cell.action_range, plan, updates, fresh)
+        report = _with_fresh(_report(result, path), cell, path)
+        visits, initial = _networks(kept, cell.stream, cell.action_range)
+        fresh = tuple(
+            _network(
+                run_files.model_of_cell(study, alone.digest), alone.document, cell.action_range
+            )
+            for alone in cell.fresh
+        )
+        return StreamSubject(name, report, plan, visits, initial, fresh, updates)
     return _subject(
         name,
         _model_of_cell(study, path.stem, cell),
@@ -247,62 +255,32 @@ def _subject(
     return Subject(name or policy.name, spec, policy, explore=explore, **known)
 
 
-def _life(
-    name: str,
-    report: StreamReport,
-    kept: run_files.Snapshots,
-    action_range: str,
-    plan: dict[str, Any],
-    updates: int | None,
-    fresh: Networks | None = None,
-) -> StreamSubject:
-    """A life with the networks that were kept of it."""
-    networks = _networks(kept.visits, report.stream, action_range)
-    initial = _networks([kept.initial], report.stream, action_range)
-    before = None if initial is None else initial[0]
-    return StreamSubject(name, report, plan, networks, before, fresh, updates)
-
-
 def _networks(
-    paths: Sequence[Path], document: SMESpec | StreamSpec, action_range: str
-) -> Networks | None:
-    """The networks of models; None if one of them was not kept."""
-    if not all(path.exists() for path in paths):
+    kept: run_files.Snapshots, stream: StreamSpec, action_range: str
+) -> tuple[Networks, Perceptron | None]:
+    """The networks at the ends of a life's visits, and the one before training."""
+    visits = tuple(_network(path, stream, action_range) for path in kept.visits)
+    return visits, _network(kept.initial, stream, action_range)
+
+
+def _network(path: Path, document: SMESpec | StreamSpec, action_range: str) -> Perceptron | None:
+    """The network of a model; None if it was not kept or is of another kind."""
+    if not path.exists():
         return None
-    models = map(load_sb3, paths)
-    return tuple(
-        perceptron_of(numpy_policy(model, document, action_range=action_range)) for model in models
-    )
-
-
-def _fresh_networks(study: Path, cell: Cell) -> Networks | None:
-    """The network of the fresh agent of each phase; None if one of them was not kept."""
-    networks = [
-        _networks([run_files.model_of_cell(study, fresh.digest)], fresh.document, cell.action_range)
-        for fresh in cell.fresh
-    ]
-    known = [network for network in networks if network is not None]
-    return tuple(network for (network,) in known) if 0 < len(known) == len(networks) else None
+    return perceptron_of(numpy_policy(load_sb3(path), document, action_range=action_range))
 
 
 def _model_of_run(folder: Path, record: RunRecord) -> tuple[Path, int | None]:
     """The model of a run; of an unfinished run its checkpoint, and the steps at it."""
-    path = folder / record.model_name
-    if path.exists():
-        return path, None
-    if record.independent or in_jax(record.algorithm):
-        agents = "independent agents" if record.independent else "agents in JAX"
-        raise OptionError(
-            f"run={str(folder)!r}: {agents} are diagnosed when their training has ended. Continue "
-            "it with `sme train … --resume`."
-        )
-    path = folder / CHECKPOINT
-    if not path.exists():
-        raise OptionError(
-            f"run={str(folder)!r}: has neither {MODEL} nor {CHECKPOINT} yet. Wait for its "
-            "first checkpoint, or continue it with `sme train … --resume`."
-        )
-    return path, record.steps_done
+    model, checkpoint = folder / record.model_name, folder / CHECKPOINT
+    if model.exists():
+        return model, None
+    if checkpoint.exists() and not record.independent and not in_jax(record.algorithm):
+        return checkpoint, record.steps_done
+    raise OptionError(
+        f"run={str(folder)!r}: has neither {record.model_name} nor a {CHECKPOINT} that can be "
+        "diagnosed. Wait for it, or continue the run with `sme train … --resume`."
+    )
 
 
 def _model_of_cell(study: Path, stem: str, cell: Cell) -> Any:
@@ -333,16 +311,14 @@ def _report_of_life(folder: Path, record: RunRecord, kept: run_files.Snapshots) 
             "folder of the run, or train it again with --force."
         )
     report = StreamReport.read(path)
-    if report.stream_digest != record.stream_digest:
-        raise OptionError(
-            f"{path}: is about the stream {report.stream_digest[:19]}…, but run.json is about "
-            f"{str(record.stream_digest)[:19]}…. Train the run again with --force."
-        )
+    advice = "Train the run again with --force."
+    check_digest(str(record.stream_digest), report.stream, f"{path}: stream of run.json", advice)
     return report
 
 
-def _with_fresh(report: StreamReport, cell: Cell, path: Path) -> StreamReport:
+def _with_fresh(report: Any, cell: Cell, path: Path) -> StreamReport:
     """The report of a cell's life, with the fresh agents of its phases once all have finished."""
+    assert isinstance(report, StreamReport)
     paths = [path.with_stem(fresh.digest.removeprefix("sha256:")) for fresh in cell.fresh]
     if not paths or not all(other.exists() for other in paths):
         return report

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from pydantic import JsonValue
 
 from sme_registry.diagnosis import behaviour, measure
-from sme_registry.diagnosis.document import Diagnosis, Level, Part, Verdict, label, table, words
+from sme_registry.diagnosis.document import Diagnosis, Level, Part, table
 from sme_registry.diagnosis.measurements import (
     LINEAR,
     POLICY,
@@ -17,20 +17,19 @@ from sme_registry.diagnosis.measurements import (
     Violations,
 )
 from sme_registry.diagnosis.questions import (
-    SAFETY_THRESHOLDS,
     THRESHOLDS,
     Comparison,
     Difference,
     TaskCase,
+    Verdict,
     answer_all,
+    label,
 )
+from sme_registry.diagnosis.rules import WHERE, WHY
 from sme_registry.diagnosis.subject import Subject, perceptron_of
-from sme_registry.diagnosis.where import WHERE
-from sme_registry.diagnosis.why import WHY
 from sme_registry.evaluation import Policy, evaluate
 from sme_registry.evaluation.references import LABELS
 from sme_registry.evaluation.report import SAFETY_REFERENCES
-from sme_registry.io.markup import fixed, percent, signed
 from sme_registry.spec import Digest, EvaluationProtocol, SMESpec
 from sme_registry.task import Task, materialize
 
@@ -48,6 +47,7 @@ class TaskDiagnosis(Diagnosis):
       measurements: what the verdicts rest on.
     """
 
+    headline_macro: ClassVar[str] = "task_headline"
     only_field: ClassVar[str] = "measurements"
 
     spec: SMESpec
@@ -68,14 +68,11 @@ class TaskDiagnosis(Diagnosis):
 
 
 def _tables_of(comparison: Comparison) -> Iterator[Part]:
-    columns: dict[str, Callable[[Difference], str]] = {
-        "quantity": lambda row: label(row.quantity),
-        "this run": lambda row: fixed(row.value, 3),
-        "other run": lambda row: fixed(row.other, 3),
-        "difference": lambda row: signed(row.value - row.other, 3),
-    }
-    notes = (words("task.jinja", "comparison", comparison),)
-    yield table("Compared with another run", comparison.differences, columns, notes, detail=False)
+    pairs = {**comparison.spec_fields, **comparison.plan_fields}
+    fields = [f"{name} ({value}, there {other})" for name, (value, other) in pairs.items()]
+    note = f"Compared with {comparison.name}. Fields that differ: {', '.join(fields) or 'none'}."
+    rows = {label(row.quantity): row for row in comparison.differences}
+    yield table("Compared with another run", "quantity", rows, "value other difference", note)
     if comparison.answers:
         answers = [(label(question), *pair) for question, pair in comparison.answers.items()]
         yield Part("Answers that differ", ("question", "this run", "other run"), answers)
@@ -83,58 +80,27 @@ def _tables_of(comparison: Comparison) -> Iterator[Part]:
 
 def _numbers(measured: Measurements) -> Iterator[Part]:
     """Tables of the references, the action channels, and of limits, distractors and layers."""
-    visited = {**measured.uniform, **measured.on_policy.scores}
-    yield table(
-        "Compared with the references",
-        measured.uniform,
-        {
-            "policy": lambda name: _NAMES[name],
-            "regret": lambda name: fixed(measured.uniform[name].regret, 3),
-            "N": lambda name: fixed(measured.uniform[name].normalised_regret, 3),
-            "regret, own episodes": lambda name: fixed(visited[name].regret, 3),
-            "N, own episodes": lambda name: fixed(visited[name].normalised_regret, 3),
-        },
-    )
-    yield table(
-        "Action channels",
-        measured.channels,
-        {
-            "channel": lambda c: str(c.channel),
-            "mae": lambda c: fixed(c.mae, 3),
-            "N": lambda c: fixed(c.normalised_regret, 3),
-            "linear N": lambda c: fixed(c.linear_normalised_regret, 3),
-            "regret": lambda c: fixed(c.regret, 3),
-            "offset": lambda c: signed(c.offset, 3),
-            "slope": lambda c: fixed(c.slope),
-            "at 0": lambda c: percent(c.at_zero, 1),
-            "at 1": lambda c: percent(c.at_one, 1),
-        },
-    )
+    for heading, scores in (
+        ("References, uniform states", measured.uniform),
+        ("References, own episodes", measured.on_policy.scores),
+    ):
+        rows: dict[str, Any] = {_NAMES[name]: score for name, score in scores.items()}
+        yield table(heading, "policy", rows, "regret mae normalised_regret", detail=True)
+    rows = {str(channel.channel): channel for channel in measured.channels}
+    fields = "mae normalised_regret linear_normalised_regret regret offset slope at_zero at_one"
+    yield table("Action channels", "channel", rows, fields, detail=True)
     if measured.limits is not None:
         yield from _limits(measured.limits)
     distraction, observation = measured.distraction, measured.observation
+    if distraction is not None:
+        fields = "normalised_regret averaged_regret half_regret owed_regret distractor_share"
+        yield table("Distractors", "states", {"uniform": distraction}, fields, detail=True)
     if distraction is not None and observation is not None:
-        regrets = {
-            "uniform": distraction.normalised_regret,
-            "actions averaged over them": distraction.averaged_regret,
-            "all at ½": distraction.half_regret,
-            **{r.name: r.normalised_regret for r in observation.distractor_regions},
-        }
-        rows = [(name, fixed(regret, 3)) for name, regret in regrets.items()]
-        yield Part("Distractors", ("distractors", "normalised regret"), rows, detail=True)
+        rows = {region.name: region for region in observation.distractor_regions}
+        yield table("Distractors by region", "region", rows, "mae normalised_regret", detail=True)
     if observation is not None and observation.probes:
-        yield table(
-            "Layers",
-            observation.probes,
-            {
-                "layer": lambda p: str(p.layer or "observation"),
-                "units": lambda p: str(p.units),
-                "R² of the state": lambda p: fixed(p.state_r2),
-                "R² of the distractors": lambda p: (
-                    "" if p.distractor_r2 is None else fixed(p.distractor_r2)
-                ),
-            },
-        )
+        rows = {str(probe.layer or "observation"): probe for probe in observation.probes}
+        yield table("Layers", "layer", rows, "units state_r2 distractor_r2", detail=True)
 
 
 _NAMES = {POLICY: "this policy", **LABELS}
@@ -149,27 +115,11 @@ def _limits(limits: Violations) -> Iterator[Part]:
         "this policy, states that it visits": limits.visited,
         **{f"this policy, {region.name}": region for region in report.regions[1:]},
     }
-    yield table(
-        "Limits: reward and cost",
-        scores,
-        {
-            "policy": lambda name: name,
-            "step reward": lambda name: fixed(scores[name].step_reward, 3),
-            "cost": lambda name: fixed(scores[name].cost, 3),
-            "violating share": lambda name: percent(scores[name].violating_share, 1),
-            "safe regret": lambda name: fixed(scores[name].safe_regret, 3),
-        },
-    )
-    yield table(
-        "Limits by action channel",
-        limits.channels,
-        {
-            "channel": lambda c: str(c.channel),
-            "violating share": lambda c: percent(c.violating_share, 1),
-            "the optimum's": lambda c: percent(c.optimal_violating_share, 1),
-            "cost": lambda c: fixed(c.cost, 3),
-        },
-    )
+    fields = "step_reward cost violating_share safe_regret"
+    yield table("Limits: reward and cost", "policy", scores, fields, detail=True)
+    channels = {str(channel.channel): channel for channel in limits.channels}
+    fields = "violating_share optimal_violating_share cost"
+    yield table("Limits by action channel", "channel", channels, fields, detail=True)
 
 
 def diagnose_task(
@@ -196,7 +146,6 @@ def diagnose_task(
         level=level(measured),
         verdicts=judge(measured, subject.spec, comparison, subject.updates),
         comparison=comparison,
-        thresholds=thresholds_of(subject.spec),
         measurements=measured,
     )
 
@@ -214,12 +163,7 @@ def judge(
         if not question.needs or getattr(measured, question.needs) is not None
     }
     case = TaskCase(measured, spec, comparison=comparison, updates=updates)
-    return answer_all(asked, case, thresholds_of(spec))
-
-
-def thresholds_of(spec: SMESpec) -> dict[str, float]:
-    """All thresholds that verdicts on a task can use."""
-    return THRESHOLDS if spec.is_plain else {**THRESHOLDS, **SAFETY_THRESHOLDS}
+    return answer_all(asked, case)
 
 
 def level(measurements: Measurements) -> Level:

@@ -23,25 +23,25 @@ import numpy as np
 
 from sme_registry.compiled.arrays import Observation
 from sme_registry.diagnosis import behaviour, measure
-from sme_registry.diagnosis.document import Diagnosis, Level, Part, Verdict, table, words
+from sme_registry.diagnosis.document import Diagnosis, Level, Part, cell
 from sme_registry.diagnosis.measurements import LINEAR, POLICY, Measurements, Score
 from sme_registry.diagnosis.questions import (
-    OPEN_REASONS,
     THRESHOLDS,
     Case,
     Decision,
     Question,
     TaskCase,
+    Verdict,
     add_to,
     answer_all,
+    words,
 )
+from sme_registry.diagnosis.rules import WHERE, WHY
 from sme_registry.diagnosis.subject import Subject
-from sme_registry.diagnosis.task import TaskDiagnosis, level, thresholds_of
-from sme_registry.diagnosis.where import WHERE
-from sme_registry.diagnosis.why import WHY
+from sme_registry.diagnosis.task import level
 from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.evaluation import Policy, TeamPolicy
-from sme_registry.io.markup import fixed, percent
+from sme_registry.io.markup import percent
 from sme_registry.spec import Digest, Integer, Real, SMESpec, StrictModel, TupleOf
 from sme_registry.task import Task, materialize
 from sme_registry.task.draw import Array
@@ -91,7 +91,7 @@ class TeamDiagnosis(Diagnosis):
       left_out: questions of a single agent's diagnosis without an answer for a team.
     """
 
-    template: ClassVar[str] = "team.jinja"
+    headline_macro: ClassVar[str] = "team_headline"
     only_field: ClassVar[str] = "agents"
 
     spec: SMESpec
@@ -114,43 +114,36 @@ class TeamDiagnosis(Diagnosis):
         yield self.findings("Who is to blame", self.verdicts)
         yield self._agents()
         for agent in self.agents:
-            where = self.findings("", agent.verdicts, TaskDiagnosis.template)
+            where = self.findings("", agent.verdicts)
             heading = f"Where the error of {agent.name} is"
             yield where._replace(heading=heading, detail=not where.rows)
         yield from self.answers(self.verdicts)
         for agent in self.agents:
-            yield from self.answers(agent.verdicts, f": {agent.name}", TaskDiagnosis.template)
+            yield from self.answers(agent.verdicts, f": {agent.name}")
 
     def _agents(self) -> Part:
         regret = max(self.visited.regret, _LEAST_REGRET)
-        columns: dict[str, Callable[[AgentDiagnosis], str]] = {
-            "agent": lambda agent: agent.name,
-            "share of regret": lambda agent: percent(agent.visited.regret_share / regret),
-            "of channels": lambda agent: percent(len(agent.action_channels) / self.spec.action_dim),
-            "N, uniform": lambda agent: fixed(agent.measurements.policy.normalised_regret, 3),
-            "N, own episodes": lambda agent: fixed(agent.visited_regret, 3),
-            "N, linear": lambda agent: fixed(agent.linear_regret, 3),
-            "gain if optimal": lambda agent: fixed(agent.visited.difference_reward, 3),
-        }
-        left_out = words(self.template, "left_out", self.left_out)
-        return table("Agents", self.agents, columns, (_LEGEND, left_out), detail=False)
+        columns = ("agent", "share of regret", "of channels", "N, uniform", "N, own episodes")
+        rows = [
+            (
+                agent.name,
+                percent(agent.visited.regret_share / regret),
+                percent(len(agent.action_channels) / self.spec.action_dim),
+                cell(agent.measurements.policy.normalised_regret),
+                cell(agent.visited_regret),
+                cell(agent.linear_regret),
+                cell(agent.visited.difference_reward),
+            )
+            for agent in self.agents
+        ]
+        notes = (_LEGEND, words("left_out", self.left_out))
+        return Part("Agents", (*columns, "N, linear", "gain if optimal"), rows, notes)
 
 
 _LEGEND = (
     "N: normalised regret over the agent's channels · gain if optimal: of the team's step reward, "
     "if this agent alone acted optimally · the shares add up to the team's regret in its episodes"
 )
-
-TEAM_THRESHOLDS = {
-    **{
-        name: THRESHOLDS[name]
-        for name in ("solved", "difference", "on_policy_ratio", *OPEN_REASONS)
-    },
-    "blame_ratio": 1.5,  # of an agent's share of the regret to its share of the channels
-    "one_suffices": 0.5,  # share of the team's regret that correcting one agent removes, at least
-    "termination_rate": 0.5,  # share of episodes that one agent ends, at least
-}
-_T = TEAM_THRESHOLDS
 
 
 @dataclass(frozen=True)
@@ -168,7 +161,7 @@ class TeamCase(Case):
 
     @property
     def solved(self) -> bool:
-        return self.learnt <= _T["solved"]
+        return self.learnt <= THRESHOLDS["solved"]
 
     @property
     def best(self) -> AgentDiagnosis:
@@ -191,7 +184,7 @@ TEAM_QUESTIONS: dict[str, Question[TeamCase]] = {}
 _question = partial(add_to, TEAM_QUESTIONS, "who")
 
 
-@_question(some_agents_to_blame="yes", spread_over_agents="no", solved="no")
+@_question(yes="some_agents_to_blame", no="spread_over_agents solved", thresholds="blame_ratio")
 def _blame(case: TeamCase) -> Decision:
     total = max(case.visited.regret, _LEAST_REGRET)
     agents: list[dict[str, Any]] = [
@@ -203,39 +196,44 @@ def _blame(case: TeamCase) -> Decision:
         }
         for agent in case.agents
     ]
-    blamed = [a for a in agents if a["regret_share"] >= _T["blame_ratio"] * a["channel_share"]]
+    blamed = [
+        a for a in agents if a["regret_share"] >= THRESHOLDS["blame_ratio"] * a["channel_share"]
+    ]
     return Decision(
         "solved" if case.solved else bool(blamed),
         {"agents": agents, "blamed": blamed, "regret": case.visited.regret},
-        ("blame_ratio",),
         sum(a["regret_share"] for a in blamed),
     )
 
 
-@_question(agents_differ="yes", agents_alike="no")
+@_question(yes="agents_differ", no="agents_alike", thresholds="difference")
 def _unequal_agents(case: TeamCase) -> Decision:
     best, worst = case.best, case.worst
     return Decision(
-        case.gap >= _T["difference"],
+        case.gap >= THRESHOLDS["difference"],
         {
             "best": best.name,
             "worst": worst.name,
             "lowest": best.visited_regret,
             "highest": worst.visited_regret,
         },
-        ("difference",),
     )
 
 
-@_question(is_cause=True, optimum_harder="yes", optimum_not_harder="no", agents_alike="no")
+@_question(
+    yes="optimum_harder",
+    no="optimum_not_harder agents_alike",
+    thresholds="difference",
+    is_cause=True,
+)
 def _harder_optimum(case: TeamCase) -> Decision:
     """Whether the worst agent's π* is harder: further from what a linear policy attains."""
     worst = case.worst
     regrets = [agent.linear_regret for agent in case.agents if agent is not worst]
     other = sum(regrets) / len(regrets) if regrets else 1.0
-    harder = worst.linear_regret - other >= _T["difference"]
+    harder = worst.linear_regret - other >= THRESHOLDS["difference"]
     return Decision(
-        "agents_alike" if case.gap < _T["difference"] else harder,
+        "agents_alike" if case.gap < THRESHOLDS["difference"] else harder,
         {
             "agent": worst.name,
             "normalised_regret": worst.measurements.policy.normalised_regret,
@@ -243,38 +241,46 @@ def _harder_optimum(case: TeamCase) -> Decision:
             "others_linear_normalised_regret": other,
             "nonlinear_variance": worst.measurements.response.nonlinear_variance,
         },
-        ("difference",),
     )
 
 
-@_question(worse_where_visited="yes", not_worse_where_visited="no", solved="no")
+@_question(
+    yes="worse_where_visited",
+    no="not_worse_where_visited solved",
+    thresholds="on_policy_ratio difference",
+)
 def _visited_states(case: TeamCase) -> Decision:
     """Whether the worst agent fails in the states that the team visits rather than everywhere."""
     worst = case.worst
     visited, uniform = worst.visited_regret, worst.measurements.policy.normalised_regret
-    worse = visited >= _T["on_policy_ratio"] * uniform and visited - uniform >= _T["difference"]
+    worse = (
+        visited >= THRESHOLDS["on_policy_ratio"] * uniform
+        and visited - uniform >= THRESHOLDS["difference"]
+    )
     return Decision(
         "solved" if case.solved else worse,
         {"agent": worst.name, "visited": visited, "uniform": uniform},
-        ("on_policy_ratio", "difference"),
     )
 
 
-@_question(one_agent_suffices="yes", several_must_improve="no", solved="no")
+@_question(yes="one_agent_suffices", no="several_must_improve solved", thresholds="one_suffices")
 def _one_correction(case: TeamCase) -> Decision:
     """Whether correcting one agent would remove most of the team's regret."""
     best = max(case.agents, key=lambda agent: agent.visited.difference_reward)
     gain, regret = best.visited.difference_reward, case.visited.regret
-    suffices = gain >= _T["one_suffices"] * regret
+    suffices = gain >= THRESHOLDS["one_suffices"] * regret
     return Decision(
         "solved" if case.solved else suffices,
         {"agent": best.name, "difference_reward": gain, "regret": regret},
-        ("one_suffices",),
         gain / max(regret, _LEAST_REGRET),
     )
 
 
-@_question(one_agent_ends_episodes="yes", no_agent_stands_out="no", no_survival_threshold="no")
+@_question(
+    yes="one_agent_ends_episodes",
+    no="no_agent_stands_out no_survival_threshold",
+    thresholds="termination_rate",
+)
 def _ended_episodes(case: TeamCase) -> Decision:
     """Whether the threshold D ends episodes for all because of one agent."""
     if case.spec.D == 0:
@@ -284,9 +290,8 @@ def _ended_episodes(case: TeamCase) -> Decision:
     first, *rest = shares.values()
     alone = not rest or rest[0] <= first / 2
     return Decision(
-        first >= _T["termination_rate"] and alone,
+        first >= THRESHOLDS["termination_rate"] and alone,
         {"D": case.spec.D, "agent": next(iter(shares)), "shares": shares},
-        ("termination_rate",),
     )
 
 
@@ -300,11 +305,11 @@ def diagnose_team(
     references = measure.fit_references(task, states, seed)
     runs = behaviour.episodes_of(policy.start(), task, references, episodes, seed)
     first = runs[0][POLICY]
-    drawn = measure.draw(task.spec, measure.affordable(task, states), seed)
+    drawn = measure.states_of(task.spec, measure.affordable(task, states), seed)
     actions = np.clip(policy(drawn.observation(drawn.s, task.spec.horizon)), 0.0, 1.0)
     uniform, uniform_credit = _team_in(task, drawn.s.astype(np.float64), actions)
     visited, visited_credit = _team_in(task, first.s[first.alive], first.a[first.alive])
-    questions, thresholds = _questions(task.spec), thresholds_of(task.spec)
+    questions = _questions(task.spec)
     agents = []
     for index, name in enumerate(task.names):
         report(f"{subject.name}: {name}")
@@ -321,7 +326,7 @@ def diagnose_team(
                 level=level(measured),
                 uniform=uniform_credit[index],
                 visited=visited_credit[index],
-                verdicts=answer_all(questions, case, thresholds),
+                verdicts=answer_all(questions, case),
                 measurements=measured,
             )
         )
@@ -330,10 +335,9 @@ def diagnose_team(
         subject,
         uniform=uniform,
         visited=visited,
-        verdicts=answer_all(TEAM_QUESTIONS, team, TEAM_THRESHOLDS),
+        verdicts=answer_all(TEAM_QUESTIONS, team),
         agents=tuple(agents),
         left_out=tuple(name for name in WHY if name not in questions and not WHY[name].needs),
-        thresholds=TEAM_THRESHOLDS,
     )
 
 

@@ -9,7 +9,7 @@ from sme_registry import evaluate
 from sme_registry.diagnosis import Diagnosis, behaviour, diagnose, load_policy
 from sme_registry.diagnosis.figures import draw
 from sme_registry.diagnosis.measurements import POLICY
-from sme_registry.diagnosis.questions import SAFETY_THRESHOLDS, THRESHOLDS
+from sme_registry.diagnosis.questions import THRESHOLDS
 from sme_registry.evaluation.references import reference_policy
 from tests.diagnosis.policies import (
     EXTENDED,
@@ -214,8 +214,12 @@ def test_policies_and_references_see_the_state_behind_a_mixing(name):
 
 def test_plain_tasks_and_mixings_alone_are_asked_nothing_of_limits_and_distractors():
     plain = diagnosis_of(shrunk)
-    assert not set(SAFETY_THRESHOLDS) & set(plain.thresholds)
-    assert plain.thresholds == THRESHOLDS
+    limited = diagnosis_of(shrunk, EXTENDED).thresholds
+    assert set(limited) - set(plain.thresholds) == {
+        "rarely_violating", "gain", "price_share", "distractor_loss", "kept_r2",
+        "owed_to_distractors", "invariant",
+    }  # fmt: skip
+    assert THRESHOLDS.items() >= limited.items() >= plain.thresholds.items()
     assert not {"limits", "observation", "distraction"} & set(plain.to_dict()["measurements"])
     mixed = diagnosis_of("linear", SPEC.derive(observation={"mixing": "orthogonal"}))
     assert mixed.measurements.distraction is None

@@ -8,9 +8,8 @@ from jinja2 import UndefinedError
 
 from sme_registry import SMESpec
 from sme_registry.diagnosis import Diagnosis, TaskDiagnosis, diagnose, load_policy, questions
-from sme_registry.diagnosis.document import label
 from sme_registry.diagnosis.measurements import CapacityProbe, Measurements, TrainingSummary
-from sme_registry.diagnosis.questions import Comparison, Difference
+from sme_registry.diagnosis.questions import Comparison, Difference, label
 from sme_registry.diagnosis.task import TASK_QUESTIONS, judge
 from tests.diagnosis.policies import (
     EXTENDED,
@@ -183,11 +182,15 @@ def test_a_diagnosis_of_schema_1_is_read(compared):
         del old[field]
     for verdict in old["verdicts"]:
         del verdict["error_share"]
+        verdict["thresholds"] = {}  # older rules named fewer
     read = Diagnosis.from_dict({**old, "schema_version": 1}, "old")
     assert isinstance(read, TaskDiagnosis)
     assert read.comparison == compared.comparison
     assert (read.schema_version, read.updates) == (2, None)
     assert [verdict.answer for verdict in read.verdicts] == [v.answer for v in compared.verdicts]
+    assert all(
+        v.sentence().replace("|", r"\|") in markdown(read, details=True) for v in read.verdicts
+    )
 
 
 @pytest.mark.parametrize(("updates", "answer"), [(None, "yes"), (19, "cannot tell"), (20, "yes")])

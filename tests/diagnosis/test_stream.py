@@ -21,7 +21,6 @@ from sme_registry.diagnosis.measurements import NetworkState, PhaseDiagnosis, Vi
 from sme_registry.diagnosis.questions import OPEN_REASONS, answer_all
 from sme_registry.diagnosis.stream import (
     STREAM_QUESTIONS,
-    STREAM_THRESHOLDS,
     StreamCase,
     outcome_of,
 )
@@ -155,7 +154,7 @@ def test_fresh_agents_say_whether_the_life_or_the_task_is_the_cause_of_a_failure
     found = diagnosis_of(report_of(policies, stream, fresh=fresh))
     verdict = found.verdict("failure to learn")
     assert verdict.reason == reason
-    assert verdict.sentence("stream.jinja")
+    assert verdict.sentence()
     if fresh == [HALF, HALF]:
         assert found.verdict("loss of plasticity").reason == "fresh_agents_learnt_little"
 
@@ -179,7 +178,7 @@ def test_a_failure_that_is_hardly_worse_than_a_fresh_agent_s_is_not_blamed_on_th
     visits = [visit_of(v, v, regret) for v, regret in enumerate((0.5, 0.93))]
     phases = [phase_of(j, 0.5, 0.5, fresh) for j, fresh in enumerate((0.5, 0.89))]
     case = StreamCase(TWO, visits, phases, None)
-    verdicts = answer_all(STREAM_QUESTIONS, case, STREAM_THRESHOLDS)
+    verdicts = answer_all(STREAM_QUESTIONS, case)
     reasons = {verdict.question: verdict.reason for verdict in verdicts}
     assert reasons["failure_to_learn"] == "failed_as_fresh_agents"
 
@@ -194,7 +193,7 @@ def test_forgetting_of_a_phase_that_was_never_learnt_is_said_to_be_that():
     assert found.forgetting > 0.0
     assert answer(found, "forgetting") == ("no", "phases_retained")
     assert "(mean over earlier phases, learnt or not)" in found.headline()
-    assert "earlier phases, learnt or not" in found.verdict("forgetting").sentence("stream.jinja")
+    assert "earlier phases, learnt or not" in found.verdict("forgetting").sentence()
 
 
 def test_the_visit_whose_regret_stands_out_is_named():
@@ -306,11 +305,11 @@ def random_case(generator):
 def test_every_reason_is_reached_and_has_a_sentence():
     generator, reached = random.Random(0), set()
     for _ in range(300):
-        for verdict in answer_all(STREAM_QUESTIONS, random_case(generator), STREAM_THRESHOLDS):
+        for verdict in answer_all(STREAM_QUESTIONS, random_case(generator)):
             reason = verdict.evidence.get("own_reason", verdict.reason)
             reached.add((verdict.question, reason))
             assert (reason != verdict.reason) == (verdict.reason in OPEN_REASONS)
-            text = verdict.sentence("stream.jinja")
+            text = verdict.sentence()
             assert text.endswith("."), text
             assert not any(bad in text for bad in ("None", " ,", " .", " ;", "( ", "..")), text
     declared = {(name, each) for name, rule in STREAM_QUESTIONS.items() for each in rule.reasons}
@@ -320,7 +319,7 @@ def test_every_reason_is_reached_and_has_a_sentence():
 def test_long_lists_are_cut_in_sentences_and_whole_in_data():
     verdict = diagnosis_of(report_of([HALF] * 10, stream_of(2, 5))).verdict("failure to learn")
     assert len(verdict.evidence["failed"]) == 10
-    assert "; and 6 more." in verdict.sentence("stream.jinja")
+    assert "; and 6 more." in verdict.sentence()
 
 
 def test_a_life_is_readable_at_every_width_and_in_a_pipe():
@@ -331,7 +330,7 @@ def test_a_life_is_readable_at_every_width_and_in_a_pipe():
         assert width is None or max(map(len, lines)) <= width
         assert found.headline() in " ".join(" ".join(lines).split())
     page = markdown(found, ["which_phases.png"], details=True)
-    assert all(verdict.sentence("stream.jinja") in page for verdict in found.verdicts)
+    assert all(verdict.sentence() in page for verdict in found.verdicts)
     assert "![which phases](which_phases.png)" in page
     assert found._repr_markdown_().startswith("# life on SME/")
     named = found.model_copy(update={"name": "<script>"})
@@ -404,7 +403,7 @@ def test_a_life_that_has_not_ended_or_lacks_files_is_refused(run, tmp_path):
     report = StreamReport.read(folder / "stream.json")
     report_of([HALF] * 2, TWO).write(folder / "stream.json")
     shutil.copytree(run / "snapshots", folder / "snapshots", dirs_exist_ok=True)
-    assert "is about the stream" in refused("diagnose", folder)
+    assert "stream of run.json=" in refused("diagnose", folder)
     (folder / "stream.json").unlink()
     assert "when it has ended" in refused("diagnose", folder)
     report.write(folder / "stream.json")
@@ -441,7 +440,7 @@ def test_a_cell_is_diagnosed_with_its_fresh_agents(tmp_path):
     key = write_cell(tmp_path, cell, report_of([HALF] * 2, TWO, [0.5, 0.6]), 0.55)
     alone = load_cell(tmp_path, key[:12])
     assert isinstance(alone, StreamSubject)
-    assert alone.networks is None
+    assert alone.networks == (None, None)
     assert diagnose(alone).verdict("dormant units").reason == "network_unknown"
     assert [each.document for each in cell.fresh] == [phase.spec for phase in TWO.phases]
     for each, policy, regret in zip(cell.fresh, (FIRST, SECOND), (0.5, 0.3), strict=True):

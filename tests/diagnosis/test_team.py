@@ -16,7 +16,7 @@ from sme_registry.diagnosis import (
 )
 from sme_registry.diagnosis.measurements import LINEAR, POLICY
 from sme_registry.diagnosis.questions import answer_all
-from sme_registry.diagnosis.team import TEAM_QUESTIONS, TEAM_THRESHOLDS, TeamCase
+from sme_registry.diagnosis.team import TEAM_QUESTIONS, TeamCase
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.spec import StudyFile, StudyPlan
@@ -83,13 +83,10 @@ def test_a_team_has_words_for_the_terminal_a_pipe_and_a_notebook_which_runs_no_h
     assert "](" not in page
     assert "scout_0" in page
     for verdict in one_fails.verdicts:
-        used = dict.fromkeys(verdict.thresholds, 0.5) | TEAM_THRESHOLDS
         for reason in TEAM_QUESTIONS[verdict.question].reasons:
             if verdict.question == "ended_episodes" and reason != verdict.reason:
                 continue  # other evidence; see the test of episodes that one agent ends
-            assert verdict.model_copy(update={"reason": reason, "thresholds": used}).sentence(
-                "team.jinja"
-            )
+            assert verdict.model_copy(update={"reason": reason}).sentence()
 
 
 def test_the_agent_that_fails_is_to_blame(one_fails):
@@ -169,10 +166,10 @@ def test_a_harder_optimum_is_a_cause_only_of_a_team_that_has_learnt(
     agents = [*others, driver.model_copy(update={"measurements": measurements})]
     visited = one_fails.visited.model_copy(update={"normalised_regret": learnt})
     case = TeamCase(agents, SPEC, visited, updates=updates)
-    verdicts = {v.question: v for v in answer_all(TEAM_QUESTIONS, case, TEAM_THRESHOLDS)}
+    verdicts = {v.question: v for v in answer_all(TEAM_QUESTIONS, case)}
     verdict = verdicts["harder_optimum"]
     assert verdict.answer == answer
-    assert "Its optimal policy is harder to learn." in verdict.sentence("team.jinja")
+    assert "Its optimal policy is harder to learn." in verdict.sentence()
 
 
 def test_an_agent_that_fails_only_where_the_team_takes_it():
@@ -192,7 +189,7 @@ def test_the_agent_that_ends_the_episodes_is_named():
     diagnosis = diagnosis_of(with_optimal(spec, driver_0=half), spec, episodes=32)
     ended = diagnosis.verdict("ended_episodes")
     assert (ended.answer, ended.evidence["agent"]) == ("yes", "driver_0")
-    assert ended.sentence("team.jinja")
+    assert ended.sentence()
     assert diagnosis.agent("scout_0").measurements.on_policy.termination_rate == 0.0
     assert diagnosis.agent("driver_0").measurements.on_policy.termination_rate > 0.5
 

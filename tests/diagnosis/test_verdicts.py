@@ -5,9 +5,8 @@ import pytest
 
 from sme_registry.diagnosis import Subject, diagnose, load_policy
 from sme_registry.diagnosis.behaviour import Log
-from sme_registry.diagnosis.document import label
 from sme_registry.diagnosis.measurements import CapacityProbe
-from sme_registry.diagnosis.questions import Comparison, Difference
+from sme_registry.diagnosis.questions import Comparison, Difference, label
 from sme_registry.diagnosis.task import judge
 from sme_registry.errors import SMEError, UnknownNameError
 from tests.diagnosis.policies import (

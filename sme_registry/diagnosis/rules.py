@@ -1,0 +1,481 @@
+"""The questions about a policy: where its error is, which measurements answer, and why it is there.
+
+Questions about the cause are about training, of which a policy shows only traces: the answer is
+"cannot tell" unless a number separates the causes.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+from sme_registry.diagnosis.measurements import LINEAR, POLICY, DistractorRegret, Violations
+from sme_registry.diagnosis.questions import THRESHOLDS, Decision, Question, TaskCase, add_to
+from sme_registry.evaluation import ObservationReport
+
+WHERE: dict[str, Question[TaskCase]] = {}
+"""Questions about the policy, in order."""
+WHY: dict[str, Question[TaskCase]] = {}
+"""Questions about its training, in order."""
+_where = partial(add_to, WHERE, "where")
+_why = partial(add_to, WHY, "why", is_cause=True)
+
+_TINY = 1e-9
+
+
+@_where(
+    yes="some_channels_unlearnt", no="spread_over_channels", thresholds="unlearnt channel_learnt"
+)
+def _action_channels(case: TaskCase) -> Decision:
+    channels = case.measurements.channels
+    rows = [c.model_dump(include={"channel", "normalised_regret", "slope"}) for c in channels]
+    unlearnt = [row for row in rows if row["normalised_regret"] >= THRESHOLDS["unlearnt"]]
+    learnt = [row for row in rows if row["normalised_regret"] <= THRESHOLDS["channel_learnt"]]
+    regret = sum(channels[row["channel"] - 1].regret for row in unlearnt)
+    share = regret / max(case.measurements.policy.regret, _TINY)
+    evidence = {
+        "channels": len(channels),
+        "unlearnt": unlearnt,
+        "learnt": learnt,
+        "best": min(rows, key=lambda row: row["normalised_regret"]),
+        "worst": max(rows, key=lambda row: row["normalised_regret"]),
+        "regret_share": share,
+    }
+    return Decision(bool(unlearnt and learnt), evidence, share)
+
+
+@_where(yes="error_localised", no="error_not_localised", thresholds="explained_variance bin_ratio")
+def _state_region(case: TaskCase) -> Decision:
+    most = max(case.measurements.partitions, key=lambda p: p.explained_variance)
+    low, high = min(most.mae), max(most.mae)
+    worst_bin = most.mae.index(high)
+    uneven = high >= THRESHOLDS["bin_ratio"] * low
+    localised = most.explained_variance >= THRESHOLDS["explained_variance"] and uneven
+    evidence = {
+        "state_channel": most.state_channel,
+        "explained_variance": most.explained_variance,
+        "lowest_mae": low,
+        "highest_mae": high,
+        "worst_bin": list(most.edges[worst_bin : worst_bin + 2]),
+    }
+    share = 1.0 - low / max(case.measurements.policy.mae, _TINY)  # if all were like the best bin
+    return Decision(localised and not case.solved, evidence, share)
+
+
+@_where(yes="similarity_lost", no="similarity_kept", thresholds="similarity_loss")
+def _out_of_distribution(case: TaskCase) -> Decision:
+    inside, outside = case.measurements.shells[0], case.measurements.shells[-1]
+    wd, ood = inside.scores[POLICY], outside.scores[POLICY]
+    loss = 100.0 * (ood.mae - wd.mae)
+    evidence = {
+        "region": outside.region,
+        "similarity_loss": loss,
+        "wd_normalised_regret": wd.normalised_regret,
+        "ood_normalised_regret": ood.normalised_regret,
+        "linear_normalised_regret": outside.scores[LINEAR].normalised_regret,
+    }
+    return Decision(loss >= THRESHOLDS["similarity_loss"], evidence)
+
+
+@_where(yes="error_changes", no="error_steady", thresholds="time_ratio time_difference")
+def _time_in_episode(case: TaskCase) -> Decision:
+    episodes = case.measurements.on_policy
+    first, last = episodes.mae[0], episodes.mae[-1]
+    low, high = sorted((first, last))
+    apart = high - low >= THRESHOLDS["time_difference"]
+    changes = apart and high >= THRESHOLDS["time_ratio"] * max(low, _TINY)
+    share = 1.0 - low / max(episodes.scores[POLICY].mae, _TINY)
+    return Decision(changes, {"first_mae": first, "last_mae": last}, share)
+
+
+@_where(
+    yes="lower_regret_where_visited higher_regret_where_visited",
+    no="similar_regret",
+    thresholds="on_policy_ratio on_policy_difference",
+)
+def _visited_states(case: TaskCase) -> Decision:
+    episodes, uniform = case.measurements.on_policy, case.learnt
+    visited = episodes.scores[POLICY].normalised_regret
+    low, high = sorted((visited, uniform))
+    apart = high - low >= THRESHOLDS["on_policy_difference"]
+    reason = "similar_regret"
+    if apart and high >= THRESHOLDS["on_policy_ratio"] * max(low, _TINY):
+        lower = visited < uniform
+        reason = "lower_regret_where_visited" if lower else "higher_regret_where_visited"
+    shift = max(episodes.state_shift)
+    evidence = {
+        "on_policy_normalised_regret": visited,
+        "uniform_normalised_regret": uniform,
+        "shifted_state_channel": episodes.state_shift.index(shift) + 1,
+        "state_shift": shift,
+    }
+    return Decision(reason, evidence, 1.0 - low / max(high, _TINY))
+
+
+@_where(yes="offset_dominant", no="offset_minor", thresholds="dominant_share")
+def _constant_offset(case: TaskCase) -> Decision:
+    share = case.measurements.squared_error.offset
+    worst = max(case.measurements.channels, key=lambda c: abs(c.offset))
+    evidence = {"share": share, "channel": worst.channel, "offset": worst.offset}
+    return Decision(share >= THRESHOLDS["dominant_share"] and not case.solved, evidence, share)
+
+
+@_where(yes="underreaction overreaction", no="scale_minor", thresholds="dominant_share")
+def _response_scale(case: TaskCase) -> Decision:
+    share, channels = case.measurements.squared_error.scale, case.measurements.channels
+    slope = sum(c.slope for c in channels) / len(channels)
+    reason = "scale_minor"
+    if share >= THRESHOLDS["dominant_share"] and not case.solved:
+        reason = "underreaction" if slope < 1 else "overreaction"
+    sensitivity = case.measurements.response.sensitivity
+    return Decision(reason, {"share": share, "slope": slope, "sensitivity": sensitivity}, share)
+
+
+@_where(
+    yes="nonlinear_part_unlearnt",
+    no="nonlinear_part_learnt neither_part_learnt optimum_nearly_linear",
+    thresholds="nonlinear_variance slope_unlearnt slope_learnt",
+)
+def _linear_only(case: TaskCase) -> Decision:
+    response = case.measurements.response
+    linear, nonlinear = response.linear_slope, response.nonlinear_slope
+    if response.nonlinear_variance < THRESHOLDS["nonlinear_variance"] or nonlinear is None:
+        reason = "optimum_nearly_linear"
+    elif nonlinear > THRESHOLDS["slope_unlearnt"]:
+        reason = "nonlinear_part_learnt"
+    elif linear is None or linear >= THRESHOLDS["slope_learnt"]:
+        reason = "nonlinear_part_unlearnt"
+    else:
+        reason = "neither_part_learnt"
+    fields = {"nonlinear_variance", "linear_slope", "nonlinear_slope"}
+    share = case.measurements.uniform[LINEAR].normalised_regret / max(case.learnt, _TINY)
+    return Decision(reason, response.model_dump(include=fields), share)
+
+
+@_where(yes="saturated", no="not_saturated", thresholds="excess_saturation")
+def _saturation(case: TaskCase) -> Decision:
+    response = case.measurements.response
+    worst = max(case.measurements.channels, key=lambda c: c.at_zero + c.at_one)
+    excess = response.saturation - response.optimal_saturation
+    evidence = {
+        **response.model_dump(include={"saturation", "optimal_saturation"}),
+        **worst.model_dump(include={"channel", "at_zero", "at_one"}),
+    }
+    return Decision(excess >= THRESHOLDS["excess_saturation"], evidence)
+
+
+@_where(yes="noisy", no="repeatable", thresholds="noise_or_time_share")
+def _action_noise(case: TaskCase) -> Decision:
+    share = case.measurements.squared_error.noise
+    return Decision(share >= THRESHOLDS["noise_or_time_share"], {"share": share}, share)
+
+
+@_where(
+    yes="depends_on_time depends_on_accumulated_reward",
+    no="independent",
+    thresholds="noise_or_time_share",
+)
+def _time_dependence(case: TaskCase) -> Decision:
+    error, time = case.measurements.squared_error, case.measurements.time_dependence
+    share = max(error.time, error.accumulated_reward)
+    reason = "independent"
+    if share >= THRESHOLDS["noise_or_time_share"] and not case.solved:
+        on_time = error.time >= error.accumulated_reward
+        reason = "depends_on_time" if on_time else "depends_on_accumulated_reward"
+    evidence = {
+        "action_change": sum(time.action_change) / len(time.action_change),
+        "time_share": error.time,
+        "accumulated_reward_share": error.accumulated_reward if case.spec.k > 1 else None,
+        "lowest_normalised_regret": min(time.normalised_regret),
+        "highest_normalised_regret": max(time.normalised_regret),
+    }
+    return Decision(reason, evidence, share)
+
+
+def _limits_of(case: TaskCase) -> Violations:
+    limits = case.measurements.limits
+    assert limits is not None  # the questions are asked only then
+    return limits
+
+
+@add_to(
+    WHERE,
+    "limits",
+    yes="beats_safe_optimum earns_by_violating violates_without_gain",
+    no="within_limits rarely_violates",
+    thresholds="rarely_violating gain",
+    needs="limits",
+)
+def _constraint_violation(case: TaskCase) -> Decision:
+    limits = _limits_of(case)
+    inside, outside, visited = limits.report.regions[0], limits.report.regions[-1], limits.visited
+    share = max(inside.violating_share, visited.violating_share)
+    gain = inside.step_reward - limits.cut_off.step_reward
+    cost = sum(channel.cost for channel in limits.channels)
+    entries = sum(channel.violating_share for channel in limits.channels)
+    worst = max(limits.channels, key=lambda channel: channel.cost)
+    if share == 0.0:
+        reason = "within_limits"
+    elif share < THRESHOLDS["rarely_violating"]:
+        reason = "rarely_violates"
+    elif inside.safe_regret < -THRESHOLDS["gain"]:
+        reason = "beats_safe_optimum"
+    else:
+        reason = "earns_by_violating" if gain >= THRESHOLDS["gain"] else "violates_without_gain"
+    evidence = {
+        "cost": inside.cost,
+        "violating_share": inside.violating_share,
+        "violating_entries": entries / len(limits.channels),
+        "visited_violating_share": visited.violating_share,
+        "region": outside.name,
+        "outside_violating_share": outside.violating_share,
+        "optimal_cost": limits.report.references["optimal"][0].cost,
+        "safe_regret": inside.safe_regret,
+        "price_of_safety": inside.price_of_safety,
+        "gain": gain,
+        "channel": worst.channel,
+        "channel_cost_share": worst.cost / max(cost, _TINY),
+        "channel_violating_share": worst.violating_share,
+    }
+    return Decision(reason, evidence)
+
+
+def _distractors_of(case: TaskCase) -> tuple[DistractorRegret, ObservationReport]:
+    distraction, observation = case.measurements.distraction, case.measurements.observation
+    assert distraction is not None
+    assert observation is not None
+    return distraction, observation
+
+
+@_where(
+    yes="similarity_lost", no="similarity_kept", thresholds="distractor_loss", needs="distraction"
+)
+def _distractors_outside(case: TaskCase) -> Decision:
+    _, observation = _distractors_of(case)
+    outside = observation.distractor_regions[-1]
+    loss = 100.0 * (outside.mae - case.measurements.policy.mae)
+    evidence = {
+        "region": outside.name,
+        "similarity_loss": loss,
+        "normalised_regret": case.learnt,
+        "outside_normalised_regret": outside.normalised_regret,
+    }
+    return Decision(loss >= THRESHOLDS["distractor_loss"], evidence)
+
+
+@_where(
+    yes="both_kept distractors_alone_kept",
+    no="state_alone_kept neither_kept",
+    unclear="layers_unknown",
+    thresholds="kept_r2",
+    needs="distraction",
+)
+def _distractors_represented(case: TaskCase) -> Decision:
+    _, observation = _distractors_of(case)
+    if len(observation.probes) < 2:
+        return Decision("layers_unknown", {})
+    last = observation.probes[-1]
+    assert last.distractor_r2 is not None
+    state, distractors = (r2 >= THRESHOLDS["kept_r2"] for r2 in (last.state_r2, last.distractor_r2))
+    if distractors:
+        reason = "both_kept" if state else "distractors_alone_kept"
+    else:
+        reason = "state_alone_kept" if state else "neither_kept"
+    layers = [probe.model_dump() for probe in observation.probes]
+    return Decision(reason, {"layers": layers, **layers[-1]})
+
+
+@_why(
+    yes="rewards_too_rare",
+    no="beat_constant_in_training policy_beats_constant",
+    unclear="no_training_log rewards_found",
+    thresholds="constant_margin rarely_rewarded exploration_cost",
+)
+def _exploration(case: TaskCase) -> Decision:
+    log, episodes = case.measurements.training, case.measurements.on_policy
+    rewarded, sd = episodes.random_signal.rewarded, case.measurements.exploration_sd
+    evidence: dict[str, Any] = {
+        "random_rewarded": rewarded,
+        "exploration_sd": None if sd is None else [min(sd), max(sd)],
+    }
+    if log is None:
+        return Decision("no_training_log", evidence)
+    regret = episodes.scores[POLICY].regret
+    cost = log.last_regret - regret
+    reported = log.source == "episodes" and cost >= THRESHOLDS["exploration_cost"]
+    evidence |= {"regret": regret, "exploration_cost": cost if reported else None}
+    fields = {"source", "steps", "improvement_step", "constant_regret", "best_regret"}
+    evidence |= log.model_dump(include=fields)
+    if log.improvement_step is not None:
+        reason = "beat_constant_in_training"
+    elif regret < log.constant_regret - THRESHOLDS["constant_margin"]:
+        reason = "policy_beats_constant"
+    else:
+        rare = rewarded < THRESHOLDS["rarely_rewarded"]
+        reason = "rewards_too_rare" if rare else "rewards_found"
+    return Decision(reason, evidence)
+
+
+@_why(no="paid_every_step", unclear="delayed_payout")
+def _credit_assignment(case: TaskCase) -> Decision:
+    k, episodes = case.spec.k, case.measurements.on_policy
+    evidence = {"k": k, "credit": episodes.credit, "random_credit": episodes.random_credit}
+    return Decision("paid_every_step" if k == 1 else "delayed_payout", evidence)
+
+
+@_why(
+    yes="rewards_gated",
+    no="no_reward_threshold rewards_frequent",
+    unclear="effect_unknown",
+    thresholds="gated_share gated_rewarded_share rarely_unrewarded",
+)
+def _sparsity(case: TaskCase) -> Decision:
+    r_min, episodes, log = case.spec.r_min, case.measurements.on_policy, case.measurements.training
+    signal, random = episodes.signal, episodes.random_signal
+    gated = signal.gated >= THRESHOLDS["gated_share"]
+    if r_min == 0:
+        reason = "no_reward_threshold"
+    elif gated and signal.rewarded <= THRESHOLDS["gated_rewarded_share"]:
+        reason = "rewards_gated"
+    elif signal.gated + signal.flat < THRESHOLDS["rarely_unrewarded"]:
+        reason = "rewards_frequent"
+    else:
+        reason = "effect_unknown"
+    evidence = {
+        "r_min": r_min,
+        **signal.model_dump(),
+        **{f"random_{name}": value for name, value in random.model_dump().items()},
+        "unrewarded_episodes": None if log is None else log.unrewarded,
+    }
+    return Decision(reason, evidence)
+
+
+@_why(
+    yes="network_cannot_fit",
+    no="network_does_better network_fits_training_states_only",
+    unclear="not_probed probe_inconclusive",
+    thresholds="probe_better probe_no_better",
+)
+def _capacity(case: TaskCase) -> Decision:
+    probe, regret = case.measurements.capacity, case.learnt
+    evidence: dict[str, Any] = {
+        "complexity": case.spec.complexity,
+        "nonlinear_variance": case.measurements.response.nonlinear_variance,
+        "normalised_regret": regret,
+    }
+    if probe is None:
+        return Decision("not_probed", evidence)
+    evidence |= probe.model_dump(mode="json", exclude={"seconds"})
+    better, no_better = (THRESHOLDS[name] * regret for name in ("probe_better", "probe_no_better"))
+    if probe.test_normalised_regret <= better:
+        reason = "network_does_better"
+    elif probe.train_normalised_regret >= no_better:
+        reason = "network_cannot_fit"
+    elif probe.train_normalised_regret <= better:
+        reason = "network_fits_training_states_only"
+    else:
+        reason = "probe_inconclusive"
+    return Decision(reason, evidence, probe.train_normalised_regret / regret)
+
+
+@_why(
+    yes="too_few_states",
+    no="states_sufficient",
+    unclear="not_separated",
+    thresholds="unlearnt probe_better probe_no_better",
+)
+def _dimension(case: TaskCase) -> Decision:
+    probe, regret = case.measurements.capacity, case.learnt
+    channels = case.measurements.channels
+    evidence: dict[str, Any] = {
+        "state_dim": case.spec.state_dim,
+        "action_dim": case.spec.action_dim,
+        "normalised_regret": regret,
+        "unlearnt_channels": sum(c.normalised_regret >= THRESHOLDS["unlearnt"] for c in channels),
+        "random_rewarded": case.measurements.on_policy.random_signal.rewarded,
+    }
+    better, no_better = (THRESHOLDS[name] * regret for name in ("probe_better", "probe_no_better"))
+    if probe is None or probe.train_normalised_regret > better:
+        return Decision("not_separated", evidence)
+    evidence |= probe.model_dump(include={"states", "test_normalised_regret"})
+    if probe.test_normalised_regret >= no_better:
+        return Decision("too_few_states", evidence, probe.test_normalised_regret / regret)
+    sufficient = probe.test_normalised_regret <= better
+    return Decision("states_sufficient" if sufficient else "not_separated", evidence)
+
+
+@_why(
+    yes="episodes_cut_short",
+    no="episodes_long_enough no_survival_threshold",
+    thresholds="termination_rate short_episode",
+)
+def _survival(case: TaskCase) -> Decision:
+    spec, episodes = case.spec, case.measurements.on_policy
+    often = episodes.termination_rate >= THRESHOLDS["termination_rate"]
+    early = episodes.mean_length <= THRESHOLDS["short_episode"] * spec.horizon
+    evidence = {
+        "D": spec.D,
+        "effective_D": max(spec.D, spec.r_min),
+        "horizon": spec.horizon,
+        **episodes.model_dump(include={"termination_rate", "mean_length", "coverage"}),
+    }
+    return Decision("no_survival_threshold" if spec.D == 0 else often and early, evidence)
+
+
+@_why(
+    yes="still_improving",
+    no="regressed plateaued",
+    unclear="no_training_log log_too_short never_improved",
+    thresholds="log_rows regressed still_improving",
+)
+def _budget(case: TaskCase) -> Decision:
+    log = case.measurements.training
+    if log is None:
+        return Decision("no_training_log", {})
+    if log.rows < THRESHOLDS["log_rows"]:
+        reason = "log_too_short"
+    elif log.last_regret - log.best_regret >= THRESHOLDS["regressed"]:
+        reason = "regressed"
+    elif log.recent_improvement >= THRESHOLDS["still_improving"]:
+        reason = "still_improving"
+    else:
+        reason = "never_improved" if log.improvement_step is None else "plateaued"
+    fields = {"source", "rows", "steps", "best_regret", "best_step", "last_regret"}
+    return Decision(reason, log.model_dump(include=fields | {"recent_improvement"}))
+
+
+@_why(
+    yes="explains_regret",
+    no="explains_little not_within_limits",
+    thresholds="rarely_violating price_share",
+    needs="limits",
+)
+def _price_of_safety(case: TaskCase) -> Decision:
+    limits, regret = _limits_of(case), case.measurements.policy.regret
+    price = limits.report.regions[0].price_of_safety
+    violating = max(limits.report.regions[0].violating_share, limits.visited.violating_share)
+    evidence = {"price_of_safety": price, "regret": regret, "violating_share": violating}
+    if violating >= THRESHOLDS["rarely_violating"]:
+        return Decision("not_within_limits", evidence)
+    explains = price >= THRESHOLDS["price_share"] * regret
+    return Decision(explains, evidence, price / max(regret, _TINY))
+
+
+@_why(
+    yes="distracted",
+    no="hardly_distracted invariant",
+    thresholds="owed_to_distractors invariant",
+    needs="distraction",
+)
+def _distraction(case: TaskCase) -> Decision:
+    effect, observation = _distractors_of(case)
+    invariance = observation.invariance[0].invariance
+    reason = "invariant" if invariance <= THRESHOLDS["invariant"] else "hardly_distracted"
+    if effect.owed_regret >= THRESHOLDS["owed_to_distractors"]:
+        reason = "distracted"
+    evidence = {
+        "distractors": case.spec.distractors,
+        "invariance": invariance,
+        **effect.model_dump(exclude={"states", "distractor_draws"}),
+    }
+    return Decision(reason, evidence, effect.owed_regret / max(case.learnt, _TINY))
