@@ -152,7 +152,7 @@ def check_names(manifest: Manifest, board_key: str | None = None) -> None:
         )
     for field, text in (
         ("training.library", training.library),
-        ("training.algorithms", training.hyperparameters),
+        ("training.hyperparameters", training.hyperparameters),
         ("training.hardware", training.hardware),
         ("statement", manifest.statement),
     ):

@@ -90,7 +90,12 @@ def test_a_local_cluster_is_started_quietly_and_ends_with_the_command(tmp_path):
     assert len(Ledger(study).results()) == 2
     assert len(Ledger(study).failures()) == 2
     lines = process.stderr.splitlines()
-    ours = ("study small-v1: ", "failed: bad on small", "2 of 4 cells failed")
+    ours = (
+        "This plan runs the code of math.",
+        "study small-v1: ",
+        "failed: bad on small",
+        "2 of 4 cells failed",
+    )
     assert [line for line in lines if not line.startswith(ours)] == []
 
 
