@@ -84,7 +84,6 @@ def register(spec: SMESpec | StreamSpec, name: str) -> str:
       >>> sme_registry.load("EveryThird").k
       3
     """
-    from sme_registry.envs.base import argument_of
     from sme_registry.spec import SMESpec
     from sme_registry.spec.catalogue import NAMESPACE, SYMMETRIC, as_document, registered
     from sme_registry.task.draw import DYNAMICS_VERSION
@@ -107,14 +106,14 @@ def register(spec: SMESpec | StreamSpec, name: str) -> str:
         if existing == document:
             return env_id
         raise NameTakenError(
-            f"{env_id!r} stands for another {argument_of(existing)} ({existing.digest[:19]}…). "
+            f"{env_id!r} stands for another {existing.kind} ({existing.digest[:19]}…). "
             "Choose another name: a released id never changes its numbers."
         )
     registered[env_id] = document.named(env_id)
     if isinstance(document, SMESpec) and document.team is not None:
         _register_team(env_id, document.to_dict())
         return env_id
-    _register(env_id, argument_of(document), document.to_dict())
+    _register(env_id, document.kind, document.to_dict())
     return env_id
 
 
@@ -205,7 +204,7 @@ def env_spec(spec: SpecLike | StreamLike, **kwargs: Any) -> EnvSpec:
       10
     """
     from sme_registry.envs import SMEEnv, arguments
-    from sme_registry.envs.base import argument_of, content_id
+    from sme_registry.envs.base import content_id
     from sme_registry.spec import SMESpec
     from sme_registry.task import load
 
@@ -214,7 +213,7 @@ def env_spec(spec: SpecLike | StreamLike, **kwargs: Any) -> EnvSpec:
     arguments.check_overrides(SMEEnv, document, overrides)
     if overrides and isinstance(document, SMESpec):
         document = document.derive(**overrides)
-    kwargs = {argument_of(document): document.to_dict(), **kwargs}
+    kwargs = {document.kind: document.to_dict(), **kwargs}
     return EnvSpec(id=content_id(document), **_ENTRY_POINTS, kwargs=kwargs)
 
 

@@ -98,7 +98,7 @@ def _env_table(files: list[EnvFile]) -> Table:
     for file in files:
         spec = file.spec
         values = (
-            1 if spec.team is None else len(spec.team.agents), spec.state_dim, spec.action_dim,
+            len(spec.agents), spec.state_dim, spec.action_dim,
             spec.complexity, spec.k, spec.r_min, spec.D, spec.horizon,
         )  # fmt: skip
         name = f"{catalogue.NAMESPACE}/{file.versioned_name}"

@@ -97,11 +97,6 @@ def content_id(document: SMESpec | StreamSpec) -> str:
     return f"{NAMESPACE}/{document.content_name}-v{DYNAMICS_VERSION}"
 
 
-def argument_of(document: SMESpec | StreamSpec) -> str:
-    """The keyword of an environment that takes the document, in its `EnvSpec`."""
-    return "stream" if isinstance(document, StreamSpec) else "spec"
-
-
 def renamed_by_content(env_spec: EnvSpec | None, document: SMESpec | StreamSpec) -> EnvSpec | None:
     """Gymnasium's spec of an environment, as plain JSON; a derived task gets the id of its content.
 
@@ -113,7 +108,7 @@ def renamed_by_content(env_spec: EnvSpec | None, document: SMESpec | StreamSpec)
         return None
     fields = SMESpec.model_fields.keys()
     registered = gymnasium.registry.get(env_spec.id)
-    argument = argument_of(document)
+    argument = document.kind
     value = env_spec.kwargs.get(argument)
     is_named = registered is None or registered.kwargs.items() <= env_spec.kwargs.items()
     named = is_named and not fields & env_spec.kwargs.keys()

@@ -232,7 +232,7 @@ class Batch:
         self.num_envs = num_envs
         spec, n = self.task.spec, len(self.task.policies)
         S, A, m = spec.state_dim, spec.action_dim, spec.distractors
-        phases = self.schedule.stream.observed_phases if self.schedule.stream is not None else 0
+        phases = self.schedule.document.observed_phases
         check_memory(
             num_envs * 8 * (5 * (S + m) + 12 * A + 20 * n + 54 + 3 * phases),
             f"num_envs={num_envs}: a batch this large",

@@ -107,7 +107,7 @@ def check_switches(stream: StreamSpec) -> None:
 
 def _check_alike(lanes: Sequence[Lane]) -> None:
     """Raise OptionError unless all lanes switch at the same steps, in the same way."""
-    first, *others = map(_switches, lanes)
+    first, *others = (lane.switches for lane in lanes)
     for index, other in enumerate(others, 1):
         if other != first:
             raise OptionError(
@@ -115,11 +115,6 @@ def _check_alike(lanes: Sequence[Lane]) -> None:
                 "steps, drift.increments, cycles, switch and observes_phase, or tasks alone. Make "
                 "two programs."
             )
-
-
-def _switches(lane: Lane) -> Any:
-    """What streams of one program have in common; None for a task."""
-    return lane.switches if isinstance(lane, StreamSpec) else None
 
 
 def _is_deep(tasks: Sequence[Task]) -> bool:

@@ -449,7 +449,9 @@ class SMESpec(Setting, NamedDocument):
     # A task is a stream of one segment that is never over: it answers what a stream is asked.
     times: ClassVar[SegmentTimes] = SegmentTimes([0], NEVER, 1)
     switch: ClassVar[Literal["episode", "step"]] = "episode"
+    switches: ClassVar[None] = None
     observed_phases: ClassVar[int] = 0
+    kind: ClassVar[str] = "spec"  # the field that holds it in a file and in an `EnvSpec`
 
     seed: Seed = 0
 

@@ -11,7 +11,7 @@ from bisect import bisect_right
 from collections.abc import Iterator
 from functools import lru_cache, partial
 from itertools import accumulate
-from typing import Annotated, Any, Literal, Self, TypeAlias
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -119,6 +119,8 @@ class StreamSpec(NamedDocument):
       >>> stream.steps, stream.visits
       (2000, 4)
     """
+
+    kind: ClassVar[str] = "stream"
 
     schema_version: SchemaVersion = 1
     phases: Annotated[tuple[Phase, ...], Field(min_length=1, max_length=1000, strict=False)]

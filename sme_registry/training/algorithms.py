@@ -107,14 +107,13 @@ class Entry:
     def check_task(self, document: SMESpec | StreamSpec) -> None:
         """Check that it can learn a task or live in a stream, beyond what a plan itself says."""
         if self.needs_limits:
-            spec = document if isinstance(document, SMESpec) else document.phases[0].spec
-            check_has_limits(self.name, spec)
+            check_has_limits(self.name, document.specs[0])
         if self.kind == "jax":
             _check_in_jax(document)
         if self.kind == "train" and (isinstance(document, StreamSpec) or document.team):
             raise SpecError(
                 f"train:{self.name}: is for a task of a single agent, and this is a "
-                f"{'stream' if isinstance(document, StreamSpec) else 'team'}. Train an algorithm "
+                f"{'team' if document.specs[0].team else 'stream'}. Train an algorithm "
                 "of Stable-Baselines3, such as PPO."
             )
 
@@ -203,8 +202,7 @@ def default_algorithm(document: SMESpec | StreamSpec) -> str:
       >>> default_algorithm(sme_registry.load("Team4"))
       'PPO'
     """
-    single = isinstance(document, StreamSpec) or document.team is None
-    return "TD3" if single else "PPO"
+    return "TD3" if document.specs[0].team is None else "PPO"
 
 
 def default_num_envs(spec: SMESpec, algorithm: Any) -> int:

@@ -111,7 +111,7 @@ class SB3Learner:
     ) -> None:
         self._uses, self._document, self._action_range = uses, document, action_range
         self._seed, self._steps = seed, steps
-        spec = document if isinstance(document, SMESpec) else document.phases[0].spec
+        spec = document.specs[0]
         entry = find(uses, field)
         self._single, monitored = spec.team is None, num_envs is not None
         env: Any

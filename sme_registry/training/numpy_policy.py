@@ -46,14 +46,11 @@ def numpy_policy(
       >>> policy(np.full((3, 10), 0.5, np.float32)).shape
       (3, 4)
     """
-    if isinstance(document, StreamSpec):
-        spec, observed = document.phases[0].spec, document.observed_phases
-    else:
-        spec, observed = document, 0
-    policy = as_policy(model, spec, action_range=action_range, observed_phases=observed)
+    spec, phases = document.specs[0], document.observed_phases
+    policy = as_policy(model, spec, action_range=action_range, observed_phases=phases)
     if not isinstance(policy, Policy):
         raise SpecError("team: must be null here. Evaluate a team with `evaluate`.")
-    return _fast(policy, model, spec.observation_dim + observed)
+    return _fast(policy, model, document.observation_dim)
 
 
 def numpy_team_policy(model: Any, spec: SMESpec, *, action_range: str | None = None) -> TeamPolicy:

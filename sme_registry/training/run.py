@@ -225,7 +225,7 @@ def _plan(
     """The record of a new run, still without its algorithm."""
     document = load(task)
     stream = document if isinstance(document, StreamSpec) else None
-    spec = document if isinstance(document, SMESpec) else document.phases[0].spec
+    spec = document.specs[0]
     if independent and spec.team is None:
         raise OptionError(
             "independent=True: must be False for a task of a single agent. Leave it out, or give a "
@@ -247,7 +247,7 @@ def _plan(
         seed=integer_in("seed", seed, 0, 2**32 - 1),
         action_range=action_range,
         num_envs=1,
-        agents=1 if spec.team is None else len(spec.team.agents),
+        agents=len(spec.agents),
         independent=independent,
         steps=steps,
         checkpoint_every=integer_in("checkpoint_every", checkpoint_every, 1, MAX_STEPS),

@@ -198,7 +198,7 @@ class Programs:
             all(spec.k == 1 and spec.D == 0 for spec in cell.specs),
             tuple(map(_shape, cell.specs)),
             tuple(map(_form, cell.specs)),
-            cell.stream and cell.stream.switches,
+            cell.document.switches,
         )
 
 
