@@ -33,7 +33,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv
 
 from sme_registry.envs.arguments import check_has_limits
-from sme_registry.envs.episodes import Episode, Episodes, info_of_lanes
+from sme_registry.envs.episodes import Episodes, info_of_lanes
 from sme_registry.errors import OptionError
 from sme_registry.io import check_new
 from sme_registry.spec import SMESpec
@@ -64,22 +64,23 @@ class _Recorder(Episodes):
         self, rewards: Any, info: Mapping[str, Any], terminated: Any, ended: Any
     ) -> list[dict[str, float]]:
         """Add a step; returns what `info["episode"]` has of each episode that ended in it."""
-        finished = self.add(rewards, info, terminated, ended)
-        if self._log is not None:
-            for episode in finished:
+        statistics = []
+        for episode in self.add(rewards, info, terminated, ended):
+            if self._log is not None:
                 self._log.add(episode)
-        return [self._statistics(episode) for episode in finished]
-
-    def _statistics(self, episode: Episode) -> dict[str, float]:
-        return {
-            "r": episode.episode_return,
-            "l": episode.length,
-            "t": episode.wall_seconds,
-            "regret": episode.regret,
-            "similarity": episode.similarity,
-            "online_regret": self.online_regret,
-            **(episode.safety._asdict() if episode.safety is not None else {}),
-        }
+            safety = episode.safety._asdict() if episode.safety is not None else {}
+            statistics.append(
+                {
+                    "r": episode.episode_return,
+                    "l": episode.length,
+                    "t": episode.wall_seconds,
+                    "regret": episode.regret,
+                    "similarity": episode.similarity,
+                    "online_regret": self.online_regret,
+                    **safety,
+                }
+            )
+        return statistics
 
     def close(self) -> None:
         if self._log is not None:
@@ -140,7 +141,7 @@ class RecordRegret(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
         self.env.close()
 
 
-class RecordVectorRegret(VectorWrapper, RecordConstructorArgs):
+class RecordVectorRegret(VectorWrapper):
     """Records the exact regret of each episode of a vector environment; see the module.
 
     Each entry of `info["episode"]` is `[num_envs]`, 0 where no episode ended; `info["_episode"]`
@@ -159,8 +160,7 @@ class RecordVectorRegret(VectorWrapper, RecordConstructorArgs):
     def __init__(
         self, env: VectorEnv[Any, Any, Any], path: Path = None, *, force: bool = False
     ) -> None:
-        RecordConstructorArgs.__init__(self, path=None if path is None else str(path), force=force)
-        VectorWrapper.__init__(self, env)
+        super().__init__(env)
         self._recorder = _Recorder(env.num_envs, self._sme_spec, path, force)
         self.episodes = self._recorder.finished
 
@@ -186,22 +186,21 @@ class RecordVectorRegret(VectorWrapper, RecordConstructorArgs):
             final = info["_final_info"]
             for key, last in _numbers(info["final_info"]).items():
                 numbers[key][final] = last[final]
-        ended = terminated | truncated
+        ended, episode = terminated | truncated, {}
         statistics = self._recorder.record(rewards, numbers, terminated, ended)
         if statistics:
-            places = np.flatnonzero(ended & ~np.isnan(numbers["regret"]))
-            columns = {key: np.array([each[key] for each in statistics]) for key in statistics[0]}
-            episode = {key: np.zeros(len(ended), of.dtype) for key, of in columns.items()}
-            for key, column in columns.items():
-                episode[key][places] = column
+            recorded = ended & ~np.isnan(numbers["regret"])
+            for key in statistics[0]:
+                column = np.array([one[key] for one in statistics])
+                episode[key] = np.zeros(len(ended), column.dtype)
+                episode[key][recorded] = column
             info["episode"] = {**episode, **info.get("episode", {})}
             info["_episode"] = ended
         return observations, rewards, terminated, truncated, info
 
     def _sme_spec(self) -> SMESpec:
         vector: Any = self.unwrapped
-        ours = hasattr(vector, "sme_spec")
-        spec: SMESpec = vector.sme_spec if ours else vector.get_attr("sme_spec")[0]
+        spec: SMESpec = getattr(vector, "sme_spec", None) or vector.get_attr("sme_spec")[0]
         return spec
 
     def close(self, **kwargs: Any) -> None:
@@ -242,7 +241,7 @@ class StepWithCost(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
         return observation, reward, float(info["cost"]), terminated, truncated, info
 
 
-class VectorStepWithCost(VectorWrapper, RecordConstructorArgs):
+class VectorStepWithCost(VectorWrapper):
     """A vector with the costs `[num_envs]` of a step as the third value that `step` returns.
 
     The task must have `safety`. All autoreset modes work; Safety-Gymnasium's vectors are in
@@ -257,8 +256,7 @@ class VectorStepWithCost(VectorWrapper, RecordConstructorArgs):
     """
 
     def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:
-        RecordConstructorArgs.__init__(self)
-        VectorWrapper.__init__(self, envs)
+        super().__init__(envs)
         _check_limits(self, envs)
 
     def step(  # type: ignore[override]
@@ -281,13 +279,10 @@ class VectorStepWithCost(VectorWrapper, RecordConstructorArgs):
 
 
 def _check_limits(wrapper: Any, env: Any) -> None:
-    """Raise OptionError if the environment is not of this package, or its task has no limits."""
-    name = type(wrapper).__name__
-    try:
-        spec = env.unwrapped.sme_spec
-    except AttributeError:
+    name, spec = type(wrapper).__name__, getattr(env.unwrapped, "sme_spec", None)
+    if spec is None:
         raise OptionError(
             f"{name}: {env!r:.80} has no `sme_spec`. Wrap an environment of sme_registry.make, "
             "or a vector of sme_registry.make_vec."
-        ) from None
+        )
     check_has_limits(name, spec)
