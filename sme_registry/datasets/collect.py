@@ -16,10 +16,10 @@ network always multiplies matrices of the same shape. A data set is the first N 
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,7 @@ from sme_registry.compiled.arrays import (
     STEP_REWARD,
     Array,
     Indices,
+    Mask,
     Observation,
 )
 from sme_registry.datasets.documents import (
@@ -45,15 +46,19 @@ from sme_registry.datasets.documents import (
 from sme_registry.datasets.transitions import Arrays, Transitions
 from sme_registry.envs.batch import Batch
 from sme_registry.errors import OptionError
-from sme_registry.evaluation import Policy, TeamPolicy, as_policy
+from sme_registry.evaluation import TeamPolicy, as_policy
 from sme_registry.evaluation.regions import expansion
-from sme_registry.evaluation.rollouts import play
+from sme_registry.evaluation.rollouts import PlayStep, play
 from sme_registry.spec import SMESpec
 from sme_registry.task import Task, draw
 from sme_registry.task.draw import bit_generator, to_uniform
 from sme_registry.task.loading import check_memory
 
 ReportProgress = Callable[[int, int], None]
+Act = Callable[[Array, Observation], Array]
+"""Actions `[B, A]` for states `[B, S]` and joint observations `[B, O]`."""
+BehaviourPolicy = Callable[[range], Act]
+"""How to act in new episodes with these numbers, one in each environment."""
 
 _AHEAD = 64  # steps whose random numbers an episode reads at once
 _BLOCK = 64  # observations in one call of a user's policy
@@ -68,16 +73,19 @@ def noise_task(task: Task, seed: int | str) -> Task:
     return replace(task, policies=policies)
 
 
-def _optimal_policy(task: Task, num_envs: int) -> Callable[[Array], Array]:
+def _plain(task: Task) -> Task:
+    """The same π* without limits and distractors, which take time."""
+    spec = task.spec.derive(safety=None, observation=None)
+    return replace(task, spec=spec, limiting=(), distractor_transition=None, mixing=())
+
+
+def _optimal_policy(plain: Task, num_envs: int) -> Callable[[Array], Array]:
     """π* from states `[B, S]` to `[B, A]`, with the same bits in any batch.
 
     The next call but one overwrites its actions.
     """
-    # The same π* without limits and distractors, which take time.
-    spec = task.spec.derive(safety=None, observation=None)
-    plain = replace(task, spec=spec, limiting=(), distractor_transition=None, mixing=())
     batch, envs = Batch(plain, num_envs, reuse=True), np.arange(num_envs)
-    observation, no_action = batch.observe(), np.zeros((num_envs, spec.action_dim))
+    observation, no_action = batch.observe(), np.zeros((num_envs, plain.spec.action_dim))
 
     def act(s: Array) -> Array:
         batch.begin(envs, observation, s)
@@ -87,92 +95,61 @@ def _optimal_policy(task: Task, num_envs: int) -> Callable[[Array], Array]:
 
 
 def episode_numbers(
-    seed: int | str, name: str, episode: int, width: int, ahead: int = _AHEAD
+    seed: int | str, stream: str, episodes: range, width: int, ahead: int = _AHEAD
 ) -> Iterator[Array]:
-    """Uniform numbers `[width]` in (0, 1) for each step of an episode, without end.
+    """Uniform numbers `[len(episodes), width]` in (0, 1) for each step of episodes, without end.
 
     Episode e reads a named stream from word 4 · 2¹²⁸ e onwards, `ahead` steps at once.
     """
-    generator = bit_generator(seed, name)
-    generator.advance(episode << 128)
+    generators = [bit_generator(seed, stream) for _ in episodes]
+    for generator, episode in zip(generators, episodes, strict=True):
+        generator.advance(episode << 128)
     while True:
-        yield from to_uniform(generator.random_raw(ahead * width)).reshape(ahead, width)
-
-
-class EpisodeNumbers:
-    """The numbers of a stream's present episodes, one in each environment of a batch."""
-
-    def __init__(self, seed: int | str, name: str, num_envs: int, width: int) -> None:
-        self._stream, self._width = (seed, name), width
-        self._numbers: list[Iterator[Array]] = [iter(())] * num_envs
-
-    def begin(self, env: int, episode: int) -> None:
-        self._numbers[env] = episode_numbers(*self._stream, episode, self._width)
-
-    def next(self) -> Array:
-        """Those of the next step, `[B, width]`."""
-        return np.concatenate([next(one) for one in self._numbers]).reshape(-1, self._width)
-
-
-@dataclass(frozen=True)
-class BehaviourPolicy:
-    """Actions `[B, A]` for states `[B, S]` and joint observations `[B, O]` of a batch."""
-
-    act: Callable[[Array, Observation], Array]
-    numbers: EpisodeNumbers | None = None  # that it uses; None if it is deterministic
+        bits = [generator.random_raw(ahead * width) for generator in generators]
+        yield from to_uniform(np.array(bits)).reshape(-1, ahead, width).swapaxes(0, 1)
 
 
 def behaviour_policy(
-    recipe: DatasetRecipe,
-    index: int,
-    task: Task,
-    num_envs: int,
-    policy: Any = None,
-    stream: str = "dataset",
+    recipe: DatasetRecipe, index: int, task: Task, policy: Any = None, stream: str = "dataset"
 ) -> BehaviourPolicy:
     """The policy of a recipe's behaviour with this index; `policy` is the user's, for its kind."""
     behaviour, name = recipe.behaviours[index], f"{stream}/{index}"
     if behaviour.nu is not None:
-        return _mixture(task, recipe.seed, behaviour.nu, f"{name}/alpha", num_envs)
+        return _mixture(task, recipe.seed, behaviour.nu, f"{name}/alpha")
     if behaviour.kind == "random":
-        numbers = EpisodeNumbers(recipe.seed, f"{name}/action", num_envs, task.spec.action_dim)
-        return BehaviourPolicy(lambda s, observation: numbers.next(), numbers)
+        return partial(_random_actions, recipe.seed, f"{name}/action", task.spec.action_dim)
     prepared = as_policy(
         policy, recipe.spec, action_range=behaviour.action_range, name=behaviour.policy
     )
-    return BehaviourPolicy(lambda s, observation: _actions(prepared, observation))
+    act = prepared.act_in if isinstance(prepared, TeamPolicy) else prepared
+    return lambda episodes: lambda s, observation: _in_blocks(act, observation)
 
 
 def constant_policy(task: Task) -> BehaviourPolicy:
     """a = ½ in every channel."""
-    return BehaviourPolicy(lambda s, observation: np.full((len(s), task.spec.action_dim), 0.5))
+    return lambda episodes: lambda s, observation: np.full((len(s), task.spec.action_dim), 0.5)
 
 
-def _mixture(task: Task, seed: int | str, nu: float, name: str, num_envs: int) -> BehaviourPolicy:
-    optimal = _optimal_policy(task, num_envs)
-    if nu == 0.0:
-        return BehaviourPolicy(lambda s, observation: optimal(s))
-    noise = _optimal_policy(noise_task(task, seed), num_envs)
-    numbers = EpisodeNumbers(seed, name, num_envs, 1)
-
-    def act(s: Array, observation: Observation) -> Array:
-        alpha = nu * numbers.next()
-        return (1.0 - alpha) * optimal(s) + alpha * noise(s)
-
-    return BehaviourPolicy(act, numbers)
+def _random_actions(seed: int | str, stream: str, action_dim: int, episodes: range) -> Act:
+    numbers = episode_numbers(seed, stream, episodes, action_dim)
+    return lambda s, observation: next(numbers)
 
 
-def _actions(policy: Policy | TeamPolicy, observation: Observation) -> Array:
-    """A user's actions `[B, A]` for joint observations."""
-    if isinstance(policy, Policy):
-        return _in_blocks(policy, observation)
-    shared = observation.shape[1] - len(policy.members)  # s and t/T; then each agent's r_cum/k
-    joint = []
-    for agent, member in enumerate(policy.members):
-        single = observation[:, [*range(shared), shared + agent]]
-        acted = _in_blocks(member.policy, member.observe(single))
-        joint.append(acted[:, : member.action_dim])
-    return np.concatenate(joint, axis=1)
+def _mixture(task: Task, seed: int | str, nu: float, stream: str) -> BehaviourPolicy:
+    plain, plain_noise = _plain(task), _plain(noise_task(task, seed))
+
+    def begin(episodes: range) -> Act:
+        optimal = _optimal_policy(plain, len(episodes))
+        noise = _optimal_policy(plain_noise, len(episodes))
+        numbers = episode_numbers(seed, stream, episodes, 1)
+
+        def act(s: Array, observation: Observation) -> Array:
+            alpha = nu * next(numbers)
+            return (1.0 - alpha) * optimal(s) + alpha * noise(s)
+
+        return act
+
+    return begin
 
 
 def _in_blocks(policy: Callable[[Observation], Array], observation: Observation) -> Array:
@@ -182,6 +159,27 @@ def _in_blocks(policy: Callable[[Observation], Array], observation: Observation)
     filled = np.concatenate([observation, np.repeat(observation[-1:], missing, axis=0)])
     blocks = [policy(filled[first : first + _BLOCK]) for first in range(0, len(filled), _BLOCK)]
     return np.concatenate(blocks)[:rows]
+
+
+def play_episodes(
+    task: Task, policy: BehaviourPolicy, seed: int | str, stream: str, episodes: range
+) -> Iterator[tuple[PlayStep, Batch]]:
+    """The steps of whole episodes of a policy, and the batch after each.
+
+    The first numbers of an episode in the stream are its initial state, which determines its
+    distractors, too. Actions are exactly as the data set stores them: float32 in [0, 1].
+    """
+    batch, envs = Batch(task, len(episodes)), np.arange(len(episodes))
+    states = next(episode_numbers(seed, stream, episodes, task.spec.state_dim, ahead=1))
+    batch.seed_by_states(envs, states)
+    batch.begin(envs, batch.observe(), states)
+    act = policy(episodes)
+
+    def stored(s: Array, observation: Observation) -> npt.NDArray[np.float32]:
+        return np.clip(act(s, observation), 0.0, 1.0).astype(np.float32)
+
+    for step in play(batch, stored):
+        yield step, batch
 
 
 def collect(
@@ -218,114 +216,81 @@ def collect(
         f"transitions={recipe.transitions}: a data set of this task",
         "Collect fewer, or several data sets with different seeds.",
     )
-    kept_share = max(1e-300, (1.0 + (recipe.coverage or 0.0)) ** S)  # of uniform states
-    parts, total = [], 0
-    for index, share in enumerate(recipe.shares):
-        expected = share / kept_share
-        if expected > _MAX_STEPS and recipe.coverage:
-            raise _too_small(recipe, f"{share:,} transitions need about {expected:.1g} steps")
-        envs = num_envs or min(_ENVS, math.ceil(expected / spec.horizon))
-        policy = behaviour_policy(recipe, index, task, envs, (policies or {}).get(index))
+    parts: list[Arrays] = []
+    for index in range(len(recipe.behaviours)):
+        policy = behaviour_policy(recipe, index, task, (policies or {}).get(index))
 
-        def report(count: int, before: int = total) -> None:
+        def report(count: int, before: int = sum(recipe.shares[:index])) -> None:
             if progress is not None:
                 progress(before + count, recipe.transitions)
 
-        episodes = _Episodes(task, policy, recipe.seed, f"dataset/{index}/start", envs)
-        patience = max(10**6, 20 * expected)
-        parts.append(_first_rows(episodes.rows(), recipe, share, patience, report))
-        total += share
+        parts.append(_first_rows(recipe, index, task, policy, num_envs or _ENVS, report))
     return _join(parts, spec)
 
 
-class _Episodes:
-    """Episodes 0, 1, 2, … of a policy in a batch, each in the first environment that is free.
-
-    The first numbers of an episode in the stream are its initial state, which determines its
-    distractors, too.
-    """
-
-    def __init__(
-        self, task: Task, policy: BehaviourPolicy, seed: int | str, stream: str, num_envs: int
-    ) -> None:
-        self._policy, self._stream, self._unused = policy, (seed, stream), itertools.count()
-        self.batch = Batch(task, num_envs)
-        self.episode, self.t = np.zeros((2, num_envs), np.int64)
-        self.begin(np.arange(num_envs), self.batch.observe())
-
-    def begin(self, envs: Indices, observation: Observation) -> None:
-        """Begin the next episodes in these environments."""
-        S, initial = self.batch.task.spec.state_dim, []
-        for env in envs.tolist():
-            episode = self.episode[env] = next(self._unused)
-            initial.append(next(episode_numbers(*self._stream, episode, S, ahead=1)))
-            if self._policy.numbers is not None:
-                self._policy.numbers.begin(env, episode)
-        self.t[envs] = 0
-        states = np.array(initial)
-        self.batch.seed_by_states(envs, states)
-        self.batch.begin(envs, observation, states)
-
-    def act(self, s: Array, observation: Observation) -> npt.NDArray[np.float32]:
-        """The behaviour's actions, exactly as the data set stores them: float32 in [0, 1]."""
-        return np.clip(self._policy.act(s, observation), 0.0, 1.0).astype(np.float32)
-
-    def rows(self) -> Iterator[Arrays]:
-        """The steps of all environments without end, as columns that are valid until the next."""
-        for step in play(self.batch, self.act, self.begin):
-            result = step.result
-            yield {
-                "episode": self.episode,
-                "t": self.t,
-                "truncated": result.truncated,
-                "values": result.values.transpose(2, 0, 1),  # `[B, 5, n]`; with safety 7
-                "limits": result.limits.transpose(1, 0, 2),  # `[B, 2, A]`: also safe actions
-                "states": step.state,
-                "next_states": self.batch.state,
-                "observations": step.observation,
-                "next_observations": result.observation,
-                "actions": step.action,
-                "optimal_actions": result.optimal,
-                "terminations": result.terminated,
-                "distractors": step.distractors,
-                "next_distractors": self.batch.distractors,
-            }
-            self.t += 1
-
-
 def _first_rows(
-    steps: Iterator[Arrays],
     recipe: DatasetRecipe,
-    wanted: int,
-    patience: float,
+    index: int,
+    task: Task,
+    policy: BehaviourPolicy,
+    num_envs: int,
     progress: Callable[[int], None],
 ) -> Arrays:
-    """The first transitions by episode and step whose states are in the sub-cube."""
+    """A behaviour's first transitions by episode and step whose states are in the sub-cube."""
+    wanted, coverage, T = recipe.shares[index], recipe.coverage, recipe.spec.horizon
+    kept_share = max(1e-300, (1.0 + (coverage or 0.0)) ** recipe.spec.state_dim)
+    expected = wanted / kept_share  # steps, of uniform states
+    if expected > _MAX_STEPS and coverage:
+        raise _too_small(recipe, f"{wanted:,} transitions need about {expected:.1g} steps")
     parts: list[Arrays] = []
-    rows_of = np.zeros(1024, np.int64)  # by episode
-    count = taken = 0
-    for step in steps:
-        episode, coverage = step["episode"], recipe.coverage
-        kept = np.ones(len(episode), bool)
-        if coverage is not None:
-            kept = expansion(step["states"]) <= coverage
-        parts.append({name: column[kept] for name, column in step.items()})
-        if episode.max() >= len(rows_of):
-            rows_of = np.pad(rows_of, (0, int(episode.max())))
-        rows_of[episode[kept]] += 1
-        count += int(kept.sum())
-        taken += len(kept)
-        progress(min(wanted, count))
-        # No later episode than the first running one can contribute a wanted row.
-        running = episode[~(step["terminations"] | step["truncated"])]
-        first = int(running.min(initial=episode.max() + 1))
-        if count >= wanted and rows_of[: first + 1].sum() >= wanted:
-            break
-        if taken > patience and count < wanted:
+    first = count = taken = 0
+    while count < wanted:
+        # As many as are needed, by the mean of those so far.
+        rows_of_one = max(1, count) / first if first else T * kept_share
+        missing = wanted - count
+        episodes = range(first, first + min(num_envs, math.ceil(missing / rows_of_one)))
+        rows_of = np.zeros(len(episodes), np.int64)
+        steps = play_episodes(task, policy, recipe.seed, f"dataset/{index}/start", episodes)
+        for t, (step, batch) in enumerate(steps):
+            kept = step.running
+            if coverage is not None:
+                kept = kept & (expansion(step.state) <= coverage)
+            parts.append(_rows(kept, np.array(episodes), t, step, batch))
+            rows_of += kept
+            count += int(kept.sum())
+            taken += int(step.running.sum())
+            progress(min(wanted, count))
+            # No episode later than the first that goes on can contribute a wanted row.
+            going_on = step.running & ~(step.result.terminated | step.result.truncated)
+            if going_on.any() and rows_of[: going_on.argmax() + 1].sum() >= missing:
+                break
+        first = episodes.stop
+        if taken > max(10**6, 20 * expected) and count < wanted:
             raise _too_small(recipe, f"{taken:,} steps gave {count:,} transitions")
     rows = _concatenate(parts)
     order = np.lexsort((rows["t"], rows["episode"]))[:wanted]
     return {name: column[order] for name, column in rows.items()}
+
+
+def _rows(kept: Mask, episodes: Indices, t: int, step: PlayStep, batch: Batch) -> Arrays:
+    """The rows of a step that are kept, by the names of their columns."""
+    result = step.result
+    columns: Arrays = {
+        "episode": episodes,
+        "t": np.full(len(kept), t),
+        "values": result.values.transpose(2, 0, 1),  # `[B, 5, n]`; with safety 7
+        "limits": result.limits.transpose(1, 0, 2),  # `[B, 2, A]`: also safe actions
+        "states": step.state,
+        "next_states": batch.state,
+        "observations": step.observation,
+        "next_observations": result.observation,
+        "actions": step.action,
+        "optimal_actions": result.optimal,
+        "terminations": result.terminated,
+        "distractors": step.distractors,
+        "next_distractors": batch.distractors,
+    }
+    return {name: column[kept] for name, column in columns.items()}
 
 
 def _too_small(recipe: DatasetRecipe, reason: str) -> OptionError:
@@ -344,7 +309,6 @@ def _join(parts: list[Arrays], spec: SMESpec) -> Transitions:
     columns = _concatenate(parts)
     episode, t = columns.pop("episode"), columns.pop("t")
     values, limits = columns.pop("values"), columns.pop("limits")
-    del columns["truncated"]
     component = np.repeat(np.arange(len(parts)), [len(part["t"]) for part in parts])
     # A trajectory ends where the next row is not its next step.
     ends = np.ones(len(t), bool)
@@ -392,12 +356,13 @@ def reference_scores(
     def rollouts(policy: BehaviourPolicy, index: int) -> EpisodeScores | None:
         if count == 0:
             return None
-        return _scores(*whole_episodes(task, policy, recipe.seed, f"{stream}/{index}/start", count))
+        start = f"{stream}/{index}/start"
+        return _scores(*whole_episodes(task, policy, recipe.seed, start, count))
 
     behaviours = []
     for index in range(len(recipe.behaviours)):
         rows, user = transitions.components == index, (policies or {}).get(index)
-        policy = behaviour_policy(recipe, index, task, max(1, count), user, stream)
+        policy = behaviour_policy(recipe, index, task, user, stream)
         similarity, step_reward = transitions.similarities[rows], transitions.step_rewards[rows]
         behaviours.append(_score(similarity, step_reward, rollouts(policy, index)))
     optimum = EpisodeScores(episodes=0, mean_return=float(T), standard_error=0.0, similarity=1.0)
@@ -431,8 +396,8 @@ def whole_episodes(
     task: Task, policy: BehaviourPolicy, seed: int | str, stream: str, count: int
 ) -> tuple[Array, Array, Array]:
     """Return, sum of r̃ and steps `[count]` of the first episodes; means over agents."""
-    episodes, sums = _Episodes(task, policy, seed, stream, count), np.zeros((3, count))
-    for step in play(episodes.batch, episodes.act):
+    sums = np.zeros((3, count))
+    for step, _ in play_episodes(task, policy, seed, stream, range(count)):
         similarity, reward = step.result.values[[SIMILARITY, REWARD]].mean(axis=1)
         sums += step.running * np.stack([reward, similarity, np.ones(count)])
     returns, similarities, steps = sums

@@ -128,9 +128,10 @@ def test_the_returns_are_those_of_single_environments():
     task = materialize(SMESpec(k=3, D=0.02))
     returns, similarities, steps = whole_episodes(task, constant_policy(task), 4, "start", 20)
     assert len(set(steps)) > 3  # they end at different steps
+    states = next(episode_numbers(4, "start", range(20), 8))
     env = sme_registry.make(task.spec)
     for episode in range(20):
-        env.reset(options={"state": next(episode_numbers(4, "start", episode, 8))})
+        env.reset(options={"state": states[episode]})
         total, similarity, count, ended = 0.0, 0.0, 0, False
         while not ended:
             _, reward, terminated, truncated, info = env.step(np.full(4, 0.5, np.float32))
