@@ -34,7 +34,7 @@ from sme_registry.evaluation.regions import (
     SafetyScore,
 )
 from sme_registry.io import read_json, require_packages, to_json, write_atomically
-from sme_registry.io.markup import Line, card, line_chart, table_html
+from sme_registry.io.markup import card, table_html
 from sme_registry.io.tables import Table
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
 from sme_registry.spec.document import StrictModel, check_digest
@@ -95,13 +95,9 @@ class ReportFile(StrictModel):
         """All tables of the report."""
         return [self.table()]
 
-    def chart(self) -> str:
-        """A curve as SVG; empty for a report without one."""
-        return ""
-
     def _repr_html_(self) -> str:
-        """The curve and the tables, for notebooks."""
-        return card(self.chart(), *map(table_html, self.tables()))
+        """The tables, for notebooks."""
+        return card(*map(table_html, self.tables()))
 
     def __str__(self) -> str:
         return "\n\n".join(map(as_text, self.tables()))
@@ -314,28 +310,14 @@ class EvaluationReport(ReportFile):
             tables.append(_probe_table(self))
         return tables
 
-    def chart(self) -> str:
-        """Normalised regret over the regions as SVG: of the policy, its agents and references."""
-        drawn = [name for name in _DRAWN if name in self.references]
-        lines = [Line(LABELS[name], _regrets(self.references[name]), "reference") for name in drawn]
-        agents = sorted((_regrets(agent.regions) for agent in self.agents.values()), reverse=True)
-        for index, regrets in enumerate(agents[:_MOST_AGENTS]):
-            lines.append(Line("" if index else "worst agent", regrets, "other"))
-        lines.append(Line("team" if agents else "policy", _regrets(self.regions)))
-        title, regions = f"Normalised regret of {self.policy}", _names_of(self.regions)
-        return line_chart(title, regions, lines, "normalised regret in each region")
-
 
 def _names_of(regions: Iterable[RegionReport | SafetyScore | Invariance]) -> list[str]:
     return [region.name for region in regions]
 
 
-def _regrets(regions: Sequence[RegionReport]) -> list[float]:
-    return [region.normalised_regret for region in regions]
-
-
 def _mean_regret(regions: Sequence[RegionReport]) -> float:
-    return sum(_regrets(regions)) / len(regions) if regions else math.nan
+    regrets = [region.normalised_regret for region in regions]
+    return sum(regrets) / len(regrets) if regrets else math.nan
 
 
 def _columns(region: RegionReport) -> dict[str, Any]:
@@ -355,8 +337,6 @@ _SAFETY = {
     "violating_share": "violating share",
     "safe_regret": "safe regret",
 }
-_DRAWN = ("constant_half", "linear_least_squares", "optimal")  # the table has them all
-_MOST_AGENTS = 20  # drawn: a card stays small
 
 
 class _RegionTable(Table):

@@ -1,20 +1,16 @@
-"""Tables at any width: nothing is cut, broken or dropped; tables and charts in notebooks."""
+"""Tables at any width: nothing is cut, broken or dropped; tables in notebooks."""
 
 import contextlib
 import io
 import json
 import re
-from itertools import pairwise
-from xml.etree import ElementTree
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from rich.console import Console
 from typer.testing import CliRunner
 
 from sme_registry.cli import app
-from sme_registry.io.markup import Line, Scale, card, folded, line_chart, pairs_html, table_html
+from sme_registry.io.markup import card, folded, pairs_html, table_html
 from sme_registry.io.tables import Table
 from sme_registry.io.terminal import failure, out, print_json, print_pairs
 
@@ -111,55 +107,6 @@ def test_a_long_table_says_how_many_rows_it_leaves_out():
     assert "row 59" in html
     assert "row 60" not in html
     assert "1,940 more" in html
-
-
-finite = st.floats(-1e6, 1e6)
-
-
-@given(st.lists(finite, max_size=5))
-def test_a_scale_covers_every_value_with_round_ends(values):
-    scale = Scale.covering(*values)
-    assert scale.low < scale.high
-    assert 2 <= len(scale.ticks) <= 8
-    for value in values:
-        margin = 1e-6 * (scale.high - scale.low)
-        assert scale.low - margin <= value <= scale.high + margin
-        assert 0.0 <= scale.part(value) <= 1.0
-
-
-def texts(svg):
-    """The texts of a chart, and how far down each is."""
-    return {
-        each.text or "": float(each.attrib["y"])
-        for each in ElementTree.fromstring(svg).iter("text")
-    }
-
-
-@given(st.lists(st.floats(0.0, 1.0), min_size=2, max_size=8))
-def test_labels_at_the_end_are_a_line_of_text_apart_and_on_the_chart(ends):
-    lines = [Line(f"line {index}", [0.5, end]) for index, end in enumerate(ends)]
-    heights = sorted(
-        y for text, y in texts(line_chart("t", ["a", "b"], lines)).items() if "line" in text
-    )
-    assert len(heights) == len(ends)
-    assert all(below - above >= 14.9 for above, below in pairwise(heights))
-    assert 0 < heights[0] <= heights[-1] < 240
-
-
-def test_a_line_is_where_its_values_are():
-    root = ElementTree.fromstring(line_chart("t", ["a", "b"], [Line("x", [0.0, 1.0])]))
-    (drawn,) = root.iter("polyline")
-    (_, low), (_, high) = (map(float, point.split(",")) for point in drawn.attrib["points"].split())
-    ticks = texts(line_chart("t", ["a", "b"], [Line("x", [0.0, 1.0])]))
-    assert (low, high) == pytest.approx((ticks["0"] - 4, ticks["1"] - 4))
-
-
-def test_labels_and_titles_are_escaped_and_read_out():
-    svg = line_chart("<b>", ["<i>"], [Line('"&<script>', [0.25])])
-    assert "<script>" not in svg
-    root = ElementTree.fromstring(svg)
-    assert root.attrib["aria-label"] == '<b>. "&<script>: 0.25'
-    assert {'"&<script>', "<i>"} <= texts(svg).keys()
 
 
 def test_no_text_reaches_a_terminal_with_control_characters(capsys):

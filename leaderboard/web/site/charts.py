@@ -6,17 +6,18 @@ Colours come from `board.css`, for light, dark and print. All text is escaped.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from markupsafe import Markup, escape
 
 from leaderboard.documents.result import Estimate
-from sme_registry.io.markup import Scale
 from sme_registry.io.terminal import fixed
 
 Edges = Sequence[tuple[float, float]]
 
+_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 _MARGIN = 3.0  # % of a bar's width at either end, for a dot at the end
 _SPARK_WIDTH, _SPARK_HEIGHT = 84.0, 30.0
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 720.0, 360.0, 60.0, 708.0, 22.0, 296.0
@@ -26,6 +27,36 @@ _MAX_LABELS = 12  # region labels below a chart
 def number(value: float, digits: int = 3) -> str:
     """A number as in every table, with a true minus sign."""
     return fixed(value, digits).replace("-", "\u2212")
+
+
+@dataclass(frozen=True)
+class Scale:
+    """An axis.
+
+    Attributes:
+      low, high: its ends; `low < high`.
+      ticks: round numbers from end to end.
+    """
+
+    low: float
+    high: float
+    ticks: tuple[float, ...]
+
+    @classmethod
+    def covering(cls, *values: float) -> Scale:
+        """The scale of about four round steps that covers the values."""
+        low, high = min(values, default=0.0), max(values, default=1.0)
+        high = high if high - low > 1e-9 else low + 1.0
+        raw = (high - low) / 4
+        power = 10.0 ** math.floor(math.log10(raw))
+        step = next(factor * power for factor in _STEPS if factor * power >= raw * (1 - 1e-9))
+        first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+        ticks = tuple(round(index * step, 12) + 0.0 for index in range(first, last + 1))
+        return cls(ticks[0], ticks[-1], ticks)
+
+    def part(self, value: float) -> float:
+        """The position of a value along the axis, 0 at its low end and 1 at its high end."""
+        return (min(max(value, self.low), self.high) - self.low) / (self.high - self.low)
 
 
 class Bars:

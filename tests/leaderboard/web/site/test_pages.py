@@ -10,6 +10,8 @@ from urllib.parse import urlsplit
 from xml.etree import ElementTree
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
@@ -583,3 +585,14 @@ def test_a_chart_has_a_title_and_a_description_and_escapes_the_name():
     assert drawn.get("aria-labelledby") == "chart-title chart-desc"
     assert drawn.find("title").text == "Normalised regret of <b>&\"' by region"
     assert "WD: 0.100, from 0.000 to 0.200" in drawn.find("desc").text
+
+
+@given(st.lists(st.floats(-1e6, 1e6), max_size=5))
+def test_a_scale_covers_every_value_with_round_ends(values):
+    scale = charts.Scale.covering(*values)
+    assert scale.low < scale.high
+    assert 2 <= len(scale.ticks) <= 8
+    for value in values:
+        margin = 1e-6 * (scale.high - scale.low)
+        assert scale.low - margin <= value <= scale.high + margin
+        assert 0.0 <= scale.part(value) <= 1.0
