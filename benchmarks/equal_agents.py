@@ -34,7 +34,7 @@ CONFIDENCE = 0.9
 def train_sb3(algorithm: str, spec: SMESpec, seed: int, steps: int) -> list[float]:
     """The regret of each part of a run of Stable-Baselines3 with its defaults."""
     from sme_registry.sb3.vec_env import SingleVecEnv
-    from sme_registry.training.learners import CountedVecEnv
+    from sme_registry.training.models import CountedVecEnv
 
     env = CountedVecEnv(SingleVecEnv(spec, action_range="symmetric"))
     total: list[float] = [0.0]

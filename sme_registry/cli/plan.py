@@ -366,16 +366,8 @@ def check_algorithms(algorithms: Iterable[StudyAlgorithm], errors: type[SMEError
 
 def warn_of_uneven_rollouts(plan: StudyPlan) -> None:
     """Print which rollouts do not end where the phases of streams do."""
-    for uneven in uneven_rollouts(plan):
-        err().print(
-            f"[yellow]uneven rollouts:[/] {escape(uneven.algorithm)} on "
-            f"{escape(', '.join(uneven.streams))}: its rollouts of {uneven.n_steps:,} steps do not "
-            "end where phases do. At the end of a visit it has learned from fewer steps than a "
-            "fresh agent, which counts as lost plasticity. Use "
-            f"--set {escape(uneven.algorithm)}.n_steps={uneven.better}, and a batch_size that "
-            "divides it.",
-            soft_wrap=True,
-        )
+    for warning in uneven_rollouts(plan):
+        err().print(f"[yellow]uneven rollouts:[/] {escape(warning)}", soft_wrap=True)
 
 
 _ALLOWED_WITH_FROM = ("path", "name", "description", "source", "force")

@@ -41,7 +41,7 @@ from sme_registry.task import Task, draw, materialize
 from sme_registry.task.draw import Array
 from sme_registry.task.loading import parameter_bytes
 from sme_registry.training import EXPLORER, short_name
-from sme_registry.training.learn import EVALUATION
+from sme_registry.training.run import EVALUATION
 from sme_registry.version import __version__
 
 FILE = EXPLORER

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import importlib.machinery
 import importlib.util
 import multiprocessing
 import os
@@ -93,12 +94,12 @@ def _extras() -> dict[str, set[str]]:
 def import_object(name: str, field: str, error: type[SMEError]) -> Any:
     """Import an object by the name `module:attribute`. The working directory is searched first."""
     module_name, _, attribute = name.partition(":")
-    folder, near = os.getcwd(), ""
-    sys.path.insert(0, folder)
+    near = ""
     try:
-        module = importlib.import_module(module_name)
-        near = did_you_mean(attribute, dir(module))
-        return getattr(module, attribute)
+        with working_directory_importable():
+            module = importlib.import_module(module_name)
+            near = did_you_mean(attribute, dir(module))
+            return getattr(module, attribute)
     except SMEError:
         raise
     except Exception as reason:
@@ -106,8 +107,34 @@ def import_object(name: str, field: str, error: type[SMEError]) -> Any:
             f"{field}={name!r}: cannot be imported: {type(reason).__name__}: {reason}.{near} It "
             "must be module:function, with the module in the working directory or installed."
         ) from reason
+
+
+@contextlib.contextmanager
+def working_directory_importable() -> Iterator[None]:
+    """Modules in the working directory can be imported inside the block."""
+    folder = os.getcwd()
+    sys.path.insert(0, folder)
+    try:
+        yield
     finally:
         sys.path.remove(folder)
+
+
+def module_file(module: str) -> str | None:
+    """The file of a module or a package, also in the working directory; None if there is none.
+
+    Imports nothing, as `importlib.util.find_spec` would import the packages that it is in.
+    """
+    places: Any = None
+    found: Any = None
+    with working_directory_importable():
+        for end in (i for i, letter in enumerate(f"{module}.") if letter == "."):
+            found = importlib.machinery.PathFinder.find_spec(module[:end], places)
+            if found is None:
+                return None
+            places = found.submodule_search_locations
+    path: str | None = found.origin
+    return path
 
 
 _PROC = Path("/proc")

@@ -181,20 +181,17 @@ class Progress:
             self._print()
 
     def prepare(self, note: str) -> None:
-        """Show at once what precedes the first steps; until `prepared`, no rate is shown."""
+        """Show at once what precedes the first steps; the rate is measured from these on."""
         self._note, self._rate_from = note, None
         if self._bars is not None:
             self._draw()
         else:
             self.message(f"{self._title}: {note}")
 
-    def prepared(self) -> None:
-        """Measure the rate from here on, if it is not measured yet."""
-        self._rate_from = self._rate_from or (self._done, time.monotonic())
-
     def update(self, done: int, note: str | None = None, *, total: int | None = None) -> None:
         """Set how far the job is; cheap enough to call at every step."""
         self._done = done
+        self._rate_from = self._rate_from or (done, time.monotonic())
         self._note = self._note if note is None else note
         self._total = self._total if total is None else total
         self._refresh()

@@ -29,7 +29,6 @@ at most. Its shortfall from the best safe action is what PPO has not learned. It
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -51,7 +50,7 @@ from sme_registry.task import materialize
 _Array = npt.NDArray[np.float32]
 
 
-def spec_with_limits(algorithm: str, env: Any) -> SMESpec:
+def _spec_with_limits(algorithm: str, env: Any) -> SMESpec:
     """The spec of an environment's task, which must have `safety`."""
     try:
         spec: SMESpec = env.get_attr("sme_spec")[0]
@@ -61,17 +60,6 @@ def spec_with_limits(algorithm: str, env: Any) -> SMESpec:
         ) from None
     check_has_limits(algorithm, spec)
     return spec
-
-
-def _costs_in(infos: Sequence[dict[str, Any]]) -> _Array:
-    """The cost of a step in each lane, `[lanes]`, from its infos."""
-    try:
-        return np.array([info["cost"] for info in infos], np.float32)
-    except KeyError:
-        raise OptionError(
-            "the environment's infos have no 'cost'. Use an environment of sme_registry whose "
-            "task has safety, with wrappers that keep its infos."
-        ) from None
 
 
 class PPOLagrangian(PPO):  # type: ignore[misc, unused-ignore]  # an untyped class without SB3
@@ -108,7 +96,7 @@ class PPOLagrangian(PPO):  # type: ignore[misc, unused-ignore]  # an untyped cla
         )
         super().__init__(policy, env, **settings)
         if self.env is not None:
-            spec_with_limits(type(self).__name__, self.env)
+            _spec_with_limits(type(self).__name__, self.env)
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -135,8 +123,7 @@ class PPOLagrangian(PPO):  # type: ignore[misc, unused-ignore]  # an untyped cla
         """Collect a rollout as PPO does, and its costs."""
         self._costs: list[_Array] = []  # [lanes] of each step
         self._cut: list[tuple[int, int, Any]] = []  # step, lane and last observation, if truncated
-        collected: bool = super().collect_rollouts(*args, **kwargs)
-        return collected
+        return bool(super().collect_rollouts(*args, **kwargs))
 
     def _update_info_buffer(
         self, infos: list[dict[str, Any]], dones: npt.NDArray[Any] | None = None
@@ -147,7 +134,13 @@ class PPOLagrangian(PPO):  # type: ignore[misc, unused-ignore]  # an untyped cla
             for lane, info in enumerate(infos)
             if info.get("TimeLimit.truncated") and "terminal_observation" in info
         ]
-        self._costs.append(_costs_in(infos))
+        try:
+            self._costs.append(np.array([info["cost"] for info in infos], np.float32))
+        except KeyError:
+            raise OptionError(
+                "the environment's infos have no 'cost'. Use an environment of sme_registry whose "
+                "task has safety, with wrappers that keep its infos."
+            ) from None
 
     def train(self) -> None:
         """Update the multiplier, the critic of costs, and then the policy as PPO does."""
@@ -192,8 +185,7 @@ class PPOLagrangian(PPO):  # type: ignore[misc, unused-ignore]  # an untyped cla
         """The critic's discounted costs from observations `[B, O]` on, `[B]`."""
         with torch.no_grad():
             values = self.cost_critic.predict_values(obs_as_tensor(observations, self.device))
-        flat: _Array = values.cpu().numpy().reshape(-1)
-        return flat
+        return np.asarray(values.cpu().numpy().reshape(-1))
 
     def _train_cost_critic(self, observations: Any, returns: _Array) -> None:
         """Fit the critic to returns, in as many minibatches as PPO's critic."""
@@ -309,7 +301,7 @@ class PPOProjection(PPO):  # type: ignore[misc, unused-ignore]  # an untyped cla
 
 def _spec(env: Any) -> SMESpec:
     """The spec of environments whose observations show the state; OptionError for any other."""
-    spec = spec_with_limits("PPOProjection", env)
+    spec = _spec_with_limits("PPOProjection", env)
     observation = spec.observation
     if observation is not None and observation.mixing != "none":
         raise OptionError(
@@ -317,7 +309,9 @@ def _spec(env: Any) -> SMESpec:
             "limits follow from the state, which mixed observations do not show. Train "
             "PPOLagrangian."
         )
-    space, normalised = Box(0.0, 1.0, (spec.observation_dim,), np.float32), _normalises(env)
+    space = Box(0.0, 1.0, (spec.observation_dim,), np.float32)
+    normaliser = unwrap_vec_normalize(env)
+    normalised = normaliser is not None and normaliser.norm_obs
     if normalised or env.observation_space != space:
         shown = "normalised" if normalised else f"{env.observation_space}"
         raise OptionError(
@@ -326,8 +320,3 @@ def _spec(env: Any) -> SMESpec:
             "wrappers that change observations, and use VecNormalize with norm_obs=False."
         )
     return spec
-
-
-def _normalises(env: Any) -> bool:
-    normaliser = unwrap_vec_normalize(env)
-    return normaliser is not None and normaliser.norm_obs

@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from sme_registry.compiled.arrays import REWARD, ROWS, ROWS_WITH_SAFETY, Array, Mask, Observation
+from sme_registry.compiled.arrays import REWARD, Array, Mask, Observation
 from sme_registry.envs import SMEEnv, arguments, infos
 from sme_registry.envs.base import html_card, renamed_by_content
 from sme_registry.envs.batch import Batch
@@ -37,8 +37,7 @@ StepResult: TypeAlias = tuple[Observation, npt.NDArray[np.float32], Mask, list[d
 class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped class without SB3
     """The part of a `VecEnv` that does not depend on how its lanes are stepped.
 
-    Args:
-      lanes: the lanes, each with its attributes, such as its spaces.
+    Each of `lanes` has its attributes, such as its spaces.
 
     Examples:
       >>> from sme_registry.sb3 import LanesVecEnv, SMEVecEnv
@@ -93,8 +92,8 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped cl
         **method_kwargs: Any,
     ) -> list[Any]:
         """Call a method of each lane, such as `reset` of a single agent's."""
-        lanes = [self._lanes[i] for i in self._get_indices(indices)]
-        return [getattr(lane, method_name)(*method_args, **method_kwargs) for lane in lanes]
+        methods = self.get_attr(method_name, indices)
+        return [method(*method_args, **method_kwargs) for method in methods]
 
     def env_is_wrapped(
         self,
@@ -153,16 +152,11 @@ class _BatchVecEnv(LanesVecEnv):
         }  # fmt: skip
         teams = range(self.num_teams)
         super().__init__(
-            [
-                self._lane_type(self, team, agent=name, **shared)
-                for team in teams
-                for name in self.agents
-            ]
+            [self._lane_type(self, team, agent=a, **shared) for team in teams for a in self.agents]
         )
         joint_space, _ = arguments.action_space(action_range, task.spec.action_dim)
         self._renderer = batch_renderer(render_mode, render_lanes, self._batch, joint_space)
         self.metadata = {**self.metadata, "render_fps": METADATA["render_fps"]}
-        self._allocate()
 
     def __repr__(self) -> str:
         lanes = f"num_envs={self.num_envs}"
@@ -183,26 +177,6 @@ class _BatchVecEnv(LanesVecEnv):
     def get_images(self) -> list[Frame]:
         """The frames of the chosen lanes or teams, each `[H, W, 3]` uint8; `render` tiles them."""
         return [] if self._renderer is None else [*self._renderer.frames()]
-
-    def _allocate(self) -> None:
-        """The values of a step, `[rows, n, teams]`, and each lane's view of them by info key."""
-        numbers = infos.numbers(self._task.spec)
-        rows = ROWS if self._task.spec.safety is None else ROWS_WITH_SAFETY
-        self._values = np.zeros((rows, len(self.agents), self.num_teams))
-        places = list(np.ndindex(self.num_teams, len(self.agents)))
-        self._numbers = {
-            key: [self._values[row, agent, team, ...] for team, agent in places]
-            for key, row in numbers.items()
-        }
-
-    # The copy of a view is no view: the copy allocates both again.
-    def __getstate__(self) -> dict[str, Any]:
-        dropped = ("_values", "_numbers")
-        return {name: value for name, value in vars(self).items() if name not in dropped}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        self._allocate()
 
     def _info_at_reset(self, lane: int) -> dict[str, Any]:
         owned = self._owned[lane % len(self.agents)]
@@ -245,9 +219,7 @@ class _BatchVecEnv(LanesVecEnv):
             arguments.check_options(of_lane, self._batch.schedule.reset_options)
         shape = (self._task.spec.state_dim,)
         states = [arguments.initial_states(of["state"], shape) for of in options if "state" in of]
-        if states and (
-            len(states) < len(options) or any((state != states[0]).any() for state in states)
-        ):
+        if states and (len(states) < len(options) or len({*map(tuple, states)}) > 1):
             raise OptionError("options: a team has one state. Give the same to each of its lanes.")
         state = states[0][None] if states else None
         # Teams have neither distractors nor a lifetime.
@@ -267,20 +239,18 @@ class _BatchVecEnv(LanesVecEnv):
         joint = self._joint_actions(unit)
         done = self._batch.advance(joint)
 
-        np.copyto(self._values, done.values)
-        reward = done.values[REWARD].T.reshape(-1)
+        values = done.values.swapaxes(1, 2).reshape(len(done.values), -1)
         optimal = arguments.from_unit(done.optimal, self._rescaled)
         limits = arguments.from_unit(done.limits, self._rescaled) if done.limits.size else ()
         columns: dict[str, list[Any]] = {
             "optimal_action": [row[part] for row in optimal for part in self._owned],
             **{key: list(rows) for key, rows in zip(infos.SAFETY_ACTIONS, limits, strict=False)},
-            **{key: [view[()] for view in views] for key, views in self._numbers.items()},
+            **{key: list(values[row]) for key, row in infos.numbers(self._task.spec).items()},
             **{key: list(values) for key, values in self._batch.lived.items()},
             "TimeLimit.truncated": np.repeat(done.truncated & ~done.terminated, n).tolist(),
         }
-        lane_infos: list[dict[str, Any]] = [
-            dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
-        ]
+        rows = zip(*columns.values(), strict=True)
+        lane_infos: list[dict[str, Any]] = [dict(zip(columns, row, strict=True)) for row in rows]
         ended: Mask = done.terminated | done.truncated
         dones = np.repeat(ended, n)
         if ended.any():
@@ -291,7 +261,8 @@ class _BatchVecEnv(LanesVecEnv):
                 self.reset_infos[lane] = self._info_at_reset(lane)
         if self._renderer is not None:
             self._renderer.record(np.flatnonzero(ended).tolist(), joint, done)
-        return self._observations(done.observation), reward.astype(np.float32), dones, lane_infos
+        reward = values[REWARD].astype(np.float32)
+        return self._observations(done.observation), reward, dones, lane_infos
 
     def _observations(self, joint: Observation) -> Observation:
         """Each lane's observation, from joint observations `[teams, S + 1 + n]`."""

@@ -11,8 +11,7 @@
     module:name            imported, from this folder or installed
 
 An entry point or `module:name` is either a class like those of Stable-Baselines3
-(`sb3_contrib:TQC`), or a function that returns a model; see `models`. Of `train:…` see
-`functions`.
+(`sb3_contrib:TQC`), or a function that returns a model; see `models`. Of `train:…` see `learn`.
 
 Hyperparameters are JSON values. Importing this module does not import PyTorch.
 """
@@ -20,31 +19,35 @@ Hyperparameters are JSON values. Importing this module does not import PyTorch.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import importlib
-import importlib.machinery
 import importlib.metadata
 import importlib.util
 import inspect
 import io
+import sys
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from sme_registry.datasets import documents
 from sme_registry.envs.arguments import check_has_limits
 from sme_registry.errors import OptionError, SpecError, UnknownNameError, did_you_mean
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.io import choice, import_object, read_json, require_packages
+from sme_registry.io.system import module_file, working_directory_importable
 from sme_registry.spec import SMESpec, StreamSpec, StudyAlgorithm
 from sme_registry.spec.study import JAX, in_jax, parse_uses
-from sme_registry.training.functions import load_function, path_of
 
 ENTRY_POINTS = "sme_registry.algorithms"
-AGENTS = ("sb3", "jax")  # whose implementation of an algorithm is trained
-_TEAMS = 8
-_MAX_REPLAY = 1_000_000  # SB3's default
+AGENTS = "sb3", "jax"  # whose implementation of an algorithm is trained
+# Arguments of an algorithm's constructor that are not hyperparameters.
+_RESERVED = ("self", "policy", "env", "seed", "device", "verbose", "tensorboard_log")
+# Arguments of a policy's constructor that the algorithm passes.
+_PASSED = ("self", "observation_space", "action_space", "lr_schedule")
+_OF_DATA_SET = ("nu", "transitions", "batch_size")  # of `offline:…`, and not the learner's
 
 
 @dataclass(frozen=True)
@@ -57,9 +60,9 @@ class Entry:
     needs_limits: bool = False
 
     @property
-    def prefix(self) -> str:
-        """Of the name in `uses`."""
-        return "" if self.kind == "sb3" else f"{self.kind}:"
+    def uses(self) -> str:
+        """The exact name in `uses`."""
+        return self.name if self.kind == "sb3" else f"{self.kind}:{self.name}"
 
     def load(self, field: str = "uses") -> Any:
         """The class or function that makes a model."""
@@ -67,19 +70,18 @@ class Entry:
             return load_function(self.name, field)[0]
         if self.kind not in ("sb3", "independent"):
             raise OptionError(
-                f"{field}='{self.prefix}{self.name}': is no algorithm of Stable-Baselines3's kind. "
-                "Use it in a study."
+                f"{field}={self.uses!r}: is no algorithm of Stable-Baselines3's kind. Use it in a "
+                "study."
             )
         require_sb3()  # every model gets its `VecEnv`
         if self.place:
             # It imports the deprecated `gym` if that is installed, which prints a long notice.
             with contextlib.redirect_stderr(io.StringIO()), quiet():
                 return getattr(importlib.import_module(self.place), self.name)
-        if ":" in self.name:
-            with quiet():
-                algorithm = import_object(self.name, field, OptionError)
-        else:
-            algorithm = _entry_point(self.name, field)
+        with quiet():
+            if ":" not in self.name:
+                return _entry_point(self.name, field)
+            algorithm = import_object(self.name, field, OptionError)
         if not callable(algorithm):
             raise OptionError(
                 f"{field}={self.name!r}: is of type {type(algorithm).__name__}: must be a class "
@@ -91,17 +93,15 @@ class Entry:
         """Check that what learns is installed here, where that can be told in little time."""
         if self.kind == "jax":
             importlib.import_module("sme_registry.jax")  # raises where JAX is missing
-        elif self.kind == "train":
-            self.load()
-        elif self.kind in ("sb3", "independent"):
+        elif self.kind == "sb3" and self.place:
             require_sb3()
-            algorithm = None if self.place and self.kind == "sb3" else self.load()
-            if self.kind != "independent" or is_on_policy(algorithm):
-                return
+        elif self.kind in ("sb3", "train"):
+            self.load()
+        elif self.kind == "independent" and not is_on_policy(self.load()):
             raise OptionError(
-                f"uses='{self.prefix}{self.name}': must be an on-policy algorithm, such as "
-                "independent:PPO, because the models of a team learn from the same rollouts. Use "
-                f"one model for all agents instead: {self.name}."
+                f"uses={self.uses!r}: must be an on-policy algorithm, such as independent:PPO, "
+                "because the models of a team learn from the same rollouts. Use one model for all "
+                f"agents instead: {self.name}."
             )
 
     def check_task(self, document: SMESpec | StreamSpec) -> None:
@@ -112,7 +112,7 @@ class Entry:
             _check_in_jax(document)
         if self.kind == "train" and (isinstance(document, StreamSpec) or document.team):
             raise SpecError(
-                f"train:{self.name}: is for a task of a single agent, and this is a "
+                f"{self.uses}: is for a task of a single agent, and this is a "
                 f"{'team' if document.specs[0].team else 'stream'}. Train an algorithm "
                 "of Stable-Baselines3, such as PPO."
             )
@@ -133,7 +133,7 @@ ALGORITHMS = _OF_SB3 | _OF_OURS
 """Names and descriptions of the algorithms that `sme train` knows by name."""
 
 LEARNERS: dict[str, Entry] = {
-    entry.prefix + entry.name: entry
+    entry.uses: entry
     for entry in (
         *(Entry("sb3", name, "stable_baselines3") for name in _OF_SB3),
         *(Entry("sb3", name, "sme_registry.sb3", needs_limits=True) for name in _OF_OURS),
@@ -164,36 +164,6 @@ def find(uses: str, field: str = "uses") -> Entry:
     return Entry("sb3", name)
 
 
-def code_notice(uses: Iterable[str]) -> str:
-    """Whose code runs to find these algorithms; empty where they name no modules that are here."""
-    modules = dict.fromkeys(filter(None, map(_module_of, uses)))
-    found = [module for module in modules if path_of(module)]
-    return f"This plan runs the code of {', '.join(found)}." if found else ""
-
-
-def _module_of(uses: str) -> str | None:
-    """The module that a name in `uses` names."""
-    kind, name = parse_uses(uses)
-    kind, name = parse_uses(name) if kind == "independent" else (kind, name)
-    return name.partition(":")[0] if kind in ("sb3", "train") and ":" in name else None
-
-
-def _check_in_jax(document: SMESpec | StreamSpec) -> None:
-    """Raise SpecError where JAX does not have a field, or agents in it cannot live in a stream."""
-    from sme_registry.jax.lives import check_switches
-    from sme_registry.jax.task import check_supported
-
-    if isinstance(document, SMESpec):
-        check_supported(document)
-        return
-    for index, phase in enumerate(document.phases):
-        try:
-            check_supported(phase.spec)
-        except SpecError as error:
-            raise SpecError(f"phases.{index}.spec: {error}") from None
-    check_switches(document)
-
-
 def default_algorithm(document: SMESpec | StreamSpec) -> str:
     """The algorithm used by default: TD3, and PPO for a team.
 
@@ -205,13 +175,8 @@ def default_algorithm(document: SMESpec | StreamSpec) -> str:
     return "TD3" if document.specs[0].team is None else "PPO"
 
 
-def default_num_envs(spec: SMESpec, algorithm: Any) -> int:
-    """The default number of parallel environments: 8 for a team and an on-policy class, or 1."""
-    return _TEAMS if spec.team is not None and is_on_policy(algorithm) else 1
-
-
 def full_name(uses: str, agents: str | None = None) -> str:
-    """The exact name of an algorithm in any case, also of `jax:…`; others' names unchanged.
+    """The exact name of an algorithm in any case; the names of others' algorithms unchanged.
 
     `agents` is whose implementation, "sb3" or "jax"; None for the one that the name says.
 
@@ -220,17 +185,12 @@ def full_name(uses: str, agents: str | None = None) -> str:
       >>> full_name("ppo", agents="jax")
       'jax:PPO'
     """
-    ours = in_jax(uses.casefold())
-    plain = uses[len(JAX) :] if ours else uses
-    if agents is not None:
-        if choice("agents", agents, AGENTS) == "sb3" and ours:
-            raise OptionError(
-                f"agents='sb3': must be left out for {uses!r}, which is in JAX. Leave it out, or "
-                f"train {plain!r}."
-            )
-        ours = agents == "jax"
-    name = next((name for name in ALGORITHMS if name.casefold() == plain.casefold()), plain)
-    return f"{JAX}{name}" if ours else name
+    if agents is not None and choice("agents", agents, AGENTS) == "sb3" and in_jax(uses):
+        raise OptionError(
+            f"agents='sb3': must be left out for {uses!r}, which is in JAX. Leave it out, or train "
+            f"{parse_uses(uses)[1]!r}."
+        )
+    return find(f"{JAX}{parse_uses(uses)[1]}" if agents == "jax" else uses, "algorithm").uses
 
 
 def short_name(uses: str) -> str:
@@ -255,30 +215,102 @@ def folder_name(uses: str) -> str:
     return f"{'jax-' * in_jax(uses)}{short_name(uses)}"
 
 
-def require_sb3() -> None:
-    """Check that Stable-Baselines3 and PyTorch are installed; imports neither."""
-    require_packages(
-        "training", {"stable_baselines3": "Stable-Baselines3", "torch": "PyTorch"}, "train"
-    )
+def code_notice(uses: Iterable[str]) -> str:
+    """Whose code runs to find these algorithms; empty where they name no modules that are here."""
+    names = (parse_uses(name.removeprefix("independent:")) for name in uses)
+    named = [name for kind, name in names if kind in ("sb3", "train") and ":" in name]
+    modules = dict.fromkeys(name.partition(":")[0] for name in named)
+    here = [module for module in modules if module_file(module)]
+    return f"This plan runs the code of {', '.join(here)}." if here else ""
+
+
+def _check_in_jax(document: SMESpec | StreamSpec) -> None:
+    """Raise SpecError where JAX does not have a field, or agents in it cannot live in a stream."""
+    from sme_registry.jax.lives import check_switches
+    from sme_registry.jax.task import check_supported
+
+    for index, spec in enumerate(document.specs):
+        try:
+            check_supported(spec)
+        except SpecError as error:
+            in_stream = isinstance(document, StreamSpec)
+            raise SpecError(f"phases.{index}.spec: {error}" if in_stream else f"{error}") from None
+    if isinstance(document, StreamSpec):
+        check_switches(document)
 
 
 def _entry_point(name: str, field: str) -> Any:
     installed = {point.name: point for point in importlib.metadata.entry_points(group=ENTRY_POINTS)}
     if name not in installed:
-        others = [known for known in LEARNERS if known not in ALGORITHMS]
-        known = [*ALGORITHMS, *sorted(installed), *others]
+        known = [*LEARNERS, *sorted(installed)]
         raise UnknownNameError(
             f"{field}={name!r}: must be one of {', '.join(known)}; or module:Class or "
             f"module:function, such as sb3_contrib:TQC.{did_you_mean(name, known)}"
         )
-    point = installed[name]
-    try:
-        return point.load()
-    except Exception as error:
+    return import_object(installed[name].value, f"{field}={name!r}: entry point", OptionError)
+
+
+_loaded: dict[str, str] = {}  # the digest of the source that a module has run
+
+
+def source_of(uses: str, field: str = "uses") -> str | None:
+    """The digest of the source of `train:module:name`, which is not imported; None of any other."""
+    kind, name = parse_uses(uses)
+    return _source(name, field)[1] if kind == "train" else None
+
+
+def load_function(name: str, field: str = "uses") -> tuple[Callable[..., Any], str]:
+    """The function `module:function` of the source that is there now, and the source's digest.
+
+    The source is run again where it has changed since, so what runs is what the digest says.
+    """
+    module_name, _, attribute = name.partition(":")
+    with working_directory_importable():
+        path, digest, source = _source(name, field)
+        module = sys.modules.get(module_name)
+        try:
+            if module is None or _loaded.get(module_name) != digest:
+                importlib.import_module(module_name.rpartition(".")[0] or "sys")
+                spec = importlib.util.spec_from_file_location(module_name, path)
+                module = module or importlib.util.module_from_spec(spec)  # type: ignore[arg-type]
+                sys.modules[module_name] = module
+                exec(compile(source, path, "exec"), vars(module))
+                _loaded[module_name] = digest
+        except Exception as error:
+            sys.modules.pop(module_name, None)
+            raise OptionError(
+                f"{field}='train:{name}': {module_name} cannot be imported: "
+                f"{type(error).__name__}: {error}. Correct it."
+            ) from error
+    function = getattr(module, attribute, None)
+    if not callable(function):
+        functions = [known for known, value in vars(module).items() if callable(value)]
         raise OptionError(
-            f"{field}={name!r}: the entry point {point.value!r} cannot be imported: "
-            f"{type(error).__name__}: {error}. Repair or remove the package that provides it."
-        ) from error
+            f"{field}='train:{name}': {path} has no function {attribute!r}."
+            f"{did_you_mean(attribute, functions)} Define {attribute}(env, steps, seed), which "
+            "returns a policy."
+        )
+    return function, digest
+
+
+def _source(name: str, field: str) -> tuple[str, str, bytes]:
+    """The path, the digest and the bytes of a module's source. Imports nothing."""
+    module = name.partition(":")[0]
+    path = module_file(module)
+    if not path or not path.endswith(".py"):
+        raise OptionError(
+            f"{field}='train:{name}': there is no Python module {module!r}. It must be "
+            "train:module:function, with the module in the working directory or installed."
+        )
+    source = Path(path).read_bytes()
+    return path, f"sha256:{hashlib.sha256(source).hexdigest()}", source
+
+
+def require_sb3() -> None:
+    """Check that Stable-Baselines3 and PyTorch are installed; imports neither."""
+    require_packages(
+        "training", {"stable_baselines3": "Stable-Baselines3", "torch": "PyTorch"}, "train"
+    )
 
 
 def is_on_policy(algorithm: Any) -> bool:
@@ -293,22 +325,6 @@ def is_sb3(algorithm: Any) -> bool:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
     return issubclass(algorithm if isinstance(algorithm, type) else type(algorithm), BaseAlgorithm)
-
-
-def replay_settings(algorithm: Any, transitions: int) -> dict[str, int]:
-    """The size of an off-policy algorithm's replay buffer; empty for an on-policy algorithm."""
-    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-
-    if not issubclass(algorithm, OffPolicyAlgorithm):
-        return {}
-    return {"buffer_size": min(_MAX_REPLAY, transitions)}
-
-
-def silence(model: Any) -> None:
-    """Disable the logger of an SB3 model; by default it creates a temporary folder."""
-    from stable_baselines3.common.logger import Logger
-
-    model.set_logger(Logger(None, []))
 
 
 def quiet() -> contextlib.AbstractContextManager[Any]:
@@ -329,12 +345,9 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-# Arguments of an algorithm's constructor that are not hyperparameters.
-_RESERVED = ("self", "policy", "env", "seed", "device", "verbose", "tensorboard_log")
-# Arguments of a policy's constructor that the algorithm passes.
-_PASSED = ("self", "observation_space", "action_space", "lr_schedule")
-OF_DATA_SET = ("nu", "transitions", "batch_size")  # of `offline:…`, and not the learner's
-_ROLLOUT, _MIN_ROLLOUT = 2048, 16  # SB3's default for PPO in one environment; ours at least
+def default_num_envs(spec: SMESpec, algorithm: Any) -> int:
+    """The default number of parallel environments: 8 for a team and an on-policy class, or 1."""
+    return 8 if spec.team is not None and is_on_policy(algorithm) else 1
 
 
 def nested_hyperparameters(flat: Mapping[str, Any]) -> dict[str, Any]:
@@ -387,14 +400,11 @@ def check_hyperparameters(
 ) -> None:
     """Check that an algorithm has hyperparameters of these names; values only in JAX and offline.
 
-    The names are those of the constructor, or of the function, and in `policy_kwargs` those of the
-    policy's constructor.
-
-    Error messages call them `field`, and may suggest one of `others`, which the caller accepts.
+    Names are those of the constructor or function, and in `policy_kwargs` those of the policy's
+    constructor. Messages call them `field`, and may suggest one of `others`, which the caller has.
 
     Examples:
       >>> from sme_registry.training import check_hyperparameters
-      >>> check_hyperparameters("PPO", {"learning_rate": 1e-4})
       >>> check_hyperparameters("PPO", {"learning_rat": 1e-4})
       Traceback (most recent call last):
       ...
@@ -409,19 +419,16 @@ def check_hyperparameters(
             "out."
         )
     if entry.kind == "offline":
-        own = {name: hyperparameters[name] for name in hyperparameters if name not in OF_DATA_SET}
-        documents.check_algorithm(entry.name, own)
-    elif entry.kind == "train":
-        names = _names(entry.load(field), ("env", "steps", "seed"))
-        _refuse_names(field, uses, hyperparameters, names, others)
+        of_learner = {n: v for n, v in hyperparameters.items() if n not in _OF_DATA_SET}
+        documents.check_algorithm(entry.name, of_learner)
     elif entry.kind == "jax":
         from sme_registry.jax.run import settings_of
 
         if others:  # where Stable-Baselines3 is needed anyway
-            refuse_unknown(find(entry.name).load(), entry.name, hyperparameters, field, others)
+            check_names(find(entry.name).load(), entry.name, hyperparameters, field, others)
         settings_of(uses, hyperparameters, field)
     else:
-        refuse_unknown(entry.load(), uses, hyperparameters, field, others)
+        check_names(entry.load(field), uses, hyperparameters, field, others)
 
 
 def check_algorithm(algorithm: StudyAlgorithm) -> None:
@@ -430,7 +437,7 @@ def check_algorithm(algorithm: StudyAlgorithm) -> None:
     check_hyperparameters(algorithm.uses, algorithm.hyperparameters, field)
 
 
-def refuse_unknown(
+def check_names(
     algorithm: Any,
     uses: str,
     hyperparameters: Mapping[str, Any],
@@ -438,30 +445,38 @@ def refuse_unknown(
     others: Iterable[str] = (),
 ) -> None:
     """Raise OptionError if an algorithm's class or function has no hyperparameter of a name."""
-    if not isinstance(algorithm, type) or not is_sb3(algorithm):
-        environment = next(iter(inspect.signature(algorithm).parameters), "env")
-        names = _names(algorithm, (environment, "seed"))
-        _refuse_names(field, uses, hyperparameters, names, others)
+    first = next(iter(inspect.signature(algorithm).parameters), "env")
+    if parse_uses(uses)[0] == "train":
+        _check_names(field, uses, hyperparameters, algorithm, (first, "steps", "seed"), others)
+    elif not isinstance(algorithm, type) or not is_sb3(algorithm):
+        _check_names(field, uses, hyperparameters, algorithm, (first, "seed"), others)
+    else:
+        _check_names(field, uses, hyperparameters, algorithm, _RESERVED, others)
+        in_policy = hyperparameters.get("policy_kwargs")
+        if isinstance(in_policy, Mapping):
+            policy: Any = cast(Any, algorithm).policy_aliases[policy_alias(algorithm)]
+            _check_names(f"{field}.policy_kwargs", f"{uses}'s policy", in_policy, policy, _PASSED)
+
+
+def _check_names(
+    field: str,
+    owner: str,
+    names: Iterable[str],
+    function: Any,
+    reserved: Iterable[str],
+    others: Iterable[str] = (),
+) -> None:
+    """Raise OptionError if a function has no argument of a name that a user may set."""
+    parameters = parameters_of(function)
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
         return
-    _refuse_names(field, uses, hyperparameters, _names(algorithm, _RESERVED), others)
-    policy_kwargs = hyperparameters.get("policy_kwargs")
-    if isinstance(policy_kwargs, Mapping):
-        names = _names(_policy_class(algorithm), _PASSED)
-        _refuse_names(f"{field}.policy_kwargs", f"{uses}'s policy", policy_kwargs, names)
-
-
-def resolved(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON values for a constructor: tuples for lists, and the classes named in `policy_kwargs`."""
-    values = {k: tuple(v) if isinstance(v, list) else v for k, v in hyperparameters.items()}
-    policy_kwargs = values.get("policy_kwargs")
-    if isinstance(policy_kwargs, Mapping):
-        values["policy_kwargs"] = {
-            name: import_object(value, f"hyperparameters.policy_kwargs.{name}", OptionError)
-            if isinstance(value, str) and ":" in value
-            else value
-            for name, value in policy_kwargs.items()
-        }
-    return values
+    known = [name for name in parameters if name not in reserved and not name.startswith("_")]
+    for name in names:
+        if name not in known:
+            raise OptionError(
+                f"{field}.{name}: {owner} has no such hyperparameter."
+                f"{did_you_mean(name, [*known, *others])} Known: {', '.join(known) or 'none'}."
+            )
 
 
 def policy_alias(algorithm: Any) -> str:
@@ -470,67 +485,17 @@ def policy_alias(algorithm: Any) -> str:
     return next(a for a in aliases if a in algorithm.policy_aliases and a.startswith("Mlp"))
 
 
-def _policy_class(algorithm: Any) -> Any:
-    return algorithm.policy_aliases[policy_alias(algorithm)]
-
-
-def for_lanes(algorithm: Any, lanes: int, chosen: Iterable[str] = ()) -> dict[str, int]:
-    """The changes to SB3's defaults that keep an algorithm the same in several lanes at once.
-
-    A lane is an environment, or one agent of a team. SB3's `n_steps` counts the steps of each: PPO
-    in 8 would collect 16,384 transitions for one update, so the rollout of 2,048 is divided. And
-    TD3 in 8 would learn an eighth as often, so it gets one update for each transition.
-
-    On Team4, r̃ was 0.77 after 16,384 steps of PPO with SB3's defaults, and 0.85 divided.
-    """
-    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-
-    if not isinstance(algorithm, type):
-        return {}
-    if issubclass(algorithm, OnPolicyAlgorithm) and "n_steps" not in chosen:
-        default = parameters_of(algorithm)["n_steps"].default
-        n_steps = min(default, max(_MIN_ROLLOUT, _ROLLOUT // lanes))
-        return {} if n_steps == default else {"n_steps": n_steps}
-    if issubclass(algorithm, OffPolicyAlgorithm) and lanes > 1:
-        return {} if {"gradient_steps", "train_freq"} & set(chosen) else {"gradient_steps": -1}
-    return {}
-
-
 def parameters_of(function: Any) -> dict[str, inspect.Parameter]:
-    """The parameters of a function, or of a class's constructor."""
+    """The parameters of a function, or of a class's constructor and those that it passes on to."""
     if not isinstance(function, type):
         return dict(inspect.signature(function).parameters)
     parameters: dict[str, inspect.Parameter] = {}
     for owner in function.__mro__:
         if "__init__" not in vars(owner):
             continue
-        own = {each.name: each for each in inspect.signature(owner).parameters.values()}
+        own = inspect.signature(owner).parameters
         parameters = {**own, **parameters}
         if not any(each.kind is each.VAR_KEYWORD for each in own.values()):
             passed_on = inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL
             return {name: p for name, p in parameters.items() if p.kind not in passed_on}
     return parameters
-
-
-def _names(function: Any, reserved: Iterable[str]) -> list[str] | None:
-    """The names of a function's arguments that a user may set; None if it accepts any."""
-    parameters = parameters_of(function)
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
-        return None
-    return [name for name in parameters if name not in reserved and not name.startswith("_")]
-
-
-def _refuse_names(
-    field: str,
-    owner: str,
-    names: Iterable[str],
-    known: list[str] | None,
-    others: Iterable[str] = (),
-) -> None:
-    for name in names:
-        if known is not None and name not in known:
-            raise OptionError(
-                f"{field}.{name}: {owner} has no such hyperparameter."
-                f"{did_you_mean(name, [*known, *others])} Known: {', '.join(known) or 'none'}."
-            )

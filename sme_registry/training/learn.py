@@ -1,39 +1,41 @@
-"""`learn`: the training of a run by any `Learner`; `write_report`: its evaluation and its figures.
+"""`Learner`, of which a function of yours is one; `learn`, which trains a run by any `Learner`.
 
-It goes on from its last checkpoint. Each finished episode is logged with its exact regret. A run on
-a task has an `EvaluationReport` of its trained model, a life in a stream a `StreamReport` of its
-snapshots, with the dynamic regret of its episodes.
+    def train(env, steps, seed):            # `train:module:train` in `sme train -a` and in plans
+        ...                                 # takes at most `steps` steps of `env`
+        return policy                       # from observations [B, O] to actions [B, A]
+
+`env` is a Gymnasium environment of one task, with the exact regret of each step in its info.
+Hyperparameters are keyword arguments. The policy acts in the environment's action space; a model
+with `predict`, as those of Stable-Baselines3, and a PyTorch module are policies, too. It is
+evaluated once, at the end of its training.
+
+A run goes on from its last checkpoint. Each finished episode is logged with its exact regret.
 """
 
 from __future__ import annotations
 
+import inspect
+import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
+import gymnasium
 import numpy as np
 from rich.console import Console
 
 from sme_registry.compiled.arrays import Array
-from sme_registry.envs.episodes import Episode, Episodes
-from sme_registry.errors import PolicyError
-from sme_registry.evaluation import (
-    EvaluationReport,
-    StreamReport,
-    dynamic_regret,
-    evaluate,
-    evaluate_stream,
-    reference_regret,
-)
-from sme_registry.evaluation.evaluate import OnBatch
-from sme_registry.io import is_installed
-from sme_registry.io.system import defer_interrupts
+from sme_registry.envs import SMEEnv
+from sme_registry.envs.episodes import Episode, Episodes, info_of_lanes
+from sme_registry.errors import OptionError, PolicyError
+from sme_registry.evaluation import Policy, TeamPolicy, as_policy
+from sme_registry.evaluation.models import saved_sb3
+from sme_registry.io import write_atomically
+from sme_registry.io.system import defer_interrupts, working_directory_importable
 from sme_registry.io.terminal import Progress
-from sme_registry.plots import reports as plot_files
-from sme_registry.plots.maps import STREAM
-from sme_registry.spec import StreamSpec
-from sme_registry.training.algorithms import short_name
+from sme_registry.spec import ActionRange, SMESpec
+from sme_registry.training.algorithms import load_function, short_name
 from sme_registry.training.record import (
     CHECKPOINT,
     EPISODES,
@@ -42,20 +44,13 @@ from sme_registry.training.record import (
     EpisodeLog,
     RunRecord,
     Snapshots,
-    read_episodes,
 )
 
 _RECENT = 20  # episodes in the running mean that the progress shows
 
 
 class Watch:
-    """What is called while a learner learns; `RunLog` of a run, and others of a study's cells.
-
-    Attributes:
-      pauses: whether `on_pause` does anything, for which a model must take SB3's callbacks.
-    """
-
-    pauses = False
+    """What is called while a learner learns; `RunLog` of a run, and another of a study's cell."""
 
     def on_steps(self) -> None:
         """The learner's environments have taken one or more steps."""
@@ -69,43 +64,41 @@ class Watch:
     def prepare(self, note: str) -> None:
         """The learner does something else before its first steps, such as compiling."""
 
-    def prepared(self) -> None:
-        """It is done."""
 
-
-class Learner(Protocol):
+class Learner:
     """What learns in environments of its own: of Stable-Baselines3, in JAX, or a function.
 
     Attributes:
       steps: environment steps so far.
       total: environment steps at the end; on-policy algorithms collect whole rollouts.
       model: the trained policy, as `evaluate` takes it.
+      hyperparameters: those that differ from the defaults.
     """
 
-    @property
-    def steps(self) -> int: ...
-    @property
-    def total(self) -> int: ...
-    @property
-    def model(self) -> Any: ...
+    steps: Any
+    total: Any
+    model: Any
+    hyperparameters: dict[str, Any]
 
     def learn(self, watch: Watch) -> None:
         """Take the steps of the run that are left; ValueError where weights are not finite."""
 
     def add_to(self, sums: Episodes) -> list[Episode]:
         """Add the steps since the last call to sums; returns the episodes that ended in them."""
+        return []
+
+    def save(self, path: Path) -> None:
+        """Write the model; nothing of one that cannot be saved."""
 
     def is_finite(self) -> bool:
-        """Whether all its weights are finite."""
+        """Whether all its weights are finite; also if they are unknown."""
+        return True
 
     def restore(self, checkpoint: Path) -> Array | None:
         """Go on from a checkpoint; returns the sums of the present episodes if these go on, too."""
 
     def save_checkpoint(self, path: Path, sums: Array) -> None:
         """Write a checkpoint, whole or not at all; `sums` are of the present episodes."""
-
-    def save(self, path: Path) -> None:
-        """Write the model; nothing of one that cannot be saved."""
 
     def begin_log(self, folder: Path) -> None:
         """Log to TensorBoard in a folder from here on, if it is installed."""
@@ -132,17 +125,14 @@ def learn(
             log.check_finite()
             raise
         log.check_finite()
-    learner.close()
-    with defer_interrupts():
-        learner.save(folder / record.model_name)
-        log.record().write(folder)
-    return log.record(), log.episodes
+        learner.close()
+        with defer_interrupts():
+            learner.save(folder / record.model_name)
+            return log.write_record(), log.episodes
 
 
 class RunLog(Watch):
     """The log, the record and the displayed progress of a run, while it trains."""
-
-    pauses = True
 
     def __init__(
         self,
@@ -190,7 +180,6 @@ class RunLog(Watch):
         return self
 
     def __exit__(self, *error: Any) -> None:
-        self._wall_before, self._start = self._wall_seconds, time.monotonic()
         self._progress.__exit__(*error)
         self._log.close()
 
@@ -200,12 +189,8 @@ class RunLog(Watch):
         return self._log.episodes
 
     def prepare(self, note: str) -> None:
-        """Show what precedes or slows the first steps; see `Progress.prepare`."""
+        """Show what precedes the first steps; see `Progress.prepare`."""
         self._progress.prepare(note)
-
-    def prepared(self) -> None:
-        """Measure the displayed rate from here on, if it is not measured yet."""
-        self._progress.prepared()
 
     def on_steps(self) -> None:
         """Log the episodes that ended, and show how far the run is."""
@@ -233,18 +218,20 @@ class RunLog(Watch):
         self.check_finite()
         with defer_interrupts():
             self._learner.save_checkpoint(self._folder / CHECKPOINT, self._sums.sums)
-            self.record().write(self._folder)
+            self.write_record()
         self._last_checkpoint = steps
 
-    def record(self) -> RunRecord:
-        """The record with its present progress."""
+    def write_record(self) -> RunRecord:
+        """Write the record with its present progress."""
         seconds, steps = self._wall_seconds, self._sums.steps
-        return self._record.updated(
+        record = self._record.updated(
             steps_done=steps,
             episodes=len(self.episodes),
             wall_seconds=round(seconds, 3),
             steps_per_second=round(steps / max(seconds, 1e-9), 3),
         )
+        record.write(self._folder)
+        return record
 
     def check_finite(self) -> None:
         """Raise PolicyError if weights are NaN or infinite; the record says that the run failed."""
@@ -270,9 +257,8 @@ class RunLog(Watch):
         """The phase of a stream, and the mean regret of the last episodes."""
         notes, stream, recent = [], self._record.stream, self.episodes[-_RECENT:]
         if stream is not None:
-            notes.append(
-                f"phase {stream.segments[stream.times.segment_at(self._sums.steps)].phase}"
-            )
+            segment = stream.times.segment_at(self._sums.steps)
+            notes.append(f"phase {stream.segments[segment].phase}")
         if recent:
             regret = np.mean([episode.regret for episode in recent])
             whose = "team's mean regret" if self._agents else "mean regret"
@@ -282,77 +268,116 @@ class RunLog(Watch):
         return ", ".join(notes)
 
 
-EVALUATION = "evaluation.json"
-REPORT_FILES = (EVALUATION, STREAM, *plot_files.FILES)
+class FunctionLearner(Learner):
+    """A function `train(env, steps, seed) -> policy` in its environment.
+
+    Attributes:
+      env: the environment, which counts its steps.
+      model: the policy that the function returned.
+      source: the digest of the module's source.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        spec: SMESpec,
+        *,
+        seed: int,
+        steps: int,
+        hyperparameters: Mapping[str, Any],
+        action_range: ActionRange,
+        field: str = "uses",
+    ) -> None:
+        self._named, self._spec, self._action_range = f"{field}='train:{name}'", spec, action_range
+        self._seed, self.total, self.hyperparameters = seed, steps, dict(hyperparameters)
+        self._function, self.source = load_function(name, field)
+        self.env = CountedEnv(SMEEnv(spec, action_range=action_range), steps, self._named)
+        self.model: Any = None
+        try:
+            inspect.signature(self._function).bind(self.env, steps, seed, **self.hyperparameters)
+        except TypeError as error:
+            raise OptionError(
+                f"{self._named}: cannot be called with an environment, steps, a seed and the "
+                f"hyperparameters {sorted(hyperparameters)}: {error}. Define "
+                f"{name.partition(':')[2]}(env, steps, seed), and hyperparameters by name."
+            ) from None
+
+    @property
+    def steps(self) -> int:
+        """Environment steps so far."""
+        return self.env.steps
+
+    def learn(self, watch: Watch) -> None:
+        """Call the function; after each step, `watch.on_steps`."""
+        self.env.after_step = watch.on_steps
+        self.env.reset(seed=self._seed)  # so that episodes without a seed are reproducible
+        with working_directory_importable():
+            self.model = self._function(self.env, self.total, self._seed, **self.hyperparameters)
+        is_policy = callable(self.model) or hasattr(self.model, "predict")
+        if not is_policy or isinstance(self.model, type):
+            raise PolicyError(
+                f"{self._named}: returned {self.model!r:.80}: must be a policy. Return a function "
+                f"from observations [B, {self._spec.observation_dim}] to actions "
+                f"[B, {self._spec.action_dim}], or a model with predict, as those of "
+                "Stable-Baselines3."
+            )
+
+    def policy(self) -> Policy | TeamPolicy:
+        """The policy that the function returned."""
+        return as_policy(self.model, self._spec, action_range=self._action_range)
+
+    def add_to(self, sums: Episodes) -> list[Episode]:
+        """Add the last step to sums; returns the episode that ended in it."""
+        reward, terminated, truncated, info = self.env.last
+        ended = [terminated or truncated]
+        return sums.add([reward], info_of_lanes([info]), [terminated], ended)
+
+    def save(self, path: Path) -> None:
+        """Write a model of Stable-Baselines3, and nothing of another policy."""
+        kinds = sys.modules.get("stable_baselines3.common.base_class")
+        if kinds is not None and isinstance(self.model, kinds.BaseAlgorithm):
+            write_atomically(path, saved_sb3(self.model))
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
 
 
-def write_report(
-    model: Any,
-    record: RunRecord,
-    episodes: Sequence[Episode],
-    folder: Path,
-    progress: bool,
-    console: Console | None,
-) -> tuple[EvaluationReport | StreamReport, tuple[Path, ...]]:
-    """Evaluate a finished run; write its report, and its figures if Matplotlib is installed."""
-    states = record.protocol.states_per_region * len(record.protocol.edges)
-    with Progress("evaluating", states, console=console, unit="states", enabled=progress) as bar:
+class CountedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment that takes no more than its steps, and counts their regret and CPU seconds.
 
-        def on_batch(done: int, total: int) -> None:
-            bar.update(done)
+    Attributes:
+      steps: taken so far.
+      seconds: of this thread, in these steps.
+      regret: the sum over them, `[1]`.
+      cost: of a task with `safety`, the sum over them; None of any other.
+      last: reward, terminated, truncated and info of the last one.
+    """
 
-        if record.stream is not None:
-            report = _evaluate_life(record, record.stream, folder, on_batch)
-            report.write(folder / STREAM)
-            return report, _draw(report, episodes, folder, model)
-        evaluated = evaluate(
-            model,
-            record.spec,
-            record.protocol,
-            action_range=record.action_range,
-            name=f"{'independent ' * record.independent}{short_name(record.algorithm)}",
-            progress=on_batch,
-        )
-    evaluated.write(folder / EVALUATION)
-    return evaluated, _draw(evaluated, episodes, folder, model)
+    def __init__(self, env: SMEEnv, budget: int, named: str) -> None:
+        super().__init__(env)
+        self._budget, self._named = budget, named
+        self.steps, self.seconds, self.regret = 0, 0.0, np.zeros(1)
+        self.cost: float | None = None if env.sme_spec.safety is None else 0.0
+        self.last: tuple[Any, bool, bool, dict[str, Any]] = (0.0, False, False, {})
+        self.after_step: Callable[[], None] = lambda: None
 
-
-def _evaluate_life(
-    record: RunRecord, stream: StreamSpec, folder: Path, on_batch: OnBatch
-) -> StreamReport:
-    files = Snapshots(folder / SNAPSHOTS, stream)
-    report = evaluate_stream(
-        files.visits,
-        stream,
-        record.protocol,
-        initial=files.initial,
-        action_range=record.action_range,
-        name=short_name(record.algorithm),
-        progress=on_batch,
-    )
-    episodes = read_episodes(folder / EPISODES)  # rounded alike in every session
-    if not episodes:
-        return report
-    step, regret, length = zip(*((e.step, e.regret, e.length) for e in episodes), strict=True)
-    log = dynamic_regret(stream, step, regret, length)
-    frozen: dict[str, Any] = {"frozen": files.visits[0], "training": log}
-    if log.visits[0].online_regret is None:  # where no episode of the first visit is in the log
-        frozen = {}
-    references = reference_regret(stream, **frozen)
-    return report.with_dynamic_regret(log).with_reference_regret(references)
-
-
-def _draw(
-    report: EvaluationReport | StreamReport, episodes: Sequence[Episode], folder: Path, model: Any
-) -> tuple[Path, ...]:
-    if not is_installed("matplotlib"):
-        return ()
-    figures: list[Path] = []
-    if episodes:
-        title = f"{report.policy} on {report.title}"
-        visits = report.visits if isinstance(report, StreamReport) else ()
-        costs = episodes[0].safety is not None
-        figures += plot_files.write_training(folder / EPISODES, folder, title, visits, costs)
-    if isinstance(report, StreamReport):
-        return (*figures, *plot_files.write_stream(report, folder))
-    return (*figures, *plot_files.write_evaluation(report, folder, model))
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """One step; PolicyError beyond the budget."""
+        if self.steps >= self._budget:
+            raise PolicyError(
+                f"{self._named}: takes more than {self._budget:,} steps: must stop at the steps "
+                "that it is given. Choose rollouts and evaluations of your own that fit, or give "
+                "more steps."
+            )
+        begun = time.thread_time()
+        result = self.env.step(action)
+        self.seconds += time.thread_time() - begun
+        info = result[4]
+        self.steps += 1
+        self.regret += info["regret"]
+        if self.cost is not None:
+            self.cost += info["cost"]
+        self.last = (float(result[1]), *result[2:])
+        self.after_step()
+        return result

@@ -1,4 +1,4 @@
-"""Models of Stable-Baselines3 and of its kind, by the names of their algorithms.
+"""Models of Stable-Baselines3 and of its kind, and `SB3Learner`, in whose environments they learn.
 
 A function that is named as an algorithm returns a model:
 
@@ -7,56 +7,55 @@ A function that is named as an algorithm returns a model:
 so anything with `learn` and `predict` can be trained. Agents in JAX have one, too, with the same
 weights: evaluation, export to ONNX, diagnosis and leaderboards take it as any other.
 
-Independent learners of a team (`IndependentModels`) are one on-policy model for each agent, trained
-at the same time. Each sees what its agent observes, (s[O_i], t/T, r_cum/k), acts on its agent's
-channels, and learns from its agent's reward alone. For each the others are part of the environment,
-which changes while they learn (de Witt et al. 2020, "Is Independent Learning All You Need in the
-StarCraft Multi-Agent Challenge?"). Their steps are collected here, for all models together, as
-`OnPolicyAlgorithm.collect_rollouts` of Stable-Baselines3 collects them for one.
-
 A checkpoint is a model's .zip that SB3 can load with one more member, the filled part of the replay
-buffer: with two files, a kill between the writes would pair a model with the wrong buffer. That of
-an agent in JAX is an .npz of all arrays of its program.
+buffer: with two files, a kill between the writes would pair a model with the wrong buffer.
 
 Imports Stable-Baselines3; import it inside functions only.
 """
 
 from __future__ import annotations
 
+import copy
 import inspect
 import io
+import time
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Never, Protocol
+from typing import Any, Protocol
 
-import gymnasium
 import numpy as np
 import numpy.typing as npt
 import torch
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 
-from sme_registry.envs.vector import EnvView
+from sme_registry.envs.episodes import Episode, Episodes
 from sme_registry.errors import OptionError, PolicyError
-from sme_registry.evaluation.models import saved_sb3
-from sme_registry.io import write_atomically
-from sme_registry.sb3 import LanesVecEnv, SMEVecEnv
+from sme_registry.evaluation import Perceptron, Policy, TeamPolicy
+from sme_registry.evaluation.models import saved_sb3, torch_policy
+from sme_registry.io import import_object, is_installed, write_atomically
+from sme_registry.sb3 import SMETeamVecEnv, SMEVecEnv
+from sme_registry.sb3.vec_env import SingleVecEnv, finished_in, log_episode
 from sme_registry.spec import ActionRange, SMESpec, StreamSpec
 from sme_registry.spec.study import parse_uses
-from sme_registry.task import materialize
 from sme_registry.training.algorithms import (
+    check_names,
+    default_num_envs,
     find,
+    is_on_policy,
     is_sb3,
+    parameters_of,
     policy_alias,
-    refuse_unknown,
-    replay_settings,
-    resolved,
-    silence,
 )
+from sme_registry.training.learn import Learner, Watch
+from sme_registry.training.numpy_policy import numpy_policy, numpy_team_policy
+from sme_registry.training.record import VisitEnds
 
-Floats = npt.NDArray[np.float32]
-_MODEL = "{}.zip"  # of an agent, in the folder of models and in the checkpoint
+_MAX_REPLAY = 1_000_000  # SB3's default
+_ROLLOUT, _MIN_ROLLOUT = 2048, 16  # SB3's default for PPO in one environment; ours at least
 _MEMBER = "sme_replay_buffer.npz"
 _ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
@@ -82,10 +81,11 @@ def new_model(
 ) -> Model:
     """Create a model that learns in a `VecEnv`, from so many steps of all its lanes."""
     algorithm = find(uses, field).load(field)
-    refuse_unknown(algorithm, uses, hyperparameters)
+    check_names(algorithm, uses, hyperparameters)
     settings = resolved(hyperparameters)
     if isinstance(algorithm, type) and is_sb3(algorithm):
-        settings = {**replay_settings(algorithm, steps + env.num_envs), **settings}
+        if is_off_policy(algorithm):
+            settings = {"buffer_size": min(_MAX_REPLAY, steps + env.num_envs), **settings}
         try:
             policy = policy_alias(algorithm)
             model = algorithm(policy, env, seed=seed, device="cpu", **settings)
@@ -197,170 +197,286 @@ def _refill(buffer: Any, replay: dict[str, Any]) -> None:
     buffer.pos = filled if was_full and not buffer.full else int(replay["pos"])
 
 
-class _AgentLanes(LanesVecEnv):
-    """The spaces of one agent in each environment, for the constructor of its model."""
+def resolved(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
+    """JSON values for a constructor: tuples for lists, and the classes named in `policy_kwargs`."""
+    values = {k: tuple(v) if isinstance(v, list) else v for k, v in hyperparameters.items()}
+    policy_kwargs = values.get("policy_kwargs")
+    if isinstance(policy_kwargs, Mapping):
+        values["policy_kwargs"] = {
+            name: import_object(value, f"hyperparameters.policy_kwargs.{name}", OptionError)
+            if isinstance(value, str) and ":" in value
+            else value
+            for name, value in policy_kwargs.items()
+        }
+    return values
 
-    def reset(self) -> Never:
-        raise NotImplementedError("The models of a team are stepped together.")
 
-    step_wait = reset
+def is_off_policy(algorithm: Any) -> bool:
+    """Whether this is an off-policy class of Stable-Baselines3, such as TD3."""
+    return isinstance(algorithm, type) and issubclass(algorithm, OffPolicyAlgorithm)
 
 
-class IndependentModels:
-    """The models of a team's agents, in environments (`SMETeamVecEnv`) that they share."""
+def for_lanes(algorithm: Any, lanes: int, chosen: Iterable[str] = ()) -> dict[str, int]:
+    """The changes to SB3's defaults that keep an algorithm the same in several lanes at once.
+
+    A lane is an environment, or one agent of a team. SB3's `n_steps` counts the steps of each: PPO
+    in 8 would collect 16,384 transitions for one update, so the rollout of 2,048 is divided. And
+    TD3 in 8 would learn an eighth as often, so it gets one update for each transition.
+
+    On Team4, r̃ was 0.77 after 16,384 steps of PPO with SB3's defaults, and 0.85 divided.
+    """
+    if lanes == 1:
+        return {}
+    if is_on_policy(algorithm) and "n_steps" not in chosen:
+        default = parameters_of(algorithm)["n_steps"].default
+        n_steps = min(default, max(_MIN_ROLLOUT, _ROLLOUT // lanes))
+        return {} if n_steps == default else {"n_steps": n_steps}
+    of_updates = {"gradient_steps", "train_freq"} & set(chosen)
+    return {"gradient_steps": -1} if is_off_policy(algorithm) and not of_updates else {}
+
+
+def silence(model: Any) -> None:
+    """Disable the logger of an SB3 model; by default it creates a temporary folder."""
+    model.set_logger(Logger(None, []))
+
+
+def random_seed(*numbers: int) -> int:
+    """A seed that follows from others."""
+    return int(np.random.SeedSequence(numbers).generate_state(1)[0] >> 1)
+
+
+class CountedVecEnv(VecEnvWrapper):  # type: ignore[misc, unused-ignore]  # untyped without SB3
+    """Environments that count their steps, regret, cost and CPU seconds of this thread.
+
+    Every model steps its environment, so counting here needs no hook in the model. `after_step` is
+    called with `steps` after each step, for example to evaluate the model; its time is not counted.
+    """
+
+    def __init__(self, venv: Any) -> None:
+        super().__init__(venv)
+        self.names: tuple[str, ...] = tuple(getattr(venv, "agents", ("",)))
+        self.steps, self.seconds = 0, 0.0
+        self.regret = np.zeros(len(self.names))  # sums over steps, by agent
+        self.cost: float | None = None if venv.sme_spec.safety is None else 0.0
+        self.last: tuple[Any, Any, list[dict[str, Any]]] = (0, 0, [])  # rewards, dones, infos
+        self.after_step: Callable[[int], None] = lambda steps: None
+
+    def reset(self) -> Any:
+        """Begin an episode in every lane."""
+        observations = self.venv.reset()
+        self.reset_infos = self.venv.reset_infos
+        return observations
+
+    def step_wait(self) -> Any:
+        """One step of every lane."""
+        begun = time.thread_time()
+        result = self.venv.step_wait()
+        self.last = result[1:]
+        infos = result[3]
+        regret = np.array([info["regret"] for info in infos])
+        self.regret += regret.reshape(-1, len(self.names)).sum(axis=0)
+        if self.cost is not None:
+            self.cost += sum(info["cost"] for info in infos)
+        self.steps += self.num_envs // len(self.names)
+        self.seconds += time.thread_time() - begun
+        self.after_step(self.steps)
+        return result
+
+
+class SB3Learner(Learner):
+    """A model of a single agent, or that the agents of a team share, in its environments.
+
+    A single agent learns in one environment, as its algorithm is defined. A shared model gets the
+    transitions of each agent. A step of a team is one step of all its agents.
+
+    Attributes:
+      env: the environments, which count the steps of the task.
+      models: what learns in them, by agent; one that is shared has no name.
+      hyperparameters: those that differ from the algorithm's defaults.
+    """
 
     def __init__(
-        self, algorithm: str, env: Any, *, seed: int, steps: int, hyperparameters: Mapping[str, Any]
+        self,
+        uses: str,
+        document: SMESpec | StreamSpec,
+        *,
+        seed: int,
+        steps: int,
+        hyperparameters: Mapping[str, Any],
+        action_range: ActionRange,
+        num_envs: int | None = None,
+        field: str = "uses",
     ) -> None:
-        task = materialize(env.sme_spec)
-        self.env = env
-        S = task.spec.state_dim
-        self._columns = [[*observed, S, S + 1] for observed in task.observed]
-        self._widths = [owned.stop - owned.start for owned in task.owned]
-        low = float(env.action_space.low.min())
-        # An agent's initial weights do not change when another one is added.
-        seeds = [
-            int(np.random.SeedSequence([seed, agent]).generate_state(1)[0] >> 1)
-            for agent in range(len(task.names))
-        ]
-        self.models: dict[str, Any] = {}
-        shapes = zip(task.names, self._columns, self._widths, seeds, strict=True)
-        for name, columns, width, own_seed in shapes:
-            lane = _lane(env, len(columns), width, low)
-            self.models[name] = new_model(
-                algorithm,
-                _AgentLanes([lane] * env.num_teams),
-                seed=own_seed,
-                steps=steps,
-                hyperparameters=hyperparameters,
-                field="algorithm",
-            )
-            _check(self.models[name], algorithm)
-        self._seed = seed
+        """With `num_envs` the environments log the returns of episodes, as in `sme train`."""
+        self._uses, self._document, self._action_range = uses, document, action_range
+        self._seed, self._steps, self._field = seed, steps, field
+        spec = document.specs[0]
+        algorithm = find(uses, field).load(field)
+        env: Any
+        if spec.team is not None:
+            teams = num_envs or default_num_envs(spec, algorithm)
+            env = SMETeamVecEnv(spec, teams, action_range=action_range)
+        elif num_envs in (None, 1):
+            env = SingleVecEnv(document, action_range=action_range)
+        else:
+            env = SMEVecEnv(document, num_envs, action_range=action_range)
+        lanes = self._lanes(env)
+        changes = for_lanes(algorithm, lanes, hyperparameters)
+        self.hyperparameters = {**changes, **hyperparameters}
+        self.env: Any = CountedVecEnv(env if num_envs is None else VecMonitor(env))
+        self.models = self._new_models()
+
+    def _lanes(self, env: Any) -> int:
+        """The lanes from which a model learns."""
+        return int(env.num_envs)
+
+    def _new_models(self) -> dict[str, Any]:
+        model = new_model(
+            self._uses,
+            self.env,
+            seed=self._seed,
+            steps=self._steps * len(self.env.names),
+            hyperparameters=self.hyperparameters,
+            field=self._field,
+        )
+        return {"": model}
 
     @property
-    def num_timesteps(self) -> int:
-        """Steps of the team over all environments."""
-        return int(next(iter(self.models.values())).num_timesteps)
+    def model(self) -> Any:
+        """The model, as `evaluate` takes it."""
+        return self.models[""]
 
-    def learn(self, steps: int, on_rollout: Callable[[], None] = lambda: None) -> None:
-        """Learn until `num_timesteps` is at least `steps`."""
-        set_random_seed(self._seed)
-        self.env.seed(self._seed)
-        observations = self._split(self.env.reset())
-        starts = np.ones(self.env.num_teams, bool)
-        while self.num_timesteps < steps:
-            on_rollout()
-            observations, starts = self._collect(observations, starts)
-            for model in self.models.values():
-                model._update_current_progress_remaining(model.num_timesteps, steps)
-                model.train()
-                model.logger.dump(model.num_timesteps)
+    @property
+    def steps(self) -> int:
+        """Environment steps so far."""
+        return int(self.env.steps)
 
-    def save(self, folder: Path) -> None:
-        """Write the model of each agent as `<agent>.zip` into a folder."""
-        folder.mkdir(exist_ok=True)
-        for name, model in self.models.items():
-            write_atomically(folder / _MODEL.format(name), saved_sb3(model))
+    @property
+    def total(self) -> int:
+        """Environment steps at the end: on-policy algorithms collect whole rollouts."""
+        first = next(iter(self.models.values()))
+        rollout: int = first.n_steps if hasattr(first, "rollout_buffer") else 1
+        chunk: int = rollout * self.env.num_envs // len(self.env.names)
+        return self.steps + -(-max(0, self._steps - self.steps) // chunk) * chunk
 
-    def save_checkpoint(self, path: Path) -> None:
-        """Write all models into one file, whole or not at all."""
-        archive = io.BytesIO()
-        with zipfile.ZipFile(archive, "w") as members:
-            for name, model in self.models.items():
-                members.writestr(_MODEL.format(name), saved_sb3(model))
-        write_atomically(path, archive.getvalue())
+    def learn(self, watch: Watch) -> None:
+        """Take at least the steps that are left; after each of them, `watch.on_steps`."""
+        stream, first_step = self._document, self.steps
+        visits = None
+        if isinstance(stream, StreamSpec):
+            visits = VisitEnds(stream, watch.on_visit, first_step)
 
-    def load_checkpoint(self, path: Path) -> None:
-        """Continue from the models in a file, which must come from a trusted source."""
+        def after_step(steps: int) -> None:
+            watch.on_steps()
+            if visits is not None:
+                visits.after_step(steps)
+
+        self.env.after_step = after_step
+        if first_step < self._steps:
+            self._learn(watch, first_step)
+        watch.on_pause()
+        if visits is not None:  # the last one ends with the training
+            visits.finish(self.steps)
+
+    def _learn(self, watch: Watch, first_step: int) -> None:
+        left = (self._steps - first_step) * len(self.env.names)
+        if is_sb3(self.model):
+            self.model.learn(left, callback=_Pauses(watch), reset_num_timesteps=first_step == 0)
+        else:
+            self.model.learn(left)
+
+    def add_to(self, sums: Episodes) -> list[Episode]:
+        """Add the last step to sums; returns the episodes that ended in it."""
+        return finished_in(sums, *self.env.last)
+
+    def policy(self) -> Policy | TeamPolicy:
+        """The present policy. Training may change it."""
+        range_ = self._action_range
+        if self.env.sme_spec.team is None:
+            return numpy_policy(self.model, self._document, action_range=range_)
+        return numpy_team_policy(self.model, self.env.sme_spec, action_range=range_)
+
+    def lasting_policy(self) -> Policy:
+        """The present policy of a single agent, which further training does not change."""
+        policy = self.policy()
+        assert isinstance(policy, Policy)  # streams have no teams
+        if isinstance(policy.act, Perceptron):
+            return policy  # a copy
+        network = torch_policy(self.model)
         try:
-            with zipfile.ZipFile(path) as members:
-                for name, model in self.models.items():
-                    content = io.BytesIO(members.read(_MODEL.format(name)))
-                    self.models[name] = type(model).load(content, env=model.env, device="cpu")
+            copied = copy.deepcopy(network or self.model, {id(self.env): self.env})
         except Exception as error:
-            raise unloadable(path, error) from error
+            raise PolicyError(
+                f"uses={self._uses!r}: cannot live in a stream, since its learner cannot be copied "
+                f"at the end of a visit: {type(error).__name__}: {error}. Give it a __deepcopy__."
+            ) from error
+        return numpy_policy(copied, self._document, action_range=self._action_range)
+
+    def is_finite(self) -> bool:
+        """Whether all weights are finite."""
+        weights = (weight for model in self.models.values() for weight in model.policy.parameters())
+        # Squared: products of weights that are finite and huge are not, and nor are the actions.
+        return all(bool(torch.isfinite(weight.square()).all()) for weight in weights)
+
+    def restore(self, checkpoint: Path) -> None:
+        """Go on from a checkpoint, with random numbers of its own."""
+        changes: dict[str, Any] = {}
+        if hasattr(self.model, "buffer_size"):
+            changes["buffer_size"] = self.model.buffer_size
+        model = load_checkpoint(type(self.model), checkpoint, self.env, **changes)
+        self.models[""] = model
         # Another stream than the first session's, the same whenever this session is repeated.
-        sequence = np.random.SeedSequence([self._seed, self.num_timesteps])
-        self._seed = int(sequence.generate_state(1)[0] >> 1)
+        model.set_random_seed(random_seed(self._seed, model.num_timesteps))
+        self.env.steps = int(model.num_timesteps) // len(self.env.names)
+        if isinstance(self._document, StreamSpec):  # a seed begins a new life, here where it was
+            self.env.set_options({"lifetime": self.env.steps})
 
-    def _collect(
-        self, observations: list[Floats], starts: npt.NDArray[Any]
-    ) -> tuple[list[Floats], npt.NDArray[Any]]:
-        """One rollout of every model; returns the last observations and which begin an episode."""
-        n = len(self.models)
-        models = list(self.models.values())
-        for model in models:
-            model.policy.set_training_mode(False)
-            model.rollout_buffer.reset()
-        for _ in range(models[0].n_steps):
-            acted = [_act(model, seen) for model, seen in zip(models, observations, strict=True)]
-            joint = self._join([clipped for *_, clipped in acted])
-            rows, rewards, dones, infos = self.env.step(joint)
-            for agent, model in enumerate(models):
-                model.num_timesteps += self.env.num_teams
-                seen, (actions, values, log_probs, _) = observations[agent], acted[agent]
-                own_rewards = self._bootstrapped(agent, model, rewards[agent::n], infos[agent::n])
-                model.rollout_buffer.add(seen, actions, own_rewards, starts, values, log_probs)
-            observations, starts = self._split(rows), dones[::n]
-        for model, seen in zip(models, observations, strict=True):
-            with torch.no_grad():
-                last = model.policy.predict_values(torch.as_tensor(seen))
-            model.rollout_buffer.compute_returns_and_advantage(last_values=last, dones=starts)
-        return observations, starts
+    def save_checkpoint(self, path: Path, sums: Any = None) -> None:
+        """Write a checkpoint; the present episodes restart, so their sums are not in it."""
+        save_checkpoint(self.model, path)
 
-    def _bootstrapped(
-        self, agent: int, model: Any, rewards: Floats, infos: list[dict[str, Any]]
-    ) -> Floats:
-        """Rewards, with the value of the last state where the horizon cut an episode off."""
-        rewards = rewards.copy()
-        for row in np.flatnonzero([info["TimeLimit.truncated"] for info in infos]):
-            seen = infos[row]["terminal_observation"][None, self._columns[agent]]
-            with torch.no_grad():
-                value = model.policy.predict_values(torch.as_tensor(seen)).item()
-            rewards[row] += model.gamma * value
-        return rewards
+    def save(self, path: Path) -> None:
+        """Write the model; nothing of one that cannot be saved."""
+        if is_sb3(self.model):
+            write_atomically(path, saved_sb3(self.model))
+        elif hasattr(self.model, "save"):
+            archive = io.BytesIO()
+            self.model.save(archive)
+            write_atomically(path, archive.getvalue())
 
-    def _split(self, rows: Any) -> list[Floats]:
-        """Each agent's own observations `[teams, |O_i| + 2]`, from the shared ones of all lanes."""
-        by_agent = rows.reshape(self.env.num_teams, len(self._columns), -1)
-        return [np.ascontiguousarray(by_agent[:, i, c]) for i, c in enumerate(self._columns)]
+    def begin_log(self, folder: Path) -> None:
+        """Log to TensorBoard in a folder if it is installed, each agent's model in its own."""
+        for name, model in self.models.items():
+            silence(model)
+            if is_installed("tensorboard"):
+                model.set_logger(configure(str(folder / name), ["tensorboard"]))
 
-    def _join(self, actions: list[Floats]) -> Floats:
-        """Actions of all lanes `[teams · n, max a_i]`, from each agent's `[teams, a_i]`."""
-        joint = np.zeros((self.env.num_teams, len(actions), max(self._widths)), np.float32)
-        for agent, of_agent in enumerate(actions):
-            joint[:, agent, : of_agent.shape[1]] = of_agent
-        return joint.reshape(self.env.num_envs, -1)
+    def log(self, episodes: Sequence[Episode]) -> None:
+        """Log finished episodes."""
+        names = self.env.names
+        for episode in episodes:
+            log_episode(self.model.logger, episode, names if len(names) > 1 else ())
+
+    def close(self) -> None:
+        """Close the logs and the environments."""
+        for model in self.models.values():
+            model.logger.close()
+        self.env.close()
 
 
-def _lane(env: Any, observation_dim: int, action_dim: int, low: float) -> EnvView:
-    """An environment as an agent sees it: its spaces."""
-    box = gymnasium.spaces.Box
-    observation_space = box(0.0, 1.0, (observation_dim,), np.float32)
-    action_space = box(low, 1.0, (action_dim,), np.float32)
-    return EnvView(
-        env, 0, observation_space=observation_space, action_space=action_space, render_mode=None
-    )
+class _Pauses(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped without SB3
+    """Calls `watch.on_pause` between rollouts.
 
+    There the model is consistent: it has learnt from all transitions, and they are in its replay
+    buffer. For off-policy algorithms that is after each environment step.
+    """
 
-def _act(model: Any, observations: Floats) -> tuple[Floats, Any, Any, Floats]:
-    """Sampled actions, their values and log π, and the actions clipped to the action space."""
-    with torch.no_grad():
-        sampled, values, log_probs = model.policy(torch.as_tensor(observations))
-    actions = sampled.numpy()
-    space = model.action_space
-    return actions, values, log_probs, np.clip(actions, space.low, space.high)
+    def __init__(self, watch: Watch) -> None:
+        super().__init__()
+        self._watch = watch
 
+    def _on_rollout_start(self) -> None:
+        self._watch.on_pause()
 
-def _check(model: Any, uses: str) -> None:
-    """Raise OptionError if a model does not collect rollouts as this module does."""
-    kind = type(model)
-    usual = isinstance(model, OnPolicyAlgorithm) and (
-        kind.collect_rollouts is OnPolicyAlgorithm.collect_rollouts
-    )
-    if not usual or model.use_sde:
-        raise OptionError(
-            f"algorithm={uses!r}: independent learners need an on-policy algorithm whose rollouts "
-            "are Stable-Baselines3's own, such as PPO or A2C, without use_sde."
-        )
+    def _on_step(self) -> bool:
+        return True

@@ -74,34 +74,26 @@ class RunRecord(StrictModel):
     many transitions.
 
     Attributes:
-      schema_version: version of the record's format.
       status: whether it is finished; "running" also after a kill.
       failure: why it failed.
       spec: the task; of a life in a stream that of its first phase.
-      spec_digest: the task's digest.
       stream: the stream that the agent lives in; null for a single task.
-      stream_digest: the stream's digest; empty for a single task.
       task: what the task's file calls it.
       algorithm: its name, as in `sme train`.
-      hyperparameters: those that differ from the algorithm's defaults. `sme train` sets some for
-        several environments and for teams; see `hyperparameters.for_lanes`.
+      hyperparameters: those that differ from the algorithm's defaults. Training sets some for
+        several environments and for teams; see `models.for_lanes`.
       device: of agents in JAX: "cpu", "gpu" or "tpu".
       source: of `train:module:function`, the SHA-256 of the module's source; empty for any other.
-      seed: of training.
-      action_range: of the environment that the agent acts in.
       num_envs: environments that step together.
       agents: of a team; 1 for a single agent.
       independent: whether it is a team with one model for each agent.
       steps: requested, of the environment, over all environments.
       steps_done: at the last checkpoint, and at the end. On-policy algorithms finish their last
         rollout, so it can exceed `steps`.
-      checkpoint_every: steps between checkpoints.
       episodes: finished ones, which episodes.csv lists.
       sessions: 1 plus the number of times the run was resumed.
       wall_seconds: over all sessions, without evaluation.
       steps_per_second: environment steps, over all sessions.
-      protocol: of the final evaluation.
-      protocol_digest: the protocol's digest.
       versions: of Python and the packages that the numbers depend on.
     """
 
@@ -166,14 +158,9 @@ class RunRecord(StrictModel):
     def continuing(self, previous: RunRecord, folder: Path) -> RunRecord:
         """This plan, with the progress and the hyperparameters of the run that it continues."""
         fields = (
-            "stream_digest",
-            "spec_digest",
-            "algorithm",
-            "seed",
-            "action_range",
-            "num_envs",
+            "stream_digest", "spec_digest", "algorithm", "seed", "action_range", "num_envs",
             "independent",
-        )
+        )  # fmt: skip
         pairs = {field: (getattr(previous, field), getattr(self, field)) for field in fields}
         for name, value in self.hyperparameters.items():
             before = previous.hyperparameters.get(name, "the algorithm's default")
@@ -292,11 +279,7 @@ def _row(episode: Episode) -> list[int | str]:
 
 
 def model_of_cell(study: Path, key: str) -> Path:
-    """Where a study keeps the trained model of a cell.
-
-    Args:
-      study: its folder.
-      key: the cell's digest.
+    """Where a study keeps the trained model of a cell, by its digest.
 
     Examples:
       >>> from pathlib import Path

@@ -9,7 +9,7 @@ time writes the files:
     model/            instead: one model for each agent of a team, `<agent>.zip`
     evaluation.json   its evaluation
     stream.json       instead, of a life in a stream: what it retained and what it cost
-    snapshots/        and its models at the end of each visit (`snapshots`)
+    snapshots/        and its models at the end of each visit (`record`)
     *.png, *.pdf      figures, if matplotlib is installed
     tensorboard/      if TensorBoard is installed
 """
@@ -19,7 +19,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -28,15 +28,27 @@ from rich.console import Console
 
 from sme_registry.envs.episodes import Episode
 from sme_registry.errors import OptionError
-from sme_registry.evaluation import EvaluationReport, StreamReport, resolve_protocol
+from sme_registry.evaluation import (
+    EvaluationReport,
+    StreamReport,
+    dynamic_regret,
+    evaluate,
+    evaluate_stream,
+    reference_regret,
+    resolve_protocol,
+)
 from sme_registry.io import (
     Lock,
     choice,
     claim_folder,
     file_lock,
     integer_in,
+    is_installed,
     is_locked,
 )
+from sme_registry.io.terminal import Progress
+from sme_registry.plots import reports as plot_files
+from sme_registry.plots.maps import STREAM
 from sme_registry.spec import (
     ACTION_RANGES,
     ActionRange,
@@ -50,20 +62,20 @@ from sme_registry.spec import (
 from sme_registry.spec.study import INDEPENDENT, parse_uses
 from sme_registry.task import load, materialize_segments
 from sme_registry.training.algorithms import (
-    check_hyperparameters,
+    Entry,
     default_algorithm,
     default_num_envs,
     find,
-    for_lanes,
     full_name,
     is_sb3,
     nested_hyperparameters,
     one_thread,
     quiet,
     require_sb3,
+    short_name,
+    source_of,
 )
-from sme_registry.training.functions import FunctionLearner, source_of
-from sme_registry.training.learn import REPORT_FILES, Learner, learn, write_report
+from sme_registry.training.learn import FunctionLearner, Learner, learn
 from sme_registry.training.record import (
     CHECKPOINT,
     EPISODES,
@@ -73,13 +85,16 @@ from sme_registry.training.record import (
     SNAPSHOTS,
     TENSORBOARD,
     RunRecord,
+    Snapshots,
+    read_episodes,
     versions_for,
 )
 
+EVALUATION = "evaluation.json"
 REPORT = "report.md"  # written by `sme demo`
 EXPLORER = "explorer.html"  # written by `sme train` and `sme explore`
 _FILES = (
-    RECORD, EPISODES, CHECKPOINT, MODEL, MODELS, SNAPSHOTS, *REPORT_FILES,
+    RECORD, EPISODES, CHECKPOINT, MODEL, MODELS, SNAPSHOTS, EVALUATION, STREAM, *plot_files.FILES,
     REPORT, EXPLORER, TENSORBOARD,
 )  # fmt: skip
 
@@ -133,8 +148,8 @@ def train(
     """Train one algorithm on one task or stream: with Stable-Baselines3 on the CPU, or in JAX.
 
     Hyperparameters that are not given have the algorithm's defaults, except in several environments
-    or for a team, where `n_steps` or `gradient_steps` keep the algorithm what it is in one; see
-    `hyperparameters.for_lanes`. `run.json` records all that differ from the defaults.
+    or for a team, where `n_steps` or `gradient_steps` keep the algorithm what it is in one.
+    `run.json` records all that differ from the defaults.
 
     A resumed run continues from its last checkpoint, with the same networks, optimisers, replay
     buffer and step count, but not bit for bit: random streams are seeded again, and the current
@@ -146,8 +161,8 @@ def train(
 
     Args:
       algorithm: a name of `algorithms.LEARNERS` that trains in an environment, in any case, an
-        entry point, "module:Class", or "train:module:function" (see `functions`); None takes TD3,
-        and PPO for a team.
+        entry point, "module:Class", or "train:module:function" (see `learn`); None takes TD3, and
+        PPO for a team.
       steps: environment steps over all environments; None takes 20,000, and those of a stream. One
         step of a team is a step of all its agents. PPO and A2C finish their last rollout.
       hyperparameters: as JSON values, such as
@@ -180,53 +195,10 @@ def train(
       >>> result.record.steps_done
       128
     """
-    plan = _plan(
-        spec,
-        steps=steps,
-        seed=seed,
-        action_range=action_range,
-        checkpoint_every=checkpoint_every,
-        protocol=protocol,
-        independent=independent,
-    )
-    with quiet():
-        plan = _with_algorithm(plan, algorithm, agents, num_envs, hyperparameters or {}, device)
-    materialize_segments(plan.document)  # fails before the folder is created
-    folder = Path(folder)
-    record = _new_or_continued(folder, plan, resume=resume, force=force)
-    with quiet(), one_thread() if _uses_torch(record) else contextlib.nullcontext():
-        # Rejects values of hyperparameters, and tasks, before the folder is created.
-        learner = _learner(record)
-        if record.sessions == 1:
-            claim_folder(folder, _FILES if force else (), force=force)
-        with _lock(folder):
-            if record.sessions == 1:
-                _remove_run(folder)
-            record.write(folder)
-            record, episodes = learn(learner, record, folder, progress, console)
-            report, figures = write_report(
-                learner.model, record, episodes, folder, progress, console
-            )
-            record = record.updated(status="finished")
-            record.write(folder)
-    return TrainingResult(folder, record, tuple(episodes), report, figures)
-
-
-def _plan(
-    task: SpecLike | StreamLike,
-    *,
-    steps: int | None,
-    seed: int,
-    action_range: ActionRange,
-    checkpoint_every: int | None,
-    protocol: ProtocolLike,
-    independent: bool,
-) -> RunRecord:
-    """The record of a new run, still without its algorithm."""
-    document = load(task)
+    document = load(spec)
     stream = document if isinstance(document, StreamSpec) else None
-    spec = document.specs[0]
-    if independent and spec.team is None:
+    task = document.specs[0]
+    if independent and task.team is None:
         raise OptionError(
             "independent=True: must be False for a task of a single agent. Leave it out, or give a "
             "team, such as Team4."
@@ -235,26 +207,51 @@ def _plan(
     if checkpoint_every is None:
         checkpoint_every = max(_MIN_STEPS_BETWEEN_CHECKPOINTS, steps // _CHECKPOINTS)
     choice("action_range", action_range, ACTION_RANGES)
-    resolved_protocol = resolve_protocol(protocol)
-    return RunRecord(
-        status="running",
-        spec=spec,
-        spec_digest=spec.digest,
-        stream=stream,
-        stream_digest="" if stream is None else stream.digest,
-        task=document.name,
-        algorithm="",
-        seed=integer_in("seed", seed, 0, 2**32 - 1),
-        action_range=action_range,
-        num_envs=1,
-        agents=len(spec.agents),
-        independent=independent,
-        steps=steps,
-        checkpoint_every=integer_in("checkpoint_every", checkpoint_every, 1, MAX_STEPS),
-        protocol=resolved_protocol,
-        protocol_digest=resolved_protocol.digest,
-        versions={},
-    )
+    protocol = resolve_protocol(protocol)
+    uses = full_name(default_algorithm(document) if algorithm is None else algorithm, agents)
+    with quiet():
+        entry = find(uses, "algorithm")
+        num_envs = _num_envs(document, entry, num_envs)
+        plan = RunRecord(
+            status="running",
+            spec=task,
+            spec_digest=task.digest,
+            stream=stream,
+            stream_digest="" if stream is None else stream.digest,
+            task=document.name,
+            algorithm=uses,
+            hyperparameters=nested_hyperparameters(hyperparameters or {}),
+            device=_device(entry, device),
+            source=source_of(uses, "algorithm") or "",
+            seed=integer_in("seed", seed, 0, 2**32 - num_envs),
+            action_range=action_range,
+            num_envs=num_envs,
+            agents=len(task.agents),
+            independent=independent,
+            steps=steps,
+            checkpoint_every=integer_in("checkpoint_every", checkpoint_every, 1, MAX_STEPS),
+            protocol=protocol,
+            protocol_digest=protocol.digest,
+            versions=versions_for(uses),
+        )
+    materialize_segments(document)  # fails before the folder is created
+    folder = Path(folder)
+    record = _new_or_continued(folder, plan, resume=resume, force=force)
+    with quiet(), contextlib.nullcontext() if entry.kind == "train" else one_thread():
+        # Rejects values of hyperparameters, and tasks, before the folder is created.
+        learner = _learner(record)
+        record = record.updated(hyperparameters=learner.hyperparameters)
+        if record.sessions == 1:
+            claim_folder(folder, _FILES if force else (), force=force)
+        with _lock(folder):
+            if record.sessions == 1:
+                _remove_run(folder)
+            record.write(folder)
+            record, episodes = learn(learner, record, folder, progress, console)
+            report, figures = _report(learner.model, record, episodes, folder, progress, console)
+            record = record.updated(status="finished")
+            record.write(folder)
+    return TrainingResult(folder, record, tuple(episodes), report, figures)
 
 
 def _steps(document: SMESpec | StreamSpec, steps: int | None) -> int:
@@ -272,80 +269,47 @@ def _steps(document: SMESpec | StreamSpec, steps: int | None) -> int:
     return integer_in("steps", document.steps, 1, MAX_STEPS, advice=advice)
 
 
-def _with_algorithm(
-    plan: RunRecord,
-    uses: str | None,
-    agents: str | None,
-    num_envs: int | None,
-    hyperparameters: Mapping[str, Any],
-    device: str | None,
-) -> RunRecord:
-    """A plan with its algorithm, the hyperparameters that the user set, and its environments."""
-    uses = full_name(default_algorithm(plan.spec) if uses is None else uses, agents)
-    settings = nested_hyperparameters(hyperparameters)
-    entry = find(uses, "algorithm")
+def _num_envs(document: SMESpec | StreamSpec, entry: Entry, num_envs: int | None) -> int:
+    """The parallel environments of a run, whose algorithm can learn in them."""
     if entry.kind == "independent":
         raise OptionError(
-            f"algorithm={uses!r}: is a name for studies. Train {entry.name!r} with "
+            f"algorithm={entry.uses!r}: is a name for studies. Train {entry.name!r} with "
             "independent=True (in the terminal, --independent)."
         )
-    if device is not None and entry.kind != "jax":
-        raise OptionError(
-            f"device={device!r}: is for agents in JAX; all others train on the CPU. Leave it out, "
-            'or use --agents jax (in Python, agents="jax").'
-        )
-    if entry.kind == "jax":
-        device = _device_in_jax(uses, settings, device)
-        num_envs = _num_envs(plan, uses, num_envs)
-    else:
-        entry.check_task(plan.document)
-        num_envs = _num_envs(plan, uses, num_envs)
-        check_hyperparameters(uses, settings)
-    return plan.updated(
-        algorithm=uses,
-        hyperparameters=settings,
-        num_envs=num_envs,
-        device=device or "",
-        source=source_of(uses, "algorithm") or "",
-        versions=versions_for(uses),
-    )
-
-
-def _device_in_jax(uses: str, settings: dict[str, Any], device: str | None) -> str:
-    """The platform on which an agent in JAX trains, after a check of its hyperparameters."""
-    require_sb3()  # `model.zip` is a model of it
-    from sme_registry.jax.device import find_device
-    from sme_registry.jax.run import settings_of
-
-    settings_of(uses, settings)
-    return str(find_device(device).platform)
-
-
-def _num_envs(plan: RunRecord, uses: str, num_envs: int | None) -> int:
-    """The parallel environments of a run."""
-    entry = find(uses, "algorithm")
-    if entry.kind != "sb3":
+    if entry.kind in ("jax", "train"):
         if num_envs not in (None, 1):
             raise OptionError(
-                f"num_envs={num_envs!r}: must be 1 for {uses!r}. Leave it out, or train an "
+                f"num_envs={num_envs!r}: must be 1 for {entry.uses!r}. Leave it out, or train an "
                 "algorithm of Stable-Baselines3."
             )
+        if entry.kind == "train":
+            entry.check_task(document)
         return 1
     algorithm = entry.load("algorithm")
-    if num_envs is None:
-        num_envs = default_num_envs(plan.spec, algorithm)
-    num_envs = integer_in("num_envs", num_envs, 1, 4096)
-    if plan.stream is not None and num_envs > 1:
+    entry.check_task(document)
+    if isinstance(document, SMESpec):
+        default = default_num_envs(document, algorithm)
+        return integer_in("num_envs", default if num_envs is None else num_envs, 1, 4096)
+    if num_envs not in (None, 1):
         raise OptionError(
             f"num_envs={num_envs}: must be 1 on a stream, since each environment would live a life "
             "of its own. Leave it out."
         )
-    integer_in("seed", plan.seed, 0, 2**32 - num_envs)
-    return num_envs
+    return 1
 
 
-def _uses_torch(record: RunRecord) -> bool:
-    return parse_uses(record.algorithm)[0] != "train"
+def _device(entry: Entry, device: str | None) -> str:
+    """The platform on which an agent in JAX trains; empty for any other."""
+    if entry.kind == "jax":
+        from sme_registry.jax.device import find_device
+
+        return str(find_device(device).platform)
+    if device is not None:
+        raise OptionError(
+            f"device={device!r}: is for agents in JAX; all others train on the CPU. Leave it out, "
+            'or use --agents jax (in Python, agents="jax").'
+        )
+    return ""
 
 
 def _learner(record: RunRecord) -> Learner:
@@ -360,13 +324,14 @@ def _learner(record: RunRecord) -> Learner:
     }
     if kind == "train":
         return FunctionLearner(name, record.spec, **options)
-    from sme_registry.training.learners import JAXLearner, SB3Learner
+    require_sb3()  # also of an agent in JAX, `model.zip` is a model of it
+    from sme_registry.training.learners import JAXLearner, new_learner
 
     if kind == "jax":
         return JAXLearner(record)
     uses = f"{INDEPENDENT * record.independent}{name}"
-    learner = SB3Learner(uses, record.document, num_envs=record.num_envs, **options)
-    if not (record.independent or is_sb3(learner.model)):
+    learner = new_learner(uses, record.document, num_envs=record.num_envs, **options)
+    if not all(map(is_sb3, learner.models.values())):
         raise OptionError(
             f"algorithm={name!r}: returned a {type(learner.model).__name__}, which is no model of "
             "Stable-Baselines3, so its training cannot be logged or resumed. Train it in a study: "
@@ -376,21 +341,17 @@ def _learner(record: RunRecord) -> Learner:
 
 
 def _new_or_continued(folder: Path, plan: RunRecord, *, resume: bool, force: bool) -> RunRecord:
-    """The plan with all its hyperparameters, and with the progress of a run that is resumed."""
+    """The plan, with the progress of a run that is resumed."""
     if is_locked(folder / _LOCK):
         raise _in_use(folder)
     previous = None if force else RunRecord.read(folder)
-    if previous is None and resume and not force:
-        raise OptionError(
-            f"{folder}: contains no run to resume. Leave out --resume to start one (in Python, "
-            "resume=True), or give the folder of the run."
-        )
-    if previous is None and parse_uses(plan.algorithm)[0] in ("jax", "train"):
-        return plan
     if previous is None:
-        lanes = plan.num_envs * (1 if plan.independent else plan.agents)
-        settings = for_lanes(find(plan.algorithm).load(), lanes, plan.hyperparameters)
-        return plan.updated(hyperparameters={**settings, **plan.hyperparameters})
+        if resume and not force:
+            raise OptionError(
+                f"{folder}: contains no run to resume. Leave out --resume to start one (in Python, "
+                "resume=True), or give the folder of the run."
+            )
+        return plan
     if previous.status != "running":
         reason = f" ({previous.failure})" if previous.failure else ""
         raise OptionError(
@@ -429,7 +390,67 @@ def _in_use(folder: Path) -> OptionError:
 
 def _remove_run(folder: Path) -> None:
     for name in _FILES:
-        if name in (MODELS, SNAPSHOTS, TENSORBOARD):
+        if (folder / name).is_dir():
             shutil.rmtree(folder / name, ignore_errors=True)
         else:
             (folder / name).unlink(missing_ok=True)
+
+
+def _report(
+    model: Any,
+    record: RunRecord,
+    episodes: Sequence[Episode],
+    folder: Path,
+    progress: bool,
+    console: Console | None,
+) -> tuple[EvaluationReport | StreamReport, tuple[Path, ...]]:
+    """Evaluate a finished run; write its report, and its figures if Matplotlib is installed."""
+    states = record.protocol.states_per_region * len(record.protocol.edges)
+    options: dict[str, Any] = {
+        "action_range": record.action_range,
+        "name": f"{'independent ' * record.independent}{short_name(record.algorithm)}",
+    }
+    report: EvaluationReport | StreamReport
+    with Progress("evaluating", states, console=console, unit="states", enabled=progress) as bar:
+        options["progress"] = bar.update_of
+        if record.stream is None:
+            report = evaluate(model, record.spec, record.protocol, **options)
+        else:
+            report = _report_of_life(record, record.stream, folder, options)
+    report.write(folder / (EVALUATION if record.stream is None else STREAM))
+    return report, _draw(report, episodes, folder, model)
+
+
+def _report_of_life(
+    record: RunRecord, stream: StreamSpec, folder: Path, options: dict[str, Any]
+) -> StreamReport:
+    files = Snapshots(folder / SNAPSHOTS, stream)
+    report = evaluate_stream(
+        files.visits, stream, record.protocol, initial=files.initial, **options
+    )
+    episodes = read_episodes(folder / EPISODES)  # rounded alike in every session
+    if not episodes:
+        return report
+    step, regret, length = zip(*((e.step, e.regret, e.length) for e in episodes), strict=True)
+    log = dynamic_regret(stream, step, regret, length)
+    frozen: dict[str, Any] = {"frozen": files.visits[0], "training": log}
+    if log.visits[0].online_regret is None:  # where no episode of the first visit is in the log
+        frozen = {}
+    references = reference_regret(stream, **frozen)
+    return report.with_dynamic_regret(log).with_reference_regret(references)
+
+
+def _draw(
+    report: EvaluationReport | StreamReport, episodes: Sequence[Episode], folder: Path, model: Any
+) -> tuple[Path, ...]:
+    if not is_installed("matplotlib"):
+        return ()
+    figures: list[Path] = []
+    if episodes:
+        title = f"{report.policy} on {report.title}"
+        visits = report.visits if isinstance(report, StreamReport) else ()
+        costs = episodes[0].safety is not None
+        figures += plot_files.write_training(folder / EPISODES, folder, title, visits, costs)
+    if isinstance(report, StreamReport):
+        return (*figures, *plot_files.write_stream(report, folder))
+    return (*figures, *plot_files.write_evaluation(report, folder, model))

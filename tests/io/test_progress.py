@@ -56,10 +56,8 @@ def test_what_precedes_the_first_steps_is_shown_at_once_and_slows_no_estimate(cl
         assert text.getvalue() == "training: compiling …\n"
         clock.now = 30.0
         progress.update(20, "")
-        progress.prepared()
         clock.now = 100.0
         progress.update(90, "")
-        progress.prepared()  # once suffices
         clock.now = 220.0
         progress.update(95, "")
     lines = text.getvalue().splitlines()[1:]

@@ -23,7 +23,7 @@ from sme_registry.jax.padding import Dimensions, Padding
 from sme_registry.jax.run import settings_of
 from sme_registry.jax.task import task_params
 from sme_registry.sb3.vec_env import SingleVecEnv
-from sme_registry.training.algorithms import silence
+from sme_registry.training.models import silence
 
 Weights = dict[str, npt.NDArray[np.float32]]
 

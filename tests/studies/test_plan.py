@@ -315,7 +315,7 @@ class TestAgents:
         classes = [{"name": "t", "setting": team, "seeds": [1]}]
         fields = {"classes": classes} if "independent" in uses else {}
         file = small_file(algorithms=[{"name": "other", "uses": uses}], **fields)
-        with pytest.raises(UnknownNameError, match=f"algorithm 'other': uses='{uses}'.*jax:PPO"):
+        with pytest.raises(UnknownNameError, match=f"'other': uses='jax:{uses}'.*jax:PPO"):
             with_agents(file, "jax")
 
     def test_both_implementations_are_two_algorithms_of_one_plan(self):

@@ -7,7 +7,6 @@ from sme_registry.training.algorithms import (
     check_hyperparameters,
     nested_hyperparameters,
     read_hyperparameters,
-    resolved,
 )
 
 pytest.importorskip("stable_baselines3")
@@ -76,6 +75,8 @@ def test_known_names_are_accepted_whatever_their_values():
 
 def test_json_values_become_those_of_a_constructor():
     from torch import nn
+
+    from sme_registry.training.models import resolved
 
     values = {"train_freq": [1, "episode"], "policy_kwargs": {"activation_fn": "torch.nn:ELU"}}
     assert resolved(values) == {

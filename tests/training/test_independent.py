@@ -40,16 +40,17 @@ def test_a_team_of_one_learns_exactly_what_sb3s_ppo_learns(team_run):
     from stable_baselines3 import PPO
     from stable_baselines3.common.utils import set_random_seed
 
-    from sme_registry.sb3 import SMETeamVecEnv, SMEVecEnv
-    from sme_registry.training.algorithms import silence
-    from sme_registry.training.models import IndependentModels
+    from sme_registry.sb3 import SMEVecEnv
+    from sme_registry.training.learn import Watch
+    from sme_registry.training.learners import new_learner
+    from sme_registry.training.models import silence
 
     spec = TINY.derive(team={"agents": [{"action_dim": 2}]})
     settings = team_run.record.hyperparameters
-    env = SMETeamVecEnv(spec, 2)
-    learners = IndependentModels("PPO", env, seed=4, steps=192, hyperparameters=settings)
-    learners.learn(192)
-    (ours,) = learners.models.values()
+    options = {"seed": 4, "steps": 192, "hyperparameters": settings, "action_range": "symmetric"}
+    learner = new_learner("independent:PPO", spec, num_envs=2, **options)
+    learner.learn(Watch())
+    (ours,) = learner.models.values()
 
     env = SMEVecEnv(TINY, 2)
     theirs = PPO("MlpPolicy", env, seed=ours.seed, device="cpu", **SETTINGS)

@@ -15,7 +15,7 @@ from tests.training.runs import PROTOCOL, TINY
 
 pytest.importorskip("stable_baselines3")
 
-from sme_registry.training.learners import SB3Learner
+from sme_registry.training.models import SB3Learner
 
 # Nobody is rewarded in phase 1, so that every regret says in which phase it was.
 BARREN = TINY.derive(seed=6, r_min=0.999)

@@ -328,7 +328,7 @@ STREAM = StreamSpec(
 def test_steps_equal_those_of_a_batch_of_one(document, action_range):
     from sme_registry.sb3 import SMEVecEnv
     from sme_registry.sb3.vec_env import SingleVecEnv
-    from sme_registry.training.learners import CountedVecEnv
+    from sme_registry.training.models import CountedVecEnv
 
     batch = SMEVecEnv(document, 1, action_range=action_range)
     monitored = CountedVecEnv(SingleVecEnv(document, action_range=action_range))

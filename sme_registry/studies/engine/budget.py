@@ -29,10 +29,15 @@ from typing import Any, NamedTuple, cast
 from sme_registry.errors import OptionError, SMEError, UnknownNameError, did_you_mean
 from sme_registry.io import choice
 from sme_registry.spec import Cell, PlannedCell, StudyAlgorithm, StudyFile, StudyPlan
-from sme_registry.spec.study import in_jax, parse_uses
+from sme_registry.spec.study import JAX, in_jax, parse_uses
 from sme_registry.studies.engine.result import CellResult
-from sme_registry.training.algorithms import AGENTS, find, is_on_policy, parameters_of
-from sme_registry.training.functions import source_of
+from sme_registry.training.algorithms import (
+    AGENTS,
+    find,
+    is_on_policy,
+    parameters_of,
+    source_of,
+)
 
 # Seconds of one training step with default hyperparameters on a fast core.
 SECONDS_PER_STEP = {
@@ -197,9 +202,8 @@ def with_agents(file: StudyFile, agents: str) -> StudyFile:
         if agents == "sb3":
             algorithm["uses"] = name if kind == "jax" else uses
         elif kind not in ("reference", "offline"):
-            from sme_registry.jax.run import full_name
-
-            algorithm["uses"] = full_name(uses, f"algorithm {algorithm['name']!r}: uses")
+            field = f"algorithm {algorithm['name']!r}: uses"
+            algorithm["uses"] = find(uses if kind == "jax" else f"{JAX}{uses}", field).uses
     plan = StudyPlan.from_dict(fields, f"the plan with agents={agents}")
     return _renamed(file, plan, f"-{agents}")
 
@@ -270,37 +274,29 @@ def selected(cells: Iterable[PlannedCell], only: Sequence[str] = ()) -> tuple[Pl
     )
 
 
-class UnevenRollouts(NamedTuple):
-    """An on-policy algorithm whose rollouts do not end where phases of streams do.
-
-    Its policy at the end of a visit has learned from fewer steps than a fresh agent's, which counts
-    as lost plasticity; `better` is the longest shorter rollout that ends where all phases do.
-    """
-
-    algorithm: str
-    n_steps: int
-    streams: tuple[str, ...]
-    better: int
-
-
-def uneven_rollouts(plan: StudyPlan) -> list[UnevenRollouts]:
-    """The algorithms of a plan that can be found here and learn from such rollouts."""
-    uneven = []
+def uneven_rollouts(plan: StudyPlan) -> list[str]:
+    """What to change where the rollouts of an on-policy algorithm do not end where phases do."""
+    warnings = []
     for algorithm in plan.algorithms if plan.streams else ():
         try:
             n = _rollout_steps(algorithm)
-        except SMEError:
+        except SMEError:  # it cannot be found here
             continue
         phases = {
             member.name: math.gcd(*(phase.steps for phase in member.stream.phases))
             for member in plan.streams
         }
-        uneven_on = tuple(name for name, steps in phases.items() if steps % n)
-        if uneven_on:
+        uneven = [name for name, steps in phases.items() if steps % n]
+        if uneven:
             together = math.gcd(*phases.values())
             better = max(m for m in range(1, min(n, together) + 1) if together % m == 0)
-            uneven.append(UnevenRollouts(algorithm.name, n, uneven_on, better))
-    return uneven
+            warnings.append(
+                f"{algorithm.name} on {', '.join(uneven)}: its rollouts of {n:,} steps do not end "
+                "where phases do. At the end of a visit it has learned from fewer steps than a "
+                "fresh agent, which counts as lost plasticity. Use "
+                f"--set {algorithm.name}.n_steps={better}, and a batch_size that divides it."
+            )
+    return warnings
 
 
 def _rollout_steps(algorithm: StudyAlgorithm) -> int:

@@ -2,8 +2,8 @@
 
     reference:…    a policy that learns nothing, evaluated as often as a learner
     offline:…      collects a data set, which it does not keep, and learns from it alone
-    jax:…          the only lane of a program (`lanes`)
-    train:…        a function (`FunctionLearner`), evaluated at its end alone
+    jax:…          the only run of a program (`programs`)
+    train:…        a `FunctionLearner`, evaluated at its end alone
     any other      an `SB3Learner` in its environments
 
 Only the evaluations run as a batch. The same cell gives the same result on the same machine, except
@@ -12,6 +12,7 @@ for `timing`.
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,14 +23,7 @@ import numpy as np
 from sme_registry.datasets import DatasetRecipe, collect, train_offline
 from sme_registry.envs.schedule import Schedule
 from sme_registry.errors import OptionError, PolicyError, SpecError
-from sme_registry.evaluation import (
-    EvaluationReport,
-    Policy,
-    StreamReport,
-    TeamPolicy,
-    as_policy,
-    evaluate,
-)
+from sme_registry.evaluation import Policy, TeamPolicy, as_policy, evaluate
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import write_atomically
@@ -47,9 +41,8 @@ from sme_registry.studies.engine.result import (
     life_report,
 )
 from sme_registry.task import materialize, materialize_segments
-from sme_registry.training.algorithms import check_hyperparameters, find, one_thread, quiet
-from sme_registry.training.functions import FunctionLearner
-from sme_registry.training.learn import Watch
+from sme_registry.training.algorithms import Entry, check_hyperparameters, find, one_thread, quiet
+from sme_registry.training.learn import FunctionLearner, Watch
 from sme_registry.training.record import Snapshots
 
 ReportSteps = Callable[[int, int], None]
@@ -65,19 +58,14 @@ def run_cell(
     """Train, evaluate during training, and evaluate in and out of distribution at the end.
 
     The evaluations' episodes are deterministic and start in states that depend only on the seed and
-    on the evaluation's number.
+    on the evaluation's number. Times are CPU seconds of this thread, so that other jobs on the
+    machine do not count.
 
     Args:
       cell: the cell to run.
       progress: called after each step with the steps done and the steps in all.
       model_path: where to save the trained model, if it has a `save` method. Of a life in a
         stream, the folder of the same name without suffix gets those at the ends of its visits.
-
-    Returns:
-      The result. Its times are CPU seconds of this thread, so that other jobs on the machine do
-      not count: `environment` is the steps of training, `evaluation` all evaluations including the
-      one at the end, `training` the rest of learning, and `steps_per_second` counts training and
-      environment together.
 
     Examples:
       >>> from sme_registry.spec import StudyFile
@@ -94,54 +82,49 @@ def run_cell(
         return _run_offline(cell, entry.name, progress)
     if entry.kind == "reference":
         check_hyperparameters(cell.uses, cell.hyperparameters)
-        return _run_reference(cell, entry.name, progress)
-    if entry.kind == "train":
-        return _run_function(cell, entry.name, progress, model_path)
-    entry.load()  # refuse a missing one before anything is made
-    from sme_registry.training.learners import SB3Learner
-
-    with quiet(), one_thread():
-        learner = SB3Learner(cell.uses, cell.document, **_options(cell))
-        models = model_path and model_path.with_suffix("")
-        watch = _Evaluations(cell, progress, learner, models)
-        watch.train()
-        if learner.steps < cell.steps:
-            raise PolicyError(
-                f"uses={cell.uses!r}: learn({cell.steps}) returned after {learner.steps} steps of "
-                "its environment. It must take all of them, in that environment."
-            )
-        return watch.result_of_training(model_path)
+        with quiet():
+            return _run_reference(cell, entry.name, progress)
+    with quiet(), contextlib.nullcontext() if entry.kind == "train" else one_thread():
+        return _train(cell, entry, progress, model_path)
 
 
-def _options(cell: Cell) -> dict[str, Any]:
-    """What a learner is made with."""
-    return {
+def _train(cell: Cell, entry: Entry, progress: ReportSteps, model_path: Path | None) -> CellResult:
+    """Train what learns online, and evaluate it whenever an evaluation is due."""
+    options: dict[str, Any] = {
         "seed": cell.seed,
         "steps": cell.steps,
         "hyperparameters": cell.hyperparameters,
         "action_range": cell.action_range,
     }
+    learner: Any
+    if entry.kind == "train":
+        learner = FunctionLearner(entry.name, cell.spec, **options)
+        if cell.source not in (None, learner.source):
+            raise OptionError(
+                f"uses={cell.uses!r}: the source of its module is {learner.source} now, and that "
+                f"of the cell is {cell.source}. Run the study again: with another source it is "
+                "another cell."
+            )
+        cell = Cell(**dict(cell) | {"source": learner.source})
+    else:
+        entry.load()  # without Stable-Baselines3, what is missing is named
+        from sme_registry.training.learners import new_learner
 
-
-def _run_function(
-    cell: Cell, name: str, progress: ReportSteps, model_path: Path | None
-) -> CellResult:
-    """Train with a function, whose policy is evaluated at the end alone."""
-    learner = FunctionLearner(name, cell.spec, **_options(cell))
-    if cell.source not in (None, learner.source):
-        raise OptionError(
-            f"uses={cell.uses!r}: the source of its module is {learner.source} now, and that of "
-            f"the cell is {cell.source}. Run the study again: with another source it is another "
-            "cell."
+        learner = new_learner(cell.uses, cell.document, **options)
+    training = _Training(cell, progress, learner, model_path and model_path.with_suffix(""))
+    training.run()
+    if entry.kind != "train" and learner.steps < cell.steps:
+        raise PolicyError(
+            f"uses={cell.uses!r}: learn({cell.steps}) returned after {learner.steps} steps of "
+            "its environment. It must take all of them, in that environment."
         )
-    cell = Cell(**dict(cell) | {"source": learner.source})
-    watch = _Evaluations(cell, progress, learner)
-    watch.train()
-    return watch.result_of_training(model_path)
+    if model_path is not None:
+        learner.save(model_path)
+    return training.result()
 
 
 def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> CellResult:
-    """Run a cell that uses JAX as the only lane of a program."""
+    """Run a cell that uses JAX as the only run of a program."""
 
     def report(done: int, total: int, note: str = "", /) -> None:
         progress(done, total)
@@ -159,76 +142,27 @@ def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> Ce
 def _run_reference(cell: Cell, name: str, progress: ReportSteps) -> CellResult:
     """Evaluate a policy that learns nothing as often as a learner."""
     evaluations = _Evaluations(cell, progress)
-    with quiet():
-        policy = as_policy(reference_policy(name, cell.spec), cell.spec)
-        for steps in evaluations.record.due:
-            evaluations.evaluate(steps, policy)
-            evaluations.report(steps)
-        return evaluations.result(policy, 0)
+    policy = as_policy(reference_policy(name, cell.spec), cell.spec)
+    for steps in evaluations.record.due:
+        evaluations.evaluate(steps, policy)
+        evaluations.report(steps)
+    return evaluations.result_of(policy, 0)
 
 
 class _Evaluations(Watch):
-    """The evaluations of a cell whose policy runs outside JAX, and the record of its training."""
+    """The evaluations of a cell whose policy runs outside JAX."""
 
-    def __init__(
-        self,
-        cell: Cell,
-        progress: ReportSteps,
-        learner: Any = None,
-        models: Path | None = None,
-    ) -> None:
-        self.cell, self._progress, self._learner = cell, progress, learner
+    def __init__(self, cell: Cell, progress: ReportSteps) -> None:
+        self.cell, self._progress = cell, progress
         tasks = materialize_segments(cell.document)
         self._schedule = Schedule(cell.document, tasks)
         agents = () if cell.spec.team is None else tasks[0].names
         self.record = Record((cell,), 1, time.thread_time, agents)
-        self._begun = time.thread_time()
-        self._life = None if cell.stream is None else _Life(cell, self.record, learner, models)
-
-    def train(self) -> None:
-        """Train the learner, and evaluate it whenever an evaluation is due."""
-        env, record = self._learner.env, self.record
-        record.start()
-        self._evaluate_due(0)
-        self.report(0)
-        self._learner.learn(self)
-        record.add(env.regret, env.cost)
-        record.spend(TRAINING)
-        while record.evaluated < len(record.due):
-            self.evaluate(env.steps, self._learner.policy())
-
-    def on_steps(self) -> None:
-        """Count a step, before the learner learns from it, and run what is due."""
-        steps = self._learner.steps
-        if self._life is not None:
-            self._life.after_step(steps)
-        self._evaluate_due(steps)
-        self.report(steps)
-
-    def on_visit(self, visit: int) -> None:
-        """Keep the policy."""
-        assert self._life is not None
-        self._life.end_visit(visit)
-
-    def result_of_training(self, model_path: Path | None) -> CellResult:
-        """The result, with the model where it is to be saved."""
-        learner = self._learner
-        if model_path is not None:
-            learner.save(model_path)
-        ended = learner.policy() if self._life is None else self._life.report(learner.steps)
-        return self.result(ended, learner.steps, learner.env.seconds)
 
     def report(self, steps: int) -> None:
         """Report the steps done; an algorithm may take more than those of the plan."""
         if steps <= self.cell.steps:
             self._progress(steps, self.cell.steps)
-
-    def _evaluate_due(self, steps: int) -> None:
-        """Run the evaluations that are due during training; the last one waits for its end."""
-        record = self.record
-        while record.evaluated + 1 < len(record.due) and record.due[record.evaluated] <= steps:
-            record.spend(TRAINING)
-            self.evaluate(steps, self._learner.policy())
 
     def evaluate(self, steps: int, policy: Policy | TeamPolicy) -> None:
         """Run the next evaluation, after `steps` steps of training."""
@@ -236,10 +170,10 @@ class _Evaluations(Watch):
         number = k + cell.evaluations - len(self.record.due)  # a function has only the last
         states = start_states(cell.seed, number, cell.evaluation_episodes, cell.spec.state_dim)
         # On the task of the last step, or that of the first.
-        segment, stream = self._schedule.segment(max(steps - 1, 0)), cell.stream
-        if stream is not None and stream.observes_phase:
+        segment, phases = self._schedule.segment(max(steps - 1, 0)), cell.document.observed_phases
+        if phases:
             assert isinstance(policy, Policy)  # streams have no teams
-            policy = policy.in_phase(int(self._schedule.phases[segment]), stream.observed_phases)
+            policy = policy.in_phase(int(self._schedule.phases[segment]), phases)
         done = rollouts(policy, self._schedule.tasks[segment], states)
         row = (
             steps,
@@ -254,58 +188,87 @@ class _Evaluations(Watch):
         self.record.evaluation(k, np.array(row)[:, None], by_agent)
         self.record.spend(EVALUATION)
 
-    def result(
-        self, ended: Policy | TeamPolicy | StreamReport, steps: int, seconds: float = 0.0
+    def result_of(
+        self, policy: Policy | TeamPolicy, steps: int, environment: float = 0.0
     ) -> CellResult:
-        """The result with the report of the trained policy, or of a life."""
-        cell, record = self.cell, self.record
-        report: EvaluationReport | StreamReport
-        if isinstance(ended, StreamReport):
-            report = ended
-        else:
-            report = evaluate(ended, cell.spec, cell.protocol, name=cell.uses)
-        record.spend(EVALUATION)
-        total = time.thread_time() - self._begun
-        timing = record.timing(steps, 0.0, environment=seconds, total=total)
-        return record.result(0, steps, report, timing)
+        """The result with the report of a policy, which learnt from so many steps."""
+        cell = self.cell
+        return self._result(
+            evaluate(policy, cell.spec, cell.protocol, name=cell.uses), steps, environment
+        )
+
+    def _result(self, report: Any, steps: int, environment: float) -> CellResult:
+        self.record.spend(EVALUATION)
+        timing = self.record.timing(steps, environment=environment)
+        return self.record.result(0, steps, report, timing)
 
 
-class _Life:
-    """A learner's life while it trains: its policies at the ends of visits, and its regret."""
+class _Training(_Evaluations):
+    """A learner and its evaluations; in a stream also its policies at the ends of visits."""
 
-    def __init__(self, cell: Cell, record: Record, learner: Any, models: Path | None) -> None:
-        assert cell.stream is not None
-        assert record.blocks is not None
-        self._cell, self._learner, self._blocks = cell, learner, record.blocks
-        self._uncounted: list[tuple[float, int]] = []  # regret and phase of steps
-        self._files = None if models is None else Snapshots(models, cell.stream)
-        self._initial, self._policies = learner.lasting_policy(), list[Policy]()
-        if self._files is not None:
-            learner.save(self._files.initial)
+    def __init__(
+        self, cell: Cell, progress: ReportSteps, learner: Any, snapshots: Path | None
+    ) -> None:
+        super().__init__(cell, progress)
+        self._learner = learner
+        self._files: Snapshots | None = None
+        self._policies: list[Policy] = []  # before training, and at the end of each visit
+        self._uncounted: list[tuple[float, int]] = []  # regret and phase of steps of a life
+        if cell.stream is not None:
+            if snapshots is not None:
+                self._files = Snapshots(snapshots, cell.stream)
+            self.on_visit(-1)
 
-    def after_step(self, steps: int) -> None:
-        """Count a step, before the learner learns from it."""
-        info = self._learner.env.last[2][0]
-        self._uncounted.append((info["regret"], info["phase"]))
-        if len(self._uncounted) >= _COUNTED_AT_ONCE:
-            self._count(steps)
+    def run(self) -> None:
+        """Train, with every evaluation."""
+        env, record = self._learner.env, self.record
+        self._evaluate_due(0)
+        self.report(0)
+        self._learner.learn(self)
+        record.add(env.regret, env.cost)
+        record.spend(TRAINING)
+        while record.evaluated < len(record.due):
+            self.evaluate(env.steps, self._learner.policy())
 
-    def report(self, steps: int) -> StreamReport:
-        """End the life after its training: what the agent retains, and its dynamic regret."""
-        self._count(steps)
-        regret = self._blocks.dynamic_regret()
-        return life_report(self._cell, self._policies, self._initial, regret)
+    def on_steps(self) -> None:
+        """Count a step, before the learner learns from it, and run what is due."""
+        steps = self._learner.steps
+        if self.cell.stream is not None:
+            info = self._learner.env.last[2][0]
+            self._uncounted.append((info["regret"], info["phase"]))
+            if len(self._uncounted) >= _COUNTED_AT_ONCE:
+                self._count(steps)
+        self._evaluate_due(steps)
+        self.report(steps)
 
-    def _count(self, steps: int) -> None:
-        if self._uncounted:
-            regret, phase = zip(*self._uncounted, strict=True)
-            self._blocks.add(steps, np.array(regret)[:, None], phase)
-            self._uncounted.clear()
-
-    def end_visit(self, visit: int) -> None:
+    def on_visit(self, visit: int) -> None:
+        """Keep the policy at the end of a visit; of visit −1 that before training."""
         self._policies.append(self._learner.lasting_policy())
         if self._files is not None:
-            self._learner.save(self._files.visits[visit])
+            self._learner.save(self._files.initial if visit < 0 else self._files.visits[visit])
+
+    def result(self) -> CellResult:
+        """The result of the trained policy, or of the life."""
+        learner, blocks = self._learner, self.record.blocks
+        if blocks is None:
+            return self.result_of(learner.policy(), learner.steps, learner.env.seconds)
+        self._count(learner.steps)
+        initial, *visits = self._policies
+        report = life_report(self.cell, visits, initial, blocks.dynamic_regret())
+        return self._result(report, learner.steps, learner.env.seconds)
+
+    def _evaluate_due(self, steps: int) -> None:
+        """Run the evaluations that are due during training; the last one waits for its end."""
+        record = self.record
+        while record.evaluated + 1 < len(record.due) and record.due[record.evaluated] <= steps:
+            record.spend(TRAINING)
+            self.evaluate(steps, self._learner.policy())
+
+    def _count(self, steps: int) -> None:
+        if self._uncounted and self.record.blocks is not None:
+            regret, phase = zip(*self._uncounted, strict=True)
+            self.record.blocks.add(steps, np.array(regret)[:, None], phase)
+            self._uncounted.clear()
 
 
 def _run_offline(cell: Cell, name: str, progress: ReportSteps) -> CellResult:

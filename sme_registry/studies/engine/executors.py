@@ -334,7 +334,6 @@ class OnRay(ConcurrentExecutor):
     def _session(self) -> Iterator[None]:
         self._connect()
         try:
-            self._steps = _start_step_counts(self._ray)
             self._task = self._ray.remote(num_cpus=1, max_retries=_RETRIES)(_task)
             yield
         finally:
@@ -348,17 +347,12 @@ class OnRay(ConcurrentExecutor):
     def _start(self, job: Job) -> None:
         if job.lanes is not None:
             job = replace(job, lanes=replace(job.lanes, state=None))
-        task = self._task.remote(self._steps, self._run, job, self._keep_models)
-        self._running[task] = job
+        self._running[self._task.remote(self._run, job, self._keep_models)] = job
 
     def _ended(self, progress: ReportProgress) -> Iterator[Outcome]:
         ready, _ = self._ray.wait(list(self._running), timeout=POLL_SECONDS)
         for reference in ready:
             yield from self._outcomes(reference, self._running.pop(reference))
-        by_key = {job.cells[0].digest: job for job in self._running.values()}
-        for key, reported in self._ray.get(self._steps.take.remote()).items():
-            if key in by_key:
-                progress(by_key[key], *reported)
 
     def _connect(self) -> None:
         """Connect, unless this process is connected already."""
@@ -368,7 +362,7 @@ class OnRay(ConcurrentExecutor):
         if self._address == "local":
             options |= {"num_cpus": self.workers, "include_dashboard": False}
         else:
-            _refuse_unreachable(self._address)
+            _check_reachable(self._address)
         try:
             self._ray.init(**options, log_to_driver=False, logging_level=logging.ERROR)
         except Exception as error:  # of many kinds, by what is wrong with the address
@@ -389,36 +383,12 @@ class OnRay(ConcurrentExecutor):
             return [failed(cell, message, text) for cell in job.cells]
 
 
-def _task(steps: Any, run: RunCell, job: Job, keep_models: bool) -> list[tuple[Any, ...]]:
-    """Run one job on a Ray worker."""
-    report = functools.partial(steps.put.remote, job.cells[0].digest)
-    return [tuple(outcome) for outcome in run_job(run, job, keep_models, report)]
+def _task(run: RunCell, job: Job, keep_models: bool) -> list[tuple[Any, ...]]:
+    """Run one job on a Ray worker, which does not report how far it is."""
+    return [tuple(outcome) for outcome in run_job(run, job, keep_models, lambda *steps: None)]
 
 
-class _StepCounts:
-    """A Ray actor to which workers report the steps they have done."""
-
-    def __init__(self) -> None:
-        self._steps: dict[str, tuple[Any, ...]] = {}
-
-    def put(self, key: str, *reported: Any) -> None:
-        self._steps[key] = reported
-
-    def take(self) -> dict[str, tuple[Any, ...]]:
-        steps, self._steps = self._steps, {}
-        return steps
-
-
-def _start_step_counts(ray: Any) -> Any:
-    """The actor, on the driver's own node: if that is lost, so is the driver."""
-    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
-    here = ray.get_runtime_context().get_node_id()
-    strategy = NodeAffinitySchedulingStrategy(node_id=here, soft=False)
-    return ray.remote(num_cpus=0, scheduling_strategy=strategy)(_StepCounts).remote()
-
-
-def _refuse_unreachable(address: str) -> None:
+def _check_reachable(address: str) -> None:
     """Raise if nothing answers at an address: Ray itself would try for many minutes."""
     host, _, port = address.rpartition(":")
     try:

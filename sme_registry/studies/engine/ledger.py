@@ -6,9 +6,8 @@ holds the lock STUDY/locks/<key>, which the operating system releases when the p
 are no leases to expire or to clean up.
 
 The state of a program of JAX that runs is an .npz of its arrays and of the records of its runs,
-written every few minutes and read after a kill. Its header says for which cells, and with what it
-was made: other versions, devices or numbers of runs would go on with other bits, so such a file is
-not used.
+written every few minutes and read after a kill. Its header says for which cells and with what it
+was made: other versions, devices or numbers of runs would go on with other bits.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ _STUDY_FILES = {PLAN, CELLS, FAILED, LOCKS, MODELS_OF_STUDY, REPORT, REQUESTS, S
 
 
 class SavedState(NamedTuple):
-    """The state of a program in a file, and the keys of the cells that are its lanes."""
+    """The state of a program in a file, and the keys of the cells that are its runs."""
 
     path: Path
     keys: list[str]
@@ -195,7 +194,7 @@ class Ledger:
         return self.folder / STATE_FILES / f"{name}.npz"
 
     def state_of(self, key: str, made_with: Mapping[str, Any]) -> SavedState | None:
-        """A saved state, made with the same, of a program that has this cell as a lane."""
+        """A saved state, made with the same, of a program that runs this cell."""
         for path in self._states():
             header = read_header(path)
             keys = header.get("cells", [])
@@ -203,11 +202,11 @@ class Ledger:
                 return SavedState(path, list(keys))
         return None
 
-    def remove_states(self, own: Path) -> None:
+    def remove_states(self, ended: Path) -> None:
         """Remove the states of which every cell has a result: a retry goes on from the others."""
         for path in self._states():
             keys = read_header(path).get("cells", [])
-            if all(self._path(CELLS, key).exists() for key in keys) and (keys or path == own):
+            if all(self._path(CELLS, key).exists() for key in keys) and (keys or path == ended):
                 path.unlink(missing_ok=True)
 
     def _states(self) -> list[Path]:
@@ -305,10 +304,9 @@ def run_label(class_name: str, algorithm: str, run: int, phase: int | None = Non
 
 @dataclass(frozen=True)
 class CellStatus:
-    """The state of a planned cell, and its error if it failed.
+    """The state of a planned cell, by its digest `key`, and its error if it failed.
 
-    It is "running" if any process runs it, and "failed" if it failed and none runs it again. A cell
-    with several places in the plan has a state for each; `key` is its digest.
+    It is "running" if any process runs it, and "failed" if it failed and none runs it again.
     """
 
     planned: PlannedCell
@@ -409,10 +407,8 @@ def study_status(
 ) -> StudyStatus:
     """The state of the study in a folder. Changes nothing, and may be called while it runs.
 
-    Args:
-      only: `class=GLOB`, `algorithm=GLOB`; empty for every cell of the plan, None for those that
-        any run asked for.
-      scale: applied to the folder's plan first.
+    `only` has patterns `class=GLOB`, `algorithm=GLOB`; it is empty for every cell of the plan, and
+    None for those that any run asked for. `scale` is applied to the folder's plan first.
 
     Examples:
       >>> from sme_registry.studies import study_status

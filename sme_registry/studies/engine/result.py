@@ -62,15 +62,9 @@ class LearningCurve(StrictModel):
 class Timing(StrictModel):
     """CPU seconds of a run, by task; the only part of a result that is not reproducible.
 
-    Of a lane of a program: the program's CPU seconds (on another device, its wall time) divided
-    by its cells. `environment` is 0 there: environment and learner are one program.
-
-    Attributes:
-      total: of the whole run.
-      training: of the learner.
-      environment: of the environment's steps.
-      evaluation: of the evaluations.
-      steps_per_second: environment steps for each of these seconds without evaluations.
+    Of a run of a program: the program's CPU seconds (on another device, its wall time) divided by
+    its cells. `environment` is 0 there: environment and learner are one program.
+    `steps_per_second` counts environment steps and the seconds without evaluations.
     """
 
     total: Real
@@ -81,12 +75,12 @@ class Timing(StrictModel):
 
 
 class ProgramResult(StrictModel):
-    """In what program a cell of JAX was a lane: its bits depend on all of it.
+    """In what program a cell of JAX ran: its bits depend on all of it.
 
     Attributes:
       device: its kind, such as "cpu" or "NVIDIA H200".
-      lanes: their number.
-      shape: S, A, L and H to which the tasks of all lanes were padded; H is 0 where L = 1.
+      lanes: the number of its runs.
+      shape: S, A, L and H to which the tasks of all runs were padded; H is 0 where L = 1.
     """
 
     device: str
@@ -154,12 +148,11 @@ class CellResult(StrictModel):
 
     @model_validator(mode="after")
     def _has_the_report_of_its_kind(self) -> Self:
-        has = {"report": self.report, "stream_report": self.stream_report}
-        own = "report" if self.cell.stream is None else "stream_report"
-        if [name for name, report in has.items() if report is not None] != [own]:
+        in_stream = self.cell.stream is not None
+        if (self.report is None, self.stream_report is None) != (in_stream, not in_stream):
             raise ValueError(
-                f"{own}: must be the only report, since the cell is "
-                f"{'on one task' if own == 'report' else 'a life in a stream'}."
+                f"{'stream_report' if in_stream else 'report'}: must be the only report, since the "
+                f"cell is {'a life in a stream' if in_stream else 'on one task'}."
             )
         return self
 
@@ -181,11 +174,6 @@ class CellResult(StrictModel):
     def _repr_html_(self) -> str:
         """The report's table, for notebooks."""
         return self.any_report._repr_html_()
-
-
-def report_field(report: EvaluationReport | StreamReport) -> dict[str, Any]:
-    """The field of a `CellResult` that a report is."""
-    return {"stream_report" if isinstance(report, StreamReport) else "report": report}
 
 
 class CellFailure(StrictModel):
@@ -227,12 +215,11 @@ TRAINING, EVALUATION = 0, 1  # what time is for
 
 
 class Record:
-    """Evaluations, regret, lives and times of the runs of some cells, all on tasks of one form.
+    """Evaluations, regret, lives and times of the runs of a program, all on tasks of one form.
 
-    The runs are those of one program; one of Stable-Baselines3 is a program with one run. The k-th
-    evaluation follows round(steps · k / evaluations) steps, the last one the end of training:
-    on-policy algorithms finish their last rollout, so it can be later. A function that trains is
-    evaluated at the end alone.
+    One of Stable-Baselines3 is a program with one run. The k-th evaluation follows
+    round(steps · k / evaluations) steps, the last one the end of training: on-policy algorithms
+    finish their last rollout, so it can be later. A function is evaluated at the end alone.
 
     Attributes:
       due: steps of the evaluations.
@@ -250,7 +237,9 @@ class Record:
         agents: Sequence[str] = (),
     ) -> None:
         cell = cells[0]
-        n = min(cell.evaluations, 1 if parse_uses(cell.uses)[0] == "train" else cell.evaluations)
+        n = cell.evaluations
+        if parse_uses(cell.uses)[0] == "train":
+            n = min(n, 1)
         self._cells, self._agents = cells, agents
         self.due = [round(cell.steps * k / n) for k in range(1, n + 1)]
         self.evaluated = 0
@@ -289,10 +278,6 @@ class Record:
             self.arrays["agents_rows"][k] = agents_regret
         self.evaluated = k + 1
 
-    def start(self) -> None:
-        """Count time from here on."""
-        self._mark = self._clock()
-
     def spend(self, purpose: int) -> None:
         """Count the time since the last call."""
         now = self._clock()
@@ -313,7 +298,8 @@ class Record:
             key=cell.digest,
             cell=cell,
             curve=self._curve(run),
-            **report_field(report),
+            report=report if isinstance(report, EvaluationReport) else None,
+            stream_report=report if isinstance(report, StreamReport) else None,
             **(self._online(run, steps) if steps else {}),
             timing=timing,
             versions=versions_for(cell.uses),
@@ -342,22 +328,15 @@ class Record:
         }
 
     def timing(
-        self,
-        steps: int,
-        at_the_end: float,
-        *,
-        cells: int = 1,
-        environment: float = 0.0,
-        total: float | None = None,
+        self, steps: int, at_the_end: float = 0.0, *, cells: int = 1, environment: float = 0.0
     ) -> Timing:
         """A cell's share of the time, and that of its evaluation at the end.
 
-        `environment` is the part of training that was spent in steps of the environment; `total`
-        also has what precedes them, if it was measured.
+        `environment` is the part of training that was spent in steps of the environment.
         """
         training, evaluation = (self.arrays["seconds"] / cells).tolist()
         return Timing(
-            total=training + evaluation + at_the_end if total is None else total,
+            total=training + evaluation + at_the_end,
             training=training - environment,
             environment=environment,
             evaluation=evaluation + at_the_end,

@@ -409,6 +409,8 @@ class _StudyRun:
         entry = outcome.entry
         if isinstance(entry, CellFailure):
             self.say(f"failed: {label(self._planned[entry.key])}: {entry.error}")
+        elif entry.program is None:
+            self._pace.report((entry.cell,), 1.0)
         try:
             self._queue.write(outcome)
         except OptionError as error:
@@ -435,6 +437,8 @@ class _StudyRun:
         for name, job in running.items():
             if name not in self._shown:
                 self._progress.start_part(name, "compiling" if job.lanes else "")
+                if job.lanes is None:
+                    self._pace.report(job.cells, 0.0)
         self._shown = running
         failed = self._queue.failed
         self._progress.update(self._queue.finished, f"{failed} failed" if failed else "")

@@ -72,7 +72,7 @@ def test_a_function_makes_the_learner_by_its_module_or_an_installed_entry_point(
     assert made("small-ppo", env).policy.net_arch == [8]
     with pytest.raises(UnknownNameError, match="Did you mean 'small-ppo'"):
         find("smal-ppo").load()
-    with pytest.raises(OptionError, match="entry point 'own_learners:lost' cannot be imported"):
+    with pytest.raises(OptionError, match="entry point='own_learners:lost': cannot be imported"):
         find("lost").load()
 
 
