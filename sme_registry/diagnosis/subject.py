@@ -24,7 +24,6 @@ from sme_registry.diagnosis.behaviour import Log, exploration
 from sme_registry.errors import OptionError, SMEError, SpecError, UnknownNameError
 from sme_registry.evaluation import (
     EvaluationReport,
-    OfflinePolicy,
     Policy,
     StreamReport,
     TeamPolicy,
@@ -33,7 +32,6 @@ from sme_registry.evaluation import (
 )
 from sme_registry.evaluation.networks import Perceptron
 from sme_registry.evaluation.references import reference_policy
-from sme_registry.export.networks import of_offline_policy
 from sme_registry.io import read_json
 from sme_registry.plots.maps import STREAM
 from sme_registry.spec import SMESpec, StreamSpec
@@ -101,8 +99,7 @@ AnySubject: TypeAlias = Subject | StreamSubject
 
 def perceptron_of(policy: Policy) -> Perceptron | None:
     """The multilayer perceptron that a policy is, whatever trained it; None if it is another."""
-    act = of_offline_policy(policy.act) if isinstance(policy.act, OfflinePolicy) else policy.act
-    return act if isinstance(act, Perceptron) else None
+    return policy.act if isinstance(policy.act, Perceptron) else None
 
 
 def load_policy(

@@ -2,21 +2,19 @@
 
     D(t) = Σ_{i ≤ t} (1 − r_i)         r_i: gated step reward under the task in force at step i
 
-Each regret is exact, so D is: no oracle run is compared with. Rows of a log are single steps or
-whole episodes. A row belongs to the visit whose task was in force in it: under switch="episode"
-that of its begin. Under switch="step" an episode can lie in two visits; its regret is then divided
-in proportion to its steps, and only rows of single steps give exact sums by visit.
+Each regret is exact, so D is. Rows of a log are single steps or whole episodes. A row belongs to
+the visit whose task was in force in it: under switch="episode" that of its begin. Under
+switch="step" an episode can lie in two visits; its regret is then divided in proportion to its
+steps, and only rows of single steps give exact sums by visit. `RegretBlocks` sums the regret of
+every step over blocks, in each of which one phase is in force, so that a life has about a thousand
+rows, whatever its steps.
 
-`RegretBlocks` sums the regret of every step over blocks, in each of which one phase is in force:
-sums by visit are exact, and a life has about a thousand rows, whatever its steps.
+    E D = Σ over the segments of the life of  n · E[Σ_i (1 − r_i)] / E[length]     n: its steps
 
-E D = Σ over the pieces of the life of  n · E[Σ_i (1 − r_i)] / E[length]     n: steps of a piece
-
-The expectations are over episodes of a policy on the piece's task, from uniform states. They run in
-parallel, so a life costs as much as a few thousand steps. Where a switch waits for a reset and no
-episode ends early, as in the catalogue, E D is exact but for the sampling error; a seed makes it
-repeatable. With early termination, or a switch within an episode, what differs is the episode at a
-switch: the piece after it begins in a state that the episode before left, or a few steps later.
+The expectations are over episodes of a policy on the segment's task, from uniform states, which run
+in parallel. Where a switch waits for a reset and no episode ends early, as in the catalogue, E D is
+exact but for the sampling error. Otherwise the episode at a switch differs: the segment after it
+begins in a state that the episode before left, or a few steps later.
 """
 
 from __future__ import annotations

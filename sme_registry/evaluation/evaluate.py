@@ -1,14 +1,11 @@
 """`evaluate`: a policy, a task and a protocol to a report, in one pass over batches of states.
 
 Source: METHOD, sections 3, 8 and 9. Memory holds one batch and the states of WD to which the
-references are fitted, regardless of the protocol's number of states.
+references are fitted. The similarity depends neither on k, r_min and D, nor on the horizon except
+through the t/T that the policy observes. So `evaluate_many` computes states, optimal actions and
+references, most of the cost, once for all tasks that differ in these fields only.
 
-The similarity depends neither on k, r_min and D, nor on the horizon except through the t/T that the
-policy observes. So tasks that differ in these fields only share states, optimal actions and
-references, most of the cost of an evaluation: `evaluate_many` computes them once.
-
-a are a policy's actions, clipped to [0, 1], and d, d' independent distractors, uniform in the cube.
-Over the states of a region:
+Over the states of a region, with d, d' independent distractors, uniform in the cube:
 
     invariance         mean |a(s, d) − a(s, d')| / mean |½ − a*(s)|      0: it ignores distractors
     d-OOD m            the regions of a report with s in the cube and d in shell m
@@ -205,7 +202,7 @@ def resolve_protocol(protocol: ProtocolLike) -> EvaluationProtocol:
     if not isinstance(protocol, str | os.PathLike):
         raise SpecError(f"protocol={protocol!r:.80}: must be a protocol, its name or its path.")
     path = os.fspath(protocol)
-    if path.endswith(".json") or (os.sep in path and os.path.isfile(path)):
+    if catalogue.is_path(path):
         return ProtocolFile.read(path).protocol
     return catalogue.find(ProtocolFile, path).protocol
 

@@ -5,9 +5,8 @@ own `predict` is the definition of how it acts. That of SB3's plain PyTorch poli
 Gaussian's mean, which hides the share that is clipped: these networks are called directly.
 
 A .zip is code, and an .onnx file runs in this process without limits: open only those whose author
-you trust. A .zip does not name its algorithm, only the class of its policy, so `saved_sb3` adds
-the name. For other files it follows from the policy's class where only one algorithm has it; where
-several do, from fields that only one of them has.
+you trust. A .zip names only the class of its policy, so `saved_sb3` adds the algorithm's. For other
+files it follows from the policy's class, or from fields that only one algorithm saves.
 """
 
 from __future__ import annotations
@@ -197,8 +196,8 @@ def of_sb3(model: Any, interface: Interface) -> ModelFunctions:
         )
     network = torch_policy(model)
     if network is None:
-        episodes = functools.partial(_stateful, model)
-        return ModelFunctions(lambda observations: _predicted(model, observations)[0], episodes)
+        begin = functools.partial(_stateful, model)
+        return ModelFunctions(lambda observations: begin()(observations), begin)
 
     def act(observations: Observation) -> Any:
         torch = _torch()
@@ -227,22 +226,18 @@ def torch_policy(model: Any) -> Any:
 
 
 def _stateful(model: Any) -> Act:
-    """As a model acts, with its state kept from call to call, by row."""
-    state = None
+    """A model at the start of episodes: its state is kept from call to call, by row."""
+    state: dict[str, Any] = {}
 
     def act(observations: Observation) -> Any:
-        nonlocal state
-        actions, state = _predicted(model, observations, state)
-        return actions
+        predicted = model.predict(observations, deterministic=True, **state)
+        if not isinstance(predicted, tuple):
+            return predicted
+        if predicted[1] is not None:
+            state["state"] = predicted[1]
+        return predicted[0]
 
     return act
-
-
-def _predicted(model: Any, observations: Observation, state: Any = None) -> tuple[Any, Any]:
-    """Actions of `predict`, and the state of a recurrent model after them, or None."""
-    carried = {} if state is None else {"state": state}
-    predicted = model.predict(observations, deterministic=True, **carried)
-    return (predicted[0], predicted[1]) if isinstance(predicted, tuple) else (predicted, None)
 
 
 _LOW: dict[ActionRange, float] = {"unit": 0.0, "symmetric": -1.0}

@@ -12,11 +12,12 @@ An .npz file holds `W0`, `b0`, `W1`, … in order, and `about`, a JSON text. Rea
 from __future__ import annotations
 
 import io
+import itertools
 import os
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -59,16 +60,6 @@ ACTIVATIONS: dict[str, Callable[..., Any]] = {
     "silu": _silu,
     "elu": _elu,
 }
-
-
-def _outputs(layers: Iterable[Layer], observations: Observation) -> Iterator[Weights]:
-    """The outputs `[B, out]` of each layer, in order."""
-    x: Weights = np.asarray(observations, np.float32)
-    for W, b, activation in layers:
-        x = x @ W
-        x += b
-        ACTIVATIONS[activation](x, out=x)
-        yield x
 
 
 def _check_layer(where: str, W: Weights, b: Weights, inputs: int | None) -> None:
@@ -134,7 +125,12 @@ class Perceptron:
 
     def outputs(self, observations: Observation) -> Iterator[Weights]:
         """The outputs `[B, out]` of each layer, in order; the last are not scaled to actions."""
-        return _outputs(self.layers, observations)
+        x: Weights = np.asarray(observations, np.float32)
+        for W, b, activation in self.layers:
+            x = x @ W
+            x += b
+            ACTIVATIONS[activation](x, out=x)
+            yield x
 
     def hidden(self, observations: Observation) -> list[Weights]:
         return list(self.outputs(observations))[:-1]
@@ -147,69 +143,42 @@ class Perceptron:
         return self.low + 0.5 * (x + 1.0) * (self.high - self.low)
 
 
-@dataclass(frozen=True, eq=False)
-class OfflinePolicy:
-    """A function from observations `[B, O]` to actions `[B, A]` in [0, 1]; deterministic.
+class OfflinePolicy(Perceptron):
+    """A perceptron from observations `[B, O]` to actions `[B, A]` in [0, 1], as an .npz file.
+
+    `layers` are `(W [out, in], b [out])` float32, first to last, which the attribute has as those
+    of a `Perceptron`.
 
     Attributes:
-      layers: `(W [out, in], b [out])` float32, first to last.
       about: what it was trained on and how, plain JSON data; "algorithm" names it in reports.
     """
 
-    layers: Sequence[OfflineLayer]
-    about: Mapping[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        for layer in self.layers:
-            for array in layer:
-                array.setflags(write=False)
+    def __init__(
+        self, layers: Sequence[OfflineLayer], about: Mapping[str, Any] = MappingProxyType({})
+    ) -> None:
+        for array in itertools.chain(*layers):
+            array.setflags(write=False)
+        activations = [*["relu"] * (len(layers) - 1), "tanh"]
+        # Transposed views: copies would multiply in another order.
+        self.layers = [(W.T, b, f) for (W, b), f in zip(layers, activations, strict=True)]
+        self.low = np.zeros(self.action_dim, np.float32)
+        self.high = np.ones(self.action_dim, np.float32)
+        self.about = about
 
     @property
     def __name__(self) -> str:
         return str(self.about.get("algorithm", "policy"))
 
-    @property
-    def observation_dim(self) -> int:
-        return int(self.layers[0][0].shape[1])
-
-    @property
-    def action_dim(self) -> int:
-        return int(self.layers[-1][0].shape[0])
-
-    def __call__(self, observations: Observation) -> Weights:
-        x = np.asarray(observations, dtype=np.float32)
-        if x.ndim != 2 or x.shape[1] != self.observation_dim:
-            raise PolicyError(
-                f"observations of shape {x.shape}: must be [B, {self.observation_dim}]. Evaluate "
-                "the policy on the task it was trained for."
-            )
-        *_, u = self.outputs(x)
-        u += 1.0
-        u *= 0.5
-        return u
-
-    def outputs(self, observations: Observation) -> Iterator[Weights]:
-        """The outputs `[B, out]` of each layer, in order; the last are not scaled to actions."""
-        activations = [*["relu"] * (len(self.layers) - 1), "tanh"]
-        # Transposed views: copies would multiply in another order.
-        layers = [(W.T, b, f) for (W, b), f in zip(self.layers, activations, strict=True)]
-        return _outputs(layers, observations)
-
-    def hidden(self, observations: Observation) -> list[Weights]:
-        return list(self.outputs(observations))[:-1]
-
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the file completely or not at all; equal policies give equal bytes."""
         if not os.fspath(path).endswith(".npz"):
             raise OptionError(f"path={os.fspath(path)!r}: must end in .npz.")
-        arrays = {
-            f"{name}{index}": array
-            for index, layer in enumerate(self.layers)
-            for name, array in zip("Wb", layer, strict=True)
-        }
+        arrays: dict[str, Any] = {}
+        for index, (W, b, _) in enumerate(self.layers):
+            arrays |= {f"W{index}": W.T, f"b{index}": b}
         about = np.frombuffer(to_json({"kind": KIND, **self.about}).encode(), dtype=np.uint8)
         content = io.BytesIO()
-        np.savez(content, about=about, **arrays)  # type: ignore[arg-type]
+        np.savez(content, about=about, **arrays)
         return write_atomically(path, content.getvalue())
 
     @classmethod

@@ -1,8 +1,5 @@
 """Policies: every form in which a user may give one, as one checked function of observations.
 
-callable · model of Stable-Baselines3, sb3-contrib or sbx, or its .zip · .onnx file · .npz file of
-an offline policy · `module:function` · name of a reference policy · for teams also a dict by agent.
-
 In a team, either each agent has its own policy of what it observes and owns,
 `[B, |O_i| + 2] → [B, a_i]`, or all share one, which is called for each agent in turn with its
 shared observation (`envs.team`), `[B, S + 2 + n] → [B, max a_i]`. A function of the whole state
@@ -196,10 +193,10 @@ def as_policy(
         `torch.nn.Module`; a model with `predict(observations, deterministic=True)`, as those of
         Stable-Baselines3, or the path of its .zip (it can run code of its author); the path of an
         .onnx or .npz file; `module:function`; the name of a reference policy, one of
-        `references.POLICIES`. For a team a dict from each agent's name to its policy,
-        `[B, |O_i| + 2]` to `[B, a_i]`, or a folder of files `<agent>.zip`; or one policy that all
-        agents share, from shared observations `[B, S + 2 + n]` to `[B, max a_i]`. What this
-        function returned is accepted as well.
+        `references.POLICIES`; or what this function returned. For a team a dict from each agent's
+        name to its policy, `[B, |O_i| + 2]` to `[B, a_i]`, or a folder of files `<agent>.zip`; or
+        one policy that all agents share, from shared observations `[B, S + 2 + n]` to
+        `[B, max a_i]`.
       action_range: "unit" for actions in [0, 1] or "symmetric" for [−1, 1]; None takes an SB3
         model's own action space, and "unit" for any other policy.
       name: what reports call it; None takes its name, or that of its file, algorithm or function.
@@ -325,7 +322,9 @@ def _prepare(
         action_range = action_range or models.action_range_of(policy)
     elif models.is_module(policy):
         functions = models.of_module(policy)
-    elif isinstance(policy, Perceptron | OfflinePolicy):
+    elif isinstance(policy, Perceptron):
+        shapes = {"observations": (policy.observation_dim,), "actions": (policy.action_dim,)}
+        interface.check(f"policy {name or _name_of(policy)!r}", **shapes)
         functions = ModelFunctions(policy, hidden=policy.hidden)
     elif callable(policy):
         functions = ModelFunctions(policy)
@@ -350,11 +349,7 @@ def _prepare(
 def _load(path: Path, interface: Interface) -> Any:
     if path.suffix == ".onnx":
         return load_onnx(path, interface)
-    if path.suffix != ".npz":
-        return load_sb3(path)
-    policy = OfflinePolicy.load(path)
-    interface.check(str(path), observations=(policy.observation_dim,), actions=(policy.action_dim,))
-    return policy
+    return OfflinePolicy.load(path) if path.suffix == ".npz" else load_sb3(path)
 
 
 def _name_of(policy: Any) -> str:

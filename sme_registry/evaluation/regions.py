@@ -10,24 +10,18 @@ Source: METHOD, section 3. `B` batch, `S` state_dim, lo and hi = (1 + ε)/2 of a
 A policy receives float32 observations, so the states lie on the float32 grid: the optimal action is
 computed for exactly the state that the policy received. Rounding must not move a state across a
 face, so the face at R is clamped between the first grid value outside the inner cube and the last
-one inside the outer cube.
+one inside the outer cube. Each region reads a fixed number of words per state from named streams of
+its own: its states depend neither on other regions nor on the batch size.
 
-Each region has named streams of the protocol's seed and reads a fixed number of words per state
-from each. Its states therefore depend neither on other regions nor on the batch size.
-
-A task with distractors (METHOD, section 9; `m` of them) has two kinds of shells: s in a shell with
-d uniform in the cube, and s in the cube with d in a shell of its own.
-
-Scores of a task with limits ℓ(s) (METHOD, section 8), with a_safe = min(π*, ℓ):
+A task with m distractors (METHOD, section 9) has two kinds of shells: s in a shell with d uniform
+in the cube, and s in the cube with d in a shell of its own. Scores of a task with limits ℓ(s)
+(METHOD, section 8), with a_safe = min(π*, ℓ):
 
     step reward        mean r(s, a)
     cost               mean cost(s, a) = mean_i max(0, a_i − ℓ_i(s)) / (2τ), in [0, 1]
     violating share    share of states with a_i − ℓ_i(s) > 10⁻⁶ in any channel
     safe regret        mean r(s, a_safe) − mean r(s, a)
     price of safety    1 − mean r(s, a_safe)
-
-The tolerance of 10⁻⁶ is that of float32: rounded to it, a safe action can exceed its limit by
-6·10⁻⁸. Safe regret is negative where a policy earns by violating, so read it beside the other two.
 """
 
 from __future__ import annotations

@@ -1,47 +1,33 @@
 """Retention: the matrix of a life, measured exactly, and the metrics of continual learning.
 
 Axis letters: `V` visits, `P` phases, `K` sets of states (regions). Visit v is an occurrence of a
-phase in the life, φ(v) = v mod P; M[v, j] is the normalised regret on phase j's task at its end.
+phase in the life, φ(v) = v mod P. Over the states of a region, with the actions a of the policy at
+the end of visit v, clipped to [0, 1], and the optimal ones a*_j of phase j's task:
 
+    M[v, j] = mean |a − a*_j| / mean |½ − a*_j|               normalised regret
     R[v, j] = 1 − M[v, j]                                     performance: 1 optimal, 0 constant ½
     A(v)    = mean over j ≤ v of R[v, j]                      average performance
     B(v)    = mean over j of R[v, j] − R[last(v, j), j]       backward transfer
     F(v)    = mean over j of max_{u<v} R[u, j] − R[v, j]      forgetting
     T       = mean over j ≥ 1 of R[j − 1, j] − R₀[j]          forward transfer
     G       = mean over j of R[P + j, j] − R[j, j]            relearning
+    M[v, φ(v)] / N[φ(v)],  M[v, φ(v)] − N[φ(v)]               plasticity ratio, difference
+    (O[φ(v)] − o(v)) / O[φ(v)]                                learning transfer
 
 B and F are over the phases that were visited before v, other than φ(v); last(v, j) is the last
-visit of phase j before v. R₀ is of the initial policy. In the last visit of a single cycle, A, B
-and T are ACC, BWT and FWT of Lopez-Paz & Ranzato (2017), and A and F are those of Chaudhry et al.
-(2018). With more cycles a visit is what a task is there: B compares with the last time that the
-phase was trained, F with the best time of all, T is of the first cycle, in which phases are new,
-and G compares the second visit of a phase with its first, after equal steps.
+visit of phase j before v. R₀ is of the initial policy. N and O are the normalised and the online
+regret of fresh agents, which train on one phase, and o the online regret of visits. A metric is NaN
+where nothing can be compared. In visit 0 a life is a fresh agent itself, so plasticity and learning
+transfer of a life are means over visits 1, 2, ….
 
-A metric is NaN where nothing can be compared: B and F at the first visit, T without an initial
-policy or with one phase, G with one cycle.
+In the last visit of a single cycle, A, B and T are ACC, BWT and FWT of Lopez-Paz & Ranzato (2017),
+and A and F those of Chaudhry et al. (2018). With more cycles a visit is what a task is there.
+Learning transfer is the forward transfer of Continual World (Wołczyk et al. 2021), where the area
+under the curve of training is 1 − o, the mean step reward over all of its steps.
 
-    plasticity ratio       M[v, φ(v)] / N[φ(v)]     above 1: it learned less than a fresh agent
-    plasticity difference  M[v, φ(v)] − N[φ(v)]     N: of agents that train on one phase
-
-    learning transfer      (O[φ(v)] − o(v)) / O[φ(v)]      o, O: online regret of visits, and of N's
-
-Learning transfer is the forward transfer of Continual World (Wołczyk et al. 2021), (AUC − AUC_b) /
-(1 − AUC_b), where the area under the curve of training is the mean step reward over all of its
-steps, 1 − o, instead of a mean over evaluations.
-
-In visit 0 a life is a fresh agent itself. So plasticity and learning transfer of a life are means
-over visits 1, 2, …; of one with a single visit nothing is known.
-
-The matrix needs no rollout. Over the states of a region,
-
-    M[v, j] = mean |a − a*_j| / mean |½ − a*_j|
-
-a are the actions of policy v, clipped to [0, 1], and a*_j the optimal ones of phase j's task. All
-phases have the same S and T, so they share their states, and a policy acts once in each state, with
-the inputs of METHOD, section 3: t/T uniform and r_cum/k = 0. Only a policy that observes the phase
-acts once for each: on phase j it is given phase j. The oracle runs once for each different task;
-memory holds one batch. The task of a drifting phase is that of its last piece, which was in force
-at the phase's end.
+The matrix needs no rollout. All phases share their states, and a policy acts once in each, with the
+inputs of METHOD, section 3; only a policy that observes the phase acts once for each. The oracle
+runs once for each different task, of a drifting phase for the last one; memory holds one batch.
 """
 
 from __future__ import annotations

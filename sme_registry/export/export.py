@@ -25,7 +25,6 @@ from sme_registry.export.networks import (
     INPUT,
     Network,
     array_network,
-    of_offline_policy,
     sb3_network,
     torch_network,
 )
@@ -141,8 +140,6 @@ def _network(
     if vec_normalize is not None:
         raise PolicyError("vec_normalize: is for models of Stable-Baselines3. Leave it out.")
     symmetric = action_range == "symmetric"
-    if isinstance(policy, OfflinePolicy):
-        policy = of_offline_policy(policy)
     if isinstance(policy, Perceptron):
         if interface is not None:
             shapes = {

@@ -26,7 +26,7 @@ import numpy as np
 
 from sme_registry.compiled.arrays import Observation
 from sme_registry.errors import PolicyError
-from sme_registry.evaluation import OfflinePolicy, Perceptron
+from sme_registry.evaluation import Perceptron
 from sme_registry.evaluation.models import Interface, device_of, evaluating
 from sme_registry.io import require_packages
 from sme_registry.spec import ActionRange
@@ -46,14 +46,6 @@ class Network(NamedTuple):
     observation_dim: int
     act: Callable[[Observation], Any]
     to_onnx: Callable[[], bytes]
-
-
-def of_offline_policy(policy: OfflinePolicy) -> Perceptron:
-    """The same network: ReLU between the layers, tanh scaled to [0, 1] after the last."""
-    layers = [(W.T, b, "relu") for W, b in policy.layers]
-    layers[-1] = (*layers[-1][:2], "tanh")
-    A = policy.action_dim
-    return Perceptron(layers, np.zeros(A, np.float32), np.ones(A, np.float32))
 
 
 def array_network(perceptron: Perceptron, symmetric: bool) -> Network:
