@@ -12,15 +12,11 @@
 
 Sources: IQM, optimality gap, performance profiles, probability of improvement and their stratified
 bootstrap, Agarwal et al. 2021 (θ is not their pooled IQM, which hardly changes when a method fails
-on one class); the factor √(n/(n − 1)), which corrects that resampling n runs understates their
-spread, Hesterberg 2015 ("narrowness bias"). Using the longer arm on both sides combines the
-percentile interval with its mirror image, the "basic" interval of Davison and Hinkley 1997, section
-5.2: with few runs that are skewed or bimodal, either interval alone covers too rarely.
-
-The run is the unit: its evaluation episodes and states are not independent evidence. The spread of
-a single run is unknown: where no class has more, there is no interval, and its ends are NaN. Every
-interval is a function of its runs and a seed, which can be any text. Axis letters: `n` runs of a
-class, `K` columns.
+on one class); the factor √(n/(n − 1)), Hesterberg 2015 ("narrowness bias"). Using the longer arm on
+both sides combines the percentile interval with its mirror image, the "basic" interval of Davison
+and Hinkley 1997, section 5.2: with few runs that are skewed or bimodal, either alone covers too
+rarely. The run is the unit, not its episodes or states; the spread of a single run is unknown.
+Axis letters: `n` runs of a class, `K` columns.
 """
 
 from __future__ import annotations
@@ -155,9 +151,8 @@ def running_median(values: Array, window: int) -> Array:
 def smoothed(step: Array, values: Array, window: int | None = None) -> tuple[Array, Array, int]:
     """The line of a training curve, from `[N]` values and the steps of each, in any order.
 
-    Returns:
-      `[P]` increasing steps, `[P]` medians of the last `window` values up to each, and the window,
-      by default that of `smoothing_window`.
+    It returns `[P]` increasing steps, `[P]` medians of the last `window` values up to each, and the
+    window, by default that of `smoothing_window`.
 
     Examples:
       >>> from sme_registry.statistics import smoothed
@@ -182,10 +177,8 @@ def aggregate(
 ) -> Array:
     """θ `[K]`: the mean over classes, which have equal weight regardless of their number of runs.
 
-    Args:
-      classes: by name, `[n, K]` scores of its runs.
-      statistic: applied within each class; one for all, or one for each by its name.
-      weights: of the classes, positive; None for equal ones.
+    A class has `[n, K]` scores of its runs. Within classes the statistic is one for all, or one for
+    each by its name; `weights` of classes are positive.
 
     Examples:
       >>> from sme_registry.statistics import aggregate
@@ -193,9 +186,9 @@ def aggregate(
       >>> aggregate(classes)
       array([1.])
     """
-    values, shares = _statistics(classes, statistic), _weights(classes, weights)
-    weighted = [shares[name] * values[name](runs) for name, runs in classes.items()]
-    return np.asarray(np.sum(weighted, axis=0) / sum(shares.values()))
+    strata = _strata(classes, statistic, weights)
+    weighted = [weight * of_class(runs) for _, runs, of_class, weight in strata]
+    return np.asarray(np.sum(weighted, axis=0) / sum(weight for *_, weight in strata))
 
 
 def stratified_bootstrap(
@@ -207,9 +200,9 @@ def stratified_bootstrap(
 ) -> tuple[Array, Array]:
     """95 % intervals of `aggregate`, with the same resampled runs for all columns.
 
-    The ends are `[K]` each, NaN where each class has a single run. Beside classes of several runs,
-    a class with a single run adds no spread: its spread is unknown. `seed` is any text: intervals
-    depend only on it and the other arguments, in every version of NumPy.
+    The ends are `[K]` each, NaN where each class has a single run; beside classes of several runs,
+    such a class adds no spread. `seed` is any text: intervals depend only on it and the other
+    arguments, in every version of NumPy.
 
     Examples:
       >>> from sme_registry.statistics import stratified_bootstrap
@@ -221,15 +214,14 @@ def stratified_bootstrap(
     value = aggregate(classes, statistic, weights)
     if max(map(len, classes.values())) == 1:
         return np.full_like(value, np.nan), np.full_like(value, np.nan)
-    shares = _weights(classes, weights)
-    total = sum(shares.values())
+    strata = _strata(classes, statistic, weights)
+    total = sum(weight for *_, weight in strata)
     deviation = np.zeros((len(value), draws))
-    for name, of_class in _statistics(classes, statistic).items():
-        runs = classes[name]
+    for name, runs, of_class, weight in strata:
         n = len(runs)
         if n == 1:
             continue
-        widened = math.sqrt(n / (n - 1)) * shares[name] / total
+        widened = math.sqrt(n / (n - 1)) * weight / total
         centre = of_class(runs)[:, None]
         bits = _stream(seed, name)
         rows = max(1, _MAX_NUMBERS // runs.size)
@@ -269,9 +261,8 @@ def probability_of_improvement(
     """The probability `[1]` that a run of x scores above one of y on a random class; ½ if equal.
 
     `x` and `y` have the same classes, of `[n]` scores each. If all pairs agree, resampled values do
-    not vary, and two runs would already give certainty. The far end is then the exact binomial
-    bound of Clopper and Pearson 1934 for N = Σ min(n_x, n_y) independent pairs that agree, ((1 −
-    LEVEL)/2)^(1/N).
+    not vary, so the far end is the exact binomial bound of Clopper and Pearson 1934 for
+    N = Σ min(n_x, n_y) independent pairs that agree, ((1 − LEVEL)/2)^(1/N).
 
     Examples:
       >>> from sme_registry.statistics import probability_of_improvement
@@ -307,16 +298,15 @@ def probability_of_improvement(
     return Estimate(value, low.clip(0.0, 1.0), high.clip(0.0, 1.0))
 
 
-def _statistics(
-    classes: Mapping[str, Array], statistic: Statistic | Mapping[str, Statistic]
-) -> dict[str, Statistic]:
-    if isinstance(statistic, Mapping):
-        return {name: statistic[name] for name in classes}
-    return dict.fromkeys(classes, statistic)
-
-
-def _weights(classes: Mapping[str, Array], weights: Mapping[str, float] | None) -> dict[str, float]:
-    return {name: 1.0 if weights is None else weights[name] for name in classes}
+def _strata(
+    classes: Mapping[str, Array],
+    statistic: Statistic | Mapping[str, Statistic],
+    weights: Mapping[str, float] | None,
+) -> list[tuple[str, Array, Statistic, float]]:
+    """Each class: its name, runs `[n, K]`, statistic and weight."""
+    of_class = statistic if isinstance(statistic, Mapping) else dict.fromkeys(classes, statistic)
+    weights = dict.fromkeys(classes, 1.0) if weights is None else weights
+    return [(name, runs, of_class[name], weights[name]) for name, runs in classes.items()]
 
 
 def _around(value: Array, deviation: Array) -> tuple[Array, Array]:

@@ -34,7 +34,7 @@ from sme_registry.envs.batch import Batch
 from sme_registry.errors import FingerprintMismatchError, OptionError, SpecError, StateError
 from sme_registry.evaluation import as_policy
 from sme_registry.evaluation.regions import expansion
-from sme_registry.evaluation.rollouts import LANES
+from sme_registry.evaluation.rollouts import MOST_ENVS
 from sme_registry.evaluation.rollouts import rollouts as run_rollouts
 from sme_registry.io import integer_in, number_in
 from sme_registry.spec import SMESpec, SpecLike
@@ -449,8 +449,8 @@ def _check_deterministic(
     policy: Callable[[Observation], npt.ArrayLike], task: Task, s: Array, t: Indices, r_cum: Array
 ) -> None:
     """Raise if the return of one episode from a state is not the only one that it can have."""
-    batch = Batch(task, min(len(s), LANES))
-    batch.place(s[:LANES], t[:LANES], r_cum[:LANES, None])
+    batch = Batch(task, min(len(s), MOST_ENVS))
+    batch.place(s[:MOST_ENVS], t[:MOST_ENVS], r_cum[:MOST_ENVS, None])
     reason = ""
     if task.spec.distractors:
         reason = f"the task has {task.spec.distractors} distractors, which are drawn at random"

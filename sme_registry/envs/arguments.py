@@ -8,6 +8,7 @@ the task's digest.
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -34,6 +35,19 @@ def load_overridden(environment: type, spec: SpecLike, overrides: dict[str, Any]
     """The task of an environment class that is called with these overrides of spec fields."""
     check_overrides(environment, None, overrides)
     return load_task(spec, **overrides)
+
+
+def agents_problem(by_agent: Mapping[str, Any], agents: Sequence[str], what: str) -> str:
+    """What is missing or too much among actions or policies by agent; empty if nothing is."""
+    missing = [name for name in agents if name not in by_agent]
+    unknown = [name for name in by_agent if name not in agents]
+    problems = [f"{', '.join(missing)}: {what} missing."] if missing else []
+    if unknown:
+        hint = did_you_mean(str(unknown[0]), missing or agents)
+        problems.append(f"{', '.join(map(repr, unknown))}: no such agent.{hint}")
+    if problems:
+        problems.append(f"Give one for each of {', '.join(agents)}.")
+    return " ".join(problems)
 
 
 def check_overrides(

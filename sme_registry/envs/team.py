@@ -278,17 +278,8 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
             return ActionError(
                 f"actions={actions!r:.60}: must be a dict from each agent's name to its action."
             )
-        missing = [name for name in self.possible_agents if name not in actions]
-        unknown = [name for name in actions if name not in self.possible_agents]
-        problems = []
-        if missing:
-            problems.append(f"{', '.join(missing)}: action missing.")
-        if unknown:
-            hint = did_you_mean(str(unknown[0]), missing or self.possible_agents)
-            problems.append(f"{', '.join(map(repr, unknown))}: no such agent.{hint}")
-        return ActionError(
-            f"actions: {' '.join(problems)} Give one for each of {', '.join(self.possible_agents)}."
-        )
+        problem = arguments.agents_problem(actions, self.possible_agents, "action")
+        return ActionError(f"actions: {problem}")
 
     def _not_finite(self, joint: Array) -> ActionError:
         for _, name, channels in self._parts:

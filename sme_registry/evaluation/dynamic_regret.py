@@ -338,10 +338,10 @@ def expected_regret(
     Args:
       life: for each visit the policy that acts in it, in any form that `evaluate` accepts; or a
         number, the online regret of an agent that learned in it.
-      episodes: run with each policy, over the pieces of one cycle; each has one or more. The
+      episodes: run with each policy, over the segments of one cycle; each has one or more. The
         standard error of a policy's online regret is about 0.02/√episodes.
       seed: of the initial states, which are the same for every policy.
-      progress: called after the episodes of each piece with the number of pieces done, and of all.
+      progress: called after the episodes of each segment with the segments done, and all of them.
 
     Examples:
       >>> from sme_registry.evaluation import expected_regret
@@ -358,29 +358,29 @@ def expected_regret(
     integer_in("episodes", episodes, 1)
     integer_in("seed", seed, 0)
     policies = _policies(life, stream, action_range, algorithm)
-    steps = np.diff([*(piece.start for piece in stream.segments), stream.cycle_steps])
-    of_phase = [[i for i, one in enumerate(stream.segments) if one.phase == j] for j in range(P)]
-    parts = [(entry, piece) for v, entry in enumerate(life) for piece in of_phase[v % P]]
-
-    # A policy acts once in each piece, in however many cycles.
-    acts = dict.fromkeys((id(entry), piece) for entry, piece in parts if id(entry) in policies)
+    segments = list(enumerate(stream.segments))
+    steps = np.diff([*(segment.start for _, segment in segments), stream.cycle_steps])
+    parts = [
+        (entry, i) for v, entry in enumerate(life) for i, one in segments if one.phase == v % P
+    ]
+    # A policy acts once in each segment, in however many cycles.
+    acts = dict.fromkeys((id(entry), i) for entry, i in parts if id(entry) in policies)
     tasks = materialize_segments(stream) if acts else ()
     means: dict[tuple[int, int], float] = {}
-    for which, piece in acts:
-        share = -(-episodes * int(steps[piece]) // int(steps.sum()))
-        policy = policies[which]
+    for which, i in acts:
+        policy, share = policies[which], -(-episodes * int(steps[i]) // stream.cycle_steps)
         if stream.observes_phase:
-            policy = policy.in_phase(stream.segments[piece].phase, P)
-        ran = rollouts(policy, tasks[piece], start_states(seed, piece, share, stream.state_dim))
-        means[which, piece] = ran.per_step(ran.regret)
+            policy = policy.in_phase(stream.segments[i].phase, P)
+        ran = rollouts(policy, tasks[i], start_states(seed, i, share, stream.state_dim))
+        means[which, i] = ran.per_step(ran.regret)
         if progress is not None:
             progress(len(means), len(acts))
-    ends = np.cumsum(steps[[piece for _, piece in parts]])
+    ends = np.cumsum(steps[[i for _, i in parts]])
     if stream.switch == "episode" and not any(phase.spec.D for phase in stream.phases):
         T = stream.horizon  # a switch waits for a reset, at the end of an episode
         ends = np.minimum(-(-ends // T) * T, stream.steps)
     lengths = np.diff(ends, prepend=0)
-    regret = np.array([means.get((id(entry), piece), entry) for entry, piece in parts])
+    regret = np.array([means.get((id(entry), i), entry) for entry, i in parts])
     lived = lengths > 0
     return dynamic_regret(stream, ends[lived], regret[lived], lengths[lived])
 

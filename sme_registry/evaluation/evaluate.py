@@ -9,21 +9,13 @@ Over the states of a region, with d, d' independent distractors, uniform in the 
 
     invariance         mean |a(s, d) − a(s, d')| / mean |½ − a*(s)|      0: it ignores distractors
     d-OOD m            the regions of a report with s in the cube and d in shell m
-
-A *probe* is the affine map of a layer's outputs h that is fitted to s, or to d, by least squares in
-one half of the states, and tested in the other half:
-
-    R² = mean over channels of  1 − Σ (y − ŷ)² / Σ (y − ȳ)²           y of the held-out states
-
-1: a linear map recovers the channels; 0 or below: no better than their mean. METHOD calls an R² of
-s what was represented, and of d what was wasted. Axis letters: `B` batch, `A` action_dim.
 """
 
 from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -31,7 +23,6 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.compiled import Engine, engine
-from sme_registry.compiled.arrays import Observation
 from sme_registry.compiled.engine import network
 from sme_registry.envs import arguments
 from sme_registry.errors import PolicyError, SpecError
@@ -39,7 +30,6 @@ from sme_registry.evaluation import references
 from sme_registry.evaluation.policies import Policy, TeamPolicy, as_policy
 from sme_registry.evaluation.regions import (
     Invariance,
-    LayerProbe,
     ObservationReport,
     Observations,
     Points,
@@ -51,6 +41,7 @@ from sme_registry.evaluation.regions import (
     States,
     Uniform,
     batch_rows,
+    probe_layers,
     region_name,
     states,
 )
@@ -65,15 +56,11 @@ from sme_registry.spec import (
     catalogue,
 )
 from sme_registry.task import Task, load, materialize
-from sme_registry.task.certificate import held_out_r2
 from sme_registry.task.draw import Array
 
 WHOLE = ""
 """The scope of all action channels, among the agents' names."""
 
-PROBE_STATES = 2**14  # of which half are held out
-_PROBED_CHANNELS = 512  # of s and d; above it the least squares take minutes and much memory
-_STATES_PER_UNKNOWN = 4  # of the fit; with fewer, R² would tell how few they are
 _POLICY_LIBRARIES = ("torch", "stable_baselines3", "onnxruntime")
 
 OnBatch = Callable[[int, int], None]
@@ -84,10 +71,6 @@ Subject = tuple[Policy | TeamPolicy, SMESpec]
 
 Key = int | str
 """The index of a policy, or the name of a reference."""
-
-HiddenLayers = Callable[[Observation], Iterable[Array] | None]
-"""From observations `[B, O]` to the outputs `[B, H]` of each hidden layer, in order; None if they
-are unknown."""
 
 
 def evaluate(
@@ -480,35 +463,3 @@ class _Distraction:
             for index, unclipped in act(drawn.seen(self._task, d)):
                 a = np.clip(unclipped, 0.0, 1.0)
                 errors[index].add(a, optimal, a != unclipped)
-
-
-def probe_layers(
-    hidden: HiddenLayers, task: Task, protocol: EvaluationProtocol
-) -> tuple[LayerProbe, ...]:
-    """Probe what an agent sees and each of its hidden layers, in states of WD."""
-    m, count = task.spec.distractors, PROBE_STATES
-    if task.spec.state_dim + m > _PROBED_CHANNELS:
-        return ()
-    [batch] = states(protocol.model_copy(update={"states_per_region": count}), 0, task.spec, count)
-    observation = batch.observation(batch.seen(task), task.spec.horizon)
-    targets = np.concatenate([batch.s, batch.d], axis=1).astype(np.float64)
-
-    def probe(layer: int, h: Array) -> LayerProbe:
-        if not np.isfinite(h).all():
-            raise PolicyError(f"hidden layer {layer}: has outputs that are NaN or infinite.")
-        r2 = held_out_r2(h.astype(np.float64), targets)
-        s_r2, d_r2 = r2[: task.spec.state_dim], r2[task.spec.state_dim :]
-        return LayerProbe(
-            layer=layer,
-            units=h.shape[1],
-            state_r2=float(s_r2.mean()),
-            distractor_r2=float(d_r2.mean()) if m else None,
-        )
-
-    layers = hidden(observation.copy())
-    if layers is None:
-        return ()
-    outputs = [observation[:, :-2].astype(np.float64), *layers]
-    if any(_STATES_PER_UNKNOWN * (h.shape[1] + 1) > count // 2 for h in outputs):
-        return ()
-    return tuple(probe(layer, h) for layer, h in enumerate(outputs))

@@ -34,7 +34,7 @@ from sme_registry.evaluation.models import Interface, ModelFunctions, load_onnx,
 from sme_registry.evaluation.networks import OfflinePolicy, Perceptron
 from sme_registry.evaluation.references import POLICIES, reference_policy
 from sme_registry.io import choice, import_object
-from sme_registry.spec import ACTION_RANGES, ActionRange, AgentSpec, SMESpec, StreamSpec
+from sme_registry.spec import ACTION_RANGES, ActionRange, SMESpec, StreamSpec
 
 
 @dataclass(frozen=True)
@@ -361,53 +361,47 @@ def _team_policy(
     policy: Any, spec: SMESpec, action_range: ActionRange | None, name: str | None
 ) -> TeamPolicy:
     """A team policy from a policy for each agent, by name, or from one that all agents share."""
-    agents, channels = spec.agents, spec.observed_channels
-    separate = isinstance(policy, Mapping)
-    if separate:
-        _check_names(policy, [agent.name for agent in agents])
+    if isinstance(policy, Mapping):
+        members = tuple(_separate_members(policy, spec, action_range))
     else:
-        policy = _prepare(policy, interface_of(spec), action_range, name)
-    members = []
-    for index, (agent, observed) in enumerate(zip(agents, channels, strict=True)):
-        observe: Callable[[Observation], Observation]
-        observe = functools.partial(shared_observation_of, index, len(agents), observed)
-        prepared = policy
-        if separate:
-            with prefixed_errors(agent.name):
-                prepared = _own_policy(policy[agent.name], agent, len(observed), spec, action_range)
-            columns = [*observed, spec.state_dim, spec.state_dim + 1]
-            observe = operator.itemgetter((slice(None), columns))
-        members.append(Member(agent.name, prepared, observe, agent.action_dim))
+        shared = _prepare(policy, interface_of(spec), action_range, name)
+        agents = zip(spec.agents, spec.observed_channels, strict=True)
+        members = tuple(
+            Member(
+                agent.name,
+                shared,
+                functools.partial(shared_observation_of, index, len(spec.agents), observed),
+                agent.action_dim,
+            )
+            for index, (agent, observed) in enumerate(agents)
+        )
     names = {member.policy.name for member in members}
     ranges = {member.policy.action_range for member in members}
     return TeamPolicy(
         name or (names.pop() if len(names) == 1 else f"{len(members)} policies"),
         ranges.pop() if len(ranges) == 1 else "mixed",
-        tuple(members),
+        members,
     )
 
 
-def _own_policy(
-    policy: Any, agent: AgentSpec, observed: int, spec: SMESpec, action_range: ActionRange | None
-) -> Policy:
-    """An agent's own policy, from the channels that it observes to those that it owns."""
-    if isinstance(policy, str):
-        policy, _ = _named(policy, spec)
-    if isinstance(policy, Mapping):  # a reference policy, of all agents
-        policy = policy.get(agent.name)
-    text = f"{observed} observed and {agent.action_dim} owned channels"
-    return _prepare(policy, Interface(observed + 2, agent.action_dim, text), action_range)
-
-
-def _check_names(policies: Mapping[str, Any], names: list[str]) -> None:
-    missing = [name for name in names if name not in policies]
-    unknown = [name for name in policies if name not in names]
-    problems = [f"{', '.join(missing)}: policy missing."] if missing else []
-    if unknown:
-        hint = did_you_mean(str(unknown[0]), missing or names)
-        problems.append(f"{', '.join(map(repr, unknown))}: no such agent.{hint}")
-    if problems:
-        raise PolicyError(f"policy: {' '.join(problems)} Give one for each of {', '.join(names)}.")
+def _separate_members(
+    policies: Mapping[str, Any], spec: SMESpec, action_range: ActionRange | None
+) -> Iterator[Member]:
+    """Agents with policies of their own, from the channels that they observe to those they own."""
+    if problem := arguments.agents_problem(policies, [a.name for a in spec.agents], "policy"):
+        raise PolicyError(f"policy: {problem}")
+    for agent, observed in zip(spec.agents, spec.observed_channels, strict=True):
+        n, a = len(observed), agent.action_dim
+        with prefixed_errors(agent.name):
+            policy = policies[agent.name]
+            if isinstance(policy, str):
+                policy, _ = _named(policy, spec)
+            if isinstance(policy, Mapping):  # a reference policy, of all agents
+                policy = policy.get(agent.name)
+            interface = Interface(n + 2, a, f"{n} observed and {a} owned channels")
+            policy = _prepare(policy, interface, action_range)
+        columns = [*observed, spec.state_dim, spec.state_dim + 1]
+        yield Member(agent.name, policy, operator.itemgetter((slice(None), columns)), a)
 
 
 def stream_policy(

@@ -22,22 +22,30 @@ in the cube, and s in the cube with d in a shell of its own. Scores of a task wi
     violating share    share of states with a_i − ℓ_i(s) > 10⁻⁶ in any channel
     safe regret        mean r(s, a_safe) − mean r(s, a)
     price of safety    1 − mean r(s, a_safe)
+
+A *probe* is the affine map of a layer's outputs h that is fitted to s, or to d, by least squares in
+one half of the states of WD, and tested in the other half: 1 if it recovers the channels, 0 or
+below if it is no better than their mean.
+
+    R² = mean over channels of  1 − Σ (y − ŷ)² / Σ (y − ȳ)²           y of the held-out states
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from sme_registry.errors import OptionError
+from sme_registry.compiled.arrays import Observation
+from sme_registry.errors import OptionError, PolicyError
 from sme_registry.spec import EvaluationProtocol, Integer, Real, SMESpec, TupleOf
 from sme_registry.spec.document import StrictModel
 from sme_registry.task import Task
+from sme_registry.task.certificate import held_out_r2
 from sme_registry.task.draw import Array, bit_generator, to_uniform
 
 Observations = npt.NDArray[np.float32]
@@ -400,3 +408,46 @@ class SafetyStats:
             safe_regret=(self._safe_reward - self._reward) / self._states,
             price_of_safety=1.0 - self._safe_reward / self._states,
         )
+
+
+PROBE_STATES = 2**14  # of which half are held out
+_PROBED_CHANNELS = 512  # of s and d; above it the least squares take minutes and much memory
+_STATES_PER_UNKNOWN = 4  # of the fit; with fewer, R² would tell how few they are
+
+
+def probe_layers(
+    hidden: Callable[[Observation], Iterable[Array] | None],
+    task: Task,
+    protocol: EvaluationProtocol,
+) -> tuple[LayerProbe, ...]:
+    """Probe what an agent sees and each of its hidden layers, in states of WD.
+
+    `hidden` maps observations `[B, O]` to the outputs `[B, H]` of each layer, in order; None if
+    they are unknown.
+    """
+    m, count = task.spec.distractors, PROBE_STATES
+    if task.spec.state_dim + m > _PROBED_CHANNELS:
+        return ()
+    [batch] = states(protocol.model_copy(update={"states_per_region": count}), 0, task.spec, count)
+    observation = batch.observation(batch.seen(task), task.spec.horizon)
+    targets = np.concatenate([batch.s, batch.d], axis=1).astype(np.float64)
+
+    def probe(layer: int, h: Array) -> LayerProbe:
+        if not np.isfinite(h).all():
+            raise PolicyError(f"hidden layer {layer}: has outputs that are NaN or infinite.")
+        r2 = held_out_r2(h.astype(np.float64), targets)
+        s_r2, d_r2 = r2[: task.spec.state_dim], r2[task.spec.state_dim :]
+        return LayerProbe(
+            layer=layer,
+            units=h.shape[1],
+            state_r2=float(s_r2.mean()),
+            distractor_r2=float(d_r2.mean()) if m else None,
+        )
+
+    layers = hidden(observation.copy())
+    if layers is None:
+        return ()
+    outputs = [observation[:, :-2].astype(np.float64), *layers]
+    if any(_STATES_PER_UNKNOWN * (h.shape[1] + 1) > count // 2 for h in outputs):
+        return ()
+    return tuple(probe(layer, h) for layer, h in enumerate(outputs))

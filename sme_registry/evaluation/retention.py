@@ -306,7 +306,7 @@ class StreamRegrets(NamedTuple):
 
 
 def final_specs(stream: StreamSpec) -> tuple[SMESpec, ...]:
-    """The task of each phase at its end: of a drifting one the spec of its last piece."""
+    """The task of each phase at its end: of a drifting one the last."""
     return tuple({segment.phase: segment.spec for segment in stream.segments}.values())
 
 

@@ -26,18 +26,18 @@ from sme_registry.envs.batch import Batch, BatchStep
 from sme_registry.evaluation.policies import Policy, TeamPolicy
 from sme_registry.task import Task, draw
 
-LANES = 4096
+MOST_ENVS = 4096
 """Most episodes in parallel, so that memory does not grow with their number."""
 
 
 class PlayStep(NamedTuple):
-    """A step of all lanes: what it began from, the actions, and what came of them."""
+    """A step of a batch: what it began from, the actions, and what came of them."""
 
     state: Array  # `[B, S]` float64
     distractors: Array  # `[B, m]`
     observation: Observation  # `[B, O]`, of all agents
     action: npt.NDArray[Any]  # `[B, A]` as the policy returned it
-    running: Mask  # `[B]` whether the lane's episode had not ended before
+    running: Mask  # `[B]` whether the episode had not ended before
     result: BatchStep
 
 
@@ -50,9 +50,9 @@ def play(
 
     Args:
       act: from states `[B, S]` and observations `[B, O]` to joint actions `[B, A]` in [0, 1]. It
-        is also called for lanes whose episodes have ended.
-      begin: begins an episode in each lane whose last one has ended, and writes its rows of the
-        observations; there is then no end. None: these lanes rest.
+        is also called where episodes have ended.
+      begin: begins an episode wherever the last one has ended, and writes its rows of the
+        observations; there is then no end. None: these environments rest.
 
     Yields:
       Each step. What it holds is valid until the next one.
@@ -113,7 +113,7 @@ def rollouts(
 
     Args:
       policy: a `Policy`, initial at the first call; of a team a `TeamPolicy`; or a function from
-        observations `[B, O]` to actions `[B, A]` in [0, 1]. B is at most `LANES`.
+        observations `[B, O]` to actions `[B, A]` in [0, 1]. B is at most `MOST_ENVS`.
       t: `[n]` steps completed before, in [0, T); None for 0, the start of an episode.
       r_cum: `[n]` accumulated reward since the last payout; None for 0.
       actions: `[n, A]` actions of the first step; None for the policy's.
@@ -126,15 +126,15 @@ def rollouts(
     t = np.zeros(n, np.int64) if t is None else t
     r_cum = np.zeros(n) if r_cum is None else r_cum
     totals = np.empty((6 + agents, n))
-    # Sorted by t, the episodes of a batch end at about the same time, and few lanes idle.
+    # Sorted by t, the episodes of a batch end at about the same time, and few environments idle.
     order = np.argsort(t, kind="stable")
-    for start in range(0, n, LANES):
-        lanes = order[start : start + LANES]
-        batch = Batch(task, len(lanes), reuse=True)
-        batch.seed_by_states(np.arange(len(lanes)), states[lanes], seed)
-        batch.place(states[lanes], t[lanes], np.repeat(r_cum[lanes, None], agents, axis=1))
-        first = None if actions is None else actions[lanes]
-        totals[:, lanes] = _sums(batch, _acting(policy, first), gamma)
+    for start in range(0, n, MOST_ENVS):
+        rows = order[start : start + MOST_ENVS]
+        batch = Batch(task, len(rows), reuse=True)
+        batch.seed_by_states(np.arange(len(rows)), states[rows], seed)
+        batch.place(states[rows], t[rows], np.repeat(r_cum[rows, None], agents, axis=1))
+        first = None if actions is None else actions[rows]
+        totals[:, rows] = _sums(batch, _acting(policy, first), gamma)
     returns, discounted, length = totals[:3]
     regret, similarity, square, *of_agents = totals[3:] / length
     return Rollouts(returns, discounted, length, regret, similarity, square, np.array(of_agents))
@@ -162,8 +162,8 @@ def _acting(
 
     def act(state: Array, observation: Observation) -> npt.NDArray[Any]:
         nonlocal first
-        given, first = first, None
-        return np.asarray(begun(observation.copy())) if given is None else given
+        action, first = first, None
+        return np.asarray(begun(observation.copy())) if action is None else action
 
     return act
 

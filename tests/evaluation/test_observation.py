@@ -6,8 +6,7 @@ import pytest
 from sme_registry import evaluate, make, materialize
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation import Perceptron, regions
-from sme_registry.evaluation.evaluate import probe_layers
-from sme_registry.evaluation.regions import expansion
+from sme_registry.evaluation.regions import expansion, probe_layers
 from sme_registry.spec import EvaluationProtocol
 from sme_registry.task.certificate import held_out_r2
 from tests.evaluation.kinds import DISTRACTED as SPEC
