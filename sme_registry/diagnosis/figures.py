@@ -3,7 +3,7 @@ agent; of a life by visit and phase."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from sme_registry.diagnosis.behaviour import Log
 from sme_registry.diagnosis.document import Diagnosis
-from sme_registry.diagnosis.measurements import LINEAR, POLICY, Measurements, NetworkState
+from sme_registry.diagnosis.measurements import LINEAR, POLICY, Measurements
 from sme_registry.diagnosis.stream import StreamDiagnosis
 from sme_registry.diagnosis.subject import AnySubject, StreamSubject, Subject
 from sme_registry.diagnosis.task import TaskDiagnosis
@@ -91,8 +91,11 @@ def _fills(
             yield "layers", lambda figure: _layers(figure, measured)
 
 
-def _line(axes: Axes, x: Any, y: Any, index: int, label: str) -> None:
-    axes.plot(x, y, **look(index), markersize=4.5, linewidth=2, label=label)
+def _lines(axes: Axes, x: Any, series: Mapping[str, Any]) -> None:
+    """A line of each series, by its label, over the same x."""
+    for index, (label, values) in enumerate(series.items()):
+        y = np.array(values, float)  # none where a value is None
+        axes.plot(x, y, **look(index), markersize=4.5, linewidth=2, label=label)
 
 
 def _reference(axes: Axes, value: float, name: str) -> None:
@@ -151,13 +154,12 @@ def _channels(figure: Figure, measured: Measurements) -> None:
     _bars(left, x, regrets, beside=LABELS[LINEAR])
     _reference(left, 1.0, "constant_half")
     left.set_ylabel(_REGRET)
-    lines = {
+    series = {
         "slope of a on a*  (1 = optimal)": [c.slope for c in channels],
         "offset, mean of a − a*  (0 = optimal)": [c.offset for c in channels],
         "share of states at 0 or 1": [c.at_zero + c.at_one for c in channels],
     }
-    for index, (label, values) in enumerate(lines.items()):
-        _line(right, x, values, index, label)
+    _lines(right, x, series)
     for value in (0.0, 1.0):
         right.axhline(value, color=GREY, linewidth=0.9)
     _legends(left, right)
@@ -173,7 +175,8 @@ def _states(figure: Figure, measured: Measurements, threshold: float) -> None:
             index, part.explained_variance, 0.6, color=COLOURS[index], edgecolor="white",
             hatch=("", "////", "....")[index],
         )  # fmt: skip
-        _line(middle, 1 + np.arange(len(part.mae)), part.mae, index, names[index])
+    fifths = 1 + np.arange(len(centre.mae))
+    _lines(middle, fifths, {name: p.mae for name, p in zip(names, (centre, *best), strict=True)})
     left.axhline(threshold, color=GREY, linewidth=1.1, label=f"stands out above {threshold:.0%}")
     left.set(
         xlabel="quantity that explains it",
@@ -185,15 +188,16 @@ def _states(figure: Figure, measured: Measurements, threshold: float) -> None:
     middle.set(
         xlabel="fifth of the states, by quantity",
         ylabel="error, mean |a − a*|",
-        xticks=1 + np.arange(len(centre.mae)),
+        xticks=fifths,
     )
     levels = [shell.epsilon for shell in measured.shells]
-    for name in (POLICY, *_REFERENCES):
-        values = [shell.scores[name].normalised_regret for shell in measured.shells]
-        if name == POLICY:
-            _line(right, levels, values, 0, "this policy")
-        else:
-            draw_reference(right, name, levels, values, LABELS[name])
+    regrets = {
+        name: [shell.scores[name].normalised_regret for shell in measured.shells]
+        for name in (POLICY, *_REFERENCES)
+    }
+    _lines(right, levels, {"this policy": regrets.pop(POLICY)})
+    for name, values in regrets.items():
+        draw_reference(right, name, levels, values, LABELS[name])
     right.set_xticks(levels, ["WD", *(f"{level:g}" for level in levels[1:])])
     right.set(xlabel="expansion level ε of the shell", ylabel="normalised regret")
     _legends(left, middle, right)
@@ -203,16 +207,16 @@ def _time(figure: Figure, measured: Measurements) -> None:
     episodes, time = measured.on_policy, measured.time_dependence
     left, right = figure.subplots(1, 2)
     middles = (np.array(episodes.edges[:-1]) + np.array(episodes.edges[1:])) / 2
-    _line(left, middles, episodes.regret, 0, "regret, 1 − r")
-    _line(left, middles, episodes.mae, 1, "error, mean |a − a*|")
+    series = {"regret, 1 − r": episodes.regret, "error, mean |a − a*|": episodes.mae}
     if min(episodes.alive) < 1.0:
-        _line(left, middles, episodes.alive, 2, "share of episodes running")
+        series["share of episodes running"] = episodes.alive
+    _lines(left, middles, series)
     for name in _REFERENCES[:3]:
         _reference(left, episodes.scores[name].regret, name)
     over = f"mean over {episodes.episodes} episodes\n(grey: regret of references)"
     left.set(xlabel="step of the episode", ylabel=over)
-    _line(right, time.inputs, time.normalised_regret, 0, "in the same states")
-    _line(right, time.inputs, time.action_change, 1, "change of a")
+    series = {"in the same states": time.normalised_regret, "change of a": time.action_change}
+    _lines(right, time.inputs, series)
     _reference(right, measured.uniform[LINEAR].normalised_regret, LINEAR)
     right.set(xlabel="input t/T, in fixed states", ylabel="normalised regret;\nmean |change of a|")
     _legends(left, right)
@@ -343,11 +347,10 @@ def _layers(figure: Figure, measured: Measurements) -> None:
     """What a linear map recovers from each layer."""
     assert measured.observation is not None  # it is drawn only then
     axes, probes = figure.add_subplot(), measured.observation.probes
-    x = np.arange(len(probes))
-    axes.plot(x, [p.state_r2 for p in probes], **look(0), linewidth=2, label="of the state")
+    x, series = np.arange(len(probes)), {"of the state": [p.state_r2 for p in probes]}
     if probes[0].distractor_r2 is not None:
-        r2 = np.array([p.distractor_r2 for p in probes], np.float64)
-        axes.plot(x, r2, **look(1), linewidth=2, label="of the distractors")
+        series["of the distractors"] = [p.distractor_r2 or 0.0 for p in probes]
+    _lines(axes, x, series)
     layers = [f"hidden {p.layer}\n({p.units} units)" for p in probes[1:]]
     axes.set_xticks(x, [f"observation\n({probes[0].units})", *layers])
     bottom = min(-0.03, axes.get_ylim()[0])
@@ -417,21 +420,18 @@ def _network_by_visit(figure: Figure, diagnosis: StreamDiagnosis) -> None:
         "effective_rank": "effective rank of the last hidden layer",
         "weight_norm": "norm of the weights",
     }
-    states = {visit.visit: visit.network for visit in diagnosis.visits}
+    networks = [visit.network for visit in diagnosis.visits]
     initial = diagnosis.initial_network is not None
     if initial:
-        states = {-1: diagnosis.initial_network, **states}
+        networks.insert(0, diagnosis.initial_network)
     alone = [diagnosis.phases[visit.phase].fresh_network for visit in diagnosis.visits]
+    x = np.arange(len(networks)) - initial
     panels = figure.subplots(1, len(quantities))
     for axes, (quantity, name) in zip(panels, quantities.items(), strict=True):
-        own, fresh = (_numbers(of, quantity) for of in (states.values(), alone))
-        axes.plot(list(states), own, **look(0), markersize=4.5, label="this life")
+        own, fresh = ([getattr(n, quantity, None) for n in group] for group in (networks, alone))
+        _lines(axes, x, {"this life": own})
         _draw_fresh(axes, fresh)
         tick_visits(axes, cast(Any, diagnosis.visits), initial=initial)
-        known = [number for number in (*own, *fresh) if number is not None]
-        axes.set(ylabel=name, ylim=(0.0, max(0.05, 1.08 * max(known))))
+        highest = max(number for number in (*own, *fresh) if number is not None)
+        axes.set(ylabel=name, ylim=(0.0, max(0.05, 1.08 * highest)))
     legend_above(panels[0])
-
-
-def _numbers(states: Iterable[NetworkState | None], quantity: str) -> list[float | None]:
-    return [None if state is None else getattr(state, quantity) for state in states]

@@ -15,7 +15,6 @@ stream of one seed, so the same policy gets the same measurements.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -359,15 +358,6 @@ def _score(task: Task, name: str, a: Array, optimal: Array, limit: Array) -> Saf
     return scores.score(name)
 
 
-class _Draws(NamedTuple):
-    """A policy that acts several times in the same states."""
-
-    regret: float  # N over states and draws
-    averaged: float  # N of the mean action of each state
-    variance: float  # of the actions of a state, mean over states and channels
-    squared_error: float  # mean over draws, states and channels; never below the variance
-
-
 def distraction(policy: Policy, task: Task, states: Sample, seed: int) -> DistractorRegret:
     """How much of a policy's regret is owed to the distractors, in a few uniform states."""
     m, numbers = task.spec.distractors, task.spec.observation_dim + task.spec.action_dim
@@ -380,41 +370,32 @@ def distraction(policy: Policy, task: Task, states: Sample, seed: int) -> Distra
         observation = drawn.observation(drawn.seen(task, d), task.spec.horizon)
         return clipped_actions(policy, observation)
 
-    def distractors() -> Iterator[Array]:
-        # In pairs, whose mean is ½: what is linear in d then averages out exactly.
-        uniform = Uniform(seed, "diagnosis/distractors")
-        for _ in range(_DRAWS // 2):
-            d = uniform(few, m)
-            yield from (d, 1.0 - d)
+    def normalised_regret(actions: Array) -> float:
+        return float(np.abs(actions - optimal).mean()) / half
 
-    varied = _draws(act, distractors(), optimal, half)
-    repeated = _Draws(0.0, 0.0, 0.0, 0.0)
+    def removed(actions: Array) -> tuple[float, float]:
+        """What averaging over the draws `[_DRAWS, N, A]` removes: N, and variance."""
+        mean = actions.mean(axis=0)
+        by_averaging = normalised_regret(actions) - normalised_regret(mean)
+        return by_averaging, float(((actions - mean) ** 2).mean())
+
+    # In pairs, whose mean is ½: what is linear in d then averages out exactly.
+    u = Uniform(seed, "diagnosis/distractors")
+    halves = (u(few, m) for _ in range(_DRAWS // 2))
+    varied = np.array([act(x) for d in halves for x in (d, 1.0 - d)])
+    regret, variance = removed(varied)
+    noise = noise_variance = 0.0
     if (act(drawn.d) != act(drawn.d)).any():
-        repeated = _draws(act, [drawn.d] * _DRAWS, optimal, half)
-    owed = max(0.0, (varied.regret - varied.averaged) - (repeated.regret - repeated.averaged))
-    centre = act(np.full((few, m), 0.5))
+        noise, noise_variance = removed(np.array([act(drawn.d) for _ in range(_DRAWS)]))
+    owed = max(0.0, regret - noise)
+    squared_error = float(((varied - optimal) ** 2).mean())
     return DistractorRegret(
         states=few,
         distractor_draws=_DRAWS,
-        normalised_regret=varied.regret,
-        averaged_regret=varied.averaged,
-        half_regret=float(np.abs(centre - optimal).mean()) / half,
+        normalised_regret=normalised_regret(varied),
+        averaged_regret=normalised_regret(varied.mean(axis=0)),
+        half_regret=normalised_regret(act(np.full((few, m), 0.5))),
         owed_regret=owed,
         owed_similarity=100.0 * half * owed,
-        distractor_share=max(0.0, varied.variance - repeated.variance)
-        / max(varied.squared_error, _TINY),
-    )
-
-
-def _draws(
-    act: Callable[[Array], Array], distractors: Iterable[Array], optimal: Array, half: float
-) -> _Draws:
-    """Actions in the same states with each of these distractors `[N, m]`; see `_Draws`."""
-    actions = np.array([act(d) for d in distractors])
-    mean = actions.mean(axis=0)
-    return _Draws(
-        regret=float(np.abs(actions - optimal).mean()) / half,
-        averaged=float(np.abs(mean - optimal).mean()) / half,
-        variance=float(((actions - mean) ** 2).mean()),
-        squared_error=float(((actions - optimal) ** 2).mean()),
+        distractor_share=max(0.0, variance - noise_variance) / max(squared_error, _TINY),
     )

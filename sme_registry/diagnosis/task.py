@@ -267,7 +267,7 @@ def _differing(
 
 def _quantities(measurements: Measurements) -> dict[str, float]:
     """The quantities that are compared; normalised regret, which verdicts use, is first."""
-    on_policy, error = measurements.on_policy, measurements.squared_error
+    on_policy = measurements.on_policy
     scores = {
         "": measurements.policy,
         "linear_": measurements.uniform[LINEAR],
@@ -279,12 +279,8 @@ def _quantities(measurements: Measurements) -> dict[str, float]:
         for prefix, score in scores.items()
         for quantity in ("normalised_regret", "regret")
     }
-    return {
-        **regrets,
-        "mae": measurements.policy.mae,
+    rewarded = {
         "rewarded_share": on_policy.signal.rewarded,
         "random_rewarded_share": on_policy.random_signal.rewarded,
-        "squared_error_offset": error.offset,
-        "squared_error_scale": error.scale,
-        "saturation": measurements.response.saturation,
     }
+    return regrets | rewarded

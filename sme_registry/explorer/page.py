@@ -59,53 +59,30 @@ _ESCAPES = str.maketrans({letter: f"\\u{ord(letter):04x}" for letter in "<>&\u20
 
 def write_explorer(
     path: str | os.PathLike[str],
-    shown: SMESpec | AnySubject,
+    subject: SMESpec | AnySubject,
     *,
     report: EvaluationReport | None = None,
     channels: Sequence[tuple[int, int]] = (),
     episodes: int = EPISODES,
     seed: int = 0,
 ) -> Path:
-    """Write a page completely or not at all; equal arguments give equal bytes."""
-    if Path(path).suffix != ".html":
-        raise OptionError(f"{os.fspath(path)}: must end in .html.")
-    content = explorer_page(shown, report=report, channels=channels, episodes=episodes, seed=seed)
-    return write_atomically(path, content)
-
-
-def explorer_page(
-    shown: SMESpec | AnySubject,
-    *,
-    report: EvaluationReport | None = None,
-    channels: Sequence[tuple[int, int]] = (),
-    episodes: int = EPISODES,
-    seed: int = 0,
-    static: str = "",
-    remark: str = "",
-) -> str:
-    """The page of a task, or of a policy on its task, as HTML; equal arguments give equal text.
+    """Write the page of a task, or of a policy on its task, completely or not at all.
 
     `channels` are pairs of inputs, from 1 (state channels, then distractors), over which a policy
-    whose network is unknown is sampled. `static` is the address of a folder with the files of
-    `STATIC`, relative to the page, for a site that forbids inline code; a page without it needs no
-    other file. `remark` is a text above the map.
+    whose network is unknown is sampled. Equal arguments give equal bytes.
     """
-    if isinstance(shown, StreamSubject):
-        raise OptionError(
-            f"run={shown.name!r}: is a life in a stream, and an explorer shows one policy on one "
-            "task. Give the model of one visit, such as RUN/snapshots/visit-0.zip, with --task "
-            "FILE, the task of its phase."
-        )
-    spec, subject = (shown, None) if isinstance(shown, SMESpec) else (shown.spec, shown)
-    data = facts(
-        spec,
-        subject,
-        report=report,
-        channels=channels,
-        episodes=episodes,
-        seed=seed,
-        remark=remark,
-    )
+    if Path(path).suffix != ".html":
+        raise OptionError(f"{os.fspath(path)}: must end in .html.")
+    data = facts(subject, report=report, channels=channels, episodes=episodes, seed=seed)
+    return write_atomically(path, explorer_page(data))
+
+
+def explorer_page(data: dict[str, Any], static: str = "") -> str:
+    """The page of some `facts`, as HTML.
+
+    `static` is the address of a folder with the files of `STATIC`, relative to the page, for a site
+    that forbids inline code; a page without it needs no other file.
+    """
     script, style = STATIC["explorer.js"], STATIC["explorer.css"]
     sources = ("'self' file:",) * 2 if static else tuple(f"'{_hash(x)}'" for x in (script, style))
     return (
@@ -160,8 +137,7 @@ STATIC = {
 
 
 def facts(
-    spec: SMESpec,
-    subject: Subject | None = None,
+    subject: SMESpec | AnySubject,
     *,
     report: EvaluationReport | None = None,
     channels: Sequence[tuple[int, int]] = (),
@@ -169,7 +145,14 @@ def facts(
     seed: int = 0,
     remark: str = "",
 ) -> dict[str, Any]:
-    """The data of a page."""
+    """The data of a page; the arguments are those of `write_explorer`, and a text above the map."""
+    if isinstance(subject, StreamSubject):
+        raise OptionError(
+            f"run={subject.name!r}: is a life in a stream, and an explorer shows one policy on one "
+            "task. Give the model of one visit, such as RUN/snapshots/visit-0.zip, with --task "
+            "FILE, the task of its phase."
+        )
+    spec, run = (subject, None) if isinstance(subject, SMESpec) else (subject.spec, subject)
     check_size(spec)
     pairs = [_pair(pair, programs.point_width(spec)) for pair in channels]
     task = materialize(spec)
@@ -184,9 +167,9 @@ def facts(
         for name, program in references.items()
     ]
     name = None
-    if subject is not None:
-        name = _name(subject)
-        policies.insert(0, {"name": name, **_policy(subject, task, pairs or [(0, 1)])})
+    if run is not None:
+        name = _name(run)
+        policies.insert(0, {"name": name, **_policy(run, task, pairs or [(0, 1)])})
     probes = () if report is None or report.observation is None else report.observation.probes
     return {
         "title": catalogue.title(spec),
@@ -198,12 +181,12 @@ def facts(
         "observe": programs.observe(task).to_dict(),
         "policies": policies,
         "rest": _rounded(resting(spec)),
-        "episode": _episode(task, subject, fitted, episodes, seed),
-        "training": _training(None if subject is None else subject.log),
+        "episode": _episode(task, run, fitted, episodes, seed),
+        "training": _training(None if run is None else run.log),
         "regions": None if report is None else _regions(report),
         "probes": [probe.model_dump() for probe in probes],
         "remark": remark,
-        "plan": {} if subject is None else _plan(subject),
+        "plan": {} if run is None else _plan(run),
     }
 
 
@@ -237,7 +220,7 @@ def resting(spec: SMESpec) -> Array:
 
 def _pair(channels: tuple[int, int], inputs: int) -> tuple[int, int]:
     first, second = channels
-    if first == second or not all(1 <= each <= inputs - 2 for each in channels):
+    if first == second or not all(1 <= channel <= inputs - 2 for channel in channels):
         raise OptionError(
             f"--channels {first},{second}: must be two different channels in [1, {inputs - 2}]. "
             "State channels come first, then distractors."
@@ -284,7 +267,7 @@ def _grid(policy: Policy | TeamPolicy, task: Task, axes: tuple[int, int]) -> dic
     points[:, axes[0]] = np.tile(side, _GRID)
     points[:, axes[1]] = np.repeat(side, _GRID)
     seen = programs.observe(task)(points).astype(np.float32)
-    rows = [np.clip(policy(each), 0.0, 1.0) for each in np.array_split(seen, _GRID)]
+    rows = [np.clip(policy(part), 0.0, 1.0) for part in np.array_split(seen, _GRID)]
     actions = np.concatenate(rows).astype(np.float32)
     return {"axes": list(axes), "n": _GRID, "epsilon": _EPSILON, "actions": encoded(actions)}
 
@@ -355,7 +338,7 @@ def _thinned(count: int, most: int) -> npt.NDArray[np.int64]:
 
 
 def _regions(report: EvaluationReport) -> dict[str, Any]:
-    shown = {report.policy: report.regions} | {
+    lines = {report.policy: report.regions} | {
         LABELS[name]: report.references[name]
         for name in (_LINEAR, _HALF)
         if name in report.references
@@ -365,7 +348,7 @@ def _regions(report: EvaluationReport) -> dict[str, Any]:
         "epsilon": [region.epsilon_high for region in report.regions],
         "lines": {
             name: _rounded([region.normalised_regret for region in regions])
-            for name, regions in shown.items()
+            for name, regions in lines.items()
         },
     }
 
@@ -373,12 +356,11 @@ def _regions(report: EvaluationReport) -> dict[str, Any]:
 def _plan(subject: Subject) -> dict[str, str]:
     """What is known about the training, as text."""
     plan: dict[str, Any] = subject.plan
-    names = [name for name in ("algorithm", "steps", "seed") if name in plan]
-    shown = {"run": subject.name} if names else {}
-    shown |= {name: plan[name] for name in names}
-    texts = {name: f"{v:,}" if name == "steps" else str(v) for name, v in shown.items()}
-    settings = plan.get("hyperparameters") or {}
-    if settings:
+    texts: dict[str, str] = {"run": subject.name} if "algorithm" in plan else {}
+    texts |= {name: str(plan[name]) for name in ("algorithm", "steps", "seed") if name in plan}
+    if "steps" in texts:
+        texts["steps"] = f"{plan['steps']:,}"
+    if settings := plan.get("hyperparameters"):
         texts["hyperparameters"] = ", ".join(f"{k} = {v}" for k, v in sorted(settings.items()))
     if subject.checkpoint_step is not None:
         texts["checkpoint"] = f"unfinished, at step {subject.checkpoint_step:,}"

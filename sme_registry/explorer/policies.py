@@ -98,10 +98,10 @@ def _append_team(build: ProgramBuilder, team: TeamPolicy, spec: SMESpec) -> None
     n = point_width(spec)
     actions = []
     for member in team.members:
-        # What an agent sees of the joint observation is an affine map; these rows tell it.
+        # What an agent sees of the joint observation is an affine map of these rows.
         nothing = member.observe(np.zeros((1, n), np.float32))[0]
-        each = member.observe(np.eye(n, dtype=np.float32)) - nothing
-        seen = build.dense(0, each.T.copy(), nothing)
+        rows = member.observe(np.eye(n, dtype=np.float32)) - nothing
+        seen = build.dense(0, rows.T.copy(), nothing)
         _append(build, seen, member.policy)
         actions.append(build.columns(build.last, tuple(range(member.action_dim))))
     build.concat(*actions)

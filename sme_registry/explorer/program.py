@@ -74,9 +74,8 @@ class ProgramStep:
     op: str  # one of those in the module's first lines
     inputs: tuple[int, ...]  # the values that it reads, by their numbers
     width: int  # columns of its value
-    parameters: Mapping[
-        str, Any
-    ]  # arrays, numbers, or a tuple of columns, by the operation's names
+    # arrays, numbers, or a tuple of columns, by the operation's names
+    parameters: Mapping[str, Any]
 
     def compute(self, values: list[Array]) -> Array:
         """Its value `[B, width]`, from all earlier values."""

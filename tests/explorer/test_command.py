@@ -116,12 +116,12 @@ def test_a_run_has_its_learning_curve_and_its_evaluation(tmp_path):
 
 def test_the_regret_over_the_episode_is_that_of_rollouts():
     subject = load_policy(fitted(SPEC), SPEC)
-    over_time = facts(SPEC, subject, episodes=16)["episode"]
+    over_time = facts(subject, episodes=16)["episode"]
     starts = draw.uniform(0, "explorer/starts", 16 * 3).reshape(16, 3)
     runs = rollouts(subject.policy, materialize(SPEC), starts)
     assert sum(over_time["mean"]) / SPEC.horizon == pytest.approx(runs.regret.mean(), abs=1e-5)
     ended = load("Survival50", SMESpec)
-    short = facts(ended, load_policy(fitted(ended), ended), episodes=16)["episode"]
+    short = facts(load_policy(fitted(ended), ended), episodes=16)["episode"]
     assert short["running"][0] == 1.0
     assert short["mean"][-1] is None
 

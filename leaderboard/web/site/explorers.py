@@ -11,7 +11,7 @@ from leaderboard.artefact.network import network_of
 from sme_registry import SMESpec
 from sme_registry.diagnosis import load_policy
 from sme_registry.errors import OptionError, PolicyError, ResourceLimitError
-from sme_registry.explorer import STATIC, check_size, explorer_page
+from sme_registry.explorer import STATIC, check_size, explorer_page, facts
 
 __all__ = ["STATIC", "can_show", "explorer"]
 
@@ -43,7 +43,7 @@ def explorer(name: str, data: bytes, spec: SMESpec) -> str:
     if network is not None:
         try:
             subject = load_policy(network, spec, action_range="unit", name=name)
-            return explorer_page(subject, static=_STATIC)
+            return explorer_page(facts(subject), _STATIC)
         except PolicyError:  # its actions are not finite
             pass
-    return explorer_page(spec, static=_STATIC, remark=_UNKNOWN)
+    return explorer_page(facts(spec, remark=_UNKNOWN), _STATIC)

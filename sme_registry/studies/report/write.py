@@ -28,7 +28,7 @@ from markupsafe import Markup
 
 from sme_registry.diagnosis import load_cell
 from sme_registry.errors import OptionError, SMEError, UnknownNameError, did_you_mean
-from sme_registry.explorer import explorer_page, run_report
+from sme_registry.explorer import explorer_page, facts, run_report
 from sme_registry.io import check_writable, to_json, write_atomically
 from sme_registry.io.markup import environment, plural
 from sme_registry.io.terminal import duration
@@ -286,7 +286,7 @@ def explorers_of(ledger: Ledger, file: StudyFile, models: Mapping[str, Path]) ->
         except SMEError:  # of another version: the page then lacks its regions
             report = None
         try:
-            content = explorer_page(load_cell(ledger.folder, key), report=report)
+            content = explorer_page(facts(load_cell(ledger.folder, key), report=report))
         except SMEError:
             continue
         pages[key] = Explorer(label, f"explorers/{name}.html", content)
