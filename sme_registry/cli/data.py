@@ -269,8 +269,6 @@ def _print(dataset: Dataset, json: bool) -> None:
         "recipe": record.recipe_digest,
         "arrays": record.arrays_digest,
     }
-    if recipe.expected_similarity is not None:
-        pairs["expected r̃ for uniform ã and a*"] = f"{recipe.expected_similarity:.4f}"
     print_pairs(f"[bold]{escape(dataset.id)}[/]", pairs)
     scores = record.scores
     rows = [_score_row("constant ½", scores.constant), _score_row("behaviour", scores.behaviour)]

@@ -141,18 +141,6 @@ class DatasetRecipe(Document):
         boundaries[-1] = self.transitions
         return tuple(high - low for low, high in itertools.pairwise(boundaries))
 
-    @property
-    def expected_similarity(self) -> float | None:
-        """Mean r̃ for independent and uniform a* and ã; None if a policy is the user's.
-
-        1 − ν/6 of a mixture, since E α = ν/2 and E |ã − a*| = 1/3; 1 − 1/3 of random actions.
-        """
-        if any(behaviour.kind == "policy" for behaviour in self.behaviours):
-            return None
-        return math.fsum(
-            b.weight * (1.0 - (1.0 / 3.0 if b.nu is None else b.nu / 6.0)) for b in self.behaviours
-        )
-
     def differences(self, other: DatasetRecipe) -> list[str]:
         """The fields in which another recipe differs, such as `spec.complexity 1, requested 2`."""
         ours, theirs = _leaves(self.to_dict()), _leaves(other.to_dict())
@@ -208,32 +196,20 @@ _Share = Annotated[Real, Field(ge=0, le=1)]
 
 
 class EpisodeScores(StrictModel):
-    """Whole episodes of a policy; 0 of them if the values are exact without rollouts.
-
-    Attributes:
-      mean_return: mean sum of rewards, in [0, T].
-      standard_error: of that mean, over episodes.
-      similarity: mean r̃ over all steps.
-    """
+    """Whole episodes of a policy; 0 of them if the values are exact without rollouts."""
 
     episodes: Integer
-    mean_return: Real
+    mean_return: Real  # in [0, T], and its standard error over episodes
     standard_error: Real
-    similarity: _Share
+    similarity: _Share  # mean r̃ over all steps
 
 
 class PolicyScore(StrictModel):
-    """The scores of one policy.
-
-    Attributes:
-      similarity: mean r̃ over the data set's states.
-      step_reward: mean r over them.
-      rollouts: null if the horizon is too long for whole episodes.
-    """
+    """The mean r̃ and r of one policy over the data set's states, and its whole episodes."""
 
     similarity: _Share
     step_reward: _Share
-    rollouts: EpisodeScores | None
+    rollouts: EpisodeScores | None  # null if the horizon is too long
 
 
 class ReferenceScores(StrictModel):
@@ -256,7 +232,6 @@ class DatasetRecord(StrictModel):
     """Provenance, reference scores and digests of a data set.
 
     Attributes:
-      schema_version: version of the record's format.
       recipe: all that the data set was generated from.
       recipe_digest, spec_digest, protocol_digest: of the recipe, its task and its protocol.
       task: what the task's file calls it.
@@ -268,7 +243,7 @@ class DatasetRecord(StrictModel):
       versions: of Python and the packages that the numbers depend on.
     """
 
-    schema_version: Literal[1] = 1
+    schema_version: SchemaVersion = 1
     recipe: DatasetRecipe
     recipe_digest: Digest
     spec_digest: Digest
@@ -355,20 +330,13 @@ def check_algorithm(
 
 
 class OfflineEvaluation(StrictModel):
-    """Episodes of the policy in the task, played during training.
+    """Episodes of the policy in the task, played during training."""
 
-    Attributes:
-      step: gradient steps before it.
-      similarity, similarity_sd: mean and standard deviation of r̃ over all steps of all episodes.
-      episode_return: mean over the episodes.
-      losses: terms of the loss of the last batch, by name.
-    """
-
-    step: Integer
-    similarity: Real
+    step: Integer  # of the gradient, before it
+    similarity: Real  # mean r̃ over all steps of all episodes, and its standard deviation
     similarity_sd: Real
-    episode_return: Real
-    losses: dict[str, Real]
+    episode_return: Real  # mean over the episodes
+    losses: dict[str, Real]  # terms of the loss of the last batch, by name
 
 
 class BehaviourQuality(StrictModel):
@@ -383,12 +351,10 @@ class OfflineRecord(StrictModel):
     """The arguments, data, evaluations and cost of an offline training.
 
     Attributes:
-      schema_version: version of the record's format.
       algorithm: behaviour cloning or implicit Q-learning.
       hyperparameters: all of them, as used.
       seed: of initial weights, shuffles, and starts of the evaluation episodes.
-      steps: of the gradient.
-      batch_size: transitions in each.
+      steps, batch_size: of the gradient, and transitions in each.
       episodes: of each evaluation.
       dataset: id of the data set; null if only its arrays were passed.
       dataset_digest: of its arrays.
@@ -402,7 +368,7 @@ class OfflineRecord(StrictModel):
       versions: of Python and the packages that the numbers depend on.
     """
 
-    schema_version: Literal[1] = 1
+    schema_version: SchemaVersion = 1
     algorithm: Literal["bc", "iql"]
     hyperparameters: dict[str, Any]
     seed: Integer

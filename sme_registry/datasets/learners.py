@@ -24,12 +24,13 @@ import itertools
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.optim import Adam
 
 from sme_registry.datasets.documents import BCHyperparameters, Hyperparameters, IQLHyperparameters
 from sme_registry.datasets.storage import SealedDataset
@@ -58,7 +59,7 @@ class Networks(ABC):
     """Networks, and one optimiser of all their losses; the policy's u is tanh of the actor."""
 
     actor: nn.Sequential
-    _adam: torch.optim.Adam
+    optimiser: Adam
 
     @abstractmethod
     def losses(self, batch: Minibatch) -> dict[str, Tensor]:
@@ -67,14 +68,10 @@ class Networks(ABC):
     def step(self, batch: Minibatch) -> dict[str, Tensor]:
         """One gradient step of all networks; returns the terms of the loss before it."""
         losses = self.losses(batch)
-        self._adam.zero_grad(set_to_none=False)
+        self.optimiser.zero_grad(set_to_none=False)
         sum(losses.values(), torch.zeros(())).backward()  # type: ignore[no-untyped-call]
-        self._adam.step()
+        self.optimiser.step()
         return losses
-
-
-def _adam(parameters: Iterable[Tensor], learning_rate: float) -> torch.optim.Adam:
-    return torch.optim.Adam(parameters, lr=learning_rate, fused=True)
 
 
 def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
@@ -98,8 +95,7 @@ def minibatches(
 ) -> Iterator[Minibatch]:
     """Shuffled rows of a data set without end; every row is used once before any repeats.
 
-    The data set is one float32 matrix, so that one gather gets all columns of a batch; one for each
-    column would take as long as a network.
+    The data set is one matrix, so that one gather gets all columns of a batch.
     """
     columns = (
         data.observations,
@@ -127,10 +123,10 @@ class BC(Networks):
         self, observation_dim: int, action_dim: int, hyperparameters: BCHyperparameters
     ) -> None:
         self.actor = mlp(observation_dim, hyperparameters.hidden, action_dim)
-        self._adam = _adam(self.actor.parameters(), hyperparameters.learning_rate)
+        parameters = self.actor.parameters()
+        self.optimiser = Adam(parameters, lr=hyperparameters.learning_rate, fused=True)
 
     def losses(self, batch: Minibatch) -> dict[str, Tensor]:
-        """The loss, `actor`: mean squared error in u, four times that in a."""
         u = torch.tanh(self.actor(batch.observations))
         return {"actor": nn.functional.mse_loss(u, batch.actions)}
 
@@ -155,9 +151,8 @@ class IQL(Networks):
         self.value = mlp(observation_dim, hidden, 1)
         trained = [self.actor, self.critics, self.value]
         parameters = [parameter for network in trained for parameter in network.parameters()]
-        self._adam = _adam([*parameters, self.spread], hyperparameters.learning_rate)
-        self._critic_parameters: list[Tensor] = list(self.critics.parameters())
-        self._target_parameters: list[Tensor] = list(self.targets.parameters())
+        parameters.append(self.spread)
+        self.optimiser = Adam(parameters, lr=hyperparameters.learning_rate, fused=True)
 
     def losses(self, batch: Minibatch) -> dict[str, Tensor]:
         inputs = torch.cat([batch.observations, batch.actions], dim=1)
@@ -184,7 +179,9 @@ class IQL(Networks):
         losses = super().step(batch)
         with torch.no_grad():  # the targets must not track gradients
             torch._foreach_lerp_(
-                self._target_parameters, self._critic_parameters, self._hyperparameters.target_rate
+                list(self.targets.parameters()),
+                list(self.critics.parameters()),
+                self._hyperparameters.target_rate,
             )
         return losses
 

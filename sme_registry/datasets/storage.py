@@ -66,19 +66,11 @@ from sme_registry.task import load, materialize
 _NAMESPACE = "namespace_metadata.json"
 _ID = re.compile(r"([A-Za-z0-9_-]+/)*[A-Za-z0-9_-]+-v[0-9]+")
 _PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "h5py", "minari")
-_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """A data set on disk, with its metadata read and checked.
-
-    Examples:
-      >>> from sme_registry.datasets import open_dataset
-      >>> data = open_dataset("sme/Default-v1-nu50-seed0-v0", "data")
-      >>> data.transitions().observations.shape
-      (200, 10)
-    """
+    """A data set on disk, with its metadata read and checked."""
 
     id: str  # Minari's, such as `sme/Default-v1-nu50-seed7-v0`
     path: Path  # its folder, which contains `data/`
@@ -86,12 +78,10 @@ class Dataset:
 
     @property
     def recipe(self) -> DatasetRecipe:
-        """What it was generated from."""
         return self.record.recipe
 
     @property
     def size_bytes(self) -> int:
-        """Of its files."""
         return sum(file.stat().st_size for file in (self.path / "data").iterdir())
 
     def minari(self) -> Any:
@@ -117,16 +107,8 @@ class Dataset:
 class SealedDataset(Columns):
     """What entrants of a season get of a data set: aligned arrays, and nothing that tells its task.
 
-    Row i is one of `N` transitions; rows of an episode are contiguous and in order.
-
-    Attributes:
-      observations: `[N, O]` float32 in [0, 1], before the step; `O` = S + 2.
-      actions: `[N, A]` float32 in [0, 1].
-      rewards: `[N]` float64 in [0, k].
-      next_observations: `[N, O]` float32, after the step; also at the end of an episode.
-      terminations: `[N]` bool: the episode ended by D. Do not bootstrap.
-      truncations: `[N]` bool: the episode ended at the horizon, or the data set does. Bootstrap,
-        unless the same row terminates.
+    The columns are those of `Transitions`. `truncations` `[N]` are true where an episode ended at
+    the horizon, or the data set does: bootstrap, unless the same row terminates.
     """
 
     observations: Observation
@@ -150,13 +132,11 @@ class SealedDataset(Columns):
     def agrees_with(self, other: Self) -> bool:
         """Whether the other has the same transitions, up to what machines round differently.
 
-        The same recipe gives rewards that differ by some 1e-14 where NumPy's linear algebra, or
-        the back-end, is another one. Numbers may differ by 1e-6, the rounding of float32; the ends
-        of episodes must be the same.
+        Numbers may differ by 1e-6, the rounding of float32; the ends of episodes must be the same.
         """
         columns = other.columns()
         return all(
-            mine.shape == columns[name].shape and np.allclose(mine, columns[name], 0, _ROUNDING)
+            mine.shape == columns[name].shape and np.allclose(mine, columns[name], 0, 1e-6)
             for name, mine in self.columns().items()
         )
 
@@ -298,7 +278,6 @@ def check_id(dataset_id: str) -> str:
 
 
 def _check_target(target: Path, root: Path, recipe: DatasetRecipe, force: bool) -> None:
-    """Check that a data set may be written to a path in the root of all data sets."""
     for parent in target.relative_to(root).parents[:-1]:
         if (root / parent / "data").exists():
             raise OptionError(
@@ -363,13 +342,7 @@ def _write(
 
 
 def datasets_folder(folder: str | os.PathLike[str] | None = None) -> Path:
-    """The folder passed, else Minari's: MINARI_DATASETS_PATH, else ~/.minari/datasets.
-
-    Examples:
-      >>> from sme_registry.datasets import datasets_folder
-      >>> datasets_folder("data").name
-      'data'
-    """
+    """The folder passed, else Minari's: MINARI_DATASETS_PATH, else ~/.minari/datasets."""
     default = os.environ.get("MINARI_DATASETS_PATH", Path.home() / ".minari" / "datasets")
     return Path(default if folder is None else folder)
 
@@ -399,28 +372,28 @@ def open_dataset(
             f"{os.fspath(id_or_path)!r}: is neither the id of a data set in {root} nor the path of "
             f"one.{did_you_mean(os.fspath(id_or_path), known)} `sme dataset list` lists them."
         )
-    metadata = _read_metadata(path)
-    if KEY not in metadata:
+    dataset = _open(path)
+    if dataset is None:
         raise MalformedDocumentError(
             f"{path / 'data' / METADATA}: was not written by `sme dataset make`. Minari can open "
             "it: minari.MinariDataset(path)."
         )
-    return _dataset(path, metadata)
+    return dataset
 
 
 def _read_metadata(path: Path) -> dict[str, Any]:
-    """The metadata of a data set's folder; empty if it is not a JSON object."""
     metadata = read_json(path / "data" / METADATA)
     return metadata if isinstance(metadata, dict) else {}
 
 
-def _dataset(path: Path, metadata: dict[str, Any]) -> Dataset:
-    source = path / "data" / METADATA
+def _open(path: Path) -> Dataset | None:
+    """The data set in a folder; None if another package wrote it."""
+    metadata, source = _read_metadata(path), path / "data" / METADATA
+    if KEY not in metadata:
+        return None
     record = DatasetRecord.from_dict(metadata[KEY], str(source))
-    for field, expected in (
-        ("total_steps", record.recipe.transitions),
-        ("total_episodes", record.trajectories),
-    ):
+    sizes = {"total_steps": record.recipe.transitions, "total_episodes": record.trajectories}
+    for field, expected in sizes.items():
         if metadata.get(field) != expected:
             raise DigestMismatchError(
                 f"{source}: {field}={metadata.get(field)!r}: must be {expected}, as generated. The "
@@ -434,10 +407,6 @@ def check_location(dataset: Dataset, folder: str | os.PathLike[str] | None = Non
 
     Inside the root of all data sets (None for Minari's folder), the path relative to it must equal
     the id, as in Minari; elsewhere the path must end with the id.
-
-    Examples:
-      >>> from sme_registry.datasets import check_location, open_dataset
-      >>> check_location(open_dataset("sme/Default-v1-nu50-seed0-v0", "data"), "data")
     """
     # Not resolved: a symbolic link in the right place is correct.
     path, root = Path(os.path.abspath(dataset.path)), Path(os.path.abspath(datasets_folder(folder)))
@@ -467,9 +436,8 @@ def list_datasets(
     errors: dict[Path, str] = {}
     for dataset_id, path in _folders(root):
         try:
-            metadata = _read_metadata(path)
-            if KEY in metadata:
-                dataset = _dataset(path, metadata)
+            dataset = _open(path)
+            if dataset is not None:
                 check_location(dataset, root)
                 datasets.append(dataset)
         except SMEError as error:

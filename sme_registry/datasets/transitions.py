@@ -412,18 +412,23 @@ def _starts(
     """Checked states, times and accumulated rewards."""
     T, M = spec.horizon, len(states) if isinstance(states, np.ndarray | list | tuple) else 0
     s = initial_states(states, (max(1, M), spec.state_dim), "states")
-    steps, accumulated = _column("t", t, len(s)), _column("r_cum", r_cum, len(s))
-    wrong = (steps != np.rint(steps)) | (steps < 0) | (steps >= T)
-    if wrong.any():
-        raise StateError(f"t={steps[wrong][0]:g}: must be an integer in [0, {T}).")
-    since = steps % spec.k
-    wrong = (accumulated < 0) | (accumulated > since + _ROUNDED)
-    if wrong.any():
+    try:
+        steps, owed = (np.broadcast_to(np.asarray(x, np.float64), (M,)).copy() for x in (t, r_cum))
+    except (TypeError, ValueError):
         raise StateError(
-            f"r_cum={accumulated[wrong][0]:g}: must be in [0, {since[wrong][0]:g}] at "
-            f"t={steps[wrong][0]:g}, the number of steps since the last payout (k={spec.k})."
+            f"t={t!r:.60}, r_cum={r_cum!r:.60}: each must be one number, or of shape ({M},)."
+        ) from None
+    valid = (steps == np.rint(steps)) & (steps >= 0) & (steps < T)
+    if not valid.all():
+        raise StateError(f"t={steps[~valid][0]:g}: must be an integer in [0, {T}).")
+    since = steps % spec.k
+    valid = (owed >= 0) & (owed <= since + _ROUNDED)
+    if not valid.all():
+        raise StateError(
+            f"r_cum={owed[~valid][0]:g}: must be in [0, {since[~valid][0]:g}] at "
+            f"t={steps[~valid][0]:g}, the number of steps since the last payout (k={spec.k})."
         )
-    return s, steps.astype(np.int64), accumulated
+    return s, steps.astype(np.int64), owed
 
 
 def _first_actions(actions: npt.ArrayLike, shape: tuple[int, int]) -> Array:
@@ -431,18 +436,6 @@ def _first_actions(actions: npt.ArrayLike, shape: tuple[int, int]) -> Array:
     if not ((array >= 0) & (array <= 1)).all():
         raise OptionError("actions: must be finite numbers in [0, 1]. Clip them.")
     return array
-
-
-def _column(name: str, value: npt.ArrayLike, rows: int) -> Array:
-    try:
-        column = np.broadcast_to(np.asarray(value, np.float64), (rows,))
-    except (TypeError, ValueError):
-        raise StateError(
-            f"{name}={value!r:.60}: must be one number, or an array of shape ({rows},)."
-        ) from None
-    if not np.isfinite(column).all():
-        raise StateError(f"{name}: contains NaN or infinity. Give finite numbers.")
-    return column.copy()
 
 
 def _check_deterministic(

@@ -127,10 +127,3 @@ def test_behaviours_are_parsed_from_numbers_names_and_policies(tmp_path):
     for wrong in (None, True, [0.5]):
         with pytest.raises(SMEError, match="must be ν"):
             parse_behaviour(wrong)
-
-
-def test_the_expected_similarity_is_one_minus_a_sixth_of_nu():
-    assert recipe().expected_similarity == pytest.approx(1 - 0.5 / 6)
-    mixed = [{"kind": "mixture", "nu": 0.3, "weight": 0.5}, {"kind": "random", "weight": 0.5}]
-    assert recipe(behaviours=mixed).expected_similarity == pytest.approx(1 - 0.025 - 1 / 6)
-    assert recipe(behaviours=[{"kind": "policy", "policy": "x"}]).expected_similarity is None
