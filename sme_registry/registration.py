@@ -204,7 +204,7 @@ def env_spec(spec: SpecLike | StreamLike, **kwargs: Any) -> EnvSpec:
       10
     """
     from sme_registry.envs import SMEEnv, arguments
-    from sme_registry.envs.base import content_id
+    from sme_registry.envs.schedule import content_id
     from sme_registry.spec import SMESpec
     from sme_registry.task import load
 

@@ -23,9 +23,9 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from sme_registry.envs import SMEEnv, SMEVectorEnv, infos
+from sme_registry.envs import SMEEnv, SMEVectorEnv
 from sme_registry.envs.arguments import from_unit
-from sme_registry.envs.schedule import Schedule
+from sme_registry.envs.schedule import Columns, Schedule
 from sme_registry.envs.team import SMETeamEnv, observed_columns
 from sme_registry.spec import ACTION_RANGES, SMESpec, SpecLike, StreamLike, StreamSpec
 from sme_registry.task import (
@@ -162,8 +162,7 @@ def _check_life(env: Any, schedule: Schedule, seed: int) -> None:
 
     `info` is flat and numeric, with the documented keys and ranges, and new at each step.
     """
-    stream, rng = schedule.stream, np.random.default_rng(seed)
-    steps = _MAX_STEPS if stream is None else min(stream.steps + stream.horizon, _LONGEST_LIFE)
+    rng, steps = np.random.default_rng(seed), _steps(schedule)
     lifetime, episode_seed = 0, cast("int | None", seed)
     written: list[npt.NDArray[Any]] = []
     while lifetime < steps:
@@ -173,7 +172,7 @@ def _check_life(env: Any, schedule: Schedule, seed: int) -> None:
         expect_same("info at reset", info, _info_at_reset(schedule, segment, lifetime))
         s, r_cum, t, ended = env.state[None], np.zeros((1, 1)), 0, False
         _check_observation("the first observation", schedule, segment, env, observation, t, r_cum)
-        while not ended and (stream is not None or lifetime < steps):
+        while not ended and (schedule.is_stream or lifetime < steps):
             task, d = schedule.tasks[segment], env.distractors
             action = next_action(env, rng)
             unit = _as_unit(env, action)
@@ -193,7 +192,7 @@ def _check_life(env: Any, schedule: Schedule, seed: int) -> None:
             s, r_cum = result.state, np.array([[info["accumulated_reward"]]])
             expect_equal("the task in force", env.sme_spec, schedule.tasks[segment].spec)
             _check_observation("the observation", schedule, segment, env, observation, t, r_cum)
-            arrays = [observation, *(info[key] for key in infos.actions(task.spec))]
+            arrays = [observation, *(info[key] for key in schedule.columns.actions)]
             if any(np.shares_memory(*pair) for pair in itertools.product(arrays, written[-9:])):
                 raise ConformanceError("A later step reuses an array that `step` returned.")
             for array in arrays:
@@ -201,14 +200,21 @@ def _check_life(env: Any, schedule: Schedule, seed: int) -> None:
             written += arrays
 
 
+def _steps(schedule: Schedule) -> int:
+    """How many steps of a life are played."""
+    document = schedule.document
+    if isinstance(document, StreamSpec):
+        return min(document.steps + document.horizon, _LONGEST_LIFE)
+    return _MAX_STEPS
+
+
 def _info_at_reset(schedule: Schedule, segment: int, lifetime: int) -> dict[str, Any]:
-    return infos.at_reset(schedule.tasks[segment].spec) | _life(schedule, segment, lifetime)
+    at_reset = schedule.columns.at_reset(schedule.document.action_dim)
+    return at_reset | _life(schedule, segment, lifetime)
 
 
 def _life(schedule: Schedule, segment: int, lifetime: int) -> dict[str, Any]:
-    if schedule.stream is None:
-        return {}
-    return {"phase": np.int64(schedule.phases[segment]), "lifetime": np.int64(lifetime)}
+    return schedule.life(np.int64(schedule.phases[segment]), np.int64(lifetime))
 
 
 def _check_info(
@@ -216,7 +222,7 @@ def _check_info(
 ) -> None:
     """The keys, types and ranges of a step's info, and where it is in a life."""
     spec, life = schedule.tasks[segment].spec, _life(schedule, segment, lifetime)
-    numbers, arrays = infos.numbers(spec), infos.actions(spec)
+    _, numbers, arrays = schedule.columns
     expect_equal("info's keys", set(info), {*numbers, *arrays, *life})
     for key, value in life.items():
         expect_same(key, info[key], value)
@@ -271,7 +277,7 @@ def _check_observation(
     if not ((d >= 0.0) & (d <= 1.0)).all():
         raise ConformanceError(f"distractors={d}: outside [0, 1].")
     plain = observe(task.spec, env.state[None], np.array([t]), r_cum)[0, task.spec.state_dim :]
-    shown = schedule.shown(int(schedule.phases[segment]))
+    shown = schedule.one_hot(int(schedule.phases[segment]))
     parts = [task.seen(env.state, d).astype(np.float32), plain, shown]
     if task.mixing:
         expect_equal(f"{what}: its shape", observation.shape, np.concatenate(parts).shape)
@@ -289,7 +295,7 @@ def _check_team_steps(env: Any, task: Task, seed: int) -> None:
     expect_equal("the agents", tuple(env.agents), task.names)
     expect_equal("the agents of infos at reset", tuple(info), task.names)
     for name, owned, _ in agents:
-        expected = infos.at_reset(spec, owned.stop - owned.start)
+        expected = Columns.of(spec).at_reset(owned.stop - owned.start)
         expect_same(f"{name}: info at reset", info[name], expected)
     s, r_cum, ended = env.state()[None], np.zeros((1, len(agents))), False
     for t in range(min(spec.horizon, _MAX_STEPS) + 1):
@@ -303,9 +309,8 @@ def _check_team_steps(env: Any, task: Task, seed: int) -> None:
         observations, rewards, terminated, truncated, info = env.step(actions)
         expect_equal("the next state", env.state(), result.state[0])
         for agent, (name, _, _) in enumerate(agents):
-            expect_equal(
-                f"{name}: info's keys", set(info[name]), {*infos.NUMBERS, "optimal_action"}
-            )
+            keys = Columns.of(spec).at_reset(1).keys()
+            expect_equal(f"{name}: info's keys", info[name].keys(), keys)
             _check_step(result, agent, symmetric, info[name], rewards[name], spec)
             expect_equal(f"{name}: terminated", terminated[name], bool(result.terminated[0]))
             expect_equal(f"{name}: truncated", truncated[name], bool(result.truncated[0]))
@@ -362,9 +367,7 @@ def _check_copies(kind: str, env: Any, horizon: int, seed: int) -> None:
 def _check_vector(schedule: Schedule, single: Make, vector: Make, seed: int) -> None:
     """A batch equals what Gymnasium's `SyncVectorEnv` of single environments returns."""
     document, num_envs = schedule.document, 3
-    steps = min(document.horizon + 5, _MAX_STEPS)
-    if schedule.stream is not None:
-        steps = min(schedule.stream.steps + document.horizon, _LONGEST_LIFE)
+    steps = _steps(schedule) if schedule.is_stream else min(document.horizon + 5, _MAX_STEPS)
     for mode, action_range in itertools.product(AutoresetMode, ACTION_RANGES):
         batch = vector(document, num_envs, action_range=action_range, autoreset_mode=mode.value)
         make = functools.partial(single, document, action_range=action_range)

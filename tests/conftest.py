@@ -45,7 +45,7 @@ settings.load_profile("deterministic")
 def pytest_configure(config):
     """Compile the step once, before the workers and their children would each do it."""
     if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
-        kernels = "sme_registry.compiled.safety_observation"
+        kernels = "sme_registry.compiled.kernels"
         if importlib.util.find_spec("numba"):  # an extra
             subprocess.run([sys.executable, "-c", f"import {kernels}"], check=True)
 

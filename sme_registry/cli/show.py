@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from rich.markup import escape
 
 from sme_registry.cli.arguments import KINDS, Json, find_any, kind_of, print_tables
-from sme_registry.envs.base import content_id
+from sme_registry.envs.schedule import content_id
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.io.tables import Table
 from sme_registry.io.terminal import out, print_json, print_pairs

@@ -279,7 +279,7 @@ def _rows(kept: Mask, episodes: Indices, t: int, step: PlayStep, batch: Batch) -
         "episode": episodes,
         "t": np.full(len(kept), t),
         "values": result.values.transpose(2, 0, 1),  # `[B, 5, n]`; with safety 7
-        "limits": result.limits.transpose(1, 0, 2),  # `[B, 2, A]`: also safe actions
+        "limits": result.actions[1:].transpose(1, 0, 2),  # with safety `[B, 2, A]`
         "states": step.state,
         "next_states": batch.state,
         "observations": step.observation,

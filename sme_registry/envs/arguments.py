@@ -1,4 +1,4 @@
-"""Checks of the arguments of environments: action ranges and actions, seeds, options, states.
+"""Checks of the arguments of environments: documents, actions, seeds, options, states, limits.
 
 The action range "unit" is [0, 1], the paper's; "symmetric" is [−1, 1], rescaled by a = (u + 1)/2,
 which SB3 prefers. The range changes learning, not the task: it belongs to a run's record, not to
@@ -8,6 +8,7 @@ the task's digest.
 from __future__ import annotations
 
 import inspect
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -22,6 +23,7 @@ from sme_registry.errors import (
     SpecError,
     StateError,
     UnexpectedKeywordError,
+    WrapperError,
     did_you_mean,
 )
 from sme_registry.io import choice, integer_in
@@ -31,10 +33,16 @@ from sme_registry.task import Task, load_task
 MAX_LIFETIME = 2**62  # at which a life may begin: its steps are counted in 64 bits
 
 
-def load_overridden(environment: type, spec: SpecLike, overrides: dict[str, Any]) -> Task:
-    """The task of an environment class that is called with these overrides of spec fields."""
+def load_team(environment: type, spec: SpecLike, overrides: dict[str, Any]) -> Task:
+    """The task of a class of team environments that is called with overrides of spec fields."""
     check_overrides(environment, None, overrides)
-    return load_task(spec, **overrides)
+    task = load_task(spec, **overrides)
+    for field in ("safety", "observation"):
+        if getattr(task.spec, field) is not None:
+            raise SpecError(
+                f"{field}: not supported for teams. Use sme_registry.make, or leave it out."
+            )
+    return task
 
 
 def agents_problem(by_agent: Mapping[str, Any], agents: Sequence[str], what: str) -> str:
@@ -56,19 +64,18 @@ def check_overrides(
     """Raise UnexpectedKeywordError on a keyword that is no field of a spec; streams have none."""
     is_stream = isinstance(document, StreamSpec)
     fields = [] if is_stream else list(SMESpec.model_fields)
-    for name in overrides:
-        if name in fields:
-            continue
+    for name in [name for name in overrides if name not in fields]:
         parameters = inspect.signature(environment).parameters.values()
-        named = [one.name for one in parameters if one.kind is one.KEYWORD_ONLY]
-        advice = did_you_mean(name, [*named, *fields]) or " Remove it."
+        keywords = [one.name for one in parameters if one.kind is one.KEYWORD_ONLY]
+        advice = did_you_mean(name, [*keywords, *fields]) or " Remove it."
         if is_stream and name in {*SMESpec.model_fields, *StreamSpec.model_fields}:
             advice = f" {another_stream(name)}"
-        allowed = f"{', '.join(named)} or a field of the spec ({', '.join(fields)})"
+        allowed = ", ".join(keywords)
+        if fields:
+            allowed += f" or a field of the spec ({', '.join(fields)})"
         raise UnexpectedKeywordError(
             f"{environment.__name__}() got an unexpected keyword argument {name!r}"
-            f"{' for a stream' if is_stream else ''}: must be "
-            f"{', '.join(named) if is_stream else allowed}.{advice}"
+            f"{' for a stream' if is_stream else ''}: must be {allowed}.{advice}"
         )
 
 
@@ -189,16 +196,6 @@ def initial_states(state: Any, shape: tuple[int, ...], name: str = "state") -> A
     return array
 
 
-def without_safety_or_observation(task: Task) -> Task:
-    """The task; SpecError if it has what teams do not support."""
-    for field in ("safety", "observation"):
-        if getattr(task.spec, field) is not None:
-            raise SpecError(
-                f"{field}: not supported for teams. Use sme_registry.make, or leave it out."
-            )
-    return task
-
-
 def single_agent(task: Task) -> Task:
     """The task; SpecError if it is for a team."""
     if len(task.policies) > 1:
@@ -215,4 +212,31 @@ def check_has_limits(who: str, spec: SMESpec) -> None:
         raise OptionError(
             f"{who}: needs a task with limits, and this one has none. Give a task with safety, "
             "such as Safety20."
+        )
+
+
+def check_outer_time_limit(horizon: int) -> None:
+    """Raise where the `reset` that calls this was called by a TimeLimit below the horizon.
+
+    Such a wrapper ends an episode before its last payout. An environment has no reference to its
+    wrappers, which may be added at any time; but each calls the `reset` of the environment inside
+    it, so the callers' frames up to the first that is no reset belong to the wrappers (and to
+    Gymnasium's function that checks a first reset).
+    """
+    frame = sys._getframe(2)
+    while frame is not None and "reset" in frame.f_code.co_name:
+        wrapper = frame.f_locals.get("self")
+        if isinstance(wrapper, gymnasium.wrappers.TimeLimit):
+            check_time_limit(wrapper._max_episode_steps, horizon)
+        frame = frame.f_back  # type: ignore[assignment]  # typed as never None
+
+
+def check_time_limit(max_episode_steps: int, horizon: int) -> None:
+    """Raise WrapperError on a time limit below the horizon."""
+    if max_episode_steps < horizon:
+        raise WrapperError(
+            f"max_episode_steps={max_episode_steps}: must be at least the horizon, {horizon}: a "
+            "shorter TimeLimit would end the episode before its last payout. Make the task itself "
+            f"shorter, horizon={max_episode_steps}; or, where the limit comes from the EnvSpec of "
+            f"another horizon, pass max_episode_steps={horizon}."
         )

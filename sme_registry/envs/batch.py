@@ -9,12 +9,9 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Mapping
-from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium.utils import seeding
 
 from sme_registry.compiled import Engine, engine
@@ -22,20 +19,17 @@ from sme_registry.compiled.arrays import (
     OWN_DISTRACTORS,
     OWN_DRAWN,
     OWN_KEY,
-    ROWS,
-    ROWS_WITH_SAFETY,
     Array,
     Indices,
     Mask,
     Observation,
 )
 from sme_registry.compiled.engine import StepMany, draw
-from sme_registry.envs import infos
 from sme_registry.envs.arguments import not_finite_error
 from sme_registry.envs.schedule import Schedule
 from sme_registry.errors import ActionError
 from sme_registry.spec import SMESpec, StreamSpec
-from sme_registry.task import Task, observe
+from sme_registry.task import Task
 from sme_registry.task.loading import check_memory
 
 _FLOAT64 = np.dtype(np.float64)
@@ -51,31 +45,29 @@ class BatchStep(NamedTuple):
     Attributes:
       observation: `[B, S + 1 + n]` float32: s, t/T, and each agent's r_cum/k. Of a stream that
         shows its phase, one-hot behind them. With `observation`, M(s, d) `[S + m]` in place of s.
-      optimal: `[B, A]` π* of the states acted in, in the unit range.
-      values: `[5, n, B]` the rows of `compiled.arrays`: similarity, step reward, regret, reward,
-        and r_cum after a payout; with `safety` also cost and safe regret.
+      actions: `[1 or 3, B, A]` in the unit range, of the states acted in: π*, and with `safety` the
+        limits and the safe action.
+      values: `[5 or 7, n, B]` the rows of `compiled.arrays`: similarity, step reward, regret,
+        reward, and r_cum after a payout; with `safety` also cost and safe regret.
       terminated: `[B]`.
       truncated: `[B]`.
-      limits: `[2, B, A]` the limits and the safe action in the states acted in, in the unit range;
-        without `safety` `[2, B, 0]`.
     """
 
     observation: Observation
-    optimal: Array
+    actions: Array
     values: Array
     terminated: Mask
     truncated: Mask
-    limits: Array
+
+    @property
+    def optimal(self) -> Array:
+        """π*, `[B, A]`."""
+        optimal: Array = self.actions[0]
+        return optimal
 
 
-class _Arrays(NamedTuple):
-    """What a step writes besides the state; see `BatchStep`. `ends` is `[2, B]`."""
-
-    observation: Observation
-    optimal: Array
-    values: Array
-    ends: Mask
-    limits: Array
+_Arrays: TypeAlias = tuple[Observation, Array, Array, Mask]
+"""What a step writes besides the state: observation, actions, values, ends `[2, B]`."""
 
 
 class _Results:
@@ -91,14 +83,8 @@ class _Results:
     view, such as setting its shape, does not outlive it.
     """
 
-    def __init__(
-        self, num_envs: int, observation_dim: int, action_dim: int, agents: int, *, safety: bool
-    ) -> None:
-        rows, limited = (ROWS_WITH_SAFETY, action_dim) if safety else (ROWS, 0)
-        self._shapes = (
-            (num_envs, observation_dim), (num_envs, action_dim), (rows, agents, num_envs),
-            (2, num_envs, limited),
-        )  # fmt: skip
+    def __init__(self, num_envs: int, observation_dim: int, actions: Any, values: Any) -> None:
+        self._shapes = (num_envs, observation_dim), actions, values, (2, num_envs)
         self._kept: list[_Arrays] = []
 
     def take(self) -> tuple[_Arrays, BatchStep]:
@@ -109,19 +95,13 @@ class _Results:
         else:
             arrays = self._allocate()
             self._kept = [*self._kept[1 - _KEPT :], arrays]
-        observation, optimal, values, ends, limits = arrays
-        views = observation[:], optimal[:], values[:], ends[0], ends[1], limits[:]
-        return arrays, BatchStep(*views)
+        observation, actions, values, ends = arrays
+        return arrays, BatchStep(observation[:], actions[:], values[:], ends[0], ends[1])
 
     def _allocate(self) -> _Arrays:
-        observation, optimal, values, limits = self._shapes
-        return _Arrays(
-            np.empty(observation, np.float32),
-            np.empty(optimal),
-            np.empty(values),
-            np.empty((2, observation[0]), bool),
-            np.empty(limits),
-        )
+        observation, actions, values, ends = self._shapes
+        numbers = np.empty(actions), np.empty(values)
+        return np.empty(observation, np.float32), *numbers, np.empty(ends, bool)
 
 
 def _references(arrays: _Arrays) -> list[int]:
@@ -130,7 +110,7 @@ def _references(arrays: _Arrays) -> list[int]:
 
 
 # Measured, since versions of Python differ in what they count.
-_ALONE = _references(_Results(1, 1, 1, 1, safety=True)._allocate())
+_ALONE = _references(_Results(1, 1, (1, 1, 1), (1, 1, 1))._allocate())
 
 
 class InitialStates:
@@ -205,8 +185,10 @@ class Distractors:
         self.own[OWN_DISTRACTORS:, envs] = distractors.T
 
     def beside(self, states: Array, envs: Indices) -> Array:
-        """Some environments' states `[len(envs), S]` and distractors, `[S + m, len(envs)]`."""
-        return np.concatenate([states.T, self.own[OWN_DISTRACTORS:, envs]])
+        """Some environments' states `[S, len(envs)]` and distractors, `[S + m, len(envs)]`."""
+        if not self._count:
+            return states
+        return np.concatenate([states, self.own[OWN_DISTRACTORS:, envs]])
 
 
 class Batch:
@@ -225,21 +207,21 @@ class Batch:
       lived: what infos say of each life in the last step; nothing, of a task.
     """
 
-    lived: Mapping[str, Indices] = MappingProxyType({})
-
     def __init__(self, schedule: Schedule | Task, num_envs: int, *, reuse: bool = False) -> None:
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule.of(schedule)
         self.num_envs = num_envs
         spec, n = self.task.spec, len(self.task.policies)
         S, A, m = spec.state_dim, spec.action_dim, spec.distractors
-        phases = self.schedule.document.observed_phases
+        P = self.document.observed_phases
         check_memory(
-            num_envs * 8 * (5 * (S + m) + 12 * A + 20 * n + 54 + 3 * phases),
+            num_envs * 8 * (5 * (S + m) + 12 * A + 20 * n + 54 + 3 * P),
             f"num_envs={num_envs}: a batch this large",
             "Use fewer environments.",
         )
         self._shape = (num_envs, A)
         self._envs = np.arange(num_envs)
+        self.observation_dim = S + m + 1 + n + P  # of all agents
+        self._of_t, self._of_phase = S + m, S + m + 1 + n  # columns of the observation
         self.initial_states = InitialStates(num_envs, S)
         self._distractors = Distractors(m, num_envs)
         # Channel by channel, [S, B] and [n, B], as the compiled step reads them.
@@ -248,7 +230,8 @@ class Batch:
         self._accumulated = np.zeros((n, num_envs))
         self._segment, self._lifetime = np.zeros((2, num_envs), np.int64)
         self._next_switch = np.zeros(num_envs, np.int64)  # at the first `begin` each may switch
-        self._soonest = 0  # so many steps at most until a segment is over
+        self._soonest = 0  # so many steps at least until a segment is over
+        self.lived: dict[str, Indices] = {}
         self._reuse = reuse
         self._load_engine()
 
@@ -268,11 +251,6 @@ class Batch:
         return self.task_of(0) if len(self._groups) == 1 else None
 
     @property
-    def observation_dim(self) -> int:
-        """Entries of a joint observation: those of a single agent's, and one for each other."""
-        return self.document.observation_dim - 1 + len(self._accumulated)
-
-    @property
     def state(self) -> Array:
         """The states, `[B, S]` float64 in [0, 1] (a copy)."""
         return self._s.T.copy()  # a copy even where the transpose is contiguous
@@ -284,18 +262,18 @@ class Batch:
 
     def _load_engine(self) -> None:
         self._engines: dict[int, Engine] = {}
-        first = self._engine_of(0)
-        self._add_many, self._see = first.add_many, first.seen
+        self._see = self._engine_of(0).seen
         self._moved = np.empty_like(self._s)
-        A, n, safety = self._shape[1], len(self._accumulated), self.task.spec.safety is not None
-        results = _Results(self.num_envs, self.observation_dim, A, n, safety=safety)
+        columns, (B, A), n = self.schedule.columns, self._shape, len(self._accumulated)
+        shapes = (len(columns.actions), B, A), (columns.rows, n, B)
+        results = _Results(B, self.observation_dim, *shapes)
         in_turn = itertools.cycle([results.take(), results.take()])
         self._take = in_turn.__next__ if self._reuse else results.take
         self._put_in_force()
 
     # Machine code cannot be pickled or copied: the copy loads it, and has arrays of its own.
     def __getstate__(self) -> dict[str, Any]:
-        dropped = {"_engines", "_add_many", "_see", "_moved", "_take", "_step_many", "_groups"}
+        dropped = {"_engines", "_see", "_moved", "_take", "_step_many", "_groups"}
         return {name: value for name, value in vars(self).items() if name not in dropped}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -308,15 +286,16 @@ class Batch:
 
     def life(self) -> dict[str, Indices]:
         """What infos say of each life, fresh arrays `[B]`: phase and steps lived; or nothing."""
-        if self.schedule.stream is None:
-            return {}
-        return infos.of_life(self._phase.copy(), self._lifetime.copy())
+        return self.schedule.life(self._phase.copy(), self._lifetime.copy())
 
     def life_of(self, env: int) -> dict[str, Any]:
         """The same of one environment, as NumPy's numbers."""
-        if self.schedule.stream is None:
-            return {}
-        return infos.of_life(self._phase[env], self._lifetime[env])
+        return self.schedule.life(self._phase[env], self._lifetime[env])
+
+    def info_of(self, step: BatchStep, env: int, rescaled: bool) -> dict[str, Any]:
+        """The info of one environment's step: all its actions, and means over its agents."""
+        values = step.values[:, :, env].mean(axis=1)
+        return self.schedule.columns.at_step(step.actions[:, env], values, rescaled)
 
     def seed(self, env: int, seed: int) -> None:
         """Restart an environment's generators, and its life."""
@@ -342,11 +321,10 @@ class Batch:
 
     def observe(self) -> Observation:
         """The present joint observations, `[B, observation_dim]`."""
-        plain = observe(self.task.spec, self.state, self._t, self._accumulated.T)
-        seen, S = self._seen(self.state, self._envs), len(self._s)
-        parts = [seen, plain[:, S:], self._shown]
-        observation: Observation = np.concatenate(parts, axis=1, dtype=np.float32)
-        self._show(self._envs, observation)
+        observation = np.empty((self.num_envs, self.observation_dim), np.float32)
+        self._write_seen(self._s, self._envs, observation)
+        observation[:, self._of_t] = self._t / self.task.spec.horizon
+        self._write_segment(self._envs, observation)
         return observation
 
     def begin(
@@ -368,14 +346,16 @@ class Batch:
         self._t[envs] = 0
         self._accumulated[:, envs] = 0.0
         self._distractors.begin(envs, distractors)
-        seen = self._seen(states, envs)
-        width = seen.shape[1]
-        observation[envs, :width] = seen
-        observation[envs, width:] = 0.0
-        self._show(envs, observation)
+        self._write_seen(states.T, envs, observation)
+        observation[envs, self._of_t : self._of_phase] = 0.0
+        observation[envs, self._of_phase :] = self._one_hot[envs]
 
     def place(
-        self, states: Array, t: Indices, accumulated: Array, distractors: Array | None = None
+        self,
+        states: Array,
+        t: Indices,
+        accumulated: Array,
+        distractors: Array | None = None,
     ) -> None:
         """Put every environment at any point of an episode; `observe` gives what is seen there.
 
@@ -400,47 +380,38 @@ class Batch:
             raise ActionError(f"action of shape {actions.shape}: must be of shape {self._shape}.")
         if actions.dtype is not _FLOAT64 or not actions.flags.c_contiguous:
             actions = np.ascontiguousarray(actions, dtype=np.float64)
-        moved = self._moved
+        own, moved = self._distractors.own, self._moved
+        drawn = None if resting is None else own[OWN_DRAWN, resting]
         arrays, result = self._take()
-        observation, optimal, values, ends, limits = arrays
+        observation, optimal, values, ends = arrays
         if not self._step_many(
-            self._s, self._t, self._accumulated, actions, moved, observation, optimal, values, ends
-        ):
+            self._s, self._t, self._accumulated, own, actions, moved,
+            observation, optimal, values, ends,
+        ):  # fmt: skip
             raise not_finite_error()
         self._s, self._moved = moved, self._s
-        if self._add_many is not None:
-            own = self._distractors.own
-            drawn = None if resting is None else own[OWN_DRAWN, resting]
-            self._add_many(own, self._moved, moved, actions, optimal, values, observation, limits)
-            if drawn is not None:
-                own[OWN_DRAWN, resting] = drawn
-        if self.schedule.stream is not None:
+        if drawn is not None:
+            own[OWN_DRAWN, resting] = drawn
+        if self.schedule.is_stream:
             self._live_on(observation, resting)
         return result
-
-    def _seen(self, states: Array, envs: Indices) -> npt.NDArray[Any]:
-        """What the agents of some environments see of states, `[len(envs), S + m]`."""
-        if self.task.spec.observation is None:
-            return states
-        return self._see(self._distractors.beside(states, envs)).T.astype(np.float32)
 
     def _live_on(self, observation: Observation, resting: Mask | None) -> None:
         """Count a step of each life, and switch where a segment ends within an episode."""
         self._lifetime += 1 if resting is None else ~resting
         self.lived = self.life()  # before the switch: of the task in which the action was taken
-        if self._shown.shape[1]:
-            observation[:, len(self._s) + 2 :] = self._shown
+        if self._one_hot.shape[1]:
+            observation[:, self._of_phase :] = self._one_hot
         if self.schedule.switches_within:
             self._soonest -= 1
             if self._soonest <= 0:
                 envs = np.flatnonzero(self._lifetime >= self._next_switch)
                 self._switch(envs)
-                self._show(envs, observation)
+                self._write_segment(envs, observation)
+                self._soonest = self._until_switch()
 
     def _switch(self, envs: Indices) -> None:
         """Put the next segment in force in those of these environments whose segment is over."""
-        if self.schedule.stream is None:
-            return
         over = envs[self._lifetime[envs] >= self._next_switch[envs]]
         if over.size:
             lifetimes, which = np.unique(self._lifetime[over], return_inverse=True)
@@ -449,7 +420,10 @@ class Batch:
             self._segment[over] = np.array(segments)[which]
             self._next_switch[over] = np.array(switches)[which]
             self._put_in_force()
-        self._soonest = int((self._next_switch - self._lifetime).min())
+
+    def _until_switch(self) -> int:
+        """So many steps at least until the next segment is over."""
+        return int((self._next_switch - self._lifetime).min())
 
     def _put_in_force(self) -> None:
         """Prepare what depends on the segments: what steps the batch, and what is shown."""
@@ -459,8 +433,9 @@ class Batch:
         self._groups = [*zip(steps, envs, strict=True)]
         self._step_many: StepMany = steps[0] if len(steps) == 1 else self._step_groups
         self._phase = self.schedule.phases[self._segment]
-        self._shown = self.schedule.shown(self._phase)
+        self._one_hot = self.schedule.one_hot(self._phase)
         self._k = self.schedule.k[self._segment]
+        self._soonest = self._until_switch()
 
     def _engine_of(self, segment: int) -> Engine:
         if segment not in self._engines:
@@ -472,31 +447,34 @@ class Batch:
         s: Array,
         t: Indices,
         accumulated: Array,
+        own: Array,
         action: Array,
         moved: Array,
         observation: Observation,
-        optimal: Array,
+        actions: Array,
         values: Array,
         ends: Mask,
     ) -> bool:
         """One step as `StepMany`, by the step of each environment's segment."""
         groups = []
         for step, envs in self._groups:
-            before = s[:, envs], t[envs], accumulated[:, envs], action[envs]
-            after = moved[:, envs], observation[envs], optimal[envs], values[..., envs]
+            before = s[:, envs], t[envs], accumulated[:, envs], own[:, envs], action[envs]
+            after = moved[:, envs], observation[envs], actions[:, envs], values[..., envs]
             arrays = [*map(np.ascontiguousarray, (*before, *after, ends[:, envs]))]
             if not step(*arrays):
                 return False  # before any environment has moved
             groups.append((envs, arrays))
         for envs, arrays in groups:
-            _, t[envs], accumulated[:, envs], _, moved[:, envs] = arrays[:5]
-            observation[envs], optimal[envs], values[..., envs], ends[:, envs] = arrays[5:]
+            _, t[envs], accumulated[:, envs], own[:, envs], _, moved[:, envs] = arrays[:6]
+            observation[envs], actions[:, envs], values[..., envs], ends[:, envs] = arrays[6:]
         return True
 
-    def _show(self, envs: Indices, observation: Observation) -> None:
-        """Write what depends on the segment in force into rows: r_cum/k, and the phase."""
-        if self.schedule.stream is not None:
-            S = len(self._s)
-            waiting = self._accumulated[0, envs] / self._k[envs]
-            observation[envs, S + 1] = np.minimum(waiting, 1.0)
-            observation[envs, S + 2 :] = self._shown[envs]
+    def _write_seen(self, states: Array, envs: Indices, observation: Observation) -> None:
+        """Write what is seen of some environments' states `[S, len(envs)]` into their rows."""
+        observation[envs, : self._of_t] = self._see(self._distractors.beside(states, envs)).T
+
+    def _write_segment(self, envs: Indices, observation: Observation) -> None:
+        """Write what depends on the segment in force into rows: each r_cum/k, and the phase."""
+        waiting = self._accumulated[:, envs] / self._k[envs]
+        observation[envs, self._of_t + 1 : self._of_phase] = np.minimum(waiting, 1.0).T
+        observation[envs, self._of_phase :] = self._one_hot[envs]

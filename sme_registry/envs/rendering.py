@@ -18,12 +18,12 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.compiled.arrays import Array
-from sme_registry.envs import arguments, infos
-from sme_registry.envs.base import TaskMixin
+from sme_registry.envs import arguments
 from sme_registry.envs.batch import Batch, BatchStep
+from sme_registry.envs.schedule import ScheduleMixin
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.io import integer_in, require_packages
-from sme_registry.spec import SMESpec
+from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.catalogue import title
 from sme_registry.task import Task
 
@@ -283,7 +283,7 @@ def _columns(values: Sequence[float], left: int, right: int) -> list[tuple[int, 
     return [(round(left + i * pitch), width, value) for i, value in enumerate(values)]
 
 
-class RenderMixin(TaskMixin):
+class RenderMixin(ScheduleMixin):
     """Frames of an episode; pygame is imported when the first is recorded."""
 
     metadata: dict[str, Any]
@@ -299,7 +299,7 @@ class RenderMixin(TaskMixin):
         """Record in an environment with a render mode; see `Renderer.record`."""
         if self._renderer is None:
             assert self.render_mode is not None
-            self._renderer = Renderer(self._task, self.render_mode, self.metadata)
+            self._renderer = Renderer(self.task, self.render_mode, self.metadata)
         self._renderer.record(env, last)
 
     def render(self) -> Any:
@@ -355,7 +355,7 @@ class BatchRenderer:
             elif unit is not None and step is not None:
                 rescaled = bool(self._space.low[0] < 0.0)
                 action = arguments.from_unit(unit[env], rescaled)
-                renderer.record(view, (action, infos.of_all_agents(step, env, rescaled)))
+                renderer.record(view, (action, self._batch.info_of(step, env, rescaled)))
 
     def frames(self) -> tuple[Frame, ...]:
         """The present frames of those drawn, each `[H, W, 3]` uint8."""
@@ -384,3 +384,35 @@ def batch_renderer(
     if render_mode is None and envs is not None:
         raise OptionError("render_lanes: needs render_mode='rgb_array'. Add it.")
     return None if render_mode is None else BatchRenderer(batch, envs, space)
+
+
+def html_card(
+    env: Any,
+    observation: Any,
+    action: Any,
+    *,
+    status: str = "",
+    autoreset: str = "",
+) -> str:
+    """A card of an environment for notebooks; a team's has its agents in place of the spaces.
+
+    The spaces are those of a single environment, or of any agent in a team. `status` is that of its
+    episode, such as "running"; a batch has none.
+    """
+    from sme_registry.io.markup import card, folded, pairs_html  # loads Jinja
+    from sme_registry.spec import cards
+
+    document: SMESpec | StreamSpec = env.document
+    seen = cards.observation_text(document)
+    span = f"float32 in [{action.low.flat[0]:g}, {action.high.flat[0]:g}]"
+    facts = {
+        "observation": f"[{observation.shape[0]}] float32 in [0, 1]: {seen}",
+        "action": f"[{action.shape[0]}] {span}",
+    }
+    if document.specs[0].team is not None:  # whose spaces are in the table of its agents
+        facts = {"actions": span}
+    facts["episode"] = f"at most {document.horizon:,} steps" + (f"; {status}" if status else "")
+    if autoreset:
+        facts["autoreset"] = autoreset
+    task = folded(cards.summary(document), *cards.parts(document))
+    return card(pairs_html(repr(env), facts), task)

@@ -1,20 +1,95 @@
 """`Schedule`: which task is in force after how many environment steps; METHOD, section 7.
 
-A task is a stream of one segment that is never over, so every environment runs a schedule.
+A task is a stream of one segment that is never over, so every environment runs a schedule. It also
+says what infos hold. At a step these are the values of `SMEEnv`, float64 of NumPy, since some
+libraries ask for a dtype. At a reset no action was taken: the same keys hold NaN, so that every
+info has one structure. A stream's also has `phase` and `lifetime`, int64, at a reset as well.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from typing import Any, cast
+from enum import Enum
+from typing import Any, NamedTuple, cast
 
+import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
-from sme_registry.compiled.arrays import Indices, Observation
+from sme_registry.compiled.arrays import (
+    ACCUMULATED_REWARD,
+    COST,
+    REGRET,
+    ROWS,
+    ROWS_WITH_SAFETY,
+    SAFE_REGRET,
+    SIMILARITY,
+    STEP_REWARD,
+    Array,
+    Indices,
+    Observation,
+)
 from sme_registry.envs import arguments
 from sme_registry.spec import SMESpec, SpecLike, StreamLike, StreamSpec
-from sme_registry.spec.catalogue import Resolved, resolve
+from sme_registry.spec.catalogue import NAMESPACE, Resolved, resolve
 from sme_registry.task import Task, materialize_segments
+from sme_registry.task.draw import DYNAMICS_VERSION
+
+_NAN = np.float64(np.nan)
+
+
+class Columns(NamedTuple):
+    """What a step computes of a task.
+
+    Attributes:
+      rows: how many `values` there are; see `compiled.arrays`.
+      numbers: the keys of infos whose values are numbers, and the row of `values` that each is.
+      actions: the keys whose values are `[A]`, in the environment's action range.
+    """
+
+    rows: int
+    numbers: dict[str, int]
+    actions: tuple[str, ...]
+
+    @classmethod
+    def of(cls, spec: SMESpec) -> Columns:
+        return _PLAIN if spec.safety is None else _WITH_SAFETY
+
+    def at_reset(self, width: int) -> dict[str, Any]:
+        """The info of a reset: NaN for every key, those of actions as fresh arrays `[width]`."""
+        arrays = {key: np.full(width, np.nan) for key in self.actions}
+        return {**arrays, **dict.fromkeys(self.numbers, _NAN)}
+
+    def at_resets(self, num_envs: int, width: int) -> dict[str, Array]:
+        """The info of B resets: fresh arrays of NaN, of actions `[B, width]`, of numbers `[B]`."""
+        arrays = {key: np.full((num_envs, width), np.nan) for key in self.actions}
+        return arrays | {key: np.full(num_envs, np.nan) for key in self.numbers}
+
+    def at_step(self, actions: Array, values: Array, rescaled: bool) -> dict[str, Any]:
+        """The info of a step from its `actions` `[1 or 3, …, A]` and `values` `[5 or 7, …]`."""
+        info = {key: values[row] for key, row in self.numbers.items()}
+        in_range = arguments.from_unit(actions, rescaled)
+        for row, key in enumerate(self.actions):
+            info[key] = in_range[row]
+        return info
+
+
+_PLAIN = Columns(
+    ROWS,
+    {
+        "similarity": SIMILARITY,
+        "step_reward": STEP_REWARD,
+        "regret": REGRET,
+        "accumulated_reward": ACCUMULATED_REWARD,
+    },
+    ("optimal_action",),
+)
+_WITH_SAFETY = Columns(
+    ROWS_WITH_SAFETY,
+    {**_PLAIN.numbers, "cost": COST, "safe_regret": SAFE_REGRET},
+    ("optimal_action", "limit", "safe_action"),
+)
 
 
 class Schedule:
@@ -22,20 +97,26 @@ class Schedule:
 
     Attributes:
       document: the spec or the stream.
-      stream: the stream; None for a task.
+      is_stream: whether it is a stream; infos then tell where in a life they are.
       tasks: the task of each segment of a cycle; segments with equal specs share one.
+      columns: what a step computes of each of them.
       phases: the phase of each segment, `[segments]`.
       k: the k of each segment, `[segments]`.
       switches_within: whether a segment may end within an episode, rather than at the next reset.
+      reset_options: the options of a reset of its environments.
     """
 
     def __init__(self, document: SMESpec | StreamSpec, tasks: Sequence[Task]) -> None:
         self.document, self.tasks = document, tuple(tasks)
-        self.stream = document if isinstance(document, StreamSpec) else None
+        self.columns = Columns.of(tasks[0].spec)
+        self.is_stream = isinstance(document, StreamSpec)
         self.phases = np.array([segment.phase for segment in document.segments])
         self.k = np.array([task.spec.k for task in tasks])
         self.switches_within = document.switch == "step"
+        optional = ("lifetime", self.is_stream), ("distractors", tasks[0].spec.distractors > 0)
+        self.reset_options = ("state", *(name for name, exists in optional if exists))
         self._times = document.times
+        self._one_hot = np.eye(self.phases[-1] + 1, document.observed_phases, dtype=np.float32)
 
     @classmethod
     def of(cls, task: Task) -> Schedule:
@@ -52,22 +133,14 @@ class Schedule:
         stream. Others are fields of a spec; a stream has none to change.
         """
         overrides = dict(overrides)
-        stream = overrides.pop("stream", None)
-        resolved: Resolved[Any]
-        resolved = resolve(document) if stream is None else resolve(stream, StreamSpec)
+        kind = StreamSpec if "stream" in overrides else None
+        resolved: Resolved[Any] = resolve(overrides.pop("stream", document), kind)
         arguments.check_overrides(environment, resolved.document, overrides)
         if overrides:
             resolved = Resolved(cast("SMESpec", resolved.document).derive(**overrides))
         tasks = materialize_segments(*resolved)
         arguments.single_agent(tasks[0])
         return cls(resolved.document, tasks)
-
-    @property
-    def reset_options(self) -> tuple[str, ...]:
-        """The options of a reset of its environments."""
-        if self.stream is not None:
-            return "state", "lifetime"
-        return ("state", "distractors") if self.tasks[0].spec.distractors else ("state",)
 
     def segment(self, lifetime: int) -> int:
         """The segment in force after so many environment steps; the last one at the end."""
@@ -77,9 +150,95 @@ class Schedule:
         """The lifetime at which that segment is over; NEVER in the last one of the life."""
         return self._times.next_switch(lifetime)
 
-    def shown(self, phase: int | Indices) -> Observation:
-        """What an observation in a phase ends with, `[…, P]`: its one-hot, or (P = 0) nothing."""
-        if not self.document.observed_phases:
-            return np.empty((*np.shape(phase), 0), np.float32)
-        one_hot: Observation = np.eye(self.document.observed_phases, dtype=np.float32)[phase]
+    def one_hot(self, phase: int | Indices) -> Observation:
+        """What an observation in a phase ends with, `[…, P]`."""
+        one_hot: Observation = self._one_hot[phase]
         return one_hot
+
+    def life(self, phase: Any, lifetime: Any) -> dict[str, Any]:
+        """What infos say of a life, or of the lives of a batch; nothing of a task's."""
+        return {"phase": phase, "lifetime": lifetime} if self.is_stream else {}
+
+
+class ScheduleMixin:
+    """What an environment runs."""
+
+    _schedule: Schedule
+
+    @property
+    def document(self) -> SMESpec | StreamSpec:
+        """What the environment runs: its spec, or a stream."""
+        return self._schedule.document
+
+    @property
+    def task(self) -> Task:
+        """The drawn task: W, b, the layers of each agent, and the equations."""
+        return self._schedule.tasks[0]
+
+    @property
+    def sme_spec(self) -> SMESpec:
+        """The spec of the task that is run, overrides included."""
+        return self.task.spec
+
+
+class GymnasiumMixin(ScheduleMixin):
+    """An environment in Gymnasium's registry."""
+
+    _env_spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Gymnasium's spec; a derived task has an id of its own, by its content.
+
+        Its `max_episode_steps` is the horizon.
+        """
+        return self._env_spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        self._env_spec = renamed_by_content(value, self.document)
+
+    @property
+    def stream(self) -> StreamSpec:
+        """The stream that is run; an environment of a task has no such attribute."""
+        if not isinstance(self.document, StreamSpec):
+            raise AttributeError(f"stream: {self!r} runs a task. Its spec is sme_spec.")
+        return self.document
+
+
+def content_id(document: SMESpec | StreamSpec) -> str:
+    """`SME/sha256-<first 12 hex of the digest>-v1`."""
+    return f"{NAMESPACE}/{document.content_name}-v{DYNAMICS_VERSION}"
+
+
+def renamed_by_content(env_spec: EnvSpec | None, document: SMESpec | StreamSpec) -> EnvSpec | None:
+    """Gymnasium's spec of an environment, as plain JSON; a derived task gets the id of its content.
+
+    `SME/Default-v1` with `complexity=10` is another task, and must not be recorded under the name
+    from which it was derived. Its `max_episode_steps` is the horizon, which wrappers ask for; a
+    TimeLimit that Gymnasium makes of it changes nothing, as the environment ends by itself.
+    """
+    if env_spec is None:
+        return None
+    fields = SMESpec.model_fields.keys()
+    registered = gymnasium.registry.get(env_spec.id)
+    argument = document.kind
+    value = env_spec.kwargs.get(argument)
+    is_named = registered is None or registered.kwargs.items() <= env_spec.kwargs.items()
+    named = is_named and not fields & env_spec.kwargs.keys()
+
+    plain = copy.deepcopy(env_spec)
+    plain.kwargs = {
+        key: value.value if isinstance(value, Enum) else value
+        for key, value in plain.kwargs.items()
+        if key not in fields and key != "max_episode_steps"
+    }
+    plain.max_episode_steps = document.horizon
+    if not named or not isinstance(value, str | dict):
+        plain.kwargs[argument] = document.to_dict()
+    if not named:
+        plain.id = content_id(document)
+        # EnvSpec derives these from the id only in its constructor.
+        plain.name = plain.id.removeprefix(f"{NAMESPACE}/").rsplit("-v", 1)[0]
+        plain.version = DYNAMICS_VERSION
+    return plain

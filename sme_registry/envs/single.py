@@ -13,25 +13,21 @@ import numpy.typing as npt
 from sme_registry.compiled import engine
 from sme_registry.compiled.arrays import (
     ACCUMULATED_REWARD,
-    HAS_MORE,
-    LANE_STATE,
-    LANE_VALUES,
-    MORE_COST,
-    MORE_OWN,
-    MORE_SAFE_REGRET,
+    BUFFER_STATE,
+    BUFFER_VALUES,
     Action,
     Array,
     Indices,
     Observation,
 )
-from sme_registry.envs import arguments, infos
-from sme_registry.envs.base import GymnasiumMixin, check_outer_time_limit, html_card
+from sme_registry.envs import arguments
 from sme_registry.envs.batch import Distractors
-from sme_registry.envs.rendering import RENDER_MODES, RenderMixin
-from sme_registry.envs.schedule import Schedule
+from sme_registry.envs.rendering import RENDER_MODES, RenderMixin, html_card
+from sme_registry.envs.schedule import GymnasiumMixin, Schedule
 from sme_registry.errors import EpisodeError
-from sme_registry.spec import ActionRange, SMESpec, SpecLike, StreamLike, StreamSpec
+from sme_registry.spec import ActionRange, SpecLike, StreamLike
 from sme_registry.spec.catalogue import title
+from sme_registry.task import Task
 
 _FLOAT32 = np.dtype(np.float32)
 _POOL_BYTES = 4096
@@ -96,28 +92,31 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         self._set_render_mode(render_mode)
         self._schedule = Schedule.load(type(self), spec, overrides)
         document = self.document
-        self._action_shape = (document.action_dim,)
-        space, self._rescaled = arguments.action_space(action_range, document.action_dim)
+        A = document.action_dim
+        self._action_shape = (A,)
+        actions = enumerate(self._schedule.columns.actions)  # of a step, one behind the other
+        self._parts = [(key, slice(i * A, (i + 1) * A)) for i, key in actions]
+        space, self._rescaled = arguments.action_space(action_range, A)
         self.action_space = cast("gymnasium.Space[Action]", space)
         width = document.observation_dim
         self.observation_space = gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32)
-        self._state = "created"
+        self._status = "not begun"
         self._keyed_by: np.random.Generator | None = None  # of which the distractors' stream is
         self._distractors = Distractors(self._schedule.tasks[0].spec.distractors, 1)
-        # Of a stream: the lifetimes of the next steps, the last one first.
-        self._lifetimes: list[Any] | None = None if self._schedule.stream is None else []
+        # The lifetimes of a stream's next steps, the last one first; a task needs none.
+        self._lifetimes: list[Any] = [0]
         self._look_ahead(0)
         self._put_in_force(0)
 
     @property
-    def document(self) -> SMESpec | StreamSpec:
-        """What the environment runs: its spec, or a stream."""
-        return self._schedule.document
+    def task(self) -> Task:
+        """The drawn task: W, b, the layers of each agent, and the equations."""
+        return self._schedule.tasks[self._segment]
 
     @property
     def state(self) -> Array:
         """The state s, `[S]` float64 in [0, 1] (a copy)."""
-        return self._lane[LANE_STATE:].copy()
+        return self._numbers[BUFFER_STATE:][: self.document.state_dim].copy()
 
     @property
     def distractors(self) -> Array:
@@ -127,36 +126,35 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
 
     def _put_in_force(self, segment: int) -> None:
         """Run the task of a segment; the episode, if one is running, goes on by `_load_engine`."""
-        self._segment, self._task = segment, self._schedule.tasks[segment]
+        self._segment = segment
         self._phase: Any = self._schedule.phases[segment]  # NumPy's number
-        self._phase_shown = self._schedule.shown(self._phase)
+        self._one_hot = self._schedule.one_hot(self._phase)
         self._load_engine()
 
     def _load_engine(self) -> None:
-        self._engine = engine(self._task)
-        self._buffer, self._lane, more = self._engine.new_buffer()  # both are views of the first
-        if self.sme_spec.distractors:
-            own = more[MORE_OWN:, None]
-            own[:] = self._distractors.own
-            self._distractors.own = own
+        self._engine = engine(self.task)
+        self._buffer, self._numbers = self._engine.new_buffer()  # a view of the buffer
+        own = self._numbers[BUFFER_STATE + self.document.state_dim :, None]
+        own[:] = self._distractors.own
+        self._distractors.own = own
         # Views of no dimension: `view[()]` makes a NumPy number in a third of `np.float64`'s time.
-        self._values = tuple(self._lane[LANE_VALUES + row, ...] for row in infos.NUMBERS.values())
-        if self.sme_spec.safety is not None:
-            self._cost, self._safe_regret = more[MORE_COST, ...], more[MORE_SAFE_REGRET, ...]
+        rows = self._schedule.columns.numbers.items()
+        values = [(key, self._numbers[BUFFER_VALUES + row, ...]) for key, row in rows]
+        self._values, self._more_values = values[:4], values[4:]
         self._rows: list[tuple[Array, Observation]] = []
-        self._step: Callable[[Any, Any], _Result] = _refuse_step
-        if self._state == "running":
+        self._step: Callable[[Any, Any], _Result] = _check_running
+        if self._status == "running":
             self._step = self._fast_step()
 
     # Machine code cannot be pickled or copied: the copy looks it up again.
     def __getstate__(self) -> dict[str, Any]:
-        dropped = {"_engine", "_buffer", "_values", "_cost", "_safe_regret", "_rows", "_step"}
+        dropped = {"_engine", "_buffer", "_values", "_more_values", "_rows", "_step"}
         return {name: value for name, value in vars(self).items() if name not in dropped}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._load_engine()
-        self._lane[:] = state["_lane"]
+        self._numbers[:] = state["_numbers"]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -178,7 +176,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
           OptionError: an unknown option, or a seed that is no integer of at least 0.
           WrapperError: an outer TimeLimit would end the episode before the horizon.
         """
-        check_outer_time_limit(self.document.horizon)
+        arguments.check_outer_time_limit(self.document.horizon)
         arguments.check_options(options, self._schedule.reset_options)
         S, seed = self.document.state_dim, arguments.checked_seed(seed)
         lifetime = arguments.lifetime_in(options)
@@ -189,26 +187,24 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         super().reset(seed=seed)  # nothing changes before every argument is checked
         life = self._live(0 if lifetime is None and seed is not None else lifetime)
         s = self.np_random.random(S) if start is None else start
-        self._lane[:LANE_STATE] = 0.0
-        self._lane[LANE_STATE:] = s
+        self._numbers[:BUFFER_STATE] = 0.0
+        self._numbers[BUFFER_STATE : BUFFER_STATE + S] = s
         seen = self._begin_seeing(s, distractors)
         observation = np.zeros(self.document.observation_dim, np.float32)
-        observation[: len(seen)], observation[len(seen) + 2 :] = seen, self._phase_shown
-        self._state = "running"
+        observation[: len(seen)], observation[len(seen) + 2 :] = seen, self._one_hot
+        self._status = "running"
         self._step = self._fast_step()
         if self.render_mode is not None:
             self._record(self, None)
-        return observation, {**infos.at_reset(self.sme_spec), **life}
+        return observation, {**self._schedule.columns.at_reset(self._action_shape[0]), **life}
 
     def _begin_seeing(self, s: Array, distractors: Array | None) -> npt.NDArray[Any]:
         """Begin an episode of the distractors; what the agent sees of the state, `[S + m]`."""
-        if self.sme_spec.observation is None:
-            return s
         if self._keyed_by is not self.np_random:
             self._distractors.seed(0, self._distractors_seed())
             self._keyed_by = self.np_random
         self._distractors.begin(_ONLY, None if distractors is None else distractors[None])
-        return self._engine.seen(self._distractors.beside(s[None], _ONLY))[:, 0]
+        return self._engine.seen(self._distractors.beside(s[:, None], _ONLY))[:, 0]
 
     def _distractors_seed(self) -> int:
         """The seed of the generator, or a number that follows from one that the user has set.
@@ -220,33 +216,29 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         return seed if seed >= 0 else int(copy.deepcopy(self.np_random).integers(2**63))
 
     def _live(self, lifetime: int | None) -> dict[str, Any]:
-        """Begin a life of a stream after so many steps; None continues the present one.
-
-        Each reset calls it before it draws a state. What it returns is added to the info.
-        """
-        if self._lifetimes is None:
+        """Begin a life of a stream after so many steps, None goes on; what infos say of it."""
+        if not self._schedule.is_stream:
             return {}
         if lifetime is None:
             lifetime = int(self._lifetimes[-1]) - 1
         else:
             self._look_ahead(lifetime)
         self._enter(self._schedule.segment(lifetime))
-        return infos.of_life(self._phase, np.int64(lifetime))
+        return self._schedule.life(self._phase, np.int64(lifetime))
 
     def _look_ahead(self, lifetime: int) -> None:
         """Fill the lifetimes of the next steps: those until a switch, or the next few."""
-        if self._lifetimes is not None:
-            stop = lifetime + _AHEAD
-            if self._schedule.switches_within:
-                stop = min(stop, self._schedule.next_switch(lifetime))
-            self._lifetimes[:] = np.arange(stop, lifetime, -1)
+        stop = lifetime + _AHEAD
+        if self._schedule.switches_within:
+            stop = min(stop, self._schedule.next_switch(lifetime))
+        self._lifetimes[:] = np.arange(stop, lifetime, -1)
 
     def _enter(self, segment: int) -> None:
         """Put another segment in force; the episode, if one is running, goes on."""
         if segment != self._segment:
-            lane = self._lane
+            numbers = self._numbers
             self._put_in_force(segment)
-            self._lane[:] = lane
+            self._numbers[:] = numbers
 
     def step(self, action: Action) -> _Result:
         """One step.
@@ -269,12 +261,14 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         Written for speed: each look-up of an attribute and each branch costs a percent of a step.
         It takes the environment as an argument, as a closure over it would be a circle.
         """
+        more_to_do = self._rescaled or self.render_mode is not None
         # Actions of this dtype need no checks; none where they are rescaled or frames are drawn.
-        no_checks = None if self._rescaled or self.render_mode is not None else _FLOAT32
+        no_checks = None if more_to_do else _FLOAT32
+        more_to_do |= len(self._parts) > 1
         step_float32, step_float64 = self._engine.step_float32, self._engine.step_float64
         buffer, next_rows = self._buffer, self._rows.pop
-        similarity, step_reward, regret, accumulated_reward = self._values
-        phase, lifetimes = self._phase, self._lifetimes
+        similarity, step_reward, regret, accumulated_reward = (view for _, view in self._values)
+        phase, lifetimes, is_stream = self._phase, self._lifetimes, self._schedule.is_stream
 
         def step(env: SMEEnv, action: Any) -> _Result:
             try:
@@ -292,15 +286,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
                 action = env._checked(action)
                 reward, end = step_float64(buffer, action, optimal, observation)
             info: dict[str, Any]
-            if lifetimes is None:
-                info = {
-                    "optimal_action": optimal,
-                    "similarity": similarity[()],
-                    "step_reward": step_reward[()],
-                    "regret": regret[()],
-                    "accumulated_reward": accumulated_reward[()],
-                }
-            else:  # written out: a dictionary that grows to seven keys costs twice as much
+            if is_stream:  # written out: a dictionary that grows to seven keys costs twice as much
                 info = {
                     "optimal_action": optimal,
                     "similarity": similarity[()],
@@ -310,10 +296,16 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
                     "phase": phase,
                     "lifetime": lifetimes.pop(),
                 }
-                if not lifetimes:
-                    plain = False
-            if end or not plain:
-                end = env._after(end, action, info, observation)
+            else:
+                info = {
+                    "optimal_action": optimal,
+                    "similarity": similarity[()],
+                    "step_reward": step_reward[()],
+                    "regret": regret[()],
+                    "accumulated_reward": accumulated_reward[()],
+                }
+            if end or more_to_do or not lifetimes:
+                env._after(end, action, info, observation)
                 return observation, reward, end == 1.0 or end == 3.0, end >= 2.0, info
             return observation, reward, False, False, info
 
@@ -321,59 +313,43 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
 
     def _refill(self) -> None:
         """Allocate what later steps write, each once. Half the cost of two `np.empty` a step."""
-        width, A = self.document.observation_dim, self._action_shape[0]
-        if self.sme_spec.safety is not None:
-            A *= 3  # the limits and the safe action as well
-        count = max(1, _POOL_BYTES // (8 * max(width, A)))
-        optimal = np.empty((count, A))
+        width = self.document.observation_dim
+        numbers = self._action_shape[0] * len(self._parts)
+        count = max(1, _POOL_BYTES // (8 * max(width, numbers)))
+        optimal = np.empty((count, numbers))
         observations = np.empty((count, width), np.float32)
-        observations[:, width - len(self._phase_shown) :] = self._phase_shown
+        observations[:, width - len(self._one_hot) :] = self._one_hot
         self._rows.extend(zip(optimal, observations, strict=True))
 
     def _after(
         self, end: float, action: Action, info: dict[str, Any], observation: Observation
-    ) -> float:
-        """What the fast path leaves out: refused actions, switches, safety, the end, frames.
-
-        Returns the end without HAS_MORE.
-        """
+    ) -> None:
+        """What the fast path leaves out: actions not taken, switches, safety, the end, frames."""
         if end < 0.0:
-            if self._lifetimes is not None:
+            if self._schedule.is_stream:
                 self._lifetimes.append(info["lifetime"])  # nothing was lived
             self._checked(action)  # raises where the size is wrong
             raise arguments.not_finite_error()
-        if self._lifetimes is not None and not self._lifetimes:
+        if not self._lifetimes:
             self._go_on(int(info["lifetime"]), observation)
-        if end >= HAS_MORE:
-            end -= HAS_MORE
-            if self.sme_spec.safety is not None:
-                self._add_limits(info)
+        row = arguments.from_unit(info["optimal_action"], self._rescaled)
+        for key, part in self._parts:  # slices: `reshape` takes three times as long
+            info[key] = row[part]
+        for key, view in self._more_values:
+            info[key] = view[()]
         if end:
-            self._state, self._step = "ended", _refuse_step
-        if self._rescaled:
-            for key in infos.actions(self.sme_spec):
-                info[key] = arguments.from_unit(info[key], True)
+            self._status, self._step = "ended", _check_running
         if self.render_mode is not None:
             self._record(self, (arguments.from_unit(action, self._rescaled), info))
-        return end
 
     def _go_on(self, lifetime: int, observation: Observation) -> None:
         """Look further ahead; where a segment ends within an episode, put the next in force."""
         self._look_ahead(lifetime)
         if self._schedule.switches_within:
             self._enter(self._schedule.segment(lifetime))
-            S = self.sme_spec.state_dim
-            waiting = self._lane[LANE_VALUES + ACCUMULATED_REWARD] / self.sme_spec.k
-            observation[S + 1], observation[S + 2 :] = min(waiting, 1.0), self._phase_shown
-
-    def _add_limits(self, info: dict[str, Any]) -> None:
-        """Complete the info of a step, whose "optimal_action" is what the step wrote, `[3A]`."""
-        row, (A,) = info["optimal_action"], self._action_shape
-        info["optimal_action"] = row[:A]  # slices: `reshape` takes three times as long
-        info["cost"] = self._cost[()]
-        info["limit"] = row[A : 2 * A]
-        info["safe_action"] = row[2 * A :]
-        info["safe_regret"] = self._safe_regret[()]
+            S = self.document.state_dim
+            waiting = self._numbers[BUFFER_VALUES + ACCUMULATED_REWARD] / self.sme_spec.k
+            observation[S + 1], observation[S + 2 :] = min(waiting, 1.0), self._one_hot
 
     def _checked(self, action: Any) -> Array:
         """The action as `[A]` float64 in the unit range."""
@@ -381,13 +357,13 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
 
     def _repr_html_(self) -> str:
         """A card for notebooks: spaces, episode and task."""
-        return html_card(self, self.observation_space, self.action_space, status=self._state)
+        return html_card(self, self.observation_space, self.action_space, status=self._status)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({title(self.document)})"
 
 
-def _refuse_step(env: SMEEnv, action: Any) -> _Result:
+def _check_running(env: SMEEnv, action: Any) -> _Result:
     """The step of an environment without a running episode."""
-    phase = "has ended" if env._state == "ended" else "has not begun"
+    phase = "has ended" if env._status == "ended" else "has not begun"
     raise EpisodeError(f"step: the episode {phase}. Call reset() first.")

@@ -27,10 +27,10 @@ import numpy.typing as npt
 from pettingzoo import ParallelEnv
 
 from sme_registry.compiled.arrays import REWARD, ROWS, Array, Indices, Observation
-from sme_registry.envs import arguments, infos
-from sme_registry.envs.base import html_card
-from sme_registry.envs.batch import Batch, BatchStep
-from sme_registry.envs.rendering import RENDER_MODES, RenderMixin
+from sme_registry.envs import arguments
+from sme_registry.envs.batch import Batch
+from sme_registry.envs.rendering import RENDER_MODES, RenderMixin, html_card
+from sme_registry.envs.schedule import Schedule
 from sme_registry.errors import ActionError, EpisodeError, OptionError, did_you_mean
 from sme_registry.spec import ActionRange, SpecLike
 from sme_registry.spec.catalogue import title
@@ -90,17 +90,17 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         **overrides: Any,
     ) -> None:
         self._set_render_mode(render_mode)
-        task = arguments.load_overridden(type(self), spec, overrides)
-        self._task = arguments.without_safety_or_observation(task)
-        self._batch = Batch(self._task, 1, reuse=True)
-        columns = observed_columns(self._task)
+        task = arguments.load_team(type(self), spec, overrides)
+        self._schedule = Schedule.of(task)
+        self._batch = Batch(self._schedule, 1, reuse=True)
+        columns = observed_columns(task)
         self._every_column = np.concatenate(columns)
         ends = np.cumsum([len(part) for part in columns]).tolist()
-        self.possible_agents = list(self._task.names)
+        self.possible_agents = list(task.names)
         parts = [slice(*part) for part in pairwise([0, *ends])]
         self._observed_parts = list(zip(self.possible_agents, parts, strict=True))
         agents = range(len(self.possible_agents))
-        self._parts = list(zip(agents, self.possible_agents, self._task.owned, strict=True))
+        self._parts = list(zip(agents, self.possible_agents, task.owned, strict=True))
         self.agents: list[str] = []
         self._begun = False
 
@@ -122,8 +122,9 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         views = [(name, row[channels]) for _, name, channels in self._parts]
         self._slots = [(name, view.shape, view) for name, view in views]
         self._values = np.zeros((ROWS, len(self._parts), 1))
+        rows = self._schedule.columns.numbers.values()
         self._numbers: list[tuple[Any, ...]] = [
-            (name, channels, *(self._values[row, agent, 0, ...] for row in infos.NUMBERS.values()))
+            (name, channels, *(self._values[row, agent, 0, ...] for row in rows))
             for agent, name, channels in self._parts
         ]
 
@@ -178,7 +179,7 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         if self.render_mode is not None:
             self._record(self._joint_view(), None)
         return self._by_agent(observation), {
-            name: infos.at_reset(self.sme_spec, len(view)) for name, _, view in self._slots
+            name: self._schedule.columns.at_reset(len(view)) for name, _, view in self._slots
         }
 
     def step(
@@ -213,8 +214,10 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         np.copyto(self._values, result.values)
         if terminated or truncated:
             self.agents = []
-        if self.render_mode is not None:
-            self._record_step(joint, result)
+        if self.render_mode is not None:  # as one agent's: all channels, and means over the agents
+            info = self._batch.info_of(result, 0, self._rescaled)
+            action = arguments.from_unit(joint[0], self._rescaled)
+            self._record(self._joint_view(), (action, info))
         names = self.possible_agents
         return (
             self._by_agent(result.observation),
@@ -300,14 +303,9 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
             state=self.state(), action_space=self._joint_space, sme_spec=self.sme_spec
         )
 
-    def _record_step(self, joint: Array, result: BatchStep) -> None:
-        """Record a step of the team as one: all channels, and the means over the agents."""
-        info = infos.of_all_agents(result, 0, self._rescaled)
-        self._record(self._joint_view(), (arguments.from_unit(joint[0], self._rescaled), info))
-
     def _repr_html_(self) -> str:
         """A card for notebooks: agents, episode and task."""
-        status = "running" if self.agents else "ended" if self._begun else "created"
+        status = "running" if self.agents else "ended" if self._begun else "not begun"
         first = self.possible_agents[0]
         spaces = self._observation_spaces[first], self._action_spaces[first]
         return html_card(self, *spaces, status=status)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -12,14 +12,13 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from sme_registry.compiled.arrays import REWARD, Array, Indices, Mask, Observation
-from sme_registry.envs import arguments, infos
-from sme_registry.envs.base import GymnasiumMixin, check_time_limit, html_card
+from sme_registry.envs import arguments
 from sme_registry.envs.batch import Batch
-from sme_registry.envs.rendering import METADATA, Frame, batch_renderer
-from sme_registry.envs.schedule import Schedule
+from sme_registry.envs.rendering import METADATA, Frame, batch_renderer, html_card
+from sme_registry.envs.schedule import GymnasiumMixin, Schedule
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.io import choice, integer_in
-from sme_registry.spec import ActionRange, SMESpec, SpecLike, StreamLike, StreamSpec
+from sme_registry.spec import ActionRange, SMESpec, SpecLike, StreamLike
 from sme_registry.spec.catalogue import title
 from sme_registry.task import Task
 
@@ -112,9 +111,10 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**METADATA, "autoreset_mode": self.autoreset_mode}
         self.render_mode = render_mode
-        self._batch = Batch(Schedule.load(type(self), spec, overrides), num_envs)
+        self._schedule = Schedule.load(type(self), spec, overrides)
+        self._batch = Batch(self._schedule, num_envs)
         if max_episode_steps is not None:
-            check_time_limit(max_episode_steps, self.document.horizon)
+            arguments.check_time_limit(max_episode_steps, self.document.horizon)
         self.num_envs = num_envs
         A, width = self.document.action_dim, self._batch.observation_dim
         self.single_action_space, self._rescaled = arguments.action_space(action_range, A)
@@ -130,11 +130,6 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         self._views: list[EnvView] = []
 
     @property
-    def document(self) -> SMESpec | StreamSpec:
-        """What the environments run: their spec, or a stream."""
-        return self._batch.document
-
-    @property
     def task(self) -> Task:
         """The task in force; EpisodeError where it is not the same in every environment."""
         task = self._batch.one_task
@@ -144,11 +139,6 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
                 "each one, get_attr('task')."
             )
         return task
-
-    @property
-    def sme_spec(self) -> SMESpec:
-        """The spec of the task in force; as `task`."""
-        return self.task.spec
 
     @property
     def state(self) -> Array:
@@ -180,7 +170,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         Raises:
           StateError, OptionError: as `SMEEnv.reset`.
         """
-        known = (*self._batch.schedule.reset_options, "reset_mask")
+        known = (*self._schedule.reset_options, "reset_mask")
         arguments.check_options(options, known)
         options = options or {}
         lifetime = arguments.lifetime_in(options)
@@ -206,8 +196,8 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         self._all_begun, self._any_ended = bool(self._begun.all()), bool(self._ended.any())
         if self._renderer is not None:
             self._renderer.record(envs.tolist())
-        info = infos.batch_at_reset(self._batch.task.spec, self.num_envs)
-        return observation, infos.masked({**info, **self._batch.life()}, mask)
+        info = self._schedule.columns.at_resets(self.num_envs, self.document.action_dim)
+        return observation, _masked({**info, **self._batch.life()}, mask)
 
     def step(  # type: ignore[override]  # Gymnasium types all three arrays alike; ends are bool
         self, actions: Any
@@ -241,7 +231,9 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         result = self._batch.advance(unit_actions, resting)
         observation, reward = result.observation, result.values[REWARD, 0]
         terminated, truncated = result.terminated, result.truncated
-        info = {**infos.of_batch(result, self._rescaled), **self._batch.lived}
+        columns = self._schedule.columns
+        info = columns.at_step(result.actions, result.values[:, 0], self._rescaled)
+        info |= self._batch.lived
         began = _NONE
         if any_ended_before:
             began = np.flatnonzero(ended_before)
@@ -250,7 +242,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
             self._begin(began, observation, info)
         ended: Mask = terminated | truncated
         any_ended = int(np.count_nonzero(ended)) > 0  # a tenth of the time of any()
-        returned = infos.masked(info)
+        returned = _masked(info)
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
             self._ended, self._any_ended = ended, any_ended
         elif any_ended:
@@ -278,7 +270,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         return {
             "final_obs": final,
             "_final_obs": ended.copy(),
-            "final_info": infos.masked(info, ended),
+            "final_info": _masked(info, ended),
             "_final_info": ended.copy(),
         }
 
@@ -328,7 +320,9 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         """Put environments at the start of an episode; write their observations and infos."""
         self._batch.begin(envs, observation)
         self._ended[envs] = False
-        infos.write_reset(info, envs, self._batch.life())
+        life = self._batch.life()
+        for key, value in info.items():
+            value[envs] = life[key][envs] if key in life else np.nan
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> npt.NDArray[Any]:
         """One seed or None for each environment, `[B]`."""
@@ -354,3 +348,20 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         if not mask.any():
             raise OptionError("reset_mask: must be True for at least one environment.")
         return mask
+
+
+def _masked(info: Mapping[str, npt.NDArray[Any]], mask: Mask | None = None) -> dict[str, Any]:
+    """Gymnasium's form of batched info: each key with its mask `_key`; None is all.
+
+    Copies arrays only where there is a mask, and writes 0 where it is False.
+    """
+    infos: dict[str, Any] = {}
+    if mask is None:
+        everywhere = np.ones(len(info["similarity"]), bool)
+        for key, value in info.items():
+            infos[key], infos[f"_{key}"] = value, everywhere
+        return infos
+    for key, value in info.items():
+        columns = mask.reshape(-1, *[1] * (value.ndim - 1))
+        infos[key], infos[f"_{key}"] = np.where(columns, value, value.dtype.type(0)), mask.copy()
+    return infos

@@ -16,12 +16,11 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from sme_registry.compiled.arrays import REWARD, Array, Mask, Observation
-from sme_registry.envs import SMEEnv, arguments, infos
-from sme_registry.envs.base import html_card, renamed_by_content
+from sme_registry.envs import SMEEnv, arguments
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.episodes import Episode, Episodes, info_of_lanes
-from sme_registry.envs.rendering import METADATA, Frame, batch_renderer
-from sme_registry.envs.schedule import Schedule
+from sme_registry.envs.rendering import METADATA, Frame, batch_renderer, html_card
+from sme_registry.envs.schedule import Schedule, renamed_by_content
 from sme_registry.envs.team import shared_action_dim, shared_observation, shared_observation_dim
 from sme_registry.envs.vector import EnvView
 from sme_registry.errors import EpisodeError, OptionError
@@ -181,7 +180,8 @@ class _BatchVecEnv(LanesVecEnv):
     def _info_at_reset(self, lane: int) -> dict[str, Any]:
         owned = self._owned[lane % len(self.agents)]
         life = self._batch.life_of(lane // len(self.agents))
-        return {**infos.at_reset(self._task.spec, owned.stop - owned.start), **life}
+        columns = self._batch.schedule.columns
+        return {**columns.at_reset(owned.stop - owned.start), **life}
 
     def seed(self, seed: int | None = None) -> list[int | None]:
         """Seed team e with seed + e at the next reset; None draws a seed."""
@@ -240,12 +240,14 @@ class _BatchVecEnv(LanesVecEnv):
         done = self._batch.advance(joint)
 
         values = done.values.swapaxes(1, 2).reshape(len(done.values), -1)
-        optimal = arguments.from_unit(done.optimal, self._rescaled)
-        limits = arguments.from_unit(done.limits, self._rescaled) if done.limits.size else ()
+        of_step = self._batch.schedule.columns
+        in_range = arguments.from_unit(done.actions, self._rescaled)
         columns: dict[str, list[Any]] = {
-            "optimal_action": [row[part] for row in optimal for part in self._owned],
-            **{key: list(rows) for key, rows in zip(infos.SAFETY_ACTIONS, limits, strict=False)},
-            **{key: list(values[row]) for key, row in infos.numbers(self._task.spec).items()},
+            **{
+                key: [row[part] for row in rows for part in self._owned]
+                for key, rows in zip(of_step.actions, in_range, strict=True)
+            },
+            **{key: list(values[row]) for key, row in of_step.numbers.items()},
             **{key: list(values) for key, values in self._batch.lived.items()},
             "TimeLimit.truncated": np.repeat(done.truncated & ~done.terminated, n).tolist(),
         }
@@ -338,8 +340,7 @@ class SMETeamVecEnv(_BatchVecEnv):
         render_lanes: Sequence[int] | None = None,
         **overrides: Any,
     ) -> None:
-        task = arguments.load_overridden(type(self), spec_or_id, overrides)
-        arguments.without_safety_or_observation(task)
+        task = arguments.load_team(type(self), spec_or_id, overrides)
         # For each channel of the joint action: the agent that owns it, and the entry of its action.
         self._owner = np.repeat(np.arange(len(task.owned)), [o.stop - o.start for o in task.owned])
         self._entry = np.concatenate([np.arange(part.stop - part.start) for part in task.owned])

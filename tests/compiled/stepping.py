@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sme_registry.compiled.arrays import LANE_STATE, LANE_VALUES, REWARD
+from sme_registry.compiled.arrays import BUFFER_STATE, BUFFER_VALUES, REWARD, ROWS
 
 
 @dataclass
@@ -31,8 +31,8 @@ class Lane:
 
     def __init__(self, task, engine, state, t=0, r_cum=0.0):
         self.task, self.engine = task, engine
-        self.buffer, self.numbers, _ = engine.new_buffer()
-        self.numbers[LANE_STATE:] = state
+        self.buffer, self.numbers = engine.new_buffer()
+        self.numbers[BUFFER_STATE : BUFFER_STATE + len(state)] = state
 
     def step(self, action):
         """One step with a float32 or float64 action; None where it was refused."""
@@ -42,8 +42,8 @@ class Lane:
         reward, end = entry(self.buffer, action, optimal, observation)
         if end < 0:
             return None
-        state = self.numbers[LANE_STATE:].copy()
-        values = self.numbers[LANE_VALUES:LANE_STATE].tolist()
+        state = self.numbers[BUFFER_STATE : BUFFER_STATE + S].copy()
+        values = self.numbers[BUFFER_VALUES : BUFFER_VALUES + ROWS].tolist()
         assert values[REWARD] == reward
         return Result(state, observation, optimal, *values, end in (1.0, 3.0), end >= 2.0)
 
@@ -54,12 +54,12 @@ def step_batch(task, engine, states, t, r_cum, actions):
     moved, observation, optimal = (
         np.empty((S, B)),
         np.empty((B, S + 1 + n), np.float32),
-        np.empty((B, A)),
+        np.empty((1, B, A)),
     )
-    values, ends = np.empty((5, n, B)), np.empty((2, B), bool)
+    own, values, ends = np.zeros((2, B)), np.empty((5, n, B)), np.empty((2, B), bool)
     if not engine.step_many(
-        np.ascontiguousarray(states.T), t.copy(), r_cum.T.copy(),
+        np.ascontiguousarray(states.T), t.copy(), r_cum.T.copy(), own,
         actions, moved, observation, optimal, values, ends,
     ):  # fmt: skip
         return None
-    return Result(moved.T, observation, optimal, *values.transpose(0, 2, 1), *ends)
+    return Result(moved.T, observation, optimal[0], *values.transpose(0, 2, 1), *ends)

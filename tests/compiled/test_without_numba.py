@@ -10,7 +10,7 @@ import threading
 
 import pytest
 
-from sme_registry.compiled import notice
+from sme_registry.compiled.engine import compiling
 
 EPISODE = """
     import gymnasium, numpy as np, sme_registry
@@ -104,8 +104,8 @@ class Terminal(io.StringIO):
 def test_a_terminal_is_told_while_it_waits(monkeypatch):
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
-    monkeypatch.setattr(notice, "_PATIENCE", 0.0)
-    with notice.compiling():
+    monkeypatch.setattr(sys.modules[compiling.__module__], "_PATIENCE", 0.0)
+    with compiling():
         assert terminal.written.wait(60)
     assert "Numba" in terminal.getvalue()
     assert terminal.getvalue().count("\n") == 1
@@ -115,9 +115,9 @@ def test_a_log_and_a_terminal_that_does_not_wait_are_told_nothing(monkeypatch):
     for stream, patience in ((Terminal(), 3600.0), (io.StringIO(), 0.0)):
         monkeypatch.setattr(sys, "stderr", stream)
         monkeypatch.delitem(sys.modules, "ipykernel", raising=False)
-        monkeypatch.setattr(notice, "_PATIENCE", patience)
+        monkeypatch.setattr(sys.modules[compiling.__module__], "_PATIENCE", patience)
         timers = set(threading.enumerate())
-        with notice.compiling():
+        with compiling():
             timers = set(threading.enumerate()) - timers
             assert bool(timers) == (patience > 0.0)
         for timer in timers:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sme_registry import SMESpec
-from sme_registry.compiled.arrays import ACCUMULATED_REWARD, LANE_VALUES
+from sme_registry.compiled.arrays import ACCUMULATED_REWARD, BUFFER_VALUES
 from sme_registry.envs import SMEEnv, SMEVectorEnv
 from sme_registry.envs.team import SMETeamEnv
 from sme_registry.testing import ConformanceError, check_env, check_team
@@ -58,7 +58,7 @@ class Forgets(SMEEnv):
 
     def __setstate__(self, state):
         super().__setstate__(state)
-        self._lane[LANE_VALUES + ACCUMULATED_REWARD] = 0.0
+        self._numbers[BUFFER_VALUES + ACCUMULATED_REWARD] = 0.0
 
 
 class MislaysLast(SMEVectorEnv):

@@ -79,7 +79,7 @@ def test_a_batch_of_any_size_is_its_singles(name, backend):
         action = actions_of(batch, rng)
         observation, *_, infos = batch.step(action)
         for lane, env in zip(checked, singles, strict=True):
-            if env._state != "running":
+            if env._status != "running":
                 continue
             seen, *_, info = env.step(action[lane])
             np.testing.assert_array_equal(observation[lane], seen)
