@@ -240,7 +240,7 @@ def show(
     if digests:
         if json or not isinstance(document, SuiteFile):
             raise OptionError("--digests: applies to suites, and not with --json. Leave one out.")
-        tasks = (*document.suite.instances, *document.suite.stream_instances)
+        tasks = document.suite.documents
         out().print("\n".join(each.digest for each in tasks), soft_wrap=True)
     else:
         _show_document(name, document, json)
@@ -355,7 +355,7 @@ def _show_suite(file: SuiteFile, json: bool) -> None:
     shown = [table for table in tables if table.rows]
     shown[0].title, shown[-1].caption = _title(file), file.digest
     print_tables(shown)
-    digests = [each.digest for each in (*suite.instances, *suite.stream_instances)]
+    digests = [each.digest for each in suite.documents]
     kind = "task" if suite.classes else "stream"
     if known(SMESpec).keys() | known(StreamSpec).keys() >= set(digests):
         out().print(f"To train on a {kind}: sme train {digests[0][: cards.SHORT]}", soft_wrap=True)

@@ -298,7 +298,7 @@ def _check(path: Path) -> dict[str, Any]:
         if isinstance(file, EnvFile | StreamFile):
             materialize_segments(*file.published)
         elif isinstance(file, SuiteFile):
-            _ = file.suite.instances, file.suite.stream_instances
+            _ = file.suite.documents
         elif isinstance(file, StudyFile):
             _ = file.plan.cells
         result["valid"] = True

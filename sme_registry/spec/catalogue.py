@@ -74,9 +74,10 @@ class Envelope(StrictModel):
       digest: of the document alone; a file with another one is refused.
     """
 
-    # The field that holds the document, and what the document is called.
+    # The field that holds the document, and the folder of the kind in the catalogue.
     content: ClassVar[str]
-    # How to write a changed document, or a bare one, as a file; `{source}` is its path.
+    folder: ClassVar[str]
+    # How to write a changed or a bare document as a file, `{source}`.
     remedy: ClassVar[str] = (
         "write the changed {content} as a new file, in Python "
         "`sme_registry.spec.{kind}(name=…, digest={content}.digest, {content}={content})"
@@ -130,6 +131,7 @@ class EnvFile(Envelope):
     """
 
     content = "spec"
+    folder = "envs"
     remedy = "save the changed spec as a new file, in Python `sme_registry.save(spec, path)`"
 
     spec: SMESpec
@@ -150,6 +152,7 @@ class StreamFile(Envelope):
     """
 
     content = "stream"
+    folder = "streams"
     remedy = "save the changed stream as a new file, in Python `sme_registry.save(stream, path)`"
 
     stream: StreamSpec
@@ -178,6 +181,7 @@ class SuiteFile(Envelope):
     """
 
     content = "suite"
+    folder = "suites"
 
     suite: Suite
 
@@ -190,6 +194,7 @@ class StudyFile(Envelope):
     """
 
     content = "plan"
+    folder = "studies"
     remedy = "write the changed plan as a new file: `sme study new NEW.json --from {source}`"
 
     plan: StudyPlan
@@ -211,6 +216,7 @@ class ProtocolFile(Envelope):
     """
 
     content = "protocol"
+    folder = "protocols"
 
     protocol: EvaluationProtocol
 
@@ -239,30 +245,23 @@ STREAM = "Stream"
 """May begin the name of a stream in an id: `SME/StreamSwitch5-v1` is `SME/Switch5-v1`."""
 
 _E = TypeVar("_E", bound=Envelope)
-_FOLDERS: dict[type[Envelope], str] = {
-    EnvFile: "envs",
-    StreamFile: "streams",
-    SuiteFile: "suites",
-    ProtocolFile: "protocols",
-    StudyFile: "studies",
-}
+_FILES: dict[type[NamedDocument], Any] = {SMESpec: EnvFile, StreamSpec: StreamFile}
 _VERSION = re.compile(r"-v(\d+)$")
 
 
 def spec_folder() -> Path:
     """The folder of the catalogue: inside the installed package, or next to it in a checkout."""
-    package = Path(__file__).resolve().parents[1]
-    installed = package / "specs"
-    return installed if installed.is_dir() else package.parent / "specs"
+    installed = Path(__file__).resolve().parents[1] / "specs"
+    return installed if installed.is_dir() else installed.parents[1] / "specs"
 
 
 def paths(kind: type[Envelope]) -> list[Path]:
     """The catalogue's files of one kind, in natural order (`StateDim4` before `StateDim16`)."""
+    return sorted((spec_folder() / kind.folder).glob("*.json"), key=_natural)
 
-    def natural(path: Path) -> list[Any]:
-        return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.stem)]
 
-    return sorted((spec_folder() / _FOLDERS[kind]).glob("*.json"), key=natural)
+def _natural(path: Path) -> list[Any]:
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.stem)]
 
 
 def names(kind: type[Envelope]) -> list[str]:
@@ -295,7 +294,7 @@ def entries(kind: type[_E]) -> list[_E]:
 def find(kind: type[_E], name: str, others: Iterable[str] = ()) -> _E:
     """The file of a name, with or without its version (then the newest)."""
     if newest := _newest(kind, name):
-        return cast(_E, _read(kind, spec_folder() / _FOLDERS[kind] / f"{newest}.json"))
+        return cast(_E, _read(kind, spec_folder() / kind.folder / f"{newest}.json"))
     known = [*names(kind), *others]
     short = [_VERSION.sub("", full) for full in known]
     raise UnknownNameError(
@@ -313,9 +312,10 @@ def _newest(kind: type[Envelope], name: str) -> str:
 
 def unique_name(document: SMESpec | StreamSpec) -> str:
     """The name of a task or a stream in the catalogue (`Default-v1`), else its name by content."""
-    kind = StreamFile if isinstance(document, StreamSpec) else EnvFile
-    released = {file.digest: file.versioned_name for file in entries(kind)}
-    return released.get(document.digest, document.content_name)
+    for file in entries(_FILES[type(document)]):
+        if file.digest == document.digest:
+            return cast(str, file.versioned_name)
+    return document.content_name
 
 
 def title(document: SMESpec | StreamSpec) -> str:
@@ -359,7 +359,6 @@ def released() -> Iterator[tuple[str, str, str]]:
 
 _HEX_DIGITS = 12  # fewest digits that name a document
 _D = TypeVar("_D", bound=NamedDocument)
-_FILES: dict[type[NamedDocument], Any] = {SMESpec: EnvFile, StreamSpec: StreamFile}
 
 registered: dict[str, SMESpec | StreamSpec] = {}
 """What is registered in this process, by id; see `registration.register`."""
@@ -392,9 +391,8 @@ def resolve(name: Any, kind: Any = None) -> Any:
         return Resolved(as_document(name, kind))
     if isinstance(name, os.PathLike) or is_path(name):
         data = read_json(name)
-        is_stream = isinstance(data, dict) and StreamFile.content in data
-        in_file = StreamFile if kind is StreamSpec or is_stream else EnvFile
-        file: Any = in_file.from_dict(data, str(name))
+        is_stream = kind is StreamSpec or (isinstance(data, dict) and StreamFile.content in data)
+        file: Any = (StreamFile if is_stream else EnvFile).from_dict(data, str(name))
         document, fingerprints = file.published
         resolved = Resolved(document.named(file.name), fingerprints)
     else:
@@ -446,23 +444,17 @@ def as_document(value: Any, kind: Any = None) -> Any:
 
 def known(kind: type[NamedDocument]) -> dict[str, Resolved[Any]]:
     """Digest → document: of the catalogue, registered here, and of the suites' instances."""
-    documents = {file.digest: file.published for file in entries(_FILES[kind])}
-    for document in registered.values():
-        if isinstance(document, kind):
-            documents.setdefault(document.digest, Resolved(document))
-    return _instances(kind) | documents
+    published = {file.digest: file.published for file in entries(_FILES[kind])}
+    others = [*registered.values(), *_instances()]
+    return {
+        document.digest: Resolved(document) for document in others if isinstance(document, kind)
+    } | published
 
 
 @functools.cache
-def _instances(kind: type[NamedDocument]) -> dict[str, Resolved[Any]]:
-    """Of the catalogue's suites, by digest."""
-    suites = [file.suite for file in entries(SuiteFile)]
-    documents = (
-        document
-        for suite in suites
-        for document in (suite.instances if kind is SMESpec else suite.stream_instances)
-    )
-    return {document.digest: Resolved(document) for document in documents}
+def _instances() -> list[SMESpec | StreamSpec]:
+    """Of the catalogue's suites."""
+    return [document for file in entries(SuiteFile) for document in file.suite.documents]
 
 
 def is_path(name: str) -> bool:

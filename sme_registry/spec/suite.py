@@ -130,6 +130,11 @@ class Suite(Document):
         return tuple(stream for member in self.streams for stream in member.instances)
 
     @property
+    def documents(self) -> tuple[SMESpec | StreamSpec, ...]:
+        """Every spec of the suite, and then every stream."""
+        return (*self.instances, *self.stream_instances)
+
+    @property
     def runs(self) -> dict[str, int]:
         """Class → number of its instances, of tasks and of streams."""
         tasks = {member.name: len(member.seeds) for member in self.classes}
