@@ -38,7 +38,6 @@ class Interface(NamedTuple):
     observation_dim: int
     action_dim: int
     description: str  # what has these widths, such as "state_dim=3, action_dim=2"
-    alternatives: str = ""  # other forms that are allowed, for the error message
     hint: str = ""  # see `Policy`
 
     def check(self, policy: str, **shapes: tuple[int, ...] | None) -> None:

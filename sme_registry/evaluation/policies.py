@@ -256,7 +256,6 @@ def interface_of(spec: SMESpec, observed_phases: int = 0) -> Interface:
         observation_dim,
         action_dim,
         f"a policy that all {len(agents)} agents share",
-        alternatives="a dict from each agent's name to its policy; or for all agents ",
         hint=f"A policy that a team shares is called for each agent in turn, from its shared "
         f"observation [B, {observation_dim}] to [B, {action_dim}]; for separate policies pass a "
         "dict by agent.",
@@ -330,10 +329,10 @@ def _prepare(
         functions = ModelFunctions(policy)
     else:
         raise PolicyError(
-            f"policy={policy!r:.80}: must be {interface.alternatives}a callable from observations "
+            f"policy={policy!r:.80}: must be a callable from observations "
             f"[B, {interface.observation_dim}] to actions [B, {interface.action_dim}], a "
             "torch.nn.Module, a Stable-Baselines3 model, the path of a .zip, .onnx or .npz file, "
-            "module:function, or the name of a reference policy."
+            f"module:function, or the name of a reference policy. {interface.hint}".rstrip()
         )
     return Policy(
         name=name or _name_of(policy),

@@ -220,22 +220,19 @@ class StreamRegion(StrictModel):
 def stream_regions(
     protocol: EvaluationProtocol,
     agent: Array,
-    initial: Array,
-    fresh: Array,
+    initial: Array | None,
     references: Mapping[str, Array],
-) -> tuple[tuple[StreamRegion, ...], StreamRegion]:
-    """The regions of a report, and the mean over the shells.
+) -> list[StreamRegion]:
+    """The regions of a report, then the mean over the shells, without fresh agents.
 
-    `agent` is `[V, P, K]` normalised regret, as are `references`; `initial` and `fresh` are
-    `[P, K]`, NaN where there is no such policy.
+    `agent` is `[V, P, K]` normalised regret, as are `references`, and `initial` `[P, K]`.
     """
     edges, n = protocol.edges, protocol.states_per_region
     names = [(region_name(k), *edge, n) for k, edge in enumerate(edges)]
     names.append(("OOD", edges[1][0], edges[-1][1], n * (len(edges) - 1)))
-    of_agent = _retentions(agent, initial, fresh)
-    unknown = np.full_like(initial, np.nan)
-    of_references = {name: _retentions(M, unknown, unknown) for name, M in references.items()}
-    regions = [
+    of_agent = _retentions(agent, initial)
+    of_references = {name: _retentions(M) for name, M in references.items()}
+    return [
         StreamRegion(
             name=name,
             epsilon_low=low,
@@ -246,37 +243,31 @@ def stream_regions(
         )
         for k, (name, low, high, count) in enumerate(names)
     ]
-    return tuple(regions[:-1]), regions[-1]
 
 
-def _retentions(M: Array, initial: Array, fresh: Array) -> list[Retention]:
+def _retentions(M: Array, initial: Array | None = None) -> list[Retention]:
     """The matrix and the metrics in each region, then of the mean over the shells."""
-    M, before, alone = map(with_shells, (M, initial, fresh))
+    unknown = np.full(M.shape[1:], np.nan)
+    M, before = with_shells(M), with_shells(unknown if initial is None else initial)
     R = 1.0 - M
-    ratio, difference = plasticity(M, alone)
     computed = {
         "average_performance": average_performance(R),
         "backward_transfer": backward_transfer(R),
         "forgetting": forgetting(R),
         "forward_transfer": forward_transfer(R, 1.0 - before),
         "relearning": relearning(R),
-        "plasticity_ratio": ratio,
-        "plasticity_difference": difference,
     }
+    nothing = (None,) * len(M)
     return [
         Retention(
             normalised_regret=tuple(map(tuple, M[..., k].tolist())),
-            initial_normalised_regret=_complete(before[:, k]),
-            fresh_normalised_regret=_complete(alone[:, k]),
+            initial_normalised_regret=None if initial is None else tuple(before[:, k].tolist()),
             **{name: _known(values[..., k]) for name, values in computed.items()},
+            plasticity_ratio=nothing,
+            plasticity_difference=nothing,
         )
         for k in range(M.shape[-1])
     ]
-
-
-def _complete(row: Array) -> tuple[float, ...] | None:
-    """A row of known numbers; None for one of NaN."""
-    return None if np.isnan(row).any() else tuple(row.tolist())
 
 
 def with_shells(values: Array) -> Array:

@@ -146,13 +146,7 @@ class StreamReport(ReportFile):
         `online_regret`, the mean regret over the training of each of them, adds the learning
         transfer of the visits.
         """
-        *regions, ood = (
-            region.model_copy(update={"agent": region.agent.with_fresh(alone)})
-            for region, alone in zip(
-                (*self.regions, self.ood), self._fresh_regrets(fresh).T, strict=True
-            )
-        )
-        report = self.model_copy(update={"regions": tuple(regions), "ood": ood})
+        report = self._with_plasticity(self._fresh_regrets(fresh))
         if online_regret is None:
             return report
         if self.dynamic_regret is None:
@@ -164,8 +158,16 @@ class StreamReport(ReportFile):
         life = expected_regret([*online_regret] * self.stream.cycles, self.stream)
         return report.with_dynamic_regret(regret).with_reference_regret({"fresh_agents": life})
 
+    def _with_plasticity(self, fresh: Array) -> Self:
+        """This report with the plasticity against fresh agents of regret `[P, K]`."""
+        *regions, ood = (
+            region.model_copy(update={"agent": region.agent.with_fresh(alone)})
+            for region, alone in zip((*self.regions, self.ood), with_shells(fresh).T, strict=True)
+        )
+        return self.model_copy(update={"regions": tuple(regions), "ood": ood})
+
     def _fresh_regrets(self, fresh: Sequence[EvaluationReport | StreamReport]) -> Array:
-        """`[P, K + 1]` regret of fresh agents on their phases, with the mean over the shells."""
+        """`[P, K]` regret of fresh agents on their phases."""
         tasks = [visit.spec_digest for visit in self.visits[: len(self.stream.phases)]]
         kinds = EvaluationReport | StreamReport
         are_reports = isinstance(fresh, Sequence) and all(isinstance(one, kinds) for one in fresh)
@@ -188,7 +190,7 @@ class StreamReport(ReportFile):
                     "agent that was trained on that phase alone."
                 )
             rows.append(row)
-        return with_shells(np.array(rows))
+        return np.array(rows)
 
     def __repr__(self) -> str:
         final = self.regions[0].agent.average_performance[-1]
@@ -338,12 +340,10 @@ def evaluate_stream(
     alone = [add(policy, f"fresh[{j}]", [j]) for j, policy in enumerate(fresh or ())]
 
     regrets, optima, oracle = stream_regrets(stream, actors, protocol, progress)
-    unknown = np.full(regrets.shape[1:], np.nan)
-    regions, ood = stream_regions(
+    *regions, ood = stream_regions(
         protocol,
         regrets[life],
-        unknown if before is None else regrets[before],
-        regrets[alone, range(P)] if alone else unknown,
+        None if before is None else regrets[before],
         {
             "frozen_optimum": np.repeat(optima[:1], V, axis=0),
             "fresh_optimum": optima[np.arange(V) % P],
@@ -352,7 +352,7 @@ def evaluate_stream(
     )
     names, last = {actors[row].policy.name for row in life}, actors[life[-1]].policy
     digests = [spec.digest for spec in final_specs(stream)]
-    return StreamReport(
+    report = StreamReport(
         policy=name or (last.name if len(names) == 1 else f"{V} policies"),
         action_range=last.action_range,
         stream=stream,
@@ -364,10 +364,11 @@ def evaluate_stream(
             Visit(visit=v, cycle=v // P, phase=v % P, lifetime=end, spec_digest=digests[v % P])
             for v, end in stream.visit_ends()
         ),
-        regions=regions,
+        regions=tuple(regions),
         ood=ood,
         versions=versions_behind(oracle),
     )
+    return report._with_plasticity(regrets[alone, range(P)]) if alone else report
 
 
 def frozen_after_first(stream: StreamSpec, policies: Sequence[_Any]) -> list[_Any]:
