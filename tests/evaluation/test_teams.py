@@ -250,7 +250,7 @@ def with_(**changed):
         (with_(left_0=lambda o: 1 / 0), r"^left_0: .*ZeroDivisionError"),
         (with_(right_0=None), r"^right_0: policy=None: must be a callable .*\[B, 5\] .*\[B, 3\]"),
         (with_(right_0="absent.zip"), r"^right_0: absent\.zip does not exist"),
-        (None, r"must be a callable .*\[B, 9\] to .*\[B, 3\].*for separate policies pass a dict by"),
+        (None, r"must be a callable .*\[B, 9\] to .*\[B, 3\].*pass a dict by agent"),
         (half(6), r"^left_0: .*\(200, 6\): must be of shape \(200, 3\).*called for each agent"),
         (lambda o: o @ np.ones((6, 6)), r"^left_0: .*ValueError: .* for separate policies pass a"),
         (lambda o: np.where(o[:, 7:8] == 1, np.nan, np.full((len(o), 3), 0.5)), "^right_0: .*NaN"),
