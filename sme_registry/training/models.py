@@ -2,10 +2,13 @@
 
 A function that is named as an algorithm returns a model:
 
-    def make(env: VecEnv, *, seed: int, **hyperparameters) -> Model
+    def make(env: VecEnv, *, seed: int, **hyperparameters) -> model
 
-so anything with `learn` and `predict` can be trained. Agents in JAX have one, too, with the same
-weights: evaluation, export to ONNX, diagnosis and leaderboards take it as any other.
+so anything can be trained that has `learn(total_timesteps)`, which takes at least so many steps,
+and `predict(observation, *, deterministic)`, which returns actions `[B, A]` in the range of
+`env.action_space`, or a tuple that begins with them. Agents in JAX have a model of
+Stable-Baselines3, too, with the same weights: evaluation, export to ONNX, diagnosis and
+leaderboards take it as any other.
 
 A checkpoint is a model's .zip that SB3 can load with one more member, the filled part of the replay
 buffer: with two files, a kill between the writes would pair a model with the wrong buffer.
@@ -22,7 +25,7 @@ import time
 import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -60,16 +63,6 @@ _MEMBER = "sme_replay_buffer.npz"
 _ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
-class Model(Protocol):
-    """What learns, such as a model of Stable-Baselines3."""
-
-    def learn(self, total_timesteps: int) -> Any:
-        """Learn from at least this many steps of the environment."""
-
-    def predict(self, observation: Any, *, deterministic: bool) -> Any:
-        """Actions `[B, A]` in the range of `env.action_space`, or a tuple that begins with them."""
-
-
 def new_model(
     uses: str,
     env: Any,
@@ -78,7 +71,7 @@ def new_model(
     steps: int,
     hyperparameters: Mapping[str, Any],
     field: str = "uses",
-) -> Model:
+) -> Any:
     """Create a model that learns in a `VecEnv`, from so many steps of all its lanes."""
     algorithm = find(uses, field).load(field)
     check_names(algorithm, uses, hyperparameters)
@@ -112,7 +105,7 @@ def new_model(
         )
     if is_sb3(model):
         silence(model)
-    return model  # type: ignore[no-any-return]
+    return model
 
 
 def new_sb3_model(

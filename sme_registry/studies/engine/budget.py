@@ -117,10 +117,12 @@ def makespan(seconds: Sequence[float], workers: int) -> float:
 
 
 class _Reported(NamedTuple):
-    """When a job first reported, what share of its steps it had done then, and has done now."""
+    """When a job reported first and last, and what shares of its steps it had done."""
 
+    cells: Sequence[Cell]
     since: float
     before: float
+    now: float
     share: float
 
 
@@ -132,30 +134,29 @@ class Pace:
     ) -> None:
         self._estimator, self._one_at_a_time = Estimator(finished), one_at_a_time
         self._reported: dict[str, _Reported] = {}  # by a job's first cell
-        self._measured: dict[str, tuple[float, float]] = {}  # a job's seconds, and as estimated
 
     def report(self, cells: Sequence[Cell], share: float) -> None:
         """The cells of a job have done this share of their steps."""
         key, now = cells[0].digest, time.monotonic()
-        first = self._reported.get(key, _Reported(now, share, share))
-        self._reported[key] = first._replace(share=share)
-        done = (share - first.before) * sum(map(self._seconds, cells))
-        self._measured[key] = now - first.since, done
+        first = self._reported.get(key, _Reported(cells, now, share, now, share))
+        self._reported[key] = first._replace(now=now, share=share)
 
     def seconds_left(self, jobs: Iterable[Sequence[Cell]], workers: int) -> float:
         """Seconds to the end of the cells of running jobs and of those that wait."""
-        took, estimated = (sum(values[i] for values in self._measured.values()) for i in (0, 1))
+        jobs_so_far = self._reported.values()
+        took = sum(job.now - job.since for job in jobs_so_far)
+        estimated = sum((job.share - job.before) * self._work(job.cells) for job in jobs_so_far)
         pace = took / estimated if estimated else 1.0
         seconds: dict[bool, list[float]] = {True: [], False: []}  # one at a time; others
         for cells in jobs:
             reported = self._reported.get(cells[0].digest)
             left = 1.0 if reported is None else 1.0 - reported.share
-            rest = pace * left * sum(map(self._seconds, cells))
-            seconds[self._one_at_a_time(cells[0])].append(rest)
+            seconds[self._one_at_a_time(cells[0])].append(pace * left * self._work(cells))
         return max(sum(seconds[True]), makespan(seconds[False], workers))
 
-    def _seconds(self, cell: Cell) -> float:
-        return sum(self._estimator.seconds(cell)) / 2
+    def _work(self, cells: Sequence[Cell]) -> float:
+        """Seconds of cells as estimated, between a fast core and a slow one."""
+        return sum(sum(self._estimator.seconds(cell)) / 2 for cell in cells)
 
 
 def scaled(

@@ -320,11 +320,11 @@ class StudyStatus:
     """The state of a study.
 
     Attributes:
-      places: the selected cells of the plan, in its order; see `study_status`. Those that any run
-        asked for include all that have finished, failed or are running. Streams may share fresh
-        agents, which run once and count once, except in `counts`.
+      places: the selected cells of the plan, in its order; see `study_status`. Streams may share
+        fresh agents, which run once and count once, except in `counts`.
       seconds_left: of one core, for the unfinished cells; running ones count in full.
       other_results: results in the folder that belong to no cell of the plan.
+      never_requested: waiting cells of the plan that no run asked for, where these are left out.
     """
 
     folder: Path
@@ -332,7 +332,7 @@ class StudyStatus:
     places: tuple[CellStatus, ...]
     seconds_left: Span
     other_results: int
-    never_requested: int = 0  # cells of the plan that no run asked for, where these are left out
+    never_requested: int = 0
 
     @property
     def cells(self) -> tuple[CellStatus, ...]:

@@ -37,14 +37,12 @@ class LearningCurve(StrictModel):
     """Evaluations during training, evenly spaced; all lists have the same length.
 
     Attributes:
-      steps: training steps before the evaluation: environment steps, or gradient steps of an
-        offline learner.
+      steps: environment steps before the evaluation, or gradient steps of an offline learner.
       episode_return: mean return of its episodes, in [0, T].
       regret: mean of 1 − step reward over all steps of its episodes, in [0, 1].
-      similarity: mean r̃ over all steps of its episodes, in [0, 1].
+      similarity: mean r̃ over them, in [0, 1].
       length: mean length of its episodes in steps, in [1, T].
-      agents_regret: for a team, `regret` of each agent by its name; the other numbers are means
-        over its agents. A single agent's JSON omits it.
+      agents_regret: for a team, `regret` of each agent; the other numbers are means over them.
     """
 
     steps: Annotated[tuple[Integer, ...], Field(strict=False)] = ()
@@ -89,16 +87,12 @@ class ProgramResult(StrictModel):
 
 
 class OfflineResult(StrictModel):
-    """What an offline cell adds: the similarity of the behaviour policy and of the learner.
+    """What an offline cell adds: its data set, and the similarity of behaviour and learner.
 
     Attributes:
       nu: ν of the behaviour policy, in [0, 1].
-      transitions: number of transitions in the data set.
-      dataset_digest: digest of its arrays.
       behaviour_similarity: mean r̃ over the transitions of the data set, in [0, 1].
-      behaviour_similarity_sd: its standard deviation over transitions.
       similarity: mean r̃ over all steps of the last evaluation's episodes, in [0, 1].
-      similarity_sd: its standard deviation over steps.
     """
 
     nu: Real
@@ -115,21 +109,17 @@ class CellResult(StrictModel):
 
     Attributes:
       key: the cell's digest.
-      cell: the complete cell.
-      curve: its learning curve.
       report: its evaluation in and out of distribution, with the references; None of a life in a
-        stream, whose JSON omits it.
+        stream.
       stream_report: of a life in a stream what the agent retains, and its dynamic regret, still
-        without fresh agents, which are cells of their own. Any other JSON omits it.
-      online_regret: mean regret over all training steps, in [0, 1]; null for references and
-        offline learners.
-      online_cost: mean cost over them, in [0, 1]; the JSON of a task without `safety` omits it.
-      agents_online_regret: the same of each agent of a team, by name. A single agent's JSON omits
-        it.
-      offline: similarities of an offline cell; null for all others.
-      program: of a cell that uses `jax:…`. The JSON of any other omits it.
-      timing: CPU seconds by task.
-      versions: versions of the packages that the numbers depend on.
+        without fresh agents, which are cells of their own; None of any other.
+      online_regret: mean regret over all training steps, in [0, 1]; None of references and offline
+        learners.
+      online_cost: mean cost over them, in [0, 1], of a task with `safety`.
+      agents_online_regret: the same of each agent of a team, by name.
+      offline: of an offline cell.
+      program: of a cell that uses `jax:…`.
+      versions: of the packages that the numbers depend on.
     """
 
     schema_version: SchemaVersion = 1
