@@ -24,7 +24,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from multiprocessing import connection
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from sme_registry.errors import OptionError
 from sme_registry.io import require_packages
@@ -216,21 +216,22 @@ class Processes(ConcurrentExecutor):
     def _ended(self, progress: ReportProgress) -> Iterator[Outcome]:
         for pipe in connection.wait(list(self._running), POLL_SECONDS):
             process = self._running[pipe]
-            received = process.receive()
-            if isinstance(received, _Steps):
+            try:
+                received = process.pipe.recv()
+            except (EOFError, OSError):
+                process.kill()
+                del self._running[pipe]
+                yield from map(process.death, process.unfinished.values())
+                continue
+            if not isinstance(received, Outcome):
                 progress(process.job, *received)
                 continue
+            del process.unfinished[received.entry.key]
             if not process.unfinished:
+                process.process.join(_SECONDS_TO_END)
+                process.kill()
                 del self._running[pipe]
-            yield from received
-
-
-class _Steps(NamedTuple):
-    """What a process reports; see `Report`."""
-
-    done: int
-    total: int
-    note: str
+            yield received
 
 
 @dataclass(frozen=True)
@@ -258,29 +259,13 @@ class _JobProcess:
         child_end.close()  # so that the pipe ends when the process does
         return cls(job, process, pipe, log, unfinished)
 
-    def receive(self) -> list[Outcome] | _Steps:
-        """How far it is, or the outcomes of cells that have ended since."""
-        try:
-            received = self.pipe.recv()
-        except (EOFError, OSError):
-            self.kill()
-            deaths = [self._death(cell) for cell in self.unfinished.values()]
-            self.unfinished.clear()
-            return deaths
-        if isinstance(received, _Steps):
-            return received
-        del self.unfinished[received.entry.key]
-        if not self.unfinished:
-            self.process.join(_SECONDS_TO_END)
-            self.kill()
-        return [received]
-
     def kill(self) -> None:
         self.process.kill()
         self.process.join()
         self.pipe.close()
 
-    def _death(self, cell: Cell) -> Outcome:
+    def death(self, cell: Cell) -> Outcome:
+        """The failure of a cell whose process has died."""
         code = self.process.exitcode
         killed_by = next((each.name for each in signal.Signals if each == -code), None)
         how = f"was killed by {killed_by}" if killed_by else f"ended with exit code {code}"
@@ -301,7 +286,7 @@ def _child(pipe: Any, run: RunCell, job: Job, keep_models: bool, log: Path) -> N
         os.dup2(handle, 1)
         os.dup2(handle, 2)
     tempfile.tempdir = str(log.parent)  # which the driver removes, also after a kill
-    for outcome in run_job(run, job, keep_models, lambda *steps: pipe.send(_Steps(*steps))):
+    for outcome in run_job(run, job, keep_models, lambda *steps: pipe.send(steps)):
         pipe.send(outcome)
 
 
