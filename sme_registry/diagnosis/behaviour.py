@@ -177,13 +177,12 @@ def episodes_of(
 
 def on_policy(task: Task, runs: dict[str, Trajectories]) -> OnPolicy:
     """A summary of one agent's episodes, from `episodes_of`."""
-    S, n = task.spec.state_dim, len(runs[POLICY].terminated)
     run, random = runs[POLICY], runs["uniform_random"]
     edges = np.linspace(0, len(run.s), min(_TIME_BINS, len(run.s)) + 1).round().astype(int)
     bins = [slice(low, high) for low, high in itertools.pairwise(edges.tolist())]
     visited = np.sort(run.s[run.alive], axis=0)
     return OnPolicy(
-        episodes=n,
+        episodes=len(run.terminated),
         scores={name: trajectories.score for name, trajectories in runs.items()},
         edges=tuple(edges.astype(float).tolist()),
         regret=tuple(1.0 - float(run.reward[b][run.alive[b]].mean()) for b in bins),
@@ -195,8 +194,8 @@ def on_policy(task: Task, runs: dict[str, Trajectories]) -> OnPolicy:
         random_signal=_reward_signal(task, random),
         credit=_credit(run),
         random_credit=_credit(random),
-        state_shift=tuple(_distance_from_uniform(visited[:, j]) for j in range(S)),
-        coverage=min(_coverage(visited[:, j]) for j in range(S)),
+        state_shift=tuple(_distance_from_uniform(values) for values in visited.T),
+        coverage=min(_coverage(values) for values in visited.T),
     )
 
 
@@ -248,8 +247,8 @@ def _distance_from_uniform(values: Array) -> float:
 
 
 def _coverage(values: Array) -> float:
-    bins = np.minimum(values * _COVERAGE_BINS, _COVERAGE_BINS - 1).astype(int)
-    return float(len(np.unique(bins)) / _COVERAGE_BINS)
+    counts, _ = np.histogram(values, _COVERAGE_BINS, (0.0, 1.0))
+    return float((counts > 0).mean())
 
 
 def training(log: Log, constant_regret: float) -> TrainingSummary:

@@ -257,7 +257,8 @@ def _forgetting(case: StreamCase) -> Decision:
 @_why(
     yes="below_fresh_agents later_visits_worse",
     no="as_fresh_agents later_visits_as_good",
-    unclear="one_visit fresh_agents_learnt_little phases_differ too_few_visits nothing_learnt",
+    unclear="one_visit below_one_fresh_agent fresh_agents_learnt_little "
+    "phases_differ too_few_visits nothing_learnt",
     thresholds="unlearnt difference visits_for_trend",
 )
 def _loss_of_plasticity(case: StreamCase) -> Decision:
@@ -295,8 +296,10 @@ def _against_fresh(visits: Sequence[VisitDiagnosis], fresh: Sequence[float]) -> 
     }
     if alone >= THRESHOLDS["unlearnt"]:
         return Decision("fresh_agents_learnt_little", evidence)
-    below = own - alone >= THRESHOLDS["difference"]
-    reason = "below_fresh_agents" if below else "as_fresh_agents"
+    reason = "as_fresh_agents"
+    if own - alone >= THRESHOLDS["difference"]:
+        agents = len({visit.phase for visit in visits[1:]})
+        reason = "below_fresh_agents" if agents > 1 else "below_one_fresh_agent"
     return Decision(reason, evidence, 1.0 - alone / max(own, _TINY))
 
 

@@ -227,6 +227,7 @@ HARDER = phases_of(SPEC, SPEC.derive(complexity=3), cycles=2)
         (CYCLES, [FIRST, SECOND] * 2, None, ("no", "later_visits_as_good")),
         (CYCLES, [FIRST, HALF] * 2, [FIRST, SECOND], ("yes", "below_fresh_agents")),
         (CYCLES, [HALF, SECOND, FIRST, SECOND], [FIRST, SECOND], ("no", "as_fresh_agents")),
+        (TWO, [FIRST, HALF], [FIRST, SECOND], ("cannot tell", "below_one_fresh_agent")),
         # Without fresh agents a trend needs phases of equal difficulty.
         (HARDER, [HALF] * 4, None, ("cannot tell", "phases_differ")),
         (TWO, [HALF] * 2, None, ("cannot tell", "too_few_visits")),
@@ -247,6 +248,8 @@ def test_a_network_that_decays_is_found_against_the_first_visit_and_fresh_agents
     assert answer(found, "rank collapse") == ("yes", "rank_collapsed")
     assert answer(found, "weight growth") == ("yes", "weights_grew")
     assert found.initial_network == found.visits[0].network
+    hasty = diagnosis_of(report, decayed, updates=19)
+    assert answer(hasty, "dormant units") == ("cannot tell", "few_updates")
     against = diagnosis_of(report, decayed, fresh_networks=(decayed[1],) * 2)
     for question in ("dormant units", "rank collapse", "weight growth"):
         assert against.verdict(question).answer == "no"
@@ -456,8 +459,7 @@ def test_a_cell_is_diagnosed_with_its_fresh_agents(tmp_path):
     assert [phase.fresh_normalised_regret for phase in found.phases] == [0.0, 0.0]
     assert answer(found, "costly visits") == ("yes", "costlier_than_fresh")
     lost = found.verdict("loss of plasticity")
-    assert (lost.answer, lost.reason) == ("cannot tell", "few_updates")
-    assert lost.evidence["own_reason"] == "below_fresh_agents"
+    assert (lost.answer, lost.reason) == ("cannot tell", "below_one_fresh_agent")
     assert found.verdict("weight growth").evidence["against"] == "fresh_agents"
 
 

@@ -169,7 +169,7 @@ def test_a_harder_optimum_is_a_cause_only_of_a_team_that_has_learnt(
     verdicts = {v.question: v for v in answer_all(TEAM_QUESTIONS, case)}
     verdict = verdicts["harder_optimum"]
     assert verdict.answer == answer
-    assert "Its optimal policy is harder to learn." in verdict.sentence()
+    assert "optimal policy is harder to learn." in verdict.sentence()
 
 
 def test_an_agent_that_fails_only_where_the_team_takes_it():
