@@ -31,6 +31,7 @@ from sme_registry.studies.report.frames import FinishedLife, frame
 # 95 % interval of one class covers the truth in 32–62 % of cases with 2 runs, in 48–86 % with 3, in
 # 94–98 % with 4 to 10.
 ENOUGH_RUNS = 5
+OFFLINE_INTERVAL = 4  # with fewer runs a mean improvement has no interval at all
 PLACE = ["class_name", "algorithm"]
 PLACE_COLUMNS = "class_name:str algorithm:str "
 INTERVAL = "runs:int64 iqm low high"
@@ -357,3 +358,11 @@ def change_verdict(worsening: float, low: float, high: float) -> str:
 def by_place(rows: pd.DataFrame) -> dict[tuple[str, str], pd.DataFrame]:
     """The rows of each (class, algorithm), in their order."""
     return dict(iter(rows.groupby(PLACE, sort=False)))
+
+
+def training_data(runs: pd.DataFrame) -> dict[str, tuple[float, int] | None]:
+    """Each algorithm's data as (ν, transitions); None where it learns online or not at all."""
+    return {
+        row.algorithm: None if math.isnan(row.nu) else (row.nu, int(row.transitions))
+        for row in runs.drop_duplicates("algorithm").itertuples()
+    }

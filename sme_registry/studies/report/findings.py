@@ -14,54 +14,61 @@ which does not mean that there is no effect.
 from __future__ import annotations
 
 import functools
-import itertools
 import math
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import pandas as pd
 
+from sme_registry.diagnosis.questions import THRESHOLDS as DIAGNOSIS
 from sme_registry.io.markup import conjunction, fixed, plural, signed
-from sme_registry.studies.report.analysis import ENOUGH_RUNS, Analysis
+from sme_registry.studies.report.analysis import (
+    ENOUGH_RUNS,
+    OFFLINE_INTERVAL,
+    Analysis,
+    training_data,
+)
 from sme_registry.studies.report.classes import ALL, SEVERAL, axis_label
 from sme_registry.studies.report.frames import frame
-from sme_registry.studies.report.life_findings import stream_findings
-from sme_registry.studies.report.sentences import (
-    THRESHOLDS,
-    Found,
-    Rows,
-    change_text,
-    ends_text,
-    few_runs,
-    finding,
-    missing_runs,
-)
-from sme_registry.studies.report.tables import OFFLINE_INTERVAL, training_data
 
 COLUMNS = (
     "section:str algorithm:str class_name:str question:str verdict:str value low high runs:Int64 "
     "sentence:str"
 )
+THRESHOLDS = {
+    "unlearnt": DIAGNOSIS["unlearnt"],  # normalised regret, at least: almost nothing was learnt
+    "broken": 0.2,  # change of normalised regret, at least
+    "hurt": 0.05,  # at least; a smaller one hurts slightly
+    "probability": 0.5,  # of improvement, for the better of two algorithms
+    "enough_runs": float(ENOUGH_RUNS),  # with fewer runs or pairs a change is an indication
+    "interval_runs": float(OFFLINE_INTERVAL),  # with fewer an improvement has no interval
+    "near": 0.02,  # difference of r̃, at most: as good as
+    "collapse": 0.1,  # of r̃ below the behaviour policy, at least
+}
 _WD, _OOD = "wd_regret", "ood_regret"
 _CHANCE = 0.05  # share of 95 % intervals that exclude 0 without an effect
-_UNLEARNT, _NEAR = THRESHOLDS["unlearnt"], THRESHOLDS["near"]
+_UNLEARNT = THRESHOLDS["unlearnt"]
+
+
+Found = Iterator[dict[str, Any]]
+Finder = Callable[[Analysis], Found]
+Rows = Sequence[Any]  # of a table, as named tuples
+FINDERS: list[Finder] = []
+
+
+def finder(find: Finder) -> Finder:
+    """Register a function that finds something, in the order of the page."""
+    FINDERS.append(find)
+    return find
 
 
 def findings(analysis: Analysis) -> pd.DataFrame:
     """The findings of a study, from its tables."""
-    parts: list[Found] = []
-    if analysis.classes:
-        parts += [_tasks(analysis), _comparison(analysis), _caveats(analysis)]
-    if not analysis.tables["offline"].empty:
-        parts.append(_offline(analysis))
-    if analysis.streams:
-        parts.append(stream_findings(analysis))
-    return frame([row for part in parts for row in part], COLUMNS)
+    return frame([row for find in FINDERS for row in find(analysis)], COLUMNS)
 
 
-# Single tasks
-
-
+@finder
 def _tasks(analysis: Analysis) -> Found:
     """Which property of the task breaks each learner, and how sure that is."""
     levels = analysis.tables["levels"]
@@ -205,6 +212,7 @@ def _outside(about: Any, contrasts: Rows, worst: Any) -> Found:
         yield from _larger(about, larger)
 
 
+@finder
 def _comparison(analysis: Analysis) -> Found:
     """The best learner over all classes among those with equal data, and its rivals."""
     rows = analysis.tables["aggregates"]
@@ -254,6 +262,7 @@ def _rivals(analysis: Analysis, best: str, among: set[str]) -> Found:
         )
 
 
+@finder
 def _caveats(analysis: Analysis) -> Found:
     """What limits all findings on single tasks."""
     rows = analysis.tables["contrasts"]
@@ -282,140 +291,6 @@ def _caveats(analysis: Analysis) -> Found:
             f"The policy_init of {conjunction(other)} also differs from the first class’s, as deep "
             "tasks require. The contrasts include its effect.",
         )  # fmt: skip
-
-
-# Learning from data
-
-
-def _offline(analysis: Analysis) -> Found:
-    """Whether each learner reaches or surpasses the policy that made its data."""
-    about = functools.partial(finding, "offline")
-    rows = list(analysis.tables["offline"].itertuples())
-    data = training_data(analysis.runs)
-    example, nu = next((name, source[0]) for name, source in data.items() if source)
-    yield about(
-        "example", "nu",
-        f"An algorithm here is a learner with its data: {example} learnt from data of ν = {nu:g}. "
-        "The behaviour policy that makes the data takes (1 − α) a* + α ã, where α is drawn from "
-        "U(0, ν) at each step and ã is the action of a second network.",
-        algorithm=example, value=nu,
-    )  # fmt: skip
-    yield _behaviour(rows)
-    for name in dict.fromkeys(row.learner for row in rows):
-        of_learner = [row for row in rows if row.learner == name]
-        yield _imitation(name, of_learner)
-        yield from _improvement(name, of_learner)
-        yield from _depth(analysis, name, of_learner)
-    few, most = min(row.runs for row in rows), max(row.runs for row in rows)
-    verdict = "few" if few < ENOUGH_RUNS else "enough"
-    text = (
-        "Each result rests on its own interval, and one in twenty intervals excludes 0 by chance."
-    )
-    if few < ENOUGH_RUNS:
-        text = f"With fewer than {ENOUGH_RUNS} runs a result is an indication at most, and with "
-        text += f"fewer than {OFFLINE_INTERVAL} it has no interval."
-    count = (f"{few} to " if few < most else "") + plural(most, "run")
-    text = f"Each learner has {count} per class and ν. “Close” means within {_NEAR} of r̃. {text}"
-    yield about("offline runs", verdict, text, runs=few)
-
-
-def _behaviour(rows: Rows) -> dict[str, Any]:
-    """The behaviour policies compared with 1 − ν/6, which independent uniform actions give."""
-    places = list({(row.class_name, row.nu): row for row in reversed(rows)}.values())[::-1]
-    off = [row.behaviour_similarity - (1.0 - row.nu / 6.0) for row in places]
-    far = [row for row, difference in zip(places, off, strict=True) if abs(difference) > _NEAR]
-    value, worst = max(zip(off, places, strict=True), key=lambda pair: abs(pair[0]))
-    verdict, text = "near", "everywhere."
-    if far:
-        verdict, text = "far", (
-            f"in {len(places) - len(far)} of {len(places)} cases, but not at {_places(far)}. A "
-            "single second network may be closer to the optimum, or further away, than "
-            "independent uniform actions are."
-        )  # fmt: skip
-    text = f"The behaviour policies are close to 1 − ν/6 {text}"
-    largest = f"The largest difference is {signed(value, 3)} ({_at(worst)})."
-    return finding("offline", "behaviour", verdict, f"{text} {largest}", value=value)
-
-
-def _imitation(name: str, rows: Rows) -> dict[str, Any]:
-    near = [row for row in rows if abs(row.improvement) <= _NEAR]
-    farthest = max(rows, key=lambda row: abs(row.improvement))
-    verdict, text = "near_at_none", f"{name} is close to the behaviour policy nowhere."
-    if len(near) == len(rows):
-        verdict = "imitates"
-        text = f"{name} imitates: its mean is close to the behaviour policy's everywhere."
-    elif near:
-        verdict = "near_at_some"
-        text = f"{name} is close to the behaviour policy at {_places(near)}."
-    largest = f"The largest difference is {signed(farthest.improvement, 3)} ({_at(farthest)})."
-    return finding(
-        "offline", "imitation", verdict, f"{text} {largest}", farthest,
-        algorithm=name, value=farthest.improvement,
-    )  # fmt: skip
-
-
-def _improvement(name: str, rows: Rows) -> Found:
-    """Where a learner surpasses its data, and where it falls behind them."""
-    hint, few = "A single run, which is only a hint, is", "There are indications (all of few runs)"
-    begins = {
-        "above": "It surpasses", "above_few": f"{few} that it surpasses",
-        "below": "It falls behind", "below_few": f"{few} that it falls behind",
-        "single_above": f"{hint} above",
-    }  # fmt: skip
-    by_verdict: dict[str, list[Any]] = {}
-    for row in rows:
-        if row.runs > 1:
-            by_verdict.setdefault(row.verdict, []).append(row)
-        elif row.improvement > _NEAR:
-            by_verdict.setdefault("single_above", []).append(row)
-    if not by_verdict.keys() & {"above", "above_few"}:
-        text = "It was not shown to surpass its data at any ν."
-        yield finding("offline", "improvement", "none", text, algorithm=name)
-    for verdict, places in by_verdict.items():
-        low, high = (signed(f(row.improvement for row in places), 3) for f in (min, max))
-        by = low if low == high else f"{low} to {high}"
-        text = f"Whether it is above or below its data is open at {_places(places)}."
-        if verdict in begins:
-            text = f"{begins[verdict]} its data at {_places(places)}, by {by}."
-        yield finding("offline", "improvement", verdict, text, algorithm=name)
-
-
-def _depth(analysis: Analysis, name: str, rows: Rows) -> Found:
-    """Whether a learner collapses on the deepest class, if classes differ in depth."""
-    classes = dict.fromkeys(analysis.tables["offline"].class_name)
-    depth = {c: float(analysis.classes[c].setting["complexity"]) for c in classes}
-    if len(set(depth.values())) < 2:
-        return
-    deepest = max(depth, key=lambda name: depth[name])
-    about = functools.partial(finding, "offline", "depth", algorithm=name, class_name=deepest)
-    rows = [row for row in rows if row.class_name == deepest]
-    if not rows:
-        yield about("no_runs", f"{name} has no finished run on the deepest class, {deepest}.")
-        return
-    collapse, reasons = THRESHOLDS["collapse"], []
-    constant = [row for row in rows if row.similarity <= row.constant_similarity + _NEAR]
-    below = [row for row in rows if row.improvement <= -collapse and row not in constant]
-    if constant:
-        reasons.append(f"at ν = {_nus(constant)} it is at most {_NEAR} better than the constant ½")
-    if below:
-        text = "it is better than the constant ½, but"
-        reasons.append(f"at ν = {_nus(below)} {text} {collapse} or more below its data")
-    lowest, runs = min(rows, key=lambda row: row.improvement), sum(row.runs for row in rows)
-    verdict, does, text = "collapses", "collapses", f"{', and '.join(reasons)}."
-    if any(row.runs < ENOUGH_RUNS for row in (*constant, *below)):
-        text += " With so few runs this is an indication."
-    if not reasons:
-        verdict, does = "holds", "does not collapse"
-        text = f"its mean is more than {_NEAR} above that of the constant ½ everywhere; compared "
-        text += (
-            f"with its data, it is {signed(lowest.improvement, 3)} at the lowest ({_at(lowest)})."
-        )
-    of = f"{plural(len(rows), 'value')} of ν, {plural(runs, 'run')}"
-    text = f"{name} {does} on the deepest class, {deepest} ({of}): {text}"
-    yield about(verdict, text, value=lowest.improvement, runs=runs)
-
-
-# Words
 
 
 def _contrasts(analysis: Analysis, algorithm: str, metric: str) -> Rows:
@@ -450,15 +325,68 @@ def _listed(contrasts: Rows) -> str:
     return ", ".join(f"{_property(c)} ({c.class_name}: {change_text(c)})" for c in contrasts)
 
 
-def _at(row: Any) -> str:
-    return f"{row.class_name}, ν = {row.nu:g}"
+def finding(
+    section: str, question: str, verdict: str, sentence: str, row: Any = None, **columns: Any
+) -> dict[str, Any]:
+    """A row of findings; those columns that `row`, of any table, has are taken from it."""
+    result = {
+        "section": section, "question": question, "verdict": verdict, "sentence": sentence,
+        "algorithm": "", "class_name": "", "value": math.nan, "low": math.nan, "high": math.nan,
+        "runs": None,
+    }  # fmt: skip
+    taken: dict[str, tuple[str, ...]] = {
+        name: (name,) for name in ("class_name", "algorithm", "low", "high")
+    }
+    taken |= {"runs": ("pairs", "fewest_runs", "runs"), "value": ("change", "iqm", "value")}
+    for column, names in taken.items():
+        known = [getattr(row, name) for name in names if hasattr(row, name)]
+        result[column] = known[0] if known else result[column]
+    return result | columns
 
 
-def _nus(rows: Rows) -> str:
-    return ", ".join(f"{row.nu:g}" for row in rows)
+def missing_runs(section: str, counts: Counter[str]) -> Found:
+    missing = counts["missing"] + counts["failed"]
+    if missing:
+        because = f", {counts['failed']:,} of them because they failed" if counts["failed"] else ""
+        text = f"{missing:,} of {plural(counts['finished'] + missing, 'run')} are missing{because}."
+        text += " No number includes them; the table of runs lists them."
+        yield finding(section, "missing runs", "missing", text, value=missing)
 
 
-def _places(rows: Rows) -> str:
-    """`shallow (ν = 0, 0.5), deep (ν = 1)`."""
-    grouped = itertools.groupby(rows, key=lambda row: row.class_name)
-    return ", ".join(f"{name} (ν = {_nus(list(at))})" for name, at in grouped)
+def few_runs(section: str, fewest: int, one: str, many: str) -> Found:
+    if fewest < ENOUGH_RUNS:
+        yield finding(
+            section, "few runs", "few",
+            f"Some numbers rest on {plural(fewest, one, many)}. The 95 % bootstrap interval of 2 "
+            "runs covers the truth in only 32–62 % of cases, of 3 runs in 48–86 %, depending on "
+            "their distribution, and of 4 or more in 94–98 %. With fewer than "
+            f"{plural(ENOUGH_RUNS, one, many)}, this report calls a change an indication at most.",
+            runs=fewest,
+        )  # fmt: skip
+
+
+def change_text(row: Any) -> str:
+    """The change of a row with its interval and the number of pairs."""
+    if math.isnan(row.low):
+        return f"{signed(row.change)}, a single pair, no interval"
+    ends = f"95 % interval {signed(row.low)} to {signed(row.high)}"
+    return f"{signed(row.change)}, {ends}, {plural(row.pairs, 'pair')}"
+
+
+def lives_text(row: Any) -> str:
+    if math.isnan(row.low):
+        return " (a single life, no interval)"
+    ends = f"95 % interval {fixed(row.low)} to {fixed(row.high)}"
+    return f" ({ends}, {plural(row.runs, 'life', 'lives')})"
+
+
+def ends_text(row: Any) -> str:
+    return "" if math.isnan(row.low) else f" ({fixed(row.low)} to {fixed(row.high)})"
+
+
+def side(row: Any, neutral: float) -> str:
+    return "above" if row.low > neutral else "below" if row.high < neutral else "open"
+
+
+def indication(row: Any) -> str:
+    return "" if row.runs >= ENOUGH_RUNS else " (an indication)"

@@ -17,6 +17,7 @@ from sme_registry.studies.report.analysis import (
     OF_LIVES,
     OF_TRAINING,
     OF_VISITS,
+    OFFLINE_INTERVAL,
     OUTSIDE,
     SPECIAL_METRICS,
     TABLES,
@@ -25,7 +26,6 @@ from sme_registry.studies.report.analysis import (
     Metric,
 )
 from sme_registry.studies.report.classes import SCHEDULE
-from sme_registry.studies.report.tables import OFFLINE_INTERVAL
 
 _ABSENT = "–"
 _STATISTICS = {"iqm": "IQM", "median": "median", "optimality_gap": "optimality gap"}

@@ -52,9 +52,8 @@ from sme_registry.studies.report.figures import (
     draw_figures,
 )
 from sme_registry.studies.report.figures.panels import Picture
-from sme_registry.studies.report.findings import findings
+from sme_registry.studies.report.findings import THRESHOLDS, findings
 from sme_registry.studies.report.frames import StudyFrames, frame, load, records, runs_of
-from sme_registry.studies.report.sentences import THRESHOLDS
 from sme_registry.studies.report.tables import analyse
 from sme_registry.studies.report.texts import TextTable, csv_tables, difference_table, text_tables
 

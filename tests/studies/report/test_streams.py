@@ -15,7 +15,8 @@ from sme_registry.io import read_json
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellFailure
-from sme_registry.studies.report import frames, lives
+from sme_registry.studies.report import frames
+from sme_registry.studies.report import streams as tables
 from sme_registry.studies.report.findings import findings
 from tests.studies import finished
 from tests.studies.lives import AGENTS, STREAMS, TASK, live, stream_study
@@ -228,7 +229,7 @@ def test_a_regret_curve_is_beside_fresh_agents_and_the_agent_frozen_after_visit_
 
 
 def test_reference_agents_are_those_that_lives_recorded_and_else_computed(streams):
-    costs = lives.reference_costs(streams.lives)
+    costs = tables.reference_costs(streams.lives)
     for (name, reference), logs in costs.items():
         own = [life.report for life in streams.lives if life.planned.class_name == name]
         recorded = {each.stream_digest: each.reference_regret[reference] for each in own}
@@ -237,12 +238,12 @@ def test_reference_agents_are_those_that_lives_recorded_and_else_computed(stream
         life._replace(report=life.report.model_copy(update={"reference_regret": {}}))
         for life in streams.lives
     ]
-    computed = lives.reference_costs(old)
+    computed = tables.reference_costs(old)
     assert computed.keys() == costs.keys()
     for place, logs in computed.items():
         for mine, theirs in zip(logs, costs[place], strict=True):
             assert mine.online_regret == pytest.approx(theirs.online_regret, abs=0.1)
-    assert lives.regret(old).frozen.isna().all()
+    assert tables.regret(old).frozen.isna().all()
 
 
 def test_what_is_missing_is_counted_and_leaves_plasticity_unknown(gaps):

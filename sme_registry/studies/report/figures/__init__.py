@@ -20,7 +20,15 @@ from sme_registry.evaluation import as_policy
 from sme_registry.evaluation.report import NOT_COMPARABLE
 from sme_registry.plots import maps, style
 from sme_registry.plots.style import GREY, literal, new_figure
-from sme_registry.studies.report.analysis import CURVES, ENOUGH_RUNS, METRICS, Analysis, by_place
+from sme_registry.studies.report.analysis import (
+    CURVES,
+    ENOUGH_RUNS,
+    METRICS,
+    OFFLINE_INTERVAL,
+    Analysis,
+    by_place,
+    training_data,
+)
 from sme_registry.studies.report.classes import ALL, SEVERAL, Group, setting_label
 from sme_registry.studies.report.figures import panels, streams
 from sme_registry.studies.report.figures.panels import (
@@ -42,7 +50,6 @@ from sme_registry.studies.report.figures.panels import (
     side_by_side,
 )
 from sme_registry.studies.report.frames import RUN
-from sme_registry.studies.report.tables import OFFLINE_INTERVAL, training_data
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
