@@ -136,8 +136,8 @@ _RUN = """wd_regret ood_regret ood_decay final_return online_regret uses:str act
     hidden_width:int64 policy_init:str rotation spec_seed:str spec_digest:str seed:int64 nu
     transitions:Int64 dataset_digest:string behaviour_similarity behaviour_similarity_sd
     offline_similarity offline_similarity_sd improvement seconds steps_per_second key:str"""
-# Columns of a run, and of its regions, where the plan has tasks with these fields.
-_EXTENSIONS = {
+# Columns of a run, and of its regions, only where the plan has tasks with these fields.
+_OF_TASKS = {
     "safety": (
         "tightness online_cost wd_cost wd_safe_regret",
         "cost violating_share safe_regret price_of_safety",
@@ -151,7 +151,6 @@ _EXTENSIONS = {
 CURVES = RUN_COLUMNS + "step:int64 episode_return regret similarity length"
 # Columns of each agent of a team, as in `wd_regret/agent_0`.
 AGENT_COLUMNS = ("normalised_regret", "wd_regret", "ood_regret", "online_regret")
-_RUN_OF_AGENT = tuple(f"{column}/" for column in AGENT_COLUMNS[1:])
 _LIVES = f"""{RUN_COLUMNS} region:str epsilon_low epsilon_high states:int64 visited_regret
     {" ".join(METRICS)} learning_transfer online_regret dynamic_regret frozen_online_regret
     uses:str action_range:str steps:int64 state_dim:int64 action_dim:int64 horizon:int64
@@ -204,34 +203,36 @@ def study_frames(plan: StudyPlan, results: Mapping[str, CellResult]) -> StudyFra
         for cell, result in planned
         if result is not None and result.report is not None and not cell.in_stream
     ]
-    rows = [row for each in finished for row in _result_rows(*each)]
+    rows = [row for run in finished for row in _result_rows(*run)]
     evaluations = [row for cell, result, _ in finished for row in curve_rows(cell, result)]
     agents = list(dict.fromkeys(name for *_, report in finished for name in report.agents))
     by_agent = " ".join(f" {column}/{name}" for column in AGENT_COLUMNS for name in agents)
     regrets = " ".join(f" regret/{name}" for name in agents)
-    extensions = "".join(
+    of_tasks = "".join(
         f" {of_run} {of_region}"
-        for field, (of_run, of_region) in _EXTENSIONS.items()
-        if any(getattr(each.setting, field) is not None for each in plan.classes)
+        for field, (of_run, of_region) in _OF_TASKS.items()
+        if any(getattr(member.setting, field) is not None for member in plan.classes)
     )
     return StudyFrames(
-        frame(rows, RUN_COLUMNS + _REGION + _RUN + extensions + by_agent),
+        frame(rows, RUN_COLUMNS + _REGION + _RUN + of_tasks + by_agent),
         frame(evaluations, CURVES + regrets),
     )
 
 
 def runs_of(results: pd.DataFrame) -> pd.DataFrame:
     """One row per run: `results` without the columns of its regions."""
-    by_agent = [name for name in results.columns if name.startswith(_RUN_OF_AGENT)]
-    extensions = _dtypes(" ".join(of_run for of_run, _ in _EXTENSIONS.values()))
-    present = [name for name in extensions if name in results.columns]
-    columns = [*RUN, *_dtypes(_RUN), *present, *by_agent]
-    return results.drop_duplicates(RUN)[columns].reset_index(drop=True)
+    of_regions = _dtypes(" ".join((_REGION, *(columns for _, columns in _OF_TASKS.values()))))
+    of_run = [
+        name
+        for name in results.columns
+        if name not in of_regions and not name.startswith(f"{AGENT_COLUMNS[0]}/")
+    ]
+    return results.drop_duplicates(RUN)[of_run].reset_index(drop=True)
 
 
 def ordered(plan: StudyPlan) -> list[PlannedCell]:
     """The plan's cells by class, then algorithm, then run; the plan itself has runs outermost."""
-    names = [*(each.name for each in plan.classes), *(each.name for each in plan.streams)]
+    names = [*(c.name for c in plan.classes), *(c.name for c in plan.streams)]
     classes = {name: i for i, name in enumerate(names)}
     algorithms = {algorithm.name: i for i, algorithm in enumerate(plan.algorithms)}
     return sorted(plan.cells, key=lambda c: (classes[c.class_name], algorithms[c.algorithm], c.run))
@@ -301,35 +302,25 @@ def place(cell: PlannedCell) -> dict[str, Any]:
 
 def _run_columns(result: CellResult, report: EvaluationReport) -> dict[str, Any]:
     """The columns of `_RUN`; those of offline runs only where there are any."""
-    cell, offline = result.cell, result.offline
+    cell, safety, observed = result.cell, report.safety, report.observation
     columns = {
-        **{
-            name: value
-            for name, value in cell.spec.every_field().items()
-            if name not in ("schema_version", "seed", "team", *_EXTENSIONS)
-        },
+        **cell.spec.every_field(),
         **{name: getattr(report, name) for name in ("wd_regret", "ood_regret", "ood_decay")},
-        **{name: getattr(cell, name) for name in ("uses", "action_range", "steps", "seed")},
+        **_of_cell(result),
         "final_return": _final_return(result),
-        "online_regret": math.nan if result.online_regret is None else result.online_regret,
+        "online_regret": result.online_regret,
+        "online_cost": result.online_cost,
         "spec_seed": str(cell.spec.seed),
         "spec_digest": cell.spec.digest,
-        "seconds": result.timing.total,
-        "steps_per_second": result.timing.steps_per_second,
-        "key": result.key,
     }
-    for field in ("safety", "observation"):
-        block = getattr(cell.spec, field)
+    for block in (cell.spec.safety, cell.spec.observation):
         columns |= {} if block is None else block.to_dict()
-    if cell.spec.safety is not None:
-        columns["online_cost"] = math.nan if result.online_cost is None else result.online_cost
-    if report.safety is not None:
-        inside = report.safety.regions[0]
+    if safety is not None:
+        inside = safety.regions[0]
         columns |= {"wd_cost": inside.cost, "wd_safe_regret": inside.safe_regret}
-    if report.observation is not None:
+    if observed is not None:
         columns["distractor_regret"] = report.distractor_regret
-    if report.observation is not None and report.observation.invariance:
-        columns["wd_invariance"] = report.observation.invariance[0].invariance
+        columns["wd_invariance"] = next((r.invariance for r in observed.invariance), None)
     for name, agent in report.agents.items():
         wd, *shells = (region.normalised_regret for region in agent.regions)
         columns |= {
@@ -337,13 +328,24 @@ def _run_columns(result: CellResult, report: EvaluationReport) -> dict[str, Any]
             f"ood_regret/{name}": float(np.mean(shells)) if shells else math.nan,
             f"online_regret/{name}": result.agents_online_regret.get(name, math.nan),
         }
-    if offline is not None:
-        columns |= offline.model_dump(exclude={"similarity", "similarity_sd"}) | {
+    if (offline := result.offline) is not None:
+        columns |= offline.model_dump() | {
             "offline_similarity": offline.similarity,
             "offline_similarity_sd": offline.similarity_sd,
             "improvement": offline.similarity - offline.behaviour_similarity,
         }
     return columns
+
+
+def _of_cell(result: CellResult) -> dict[str, Any]:
+    """Columns of runs and of lives."""
+    names = ("uses", "action_range", "steps", "seed")
+    return {
+        **{name: getattr(result.cell, name) for name in names},
+        "seconds": result.timing.total,
+        "steps_per_second": result.timing.steps_per_second,
+        "key": result.key,
+    }
 
 
 def _final_return(result: CellResult) -> float:
@@ -389,17 +391,17 @@ def load_streams(folder: str | os.PathLike[str]) -> StreamFrames:
 
 def finished_lives(plan: StudyPlan, results: Mapping[str, CellResult]) -> list[FinishedLife]:
     """The finished lives, from results by the digests of their cells."""
-    found = []
+    lives = []
     for planned in ordered(plan):
         result = results.get(planned.cell.digest)
         if planned.phase is None and result is not None and result.stream_report is not None:
-            alone = [results.get(cell.digest) for cell in planned.cell.fresh]
-            finished = [one for one in alone if one is not None]
+            fresh = [results.get(cell.digest) for cell in planned.cell.fresh]
+            finished = [agent for agent in fresh if agent is not None]
             report = result.stream_report
-            if alone and len(finished) == len(alone):
+            if fresh and len(finished) == len(fresh):
                 report = _with_fresh(report, finished)
-            found.append(FinishedLife(planned, result, report, len(finished)))
-    return found
+            lives.append(FinishedLife(planned, result, report, len(finished)))
+    return lives
 
 
 def stream_frames(lives: Sequence[FinishedLife]) -> StreamFrames:
@@ -420,31 +422,21 @@ def _with_fresh(report: StreamReport, fresh: Sequence[CellResult]) -> StreamRepo
 
 
 def _life_rows(life: FinishedLife) -> Iterator[dict[str, Any]]:
-    cell, result, regret = life.result.cell, life.result, life.report.dynamic_regret
-    frozen = life.report.reference_regret.get("frozen_agent")
+    regret, frozen = life.report.dynamic_regret, life.report.reference_regret.get("frozen_agent")
     of_life = {
         **place(life.planned),
-        **{name: getattr(cell, name) for name in ("uses", "action_range", "steps", "seed")},
-        **{
-            name: None if regret is None else getattr(regret, name)
-            for name in ("learning_transfer", "online_regret", "dynamic_regret")
-        },
-        **{
-            name: getattr(life.report.stream, name)
-            for name in ("state_dim", "action_dim", "horizon")
-        },
+        **life.report.stream.phases[0].spec.every_field(),
+        **_of_cell(life.result),
+        **_training(regret),
         "frozen_online_regret": None if frozen is None else frozen.online_regret,
         "stream_digest": life.report.stream_digest,
         "fresh_agents": life.fresh_agents,
-        "seconds": result.timing.total,
-        "steps_per_second": result.timing.steps_per_second,
-        "key": result.key,
     }
     for region in _regions(life.report):
         M = np.array(region.agent.normalised_regret)
         yield {
             **of_life,
-            **region.model_dump(include={"epsilon_low", "epsilon_high", "states"}),
+            **{n: getattr(region, n) for n in ("epsilon_low", "epsilon_high", "states")},
             **{name: region.agent.final(name) for name in METRICS},
             "region": region.name,
             "visited_regret": M[np.arange(len(M)), np.arange(len(M)) % M.shape[1]].mean(),
@@ -457,7 +449,7 @@ def _visit_rows(life: FinishedLife) -> Iterator[dict[str, Any]]:
         v, j = visit.visit, visit.phase
         of_visit = {
             **place(life.planned),
-            **visit.model_dump(include={"visit", "cycle", "phase", "lifetime"}),
+            **visit.model_dump(),
             **_visit_regret(report, v, j),
         }
         for region in _regions(report):
@@ -477,12 +469,17 @@ def _visit_regret(report: StreamReport, visit: int, phase: int) -> dict[str, Any
     if regret is None or visit >= len(regret.visits):
         return {}
     alone, frozen = regret.fresh_online_regret, report.reference_regret.get("frozen_agent")
-    names = ("online_regret", "dynamic_regret", "learning_transfer")
     return {
-        **{name: getattr(regret.visits[visit], name) for name in names},
+        **_training(regret.visits[visit]),
         "frozen_online_regret": None if frozen is None else frozen.visits[visit].online_regret,
         "fresh_online_regret": None if alone is None else alone[phase],
     }
+
+
+def _training(regret: Any) -> dict[str, Any]:
+    """The columns of a life's or visit's training; empty if its cost is unknown."""
+    names = ("online_regret", "dynamic_regret", "learning_transfer")
+    return {} if regret is None else {name: getattr(regret, name) for name in names}
 
 
 def _retention_rows(life: FinishedLife) -> Iterator[tuple[Any, ...]]:

@@ -47,10 +47,10 @@ from sme_registry.studies.report.analysis import (
 )
 from sme_registry.studies.report.figures import (
     draw,
-    draw_class_curves,
     draw_differences,
     draw_figures,
 )
+from sme_registry.studies.report.figures.curves import draw_class_curves
 from sme_registry.studies.report.figures.panels import Picture
 from sme_registry.studies.report.findings import THRESHOLDS, findings
 from sme_registry.studies.report.frames import StudyFrames, frame, load, records, runs_of

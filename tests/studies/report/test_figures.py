@@ -11,7 +11,7 @@ from tests.studies.finished import analysed, with_tables
 pytest.importorskip("matplotlib")
 
 from sme_registry.studies.report import figures
-from sme_registry.studies.report.figures import draw_figures
+from sme_registry.studies.report.figures import curves, draw_figures
 from sme_registry.studies.report.figures.panels import Scale, spacing
 from tests.geometry import assert_readable
 from tests.studies.report.test_report import FIGURES
@@ -84,7 +84,7 @@ def test_curves_and_levels_near_1_have_headroom(analysis):
     squeezed.loc[squeezed.index[::3], "q75"] = 1.0
     levels = analysis.tables["levels"].assign(iqm=0.999, linear=0.999, low=0.99, high=1.0)
     unlearnt = with_tables(analysis, learning_curves=squeezed, levels=levels)
-    drawings = [figures.draw_class_curves, figures.draw_regret]
+    drawings = [curves.draw_class_curves, curves.draw_regret]
     (picture, *levels), _ = figures.draw(drawings, unlearnt, ())
     assert "each a running median over 2 evaluations" in picture.caption
     ((low, high),) = {axes.get_ylim() for axes in picture.figure.axes if axes.get_visible()}
@@ -107,7 +107,7 @@ def test_levels_of_one_state_dimension_are_comparable(analysis):
 
 def test_an_axis_with_a_single_class_has_no_figure(finished):
     two = analysed(finished, lambda planned: planned.class_name not in ("default", "k-25"))
-    pictures, _ = figures.draw([figures.draw_learning_curves], two, ())
+    pictures, _ = figures.draw([curves.draw_learning_curves], two, ())
     assert [picture.name for picture in pictures] == ["learning-curves-k"]
 
 

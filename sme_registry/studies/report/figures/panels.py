@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 import numpy as np
 import pandas as pd
 
+from sme_registry.evaluation.report import NOT_COMPARABLE
 from sme_registry.plots.style import (
     COLOURS,
     GREY,
@@ -41,6 +42,7 @@ FEW = f"Hollow: fewer than {ENOUGH_RUNS}"
 INDICATION = "so that the interval is an indication only."
 WIDTH = 7.2  # inches: of a page, so that 9 points stay 9 points
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (8, 2)))
+HEADINGS = {"wd_regret": "within distribution (WD)", "ood_regret": "out of distribution (OOD)"}
 _LABELS = 2.4  # inches of the names of rows
 _LINE = 0.17  # inches: the height of a line of text
 
@@ -69,13 +71,14 @@ LINEAR = new_look(GREY, dash=REFERENCE_DASHES["linear_least_squares"])
 CONSTANT = new_look(GREY, dash=REFERENCE_DASHES["constant_half"])
 
 
-def looks_of(analysis: Analysis) -> dict[str, Look]:
-    """The look of each algorithm: colours for those that learn, grey for references."""
+def looks_of(analysis: Analysis, names: Iterable[str] | None = None) -> dict[str, Look]:
+    """The look of each algorithm, or of these: colours for those that learn, grey for others."""
     looks = numbered_looks(analysis.learners)
     references = [name for name in analysis.algorithms if name not in looks]
     for i, name in enumerate(references):
         looks[name] = new_look(GREY, "x+12"[i % 4], DASHES[1 + i % 4])
-    return looks
+    present = set(looks if names is None else names)
+    return {name: look for name, look in looks.items() if name in present}
 
 
 def numbered_looks(
@@ -215,6 +218,16 @@ def curves_caption(rows: pd.DataFrame) -> str:
     window = rows.window.max()
     smoothed = f", each a running median over {window} evaluations" if window > 1 else ""
     return f"Median over runs, with the interquartile range as a band{smoothed}."
+
+
+def dims(analysis: Analysis) -> list[int]:
+    """The different state dimensions of the runs, in rising order."""
+    return sorted(set(analysis.tables["results"].state_dim))
+
+
+def epsilon_remark(analysis: Analysis) -> str:
+    """For captions with levels ε of several runs; "" where all have one state dimension."""
+    return f" {NOT_COMPARABLE}" if len(dims(analysis)) > 1 else ""
 
 
 def step_text(value: float, _: Any) -> str:
