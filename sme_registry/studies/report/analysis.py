@@ -21,7 +21,7 @@ import pandas as pd
 from sme_registry import statistics
 from sme_registry.evaluation import retention
 from sme_registry.evaluation.dynamic_regret import DynamicRegret
-from sme_registry.spec import StudyFile, StudyPlan
+from sme_registry.spec import PlannedCell, StudyFile, StudyPlan
 from sme_registry.statistics import Array, Statistic
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.report.classes import ALL, ClassInfo, Group, StreamInfo
@@ -204,6 +204,11 @@ class Analysis:
             return "failed"
         requested = self.requested_cells is None or key in self.requested_cells
         return "missing" if requested else "left out"
+
+    def missing(self, *, streams: bool) -> list[PlannedCell]:
+        """The requested cells that have not finished."""
+        cells = [cell for cell in self.plan.cells if cell.in_stream == streams]
+        return [c for c in cells if self.state(c.cell.digest) in ("missing", "failed")]
 
     def counts(self, *, streams: bool) -> Counter[str]:
         """How many runs are in each state; of streams those that differ: lives share others."""

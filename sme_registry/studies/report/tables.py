@@ -149,10 +149,8 @@ def analyse(
 def _missing(analysis: Analysis, part: Part) -> pd.DataFrame:
     """Each requested run that has not finished."""
     rows = [
-        (*place(planned).values(), planned.phase, analysis.errors.get(key, ""), key)
-        for planned in analysis.plan.cells
-        if planned.in_stream == part.streams
-        and analysis.state(key := planned.cell.digest) in ("missing", "failed")
+        (*place(c).values(), c.phase, analysis.errors.get(c.cell.digest, ""), c.cell.digest)
+        for c in analysis.missing(streams=part.streams)
     ]
     columns = f"{PLACE_COLUMNS} run:int64 phase:Int64 error:str key:str"
     missing = frame(rows, columns)

@@ -35,7 +35,7 @@ from sme_registry.io.terminal import duration
 from sme_registry.plots.style import WRITTEN
 from sme_registry.spec import StudyFile
 from sme_registry.spec.study import in_jax
-from sme_registry.studies.engine.ledger import REPORT, Ledger, requested, run_label
+from sme_registry.studies.engine.ledger import REPORT, Ledger, label, requested
 from sme_registry.studies.report.analysis import (
     DIFFERENCES,
     METRICS,
@@ -162,7 +162,7 @@ def _contents(
         contents |= {f"tables/{name}.csv": text for name, text in csv_tables(analysis).items()}
     if "latex" in formats:
         contents |= {f"tables/{table.name}.tex": table.latex() for table in tables}
-    return contents | {each.path: each.content for each in explorers}
+    return contents | {page.path: page.content for page in explorers}
 
 
 def page(
@@ -225,13 +225,8 @@ def _kinds(analysis: Analysis) -> list[str]:
 
 def _missing(analysis: Analysis) -> list[tuple[str, str]]:
     """What each missing run is, and its error."""
-    in_streams = analysis.tables.get("stream_missing")
-    return [
-        *((run_label(r.class_name, r.algorithm, r.run), r.error)
-          for r in analysis.tables["missing"].itertuples()),
-        *((run_label(r.class_name, r.algorithm, r.run, None if pd.isna(r.phase) else r.phase),
-           r.error) for r in (() if in_streams is None else in_streams.itertuples())),
-    ]  # fmt: skip
+    missing = [*analysis.missing(streams=False), *analysis.missing(streams=True)]
+    return [(label(planned), analysis.errors.get(planned.cell.digest, "")) for planned in missing]
 
 
 def _in_jax(analysis: Analysis) -> list[str]:
@@ -259,7 +254,7 @@ def _origin(analysis: Analysis) -> Iterable[tuple[str, str, str]]:
         text = f"{budget}{algorithm.action_range} actions"
         yield algorithm.name, algorithm.uses, f"{text}, {settings or 'default hyperparameters'}"
     programs = (result.program for result in analysis.cells.values())
-    kinds = Counter((each.device, each.lanes) for each in programs if each is not None)
+    kinds = Counter((p.device, p.lanes) for p in programs if p is not None)
     for (device, lanes), count in kinds.most_common():
         text = f"on {device}, in programs of {plural(lanes, 'lane')}"
         yield f"{plural(count, 'run')} in JAX", "", text
@@ -278,7 +273,6 @@ def explorers_of(ledger: Ledger, file: StudyFile, models: Mapping[str, Path]) ->
         key = planned.cell.digest
         if planned.in_stream or key not in models or key in pages:
             continue
-        label = run_label(planned.class_name, planned.algorithm, planned.run)
         name = key.removeprefix("sha256:")[:_DIGITS]
         try:
             report = run_report(ledger.folder, key)
@@ -288,7 +282,7 @@ def explorers_of(ledger: Ledger, file: StudyFile, models: Mapping[str, Path]) ->
             content = explorer_page(facts(load_cell(ledger.folder, key), report=report))
         except SMEError:
             continue
-        pages[key] = Explorer(label, f"explorers/{name}.html", content)
+        pages[key] = Explorer(label(planned), f"explorers/{name}.html", content)
     return list(pages.values())
 
 

@@ -18,7 +18,7 @@ from sme_registry.errors import SMEError
 from sme_registry.evaluation import as_policy
 from sme_registry.plots import maps, style
 from sme_registry.plots.style import GREY, literal, new_figure
-from sme_registry.studies.report.analysis import ENOUGH_RUNS, METRICS, Analysis, by_place
+from sme_registry.studies.report.analysis import METRICS, Analysis, by_place
 from sme_registry.studies.report.classes import ALL
 from sme_registry.studies.report.figures import curves, panels, streams
 from sme_registry.studies.report.figures.panels import (
@@ -91,8 +91,8 @@ def draw_contrasts(analysis: Analysis) -> Drawn:
         ]
         labels = [metric.label.partition(",")[0] for metric in metrics]
         figure = mark_rows(
-            rows.assign(place=rows.class_name, enough=rows.enough_pairs), "change", columns,
-            _class_places(analysis, rows), looks_of(analysis, rows.algorithm),
+            rows, "change", columns, "class_name", _class_places(analysis, rows),
+            looks_of(analysis, rows.algorithm),
             share_x=name == "regret",
         )  # fmt: skip
         yield Picture(
@@ -110,7 +110,7 @@ def draw_agents(analysis: Analysis) -> Drawn:
     rows = analysis.tables["agents"]
     if rows.empty:
         return
-    rows = rows.assign(place=rows.class_name + ", " + rows.agent, enough=rows.runs >= ENOUGH_RUNS)
+    rows = rows.assign(place=rows.class_name + ", " + rows.agent)
     blocks = dict(zip(rows.place, rows.class_name, strict=True))
     yield Picture(
         "agents",
@@ -118,8 +118,8 @@ def draw_agents(analysis: Analysis) -> Drawn:
         "IQM over runs with its 95 % bootstrap interval, over the action channels that the agent "
         f"owns: 0 is the optimum, 1 the constant ½. {FEW} runs.",
         mark_rows(
-            rows, "iqm", _both("normalised regret"), _spaced(blocks), looks_of(analysis),
-            share_x=True,
+            rows, "iqm", _both("normalised regret"), "place", _spaced(blocks),
+            looks_of(analysis), share_x=True,
         ),
     )  # fmt: skip
 
@@ -210,14 +210,13 @@ def draw_aggregates(analysis: Analysis) -> Drawn:
         )
         return
     rows = rows[rows.statistic == "iqm"]
-    rows = rows.assign(place=rows.group, enough=rows.fewest_runs >= ENOUGH_RUNS)
     yield Picture(
         "aggregates",
         "Aggregates over kinds of tasks",
         "Mean over classes of the IQM over runs, with its 95 % stratified bootstrap interval: "
         "1 is the optimum, 0 the constant ½. The classes of an axis include the first class.",
         mark_rows(
-            rows, "value", _both("IQM of 1 − normalised regret"), _spaced(rows.place),
+            rows, "value", _both("IQM of 1 − normalised regret"), "group", _spaced(rows.group),
             looks_of(analysis), share_x=True,
         ),
     )  # fmt: skip
@@ -233,18 +232,19 @@ def draw_improvements(analysis: Analysis) -> Drawn:
         )
         return
     rows = rows[rows.group == ALL]
-    place = rows["first"] + " over " + rows["second"]
-    rows = rows.assign(place=place, enough=rows.fewest_runs >= ENOUGH_RUNS, algorithm="")
+    rows = rows.assign(place=rows["first"] + " over " + rows["second"], algorithm="")
     caption = (
         "How probably a run of the first algorithm beats a run of the second on a class drawn at "
         "random, with its 95 % interval: ½ where neither is better."
     )
     if not analysis.tables["offline"].empty:
         caption += " Algorithms that learnt from different data are not compared."
-    columns = _both("P(a run of X beats a run of Y)", neutral=0.5, limits=(-0.02, 1.02))
-    figure = mark_rows(
-        rows, "probability", columns, _spaced(place), {"": new_look("black", "o")}, share_x=True
+    columns, looks = (
+        _both("P(a run of X beats a run of Y)", neutral=0.5),
+        {"": new_look("black", "o")},
     )
+    places = _spaced(rows.place)
+    figure = mark_rows(rows, "probability", columns, "place", places, looks, share_x=True)
     yield Picture("improvements", "Probability of improvement", caption, figure)
 
 
@@ -269,9 +269,9 @@ def draw_differences(analysis: Analysis) -> Drawn:
         "with its 95 % bootstrap interval. The runs of a pair have the same instance and seed. "
         f"{FEW} pairs, {INDICATION}",
         mark_rows(
-            rows.assign(algorithm=rows.second, place=rows.class_name, enough=rows.enough_pairs),
-            "difference", [Column(metric.key, label, metric.label, 0.0) for metric in drawn],
-            places, looks, share_x=True,
+            rows.assign(algorithm=rows.second), "difference",
+            [Column(metric.key, label, metric.label, 0.0) for metric in drawn],
+            "class_name", places, looks, share_x=True,
         ),
     )  # fmt: skip
 

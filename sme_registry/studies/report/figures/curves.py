@@ -97,7 +97,7 @@ def _draw_axis(
     x = dict(zip(group.classes, scale.at, strict=True))
     levels = analysis.tables["levels"]
     levels = levels[(levels.metric == metric) & levels.class_name.isin(x)]
-    levels = levels.assign(at=levels.class_name.map(x), enough=levels.runs >= ENOUGH_RUNS)
+    levels = levels.assign(at=levels.class_name.map(x))
     levels = levels.sort_values("at", kind="stable")
     linear = levels.drop_duplicates("class_name", keep="last")
     look = LINEAR if ordered else new_look(GREY, "_", "none")
@@ -237,7 +237,6 @@ def _draw_improvements(
         axes.plot(data.nu, height, **look, linewidth=1.1, zorder=1.6)
     nus = sorted(set(analysis.tables["offline"].nu))
     apart = min((b - a for a, b in itertools.pairwise(nus)), default=1.0)
-    rows = rows.assign(enough=rows.runs >= ENOUGH_RUNS)
     for name, look, shift in side_by_side(looks, 0.25 * apart):
         means, singles = rows[rows.learner == name], runs[runs.learner == name]
         marks(axes, means, "improvement", means.nu + shift, look, upright=True, joined=True)

@@ -180,9 +180,11 @@ def marks(
 ) -> None:
     """Marks of the column `value` along x, or y if `upright`, with intervals from `low` to `high`.
 
-    They are hollow where the column `enough` is false.
+    They are hollow where a row rests on fewer than `ENOUGH_RUNS` runs, lives or pairs.
     """
     x, y = (at, rows[value]) if upright else (rows[value], at)
+    count = next(name for name in ("pairs", "fewest_runs", "runs") if name in rows)
+    enough = rows[count] >= ENOUGH_RUNS
     colour, known = look["color"], rows.low.notna()
     if joined:
         axes.plot(x, y, **{**look, "marker": ""}, linewidth=1.1, alpha=0.7)
@@ -190,7 +192,7 @@ def marks(
         draw_interval = axes.vlines if upright else axes.hlines
         draw_interval(at[known], rows.low[known], rows.high[known], color=colour, linewidth=1.4)
     style = {**look, "linestyle": "none", "markersize": 4.5, "markeredgewidth": 1.1}
-    for selected, face in ((rows.enough, colour), (~rows.enough, "white")):
+    for selected, face in ((enough, colour), (~enough, "white")):
         axes.plot(x[selected], y[selected], markerfacecolor=face, **style, zorder=3)
 
 
@@ -243,19 +245,19 @@ def tick_steps(axes: Axes) -> None:
 
 
 class Column(NamedTuple):
-    """A panel of rows of marks: the rows' metric, labels, a line at the neutral value, limits."""
+    """A panel of rows of marks: the rows' metric, labels, and a line at the neutral value."""
 
     metric: str
     label: str
     title: str = ""
     neutral: float | None = None
-    limits: tuple[float, float] | None = None
 
 
 def mark_rows(
     rows: pd.DataFrame,
     value: str,
     columns: Sequence[Column],
+    place: str,
     places: Mapping[str, float],
     looks: Mapping[str, Look],
     *,
@@ -263,12 +265,12 @@ def mark_rows(
 ) -> Figure:
     """A figure with a named row of marks at the height of each place, and a panel for each column.
 
-    `rows` has, beside the marks, the column `place`.
+    `place` is the column that says in which row a mark is.
     """
 
     def draw(axes: Axes, column: Column) -> None:
         of_metric = rows[rows.metric == column.metric]
-        at = of_metric.place.map(places)
+        at = of_metric[place].map(places)
         for name, look, shift in side_by_side(looks, 0.7):
             selected = of_metric.algorithm == name
             marks(axes, of_metric[selected], value, at[selected] + shift, look)
@@ -281,8 +283,6 @@ def mark_rows(
         axes.locator_params(axis="x", nbins=5)
         lines = column.label.splitlines()
         axes.set_xlabel("\n".join(wrapped(line, 0.9 * WIDTH / len(columns)) for line in lines))
-        if column.limits is not None:
-            axes.set_xlim(*column.limits)
 
     highest = max(places.values())
     labels = [wrapped(literal(name), _LABELS) for name in places]

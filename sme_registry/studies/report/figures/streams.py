@@ -13,7 +13,7 @@ from sme_registry.evaluation.streams import Visit
 from sme_registry.plots.curves import performance_curve, shade_visits, tick_visits
 from sme_registry.plots.maps import MATRIX_SCALE, draw_matrix
 from sme_registry.plots.style import GREY, legend_below
-from sme_registry.studies.report.analysis import CURVES, ENOUGH_RUNS, OF_LIVES, WITHIN, Analysis
+from sme_registry.studies.report.analysis import CURVES, OF_LIVES, WITHIN, Analysis
 from sme_registry.studies.report.figures import panels
 from sme_registry.studies.report.figures.panels import CONSTANT, Look, Picture, new_look, panel_grid
 from sme_registry.studies.report.texts import slug
@@ -56,13 +56,12 @@ def draw_metrics(analysis: Analysis) -> Iterator[Picture]:
         for metric in OF_LIVES
         if metric.key in _SHOWN and metric.key in set(rows.metric)
     ]
-    rows = rows.assign(place=rows.class_name, enough=rows.runs >= ENOUGH_RUNS)
     places = {name: float(i) for i, name in enumerate(_lived(analysis))}
     yield Picture(
         "stream-metrics",
         "Performance, forgetting and plasticity of whole lives",
         f"{_INTERVAL} Black lines: the constant ½, no forgetting, and as good as a fresh agent.",
-        panels.mark_rows(rows, "iqm", columns, places, _looks(analysis)),
+        panels.mark_rows(rows, "iqm", columns, "class_name", places, _looks(analysis)),
     )
 
 
@@ -104,15 +103,14 @@ def draw_plasticity(analysis: Analysis) -> Iterator[Picture]:
     """The plasticity ratio by visit, one panel a stream."""
     rows = _within(analysis.tables["stream_visit_metrics"])
     rows = rows[rows.metric == "plasticity_ratio"]
-    rows = rows.assign(enough=rows.runs >= ENOUGH_RUNS)
     if rows.empty:
         return
     looks = _looks(analysis)
 
     def draw_stream(axes: Axes, name: str) -> None:
         for algorithm, look, shift in panels.side_by_side(looks, 0.4):
-            own = rows[(rows.class_name == name) & (rows.algorithm == algorithm)]
-            panels.marks(axes, own, "iqm", own.visit + shift, look, upright=True, joined=True)
+            lives = rows[(rows.class_name == name) & (rows.algorithm == algorithm)]
+            panels.marks(axes, lives, "iqm", lives.visit + shift, look, upright=True, joined=True)
         axes.axhline(1.0, color="black", linewidth=0.9, zorder=1.5)
         tick_visits(axes, _visits(analysis, name))
 
