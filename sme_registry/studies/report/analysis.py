@@ -273,9 +273,9 @@ def with_tables(analysis: Analysis) -> Analysis:
         else:
             wanted = analysis.streams or not name.startswith("stream_")
             rows = {name: entry.make(analysis)} if wanted else {}
-        for key, made in rows.items():
-            is_frame = isinstance(made, pd.DataFrame)
-            analysis.tables[key] = made if is_frame else frame([*made], entry.columns)
+        for key, content in rows.items():
+            is_frame = isinstance(content, pd.DataFrame)
+            analysis.tables[key] = content if is_frame else frame([*content], entry.columns)
     return analysis
 
 

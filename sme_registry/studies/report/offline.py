@@ -107,8 +107,8 @@ def learner_names(algorithms: Sequence[StudyAlgorithm]) -> dict[str, str]:
         options = settings[algorithm.name]
         differing = [
             f"{key} = {options[key]}" if key in options else f"default {key}"
-            for key in sorted({key for each in alike for key in each})
-            if any(each.get(key) != alike[0].get(key) for each in alike)
+            for key in sorted({key for setting in alike for key in setting})
+            if any(setting.get(key) != alike[0].get(key) for setting in alike)
         ]
         name = parse_uses(algorithm.uses)[1].upper()
         names[algorithm.name] = f"{name} ({', '.join(differing)})" if differing else name

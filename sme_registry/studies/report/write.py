@@ -143,8 +143,8 @@ def _contents(
     figures, absent = draw_figures(analysis, figure_formats) if figure_formats else ([], [])
     contents: dict[str, str | bytes] = {}
     if "html" in formats:
-        found = findings(analysis)
-        contents["index.html"] = page(analysis, found, figures, absent, tables, explorers)
+        rows = findings(analysis)
+        contents["index.html"] = page(analysis, rows, figures, absent, tables, explorers)
         contents["findings.json"] = to_json(
             {
                 "schema_version": 2,  # 1 had nested documents instead of a table
@@ -152,7 +152,7 @@ def _contents(
                 "digest": analysis.file.digest,
                 "base": analysis.base,
                 "thresholds": THRESHOLDS,
-                "findings": records(found),
+                "findings": records(rows),
             }
         )
     for ending in ("png", "pdf"):
@@ -167,7 +167,7 @@ def _contents(
 
 def page(
     analysis: Analysis,
-    found: pd.DataFrame,
+    rows: pd.DataFrame,
     figures: Sequence[Picture],
     absent: Sequence[str],
     tables: Sequence[TextTable],
@@ -183,7 +183,7 @@ def page(
     }
     present = {
         "tables": True, "origin": True, "findings": analysis.classes, "streams": analysis.streams,
-        "offline": "offline" in set(found.section), "absent": absent, "explorers": explorers,
+        "offline": "offline" in set(rows.section), "absent": absent, "explorers": explorers,
     }  # fmt: skip
     offline = [table for table in tables if table.name.startswith("offline")]
     return templates.get_template("page.html.jinja").render(
@@ -195,7 +195,7 @@ def page(
             for key, (heading, _) in _SECTIONS.items()
             if present.get(key) or by_section[key]
         },
-        findings=_by_subject(found),
+        findings=_by_subject(rows),
         in_jax=_in_jax(analysis),
         figures=by_section,
         tables={"offline": offline, "tables": [t for t in tables if t not in offline]},
@@ -207,10 +207,10 @@ def page(
     )
 
 
-def _by_subject(found: pd.DataFrame) -> dict[str, dict[str, list[str]]]:
+def _by_subject(rows: pd.DataFrame) -> dict[str, dict[str, list[str]]]:
     """The sentences of each section, by algorithm, or by class in the sections of streams."""
     sections: dict[str, dict[str, list[str]]] = {}
-    for row in found.itertuples():
+    for row in rows.itertuples():
         subject = row.class_name if row.section.startswith("stream") else row.algorithm
         sections.setdefault(row.section, {}).setdefault(subject, []).append(row.sentence)
     return sections

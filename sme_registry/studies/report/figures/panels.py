@@ -183,8 +183,10 @@ def marks(
     They are hollow where a row rests on fewer than `ENOUGH_RUNS` runs, lives or pairs.
     """
     x, y = (at, rows[value]) if upright else (rows[value], at)
-    count = next(name for name in ("pairs", "fewest_runs", "runs") if name in rows)
-    enough = rows[count] >= ENOUGH_RUNS
+    if "enough_pairs" in rows:
+        enough = rows.enough_pairs
+    else:
+        enough = rows["fewest_runs" if "fewest_runs" in rows else "runs"] >= ENOUGH_RUNS
     colour, known = look["color"], rows.low.notna()
     if joined:
         axes.plot(x, y, **{**look, "marker": ""}, linewidth=1.1, alpha=0.7)
