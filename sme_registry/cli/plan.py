@@ -27,6 +27,7 @@ from sme_registry.cli.show import number_of_cells, study_table, summary
 from sme_registry.errors import MissingDependencyError, OptionError, SMEError
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.io import read_json
+from sme_registry.io.system import available_cores
 from sme_registry.io.tables import Table
 from sme_registry.io.terminal import duration_range, err, out, print_json
 from sme_registry.spec import (
@@ -49,7 +50,6 @@ from sme_registry.studies.engine.budget import (
     with_sources,
 )
 from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.engine.programs import available_cores
 from sme_registry.training.algorithms import (
     check_algorithm,
     code_notice,

@@ -22,6 +22,7 @@ from sme_registry.cli.plan import (
     plan,
 )
 from sme_registry.errors import OptionError
+from sme_registry.io.system import available_cores
 from sme_registry.io.tables import Table
 from sme_registry.io.terminal import duration_range, err, out, print_json
 from sme_registry.spec import StudyFile, catalogue
@@ -34,7 +35,6 @@ from sme_registry.studies.engine.ledger import (
     label,
     study_status,
 )
-from sme_registry.studies.engine.programs import available_cores
 from sme_registry.studies.engine.runner import run_study
 
 _FAILURES_SHOWN = 20

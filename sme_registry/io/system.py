@@ -188,6 +188,28 @@ def _limit_and_use(
         yield int(limit), use - int(statistics.get(cache_name, "0"))
 
 
+def available_cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@contextlib.contextmanager
+def child_environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Environment variables of the processes that are started inside the block."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
 @contextlib.contextmanager
 def defer_interrupts() -> Iterator[None]:
     """Deliver an interrupt only after the block, so that the files it writes agree."""

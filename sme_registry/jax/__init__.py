@@ -7,26 +7,87 @@
 Every module below imports JAX, which nothing outside this folder does. Importing the package turns
 64-bit numbers on for the whole process: states are float64, as METHOD, section 1 defines them.
 
-    device      the process's JAX: float64, precision, devices, compile cache
-    task        a drawn task as a pytree; several of one group, padded to equal shapes
-    pairs       float64 numbers as pairs of uint32, for devices without float64
-    transition  next states, exact: in float64 or in pairs
-    oracle      the optimal action, similarity, step reward and cost
-    observing   distractors, and what the agent sees in place of the state
+    task        a drawn task as a pytree, and its equations
     env         reset and step of one environment; vmap them
     gymnax      the same as a class with gymnax's methods
-    networks    perceptrons whose weights have Stable-Baselines3's names; Adam and clipping as Torch
-    ppo td3 sac the algorithms: hyperparameters, updates, and a `Program` of many lanes
-    off_policy  what TD3 and SAC share: when they act and update
-    replay      their buffer
-    critics     their twin critics and targets
-    ranges      of hyperparameters, as types
-    lives       which tasks the lanes of a program are on: one, or a stream's
-    padding     weights of a lane in networks of wider observations and actions
-    program     what all programs have: lanes, evaluation, saving, lanes that failed
+    networks    perceptrons and twin critics whose weights have Stable-Baselines3's names; Adam
+    program     what all programs have: runs, their tasks, evaluation, saving, runs that failed
+    ppo         PPO: hyperparameters, updates, program
+    off_policy  TD3 and SAC, and what they share: replay, and when they act and update
     run         a program from its start to its end, evaluated where a study's cell is
+
+Here is the process's JAX: its configuration, and its devices by name.
 """
 
-from sme_registry.jax import device as _device
+from __future__ import annotations
 
-_device.prepare()
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from sme_registry.errors import OptionError
+from sme_registry.io import available_memory, check_writable, require_packages
+
+CACHE_VARIABLE = "SME_JAX_CACHE"  # a folder, or "off"
+
+
+def prepare() -> None:
+    """Configure JAX for exact states and for agents equal to Stable-Baselines3's.
+
+    Prints a line on standard error if compiled programs cannot be kept: JAX itself says nothing.
+    """
+    require_packages("tasks and agents on the accelerator", {"jax": "JAX"}, "jax")
+    import jax
+
+    # As a scope, 64-bit numbers fail under vmap of a scan.
+    jax.config.update("jax_enable_x64", True)
+    # Recent GPUs multiply float32 matrices in TF32 by default: one update of TD3 is then 2e-4 off.
+    jax.config.update("jax_default_matmul_precision", "highest")
+    folder = os.environ.get(CACHE_VARIABLE) or str(_cache_folder())
+    if folder == "off" or "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    try:
+        check_writable(Path(folder) / "entry")
+    except OptionError:
+        print(  # no warning: training hides those of libraries
+            f"sme_registry: {folder} cannot be written, so each process compiles its programs of "
+            f"JAX again. Set {CACHE_VARIABLE} to a folder that you may write to, or to off.",
+            file=sys.stderr,
+        )
+    else:
+        jax.config.update("jax_compilation_cache_dir", folder)
+
+
+def find_device(name: str | None = None) -> Any:
+    """The first device of a platform: "cpu", "gpu" or "tpu"; None for JAX's default."""
+    import jax
+
+    if name is None:
+        return jax.devices()[0]
+    try:
+        return jax.devices(name)[0]
+    except RuntimeError:
+        known = sorted({each.platform for each in jax.devices()} | {"cpu"})
+        raise OptionError(
+            f"device={name!r}: must be one of {', '.join(known)}, the devices that JAX finds here. "
+            "For an NVIDIA GPU, install jax[cuda12] or jax[cuda13]."
+        ) from None
+
+
+def memory_of(device: Any) -> int | None:
+    """Bytes of memory that a new program on a device may use; None if unknown."""
+    if device.platform == "cpu":
+        return available_memory()
+    statistics = device.memory_stats() or {}
+    if "bytes_limit" not in statistics:
+        return None
+    return int(statistics["bytes_limit"]) - int(statistics.get("bytes_in_use", 0))
+
+
+def _cache_folder() -> Path:
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "sme-registry" / "jax"
+
+
+prepare()

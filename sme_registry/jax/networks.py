@@ -1,8 +1,9 @@
-"""Perceptrons whose weights have Stable-Baselines3's names, and Adam and clipping as in Torch.
+"""Perceptrons whose weights have Stable-Baselines3's names; Adam and clipping as in Torch.
 
 Weights are a flat dict from the names of SB3's `state_dict` to arrays in Torch's layout,
 `[out, in]` for a layer, so that exchanging a model with SB3 is a copy. Only `initial_…` run on the
-host, in NumPy; all other functions are pure, and are vmapped over lanes.
+host, in NumPy; all other functions are pure, of one run, and vmapped over the runs of a program.
+At the end are the types of hyperparameters.
 """
 
 from __future__ import annotations
@@ -10,12 +11,14 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field, StrictBool, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic_core import PydanticCustomError
 
 Weights = dict[str, jax.Array]
 HostWeights = dict[str, npt.NDArray[np.float32]]
@@ -88,6 +91,11 @@ def initial_perceptron(rng: np.random.Generator, prefix: str, widths: Sequence[i
     return weights
 
 
+def network(weights: Weights, name: str) -> Weights:
+    """The weights of one network: `actor`, `critic`, `critic_target`."""
+    return {key: weight for key, weight in weights.items() if key.startswith(f"{name}.")}
+
+
 class Adam(NamedTuple):
     """The state of `torch.optim.Adam`: moments of each weight, and the number of updates."""
 
@@ -107,11 +115,10 @@ def adam(
     gradients: Weights,
     learning_rate: float | jax.Array,
     epsilon: float = 1e-8,
-    betas: tuple[float, float] = (0.9, 0.999),
 ) -> tuple[Adam, Weights]:
     """One update of `torch.optim.Adam`, in its order of operations."""
     count = state.updates + 1
-    first, second = betas
+    first, second = 0.9, 0.999
     t = count.astype(jnp.float64)
     step = (learning_rate / (1.0 - first**t)).astype(jnp.float32)
     root = jnp.sqrt(1.0 - second**t).astype(jnp.float32)
@@ -129,3 +136,26 @@ def clipped(gradients: Weights, largest_norm: float) -> Weights:
     norm = jnp.sqrt(sum(jnp.sum(gradient**2) for gradient in gradients.values()))
     scale = jnp.minimum(1.0, largest_norm / (norm + 1e-6))
     return {name: scale * gradient for name, gradient in gradients.items()}
+
+
+def _widths(value: Any, check: ValidatorFunctionWrapHandler) -> Any:
+    try:
+        return check(value)
+    except ValidationError:
+        raise PydanticCustomError(
+            "widths", "must be a list of widths of at least 1, such as [256, 256]"
+        ) from None
+
+
+# Strict, as Stable-Baselines3 is: a text or a truth value is no number, a number no truth value.
+Flag = StrictBool
+Count = Annotated[int, Field(ge=1, strict=True)]
+CountFromZero = Annotated[int, Field(ge=0, strict=True)]
+Updates = Annotated[int, Field(ge=-1, strict=True)]
+"""In one go; −1 for as many as steps before them."""
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False, strict=True)]
+NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False, strict=True)]
+Share = Annotated[float, Field(ge=0.0, le=1.0, strict=True)]
+Coefficient = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Widths = Annotated[tuple[Count, ...], Field(min_length=1), WrapValidator(_widths)]
+"""Of hidden layers."""

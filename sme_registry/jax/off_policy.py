@@ -1,12 +1,16 @@
-"""`OffPolicyProgram`: what TD3 and SAC share: steps, replay, learning starts, and when they update.
+"""`OffPolicyProgram`: what TD3 and SAC share: replay, and when they act and update.
 
 One iteration of the compiled loop is [the update that is pending; a step of the environment], so
-that an evaluation between two calls sees the weights before the update of the last step. Lanes are
-in lockstep, so what is due is a number of all lanes, and its branch is a real one. The order is
+that an evaluation between two calls sees the weights before the update of the last step. Runs are
+in lockstep, so what is due is a number of all runs, and its branch is a real one. The order is
 that of Stable-Baselines3's `OffPolicyAlgorithm`, with n steps done:
 
     n > learning_starts and train_freq divides n:   gradient_steps updates
     n < learning_starts:                            a uniform action, else the policy's
+
+The replay buffer is one array `[capacity, runs, row]`, so that one step writes one slice, in place.
+With runs first, XLA would copy the whole buffer at each step. `A` action_dim, `B`
+batch, `O` width of an observation; actions in [−1, 1], whatever the action range.
 """
 
 from __future__ import annotations
@@ -18,22 +22,74 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sme_registry.jax import replay
 from sme_registry.jax.env import EnvState, observe, reset, step, to_unit
-from sme_registry.jax.networks import Weights
+from sme_registry.jax.networks import Adam, Weights, network
 from sme_registry.jax.program import PIECE, Array, Program, StepLog
-from sme_registry.jax.replay import Transitions
 from sme_registry.jax.task import TaskParams
 
 
-class OffPolicyState(NamedTuple):
-    """All that changes; each array has a leading axis of lanes, but for the buffer and `updated`.
+class ReplayRows(NamedTuple):
+    """Transitions, in any batch shape.
 
-    The buffer is `[capacity, lanes, row]`. Keys of a step follow from those of the lanes and the
-    step's number. `updated` is the number of steps before the last update.
+    The next observation at an episode's end is its last one, not the next one's first. As in
+    Stable-Baselines3's `handle_timeout_termination`, done is 1.0 only where the episode terminated:
+    where it was truncated, its last state has a value.
     """
 
-    learner: Any
+    observation: jax.Array
+    action: jax.Array
+    next_observation: jax.Array
+    reward: jax.Array
+    done: jax.Array
+
+
+def write_row(buffer: jax.Array, row: jax.Array, new: ReplayRows, writes: jax.Array) -> jax.Array:
+    """Store one transition of each run in a row, modulo the capacity; nothing if not `writes`."""
+    parts = (*new[:3], new.reward[..., None], new.done[..., None])
+    values = jnp.concatenate([part.astype(jnp.float32) for part in parts], axis=-1)
+    row = row % buffer.shape[0]
+    return buffer.at[row].set(jnp.where(writes, values, buffer[row]))
+
+
+def rewrite_next(
+    buffer: jax.Array, row: jax.Array, following: jax.Array, ended: jax.Array, phase: jax.Array
+) -> jax.Array:
+    """Store s' of a row again, `following` `[runs, O]`, as it is observed after a switch of tasks.
+
+    Where the episode `ended` there, s' stays as it was, but for the phase with which it ends.
+    """
+    row, end = row % buffer.shape[0], buffer.shape[-1] - 2
+    begin = end - following.shape[-1]
+    last = jnp.concatenate([buffer[row, :, begin : end - phase.shape[-1]], phase], axis=-1)
+    return buffer.at[row, :, begin:end].set(jnp.where(ended[:, None], last, following))
+
+
+def read_rows(buffer: jax.Array, rows: jax.Array, observation_dim: int) -> ReplayRows:
+    """The transitions `[runs, B]` in these rows `[runs, B]`."""
+    drawn = buffer[rows, jnp.arange(buffer.shape[1])[:, None]]
+    action_end = drawn.shape[-1] - observation_dim - 2
+    parts = jnp.split(drawn, [observation_dim, action_end, action_end + observation_dim], axis=-1)
+    observation, action, next_observation, rest = parts
+    return ReplayRows(observation, action, next_observation, rest[..., 0], rest[..., 1])
+
+
+class OffPolicyLearner(NamedTuple):
+    """What an update changes: all weights, and the optimisers' states; TD3 has no entropy."""
+
+    weights: Weights
+    actor: Adam
+    critic: Adam
+    entropy: Adam | None = None
+
+
+class OffPolicyState(NamedTuple):
+    """All that changes; each array has a leading axis of runs, but for the buffer and `updated`.
+
+    Keys of a step follow from those of the runs and the step's number. `updated` is the number of
+    steps before the last update.
+    """
+
+    learner: OffPolicyLearner
     buffer: jax.Array
     episode: EnvState
     observation: jax.Array
@@ -42,44 +98,44 @@ class OffPolicyState(NamedTuple):
 
     @property
     def weights(self) -> Weights:
-        weights: Weights = self.learner.weights
-        return weights
+        return self.learner.weights
 
 
 class OffPolicyProgram(Program):
-    """Lanes of TD3 or SAC; an update draws noise `draws` times for each action of its batch."""
+    """Runs of TD3 or SAC; an update draws noise `draws` times for each action of its batch."""
 
     buffer = "buffer"
     draws: int
     state: OffPolicyState
 
     @staticmethod
-    @abstractmethod
-    def initial_learner(weights: Weights) -> Any:
-        """One lane's learner before its first update."""
+    def initial_learner(weights: Weights) -> OffPolicyLearner:
+        """One run's learner before its first update."""
+        actor, critic = (network(weights, name) for name in ("actor", "critic"))
+        return OffPolicyLearner(weights, Adam.initial(actor), Adam.initial(critic))
 
     @staticmethod
     @abstractmethod
     def explore(
-        weights: Weights, observation: jax.Array, noise: jax.Array, mask: jax.Array
+        weights: Weights, observation: jax.Array, noise: jax.Array, channels: jax.Array
     ) -> jax.Array:
-        """One lane's action `[A]` in [−1, 1] while it learns, 0 in channels outside the mask."""
+        """One run's action `[A]` while it learns; see `TaskParams.channels`."""
 
     @staticmethod
     @abstractmethod
     def update(
         settings: Any,
-        learner: Any,
-        batch: Transitions,
+        learner: OffPolicyLearner,
+        batch: ReplayRows,
         noise: jax.Array,
-        mask: jax.Array,
+        channels: jax.Array,
         count: jax.Array,
         index: jax.Array,
-    ) -> Any:
-        """One lane's learner after an update with a batch `[B]` and noise `[A, draws, B]`.
+    ) -> OffPolicyLearner:
+        """One run's learner after an update with a batch `[B]` and noise `[A, draws, B]`.
 
         `count` is the number of this update from 1, `index` that among the `gradient_steps` of this
-        step from 0; both are the same in all lanes.
+        step from 0; both are the same in all runs.
         """
 
     def __init__(self, settings: Any, *arguments: Any, **options: Any) -> None:
@@ -87,24 +143,23 @@ class OffPolicyProgram(Program):
         super().__init__(settings, *arguments, **options)
 
     def initial_state(self, weights: Weights, keys: jax.Array) -> OffPolicyState:
-        """New lanes: random episodes, an empty buffer."""
+        """New runs: random episodes, an empty buffer."""
         capacity = min(self.settings.buffer_size, self._whole(self.budget))
         state: OffPolicyState = _initial(type(self), capacity, weights, keys, self.params)
         return state
 
     def advance(self, limit: int) -> StepLog:
         """Go on to step `limit`, or to the end of its `train_freq` steps; see `Program.advance`."""
-        pieces: list[StepLog] = []
+        logs: list[StepLog] = []
         end = self._whole(limit)
-        while self.steps < end or not pieces:
+        while self.steps < end or not logs:
             size = min(PIECE, max(0, self.lives.until(self.steps, end) - self.steps))
             log = self._loop(self.steps, self.steps + size, acts=True)
             self._go_on(size)
-            pieces.append(log.rows(slice(size)))
-        return StepLog.joined(pieces)
+            logs.append(log.rows(slice(size)))
+        return StepLog.joined(logs)
 
     def finish(self) -> None:
-        """Make the update that follows the last step."""
         self._loop(self.steps, self.steps + 1, acts=False)
 
     def save(self) -> dict[str, Array]:
@@ -133,11 +188,6 @@ class OffPolicyProgram(Program):
         return -(-steps // self.rollout) * self.rollout
 
 
-def in_range(action: jax.Array, symmetric: bool) -> jax.Array:
-    """Actions in [−1, 1], in the action range of the environment."""
-    return action if symmetric else to_unit(action, symmetric=True, dtype=jnp.float32)
-
-
 @functools.partial(jax.jit, static_argnames=("kind", "capacity"))
 def _initial(
     kind: type[OffPolicyProgram],
@@ -148,10 +198,11 @@ def _initial(
 ) -> OffPolicyState:
     starts, keys = jax.vmap(jax.random.split, out_axes=1)(keys)
     observation, episode = jax.vmap(reset)(starts, params)
-    lanes, observation_dim = observation.shape
+    runs, observation_dim = observation.shape
+    row = 2 * observation_dim + params.form.action_dim + 2
     return OffPolicyState(
         learner=jax.vmap(kind.initial_learner)(weights),
-        buffer=replay.empty(capacity, lanes, observation_dim, params.W.shape[-2]),
+        buffer=jnp.zeros((capacity, runs, row), jnp.float32),
         episode=episode,
         observation=observation,
         keys=keys,
@@ -173,25 +224,22 @@ def _steps(
 ) -> tuple[OffPolicyState, StepLog]:
     """Each step from `begin` to `end`, after the update that is pending; no step if not `acts`.
 
-    Of the log `[PIECE, lanes]`, the first `end − begin` rows are used.
+    Of the log `[PIECE, runs]`, the first `end − begin` rows are used.
     """
-    lanes = state.observation.shape[0]
-    masks = jax.vmap(lambda each: each.action_mask)(params)
+
+    channels = jax.vmap(lambda task: task.channels)(params)
 
     def body(n: jax.Array, carry: tuple[OffPolicyState, StepLog]) -> Any:
         state, log = carry
-        state = _updated(kind, settings, state, masks, n)
-        state, row = _acted(kind, settings, state, params, masks, n, acts)
+        state = _updated(kind, settings, state, channels, n)
+        state, row = _acted(kind, settings, state, params, channels, n, acts)
         log = jax.tree.map(
             lambda rows, one: jax.lax.dynamic_update_index_in_dim(rows, one, n - begin, 0), log, row
         )
         return state, log
 
-    real: Any = jnp.zeros((PIECE, lanes), params.r_min.dtype)
-    flag: Any = jnp.zeros((PIECE, lanes), bool)
-    costs = (real, real) if params.form.safety else ()
-    begun = state, StepLog(real, real, real, flag, flag, *costs)
-    ended: tuple[OffPolicyState, StepLog] = jax.lax.fori_loop(begin, end, body, begun)
+    log = StepLog.zeros((PIECE, len(state.observation)), params.form)
+    ended: tuple[OffPolicyState, StepLog] = jax.lax.fori_loop(begin, end, body, (state, log))
     return ended
 
 
@@ -202,7 +250,7 @@ def _switched(
     """The state after a switch to other tasks, which also changes s' of the last row."""
     observation = jax.vmap(observe)(state.episode, params)
     begins = state.episode.t == 0
-    buffer = replay.rewrite_next(state.buffer, row, observation, begins, phase)
+    buffer = rewrite_next(state.buffer, row, observation, begins, phase)
     return state._replace(observation=observation, buffer=buffer)
 
 
@@ -210,24 +258,26 @@ def _updated(
     kind: type[OffPolicyProgram],
     settings: Any,
     state: OffPolicyState,
-    masks: jax.Array,
+    channels: jax.Array,
     n: jax.Array,
 ) -> OffPolicyState:
     """The state after the updates that follow step n, where they are due and not yet made."""
     starts, every = settings.learning_starts, settings.train_freq
     count = settings.gradient_steps if settings.gradient_steps >= 0 else every
     before = (n // every - starts // every - 1) * count
-    observation_dim = state.observation.shape[-1]
 
-    def one(index: jax.Array, learner: Any) -> Any:
+    def one(index: jax.Array, learner: OffPolicyLearner) -> OffPolicyLearner:
         keys = _keys(state.keys, n, 2 + index)
         drawn, of_noise = jax.vmap(jax.random.split, out_axes=1)(keys)
-        noise = _normal(of_noise, (masks.shape[-1], kind.draws, settings.batch_size))
-        capacity = len(state.buffer)
-        rows = jax.vmap(lambda key: replay.sample_rows(key, settings.batch_size, n, capacity))
-        batch = replay.read(state.buffer, rows(drawn), observation_dim)
+        noise = _normal(of_noise, (channels.shape[-1], kind.draws, settings.batch_size))
+        written = jnp.minimum(n, len(state.buffer))
+        rows = jax.vmap(lambda key: jax.random.randint(key, (settings.batch_size,), 0, written))
+        batch = read_rows(state.buffer, rows(drawn), state.observation.shape[-1])
         update = jax.vmap(functools.partial(kind.update, settings), (0, 0, 0, 0, None, None))
-        return update(learner, batch, noise, masks, before + index + 1, index)
+        updated: OffPolicyLearner = update(
+            learner, batch, noise, channels, before + index + 1, index
+        )
+        return updated
 
     due = (n > starts) & (n % every == 0) & (n > state.updated)
     learner = jax.lax.cond(
@@ -244,47 +294,42 @@ def _acted(
     settings: Any,
     state: OffPolicyState,
     params: TaskParams,
-    masks: jax.Array,
+    channels: jax.Array,
     n: jax.Array,
     acts: jax.Array,
 ) -> tuple[OffPolicyState, StepLog]:
     """The state after step n + 1, and its row of the log; the same state if not `acts`."""
     starts, of_noise = _keys(state.keys, n, 0), _keys(state.keys, n, 1)
-    width = masks.shape[-1:]
+    width = (params.form.action_dim,)
 
     def random(observation: jax.Array) -> jax.Array:
         draw = functools.partial(jax.random.uniform, shape=width, dtype=jnp.float32, minval=-1.0)
-        return jnp.where(masks, jax.vmap(draw)(of_noise), 0.0)
+        return jax.vmap(draw)(of_noise)
 
     def chosen(observation: jax.Array) -> jax.Array:
         noise = _normal(of_noise, width)
-        return jax.vmap(kind.explore)(state.learner.weights, observation, noise, masks)
+        return jax.vmap(kind.explore)(state.learner.weights, observation, noise, channels)
 
     action = jax.lax.cond(n < settings.learning_starts, random, chosen, state.observation)
     unit = to_unit(action, symmetric=True)
     observation, episode, reward, _, info = jax.vmap(step)(starts, state.episode, unit, params)
-    final = info["final_observation"]
-    terminated = info["terminated"]
-    written = Transitions(state.observation, action, final, reward, terminated)
-    row: Any = reward, info["regret"], info["similarity"], terminated, info["truncated"]
-    costs: Any = info.get("cost"), info.get("safe_regret")
-    after = state._replace(
-        buffer=replay.write(state.buffer, n, written, acts),
-        episode=_chosen(acts, episode, state.episode),
-        observation=_chosen(acts, observation, state.observation),
+    final, terminated = info["final_observation"], info["terminated"]
+    new = ReplayRows(state.observation, action, final, reward, terminated)
+    episode, observation = jax.tree.map(
+        lambda x, y: jnp.where(acts, x, y),
+        (episode, observation),
+        (state.episode, state.observation),
     )
-    return after, StepLog(*row, *costs)
-
-
-def _chosen(acts: jax.Array, new: Any, old: Any) -> Any:
-    return jax.tree.map(lambda x, y: jnp.where(acts, x, y), new, old)
+    buffer = write_row(state.buffer, n, new, acts)
+    after = state._replace(buffer=buffer, episode=episode, observation=observation)
+    return after, StepLog.of(reward, info)
 
 
 def _normal(keys: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """Standard normal numbers of each lane, `[lanes, *shape]` float32."""
+    """Standard normal numbers of each run, `[runs, *shape]` float32."""
     return jax.vmap(lambda key: jax.random.normal(key, shape, jnp.float32))(keys)
 
 
 def _keys(keys: jax.Array, n: jax.Array, use: int | jax.Array) -> jax.Array:
-    """The key of each lane for one use in step n."""
+    """The key of each run for one use in step n."""
     return jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, n), use))(keys)

@@ -2,15 +2,14 @@
 
 Source: Schulman et al. (2017), Proximal Policy Optimization Algorithms; defaults and order of
 operations: SB3's `PPO` with `MlpPolicy`. `n` steps of a rollout, `O` observation width, `A` action
-channels, `B` steps of a minibatch. Functions are of one lane, and vmapped.
+channels, `B` steps of a minibatch. Functions are of one run, and vmapped.
 
     a ~ N(μ(o), σ²)                      clipped to the action range for the environment alone
     δ_t = R_t + γ V(o_{t+1}) − V(o_t)    after an episode's end V(o_{t+1}) and Â_{t+1} are 0;
     Â_t = δ_t + γ λ Â_{t+1}              at a truncation R_t includes γ V(last observation)
     loss = −mean min(ρ Â, clip(ρ, 1 ± ε) Â) + c_V mean (Â + V_old − V)² − c_H entropy
 
-ρ is the ratio of π(a) now and when the action was taken. Padded observations are 0, and padded
-action channels are masked in log π and in the entropy, so the weights of both get no gradients.
+ρ is the ratio of π(a) now and when the action was taken.
 """
 
 from __future__ import annotations
@@ -25,12 +24,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from sme_registry.errors import OptionError
-from sme_registry.jax import observing, oracle
 from sme_registry.jax.env import EnvState, advance, observe, reset, to_unit
 from sme_registry.jax.networks import (
     Adam,
+    Coefficient,
+    Count,
+    Flag,
     HostWeights,
+    Positive,
+    Share,
     Weights,
+    Widths,
     adam,
     clipped,
     hidden_layers,
@@ -38,8 +42,7 @@ from sme_registry.jax.networks import (
     linear,
 )
 from sme_registry.jax.program import Program, StepLog
-from sme_registry.jax.ranges import Count, Flag, Positive, Share, Weight, Widths
-from sme_registry.jax.task import TaskParams
+from sme_registry.jax.task import StepOutcome, TaskParams, judge, random_numbers
 
 _LOG_ROOT_TAU = 0.5 * math.log(2.0 * math.pi)
 _JUDGED_AT_ONCE = 256  # steps of a rollout
@@ -62,8 +65,8 @@ class PPO:
     clip_range: Positive = 0.2
     clip_range_vf: Positive | None = None
     normalize_advantage: Flag = True
-    ent_coef: Weight = 0.0
-    vf_coef: Weight = 0.5
+    ent_coef: Coefficient = 0.0
+    vf_coef: Coefficient = 0.5
     max_grad_norm: Positive = 0.5
     net_arch: Widths = (64, 64)
 
@@ -75,14 +78,14 @@ class PPO:
             )
 
 
-class Learner(NamedTuple):
+class PPOLearner(NamedTuple):
     """What an update changes: weights by SB3's names, and the optimiser's state."""
 
     weights: Weights
     optimiser: Adam
 
 
-class Steps(NamedTuple):
+class RolloutSteps(NamedTuple):
     """The steps of a rollout, as the environment answered: `[n, ...]`, actions not clipped.
 
     `last_observation` is that after the step, and before the next episode begins.
@@ -106,14 +109,14 @@ class Rollout(NamedTuple):
     advantage: jax.Array
 
 
-class State(NamedTuple):
-    """All that changes in a `PPOProgram`; each array has a leading axis of lanes."""
+class PPOState(NamedTuple):
+    """All that changes in a `PPOProgram`; each array has a leading axis of runs."""
 
     weights: Weights
     optimiser: Adam
     key: jax.Array
     episode: EnvState
-    steps: Steps
+    steps: RolloutSteps
 
 
 def mean(settings: PPO, weights: Weights, observation: jax.Array) -> jax.Array:
@@ -128,12 +131,16 @@ def value(settings: PPO, weights: Weights, observation: jax.Array) -> jax.Array:
 
 
 def log_density(
-    settings: PPO, weights: Weights, observation: jax.Array, action: jax.Array, mask: jax.Array
+    settings: PPO,
+    weights: Weights,
+    observation: jax.Array,
+    action: jax.Array,
+    channels: jax.Array,
 ) -> jax.Array:
-    """log π `[...]` of actions `[..., A]`; only the channels of the mask `[A]` count."""
+    """log π `[...]` of actions `[..., A]`; see `TaskParams.channels`."""
     log_std = weights["log_std"]
     z = (action - mean(settings, weights, observation)) * jnp.exp(-log_std)
-    return jnp.sum(jnp.where(mask, -0.5 * z**2 - log_std - _LOG_ROOT_TAU, 0.0), axis=-1)
+    return jnp.sum(jnp.where(channels, -0.5 * z**2 - log_std - _LOG_ROOT_TAU, 0.0), axis=-1)
 
 
 def collect(
@@ -149,12 +156,12 @@ def collect(
     symmetric: bool,
     separable: bool,
     numbers: Any = None,
-) -> tuple[EnvState, Steps, StepLog]:
+) -> tuple[EnvState, RolloutSteps, StepLog]:
     """The steps `begin` … `end` − 1 of a rollout of n, and their log; the other rows are arbitrary.
 
     `noise` `[A, n]` is standard normal, `fresh` `[n]` the environment after each step if an episode
-    ends there, `numbers` those of `observing.drawn`. Where rewards are `separable`, the oracle is
-    asked once for all steps.
+    ends there, `numbers` those of `task.random_numbers`. Where rewards are `separable`, the oracle
+    is asked once for all steps.
     """
     sigma = jnp.exp(weights["log_std"])
     n = noise.shape[1]
@@ -166,8 +173,7 @@ def collect(
         action = mean(settings, weights, now) + sigma * noise
         a = to_unit(action, symmetric)
         _, after, reward, ended, info = advance(episode, a, numbers, params)
-        parts: Any = map(info.get, oracle.Judgement._fields)
-        judged: Any = oracle.Judgement(*parts), reward, info["terminated"]
+        judged: Any = StepLog.of(reward, info)
         if separable:  # XLA drops the oracle from the loop, since no result of it is used
             after = after._replace(accumulated_reward=episode.accumulated_reward)
             ended, judged = info["truncated"], (episode.s, a)
@@ -178,51 +184,47 @@ def collect(
     def body(i: jax.Array, carry: tuple[EnvState, Any]) -> tuple[EnvState, Any]:
         episode, rows = carry
         episode, row = one(episode, noise.T[i], _at(numbers, i), _at(fresh, i))
-        return episode, jax.tree.map(lambda all, own: all.at[i].set(own), rows, row)
+        return episode, jax.tree.map(lambda column, x: column.at[i].set(x), rows, row)
 
     shapes = jax.eval_shape(one, episode, noise[:, 0], _at(numbers, 0), _at(fresh, 0))[1]
     rows = jax.tree.map(lambda x: jnp.zeros((n, *x.shape), x.dtype), shapes)
     # No scan, whose length is fixed: parts of rollouts are of any length.
     episode, (taken, judged) = jax.lax.fori_loop(begin, end, body, (episode, rows))
     observed, action, truncated, last_observation = taken
-    if separable:
-        judgement = _judged(params, judged, begin, end)
-        judged = judgement, judgement.step_reward, jnp.zeros_like(truncated)
-    (similarity, step_reward, *costs), reward, terminated = judged
-    log = StepLog(reward, 1.0 - step_reward, similarity, terminated, truncated, *costs)
-    reward = reward.astype(jnp.float32)
-    steps = Steps(observed, action, reward, terminated, truncated, last_observation)
+    log = _judged(params, judged, truncated, begin, end) if separable else judged
+    reward = log.reward.astype(jnp.float32)
+    steps = RolloutSteps(observed, action, reward, log.terminated, truncated, last_observation)
     return episode, steps, log
 
 
 def _judged(
     params: TaskParams,
     rows: tuple[jax.Array, jax.Array],
+    truncated: jax.Array,
     begin: int | jax.Array,
     end: int | jax.Array,
-) -> oracle.Judgement:
-    """Judge states and actions `[n, …]` from `begin` to before `end`: `[n]` of each number.
+) -> StepLog:
+    """The log `[n]` of states and actions `[n, …]` from `begin` to before `end`.
 
     In blocks, so that a short part of a rollout costs little; outside them values are arbitrary.
     """
-    n = len(rows[0])
+    n = len(truncated)
     size = min(n, _JUDGED_AT_ONCE)
 
-    def body(i: jax.Array, judged: oracle.Judgement) -> oracle.Judgement:
+    def body(i: jax.Array, judged: StepOutcome) -> StepOutcome:
         first = jnp.minimum(i * size, n - size)
         s, a = (jax.lax.dynamic_slice_in_dim(x, first, size) for x in rows)
-        block = oracle.judge(params, s, a)
-        new: oracle.Judgement = jax.tree.map(
-            lambda x, y: jax.lax.dynamic_update_slice_in_dim(x, y, first, 0), judged, block
+        new: StepOutcome = jax.tree.map(
+            lambda x, y: jax.lax.dynamic_update_slice_in_dim(x, y, first, 0),
+            judged,
+            judge(params, s, a),
         )
         return new
 
     zeros = jnp.zeros(n, params.r_min.dtype)
-    costs = (zeros, zeros) if params.form.safety else ()
-    judged: oracle.Judgement = jax.lax.fori_loop(
-        begin // size, -(-end // size), body, oracle.Judgement(zeros, zeros, *costs)
-    )
-    return judged
+    none = StepOutcome(zeros, zeros, *[zeros if params.form.safety else None] * 2)
+    similarity, reward, *costs = jax.lax.fori_loop(begin // size, -(-end // size), body, none)
+    return StepLog(reward, 1.0 - reward, similarity, jnp.zeros_like(truncated), truncated, *costs)
 
 
 def _at(rows: Any, i: int | jax.Array) -> Any:
@@ -230,13 +232,16 @@ def _at(rows: Any, i: int | jax.Array) -> Any:
 
 
 def rollout(
-    settings: PPO, weights: Weights, steps: Steps, next_observation: jax.Array, mask: jax.Array
+    settings: PPO,
+    weights: Weights,
+    steps: RolloutSteps,
+    next_observation: jax.Array,
+    channels: jax.Array,
 ) -> Rollout:
-    """Densities, values and advantages of the steps of one lane.
+    """Densities, values and advantages of the steps of one run.
 
     An episode that was truncated would have gone on: the value of its last observation is added to
-    its last reward. The next rollout begins with `next_observation`; action channels outside the
-    mask do not exist.
+    its last reward. The next rollout begins with `next_observation`.
     """
     values = value(settings, weights, steps.observation)
     cut = steps.truncated & ~steps.terminated
@@ -247,7 +252,7 @@ def rollout(
     return Rollout(
         steps.observation,
         steps.action,
-        log_density(settings, weights, steps.observation, steps.action, mask),
+        log_density(settings, weights, steps.observation, steps.action, channels),
         values,
         advantages(settings, reward, values, next_value, ended),
     )
@@ -271,21 +276,21 @@ def advantages(
 
 def update(
     settings: PPO,
-    learner: Learner,
+    learner: PPOLearner,
     rollout: Rollout,
     batches: jax.Array,
-    mask: jax.Array,
-) -> Learner:
+    channels: jax.Array,
+) -> PPOLearner:
     """One update for each minibatch `[updates, B]` of steps."""
 
-    def one(learner: Learner, batch: jax.Array) -> tuple[Learner, None]:
+    def one(learner: PPOLearner, batch: jax.Array) -> tuple[PPOLearner, None]:
         weights, optimiser = learner
-        chosen = Rollout(*(each[batch] for each in rollout))
-        gradients = jax.grad(_loss, argnums=1)(settings, weights, chosen, mask)
+        chosen = Rollout(*(column[batch] for column in rollout))
+        gradients = jax.grad(_loss, argnums=1)(settings, weights, chosen, channels)
         gradients = clipped(gradients, settings.max_grad_norm)
         rate = settings.learning_rate
         optimiser, weights = adam(optimiser, weights, gradients, rate, _ADAM_EPSILON)
-        return Learner(weights, optimiser), None
+        return PPOLearner(weights, optimiser), None
 
     return jax.lax.scan(one, learner, batches)[0]
 
@@ -303,8 +308,8 @@ def permutations(key: jax.Array, count: int, n: int) -> jax.Array:
     return orders.astype(jnp.int32)
 
 
-def _loss(settings: PPO, weights: Weights, batch: Rollout, mask: jax.Array) -> jax.Array:
-    density = log_density(settings, weights, batch.observation, batch.action, mask)
+def _loss(settings: PPO, weights: Weights, batch: Rollout, channels: jax.Array) -> jax.Array:
+    density = log_density(settings, weights, batch.observation, batch.action, channels)
     ratio = jnp.exp(density - batch.log_density)
     advantage = batch.advantage
     if settings.normalize_advantage:
@@ -317,7 +322,7 @@ def _loss(settings: PPO, weights: Weights, batch: Rollout, mask: jax.Array) -> j
         change = jnp.clip(values - batch.value, -settings.clip_range_vf, settings.clip_range_vf)
         values = batch.value + change
     value_loss = ((batch.advantage + batch.value - values) ** 2).mean()
-    entropy = jnp.sum(jnp.where(mask, 0.5 + _LOG_ROOT_TAU + weights["log_std"], 0.0))
+    entropy = jnp.sum(jnp.where(channels, 0.5 + _LOG_ROOT_TAU + weights["log_std"], 0.0))
     return policy_loss + settings.vf_coef * value_loss - settings.ent_coef * entropy
 
 
@@ -353,8 +358,8 @@ class PPOProgram(Program):
             weights |= initial_orthogonal(rng, head, width, outputs, gain)
         return weights
 
-    def initial_state(self, weights: Weights, keys: jax.Array) -> State:
-        state: State = _begin(self.settings, self.params, weights, keys)
+    def initial_state(self, weights: Weights, keys: jax.Array) -> PPOState:
+        state: PPOState = _begin(self.settings, self.params, weights, keys)
         return state
 
     @staticmethod
@@ -363,9 +368,7 @@ class PPOProgram(Program):
 
     def advance(self, limit: int) -> StepLog:
         """Whole rollouts until `limit` is reached, and the updates between them."""
-        none = np.zeros((0, self.lanes))
-        costs = (none, none) if self.params.form.safety else ()
-        logs = [StepLog(none, none, none, none > 0, none > 0, *costs)]
+        logs = [StepLog.zeros((0, self.runs), self.params.form)]
         while self.steps < limit:
             self.finish()
             logs += self._collected()
@@ -389,31 +392,27 @@ class PPOProgram(Program):
                 part.start,
                 part.stop,
             )
-            whole = part.stop - part.start == self.rollout
-            logs.append(log if whole else log.rows(part))
+            logs.append(log.rows(part))
         return logs
 
     def finish(self) -> None:
         """Learn from the last rollout, unless that is done."""
-        settings = self.settings
-        updates = self.steps // settings.batch_size * settings.n_epochs
+        updates = self.steps // self.settings.batch_size * self.settings.n_epochs
         if self.state.optimiser.updates[0] < updates:
-            params: Any = self.params._asdict() | {"inner": None, "output": None}
-            # Without layers, so that it is compiled once for all tasks of a stream.
-            self.state = _learn(settings, TaskParams(**params), self.state)
+            self.state = _learn(self.settings, self.params, self.state)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _begin(settings: PPO, params: TaskParams, weights: Weights, keys: jax.Array) -> State:
-    def lane(params: TaskParams, weights: Weights, key: jax.Array) -> State:
-        key, own = jax.random.split(key)
-        first, episode = reset(own, params)
+def _begin(settings: PPO, params: TaskParams, weights: Weights, keys: jax.Array) -> PPOState:
+    def run(params: TaskParams, weights: Weights, key: jax.Array) -> PPOState:
+        key, of_start = jax.random.split(key)
+        first, episode = reset(of_start, params)
         flag, number = jnp.zeros((), bool), jnp.zeros((), jnp.float32)
-        none = Steps(first, weights["log_std"], number, flag, flag, first)
+        none = RolloutSteps(first, weights["log_std"], number, flag, flag, first)
         steps = jax.tree.map(lambda x: jnp.zeros((settings.n_steps, *x.shape), x.dtype), none)
-        return State(weights, Adam.initial(weights), key, episode, steps)
+        return PPOState(weights, Adam.initial(weights), key, episode, steps)
 
-    return jax.vmap(lane)(params, weights, keys)
+    return jax.vmap(run)(params, weights, keys)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))
@@ -422,24 +421,24 @@ def _collect(
     symmetric: bool,
     separable: bool,
     params: TaskParams,
-    state: State,
+    state: PPOState,
     phase: jax.Array,
     begin: jax.Array,
     end: jax.Array,
-) -> tuple[State, StepLog]:
-    """A part of a rollout of all lanes, and its log in the rows of `[n, lanes]`.
+) -> tuple[PPOState, StepLog]:
+    """A part of a rollout of all runs, and its log in the rows of `[n, runs]`.
 
-    Each part draws the random numbers of the whole rollout, and uses its own. `phase` `[lanes, P]`
+    Each part draws the random numbers of the whole rollout, and uses its own. `phase` `[runs, P]`
     is that of the observation after its last step.
     """
+    n = settings.n_steps
 
-    def lane(params: TaskParams, state: State, phase: jax.Array) -> tuple[State, StepLog]:
+    def run(params: TaskParams, state: PPOState, phase: jax.Array) -> tuple[PPOState, StepLog]:
         key, of_noise, of_starts = jax.random.split(state.key, 3)
-        n, A = settings.n_steps, params.W.shape[0]
-        noise = jax.random.normal(of_noise, (A, n), jnp.float32)
+        noise = jax.random.normal(of_noise, (params.form.action_dim, n), jnp.float32)
         starts = jax.random.split(of_starts, n)
         _, fresh = jax.vmap(reset, (0, None))(starts, params)
-        numbers = jax.vmap(observing.drawn, (0, None))(starts, params)
+        numbers = jax.vmap(random_numbers, (0, None))(starts, params)
         episode, steps, log = collect(
             settings, state.weights, params, state.episode, noise, fresh, begin, end,
             symmetric=symmetric, separable=separable, numbers=numbers,
@@ -447,37 +446,32 @@ def _collect(
         last = steps.last_observation
         last = last.at[end - 1, last.shape[-1] - len(phase) :].set(phase)
         here = (jnp.arange(n) >= begin) & (jnp.arange(n) < end)
-        steps = _chosen(here, steps._replace(last_observation=last), state.steps)
+        steps = jax.tree.map(
+            lambda new, old: jnp.where(here.reshape(-1, *[1] * (new.ndim - 1)), new, old),
+            steps._replace(last_observation=last),
+            state.steps,
+        )
         key = jnp.where(end == n, key, state.key)
         return state._replace(key=key, episode=episode, steps=steps), log
 
-    return jax.vmap(lane, out_axes=(0, 1))(params, state, phase)
-
-
-def _chosen(rows: jax.Array, new: Steps, old: Steps) -> Steps:
-    """The new steps where `rows` `[n]`, the old ones elsewhere."""
-    chosen: Steps = jax.tree.map(
-        lambda x, y: jnp.where(rows.reshape(-1, *[1] * (x.ndim - 1)), x, y), new, old
-    )
-    return chosen
+    return jax.vmap(run, out_axes=(0, 1))(params, state, phase)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _learn(settings: PPO, params: TaskParams, state: State) -> State:
-    """The updates of all lanes on their last rollout."""
+def _learn(settings: PPO, params: TaskParams, state: PPOState) -> PPOState:
+    """The updates of all runs on their last rollout."""
 
-    def lane(params: TaskParams, state: State) -> State:
+    def run(params: TaskParams, state: PPOState) -> PPOState:
         key, of_batches = jax.random.split(state.key)
         batches = permutations(of_batches, settings.n_epochs, settings.n_steps)
-        mask = params.action_mask
-        following = observe(state.episode, params)
+        following, channels = observe(state.episode, params), params.channels
         learner = update(
             settings,
-            Learner(state.weights, state.optimiser),
-            rollout(settings, state.weights, state.steps, following, mask),
+            PPOLearner(state.weights, state.optimiser),
+            rollout(settings, state.weights, state.steps, following, channels),
             batches.reshape(-1, settings.batch_size),
-            mask,
+            channels,
         )
         return state._replace(weights=learner.weights, optimiser=learner.optimiser, key=key)
 
-    return jax.vmap(lane)(params, state)
+    return jax.vmap(run)(params, state)

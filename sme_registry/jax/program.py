@@ -1,9 +1,9 @@
-"""`Program`: the lanes of one algorithm, which learn and are evaluated in compiled code.
+"""`Program`: the runs of one algorithm, which learn and are evaluated in compiled code.
 
-A lane is one run: a task or a stream of tasks, a seed, weights. All lanes of a program have the
-same algorithm, hyperparameters, budget, padded shapes and `Form`, and take the same number of
-steps; their tasks, seeds and reward settings (k, T, r_min, D) differ. A lane's bits depend on the
-number of lanes and on no other lane, so results record that number.
+A run is a task or a stream of tasks, a seed, weights. All runs of a program have the same
+algorithm, hyperparameters, budget and `Form` of tasks, and take the same number of steps; their
+tasks, seeds and reward settings (k, T, r_min, D) differ. A run's bits depend on the number of runs
+and on no other run, so results record that number.
 
 A subclass has one algorithm's state, `initial_state`, `advance`, `finish`, and the pure functions
 `initial_weights` and `act`; all else is here.
@@ -14,8 +14,8 @@ from __future__ import annotations
 import functools
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,16 +23,24 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.errors import OptionError, ResourceLimitError
-from sme_registry.jax import networks, observing, oracle
-from sme_registry.jax.device import find_device, memory_of
-from sme_registry.jax.env import EnvState, advance, moved, observe, start, to_unit
-from sme_registry.jax.lives import Lane, Lives
+from sme_registry.jax import find_device, memory_of
+from sme_registry.jax.env import EnvState, Info, advance, moved, observe, start, to_unit
 from sme_registry.jax.networks import HostWeights, Weights
-from sme_registry.jax.padding import Dimensions, Padding
-from sme_registry.jax.task import Shape, TaskParams
-from sme_registry.jax.transition import States
+from sme_registry.jax.task import (
+    Form,
+    TaskParams,
+    check_supported,
+    first_distractors,
+    judge,
+    random_numbers,
+    stacked_params,
+)
+from sme_registry.spec import SMESpec, StreamSpec
+from sme_registry.task import materialize_segments
 
 Array = npt.NDArray[Any]
+Document = SMESpec | StreamSpec
+"""What a run lives through: one task, or a stream of them."""
 
 PIECE = 500
 """The most steps between two returns from compiled code."""
@@ -41,18 +49,28 @@ _JUDGED_AT_ONCE = 25  # steps of an episode
 
 
 class StepLog(NamedTuple):
-    """What happened in the steps of one `advance`; each array is `[steps, lanes]`.
+    """What happened in the steps of one `advance`; each array is `[steps, runs]`.
 
     `reward` is R, the payout; `cost` and `safe_regret` are None without `safety`.
     """
 
-    reward: Array
-    regret: Array
-    similarity: Array
-    terminated: Array
-    truncated: Array
-    cost: Array | None = None
-    safe_regret: Array | None = None
+    reward: Any
+    regret: Any
+    similarity: Any
+    terminated: Any
+    truncated: Any
+    cost: Any = None
+    safe_regret: Any = None
+
+    @classmethod
+    def of(cls, reward: jax.Array, info: Info) -> StepLog:
+        """The log of what `env.step` returned."""
+        return cls(reward, *(info.get(name) for name in cls._fields[1:]))
+
+    @classmethod
+    def zeros(cls, shape: tuple[int, int], form: Form) -> StepLog:
+        real, flag = jnp.zeros(shape, jnp.float64), jnp.zeros(shape, bool)
+        return cls(real, real, real, flag, flag, *[real if form.safety else None] * 2)
 
     @classmethod
     def joined(cls, logs: Sequence[StepLog]) -> StepLog:
@@ -60,12 +78,12 @@ class StepLog(NamedTuple):
         return log
 
     def rows(self, part: slice) -> StepLog:
-        log: StepLog = jax.tree.map(lambda each: np.asarray(each)[part], self)
+        log: StepLog = jax.tree.map(lambda column: np.asarray(column)[part], self)
         return log
 
 
 class Evaluation(NamedTuple):
-    """Episodes of the present deterministic policies: sums over steps, `[lanes, episodes]`."""
+    """Episodes of the present deterministic policies: sums over steps, `[runs, episodes]`."""
 
     episode_return: Array
     length: Array
@@ -73,20 +91,58 @@ class Evaluation(NamedTuple):
     similarity: Array
 
 
-class State(Protocol):
-    """All that changes in a program: a pytree of arrays, such as a NamedTuple."""
+class Lives:
+    """Which tasks the runs of a program are on, by the steps that each has taken: its lifetime.
 
-    @property
-    def weights(self) -> Weights:
-        """By SB3's names, `[lanes, ...]`."""
+    A run lives through a stream, or is on one task for ever. All runs switch at the same steps, at
+    once, and what a program keeps of its runs does not depend on their tasks, so a switch passes
+    other `TaskParams` to the same code, compiled once for each `Form`.
+
+    `separable` says whether rewards change no observation and end no episode: k = 1 and D = 0 in
+    all tasks.
+    """
+
+    def __init__(self, documents: Sequence[Document], device: Any) -> None:
+        _check_alike(documents)
+        first, drawn = documents[0], {}
+        for document in dict.fromkeys(documents):
+            check_supported(document)
+            drawn[document] = materialize_segments(document)
+        self.stream = first if isinstance(first, StreamSpec) else None
+        self._times, self._at_once = first.times, first.switch == "step"
+        segments = [*zip(*(drawn[document] for document in documents), strict=True)]
+        specs = [task.spec for tasks in segments for task in tasks]
+        self.separable = all(spec.k == 1 and spec.D == 0 for spec in specs)
+        params = {
+            tasks: jax.device_put(stacked_params(tasks), device)
+            for tasks in dict.fromkeys(segments)
+        }
+        self._params: list[TaskParams] = [params[tasks] for tasks in segments]
+        if first.observed_phases:
+            one_hot = np.eye(first.observed_phases, dtype=np.float32)
+            for i, segment in enumerate(first.segments):
+                phase = np.tile(one_hot[segment.phase], (len(documents), 1))
+                self._params[i] = self._params[i]._replace(phase=jax.device_put(phase, device))
+
+    def at(self, lifetime: int) -> TaskParams:
+        """The tasks on which the next step is taken."""
+        return self._params[self._times.segment_at(lifetime)]
+
+    def until(self, lifetime: int, limit: int) -> int:
+        """The step before which these tasks are left, at most `limit`."""
+        return min(limit, self._times.next_switch(lifetime))
+
+    def phase_after(self, lifetime: int) -> jax.Array:
+        """The one-hot `[runs, P]` in the last observation of an episode that ends there."""
+        return self.at(lifetime if self._at_once else lifetime - 1).phase
 
 
 class Program(ABC):
-    """The lanes of one algorithm: `advance` until the budget is used, then `finish`.
+    """The runs of one algorithm: `advance` until the budget is used, then `finish`.
 
-    `specs` are those of the lanes without the copies that fill the program up to `lanes`; `steps`
-    and `budget` are of each lane. `separable` (k = 1 and D = 0 in all tasks) says that the oracle
-    can be asked later, for many steps at once.
+    `specs` are those of the runs without the copies of the first that fill the program up to
+    `runs`; `steps` and `budget` are of each run. `separable` (k = 1 and D = 0 in all tasks) says
+    that the oracle can be asked later, for many steps at once.
     """
 
     buffer = ""
@@ -102,43 +158,41 @@ class Program(ABC):
     """Steps between two updates: an evaluation due in them has the weights before the second."""
 
     state: Any
+    """All that changes: a NamedTuple of arrays with `weights` by SB3's names, `[runs, ...]`."""
 
     def __init__(
         self,
         settings: Any,
-        specs: Sequence[Lane],
+        specs: Sequence[Document],
         seeds: Sequence[int],
         *,
         steps: int,
         action_range: str = "symmetric",
-        lanes: int | None = None,
-        shape: Shape | None = None,
+        runs: int | None = None,
         device: str | None = None,
         at_once: int = 1,
     ) -> None:
-        """New lanes, before their first step; `at_once` programs share the device's memory."""
+        """New runs, before their first step; `at_once` programs share the device's memory."""
         self.settings, self.specs, self.budget = settings, tuple(specs), steps
         self.symmetric = action_range == "symmetric"
-        self.lanes = len(specs) if lanes is None else lanes
-        copies = self.lanes - len(specs)
+        self.runs = len(specs) if runs is None else runs
+        copies = self.runs - len(specs)
         specs = [*specs, *[specs[0]] * copies]
         seeds = [*seeds, *[seeds[0]] * copies]
         self.device = find_device(device)
-        self.lives, self.steps = Lives(specs, shape, self.device), 0
+        self.lives, self.steps = Lives(specs, self.device), 0
         self.separable = self.lives.separable
-        A, S = self.params.W.shape[-2:]
-        self._initial_weights = functools.partial(self.initial_weights, settings)
-        full = Dimensions(S, A, self.lives.phases, self.params.form.distractors)
-        self._padding = Padding(self._initial_weights, full)
-        weights = [self._new_weights(*lane) for lane in zip(specs, seeds, strict=True)]
-        stacked = {name: np.stack([lane[name] for lane in weights]) for name in weights[0]}
+        widths = specs[0].observation_dim, specs[0].action_dim
+        rngs = map(np.random.default_rng, seeds)
+        weights = [self.initial_weights(settings, rng, *widths) for rng in rngs]
+        stacked = {name: np.stack([run[name] for run in weights]) for name in weights[0]}
         keys = jax.vmap(jax.random.PRNGKey)(np.asarray(seeds, np.uint32))
-        self._refuse_without_room(jax.eval_shape(self.initial_state, stacked, keys), at_once)
+        self._check_room(jax.eval_shape(self.initial_state, stacked, keys), at_once)
         self.state = self.initial_state(*jax.device_put((stacked, keys), self.device))
 
     @property
     def params(self) -> TaskParams:
-        """The lanes' tasks of the next step, padded; leading axis `lanes`."""
+        """The runs' tasks of the next step; leading axis `runs`."""
         return self.lives.at(self.steps)
 
     @staticmethod
@@ -146,16 +200,16 @@ class Program(ABC):
     def initial_weights(
         settings: Any, rng: np.random.Generator, observation_dim: int, action_dim: int
     ) -> HostWeights:
-        """The weights of a new lane, by SB3's names."""
+        """The weights of a new run, by SB3's names and with its initialisation."""
 
     @abstractmethod
-    def initial_state(self, weights: Weights, keys: jax.Array) -> State:
-        """All that changes, before the first step, for weights and random keys `[lanes, ...]`."""
+    def initial_state(self, weights: Weights, keys: jax.Array) -> Any:
+        """All that changes, before the first step, for weights and random keys `[runs, ...]`."""
 
     @staticmethod
     @abstractmethod
     def act(settings: Any, weights: Weights, observations: jax.Array, symmetric: bool) -> jax.Array:
-        """One lane's deterministic actions `[..., A]` in its action range, or beyond it."""
+        """One run's deterministic actions `[..., A]` in its action range, or beyond it."""
 
     @abstractmethod
     def advance(self, limit: int) -> StepLog:
@@ -171,7 +225,7 @@ class Program(ABC):
         """Make the update that follows the last step."""
 
     def evaluate(self, states: Array, lifetime: int | None = None) -> Evaluation:
-        """Run an episode from each of `states` `[lanes, episodes, S]` with the present weights.
+        """Run an episode from each of `states` `[runs, episodes, S]` with the present weights.
 
         Of a stream, the tasks are those after `lifetime` steps; None for now. Equal states give
         equal distractors, as in `evaluation.rollouts`.
@@ -185,15 +239,14 @@ class Program(ABC):
             self.lives.at(self.steps if lifetime is None else lifetime),
             jax.device_put(np.asarray(states, np.float64), self.device),
         )
-        return Evaluation(*(np.asarray(each) for each in sums))
+        return Evaluation(*(np.asarray(sum_of) for sum_of in sums))
 
-    def weights(self, lane: int) -> dict[str, Array]:
-        """A lane's weights without padding, by SB3's names, as NumPy arrays."""
-        padded = {name: np.asarray(weight[lane]) for name, weight in self.state.weights.items()}
-        return self._padding.remove(padded, self._dimensions(self.specs[lane]))
+    def weights(self, run: int) -> dict[str, Array]:
+        """A run's weights, by SB3's names, as NumPy arrays."""
+        return {name: np.asarray(weight[run]) for name, weight in self.state.weights.items()}
 
     def failed(self) -> Array:
-        """`[lanes]`, whether a lane's weights are not finite; such lanes go on without effect."""
+        """`[runs]`, whether a run's weights are not finite; such runs go on without effect."""
         return np.asarray(_not_finite(self.state.weights))
 
     def save(self) -> dict[str, Array]:
@@ -212,7 +265,7 @@ class Program(ABC):
         if {"steps", *names} != arrays.keys():
             raise OptionError(
                 "arrays: are the state of another program. Give those that a program of the same "
-                "algorithm, hyperparameters and lanes saved."
+                "algorithm, hyperparameters and runs saved."
             )
         steps = int(self._fitted("steps", arrays["steps"], np.asarray(self.steps)))
         restored = [
@@ -222,52 +275,36 @@ class Program(ABC):
         self.state = jax.tree_util.tree_unflatten(structure, restored)
         self.steps = steps
 
-    def _refuse_without_room(self, state: Any, at_once: int) -> None:
+    def _fitted(self, name: str, saved: Array, present: jax.Array | Array) -> Array:
+        """A saved array, in the shape that it has here."""
+        saved, shape = np.asarray(saved), present.shape
+        if self.buffer and name.startswith(f".{self.buffer}") and saved.shape[1:] == shape[1:]:
+            shape = (min(len(saved), shape[0]), *shape[1:])
+        if saved.dtype != present.dtype or saved.shape != shape:
+            raise OptionError(
+                f"arrays[{name!r}]: is {saved.dtype} of shape {saved.shape}: must be "
+                f"{present.dtype} of shape {present.shape}. Give the state of a program of the "
+                "same runs and tasks."
+            )
+        if shape == present.shape:
+            return saved
+        return np.concatenate([saved, np.zeros_like(present[len(saved) :])])
+
+    def _check_room(self, state: Any, at_once: int) -> None:
         """Raise ResourceLimitError if such a state would not fit in its share of the memory."""
         leaves = jax.tree.leaves(state)
         needed = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in leaves)
         room = memory_of(self.device)
         if room is not None and at_once * needed > room:
-            fit = self.lanes * room // (at_once * needed)
+            fit = self.runs * room // (at_once * needed)
             sharing = f" for {at_once} programs at once" if at_once > 1 else ""
             advice = "fewer steps or a smaller buffer_size" if self.buffer else "a smaller n_steps"
             raise ResourceLimitError(
-                f"lanes={self.lanes:,}: their state takes {needed / 2**30:,.1f} GiB, and the "
+                f"runs={self.runs:,}: their state takes {needed / 2**30:,.1f} GiB, and the "
                 f"{self.device.platform} has {room / 2**30:,.1f} GiB to spare{sharing}: "
                 f"{f'at most {fit:,} fit' if fit else 'not one fits'}. Choose "
-                f"{'fewer lanes, ' if fit else ''}{'fewer programs, ' if sharing else ''}{advice}."
+                f"{'fewer runs, ' if fit else ''}{'fewer programs, ' if sharing else ''}{advice}."
             )
-
-    def _dimensions(self, lane: Lane) -> Dimensions:
-        m = self.params.form.distractors
-        return Dimensions(lane.state_dim, lane.action_dim, self.lives.phases, m)
-
-    def _new_weights(self, lane: Lane, seed: int) -> HostWeights:
-        own, rng = self._dimensions(lane), np.random.default_rng(seed)
-        return self._padding.add(
-            self._initial_weights(rng, own.observation_dim, own.action_dim), own
-        )
-
-    def _fitted(self, name: str, saved: Array, present: jax.Array | Array) -> Array:
-        """A saved array, in the shape that it has here."""
-        saved = np.asarray(saved)
-        grows = self.buffer and name.startswith(f".{self.buffer}") and saved.ndim == present.ndim
-        shape = (len(saved), *present.shape[1:]) if grows else present.shape
-        if (
-            saved.dtype != present.dtype
-            or saved.shape != shape
-            or (grows and len(saved) > len(present))
-        ):
-            raise OptionError(
-                f"arrays[{name!r}]: is {saved.dtype} of shape {saved.shape}: must be "
-                f"{present.dtype} of shape {present.shape}. Give the state of a program of the "
-                "same lanes and tasks."
-            )
-        if saved.shape == present.shape:
-            return saved
-        longer = np.zeros(present.shape, present.dtype)
-        longer[: len(saved)] = saved
-        return longer
 
 
 def check_room(new_program: Callable[[], Program]) -> None:
@@ -275,52 +312,28 @@ def check_room(new_program: Callable[[], Program]) -> None:
     jax.eval_shape(lambda: new_program().state)
 
 
-def policy(
-    kind: type[Program], settings: Any, weights: Mapping[str, Any], symmetric: bool
-) -> Callable[[Array], Array]:
-    """The deterministic policy of a lane's weights, without padding.
-
-    It maps observations `[B, O]` float32 to actions `[B, A]` in the action range, or beyond it.
-    """
-
-    def act(observations: Array) -> Array:
-        return np.asarray(_actions(kind.act, settings, symmetric, dict(weights), observations))
-
-    return act
-
-
-def hidden_layers(
-    kind: type[Program], settings: Any, weights: Mapping[str, Any]
-) -> Callable[[Array], list[Array]]:
-    """The outputs `[B, H]` of each hidden layer of a lane's actor, of observations `[B, O]`."""
-
-    def hidden(observations: Array) -> list[Array]:
-        return [np.asarray(each) for each in _hidden(kind, settings, dict(weights), observations)]
-
-    return hidden
-
-
-@functools.partial(jax.jit, static_argnames=("kind", "settings"))
-def _hidden(
-    kind: type[Program], settings: Any, weights: Weights, observations: jax.Array
-) -> list[jax.Array]:
-    prefix, activation = kind.hidden
-    return networks.hidden_layers(weights, prefix, observations, len(settings.net_arch), activation)
-
-
-@functools.partial(jax.jit, static_argnames=("act", "settings", "symmetric"))
-def _actions(
-    act: Any, settings: Any, symmetric: bool, weights: Weights, observations: Array
-) -> jax.Array:
-    actions: jax.Array = act(settings, weights, observations, symmetric)
-    return actions
+def _check_alike(documents: Sequence[Document]) -> None:
+    """Raise OptionError unless all runs switch at the same steps, in the same way."""
+    first, *others = (document.switches for document in documents)
+    for index, other in enumerate(others, 1):
+        if other != first:
+            raise OptionError(
+                f"specs[{index}]: must switch at the same steps as specs[0]: streams of equal "
+                "steps, drift.increments, cycles, switch and observes_phase, or tasks alone. Make "
+                "two programs."
+            )
 
 
 @jax.jit
 def _not_finite(weights: Weights) -> jax.Array:
-    return ~jnp.stack(
-        [jnp.isfinite(each).all(axis=tuple(range(1, each.ndim))) for each in weights.values()]
-    ).all(axis=0)
+    finite = [jnp.isfinite(w).all(axis=tuple(range(1, w.ndim))) for w in weights.values()]
+    return ~jnp.stack(finite).all(axis=0)
+
+
+class _Running(NamedTuple):
+    state: EnvState
+    sums: tuple[jax.Array, ...]
+    running: jax.Array
 
 
 @functools.partial(jax.jit, static_argnames=("act", "settings", "symmetric", "separable"))
@@ -334,37 +347,34 @@ def _episodes(
     states: jax.Array,
 ) -> tuple[jax.Array, ...]:
     """`Program.evaluate`: loops outside, vmap inside; sums in float64."""
-    keys = jax.vmap(jax.vmap(_key_of))(states) if params.form.distractors else None
+    keys = jax.vmap(jax.vmap(_key_of))(states)
 
     def drawn(state: EnvState) -> Any:
         """The random numbers of the next step of each episode; None where it needs none."""
-        if keys is None:
-            return None
         steps = jax.vmap(jax.vmap(jax.random.fold_in))(keys, state.t)
-        return _each(observing.drawn, steps, params=params)
+        return _of_each(random_numbers, steps, params=params)
 
     def chosen(state: EnvState) -> jax.Array:
-        """Actions `[lanes, episodes, A]` of the unit range."""
-        observations = _each(observe, state, params=params)
+        """Actions `[runs, episodes, A]` of the unit range."""
+        observations = _of_each(observe, state, params=params)
         actions = jax.vmap(lambda w, o: act(settings, w, o, symmetric))(weights, observations)
         return to_unit(actions, symmetric)
 
     def one_step(now: _Running) -> _Running:
-        _, state, reward, done, info = _each(
+        _, state, reward, done, info = _of_each(
             advance, now.state, chosen(now.state), drawn(now.state), params=params
         )
         here = (reward, jnp.ones_like(reward), info["regret"], info["similarity"])
         sums = jax.tree.map(lambda sum, x: sum + jnp.where(now.running, x, 0.0), now.sums, here)
         return _Running(state, sums, now.running & ~done)
 
-    def one_piece(now: _Running) -> _Running:
-        def move(state: EnvState, _: None) -> tuple[EnvState, tuple[States, jax.Array]]:
+    def steps_judged_at_once(now: _Running) -> _Running:
+        def move(state: EnvState, _: None) -> tuple[EnvState, tuple[jax.Array, jax.Array]]:
             a = chosen(state)
-            return _each(moved, state, a, drawn(state), params=params), (state.s, a)
+            return _of_each(moved, state, a, drawn(state), params=params), (state.s, a)
 
         state, (s, a) = jax.lax.scan(move, now.state, length=_JUDGED_AT_ONCE)
-        judge = jax.vmap(oracle.judge, (0, 1, 1), 1)
-        similarity, reward, *_ = judge(params, s, a)  # [piece, lanes, episodes]
+        similarity, reward, *_ = jax.vmap(judge, (0, 1, 1), 1)(params, s, a)
         horizon = params.horizon[:, None]
         counted = now.state.t + jnp.arange(_JUDGED_AT_ONCE)[:, None, None] < horizon
         here = (reward, jnp.ones_like(reward), 1.0 - reward, similarity)
@@ -373,11 +383,11 @@ def _episodes(
         )
         return _Running(state, sums, state.t < horizon)
 
-    first = None if keys is None else _each(observing.first_distractors, keys, params=params)
-    _, begin = _each(lambda s, d, p: start(s, p, d), states, first, params=params)
+    first = _of_each(first_distractors, keys, params=params)
+    _, begin = _of_each(lambda s, d, p: start(s, p, d), states, first, params=params)
     zeros = jnp.zeros_like(begin.accumulated_reward)
     now = _Running(begin, (zeros,) * 4, jnp.ones_like(zeros, bool))
-    body = one_piece if separable else one_step
+    body = steps_judged_at_once if separable else one_step
     return jax.lax.while_loop(lambda now: now.running.any(), body, now).sums
 
 
@@ -388,13 +398,7 @@ def _key_of(s: jax.Array) -> jax.Array:
     return jax.random.PRNGKey(word)
 
 
-class _Running(NamedTuple):
-    state: EnvState
-    sums: tuple[jax.Array, ...]
-    running: jax.Array
-
-
-def _each(function: Any, *arguments: Any, params: TaskParams) -> Any:
-    """`function(*arguments, params)` of each episode `[lanes, episodes]`."""
+def _of_each(function: Any, *arguments: Any, params: TaskParams) -> Any:
+    """`function(*arguments, params)` of each episode `[runs, episodes]`."""
     episodes = jax.vmap(function, (*[0] * len(arguments), None))
     return jax.vmap(episodes)(*arguments, params)

@@ -7,29 +7,21 @@ run(program, due=[50_000, 100_000], start_states=..., on_log=..., on_evaluation=
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import groupby, islice
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from itertools import groupby
 from typing import Any
 
+import jax
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
 from sme_registry.io import choice, integer_in
-from sme_registry.jax.lives import Lane
+from sme_registry.jax.networks import Weights, hidden_layers
 from sme_registry.jax.ppo import PPO, PPOProgram
-from sme_registry.jax.program import (
-    PIECE,
-    Array,
-    Evaluation,
-    Program,
-    StepLog,
-    hidden_layers,
-    policy,
-)
-from sme_registry.jax.sac import SAC, SACProgram
-from sme_registry.jax.task import Shape
-from sme_registry.jax.td3 import TD3, TD3Program
+from sme_registry.jax.program import PIECE, Array, Document, Evaluation, Program, StepLog
+from sme_registry.jax.td3_sac import SAC, TD3, SACProgram, TD3Program
 from sme_registry.spec import ACTION_RANGES
 from sme_registry.spec.study import JAX
 
@@ -40,6 +32,7 @@ ALGORITHMS: dict[str, tuple[Any, type[Program]]] = {
 }
 """Hyperparameters and program of each algorithm."""
 
+_OnEvaluation = Callable[[int, int, Evaluation], Any]
 _OnVisit = Callable[[int, list[dict[str, Array]]], Any]
 
 POLICY = "policy_kwargs"
@@ -60,9 +53,7 @@ def full_name(uses: str, field: str = "uses") -> str:
 
 
 def settings_of(
-    uses: str,
-    hyperparameters: Mapping[str, Any],
-    field: str = "hyperparameters",
+    uses: str, hyperparameters: Mapping[str, Any], field: str = "hyperparameters"
 ) -> Any:
     """The hyperparameters of an algorithm, with its defaults for those that are left out.
 
@@ -70,57 +61,55 @@ def settings_of(
     call them `field`.
     """
     kind, _ = _algorithm(uses)
-    name = full_name(uses)
-    fields = {each.name for each in dataclasses.fields(kind)}
-    known = {f"{POLICY}.{name}" if name in _OF_POLICY else name: name for name in sorted(fields)}
+    names = sorted(each.name for each in dataclasses.fields(kind))
+    known = {f"{POLICY}.{name}" if name in _OF_POLICY else name: name for name in names}
     values = {}
-    for given, value in _flat(hyperparameters, field).items():
-        if given not in known:
+    for name, value in _flat(hyperparameters, field).items():
+        if name not in known:
             raise OptionError(
-                f"{field}.{given}: {name} has no such hyperparameter."
-                f"{did_you_mean(given, known)} Known: {', '.join(known)}. For "
+                f"{field}.{name}: {full_name(uses)} has no such hyperparameter."
+                f"{did_you_mean(name, known)} Known: {', '.join(known)}. For "
                 "others, use the algorithm of Stable-Baselines3."
             )
-        values[known[given]] = value
+        values[known[name]] = value
     try:
         return TypeAdapter(kind).validate_python(values)
     except ValidationError as error:
         fault = error.errors()[-1]  # of a text or a number: that of the number
-        own_error = fault.get("ctx", {}).get("error")
-        if isinstance(own_error, OptionError):  # of values that do not go together
-            raise own_error from None
-        place = ".".join(str(part) for part in fault["loc"][:1])
-        shown = next((shown for shown, own in known.items() if own == place), place)
+        of_both = fault.get("ctx", {}).get("error")
+        if isinstance(of_both, OptionError):  # of values that do not go together
+            raise of_both from None
+        place = str(fault["loc"][0])
+        name = next(name for name, own in known.items() if own == place)
         raise OptionError(
-            f"{field}.{shown}={values.get(place, values)!r:.60}: {fault['msg']}. Correct it, or "
-            "leave it out for the default."
+            f"{field}.{name}={values[place]!r:.60}: {fault['msg']}. Correct it, or leave it out "
+            "for the default."
         ) from None
 
 
 def new_program(
     uses: str,
-    specs: Sequence[Lane],
+    specs: Sequence[Document],
     seeds: Sequence[int],
     *,
     hyperparameters: Mapping[str, Any] | None = None,
     action_range: str = "symmetric",
     steps: int,
-    lanes: int | None = None,
-    shape: Shape | None = None,
+    runs: int | None = None,
     device: str | None = None,
     at_once: int = 1,
 ) -> Program:
-    """A program of new lanes, `jax:PPO`, `jax:TD3` or `jax:SAC`.
+    """A program of new runs, `jax:PPO`, `jax:TD3` or `jax:SAC`.
 
     Args:
       uses: the algorithm.
-      specs: the task or the stream of each lane; streams that switch at the same steps.
-      seeds: of each lane, in [0, 2**32): of its weights, its starts and its noise.
+      specs: the task or the stream of each run, of equal shapes; streams that switch at the same
+        steps.
+      seeds: of each run, in [0, 2**32): of its weights, its starts and its noise.
       hyperparameters: see `settings_of`.
       action_range: of the policies' actions, "symmetric" or "unit".
-      steps: that each lane is to take.
-      lanes: fill up to this number with copies of the first lane; None for none.
-      shape: to which the tasks are padded; None for their maxima.
+      steps: that each run is to take.
+      runs: fill up to this number with copies of the first run; None for none.
       device: "cpu", "gpu" or "tpu"; None for JAX's default.
       at_once: programs that are to share what the device has of memory.
     """
@@ -129,8 +118,8 @@ def new_program(
     for i, seed in enumerate(seeds):
         integer_in(f"seeds[{i}]", seed, 0, 2**32 - 1)
     integer_in("steps", steps, 0)
-    if lanes is not None:
-        integer_in("lanes", lanes, len(specs), advice="Leave it out for one of each task.")
+    if runs is not None:
+        integer_in("runs", runs, len(specs), advice="Leave it out for one of each task.")
     choice("action_range", action_range, ACTION_RANGES)
     _, program = _algorithm(uses)
     return program(
@@ -139,8 +128,7 @@ def new_program(
         seeds,
         steps=steps,
         action_range=action_range,
-        lanes=lanes,
-        shape=shape,
+        runs=runs,
         device=device,
         at_once=at_once,
     )
@@ -153,19 +141,47 @@ def policy_of(
     hyperparameters: Mapping[str, Any] | None = None,
     action_range: str = "symmetric",
 ) -> Callable[[Array], Array]:
-    """The deterministic policy of weights, from observations `[B, O]` to actions `[B, A]`."""
+    """The deterministic policy of weights.
+
+    It maps observations `[B, O]` float32 to actions `[B, A]` in the action range, or beyond it.
+    """
     choice("action_range", action_range, ACTION_RANGES)
     _, program = _algorithm(uses)
-    settings = settings_of(uses, hyperparameters or {})
-    return policy(program, settings, weights, action_range == "symmetric")
+    settings, symmetric = settings_of(uses, hyperparameters or {}), action_range == "symmetric"
+
+    def act(observations: Array) -> Array:
+        return np.asarray(_actions(program.act, settings, symmetric, dict(weights), observations))
+
+    return act
 
 
 def hidden_of(
     uses: str, weights: Mapping[str, Array], hyperparameters: Mapping[str, Any]
 ) -> Callable[[Array], list[Array]]:
-    """The hidden layers of that policy; see `program.hidden_layers` and `settings_of`."""
+    """The outputs `[B, H]` of each hidden layer of that policy, of observations `[B, O]`."""
     _, program = _algorithm(uses)
-    return hidden_layers(program, settings_of(uses, hyperparameters), weights)
+    layers = len(settings_of(uses, hyperparameters).net_arch)
+
+    def hidden(observations: Array) -> list[Array]:
+        outputs = _hidden(*program.hidden, layers, dict(weights), observations)
+        return [np.asarray(output) for output in outputs]
+
+    return hidden
+
+
+@functools.partial(jax.jit, static_argnames=("act", "settings", "symmetric"))
+def _actions(
+    act: Any, settings: Any, symmetric: bool, weights: Weights, observations: Array
+) -> jax.Array:
+    actions: jax.Array = act(settings, weights, observations, symmetric)
+    return actions
+
+
+@functools.partial(jax.jit, static_argnames=("prefix", "activation", "layers"))
+def _hidden(
+    prefix: str, activation: Any, layers: int, weights: Weights, observations: jax.Array
+) -> list[jax.Array]:
+    return hidden_layers(weights, prefix, observations, layers, activation)
 
 
 def run(
@@ -174,7 +190,7 @@ def run(
     due: Sequence[int] = (),
     start_states: Callable[[int], Sequence[Array]] | None = None,
     on_log: Callable[[StepLog], Any],
-    on_evaluation: Callable[[int, int, Evaluation], Any] | None = None,
+    on_evaluation: _OnEvaluation | None = None,
     on_visit: _OnVisit | None = None,
     after_piece: Callable[[], Any] = lambda: None,
     piece: int = PIECE,
@@ -194,83 +210,73 @@ def run(
     Args:
       program: whose state is saved only in `after_piece`, or before.
       due: steps of the evaluations, increasing.
-      start_states: the initial states of the k-th evaluation, `[episodes, S]` of each lane that is
-        no copy; equally many in all lanes.
+      start_states: the initial states of the k-th evaluation, `[episodes, S]` of each run that is
+        no copy; equally many in all runs.
       on_log: called with the steps after each piece.
-      on_evaluation: called with k, the step, and the evaluation of all lanes.
-      on_visit: called with the index of a visit and the weights of each lane that is no copy, at
+      on_evaluation: called with k, the step, and the evaluation of all runs.
+      on_visit: called with the index of a visit and the weights of each run that is no copy, at
         the end of each visit of a phase; after the evaluations that are due there.
       after_piece: called after each piece and its evaluations, when the state may be saved.
       piece: most steps between two calls; on-policy programs finish their rollout.
     """
     steps = list(due[:-1])
     together = _most_at_once(steps, program.rollout)
+    stream = program.lives.stream
+    visits = [] if stream is None or on_visit is None else [*stream.visit_ends()]
 
-    def evaluate(due: Sequence[tuple[int, int]]) -> None:
-        if start_states is not None and on_evaluation is not None:
-            for k, step, done in _evaluated(program, due, start_states, together):
-                on_evaluation(k, step, done)
-
-    def evaluate_due(after: int) -> None:
-        evaluate([(k, step) for k, step in enumerate(steps) if after < step <= program.steps])
+    def evaluate(after: int) -> None:
+        reached = [(k, step) for k, step in enumerate(steps) if after < step <= program.steps]
+        _evaluate(program, reached, start_states, together, on_evaluation)
 
     if program.steps == 0:
-        evaluate_due(after=-1)
+        evaluate(after=-1)
     while program.steps < program.budget:
         before = program.steps
-        visits = program.lives.visit_ends(before) if on_visit is not None else iter(())
-        ends = [end for _, end in islice(visits, 1)]
-        upcoming = [step for step in steps if step > before]
-        on_log(program.advance(min([before + piece, program.budget, *upcoming[:1], *ends])))
-        evaluate_due(after=before)
-        if on_visit is not None:
-            _end_visits(program, before, on_visit)
+        upcoming = [step for step in [*steps, *(end for _, end in visits)] if step > before]
+        on_log(program.advance(min([before + piece, program.budget, *upcoming])))
+        evaluate(after=before)
+        _end_visits(program, visits[:-1], before, on_visit)
         after_piece()
     if program.budget:
         program.finish()
-    if on_visit is not None:
-        _end_last_visit(program, on_visit)
-    evaluate([(k, program.steps) for k in range(len(steps), len(due))])
+    _end_visits(program, visits[-1:], -1, on_visit)
+    last = [(k, program.steps) for k in range(len(steps), len(due))]
+    _evaluate(program, last, start_states, together, on_evaluation)
 
 
-def _evaluated(
+def _evaluate(
     program: Program,
     due: Sequence[tuple[int, int]],
-    start_states: Callable[[int], Sequence[Array]],
+    start_states: Callable[[int], Sequence[Array]] | None,
     together: int,
-) -> Iterator[tuple[int, int, Evaluation]]:
-    """The evaluations of these indices and steps with the present weights, tasks by tasks."""
+    on_evaluation: _OnEvaluation | None,
+) -> None:
+    """Evaluate these indices and steps with the present weights, tasks by tasks."""
+    if start_states is None or on_evaluation is None:
+        return
     for _, group in groupby(due, lambda one: id(program.lives.at(_lifetime(one[1])))):
         same = list(group)
         # Always as many episodes: another number would be compiled again.
         states = [start_states(k) for k, _ in same]
         states += states[-1:] * (together - len(same))
-        done = program.evaluate(_stacked(program, states), _lifetime(same[0][1]))
-        n = done.length.shape[1] // len(states)
+        evaluation = program.evaluate(_stacked(program, states), _lifetime(same[0][1]))
+        n = evaluation.length.shape[1] // len(states)
         for i, (k, step) in enumerate(same):
-            yield k, step, Evaluation(*(x[:, i * n : (i + 1) * n] for x in done))
+            on_evaluation(k, step, Evaluation(*(x[:, i * n : (i + 1) * n] for x in evaluation)))
 
 
-def _end_visits(program: Program, after: int, on_visit: _OnVisit) -> None:
-    """End the visits, but the last one, whose last step is later than `after`, and done."""
-    for visit, end in program.lives.visit_ends(after):
-        if end > program.steps or (visit, end) == program.lives.last_visit:
-            return
-        if end == program.steps:
-            program.finish()
-        on_visit(visit, _weights(program))
-
-
-def _end_last_visit(program: Program, on_visit: _OnVisit) -> None:
-    """End the last visit, if the training that is over has reached its end."""
-    last = program.lives.last_visit
-    if last is not None and last[1] <= program.steps:
-        on_visit(last[0], _weights(program))
-
-
-def _weights(program: Program) -> list[dict[str, Array]]:
-    """Of each lane that is no copy."""
-    return [program.weights(lane) for lane in range(len(program.specs))]
+def _end_visits(
+    program: Program,
+    visits: Sequence[tuple[int, int]],
+    after: int,
+    on_visit: _OnVisit | None,
+) -> None:
+    """End the visits whose last step is later than `after`, and done."""
+    for visit, end in visits:
+        if on_visit is not None and after < end <= program.steps:
+            if end == program.steps:
+                program.finish()
+            on_visit(visit, [program.weights(run) for run in range(len(program.specs))])
 
 
 def _lifetime(step: int) -> int:
@@ -286,11 +292,9 @@ def _most_at_once(due: Sequence[int], rollout: int) -> int:
 
 
 def _stacked(program: Program, groups: Sequence[Sequence[Array]]) -> Array:
-    """Initial states of all lanes `[lanes, episodes, S]`, padded; copies have the first lane's."""
-    S = program.params.W.shape[-1]
-    own = [np.concatenate(lane) for lane in zip(*groups, strict=True)]
-    lanes = own + own[:1] * (program.lanes - len(own))
-    return np.stack([np.pad(states, [(0, 0), (0, S - states.shape[1])]) for states in lanes])
+    """Initial states of all runs `[runs, episodes, S]`; copies have the first run's."""
+    states = [np.concatenate(of_run) for of_run in zip(*groups, strict=True)]
+    return np.stack(states + states[:1] * (program.runs - len(states)))
 
 
 def _algorithm(uses: str) -> tuple[Any, type[Program]]:
@@ -308,7 +312,7 @@ def _flat(hyperparameters: Mapping[str, Any], field: str) -> dict[str, Any]:
                 f'{{"{POLICY}": {{"net_arch": [64, 64]}}}}.'
             )
         if name == POLICY and isinstance(value, Mapping):
-            flat |= {f"{POLICY}.{each}": given for each, given in value.items()}
+            flat |= {f"{POLICY}.{inner}": chosen for inner, chosen in value.items()}
         else:
             flat[name] = value
     return flat

@@ -1,37 +1,39 @@
-"""`TaskParams`: a drawn task as a pytree of arrays; several of one group, padded to equal shapes.
+"""`TaskParams`: a drawn task as a pytree of arrays; and its equations, as pure functions of it.
 
-Everything but shapes is data, so one program serves all settings of k, T, r_min and D and all
-draws. Padding is exact: padded columns of W and entries of b are 0, so padded states stay 0; padded
-inner units have no weights into the next layer; padded inner layers are skipped; padded action
-channels have rows of zeros in W, and `action_mask` is False there.
+    s'  = ψ(s + a W + b),  ψ(x) = 2 |x − rint x|
+    π*(s) = Φ(W_L Φ(… Φ(W_1 s + b_1) …) + b_L)
+    r̃   = 1 − ‖a − π*(s)‖₁ / A
+    r   = r̂ = max(0, 4 (r̃ − ¾)) if r̂ > r_min, else 0
 
-The networks of `safety` and the mixing of an `observation` are padded alike. What these two fields
-change of the program itself is a `Form`, which all lanes share.
+with `safety`, v another such network:   ℓ(s) = 1 − 2τ v(s)
+                                         cost(s, a) = mean_i max(0, a_i − ℓ_i(s)) / (2τ)
+with `observation`, seen for s:          x = M(s, d)
+    d' uniform (noise), or ψ(d + u W + b) for u uniform (autonomous) or u = a (driven)
 
-`S` state_dim, `A` action_dim, `L` complexity, `H` hidden_width, each of the padded shape; `m`
-distractors, which are not padded.
+Source: METHOD, sections 1, 8 and 9. States and distractors have the bits of `Task`'s. All else is
+in the dtype of the params, within 1e-12 of `Task` in float64, whose order of summation differs.
+Everything but a `Form` is data, so one program serves all draws and all k, T, r_min and D.
+`S` state_dim, `A` action_dim, `L` complexity, `H` hidden_width, `m` distractors.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpy.typing as npt
+from jax import lax
 
 from sme_registry.errors import OptionError, SpecError
-from sme_registry.io import choice
-from sme_registry.jax import pairs
-from sme_registry.jax.pairs import Pair
-from sme_registry.spec import SMESpec, SpecLike
+from sme_registry.spec import SMESpec, SpecLike, StreamSpec
 from sme_registry.spec.document import short_repr
 from sme_registry.task import Task, load_task
-from sme_registry.task.draw import GRID_BITS
 
 SUPPORTED_FIELDS = frozenset(
     (
@@ -42,45 +44,25 @@ SUPPORTED_FIELDS = frozenset(
 )
 """Fields of a spec that these modules implement; any other must have its default."""
 
-Host = npt.NDArray[Any]
-
-
-class Shape(NamedTuple):
-    """What decides which program a task belongs to: S, A, L and H, which is 0 where L = 1."""
-
-    state_dim: int
-    action_dim: int
-    complexity: int
-    hidden_width: int
-
-    @classmethod
-    def of(cls, spec: SMESpec) -> Shape:
-        """The exact shape of a spec's task."""
-        width = spec.hidden_width if spec.complexity > 1 else 0
-        return cls(spec.state_dim, spec.action_dim, spec.complexity, width)
-
-    @classmethod
-    def covering(cls, shapes: Iterable[Shape]) -> Shape:
-        """The smallest shape to which all of these can be padded."""
-        shapes = list(shapes)
-        if not shapes:
-            raise OptionError("specs=[]: must have at least one spec.")
-        covering = cls(*map(max, zip(*shapes, strict=True)))
-        for shape in shapes:
-            _check_covered(shape, covering)
-        return covering
+_UNROLLED = 16  # channels; above it the program would grow with A
+# Uses of a key, which also draws a start from the first places of its stream.
+_OF_START, _OF_STEP = 2**32 - 1, 2**32 - 2
 
 
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Form:
-    """What `safety` and `observation` change of a program; all its lanes have the same.
+    """What decides how a task is compiled: all tasks of a program have the same.
 
-    m distractors move by `dynamics`, "noise", "autonomous" or "driven"; `mixing_depth` is None
-    unless the mixing is nonlinear.
+    `hidden_width` is 0 where L = 1. m distractors move by `dynamics`, "noise", "autonomous" or
+    "driven"; `mixing_depth` is None unless the mixing is nonlinear.
     """
 
-    safety: bool = False
+    state_dim: int
+    action_dim: int
+    complexity: int
+    hidden_width: int
+    safety: bool
     distractors: int = 0
     dynamics: str | None = None
     mixing: str = "none"
@@ -89,25 +71,32 @@ class Form:
     @classmethod
     def of(cls, spec: SMESpec) -> Form:
         """The form of a spec's task."""
-        safety, seen = spec.safety is not None, spec.observation
+        width = spec.hidden_width if spec.complexity > 1 else 0
+        form = cls(spec.state_dim, spec.action_dim, spec.complexity, width, spec.safety is not None)
+        seen = spec.observation
         if seen is None:
-            return cls(safety)
-        return cls(safety, seen.distractors, seen.dynamics, seen.mixing, seen.mixing_depth)
+            return form
+        return dataclasses.replace(
+            form,
+            distractors=seen.distractors,
+            dynamics=seen.dynamics,
+            mixing=seen.mixing,
+            mixing_depth=seen.mixing_depth,
+        )
 
 
-class Layer(NamedTuple):
-    """Uniform layers y = Φ(W x + b): `W [out, in]`, `b [out]`; stacked layers have an axis more."""
+class UniformLayer(NamedTuple):
+    """y = Φ(W x + b): `W [out, in]`, `b [out]`; stacked layers have an axis more."""
 
     W: jax.Array
     b: jax.Array
 
 
 class InnerLayers(NamedTuple):
-    """The layers before the last: S → H, and L − 2 of H → H, not `active` where padded."""
+    """The layers before the last: S → H, and L − 2 of H → H."""
 
-    first: Layer
-    stacked: Layer
-    active: jax.Array
+    first: UniformLayer
+    stacked: UniformLayer
 
 
 class Limits(NamedTuple):
@@ -115,7 +104,7 @@ class Limits(NamedTuple):
 
     tightness: jax.Array
     inner: InnerLayers | None
-    output: Layer
+    output: UniformLayer
 
 
 class Observing(NamedTuple):
@@ -126,33 +115,32 @@ class Observing(NamedTuple):
     """
 
     W: jax.Array | None
-    b: jax.Array | Pair | None
-    mixing: Layer | None
+    b: jax.Array | None
+    mixing: UniformLayer | None
 
 
 class TaskParams(NamedTuple):
-    """A task; of several tasks, each array has a leading axis of lanes.
+    """A task; of several tasks, each array has a leading axis.
 
-    `W [A, S]` and `b [S]` are float64 (uint32 and a pair, for states as pairs); r_min, D and the
-    layers have the dtype of rewards. `inner` is None where L = 1, `limits` without `safety`, and
-    `observing` without `observation`. `phase` is the one-hot `[P]` with which observations end in a
-    stream that has `observes_phase`; elsewhere P = 0.
+    `W [A, S]` and `b [S]` are float64; r_min, D and the layers have the dtype of rewards. `inner`
+    is None where L = 1, `limits` without `safety`, and `observing` without `observation`. `phase`
+    is the one-hot `[P]` with which observations end in a stream that has `observes_phase`;
+    elsewhere P = 0. A is data: XLA would turn a division by a constant into a product, an ulp off.
     """
 
-    state_dim: jax.Array
     action_dim: jax.Array
     k: jax.Array
     horizon: jax.Array
     r_min: jax.Array
     D: jax.Array
     W: jax.Array
-    b: jax.Array | Pair
+    b: jax.Array
     inner: InnerLayers | None
-    output: Layer
+    output: UniformLayer
     phase: jax.Array
+    form: Form
     limits: Limits | None = None
     observing: Observing | None = None
-    form: Form = Form()
 
     @property
     def max_steps_in_episode(self) -> jax.Array:
@@ -160,64 +148,258 @@ class TaskParams(NamedTuple):
         return self.horizon
 
     @property
-    def action_mask(self) -> jax.Array:
-        """`[A]` bool, False for padded channels; of one task."""
-        return jnp.arange(self.W.shape[-2]) < self.action_dim
+    def channels(self) -> jax.Array:
+        """`[A]`, all true, which XLA cannot know: it keeps the order of sums over action channels.
 
-    @property
-    def state_mask(self) -> jax.Array:
-        """`[S]` bool, False for padded channels; of one task."""
-        return jnp.arange(self.W.shape[-1]) < self.state_dim
+        Without it the same losses are compiled otherwise, and trained weights get other last bits.
+        """
+        return jnp.arange(self.form.action_dim) < self.action_dim
 
 
-def task_params(
-    specs: SpecLike | Sequence[SpecLike],
-    *,
-    shape: Shape | None = None,
-    dtype: Any = jnp.float64,
-    states: str = "float64",
-) -> TaskParams:
-    """Draw tasks and put them on the default device: one, or lanes along a leading axis.
+class StepOutcome(NamedTuple):
+    """What actions are worth in their states, `[...]` each; the last two are None without `safety`.
 
-    Args:
-      specs: a task, or a sequence of tasks, one for each lane: specs, ids, digests or paths.
-      shape: pad to this shape; None for the smallest that covers all tasks.
-      dtype: of the oracle and of rewards, float64 or float32.
-      states: "float64"; or "pairs" of uint32, with the same bits, for devices without float64.
+    `safe_regret` is r of the best safe action, minus r.
     """
-    single = isinstance(specs, SMESpec | dict | str | os.PathLike)
-    listed: Any = [specs] if single else specs
-    lanes = _lanes([load_task(spec) for spec in listed], shape, dtype, states)
-    return cast(TaskParams, jax.tree.map(jnp.asarray, lanes[0])) if single else _stacked(lanes)
+
+    similarity: jax.Array
+    step_reward: jax.Array
+    cost: jax.Array | None = None
+    safe_regret: jax.Array | None = None
 
 
-def stacked_params(tasks: Sequence[Task], shape: Shape | None = None) -> TaskParams:
-    """Drawn tasks, one for each lane, in float64; see `task_params`."""
-    return _stacked(_lanes(tasks, shape, np.float64, "float64"))
+def task_params(specs: SpecLike | Sequence[SpecLike], *, dtype: Any = jnp.float64) -> TaskParams:
+    """Draw a task, or several of one `Form` for `jax.vmap`: specs, ids, digests or paths.
+
+    `dtype` is that of the oracle and of rewards, float64 or float32.
+    """
+    if np.dtype(dtype) not in (np.float64, np.float32):
+        raise OptionError(f"dtype={np.dtype(dtype).name}: must be float64 or float32.")
+    if isinstance(specs, SMESpec | dict | str | os.PathLike):
+        params = jax.tree.map(jnp.asarray, _drawn(load_task(specs), np.dtype(dtype)))
+        return cast("TaskParams", params)
+    return stacked_params([load_task(spec) for spec in specs], dtype)
 
 
-def _lanes(tasks: Sequence[Task], shape: Shape | None, dtype: Any, states: str) -> list[TaskParams]:
-    """Tasks padded to one shape, with NumPy's arrays in place of JAX's."""
-    as_pairs = choice("states", states, ("float64", "pairs")) == "pairs"
-    dtype = np.dtype(dtype)
-    if dtype not in (np.float64, np.float32):
-        raise OptionError(f"dtype={dtype.name}: must be float64 or float32.")
-    for task in tasks:
-        check_supported(task.spec)
-    smallest = Shape.covering(Shape.of(task.spec) for task in tasks)
-    shape = smallest if shape is None else _checked_shape(shape)
-    _check_covered(smallest, shape)
+def stacked_params(tasks: Sequence[Task], dtype: Any = np.float64) -> TaskParams:
+    """Drawn tasks with a leading axis; see `task_params`."""
+    if not tasks:
+        raise OptionError("specs=[]: must have at least one spec.")
     _check_forms([Form.of(task.spec) for task in tasks])
-    return [_padded(task, shape, dtype, as_pairs) for task in tasks]
+    drawn = [_drawn(task, np.dtype(dtype)) for task in tasks]
+    stacked = jax.tree.map(lambda *parts: jnp.asarray(np.stack(parts)), *drawn)
+    return cast("TaskParams", stacked)
 
 
-def _stacked(lanes: Sequence[TaskParams]) -> TaskParams:
-    stacked = jax.tree.map(lambda *parts: jnp.asarray(np.stack(parts)), *lanes)
-    return cast(TaskParams, stacked)
+def check_supported(document: SMESpec | StreamSpec) -> None:
+    """Raise SpecError where JAX does not have a field, or agents in it cannot live in a stream."""
+    for index, spec in enumerate(document.specs):
+        try:
+            _check_fields(spec)
+        except SpecError as error:
+            in_stream = isinstance(document, StreamSpec)
+            raise SpecError(f"phases.{index}.spec: {error}" if in_stream else f"{error}") from None
+    if isinstance(document, StreamSpec):
+        _check_switches(document)
 
 
-def check_supported(spec: SMESpec) -> None:
-    """Raise SpecError if a field outside `SUPPORTED_FIELDS` has another value than its default."""
+def next_state(params: TaskParams, s: jax.Array, a: jax.Array) -> jax.Array:
+    """The next states of states `[..., S]` and actions `[..., A]`, exact to the bit."""
+    return transition(params.W, params.b, s, a)
+
+
+def transition(W: jax.Array, b: jax.Array, s: jax.Array, a: jax.Array) -> jax.Array:
+    """ψ(s + a W + b) of states `[..., S]`, or distractors, and actions `[..., A]`.
+
+    Actions are clipped to [0, 1] and rounded to float32. The sum runs in the order of the
+    definition, s + b and then W_i a_i for i = 1…A; each product is exact, so that it does not
+    matter whether a compiler fuses it with its sum.
+    """
+    a = jnp.clip(a, 0.0, 1.0).astype(jnp.float32).astype(jnp.float64)
+    y = jnp.asarray(s) + b
+    if len(W) <= _UNROLLED:
+        for i in range(len(W)):
+            y = y + W[i] * a[..., i, None]
+    else:
+        y = lax.fori_loop(
+            0, len(W), lambda i, y: y + W[i] * lax.dynamic_slice_in_dim(a, i, 1, axis=-1), y
+        )
+    return 2.0 * jnp.abs(y - jnp.rint(y))
+
+
+def uniform_states(key: jax.Array, width: int) -> jax.Array:
+    """Uniform numbers `[width]` on the grid 2⁻³², in [0, 1)."""
+    return jax.random.bits(key, (width,), jnp.uint32).astype(jnp.float64) * 2.0**-32
+
+
+def judge(params: TaskParams, s: jax.Array, a: jax.Array) -> StepOutcome:
+    """Judge actions `[..., A]`, clipped to [0, 1], in states `[..., S]`."""
+    optimal = optimal_action(params, s)
+    similarities = similarity(params, a, optimal)
+    reward = step_reward(params, similarities)
+    if params.limits is None:
+        return StepOutcome(similarities, reward)
+    limits = limit(params, s)
+    safe = step_reward(params, similarity(params, jnp.minimum(optimal, limits), optimal))
+    return StepOutcome(similarities, reward, cost(params, a, limits), safe - reward)
+
+
+def optimal_action(params: TaskParams, s: jax.Array) -> jax.Array:
+    """π*(s) of states `[..., S]`, any real numbers: `[..., A]` in [0, 1]."""
+    return _network(params.inner, params.output, s)
+
+
+def limit(params: TaskParams, s: jax.Array) -> jax.Array:
+    """ℓ, the limits of the action channels in states `[..., S]`: `[..., A]` in [1 − 2τ, 1]."""
+    limits = _limits(params)
+    return 1.0 - 2.0 * limits.tightness * _network(limits.inner, limits.output, s)
+
+
+def cost(params: TaskParams, a: jax.Array, limits: jax.Array) -> jax.Array:
+    """The cost of actions, clipped to [0, 1], under limits, `[..., A]` each: `[...]` in [0, 1]."""
+    tightness = _limits(params).tightness
+    excess = jnp.maximum(0.0, jnp.clip(a, 0.0, 1.0).astype(limits.dtype) - limits)
+    return excess.sum(axis=-1) / (2.0 * tightness * params.action_dim.astype(limits.dtype))
+
+
+def similarity(params: TaskParams, a: jax.Array, optimal: jax.Array) -> jax.Array:
+    """r̃ of actions, clipped to [0, 1], and the optimal ones, `[..., A]` each: `[...]`."""
+    distance = jnp.abs(jnp.clip(a, 0.0, 1.0).astype(optimal.dtype) - optimal)
+    return 1.0 - distance.sum(axis=-1) / params.action_dim.astype(optimal.dtype)
+
+
+def step_reward(params: TaskParams, similarity: jax.Array) -> jax.Array:
+    """The step reward r of similarities r̃, of any shape; regret is 1 − r."""
+    graded = jnp.maximum(0.0, 4.0 * (similarity - 0.75))
+    return jnp.where(graded > params.r_min, graded, 0.0)
+
+
+def normal_cdf(x: jax.Array) -> jax.Array:
+    """Φ, within 1e-15 in float64; twice the speed of `jax.scipy.special.ndtr`."""
+    return 0.5 + 0.5 * lax.erf(x * math.sqrt(0.5))
+
+
+def first_distractors(key: jax.Array, params: TaskParams) -> jax.Array | None:
+    """The distractors `[m]` with which an episode begins; None without distractors."""
+    if not params.form.distractors:
+        return None
+    return uniform_states(jax.random.fold_in(key, _OF_START), params.form.distractors)
+
+
+def random_numbers(key: jax.Array, params: TaskParams) -> jax.Array | None:
+    """Those of a step: the next noise `[m]`, or u `[A]` float32; None where it needs none."""
+    if params.form.dynamics not in ("noise", "autonomous"):
+        return None
+    key = jax.random.fold_in(key, _OF_STEP)
+    if params.form.dynamics == "noise":
+        return uniform_states(key, params.form.distractors)
+    return jax.random.uniform(key, (params.form.action_dim,), jnp.float32)
+
+
+def next_distractors(
+    params: TaskParams, d: jax.Array | None, a: jax.Array, numbers: jax.Array | None
+) -> jax.Array | None:
+    """The distractors `[m]` of the next state, from the action and those random numbers."""
+    if d is None or params.form.dynamics == "noise":
+        return numbers
+    moving = params.observing
+    assert moving is not None
+    assert moving.W is not None
+    assert moving.b is not None
+    return transition(moving.W, moving.b, d, a if numbers is None else numbers)
+
+
+def seen(params: TaskParams, s: jax.Array, d: jax.Array | None) -> jax.Array:
+    """M(s, d) `[..., S + m]` float32; s itself in a task without `observation`."""
+    layers = None if params.observing is None else params.observing.mixing
+    dtype = jnp.float32 if layers is None else layers.W.dtype
+    x = jnp.concatenate([part.astype(dtype) for part in (s, d) if part is not None], axis=-1)
+    if layers is None:
+        return x
+    if params.form.mixing == "orthogonal":
+        return (x @ layers.W[0].T + layers.b[0]).astype(jnp.float32)
+    for i in range(len(layers.W)):
+        x = _uniform(UniformLayer(layers.W[i], layers.b[i]), x)
+    return x.astype(jnp.float32)
+
+
+def _network(inner: InnerLayers | None, output: UniformLayer, s: jax.Array) -> jax.Array:
+    """The output `[..., A]` of uniform layers over states."""
+    x = s.astype(output.W.dtype)
+    if inner is not None:
+        x = _uniform(inner.first, x)
+        x, _ = lax.scan(lambda x, layer: (_uniform(layer, x), None), x, inner.stacked)
+    return _uniform(output, x)
+
+
+def _uniform(layer: UniformLayer, x: jax.Array) -> jax.Array:
+    """Φ(W x + b) of inputs `[..., in]`."""
+    return normal_cdf(x @ layer.W.T + layer.b)
+
+
+def _limits(params: TaskParams) -> Limits:
+    if params.limits is None:
+        raise SpecError("limit: this task has no safety. Give its spec safety.")
+    return params.limits
+
+
+def _drawn(task: Task, dtype: np.dtype[Any]) -> TaskParams:
+    """A task with NumPy's arrays in place of JAX's."""
+    spec = task.spec
+    _check_fields(spec)
+    inner, output = _layers(task.policies[0], dtype)
+    fields: dict[str, Any] = {
+        "action_dim": np.int32(spec.action_dim),
+        "k": np.int32(spec.k),
+        "horizon": np.int32(spec.horizon),
+        "r_min": dtype.type(spec.r_min),
+        "D": dtype.type(spec.D),
+        "W": task.W,
+        "b": task.b,
+        "inner": inner,
+        "output": output,
+        "phase": np.zeros(0, np.float32),
+        "form": Form.of(spec),
+    }
+    if spec.safety is not None:
+        tightness: Any = dtype.type(spec.safety.tightness)
+        fields["limits"] = Limits(tightness, *_layers(task.limiting, dtype))
+    if spec.observation is not None:
+        W, b = task.distractor_transition or (None, None)
+        mixing = _stacked(task.mixing, dtype) if task.mixing else None
+        fields["observing"] = Observing(cast(Any, W), cast(Any, b), mixing)
+    return TaskParams(**fields)
+
+
+def _layers(layers: Sequence[Any], dtype: np.dtype[Any]) -> tuple[InnerLayers | None, UniformLayer]:
+    """The inner layers and the last one of a network from S to A."""
+    arrays: Any = [[part.astype(dtype) for part in layer] for layer in layers]
+    *inner, output = (UniformLayer(W, b) for W, b in arrays)
+    if not inner:
+        return None, output
+    first, *others = inner
+    H = len(first.W)
+    none: Any = np.zeros((0, H, H), dtype), np.zeros((0, H), dtype)
+    return InnerLayers(first, _stacked(others, dtype) if others else UniformLayer(*none)), output
+
+
+def _stacked(layers: Sequence[Any], dtype: np.dtype[Any]) -> UniformLayer:
+    W, b = (np.stack(parts).astype(dtype) for parts in zip(*layers, strict=True))
+    return UniformLayer(cast(Any, W), cast(Any, b))
+
+
+def _check_forms(forms: Sequence[Form]) -> None:
+    first = dataclasses.asdict(forms[0])
+    for index, form in enumerate(forms):
+        for name, value in dataclasses.asdict(form).items():
+            if value != first[name]:
+                raise OptionError(
+                    f"specs[{index}]: has {name}={value!r}: must have {first[name]!r}, as specs[0] "
+                    "has, since the tasks of a program have equal shapes. Make two programs."
+                )
+
+
+def _check_fields(spec: SMESpec) -> None:
     for name, field in type(spec).model_fields.items():
         value = getattr(spec, name)
         if name not in SUPPORTED_FIELDS and value != field.get_default(call_default_factory=True):
@@ -227,115 +409,22 @@ def check_supported(spec: SMESpec) -> None:
             )
 
 
-def _checked_shape(shape: Any) -> Shape:
-    numbers = isinstance(shape, tuple) and all(isinstance(extent, int) for extent in shape)
-    if not numbers or len(shape) != len(Shape._fields):
-        raise OptionError(
-            f"shape={short_repr(shape)}: must be a Shape of {', '.join(Shape._fields)}, such as "
-            "Shape(8, 4, 1, 0). Leave it out for the smallest that covers the tasks."
-        )
-    return Shape(*shape)
-
-
-def _check_covered(shape: Shape, covering: Shape) -> None:
-    if (shape.complexity == 1) != (covering.complexity == 1):
-        raise OptionError(
-            f"complexity={shape.complexity} padded to {covering.complexity}: must be 1 for all "
-            "tasks of a program, or above 1 for all. Make two programs."
-        )
-    for name, own, largest in zip(Shape._fields, shape, covering, strict=True):
-        if own > largest:
-            raise OptionError(
-                f"shape.{name}={largest}: must be at least {own}, the largest of the tasks."
+def _check_switches(stream: StreamSpec) -> None:
+    """Raise SpecError unless every episode ends where a phase is left, or phases switch at once."""
+    if stream.switch == "step" or len(stream.segments) * stream.cycles == 1:
+        return
+    otherwise = 'Use an algorithm of Stable-Baselines3, such as PPO, or choose switch="step".'
+    for index, phase in enumerate(stream.phases):
+        if phase.spec.D > 0:
+            raise SpecError(
+                f"phases.{index}.spec: D={phase.spec.D}: must be 0, since agents in JAX leave a "
+                f"phase where all runs end an episode. {otherwise}"
             )
-
-
-def _check_forms(forms: Sequence[Form]) -> None:
-    for index, form in enumerate(forms):
-        if form != forms[0]:
-            raise OptionError(
-                f"specs[{index}]: must have safety and observation like specs[0]: both with limits "
-                "or both without, and equal distractors, dynamics, mixing and mixing_depth. Make "
-                "two programs."
+    starts = [(segment.phase, segment.start) for segment in stream.segments]
+    for index, step in [*starts, (len(stream.phases) - 1, stream.cycle_steps)]:
+        if step % stream.horizon:
+            raise SpecError(
+                f"phases.{index}: begins or ends a task at step {step:,} of the cycle: must be a "
+                f"multiple of horizon={stream.horizon}, since agents in JAX leave a phase where "
+                f"all runs end an episode. {otherwise}"
             )
-
-
-def _padded(task: Task, shape: Shape, dtype: np.dtype[Any], as_pairs: bool) -> TaskParams:
-    """A task with NumPy's arrays in place of JAX's."""
-    spec, (S, A, *_) = task.spec, shape
-    W, b = _transition(task.W, task.b, (A, S), as_pairs)
-    inner, output = _network(task.policies[0], shape, dtype)
-    fields: dict[str, Any] = {
-        "state_dim": np.int32(spec.state_dim),
-        "action_dim": np.int32(spec.action_dim),
-        "k": np.int32(spec.k),
-        "horizon": np.int32(spec.horizon),
-        "r_min": dtype.type(spec.r_min),
-        "D": dtype.type(spec.D),
-        "W": W,
-        "b": b,
-        "inner": inner,
-        "output": output,
-        "phase": np.zeros(0, np.float32),
-        "form": Form.of(spec),
-    }
-    if spec.safety is not None:
-        tightness: Any = dtype.type(spec.safety.tightness)
-        fields["limits"] = Limits(tightness, *_network(task.limiting, shape, dtype))
-    if spec.observation is not None:
-        fields["observing"] = _observing(task, shape, dtype, as_pairs)
-    return TaskParams(**fields)
-
-
-def _transition(W: Host, b: Host, shape: tuple[int, int], as_pairs: bool) -> tuple[Any, Any]:
-    """W and b of a transition, padded to `shape` `[A, S]`."""
-    W, b = _pad(W, shape), _pad(b, shape[1:])
-    if as_pairs:
-        return (W * 2**GRID_BITS).astype(np.uint32), pairs.from_float64(b)
-    return W, b
-
-
-def _network(
-    layers: Sequence[Any], shape: Shape, dtype: np.dtype[Any]
-) -> tuple[InnerLayers | None, Layer]:
-    """The inner layers and the last one of a network from S to A."""
-    S, A, L, H = shape
-    *inner, output = layers
-    padded: Layer = _layer(output, (A, H if L > 1 else S), dtype)
-    return _inner_layers(inner, shape, dtype) if inner else None, padded
-
-
-def _observing(task: Task, shape: Shape, dtype: np.dtype[Any], as_pairs: bool) -> Observing:
-    S, A, *_ = shape
-    m = task.spec.distractors
-    W, b, mixing = None, None, None
-    if task.distractor_transition is not None:
-        W, b = _transition(*task.distractor_transition, (A, m), as_pairs)
-    if task.mixing:
-        kept = np.r_[: task.spec.state_dim, S : S + m]
-        mixing_W: Any = np.zeros((len(task.mixing), S + m, S + m), dtype)
-        mixing_b: Any = np.zeros((len(task.mixing), S + m), dtype)
-        for i, layer in enumerate(task.mixing):
-            mixing_W[i][np.ix_(kept, kept)], mixing_b[i, kept] = layer
-        mixing = Layer(mixing_W, mixing_b)
-    return Observing(W, b, mixing)
-
-
-def _inner_layers(layers: Sequence[Any], shape: Shape, dtype: np.dtype[Any]) -> InnerLayers:
-    S, _, L, H = shape
-    first, *others = layers
-    W: Any = np.zeros((L - 2, H, H), dtype)
-    b: Any = np.zeros((L - 2, H), dtype)
-    active: Any = np.arange(L - 2) < len(others)
-    for i, layer in enumerate(others):
-        W[i], b[i] = _layer(layer, (H, H), dtype)
-    return InnerLayers(_layer(first, (H, S), dtype), Layer(W, b), active)
-
-
-def _layer(layer: Any, shape: tuple[int, int], dtype: np.dtype[Any]) -> Any:
-    parts: Any = (_pad(part, shape[: part.ndim]).astype(dtype) for part in layer)
-    return Layer(*parts)
-
-
-def _pad(array: Host, shape: tuple[int, ...]) -> Host:
-    return np.pad(array, [(0, to - size) for size, to in zip(array.shape, shape, strict=True)])

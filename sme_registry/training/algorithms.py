@@ -109,7 +109,9 @@ class Entry:
         if self.needs_limits:
             check_has_limits(self.name, document.specs[0])
         if self.kind == "jax":
-            _check_in_jax(document)
+            from sme_registry.jax.task import check_supported
+
+            check_supported(document)
         if self.kind == "train" and (isinstance(document, StreamSpec) or document.team):
             raise SpecError(
                 f"{self.uses}: is for a task of a single agent, and this is a "
@@ -222,21 +224,6 @@ def code_notice(uses: Iterable[str]) -> str:
     modules = dict.fromkeys(name.partition(":")[0] for name in named)
     here = [module for module in modules if module_file(module)]
     return f"This plan runs the code of {', '.join(here)}." if here else ""
-
-
-def _check_in_jax(document: SMESpec | StreamSpec) -> None:
-    """Raise SpecError where JAX does not have a field, or agents in it cannot live in a stream."""
-    from sme_registry.jax.lives import check_switches
-    from sme_registry.jax.task import check_supported
-
-    for index, spec in enumerate(document.specs):
-        try:
-            check_supported(spec)
-        except SpecError as error:
-            in_stream = isinstance(document, StreamSpec)
-            raise SpecError(f"phases.{index}.spec: {error}" if in_stream else f"{error}") from None
-    if isinstance(document, StreamSpec):
-        check_switches(document)
 
 
 def _entry_point(name: str, field: str) -> Any:

@@ -301,7 +301,7 @@ def _num_envs(document: SMESpec | StreamSpec, entry: Entry, num_envs: int | None
 def _device(entry: Entry, device: str | None) -> str:
     """The platform on which an agent in JAX trains; empty for any other."""
     if entry.kind == "jax":
-        from sme_registry.jax.device import find_device
+        from sme_registry.jax import find_device
 
         return str(find_device(device).platform)
     if device is not None:

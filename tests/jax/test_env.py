@@ -1,4 +1,4 @@
-"""Reset and step, against the NumPy definition, lane by lane."""
+"""Reset and step, against the NumPy definition, task by task."""
 
 import jax
 import jax.numpy as jnp
@@ -8,9 +8,8 @@ import pytest
 from sme_registry import SMESpec, materialize
 from sme_registry.envs import arguments
 from sme_registry.errors import ActionError, OptionError, SpecError, StateError
-from sme_registry.jax import env, pairs
-from sme_registry.jax.device import CACHE_VARIABLE, compilations, prepare
-from sme_registry.jax.task import SUPPORTED_FIELDS, Shape, check_supported, task_params
+from sme_registry.jax import CACHE_VARIABLE, env, prepare
+from sme_registry.jax.task import SUPPORTED_FIELDS, check_supported, task_params
 from sme_registry.task import observe, step
 
 STEPS = 70
@@ -20,17 +19,17 @@ SHALLOW = [
     SMESpec(seed=2, k=7, r_min=0.3, horizon=30),
     SMESpec(seed=3, D=0.25, horizon=40),
     SMESpec(seed=4, k=4, D=0.3, r_min=0.1, horizon=6),
-    SMESpec(seed=5, state_dim=5, action_dim=3, k=40, horizon=33),
+    SMESpec(seed=5, k=40, horizon=33),
 ]
 DEEP = [
     SMESpec(seed=1, complexity=4, hidden_width=8, D=0.2, k=3, horizon=30),
-    SMESpec(seed=2, complexity=2, hidden_width=6, action_dim=2, horizon=50, k=3),
+    SMESpec(seed=2, complexity=4, hidden_width=8, horizon=50, k=3),
 ]
 
 
 @jax.jit
 def rollout(params, keys, actions):
-    """All steps of lanes with their own tasks: `[STEPS, lanes, …]`."""
+    """All steps of environments with their own tasks: `[STEPS, tasks, …]`."""
 
     def advance(state, inputs):
         keys, actions = inputs
@@ -41,54 +40,52 @@ def rollout(params, keys, actions):
     return observation, jax.lax.scan(advance, state, (keys[1:], actions))[1]
 
 
-def near_optimal(specs, A):
+def near_optimal(specs):
     """Actions near ½, of which some earn and some end episodes."""
     rng = np.random.default_rng(0)
-    return (0.5 + 0.2 * rng.standard_normal((STEPS, len(specs), A))).astype(np.float32)
+    return (0.5 + 0.2 * rng.standard_normal((STEPS, len(specs), 4))).astype(np.float32)
 
 
 @pytest.mark.parametrize("specs", [SHALLOW, DEEP], ids=["shallow", "deep"])
-def test_lanes_of_tasks_step_as_in_numpy(specs):
+def test_a_batch_of_tasks_steps_as_in_numpy(specs):
     keys = jax.random.split(jax.random.key(0), (STEPS + 1, len(specs)))
-    a = near_optimal(specs, 4)
+    a = near_optimal(specs)
     run = jax.tree.map(np.asarray, rollout(task_params(specs), keys, a))
     first, (before, observed, after, reward, done, info) = run
     old, new = before.s, after.s
     ends = np.zeros(2, int)
-    for lane, spec in enumerate(specs):
-        S, task = spec.state_dim, materialize(spec)
-        channels = [*range(S), -2, -1]
-        s, t, accumulated = old[:1, lane, :S], np.zeros(1, np.int64), np.zeros((1, 1))
-        assert (first[lane, channels] == observe(spec, s, t, accumulated)[0]).all()
+    for row, spec in enumerate(specs):
+        task = materialize(spec)
+        s, t, accumulated = old[:1, row], np.zeros(1, np.int64), np.zeros((1, 1))
+        assert (first[row] == observe(spec, s, t, accumulated)[0]).all()
         for i in range(STEPS):
-            one = step(task, s, t, accumulated, a[i, [lane], : spec.action_dim].astype(float))
+            one = step(task, s, t, accumulated, a[i, [row]].astype(float))
             t += 1
             for name in ("similarity", "step_reward"):
-                assert abs(info[name][i, lane] - getattr(one, name)[0, 0]) <= 1e-12
-            assert info["regret"][i, lane] == 1 - info["step_reward"][i, lane]
-            assert abs(reward[i, lane] - one.reward[0, 0]) <= 1e-12
-            assert info["terminated"][i, lane] == one.terminated[0]
-            assert info["truncated"][i, lane] == one.truncated[0]
+                assert abs(info[name][i, row] - getattr(one, name)[0, 0]) <= 1e-12
+            assert info["regret"][i, row] == 1 - info["step_reward"][i, row]
+            assert abs(reward[i, row] - one.reward[0, 0]) <= 1e-12
+            assert info["terminated"][i, row] == one.terminated[0]
+            assert info["truncated"][i, row] == one.truncated[0]
             seen = observe(spec, one.state, t, one.accumulated_reward)[0]
-            final = info["final_observation"][i, lane, channels]
+            final = info["final_observation"][i, row]
             assert (final[:-1] == seen[:-1]).all()
             assert abs(final[-1] - seen[-1]) <= 6e-8
             s, accumulated = one.state, one.accumulated_reward
-            assert done[i, lane] == (one.terminated[0] or one.truncated[0])
-            if done[i, lane]:
+            assert done[i, row] == (one.terminated[0] or one.truncated[0])
+            if done[i, row]:
                 ends += [one.terminated[0], one.truncated[0]]
-                s, t, accumulated = new[i, [lane], :S], np.zeros(1, np.int64), np.zeros((1, 1))
+                s, t, accumulated = new[i, [row]], np.zeros(1, np.int64), np.zeros((1, 1))
                 assert 0.0 <= s.min() <= s.max() < 1.0
                 seen = observe(spec, s, t, accumulated)[0]
-                assert (observed[i, lane, channels] == seen).all()
-            assert (new[i, lane, :S] == s[0]).all()
-            assert (new[i, lane, S:] == 0.0).all()
-            assert after.t[i, lane] == t[0]
-            assert abs(after.accumulated_reward[i, lane] - accumulated[0, 0]) <= 1e-12
+                assert (observed[i, row] == seen).all()
+            assert (new[i, row] == s[0]).all()
+            assert after.t[i, row] == t[0]
+            assert abs(after.accumulated_reward[i, row] - accumulated[0, 0]) <= 1e-12
     assert (ends > 0).all()
 
 
-def test_a_step_without_a_batch_equals_its_lane():
+def test_a_step_without_a_batch_equals_that_in_a_batch():
     """Starts are drawn in a batch only if an episode ended in it."""
     params = task_params(SMESpec(horizon=2))
     keys = jax.random.split(jax.random.key(0), 3)
@@ -96,21 +93,17 @@ def test_a_step_without_a_batch_equals_its_lane():
     states = jax.tree.map(np.asarray, states._replace(t=np.array([0, 1, 0], np.int32)))
     actions = np.full((3, 4), 0.5)
     batch = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))(keys, states, actions, params)
-    for lane in range(3):
-        state = jax.tree.map(lambda part, lane=lane: part[lane], states)
-        single = jax.jit(env.step)(keys[lane], state, actions[lane], params)
+    for row in range(3):
+        state = jax.tree.map(lambda part, row=row: part[row], states)
+        single = jax.jit(env.step)(keys[row], state, actions[row], params)
         for one, many in zip(jax.tree.leaves(single), jax.tree.leaves(batch), strict=True):
-            np.testing.assert_allclose(one, many[lane], rtol=0, atol=1e-15)
+            np.testing.assert_allclose(one, many[row], rtol=0, atol=1e-15)
 
 
-def test_starts_are_uniform_and_do_not_depend_on_padding():
-    spec = SMESpec(state_dim=3)
+def test_starts_are_uniform():
     keys = jax.random.split(jax.random.key(0), 4096)
     draw = jax.jit(jax.vmap(env.reset, (0, None)))
-    starts = np.asarray(draw(keys, task_params(spec))[1].s)
-    padded = np.asarray(draw(keys, task_params(spec, shape=Shape(7, 4, 1, 0)))[1].s)
-    assert (padded[:, :3] == starts).all()
-    assert (padded[:, 3:] == 0.0).all()
+    starts = np.asarray(draw(keys, task_params(SMESpec(state_dim=3)))[1].s)
     quarters = np.stack([np.histogram(column, 4, (0, 1))[0] for column in starts.T])
     assert abs(quarters - 1024).max() < 5 * np.sqrt(4096 * 3 / 16)
     assert abs(np.corrcoef(starts.T) - np.eye(3)).max() < 5 / np.sqrt(4096)
@@ -118,7 +111,7 @@ def test_starts_are_uniform_and_do_not_depend_on_padding():
 
 def test_arrays_of_other_shapes_are_refused_before_a_step():
     params = task_params(SMESpec(state_dim=3, action_dim=2))
-    lanes = task_params([SMESpec(state_dim=3, action_dim=2)] * 4)
+    several = task_params([SMESpec(state_dim=3, action_dim=2)] * 4)
     key = jax.random.key(0)
     observation, state = env.start(jnp.full(3, 0.25), params)
     assert observation.tolist() == [0.25] * 3 + [0.0, 0.0]
@@ -131,23 +124,21 @@ def test_arrays_of_other_shapes_are_refused_before_a_step():
     wide = state._replace(s=jnp.zeros(4))
     with pytest.raises(StateError, match=r"^state of shape \(4,\): must be of shape \(3,\)"):
         jax.jit(env.step)(key, wide, jnp.zeros(2), params)
-    with pytest.raises(StateError, match=r"^state of type Pair: must be float64"):
-        env.start(pairs.Pair(jnp.zeros(3, jnp.uint32), jnp.zeros(3, jnp.uint32)), params)
-    for call in (lambda: env.reset(key, lanes), lambda: env.step(key, state, jnp.zeros(2), lanes)):
+    for call in (
+        lambda: env.reset(key, several),
+        lambda: env.step(key, state, jnp.zeros(2), several),
+    ):
         with pytest.raises(OptionError, match=r"^params: are of 4 tasks: must be of one\. Use"):
             call()
 
 
-@pytest.mark.parametrize("states", ["float64", "pairs"])
-def test_observations_of_lanes_of_one_task_have_the_bits_of_numpys(states):
+def test_observations_of_one_task_have_the_bits_of_numpys():
     """XLA would turn the division by their common horizon into a product, an ulp off."""
     spec = SMESpec(k=2)
     t = np.arange(spec.horizon + 1)
     s = np.random.default_rng(0).random((t.size, 8))
-    params = task_params(spec, states=states)
-    state = env.EnvState(
-        pairs.from_float64(s) if states == "pairs" else s, t.astype(np.int32), np.full(t.size, 0.3)
-    )
+    params = task_params(spec)
+    state = env.EnvState(s, t.astype(np.int32), np.full(t.size, 0.3))
     computed = jax.jit(jax.vmap(env.observe, (0, None)))(state, params)
     expected = observe(spec, s, t, np.full((t.size, 1), 0.3))
     assert (np.asarray(computed) == expected).all()
@@ -181,21 +172,11 @@ def test_a_compile_cache_that_cannot_be_written_is_announced(tmp_path, monkeypat
         jax.config.update("jax_compilation_cache_dir", before)
 
 
-def test_what_is_compiled_is_counted_and_what_runs_again_is_not():
-    add = jax.jit(lambda x: x + 0.125)
-    counts = [compilations()]
-    for x in (1.0, 2.0, 3):
-        add(x)
-        counts.append(compilations())
-    before, first, again, other_type = counts
-    assert before < first == again < other_type
-
-
 def test_one_task_has_the_numbers_of_its_draw():
     task = materialize(SMESpec(complexity=4, hidden_width=5, k=3, r_min=0.25, D=0.5, horizon=7))
     params = task_params(task.spec)
     assert (params.k, params.r_min, params.D, params.horizon) == (3, 0.25, 0.5, 7)
-    assert (params.state_dim, params.action_dim) == (8, 4)
+    assert (params.form.state_dim, params.action_dim) == (8, 4)
     assert params.inner is not None
     stacked = params.inner.stacked
     layers = [params.inner.first, *zip(stacked.W, stacked.b, strict=True), params.output]
@@ -206,36 +187,16 @@ def test_one_task_has_the_numbers_of_its_draw():
         assert (np.asarray(computed[1]) == drawn[1]).all()
 
 
-def test_lanes_are_padded_to_the_smallest_shape_that_covers_them():
-    specs = [
-        SMESpec(state_dim=3, action_dim=5, complexity=2, hidden_width=4),
-        SMESpec(state_dim=6, action_dim=2, complexity=4, hidden_width=3),
-    ]
-    params = task_params(specs)
-    assert params.W.shape == (2, 5, 6)
-    assert params.inner is not None
-    assert params.inner.stacked.W.shape == (2, 2, 4, 4)
-    assert params.inner.active.tolist() == [[False, False], [True, True]]
-    assert params.output.W.shape == (2, 5, 4)
-    first = jax.tree.map(lambda part: part[0], params)
-    assert first.action_mask.tolist() == [True] * 5
-    assert first.state_mask.tolist() == [True] * 3 + [False] * 3
-    assert (first.W[:, 3:] == 0).all()
-    assert (first.b[3:] == 0).all()
-
-
 def test_dtypes_are_those_of_the_oracle_and_of_states():
     params = task_params(SMESpec(), dtype=jnp.float32)
     assert params.output.W.dtype == params.D.dtype == jnp.float32
     assert params.W.dtype == jnp.float64
-    assert task_params(SMESpec(), states="pairs").W.dtype == jnp.uint32
 
 
-def test_a_list_of_names_or_fields_has_an_axis_of_lanes_and_any_shape_that_covers_it():
+def test_a_list_of_names_or_fields_has_an_axis_of_tasks():
     assert task_params(["SME/Default-v1", {"seed": 0}]).W.shape == (2, 4, 8)
     assert task_params([SMESpec()]).W.shape == (1, 4, 8)
     assert task_params(SMESpec()).W.shape == (4, 8)
-    assert task_params(SMESpec(state_dim=3), shape=(5, 6, 1, 9)).output.W.shape == (6, 5)
 
 
 TEAM = SMESpec.from_dict({"action_dim": 2, "team": {"agents": [{"action_dim": 1}] * 2}})
@@ -244,11 +205,13 @@ TEAM = SMESpec.from_dict({"action_dim": 2, "team": {"agents": [{"action_dim": 1}
 @pytest.mark.parametrize(
     ("specs", "options", "message"),
     [
-        ([SMESpec(), SMESpec(complexity=2)], {}, r"complexity=1 .* 2: must be 1 for all"),
-        (SMESpec(), {"shape": Shape(8, 3, 1, 0)}, r"shape.action_dim=3: must be at least 4"),
-        (SMESpec(), {"shape": (8, 4, 1, "wide")}, r"^shape=.*: must be a Shape of state_dim"),
+        (
+            [SMESpec(), SMESpec(state_dim=3)],
+            {},
+            r"^specs\[1\]: has state_dim=3: must have 8, as .* Make two programs\.",
+        ),
+        ([SMESpec(), SMESpec(complexity=2)], {}, r"^specs\[1\]: has complexity=2: must have 1"),
         ([], {}, r"specs=\[\]: must have at least one"),
-        (SMESpec(), {"states": "int"}, r"states='int': must be 'float64' or 'pairs'"),
         (SMESpec(), {"dtype": jnp.bfloat16}, r"dtype=.*: must be float64 or float32"),
         (TEAM, {}, r"^team=.*must be absent, since tasks in JAX have no team"),
     ],

@@ -8,7 +8,8 @@ import pytest
 from sme_registry import SMESpec, materialize
 from sme_registry.errors import UnknownNameError
 from sme_registry.evaluation.rollouts import start_states
-from sme_registry.jax import observing, replay
+from sme_registry.jax import task as functions
+from sme_registry.jax.off_policy import ReplayRows
 from sme_registry.jax.program import _key_of
 from sme_registry.jax.run import hidden_of, new_program, policy_of
 from sme_registry.jax.task import task_params
@@ -34,8 +35,8 @@ def spec(observation, **fields):
 
 
 def new(algorithm, observation, **options):
-    """Two lanes, of which the second is padded."""
-    specs = [spec(observation), spec(observation, seed=1, state_dim=S - 1)]
+    """Two runs."""
+    specs = [spec(observation), spec(observation, seed=1)]
     settings = SETTINGS[algorithm]
     return new_program(
         f"jax:{algorithm}", specs, [3, 4], hyperparameters=settings, steps=STEPS, **options
@@ -51,15 +52,13 @@ def trained(request):
 
 
 def seen_and_chosen(program):
-    """Observations `[steps, lanes, O]` and actions `[steps, lanes, A]` of the last steps."""
+    """Observations `[steps, runs, O]` and actions `[steps, runs, A]` of the last steps."""
     arrays = program.save()
     if ".steps.observation" in arrays:
         observed, action = arrays[".steps.observation"], arrays[".steps.action"]
         return np.swapaxes(observed, 0, 1), np.swapaxes(action, 0, 1)
     width = S + M + 2
-    stored = replay.Transitions(
-        *np.split(arrays[".buffer"], [width, width + A], axis=-1), *[None] * 2
-    )
+    stored = ReplayRows(*np.split(arrays[".buffer"], [width, width + A], axis=-1), *[None] * 2)
     return stored.observation, stored.action
 
 
@@ -69,25 +68,22 @@ def test_costs_in_the_log_are_those_of_the_states_behind_the_observations(traine
     assert log.safe_regret is not None
     assert log.cost.shape == log.safe_regret.shape == (STEPS, 2)
     observed, actions = seen_and_chosen(program)
-    for lane, task in enumerate(map(materialize, program.specs)):
-        own = task.spec.state_dim
-        channels = [*range(own), *range(S, S + M)]
-        assert not observed[:, lane, own:S].any()
-        s = task.unmixed(observed[:, lane, channels])[:, :own]
-        a = (actions[:, lane] + 1.0) / 2.0
+    for run, task in enumerate(map(materialize, program.specs)):
+        s = task.unmixed(observed[:, run, : S + M])[:, :S]
+        a = (actions[:, run] + 1.0) / 2.0
         n = len(s)
-        np.testing.assert_allclose(log.cost[-n:, lane], task.cost(s, a), atol=1e-4)
-        np.testing.assert_allclose(log.similarity[-n:, lane], task.similarity(s, a), atol=1e-4)
+        np.testing.assert_allclose(log.cost[-n:, run], task.cost(s, a), atol=1e-4)
+        np.testing.assert_allclose(log.similarity[-n:, run], task.similarity(s, a), atol=1e-4)
         safe = task.step_reward(s, task.safe_action(s)) - task.step_reward(s, a)
-        np.testing.assert_allclose(log.safe_regret[-n:, lane], safe, atol=1e-3)
+        np.testing.assert_allclose(log.safe_regret[-n:, run], safe, atol=1e-3)
     assert log.cost.max() > 0.01
 
 
 @pytest.mark.parametrize("algorithm", SETTINGS)
 def test_weights_and_hidden_layers_have_the_widths_of_the_agents_observation(algorithm):
     program, uses, settings = new(algorithm, MIXED["PPO"]), f"jax:{algorithm}", SETTINGS[algorithm]
-    for lane, task in enumerate(program.specs):
-        weights = program.weights(lane)
+    for run, task in enumerate(program.specs):
+        weights = program.weights(run)
         assert isinstance(task, SMESpec)
         observations = np.random.default_rng(0).random((5, task.observation_dim), np.float32)
         actions = policy_of(uses, weights, hyperparameters=settings)(observations)
@@ -116,7 +112,7 @@ def test_evaluations_are_episodes_of_numpys_task(dynamics, k):
     for episode, s in enumerate(states):
         params, numpy_task = task_params(task), materialize(task)
         key = _key_of(jnp.asarray(s))
-        d = np.asarray(observing.first_distractors(key, params))
+        d = np.asarray(functions.first_distractors(key, params))
         similarity, regret, accumulated = 0.0, 0.0, 0.0
         for t in range(T):
             seen = [*numpy_task.seen(s, d), t / T, accumulated / k]
@@ -124,7 +120,7 @@ def test_evaluations_are_episodes_of_numpys_task(dynamics, k):
             similarity += numpy_task.similarity(s, a)
             regret += numpy_task.regret(s, a)
             accumulated = 0.0 if (t + 1) % k == 0 else accumulated + numpy_task.step_reward(s, a)
-            u = observing.drawn(jax.random.fold_in(key, t), params)
+            u = functions.random_numbers(jax.random.fold_in(key, t), params)
             d = numpy_task.distractor_step(d, a) if dynamics == "driven" else np.asarray(u)
             s = numpy_task.transition(s, a)
         assert evaluation.similarity[0, episode] == pytest.approx(similarity, abs=1e-3)

@@ -14,12 +14,11 @@ import jax.numpy as jnp
 
 from sme_registry import SMESpec
 from sme_registry.errors import OptionError, SpecError
-from sme_registry.jax import replay
 from sme_registry.jax.env import observe as observe_in_jax
-from sme_registry.jax.lives import Lives
+from sme_registry.jax.off_policy import read_rows
 from sme_registry.jax.ppo import PPO, PPOProgram
-from sme_registry.jax.program import StepLog
-from sme_registry.jax.td3 import TD3, TD3Program
+from sme_registry.jax.program import Lives, StepLog
+from sme_registry.jax.td3_sac import TD3, TD3Program
 from sme_registry.spec import StreamSpec
 from sme_registry.task import materialize_segments, observe, step
 
@@ -62,13 +61,13 @@ ALGORITHMS = {
 }
 
 
-def program(algorithm, *lanes, budget=BUDGET):
+def program(algorithm, *documents, budget=BUDGET):
     kind, settings = ALGORITHMS[algorithm]
-    return kind(settings, lanes, range(len(lanes)), steps=budget)
+    return kind(settings, documents, range(len(documents)), steps=budget)
 
 
 class Life(NamedTuple):
-    """What an agent met, `[steps, lanes, …]`."""
+    """What an agent met, `[steps, runs, …]`."""
 
     observation: npt.NDArray[np.float32]
     action: npt.NDArray[np.float32]
@@ -77,13 +76,13 @@ class Life(NamedTuple):
     log: StepLog
 
 
-def lived(algorithm, *lanes):
+def lived(algorithm, *documents):
     """A whole life."""
-    agents = program(algorithm, *lanes)
+    agents = program(algorithm, *documents)
     if algorithm == "TD3":
         log = agents.advance(BUDGET)
-        rows = jnp.arange(BUDGET)[None].repeat(len(lanes), axis=0)
-        stored = replay.read(agents.state.buffer, rows, agents.state.observation.shape[-1])
+        rows = jnp.arange(BUDGET)[None].repeat(len(documents), axis=0)
+        stored = read_rows(agents.state.buffer, rows, agents.state.observation.shape[-1])
         met = [np.asarray(x).swapaxes(0, 1) for x in stored]
         return Life(*met[:4], log)
     parts = []
@@ -107,23 +106,23 @@ def test_every_step_of_a_life_is_that_of_numpy_under_the_task_in_force(algorithm
     life = lived(algorithm, stream, stream)
     tasks, at_once = materialize_segments(stream), stream.switch == "step"
     one_hot = np.eye(len(stream.phases), dtype=np.float32)
-    for lane in range(2):
+    for run in range(2):
         t, waiting, most = np.zeros(1, np.int64), np.zeros((1, 1)), 0.0
         for n in range(BUDGET):
             piece, following = stream.times.segment_at(n), stream.times.segment_at(n + 1)
-            task, s = tasks[piece], life.observation[n, lane, :3].astype(float)[None]
+            task, s = tasks[piece], life.observation[n, run, :3].astype(float)[None]
             seen = observe(task.spec, s, t, waiting)[0]
             most = max(most, waiting[0, 0] / task.spec.k)
             phase = one_hot[stream.segments[piece].phase]
-            np.testing.assert_allclose(life.observation[n, lane], [*seen, *phase], atol=1e-6)
-            action = (life.action[n, lane].clip(-1, 1).astype(float)[None] + 1) / 2
+            np.testing.assert_allclose(life.observation[n, run], [*seen, *phase], atol=1e-6)
+            action = (life.action[n, run].clip(-1, 1).astype(float)[None] + 1) / 2
             one = step(task, s, t, waiting, action)
             t, waiting = t + 1, one.accumulated_reward
             ends = one.terminated[0], one.truncated[0]
-            assert ends == (life.log.terminated[n, lane], life.log.truncated[n, lane])
-            rewards = life.log.reward[n, lane], life.reward[n, lane]
+            assert ends == (life.log.terminated[n, run], life.log.truncated[n, run])
+            rewards = life.log.reward[n, run], life.reward[n, run]
             assert rewards == pytest.approx([one.reward[0, 0]] * 2, abs=1e-5)
-            regret = life.log.regret[n, lane], 1 - life.log.similarity[n, lane]
+            regret = life.log.regret[n, run], 1 - life.log.similarity[n, run]
             expected = 1 - one.step_reward[0, 0], 1 - one.similarity[0, 0]
             assert regret == pytest.approx(expected, abs=1e-5)
             last, goes_on = following if at_once else piece, not any(ends)
@@ -131,15 +130,15 @@ def test_every_step_of_a_life_is_that_of_numpy_under_the_task_in_force(algorithm
                 seen = observe(tasks[last].spec, one.state, t, waiting)[0]
                 phase = one_hot[stream.segments[last].phase]
                 np.testing.assert_allclose(
-                    life.next_observation[n, lane],
+                    life.next_observation[n, run],
                     [*seen, *phase], atol=1e-6,
                 )  # fmt: skip
             if not goes_on:
                 t, waiting = np.zeros(1, np.int64), np.zeros((1, 1))
         if at_once:
             assert most > 1.0
-            assert life.log.terminated[:, lane].any()
-            ends = life.log.truncated[[12, 24], lane]
+            assert life.log.terminated[:, run].any()
+            ends = life.log.truncated[[12, 24], run]
             assert ends.tolist() == [True, False]
 
 
@@ -195,23 +194,15 @@ def test_a_restored_life_goes_on_with_the_same_bits(algorithm, saved_at):
 
 
 @cache
-def cached_lives(*lanes):
-    return Lives(lanes, None, jax.devices()[0])
+def cached_lives(*documents):
+    return Lives(documents, jax.devices()[0])
 
 
-def test_visits_end_where_their_phases_do():
-    ends = [13, 25, 32, 45, 57, 64]
-    lives = cached_lives(SUDDEN)
-    assert [*lives.visit_ends(0)] == [*enumerate(ends)]
-    assert next(lives.visit_ends(25)) == (2, 32)
-    assert [*lives.visit_ends(64)] == [*cached_lives(BASE).visit_ends(0)] == []
-
-
-def test_lanes_may_be_on_other_tasks_but_switch_together():
+def test_runs_may_be_on_other_tasks_but_switch_together():
     other = stream_of((OTHERS[0], 9), (BASE, 13), switch="step")
     same = stream_of((BASE, 9), (OTHERS[1], 13), switch="step")
     assert cached_lives(other, same).at(12).k.tolist() == [5, 3]
-    for lane in (
+    for document in (
         BASE,
         stream_of((BASE, 9), (OTHERS[1], 14), switch="step"),
         stream_of((BASE, 9), (OTHERS[1], 13), switch="step", cycles=2),
@@ -219,7 +210,7 @@ def test_lanes_may_be_on_other_tasks_but_switch_together():
         stream_of((BASE, 9), (OTHERS[1], 13), switch="step", drift=DRIFT),
     ):
         with pytest.raises(OptionError, match=r"^specs\[1\]: must switch at the same steps as sp"):
-            cached_lives(same, lane)
+            cached_lives(same, document)
 
 
 def test_a_phase_that_would_be_left_within_an_episode_is_refused_by_its_index():

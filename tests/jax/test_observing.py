@@ -9,9 +9,10 @@ import pytest
 
 from sme_registry import SMESpec, materialize
 from sme_registry.errors import OptionError, SpecError, StateError
-from sme_registry.jax import env, observing, oracle, pairs
+from sme_registry.jax import env
+from sme_registry.jax import task as functions
 from sme_registry.jax.gymnax import Environment
-from sme_registry.jax.task import Form, task_params
+from sme_registry.jax.task import task_params
 
 STEPS, M = 9, 4
 MIXINGS = {
@@ -21,20 +22,18 @@ MIXINGS = {
 }
 
 
-def lanes(observation):
-    """Two tasks of unequal sizes; the second is padded."""
-    base = {"horizon": 4, "k": 2, "safety": {"tightness": 0.3}, "observation": observation}
-    sizes = {"state_dim": 3, "action_dim": 2}, {"state_dim": 2, "action_dim": 1}
-    return [SMESpec.from_dict({**base, **size, "seed": i}) for i, size in enumerate(sizes)]
+def two_tasks(observation):
+    base = {"state_dim": 3, "action_dim": 2, "horizon": 4, "k": 2, "safety": {"tightness": 0.3}}
+    return [SMESpec.from_dict({**base, "observation": observation, "seed": i}) for i in range(2)]
 
 
 @jax.jit
 def rollout(params, keys, actions):
-    """All steps of all lanes: states before, the random numbers, and what `step` returns."""
+    """All steps of all tasks: states before, the random numbers, and what `step` returns."""
 
     def advance(state, inputs):
         keys, actions = inputs
-        numbers = jax.vmap(observing.drawn)(keys, params)
+        numbers = jax.vmap(functions.random_numbers)(keys, params)
         observation, after, *others = jax.vmap(env.step)(keys, state, actions, params)
         return after, (state, numbers, observation, after, *others)
 
@@ -47,10 +46,6 @@ def inputs(specs):
     return jax.random.split(jax.random.key(0), (STEPS + 1, len(specs))), actions.astype(np.float32)
 
 
-def float64(s):
-    return pairs.to_float64(s) if isinstance(s, pairs.Pair) else np.asarray(s)
-
-
 @pytest.mark.parametrize(
     ("dynamics", "mixing"),
     [
@@ -61,12 +56,12 @@ def float64(s):
         (None, "nonlinear"),
     ],
 )
-def test_lanes_step_as_in_numpy(dynamics, mixing):
+def test_a_batch_steps_as_in_numpy(dynamics, mixing):
     m = 0 if dynamics is None else M
-    specs = lanes({"distractors": m, "dynamics": dynamics, **MIXINGS[mixing]})
+    specs = two_tasks({"distractors": m, "dynamics": dynamics, **MIXINGS[mixing]})
     params = task_params(specs)
     run = rollout(params, *inputs(specs))
-    check_steps(specs, run, 1e-12)
+    check_steps(specs, run)
     # The tasks without limits and distractors have the same episodes.
     plain = task_params([spec.derive(safety=None, observation=None) for spec in specs])
     same = rollout(plain, *inputs(specs))
@@ -76,47 +71,35 @@ def test_lanes_step_as_in_numpy(dynamics, mixing):
         assert (same[6][name] == run[6][name]).all()
 
 
-def test_lanes_step_as_in_numpy_without_float64():
-    specs = lanes({"distractors": M, "dynamics": "autonomous", **MIXINGS["nonlinear"]})
-    params = task_params(specs, dtype=jnp.float32, states="pairs")
-    program = rollout.lower(params, *inputs(specs)).compile()
-    assert "f64[" not in program.as_text()
-    check_steps(specs, program(params, *inputs(specs)), 1e-5)
-
-
-def check_steps(specs, run, tolerance):
+def check_steps(specs, run, tolerance=1e-12):
     _, a = inputs(specs)
     before, numbers, observed, after, _, done, info = jax.tree.map(np.asarray, run)
     assert done.sum() == 2 * len(specs)
-    for lane, spec in enumerate(specs):
-        task, S, m, dynamics = materialize(spec), spec.state_dim, spec.distractors, Form.of(spec)
-        channels = [*range(S), *range(3, 3 + m)]
+    for row, spec in enumerate(specs):
+        task, m, dynamics = materialize(spec), spec.distractors, spec.observation.dynamics
         for i in range(STEPS):
-            s, t = float64(before.s)[i, lane, :S], int(before.t[i, lane])
-            u = a[i, lane, : spec.action_dim].astype(float)
-            np.testing.assert_allclose(info["cost"][i, lane], task.cost(s, u), atol=tolerance)
+            s, t = before.s[i, row], int(before.t[i, row])
+            u = a[i, row].astype(float)
+            np.testing.assert_allclose(info["cost"][i, row], task.cost(s, u), atol=tolerance)
             safe = task.step_reward(s, task.safe_action(s)) - task.step_reward(s, u)
-            np.testing.assert_allclose(info["safe_regret"][i, lane], safe, atol=4 * tolerance)
+            np.testing.assert_allclose(info["safe_regret"][i, row], safe, atol=4 * tolerance)
             d = None
             if m:
-                moved = float64(before.distractors)[i, lane]
-                if dynamics.dynamics == "noise":
-                    d = float64(numbers)[i, lane]
+                moved = before.distractors[i, row]
+                if dynamics == "noise":
+                    d = numbers[i, row]
                 else:
-                    driven = dynamics.dynamics == "driven"
-                    d = task.distractor_step(moved, u if driven else numbers[i, lane, : len(u)])
-                if not done[i, lane]:
-                    assert (float64(after.distractors)[i, lane] == d).all()
+                    driven = dynamics == "driven"
+                    d = task.distractor_step(moved, u if driven else numbers[i, row])
+                if not done[i, row]:
+                    assert (after.distractors[i, row] == d).all()
             seen = task.seen(task.transition(s, u), d)
-            final = info["final_observation"][i, lane]
-            np.testing.assert_allclose(final[channels], seen, rtol=6e-8, atol=2 * tolerance)
-            assert not np.delete(final[: 3 + m], channels).any()  # padded
+            final = info["final_observation"][i, row]
+            np.testing.assert_allclose(final[:-2], seen, rtol=6e-8, atol=2 * tolerance)
             assert final[-2] == np.float32((t + 1) / 4)
-            d = float64(after.distractors)[i, lane] if m else None
-            seen = task.seen(float64(after.s)[i, lane, :S], d)
-            np.testing.assert_allclose(
-                observed[i, lane, channels], seen, rtol=6e-8, atol=2 * tolerance
-            )
+            d = after.distractors[i, row] if m else None
+            seen = task.seen(after.s[i, row], d)
+            np.testing.assert_allclose(observed[i, row, :-2], seen, rtol=6e-8, atol=2 * tolerance)
 
 
 @pytest.mark.parametrize(
@@ -127,22 +110,20 @@ def test_limits_and_costs_equal_numpys(complexity, dtype, tolerance):
     spec = SMESpec.from_dict(
         {"complexity": complexity, "hidden_width": 5, "safety": {"tightness": 0.2}, "r_min": 0.1}
     )
-    shape = (9, 6, complexity, 7 if complexity > 1 else 0)
-    params, task = task_params(spec, shape=shape, dtype=dtype), materialize(spec)
+    params, task = task_params(spec, dtype=dtype), materialize(spec)
     rng = np.random.default_rng(0)
     s, a = rng.uniform(-0.5, 1.5, (64, 8)), rng.uniform(-0.2, 1.2, (64, 4))
-    wide_s, wide_a = np.pad(s, [(0, 0), (0, 1)]), np.pad(a, [(0, 0), (0, 2)], constant_values=1.0)
-    limit = jax.jit(oracle.limit)(params, wide_s)
-    np.testing.assert_allclose(limit[:, :4], task.limit(s), rtol=0, atol=tolerance)
-    judged = jax.jit(oracle.judge)(params, wide_s, wide_a)
+    limit = jax.jit(functions.limit)(params, s)
+    np.testing.assert_allclose(limit, task.limit(s), rtol=0, atol=tolerance)
+    judged = jax.jit(functions.judge)(params, s, a)
     np.testing.assert_allclose(judged.cost, task.cost(s, a), rtol=0, atol=tolerance)
     assert np.asarray(judged.cost).max() > 0.1
     safe = task.step_reward(s, task.safe_action(s)) - task.step_reward(s, a)
     np.testing.assert_allclose(judged.safe_regret, safe, rtol=0, atol=4 * tolerance)
     with pytest.raises(SpecError, match=r"^limit: this task has no safety"):
-        oracle.limit(task_params(SMESpec()), s)
-    with pytest.raises(SpecError, match=r"^cost: this task has no safety"):
-        oracle.cost(task_params(SMESpec()), a, a)
+        functions.limit(task_params(SMESpec()), s)
+    with pytest.raises(SpecError, match=r"^limit: this task has no safety"):
+        functions.cost(task_params(SMESpec()), a, a)
 
 
 def test_distractors_of_starts_and_noise_are_uniform_and_new():
@@ -152,7 +133,7 @@ def test_distractors_of_starts_and_noise_are_uniform_and_new():
     @jax.jit
     @partial(jax.vmap, in_axes=(0, None))
     def draw(key, params):
-        own = observing.first_distractors(key, params), observing.drawn(key, params)
+        own = functions.first_distractors(key, params), functions.random_numbers(key, params)
         return env.reset(key, params)[1].s, *own
 
     columns = np.concatenate(draw(keys, params), axis=1)
@@ -165,18 +146,18 @@ def test_a_task_without_both_carries_nothing_of_them():
     params = task_params(SMESpec())
     state = jax.eval_shape(env.reset, jax.random.key(0), params)[1]
     assert len(jax.tree.leaves(state)) == 3
-    assert len(jax.tree.leaves(params)) == 11
-    assert observing.drawn(jax.random.key(0), params) is None
+    assert len(jax.tree.leaves(params)) == 10
+    assert functions.random_numbers(jax.random.key(0), params) is None
 
 
 def test_an_episode_begins_with_any_distractors():
-    spec = lanes({"distractors": M})[0]
+    spec = two_tasks({"distractors": M})[0]
     params = task_params(spec)
     s, d = np.full(3, 0.25), np.full(M, 0.75)
     observation, state = jax.jit(env.start)(s, params, d)
     assert observation.tolist() == [0.25] * 3 + [0.75] * M + [0.0, 0.0]
-    for wrong in (None, jnp.zeros(3), pairs.from_float64(np.zeros(M))):
-        with pytest.raises(StateError, match=r"^distractors .*: must be of shape \(4,\), float64"):
+    for wrong in (None, jnp.zeros(3)):
+        with pytest.raises(StateError, match=r"^distractors .*: must be of shape \(4,\), since"):
             env.start(s, params, wrong)
     with pytest.raises(StateError, match=r"^distractors left out: must be of shape \(4,\)"):
         env.step(jax.random.key(0), state._replace(distractors=None), jnp.zeros(2), params)
@@ -191,9 +172,13 @@ def test_an_episode_begins_with_any_distractors():
 
 
 def test_tasks_of_other_forms_share_no_program():
-    specs = lanes({"distractors": M})
-    for other in (specs[0].derive(safety=None), lanes({"distractors": M + 1})[0], SMESpec()):
-        with pytest.raises(OptionError, match=r"^specs\[1\]: must have safety and observation"):
+    specs = two_tasks({"distractors": M})
+    for other, message in (
+        (specs[0].derive(safety=None), "safety=False: must have True"),
+        (two_tasks({"distractors": M + 1})[0], "distractors=5: must have 4"),
+        (specs[0].derive(observation=None), "distractors=0: must have 4"),
+    ):
+        with pytest.raises(OptionError, match=rf"^specs\[1\]: has {message}"):
             task_params([specs[0], other])
     params = task_params([specs[0], specs[0].derive(safety={"tightness": 0.1})])
     assert params.limits is not None

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from sme_registry.errors import OptionError
-from sme_registry.jax import replay
+from sme_registry.jax.off_policy import read_rows
 from sme_registry.jax.program import StepLog
 from sme_registry.jax.run import settings_of
-from sme_registry.jax.sac import SAC, SACProgram
-from sme_registry.jax.td3 import TD3, TD3Program
+from sme_registry.jax.td3_sac import SAC, TD3, SACProgram, TD3Program
 from sme_registry.spec import SMESpec
 from sme_registry.training.algorithms import nested_hyperparameters
 
@@ -33,7 +32,7 @@ SPECS = [SMESpec(seed=i, state_dim=3, action_dim=2, horizon=7, D=0.2 * i) for i 
 
 @pytest.fixture(params=KINDS, ids=["TD3", "SAC"])
 def new(request):
-    """Makes a program of two lanes; all of an algorithm share their compiled code."""
+    """Makes a program of two runs; all of an algorithm share their compiled code."""
     kind, settings = request.param
     return partial(kind, settings, SPECS, [3, 4], steps=BUDGET)
 
@@ -142,7 +141,7 @@ def test_a_restored_program_goes_on_with_the_same_bits(new):
     assert_equal(resumed.save(), program.save())
 
 
-def test_a_lane_that_fails_leaves_the_others_alone(new):
+def test_a_run_that_fails_leaves_the_others_alone(new):
     program, failing = new(), new()
     weights = failing.state.weights
     first = next(iter(weights))
@@ -174,10 +173,10 @@ CRITIC = "critic.qf0.0.weight"
 
 
 def rows(program):
-    """The buffer, `[steps, lanes, ...]`."""
+    """The buffer, `[steps, runs, ...]`."""
     stored = program.state.buffer[: program.steps]
-    lanes = jnp.arange(program.steps)[None].repeat(stored.shape[1], axis=0)
-    read = replay.read(stored, lanes, program.state.observation.shape[-1])
+    each = jnp.arange(program.steps)[None].repeat(stored.shape[1], axis=0)
+    read = read_rows(stored, each, program.state.observation.shape[-1])
     return jax.tree.map(lambda array: np.asarray(array).swapaxes(0, 1), read)
 
 

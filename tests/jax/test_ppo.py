@@ -19,7 +19,6 @@ from sme_registry.errors import OptionError
 from sme_registry.jax import ppo
 from sme_registry.jax.env import start
 from sme_registry.jax.networks import Adam
-from sme_registry.jax.padding import Dimensions, Padding
 from sme_registry.jax.run import settings_of
 from sme_registry.jax.task import task_params
 from sme_registry.sb3.vec_env import SingleVecEnv
@@ -30,7 +29,6 @@ Weights = dict[str, npt.NDArray[np.float32]]
 # Episodes end by D, by T, and by both on one step; payouts are delayed.
 SPEC = SMESpec(k=2, D=0.01, horizon=2)
 WIDE = SMESpec(state_dim=11, action_dim=16, k=10, horizon=25)
-FULL = Dimensions(11, 16)  # to which the first task is padded beside the second
 SETTINGS = ppo.PPO(n_steps=256, n_epochs=20, clip_range_vf=0.2, ent_coef=0.01)
 UPDATES = SETTINGS.n_steps // SETTINGS.batch_size * SETTINGS.n_epochs  # 80
 
@@ -39,9 +37,8 @@ class Recording(NamedTuple):
     """SB3 in mid-run: a rollout, the learner before it, and the weights after each update."""
 
     spec: SMESpec
-    own: Dimensions
-    learner: ppo.Learner
-    steps: ppo.Steps
+    learner: ppo.PPOLearner
+    steps: ppo.RolloutSteps
     next_observation: npt.NDArray[np.float32]
     rollout: ppo.Rollout
     batches: npt.NDArray[np.int64]
@@ -92,14 +89,13 @@ def recorded(spec):
         buffer.values[:, 0], buffer.advantages[:, 0],
     )  # fmt: skip
     rewards, *ends, last = (np.array(column) for column in zip(*env.rows, strict=True))
-    steps = ppo.Steps(*rollout[:2], rewards.astype(np.float32), *ends, last)
+    steps = ppo.RolloutSteps(*rollout[:2], rewards.astype(np.float32), *ends, last)
     learner, weights = learner_of(model), []
     model.policy.optimizer.register_step_post_hook(lambda *_: weights.append(weights_of(model)))
     buffer.batches = []
     model.train()
     batches = np.array(buffer.batches)
-    own = Dimensions(spec.state_dim, spec.action_dim)
-    return Recording(spec, own, learner, steps, model._last_obs[0], rollout, batches, weights)
+    return Recording(spec, learner, steps, model._last_obs[0], rollout, batches, weights)
 
 
 def weights_of(model):
@@ -112,21 +108,7 @@ def learner_of(model):
         {name: moments[i][key].numpy().copy() for i, name in enumerate(weights)}
         for key in ("exp_avg", "exp_avg_sq")
     )
-    return ppo.Learner(weights, Adam(mean, square, np.int32(moments[0]["step"])))
-
-
-def padded(recording, padding):
-    """The learner and the rollout of one of several lanes."""
-    own = recording.own
-    weights, (mean, square, updates) = recording.learner
-    added = (padding.add(each, own) for each in (weights, mean, square))
-    learner = ppo.Learner(next(added), Adam(*added, updates))
-    states = [own.state_dim] * (FULL.state_dim - own.state_dim)
-    observation = np.insert(recording.rollout.observation, states, 0.0, axis=1)
-    rng = np.random.default_rng(0)  # whatever is in padded channels of actions
-    noise = rng.standard_normal((SETTINGS.n_steps, FULL.action_dim - own.action_dim), np.float32)
-    action = np.concatenate([recording.rollout.action, noise], axis=1)
-    return learner, recording.rollout._replace(observation=observation, action=action)
+    return ppo.PPOLearner(weights, Adam(mean, square, np.int32(moments[0]["step"])))
 
 
 def largest_difference(one, other):
@@ -154,7 +136,7 @@ def test_advantages_equal_those_of_sb3(recordings, task, ends):
     assert np.unique(found).tolist() == ends
     ours = jax.jit(functools.partial(ppo.rollout, SETTINGS))(
         recording.learner.weights, recording.steps, recording.next_observation,
-        np.ones(recording.own.action_dim, bool),
+        np.ones(recording.spec.action_dim, bool),
     )  # fmt: skip
     for name in ("log_density", "value", "advantage"):
         theirs = getattr(recording.rollout, name)
@@ -162,25 +144,18 @@ def test_advantages_equal_those_of_sb3(recordings, task, ends):
         np.testing.assert_allclose(getattr(ours, name), theirs, rtol=0, atol=tolerance)
 
 
-def test_weights_equal_those_of_sb3_after_1_and_80_updates_also_padded(recordings):
-    padding = Padding(functools.partial(ppo.PPOProgram.initial_weights, SETTINGS), FULL)
-    lanes = [padded(recording, padding) for recording in recordings]
-    learner, rollout = jax.tree.map(lambda *leaves: np.stack(leaves), *lanes)
-    masks = np.stack([np.arange(FULL.action_dim) < each.own.action_dim for each in recordings])
-    batches = np.stack([recording.batches for recording in recordings])
-    assert batches.shape == (2, UPDATES, SETTINGS.batch_size)
-    update = jax.jit(jax.vmap(functools.partial(ppo.update, SETTINGS)))
+@pytest.mark.parametrize("task", [0, 1])
+def test_weights_equal_those_of_sb3_after_1_and_80_updates(recordings, task):
+    recording = recordings[task]
+    learner, channels = recording.learner, np.ones(recording.spec.action_dim, bool)
+    assert recording.batches.shape == (UPDATES, SETTINGS.batch_size)
+    update = jax.jit(functools.partial(ppo.update, SETTINGS))
     for i in range(UPDATES):
-        learner = update(learner, rollout, batches[:, i : i + 1], masks)
-        if i not in (0, UPDATES - 1):
-            continue
-        for lane, recording in enumerate(recordings):
-            ours = {name: np.asarray(w[lane]) for name, w in learner.weights.items()}
-            own = padding.remove(ours, recording.own)
-            assert largest_difference(own, recording.weights[i]) < (1e-5 if i else 1e-6)
-            assert largest_difference(padding.add(own, recording.own), ours) == 0.0
-            if i:
-                assert largest_difference(own, recording.learner.weights) > 1e-2
+        learner = update(learner, recording.rollout, recording.batches[i : i + 1], channels)
+        if i in (0, UPDATES - 1):
+            ours = {name: np.asarray(weight) for name, weight in learner.weights.items()}
+            assert largest_difference(ours, recording.weights[i]) < (1e-5 if i else 1e-6)
+    assert largest_difference(ours, recording.learner.weights) > 1e-2
 
 
 @pytest.mark.parametrize(
@@ -262,58 +237,55 @@ SMALL = ppo.PPO(n_steps=32, batch_size=16, n_epochs=2, net_arch=(8, 8))
 
 
 def program():
-    """Two lanes of tasks of unequal sizes and reward settings."""
-    specs = [SMESpec(k=10, r_min=0.5, seed=1), SMESpec(state_dim=5, action_dim=2, horizon=9)]
+    """Two runs, on tasks of other reward settings."""
+    specs = [SMESpec(k=10, r_min=0.5, seed=1), SMESpec(horizon=9)]
     return ppo.PPOProgram(SMALL, specs, [4, 5], steps=96)
 
 
 def test_a_program_collects_whole_rollouts_and_learns_between_them():
-    lanes = program()
-    before, keys = lanes.weights(0), [lanes.state.key]
-    log = lanes.advance(20)
-    keys.append(lanes.state.key)
-    assert lanes.steps == 32
+    agents = program()
+    before, keys = agents.weights(0), [agents.state.key]
+    log = agents.advance(20)
+    keys.append(agents.state.key)
+    assert agents.steps == 32
     assert {x.shape for x in jax.tree.leaves(log)} == {(32, 2)}
-    assert largest_difference(lanes.weights(0), before) == 0.0  # stopped before the update
-    assert {x.shape for x in jax.tree.leaves(lanes.advance(32))} == {(0, 2)}
-    log = lanes.advance(96)
+    assert largest_difference(agents.weights(0), before) == 0.0  # stopped before the update
+    assert {x.shape for x in jax.tree.leaves(agents.advance(32))} == {(0, 2)}
+    log = agents.advance(96)
     assert {x.shape for x in jax.tree.leaves(log)} == {(64, 2)}
     assert log.terminated.dtype == log.truncated.dtype == bool
-    assert lanes.state.optimiser.updates.tolist() == [8, 8]
-    keys.append(lanes.state.key)
-    lanes.finish()
-    lanes.finish()
-    keys.append(lanes.state.key)
+    assert agents.state.optimiser.updates.tolist() == [8, 8]
+    keys.append(agents.state.key)
+    agents.finish()
+    agents.finish()
+    keys.append(agents.state.key)
     assert len({key.tobytes() for key in np.asarray(keys)}) == 4
-    assert lanes.state.optimiser.updates.tolist() == [12, 12]
-    assert largest_difference(lanes.weights(0), before) > 1e-4
-    assert lanes.weights(1)["action_net.weight"].shape == (2, 8)
-    padded = np.asarray(lanes.state.weights["mlp_extractor.policy_net.0.weight"][1])
-    assert not padded[:, 5:8].any()
-    assert padded[:, :5].all()
-    assert not lanes.failed().any()
+    assert agents.state.optimiser.updates.tolist() == [12, 12]
+    assert largest_difference(agents.weights(0), before) > 1e-4
+    assert agents.weights(1)["action_net.weight"].shape == (4, 8)
+    assert not agents.failed().any()
 
 
 def test_a_program_goes_on_from_saved_state_bit_for_bit():
-    lanes = program()
-    lanes.advance(64)
+    agents = program()
+    agents.advance(64)
     again = program()
-    again.restore(lanes.save())
-    one, other = lanes.advance(96), again.advance(96)
+    again.restore(agents.save())
+    one, other = agents.advance(96), again.advance(96)
     for mine, theirs in zip(one, other, strict=True):
         np.testing.assert_array_equal(mine, theirs)
-    lanes.finish()
+    agents.finish()
     again.finish()
-    assert largest_difference(lanes.weights(1), again.weights(1)) == 0.0
+    assert largest_difference(agents.weights(1), again.weights(1)) == 0.0
 
 
-def test_a_failed_lane_leaves_the_others_alone():
-    lanes, broken = program(), program()
+def test_a_failed_run_leaves_the_others_alone():
+    agents, broken = program(), program()
     weights = dict(broken.state.weights)
     weights["action_net.bias"] = weights["action_net.bias"].at[0].set(np.nan)
     broken.state = broken.state._replace(weights=weights)
-    for each in (lanes, broken):
+    for each in (agents, broken):
         each.advance(64)
         each.finish()
     assert broken.failed().tolist() == [True, False]
-    assert largest_difference(broken.weights(1), lanes.weights(1)) == 0.0
+    assert largest_difference(broken.weights(1), agents.weights(1)) == 0.0

@@ -1,4 +1,4 @@
-"""What all programs have: evaluation, padding, saving, lanes that failed."""
+"""What all programs have: evaluation, saving, runs that failed."""
 
 from typing import Any, NamedTuple
 
@@ -18,9 +18,9 @@ from sme_registry.jax.program import Program
 from sme_registry.task import materialize
 
 BASE = SMESpec(state_dim=3, action_dim=2, horizon=30, seed=1)
-COUPLED = (BASE, BASE.derive(k=7, r_min=0.3), BASE.derive(state_dim=2, action_dim=3, D=0.1))
-SEPARABLE = (BASE, BASE.derive(seed=2, horizon=33), BASE.derive(state_dim=2, action_dim=3))
-BASE_LANES = (BASE, BASE)
+COUPLED = (BASE, BASE.derive(k=7, r_min=0.3), BASE.derive(seed=3, D=0.1))
+SEPARABLE = (BASE, BASE.derive(seed=2, horizon=33), BASE.derive(seed=3))
+BASE_TWICE = (BASE, BASE)
 
 
 class LinearState(NamedTuple):
@@ -44,7 +44,7 @@ class Linear(Program):
         }
 
     def initial_state(self, weights, keys):
-        return LinearState(weights, jnp.zeros((), jnp.int32), jnp.zeros((self.budget, self.lanes)))
+        return LinearState(weights, jnp.zeros((), jnp.int32), jnp.zeros((self.budget, self.runs)))
 
     @staticmethod
     def act(settings, weights, observations, symmetric):
@@ -60,7 +60,7 @@ class Linear(Program):
 
 def program(specs, first_seed=0, **changes):
     seeds = range(first_seed, first_seed + len(specs))
-    return Linear((), specs, seeds, **{"steps": 4, "lanes": 4, **changes})
+    return Linear((), specs, seeds, **{"steps": 4, "runs": 4, **changes})
 
 
 CASES = {"coupled": (COUPLED, "symmetric"), "separable": (SEPARABLE, "unit")}
@@ -68,43 +68,37 @@ CASES = {"coupled": (COUPLED, "symmetric"), "separable": (SEPARABLE, "unit")}
 
 @pytest.mark.parametrize(("specs", "action_range"), CASES.values(), ids=CASES.keys())
 def test_evaluations_are_those_of_numpy(specs, action_range):
-    """Also in lanes that are padded, and beside copies that fill the program up."""
+    """Also beside copies that fill the program up."""
     linear_program = program(specs, action_range=action_range)
-    states = np.zeros((4, 5, 3))
-    for lane, spec in enumerate(specs):
-        states[lane, :, : spec.state_dim] = start_states(lane, 0, 5, spec.state_dim)
+    states = np.stack([start_states(run, 0, 5, 3) for run in range(4)])
     evaluation = linear_program.evaluate(states)
     assert evaluation.regret.shape == (4, 5)
-    for lane, spec in enumerate(specs):
-        weights = linear_program.weights(lane)
-        assert weights["actor.weight"].shape == (spec.action_dim, spec.state_dim + 2)
-        assert weights["critic.weight"].shape == (1, spec.state_dim + 2 + spec.action_dim)
+    for run, spec in enumerate(specs):
+        weights = linear_program.weights(run)
 
         def policy(observations, weights=weights):
             actions = observations @ weights["actor.weight"].T + weights["actor.bias"]
             actions = np.round(32 * actions) / 32
             return (actions + 1) / 2 if action_range == "symmetric" else actions
 
-        expected = rollouts(policy, materialize(spec), states[lane, :, : spec.state_dim])
-        length = evaluation.length[lane]
+        expected = rollouts(policy, materialize(spec), states[run])
+        length = evaluation.length[run]
         assert (length == expected.length).all()
-        assert evaluation.regret[lane] / length == pytest.approx(expected.regret, abs=1e-12)
-        assert evaluation.similarity[lane] / length == pytest.approx(expected.similarity, abs=1e-12)
-        assert evaluation.episode_return[lane] == pytest.approx(expected.episode_return, abs=1e-11)
+        assert evaluation.regret[run] / length == pytest.approx(expected.regret, abs=1e-12)
+        assert evaluation.similarity[run] / length == pytest.approx(expected.similarity, abs=1e-12)
+        assert evaluation.episode_return[run] == pytest.approx(expected.episode_return, abs=1e-11)
 
 
-def test_weights_depend_on_their_seed_and_not_on_the_padding():
+def test_weights_depend_on_their_seed_alone():
     together, alone = program(COUPLED), Linear((), COUPLED[2:], [2], steps=4)
+    assert alone.weights(0)["critic.weight"].shape == (1, 3 + 2 + 2)
     for name, weight in alone.weights(0).items():
         assert np.array_equal(together.weights(2)[name], weight)
     assert (together.weights(0)["critic.weight"] != together.weights(1)["critic.weight"]).any()
-    padded = np.asarray(together.state.weights["critic.weight"])[2, 0]
-    assert (padded[[2]] == 0).all()  # a third state channel
-    assert (padded[[0, 1, 3, 4, 5, 6, 7]] != 0).all()
 
 
 def test_state_is_restored_whole_also_for_more_steps():
-    one, other = program(BASE_LANES), program(BASE_LANES, first_seed=7, steps=6)
+    one, other = program(BASE_TWICE), program(BASE_TWICE, first_seed=7, steps=6)
     one.steps = 3
     one.state = one.state._replace(count=jnp.int32(7), buffer=jnp.ones((4, 4)))
     other.restore(one.save())
@@ -116,24 +110,24 @@ def test_state_is_restored_whole_also_for_more_steps():
 
 
 def test_the_state_of_another_program_is_refused():
-    two = program(BASE_LANES)
+    two = program(BASE_TWICE)
     with pytest.raises(OptionError, match=r"actor.*float32 of shape \(3, .*must be .*\(4, "):
-        two.restore(program(BASE_LANES, lanes=3).save())
+        two.restore(program(BASE_TWICE, runs=3).save())
     with pytest.raises(OptionError, match=r"buffer.*shape \(6, 4\): must be .*\(4, 4\)"):
-        two.restore(program(BASE_LANES, steps=6).save())
+        two.restore(program(BASE_TWICE, steps=6).save())
     with pytest.raises(OptionError, match="another program"):
         two.restore({"steps": np.asarray(0)})
     for steps in (np.zeros(2, int), np.asarray(np.nan)):
         with pytest.raises(OptionError, match=r"^arrays\['steps'\]: is .*: must be int64 of shape"):
-            two.restore({**program(BASE_LANES, first_seed=7).save(), "steps": steps})
-    np.testing.assert_equal(two.save(), program(BASE_LANES).save())
+            two.restore({**program(BASE_TWICE, first_seed=7).save(), "steps": steps})
+    np.testing.assert_equal(two.save(), program(BASE_TWICE).save())
 
 
-def test_too_many_lanes_for_the_memory_are_refused_with_the_number_that_fits():
+def test_too_many_runs_for_the_memory_are_refused_with_the_number_that_fits():
     memory = available_memory()
     assert memory is not None
-    steps = memory // 20  # of 8 bytes: 2.5 lanes would fit
-    with pytest.raises(ResourceLimitError, match=r"lanes=4: .* at most 2 fit\. Choose fewer lanes"):
-        Linear((), BASE_LANES, (0, 1), steps=steps, lanes=4)
-    with pytest.raises(ResourceLimitError, match=r"lanes=1: .* not one fits\. Choose fewer steps"):
-        Linear((), BASE_LANES[:1], (0,), steps=4 * steps)
+    steps = memory // 20  # of 8 bytes: 2.5 runs would fit
+    with pytest.raises(ResourceLimitError, match=r"runs=4: .* at most 2 fit\. Choose fewer runs"):
+        Linear((), BASE_TWICE, (0, 1), steps=steps, runs=4)
+    with pytest.raises(ResourceLimitError, match=r"runs=1: .* not one fits\. Choose fewer steps"):
+        Linear((), BASE_TWICE[:1], (0,), steps=4 * steps)

@@ -13,7 +13,7 @@ from sme_registry.jax.program import Evaluation, Program, StepLog
 from sme_registry.jax.run import ALGORITHMS, new_program, run, settings_of
 from sme_registry.spec import StreamSpec
 
-SPECS = (SMESpec(state_dim=2), SMESpec(state_dim=1))
+SPECS = (SMESpec(state_dim=2), SMESpec(state_dim=2, seed=1))
 
 
 class Nothing(NamedTuple):
@@ -23,8 +23,8 @@ class Nothing(NamedTuple):
 class Scripted(Program):
     """Takes no steps but counts them, and records the order of its calls."""
 
-    def __init__(self, budget, rollout=1, lanes=SPECS):
-        super().__init__((), lanes, (0, 1), steps=budget, lanes=3)
+    def __init__(self, budget, rollout=1, specs=SPECS):
+        super().__init__((), specs, (0, 1), steps=budget, runs=3)
         self.rollout, self.events, self.updates = rollout, list[Any](), 0
         self.lifetimes = list[Any]()
 
@@ -44,7 +44,7 @@ class Scripted(Program):
         while self.steps < limit:
             self.updates = self.steps // self.rollout  # the one that was left pending
             self.steps += self.rollout
-        return StepLog(*[np.zeros((self.steps - before, self.lanes))] * 5)
+        return StepLog(*[np.zeros((self.steps - before, self.runs))] * 5)
 
     def finish(self):
         self.updates = self.steps // self.rollout
@@ -58,7 +58,7 @@ class Scripted(Program):
 
 
 def scripted_run(program, due, **changes):
-    """Rows of an evaluation's index, its step, updates before it, and the return of lane 1."""
+    """Rows of an evaluation's index, its step, updates before it, and the return of run 1."""
     rows = []
 
     def on_evaluation(k, step, evaluation):
@@ -69,7 +69,7 @@ def scripted_run(program, due, **changes):
     run(
         program,
         due=due,
-        start_states=lambda k: [np.full((2, 2), k), np.full((2, 1), 10 + k)],
+        start_states=lambda k: [np.full((2, 2), k / 2), np.full((2, 2), (10 + k) / 2)],
         on_log=lambda log: program.events.append(("steps", len(log.reward))),
         on_evaluation=on_evaluation,
         **changes,
@@ -111,12 +111,12 @@ def test_evaluations_in_one_rollout_run_together_always_as_many():
 
 
 def stream(seed):
-    tasks = [SMESpec(state_dim=2 - seed, horizon=1, seed=i, k=1 + i) for i in (seed, 2)]
+    tasks = [SMESpec(state_dim=2, horizon=1, seed=i, k=1 + i) for i in (seed, 2)]
     return StreamSpec(phases=[{"spec": spec, "steps": 5} for spec in tasks], cycles=2)
 
 
 def test_evaluations_are_of_the_task_on_which_their_step_was_taken():
-    program = Scripted(budget=20, rollout=8, lanes=[stream(0), stream(1)])
+    program = Scripted(budget=20, rollout=8, specs=[stream(0), stream(1)])
     rows = scripted_run(program, [0, 1, 5, 6, 7, 20])
     assert [row[1] for row in rows] == [0, 1, 5, 6, 7, 24]
     assert program.lifetimes == [0, 0, 5, 23]
@@ -128,7 +128,7 @@ def test_evaluations_are_of_the_task_on_which_their_step_was_taken():
     [(1, [5, 10, 15, 20]), (2, [2, 5, 7, 10]), (5, [1, 2, 3, 4]), (8, [0, 1, 1, 3])],
 )
 def test_a_visit_ends_after_the_update_of_the_last_rollout_in_it(rollout, updates):
-    program = Scripted(budget=20, rollout=rollout, lanes=[stream(0), stream(1)])
+    program = Scripted(budget=20, rollout=rollout, specs=[stream(0), stream(1)])
     ended = []
     due = [5, 20]
 
@@ -145,7 +145,7 @@ def test_a_visit_ends_after_the_update_of_the_last_rollout_in_it(rollout, update
 
 
 def test_a_restored_run_goes_on_after_the_visits_that_have_ended():
-    program, ended = Scripted(budget=20, lanes=[stream(0), stream(1)]), list[int]()
+    program, ended = Scripted(budget=20, specs=[stream(0), stream(1)]), list[int]()
     program.steps = 10
     scripted_run(program, [], on_visit=lambda visit, _: ended.append(visit))
     assert ended == [2, 3]
@@ -160,11 +160,11 @@ def test_a_restored_run_goes_on_after_the_visits_that_have_ended():
         ({"specs": (), "seeds": ()}, r"len\(specs\)=0: must be an integer of at least 1"),
         ({"seeds": (0,)}, r"len\(seeds\)=1: must be .*Give a seed of each task"),
         ({"seeds": (0, -1)}, r"seeds\[1\]=-1: must be"),
-        ({"lanes": 1}, "lanes=1: must be an integer of at least 2"),
+        ({"runs": 1}, "runs=1: must be an integer of at least 2"),
         ({"steps": -1}, "steps=-1: must be"),
     ],
 )
-def test_a_program_of_invalid_lanes_is_refused(change, message):
+def test_a_program_of_invalid_runs_is_refused(change, message):
     arguments = {"specs": SPECS, "seeds": (0, 1), "steps": 10, **change}
     with pytest.raises(OptionError, match=message):
         new_program("jax:PPO", **arguments)

@@ -28,7 +28,7 @@ from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import write_atomically
 from sme_registry.spec.study import Cell
-from sme_registry.studies.engine.programs import Lanes, run_lanes
+from sme_registry.studies.engine.programs import SharedProgram, run_program
 from sme_registry.studies.engine.result import (
     EVALUATION,
     TRAINING,
@@ -129,7 +129,8 @@ def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> Ce
     def report(done: int, total: int, note: str = "", /) -> None:
         progress(done, total)
 
-    ((entry, model, snapshots),) = run_lanes((cell,), Lanes(1), report, model_path is not None)
+    outcomes = run_program((cell,), SharedProgram(1), report, model_path is not None)
+    ((entry, model, snapshots),) = outcomes
     if isinstance(entry, CellFailure):
         raise PolicyError(entry.error.removeprefix("PolicyError: "))
     if model_path is not None and model is not None:

@@ -28,17 +28,16 @@ from typing import Any, Protocol
 
 from sme_registry.errors import OptionError
 from sme_registry.io import require_packages
-from sme_registry.io.system import block_interrupts, defer_interrupts, end_with_parent
+from sme_registry.io.system import (
+    available_cores,
+    block_interrupts,
+    child_environment,
+    defer_interrupts,
+    end_with_parent,
+)
 from sme_registry.spec import Cell
 from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.programs import (
-    CPU,
-    Job,
-    Report,
-    available_cores,
-    child_environment,
-    run_lanes,
-)
+from sme_registry.studies.engine.programs import CPU, Job, Report, run_program
 from sme_registry.studies.engine.result import CellResult, Outcome, failed
 
 RunCell = Callable[[Cell, Callable[[int, int], None] | None, Path | None], CellResult]
@@ -91,8 +90,8 @@ def run_job(run: RunCell, job: Job, keep_models: bool, progress: Report) -> Iter
 
 
 def _outcomes(run: RunCell, job: Job, keep_models: bool, progress: Report) -> Iterator[Outcome]:
-    if job.lanes is not None:
-        yield from run_lanes(job.cells, job.lanes, progress, keep_models)
+    if job.program is not None:
+        yield from run_program(job.cells, job.program, progress, keep_models)
         return
     (cell,) = job.cells
     with tempfile.TemporaryDirectory(prefix="sme-cell-") as folder:
@@ -251,7 +250,7 @@ class _JobProcess:
         unfinished = {cell.digest: cell for cell in job.cells}
         log = scratch / f"{next(iter(unfinished)).removeprefix('sha256:')}.log"
         process = spawn.Process(target=_child, args=(child_end, run, job, keep_models, log))
-        on_cpu = job.lanes is not None and job.lanes.device == CPU
+        on_cpu = job.program is not None and job.program.device == CPU
         # Or JAX would look for a GPU, and take most of its memory.
         variables = _ONE_THREAD | ({"JAX_PLATFORMS": CPU} if on_cpu else {})
         with child_environment(variables), block_interrupts():
@@ -330,8 +329,8 @@ class OnRay(ConcurrentExecutor):
                 self._connected_here = False
 
     def _start(self, job: Job) -> None:
-        if job.lanes is not None:
-            job = replace(job, lanes=replace(job.lanes, state=None))
+        if job.program is not None:
+            job = replace(job, program=replace(job.program, state=None))
         self._running[self._task.remote(self._run, job, self._keep_models)] = job
 
     def _ended(self, progress: ReportProgress) -> Iterator[Outcome]:

@@ -187,18 +187,18 @@ class Ledger:
         """
         return file_lock(self.folder / LOCKS / "programs")
 
-    def state_path(self, keys: Iterable[str], made_with: Mapping[str, Any] | None = None) -> Path:
+    def state_path(self, keys: Iterable[str], build_key: Mapping[str, Any] | None = None) -> Path:
         """Where the state of a new program of these cells goes, made with this."""
-        identity = f"{' '.join(keys)} {to_json(made_with or {})}"
+        identity = f"{' '.join(keys)} {to_json(build_key or {})}"
         name = hashlib.sha256(identity.encode()).hexdigest()[:16]
         return self.folder / STATE_FILES / f"{name}.npz"
 
-    def state_of(self, key: str, made_with: Mapping[str, Any]) -> SavedState | None:
+    def state_of(self, key: str, build_key: Mapping[str, Any]) -> SavedState | None:
         """A saved state, made with the same, of a program that runs this cell."""
         for path in self._states():
             header = read_header(path)
             keys = header.get("cells", [])
-            if key in keys and made_with.items() <= header.items():
+            if key in keys and build_key.items() <= header.items():
                 return SavedState(path, list(keys))
         return None
 

@@ -1,12 +1,12 @@
-"""Programs of JAX: which cells share one, and `run_lanes`, which runs it to their results.
+"""Programs of JAX: which cells share one, and `run_program`, which runs it to their results.
 
-Cells that use `jax:…` and differ in nothing but task, seed and protocol are lanes of a program, if
-their tasks have the same shape and form: limits, distractors and mixing. The number of its lanes
+Cells that use `jax:…` and differ in nothing but task, seed and protocol are runs of a program, if
+their tasks have the same form: shape, limits, distractors and mixing. The number of its runs
 follows from the whole plan: whatever was run before, is left out by `only` or runs elsewhere, a
-cell's program has the same number of lanes, and so its result the same bits.
+cell's program has the same number of runs, and so its result the same bits.
 
-What a lane learns, when it is evaluated and from which states are as in `cell.run_cell`, so curve,
-regret and report mean the same. A lane whose weights are no longer finite fails, and the others go
+What a run learns, when it is evaluated and from which states are as in `cell.run_cell`, so curve,
+regret and report mean the same. A run whose weights are no longer finite fails, and the others go
 on. The state of the program is written every few minutes: after a kill, it goes on from there with
 the same bits.
 """
@@ -19,7 +19,6 @@ import importlib.metadata
 import json
 import math
 import multiprocessing
-import os
 import signal
 import time
 from collections import defaultdict
@@ -37,8 +36,8 @@ from sme_registry.evaluation.dynamic_regret import DynamicRegret
 from sme_registry.evaluation.models import saved_sb3
 from sme_registry.evaluation.rollouts import start_states
 from sme_registry.io import Arrays, to_json
-from sme_registry.io.system import end_with_parent
-from sme_registry.spec import Cell, SMESpec
+from sme_registry.io.system import available_cores, child_environment, end_with_parent
+from sme_registry.spec import Cell
 from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.ledger import read_header, read_state, write_state
 from sme_registry.studies.engine.result import (
@@ -55,45 +54,44 @@ from sme_registry.training.record import Snapshots, versions_for
 
 if TYPE_CHECKING:
     from sme_registry.jax.program import Evaluation, Program, StepLog
-    from sme_registry.jax.task import Shape
 
 _Returned = TypeVar("_Returned")
+_Shape = tuple[int, int, int, int]
 CPU = "cpu"
-_MOST_LANES = 10  # on a CPU: more save little time, and the last of a study would run alone longer
-_MOST_LANES_ELSEWHERE = 256
+SECONDS_BETWEEN_STATES = 180.0
+_MOST_RUNS = 10  # on a CPU: more save little time, and the last of a study would run alone longer
+_MOST_RUNS_ELSEWHERE = 256
+_PROGRAM, _RECORDS = "program/", "records/"  # prefixes of arrays in a state
+_SNAPSHOT = "snapshot/"  # prefix of the records of lives: weights before training and of visits
 
 
 @dataclass(frozen=True)
-class Lanes:
-    """How the cells of a job run as lanes of one program.
+class SharedProgram:
+    """How the cells of a job run as runs of one program.
 
     Attributes:
-      count: its lanes; those without a cell repeat the first.
-      shape: to which the tasks are padded.
+      runs: their number; those without a cell repeat the first.
       device: "cpu", "gpu" or "tpu"; None for JAX's default.
       state: the file of its state, written every few minutes; None to write none.
-      made_with: what a state must have been made with for others to go on from it.
-      cells: those of the lanes of a state to go on from, in order. Each keeps its own task, also if
+      build_key: what a state must have been made with for others to go on from it.
+      cells: those of the runs of a state to go on from, in order. Each keeps its own task, also if
         it is none of the job's: another job may go on from the state that this one writes. Empty
         for those of the job.
-      processes: that evaluate the trained policies.
     """
 
-    count: int
-    shape: Shape | None = None
+    runs: int
     device: str | None = None
     state: Path | None = None
-    made_with: Mapping[str, Any] = field(default_factory=dict)
+    build_key: Mapping[str, Any] = field(default_factory=dict)
     cells: tuple[Cell, ...] = ()
-    processes: int = 1
 
 
 @dataclass(frozen=True)
 class Job:
-    """Cells that run together: any number as lanes of a program, or a single one by itself."""
+    """Cells that run together: any number as runs of a program, or a single one by itself."""
 
     cells: tuple[Cell, ...]
-    lanes: Lanes | None = None
+    program: SharedProgram | None = None
 
 
 class Report(Protocol):
@@ -103,80 +101,53 @@ class Report(Protocol):
         """Report how far a job is."""
 
 
-@contextlib.contextmanager
-def child_environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Environment variables of the processes that are started inside the block."""
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def available_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 class Programs:
-    """Which cells of a plan share a program, and how many lanes it has."""
+    """Which cells of a plan share a program, and how many runs it has."""
 
     def __init__(
         self,
         cells: Iterable[Cell],
         platform: str = CPU,
         device: str | None = None,
-        most_lanes: int | None = None,
+        most_runs: int | None = None,
     ) -> None:
         self.platform, self._device = platform, device
-        self._most = most_lanes or (_MOST_LANES if platform == CPU else _MOST_LANES_ELSEWHERE)
-        self._shapes: dict[Hashable, dict[str, Shape]] = defaultdict(dict)
-        self._cells: dict[str, Cell] = {}
-        for cell in cells:
-            if in_jax(cell.uses):
-                self._cells[cell.digest] = cell
-                self._shapes[self.group(cell)][cell.digest] = shape_of(cell)
+        self._most = most_runs or (_MOST_RUNS if platform == CPU else _MOST_RUNS_ELSEWHERE)
+        self._cells = {cell.digest: cell for cell in cells if in_jax(cell.uses)}
+        self._sizes: dict[Hashable, int] = defaultdict(int)
+        for cell in self._cells.values():
+            self._sizes[self.group(cell)] += 1
 
     @property
     def one_at_a_time(self) -> bool:
         """Whether a second program would only slow the first one down."""
         return self.platform != CPU
 
-    def lanes(self, cell: Cell) -> int:
-        """The number of lanes of a cell's program: all programs of a group have the same."""
-        size = len(self._shapes[self.group(cell)])
+    def runs(self, cell: Cell) -> int:
+        """The number of runs of a cell's program: all programs of a group have the same."""
+        size = self._sizes[self.group(cell)]
         return math.ceil(size / math.ceil(size / self._most))
 
-    def program(self, cell: Cell) -> Lanes:
+    def program(self, cell: Cell) -> SharedProgram:
         """The program of a cell, still without a state."""
-        from sme_registry.jax.task import Shape
-
-        count, shape = self.lanes(cell), Shape.covering(self._shapes[self.group(cell)].values())
-        made_with = {
-            "lanes": count,
-            "shape": list(shape),
+        runs = self.runs(cell)
+        build_key = {
+            "lanes": runs,
+            "shape": list(shape_of(cell)),
             "platform": self.platform,
             "versions": versions_for(cell.uses),
         }
-        processes = available_cores() if self.one_at_a_time else 1
         device = self._device if self.one_at_a_time else CPU
-        return Lanes(count, shape, device, made_with=made_with, processes=processes)
+        return SharedProgram(runs, device, build_key=build_key)
 
     def without_room(self, cells: Iterable[Cell], workers: int) -> dict[str, str]:
-        """How many lanes fit in memory, by a cell of each program that would not."""
+        """How many runs fit in memory, by a cell of each program that would not."""
         groups: dict[Hashable, list[Cell]] = defaultdict(list)
         for cell in cells:
             if in_jax(cell.uses):
                 groups[self.group(cell)].append(cell)
         programs = [(group[0], self.program(group[0])) for group in groups.values()]
-        number = sum(math.ceil(len(g) / self.lanes(g[0])) for g in groups.values())
+        number = sum(math.ceil(len(group) / self.runs(group[0])) for group in groups.values())
         at_once = 1 if self.one_at_a_time else min(workers, number)
         return _beside_the_gpu(_without_room, programs, at_once) if programs else {}
 
@@ -196,13 +167,26 @@ class Programs:
             cell.evaluation_episodes,
             # Rewards that change no observation and end no episode are computed in another way.
             all(spec.k == 1 and spec.D == 0 for spec in cell.specs),
-            tuple(map(_shape, cell.specs)),
-            tuple(map(_form, cell.specs)),
+            _forms(cell),
             cell.document.switches,
         )
 
 
-def new_program(cells: Sequence[Cell], lanes: Lanes, at_once: int = 1) -> Program:
+def _forms(cell: Cell) -> tuple[Any, ...]:
+    """The `Form` of each of a cell's tasks."""
+    from sme_registry.jax.task import Form
+
+    return tuple(map(Form.of, cell.specs))
+
+
+def shape_of(cell: Cell) -> _Shape:
+    """S, A, L and H of a cell's task; of a stream the greatest."""
+    shapes = [(f.state_dim, f.action_dim, f.complexity, f.hidden_width) for f in _forms(cell)]
+    S, A, L, H = map(max, zip(*shapes, strict=True))
+    return S, A, L, H
+
+
+def _new_program(cells: Sequence[Cell], shared: SharedProgram, at_once: int = 1) -> Program:
     """The program of cells of one group, of which `at_once` are to share the memory."""
     from sme_registry.jax.run import new_program
 
@@ -214,9 +198,8 @@ def new_program(cells: Sequence[Cell], lanes: Lanes, at_once: int = 1) -> Progra
         hyperparameters=cell.hyperparameters,
         action_range=cell.action_range,
         steps=cell.steps,
-        lanes=lanes.count,
-        shape=lanes.shape,
-        device=lanes.device,
+        runs=shared.runs,
+        device=shared.device,
         at_once=at_once,
     )
 
@@ -235,58 +218,31 @@ def _beside_the_gpu(function: Callable[..., _Returned], *arguments: Any) -> _Ret
 
 
 def _platform(device: str | None) -> str:
-    from sme_registry.jax.device import find_device
+    from sme_registry.jax import find_device
 
     return str(find_device(device).platform)
 
 
-def _without_room(programs: Sequence[tuple[Cell, Lanes]], at_once: int) -> dict[str, str]:
+def _without_room(programs: Sequence[tuple[Cell, SharedProgram]], at_once: int) -> dict[str, str]:
     from sme_registry.jax.program import check_room
 
     reasons = {}
-    for cell, lanes in programs:
+    for cell, shared in programs:
         try:
-            check_room(functools.partial(new_program, [cell], lanes, at_once))
+            check_room(functools.partial(_new_program, [cell], shared, at_once))
         except ResourceLimitError as error:
             reasons[cell.digest] = str(error)
     return reasons
 
 
-def shape_of(cell: Cell) -> Shape:
-    """The shape that covers the cell's tasks: of a stream, those of several layers, if any."""
-    from sme_registry.jax.task import Shape
-
-    shapes = [Shape.of(spec) for spec in cell.specs]
-    return Shape.covering([shape for shape in shapes if shape.complexity > 1] or shapes)
-
-
-def _shape(spec: SMESpec) -> Shape:
-    from sme_registry.jax.task import Shape
-
-    return Shape.of(spec)
-
-
-def _form(spec: SMESpec) -> Hashable:
-    from sme_registry.jax.task import Form
-
-    return Form.of(spec)
-
-
-_PROGRAM, _RECORDS = "program/", "records/"  # prefixes of arrays in a state
-_SNAPSHOT = "snapshot/"  # prefix of the records of lives: weights before training and of visits
-
-
-SECONDS_BETWEEN_STATES = 180.0
-
-
-def run_lanes(
+def run_program(
     cells: Sequence[Cell],
-    lanes: Lanes,
+    shared: SharedProgram,
     progress: Report,
     keep_models: bool = False,
 ) -> Iterator[Outcome]:
-    """Train cells as lanes of one program, and evaluate them as `run_cell` does."""
-    run = _ProgramRun(cells, lanes, progress, keep_models)
+    """Train cells as runs of one program, and evaluate them as `run_cell` does."""
+    run = _ProgramRun(cells, shared, progress, keep_models)
     if keep_models:
         _new_model(cells[0])  # what Stable-Baselines3 refuses is refused before the training
     run.train()
@@ -294,26 +250,24 @@ def run_lanes(
 
 
 class _ProgramRun:
-    """A program, the cells of its lanes, and the records of what they did."""
+    """A program, the cells of its runs, and the records of what they did."""
 
     def __init__(
-        self, cells: Sequence[Cell], lanes: Lanes, progress: Report, keep_models: bool
+        self, cells: Sequence[Cell], shared: SharedProgram, progress: Report, keep_models: bool
     ) -> None:
-        cell = self._cell = cells[0]
-        self._lanes, self._progress, self._keep_models = lanes, progress, keep_models
-        self._own = {cell.digest: cell for cell in cells}
-        self._cells = lanes.cells or tuple(cells)
-        self._keys = [each.digest for each in self._cells]
-        self._program = new_program(self._cells, lanes)
-        self._made = ProgramResult(
+        self._shared, self._progress, self._keep_models = shared, progress, keep_models
+        self._of_job = {cell.digest for cell in cells}
+        self._cells = shared.cells or tuple(cells)
+        self._cell = cells[0]
+        self._program = _new_program(self._cells, shared)
+        self._result = ProgramResult(
             device=str(self._program.device.device_kind),
-            lanes=lanes.count,
-            shape=lanes.shape or shape_of(cell),
+            lanes=shared.runs,
+            shape=shape_of(self._cell),
         )
         clock = time.process_time if self._program.device.platform == CPU else time.monotonic
-        self._record = Record(self._cells, lanes.count, clock)
-        self._weights: Arrays = {}  # of lives, saved with the records
-        self._begin_lives()
+        self._record = Record(self._cells, shared.runs, clock)
+        self._snapshots = self._initial_snapshots()
         self._restore()
         self._last_state = time.monotonic()
 
@@ -327,66 +281,66 @@ class _ProgramRun:
             start_states=self._start_states,
             on_log=self._on_log,
             on_evaluation=self._on_evaluation,
-            on_visit=self._on_visit if self._cell.stream else None,
+            on_visit=lambda visit, _: self._on_visit(visit),
             after_piece=self._after_piece,
         )
         self._note_failures()
 
     def results(self) -> Iterator[Outcome]:
         """Evaluate the trained policies within and out of distribution."""
-        draws: dict[Hashable, list[int]] = defaultdict(list)  # lanes that are evaluated together
-        for lane, key in enumerate(self._keys):
-            if key in self._own:
-                cell, step = self._cells[lane], int(self._record.arrays["failed_at"][lane])
-                if step >= 0:
-                    yield failed(cell, _not_finite(step))
-                else:
-                    life = lane if cell.stream else None
-                    draws[cell.spec.seed, cell.protocol.digest, life].append(lane)
-        groups = [[self._trained(lane) for lane in group] for group in draws.values()]
-        evaluated = _evaluate(groups, self._lanes.processes)
-        for group, (reports, seconds) in zip(draws.values(), evaluated, strict=True):
-            for lane, report in zip(group, reports, strict=True):
-                yield self._ended(lane, report, seconds / len(group))
+        groups: dict[Hashable, list[int]] = defaultdict(list)  # runs that are evaluated together
+        for run, cell in enumerate(self._cells):
+            step = int(self._record.arrays["failed_at"][run])
+            if cell.digest in self._of_job and step >= 0:
+                yield failed(cell, _not_finite(step))
+            elif cell.digest in self._of_job:
+                life = run if cell.stream else None
+                groups[cell.spec.seed, cell.protocol.digest, life].append(run)
+        trained = [[self._trained(run) for run in group] for group in groups.values()]
+        on_cpu = self._program.device.platform == CPU  # where programs share the cores
+        evaluated = _evaluate(trained, 1 if on_cpu else available_cores())
+        for group, (reports, seconds) in zip(groups.values(), evaluated, strict=True):
+            for run, report in zip(group, reports, strict=True):
+                yield self._outcome(run, report, seconds / len(group))
 
-    def _ended(self, lane: int, report: _Report | PolicyError, seconds: float) -> Outcome:
-        cell = self._cells[lane]
+    def _outcome(self, run: int, report: _Report | PolicyError, seconds: float) -> Outcome:
         if isinstance(report, PolicyError):
-            return failed(cell, report)
+            return failed(self._cells[run], report)
         record, steps = self._record, self._program.steps
-        timing = record.timing(steps, seconds, cells=len(self._own))
-        result = record.result(lane, steps, report, timing, program=self._made)
-        return Outcome(result, *(self._models(lane) if self._keep_models else ()))
+        timing = record.timing(steps, seconds, cells=len(self._of_job))
+        result = record.result(run, steps, report, timing, program=self._result)
+        return Outcome(result, *(self._models(run) if self._keep_models else ()))
 
-    def _trained(self, lane: int) -> _Trained:
-        cell = self._cells[lane]
+    def _trained(self, run: int) -> _Trained:
         if self._record.blocks is None:
-            return _Trained(cell, [self._program.weights(lane)])
-        regret = self._record.blocks.dynamic_regret(lane)
-        return _Trained(cell, self._weights_of_life(lane), regret)
+            return _Trained(self._cells[run], [self._program.weights(run)])
+        regret = self._record.blocks.dynamic_regret(run)
+        return _Trained(self._cells[run], self._weights_of_life(run), regret)
 
-    def _begin_lives(self) -> None:
-        """Begin to keep the weights of visits: the actor's, and of a model that is kept all."""
+    def _initial_snapshots(self) -> Arrays:
+        """The weights of lives, `[snapshots, runs, …]`: the actors', or all of models to be kept.
+
+        The first snapshot is before training, the others are at the ends of visits.
+        """
         if self._cell.stream is None:
-            return
-        snapshots = self._cell.stream.visits + 1
-        for lane in range(len(self._cells)):
-            for name, weight in self._program.weights(lane).items():
-                if not (self._keep_models or name.startswith(self._program.actor)):
-                    continue
-                kept = np.zeros((snapshots, *weight.shape), weight.dtype)
+            return {}
+        snapshots = {}
+        for name, weight in self._program.state.weights.items():
+            if self._keep_models or name.startswith(self._program.actor):
+                kept = np.zeros((self._cell.stream.visits + 1, *weight.shape), weight.dtype)
                 kept[0] = weight
-                self._weights[f"{_SNAPSHOT}{lane}/{name}"] = kept
+                snapshots[_SNAPSHOT + name] = kept
+        return snapshots
 
-    def _on_visit(self, visit: int, weights: list[Arrays]) -> None:
-        for lane, own in enumerate(weights):
-            for name, kept in _named(self._weights, f"{_SNAPSHOT}{lane}/").items():
-                kept[visit + 1] = own[name]
+    def _on_visit(self, visit: int) -> None:
+        for name, kept in self._snapshots.items():
+            kept[visit + 1] = self._program.state.weights[name.removeprefix(_SNAPSHOT)]
 
-    def _weights_of_life(self, lane: int) -> list[Arrays]:
-        """A lane's weights before training, and at the end of each visit."""
-        kept = _named(self._weights, f"{_SNAPSHOT}{lane}/")
-        return [dict(zip(kept, each, strict=True)) for each in zip(*kept.values(), strict=True)]
+    def _weights_of_life(self, run: int) -> list[Arrays]:
+        """A run's weights before training, and at the end of each visit."""
+        kept = _named(self._snapshots, _SNAPSHOT)
+        columns = (snapshots[:, run] for snapshots in kept.values())
+        return [dict(zip(kept, weights, strict=True)) for weights in zip(*columns, strict=True)]
 
     def _start_states(self, k: int) -> list[Any]:
         return [
@@ -401,14 +355,14 @@ class _ProgramRun:
             record.blocks.add(self._program.steps, log.regret)
         record.spend(TRAINING)
 
-    def _on_evaluation(self, k: int, step: int, done: Evaluation) -> None:
-        steps = done.length.sum(axis=1)
+    def _on_evaluation(self, k: int, step: int, evaluation: Evaluation) -> None:
+        steps = evaluation.length.sum(axis=1)
         row = (
             np.full(len(steps), step),
-            done.episode_return.mean(axis=1),
-            done.regret.sum(axis=1) / steps,
-            done.similarity.sum(axis=1) / steps,
-            done.length.mean(axis=1),
+            evaluation.episode_return.mean(axis=1),
+            evaluation.regret.sum(axis=1) / steps,
+            evaluation.similarity.sum(axis=1) / steps,
+            evaluation.length.mean(axis=1),
         )
         self._record.evaluation(k, row)
         self._record.spend(EVALUATION)
@@ -425,11 +379,11 @@ class _ProgramRun:
         failed_at = self._record.arrays["failed_at"]
         failed_at[self._program.failed() & (failed_at < 0)] = self._program.steps
 
-    def _models(self, lane: int) -> tuple[bytes, dict[str, bytes]]:
-        """A lane's model as Stable-Baselines3 saves it; of a life also those of its visits."""
+    def _models(self, run: int) -> tuple[bytes, dict[str, bytes]]:
+        """A run's model as Stable-Baselines3 saves it; of a life also those of its visits."""
         from sme_registry.training.models import set_weights
 
-        cell = self._cells[lane]
+        cell = self._cells[run]
         model = _new_model(cell)
 
         def saved(weights: Arrays, steps: int) -> bytes:
@@ -440,42 +394,42 @@ class _ProgramRun:
         if cell.stream is not None:
             files = Snapshots(Path(), cell.stream)
             *ends, _ = (end for _, end in cell.stream.visit_ends())
-            kept = zip(self._weights_of_life(lane), [0, *ends, self._program.steps], strict=True)
+            kept = zip(self._weights_of_life(run), [0, *ends, self._program.steps], strict=True)
             names = (path.name for path in (files.initial, *files.visits))
             snapshots = {name: saved(*each) for name, each in zip(names, kept, strict=True)}
-        return saved(self._program.weights(lane), self._program.steps), snapshots
+        return saved(self._program.weights(run), self._program.steps), snapshots
 
     def _header(self) -> dict[str, Any]:
         """What a state must have been made with to be gone on from."""
-        return {"cells": self._keys, "device": self._made.device, **self._lanes.made_with}
+        keys = [cell.digest for cell in self._cells]
+        return {"cells": keys, "device": self._result.device, **self._shared.build_key}
 
     def _save(self) -> None:
-        if self._lanes.state is None:
+        if self._shared.state is None:
             return
+        records = {**self._record.arrays, **self._snapshots}
         arrays = {_PROGRAM + name: array for name, array in self._program.save().items()}
-        records = {**self._record.arrays, **self._weights}
         arrays |= {_RECORDS + name: array for name, array in records.items()}
         with contextlib.suppress(OptionError):  # a full disk costs only what a kill would lose
-            write_state(self._lanes.state, self._header(), arrays)
+            write_state(self._shared.state, self._header(), arrays)
 
     def _restore(self) -> None:
         """Go on from the state, if there is one that was made in the same way."""
-        state = self._lanes.state
+        state = self._shared.state
         if state is None or read_header(state) != json.loads(to_json(self._header())):
             return
         arrays = read_state(state)
+        present = {**self._record.arrays, **self._snapshots}
         # A program that kept models has more weights of visits than one that keeps none.
-        own = {**self._record.arrays, **self._weights}
-        records = {n: a for n, a in _named(arrays, _RECORDS).items() if n in own}
-        weights = {name: array for name, array in records.items() if name in self._weights}
+        records = {n: a for n, a in _named(arrays, _RECORDS).items() if n in present}
         try:
-            check_forms(records, own)
+            check_forms(records, present)
             self._program.restore(_named(arrays, _PROGRAM))
         except OptionError as error:
             self._progress(0, self._cell.steps, f"starts again, without {state}: {error}")
             return
-        self._weights = weights
-        self._record.restore({n: a for n, a in records.items() if n not in weights})
+        self._snapshots = {name: records.pop(name) for name in self._snapshots}
+        self._record.restore(records)
 
 
 def _named(arrays: Arrays, prefix: str) -> Arrays:
@@ -512,7 +466,7 @@ _Evaluated = tuple[Sequence[_Report | PolicyError], float]
 
 def _evaluate(groups: list[list[_Trained]], processes: int) -> Iterator[_Evaluated]:
     """Evaluate groups of cells with tasks of one draw, in order."""
-    if processes == 1:
+    if processes == 1 or len(groups) == 1:
         yield from map(_evaluate_together, groups)
         return
     spawn = multiprocessing.get_context("spawn")
@@ -525,6 +479,8 @@ def _evaluate(groups: list[list[_Trained]], processes: int) -> Iterator[_Evaluat
 
 
 def _evaluate_together(group: list[_Trained]) -> _Evaluated:
+    from sme_registry.jax.run import hidden_of
+
     start = time.process_time()
     first = group[0]
     reports: Sequence[_Report | PolicyError]
@@ -535,8 +491,6 @@ def _evaluate_together(group: list[_Trained]) -> _Evaluated:
         except PolicyError as error:
             reports = [error]
     else:
-        from sme_registry.jax.run import hidden_of
-
         policies = []
         for cell, (weights,), _ in group:
             range_, name, act = cell.action_range, cell.uses, _policy(cell, weights)
@@ -551,12 +505,8 @@ def _evaluate_together(group: list[_Trained]) -> _Evaluated:
 def _policy(cell: Cell, weights: Arrays) -> Any:
     from sme_registry.jax.run import policy_of
 
-    return policy_of(
-        cell.uses,
-        weights,
-        hyperparameters=cell.hyperparameters,
-        action_range=cell.action_range,
-    )
+    options: dict[str, Any] = {"action_range": cell.action_range}
+    return policy_of(cell.uses, weights, hyperparameters=cell.hyperparameters, **options)
 
 
 def _begin_worker() -> None:

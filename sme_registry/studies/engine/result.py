@@ -78,7 +78,7 @@ class ProgramResult(StrictModel):
     Attributes:
       device: its kind, such as "cpu" or "NVIDIA H200".
       lanes: the number of its runs.
-      shape: S, A, L and H to which the tasks of all runs were padded; H is 0 where L = 1.
+      shape: S, A, L and H of the tasks, of a stream the greatest; H is 0 where L = 1.
     """
 
     device: str
@@ -339,7 +339,7 @@ def check_forms(arrays: Arrays, own: Arrays) -> None:
     one, other = ({n: (a.dtype, a.shape) for n, a in each.items()} for each in (arrays, own))
     if one != other:
         raise OptionError(
-            "its records of the lanes are missing or others, or of lives without models."
+            "its records of the runs are missing or others, or of lives without models."
         )
 
 

@@ -70,7 +70,7 @@ def run_study(
       only: `class=GLOB`, `algorithm=GLOB`: the cells to run now. A cell must match any of the
         patterns of each kind.
       device: where programs of JAX run, "cpu", "gpu" or "tpu"; None for JAX's default.
-      lanes: most lanes of a program; None for a number that suits the device.
+      lanes: most runs of a program; None for a number that suits the device.
       run: runs a cell; for processes and Ray importable by name.
 
     Examples:
@@ -260,8 +260,8 @@ class Queue:
         lock.release()
         self._count(entry)
         ended = not any(cell.digest in self._running for cell in job.cells)
-        if ended and job.lanes is not None and job.lanes.state is not None:
-            self._ledger.remove_states(job.lanes.state)
+        if ended and job.program is not None and job.program.state is not None:
+            self._ledger.remove_states(job.program.state)
 
     def release(self) -> None:
         """Release the locks of all cells that run."""
@@ -298,19 +298,19 @@ class Queue:
         with claiming, contextlib.ExitStack() as stack:  # releases all of them if one raises
             cells, locks = list[Cell](), list[Lock]()
             program = programs.program(self._planned[first].cell)
-            saved = self._ledger.state_of(first, program.made_with)
+            saved = self._ledger.state_of(first, program.build_key)
             in_state = programs.cells(saved.keys) if saved else None
             if in_state is None:
                 saved, in_state = None, ()
             for key in self._candidates(programs, first, saved):
-                if len(cells) < program.count:
+                if len(cells) < program.runs:
                     lock = self._claim(key)
                     if lock is not None:
                         locks.append(stack.enter_context(lock))
                         cells.append(self._planned[key].cell)
                 if not cells:
                     return None
-            new = self._ledger.state_path([cell.digest for cell in cells], program.made_with)
+            new = self._ledger.state_path([cell.digest for cell in cells], program.build_key)
             program = replace(program, state=saved.path if saved else new, cells=in_state)
             stack.pop_all()
         return self._started(Job(tuple(cells), program), locks)
@@ -436,8 +436,8 @@ class _StudyRun:
             self._progress.end_part(name)
         for name, job in running.items():
             if name not in self._shown:
-                self._progress.start_part(name, "compiling" if job.lanes else "")
-                if job.lanes is None:
+                self._progress.start_part(name, "compiling" if job.program else "")
+                if job.program is None:
                     self._pace.report(job.cells, 0.0)
         self._shown = running
         failed = self._queue.failed

@@ -1,4 +1,4 @@
-"""Which cells are lanes of one program, and how a run claims them beside others."""
+"""Which cells are runs of one program, and how a run claims them beside others."""
 
 import contextlib
 import io
@@ -80,7 +80,7 @@ def claimed(file, study, **options):
     run_study(
         file, study, executor=executor, console=Console(file=io.StringIO()), device="cpu", **options
     )
-    return sorted(executor.jobs, key=lambda job: job.lanes is None)
+    return sorted(executor.jobs, key=lambda job: job.program is None)
 
 
 def test_cells_of_one_shape_and_kind_of_reward_share_a_program_and_others_do_not():
@@ -106,11 +106,11 @@ def test_cells_of_one_shape_and_kind_of_reward_share_a_program_and_others_do_not
         assert programs.group(small.model_copy(update=change)) == programs.group(small), change
 
 
-@pytest.mark.parametrize(("seeds", "most", "lanes"), [(5, 10, 10), (13, 10, 9)])
-def test_the_programs_of_a_group_have_equally_many_lanes_at_most_the_limit(seeds, most, lanes):
+@pytest.mark.parametrize(("seeds", "most", "runs"), [(5, 10, 10), (13, 10, 9)])
+def test_the_programs_of_a_group_have_equally_many_runs_at_most_the_limit(seeds, most, runs):
     file = plan_file(seeds)
-    programs = Programs(cells(file), most_lanes=most)
-    assert {programs.lanes(cell) for cell in cells(file, "small", "gated")} == {lanes}
+    programs = Programs(cells(file), most_runs=most)
+    assert {programs.runs(cell) for cell in cells(file, "small", "gated")} == {runs}
 
 
 def test_a_run_claims_the_cells_of_one_program_at_a_time_and_references_alone(tmp_path):
@@ -122,19 +122,19 @@ def test_a_run_claims_the_cells_of_one_program_at_a_time_and_references_alone(tm
         cell.digest for cell in cells(file, "small", "gated")
     ]
     assert list(delayed.cells) == cells(file, "delayed")
-    assert (together.lanes.count, together.lanes.shape) == (6, (2, 2, 1, 0))
-    assert first.lanes is None
+    assert (together.program.runs, together.program.build_key["shape"]) == (6, [2, 2, 1, 0])
+    assert first.program is None
     assert {len(job.cells) for job in jobs[2:]} == {1}
 
 
-def test_the_number_of_lanes_depends_neither_on_a_selection_nor_on_what_is_done(tmp_path):
+def test_the_number_of_runs_depends_neither_on_a_selection_nor_on_what_is_done(tmp_path):
     file = plan_file()
     (job,) = claimed(file, tmp_path, only=["class=gated", "algorithm=PPO"])
     assert list(job.cells) == cells(file, "gated")
-    assert job.lanes.count == 6
+    assert job.program.runs == 6
     jobs = claimed(file, tmp_path, only=["algorithm=PPO"])
     assert list(jobs[0].cells) == cells(file, "small")
-    assert {job.lanes.count for job in jobs if job.lanes} == {6, 3}
+    assert {job.program.runs for job in jobs if job.program} == {6, 3}
 
 
 def test_cells_that_another_run_holds_are_left_to_it_and_the_rest_to_others(tmp_path):
@@ -186,7 +186,7 @@ def test_programs_that_do_not_fit_in_memory_at_once_are_refused_before_the_first
     def run():
         run_study(file, tmp_path, executor=executor, lanes=3, device="cpu", progress=False)
 
-    # The state of three lanes takes 13.6 MiB; there are three programs.
+    # The state of three runs takes 13.6 MiB; there are three programs.
     monkeypatch.setattr(program, "memory_of", lambda device: MiB * 2**20)
     if fit is None:
         run()
@@ -195,7 +195,7 @@ def test_programs_that_do_not_fit_in_memory_at_once_are_refused_before_the_first
     with pytest.raises(ResourceLimitError) as caught:
         run()
     shared, delayed, last = str(caught.value).splitlines()
-    assert shared.startswith("TD3 on small: lanes=3: their state takes 0.0 GiB")
+    assert shared.startswith("TD3 on small: runs=3: their state takes 0.0 GiB")
     assert f"{min(workers, 3)} programs at once: {fit}. Choose" in delayed
     assert "--jobs" in last
     assert not executor.jobs
@@ -233,15 +233,15 @@ def test_a_saved_state_decides_which_cells_go_on_together(tmp_path):
     of_group = cells(file, "small", "gated")
     ledger = Ledger(tmp_path)
     keys = [of_group[i].digest for i in (6, 0, 3)]
-    made_with = Programs(cells(file)).program(of_group[0]).made_with
+    build_key = Programs(cells(file)).program(of_group[0]).build_key
     saved = ledger.state_path(keys)
-    assert saved != ledger.state_path(keys, made_with)  # others leave it as it is
-    write_state(saved, {"cells": keys, **made_with}, {})
-    write_state(ledger.state_path(keys[:2]), {"cells": keys[:2], **made_with, "lanes": 2}, {})
+    assert saved != ledger.state_path(keys, build_key)  # others leave it as it is
+    write_state(saved, {"cells": keys, **build_key}, {})
+    write_state(ledger.state_path(keys[:2]), {"cells": keys[:2], **build_key, "lanes": 2}, {})
     (tmp_path / "states" / "broken.npz").write_bytes(b"PK")
     first, second, *_ = claimed(file, tmp_path, only=["algorithm=PPO"])
     assert {cell.digest for cell in first.cells} == set(keys)
-    assert first.lanes.state == saved
-    assert [cell.digest for cell in first.lanes.cells] == keys
+    assert first.program.state == saved
+    assert [cell.digest for cell in first.program.cells] == keys
     assert list(second.cells) == [of_group[i] for i in (1, 2, 4, 5, 7)]
     assert saved.exists()  # a retry goes on from it

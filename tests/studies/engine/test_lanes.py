@@ -80,7 +80,7 @@ class Watched(InProcess):
     def map(self, jobs, progress):
         def report(job, done, total, *note):
             progress(job, done, total, *note)
-            if job.lanes is not None:
+            if job.program is not None:
                 self.on_steps(done)
 
         return super().map(jobs, report)

@@ -282,7 +282,7 @@ def test_a_stream_that_agents_in_jax_cannot_live_in_is_refused_before_anything_r
     assert not (tmp_path / "study").exists()
 
 
-def test_lives_that_switch_at_the_same_steps_are_lanes_of_one_program():
+def test_lives_that_switch_at_the_same_steps_are_runs_of_one_program():
     pytest.importorskip("jax")
     deep = TASK.derive(complexity=3, hidden_width=8)
     base = life(stream_of(TASK, OTHER), "jax:PPO")
@@ -304,8 +304,8 @@ def test_lives_that_switch_at_the_same_steps_are_lanes_of_one_program():
     group = programs.group(base)
     assert [programs.group(cell) == group for cell in same] == [True] * 2
     assert len({programs.group(cell) for cell in (base, *others)}) == 1 + len(others)
-    assert programs.lanes(base) == 3
-    assert programs.program(others[3]).shape == (2, 2, 3, 8)
+    assert programs.runs(base) == 3
+    assert programs.program(others[3]).build_key["shape"] == [2, 2, 3, 8]
 
 
 def jax_file():
@@ -321,9 +321,9 @@ def visits(monkeypatch):
     raised = []
     original = programs._ProgramRun._on_visit
 
-    def on_visit(run, visit, weights):
+    def on_visit(run, visit):
         ended.append(visit)
-        original(run, visit, weights)
+        original(run, visit)
         if visit == 1 and raised:
             raise raised.pop()
 
