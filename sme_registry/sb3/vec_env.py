@@ -237,11 +237,11 @@ class _BatchVecEnv(LanesVecEnv):
         n, shape = len(self.agents), (self.num_envs, self._action_dim)
         unit = arguments.to_unit(actions, shape, self._rescaled)
         joint = self._joint_actions(unit)
-        done = self._batch.advance(joint)
+        step = self._batch.advance(joint)
 
-        values = done.values.swapaxes(1, 2).reshape(len(done.values), -1)
+        values = step.values.swapaxes(1, 2).reshape(len(step.values), -1)
         of_step = self._batch.schedule.columns
-        in_range = arguments.from_unit(done.actions, self._rescaled)
+        in_range = arguments.from_unit(step.actions, self._rescaled)
         columns: dict[str, list[Any]] = {
             **{
                 key: [row[part] for row in rows for part in self._owned]
@@ -249,22 +249,22 @@ class _BatchVecEnv(LanesVecEnv):
             },
             **{key: list(values[row]) for key, row in of_step.numbers.items()},
             **{key: list(values) for key, values in self._batch.lived.items()},
-            "TimeLimit.truncated": np.repeat(done.truncated & ~done.terminated, n).tolist(),
+            "TimeLimit.truncated": np.repeat(step.truncated & ~step.terminated, n).tolist(),
         }
         rows = zip(*columns.values(), strict=True)
         lane_infos: list[dict[str, Any]] = [dict(zip(columns, row, strict=True)) for row in rows]
-        ended: Mask = done.terminated | done.truncated
+        ended: Mask = step.terminated | step.truncated
         dones = np.repeat(ended, n)
         if ended.any():
-            last = self._observations(done.observation.copy())
-            self._batch.begin(np.flatnonzero(ended), done.observation)
+            last = self._observations(step.observation.copy())
+            self._batch.begin(np.flatnonzero(ended), step.observation)
             for lane in np.flatnonzero(dones).tolist():
                 lane_infos[lane]["terminal_observation"] = last[lane]
                 self.reset_infos[lane] = self._info_at_reset(lane)
         if self._renderer is not None:
-            self._renderer.record(np.flatnonzero(ended).tolist(), joint, done)
+            self._renderer.record(np.flatnonzero(ended).tolist(), joint, step)
         reward = values[REWARD].astype(np.float32)
-        return self._observations(done.observation), reward, dones, lane_infos
+        return self._observations(step.observation), reward, dones, lane_infos
 
     def _observations(self, joint: Observation) -> Observation:
         """Each lane's observation, from joint observations `[teams, S + 1 + n]`."""

@@ -175,17 +175,17 @@ class _Evaluations(Watch):
         if phases:
             assert isinstance(policy, Policy)  # streams have no teams
             policy = policy.in_phase(int(self._schedule.phases[segment]), phases)
-        done = rollouts(policy, self._schedule.tasks[segment], states)
+        episodes = rollouts(policy, self._schedule.tasks[segment], states)
         row = (
             steps,
-            float(done.episode_return.mean()),
-            done.per_step(done.regret),
-            done.per_step(done.similarity),
-            float(done.length.mean()),
+            float(episodes.episode_return.mean()),
+            episodes.per_step(episodes.regret),
+            episodes.per_step(episodes.similarity),
+            float(episodes.length.mean()),
         )
         by_agent = None
         if cell.spec.team is not None:
-            by_agent = [done.per_step(regret) for regret in done.agents_regret]
+            by_agent = [episodes.per_step(regret) for regret in episodes.agents_regret]
         self.record.evaluation(k, np.array(row)[:, None], by_agent)
         self.record.spend(EVALUATION)
 
