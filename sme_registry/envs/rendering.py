@@ -23,7 +23,8 @@ from sme_registry.envs.batch import Batch, BatchStep
 from sme_registry.envs.schedule import ScheduleMixin
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.io import integer_in, require_packages
-from sme_registry.spec import SMESpec, StreamSpec
+from sme_registry.io.markup import card, folded, pairs_html
+from sme_registry.spec import SMESpec, StreamSpec, cards
 from sme_registry.spec.catalogue import title
 from sme_registry.task import Task
 
@@ -399,9 +400,6 @@ def html_card(
     The spaces are those of a single environment, or of any agent in a team. `status` is that of its
     episode, such as "running"; a batch has none.
     """
-    from sme_registry.io.markup import card, folded, pairs_html  # loads Jinja
-    from sme_registry.spec import cards
-
     document: SMESpec | StreamSpec = env.document
     seen = cards.observation_text(document)
     span = f"float32 in [{action.low.flat[0]:g}, {action.high.flat[0]:g}]"

@@ -1,8 +1,7 @@
 """Files, checks of arguments, and the machine; terminal, tables and markup are imported by name."""
 
-from sme_registry.io.checks import Address, choice, integer_in, number_in, printable, server_address
+from sme_registry.io.checks import choice, integer_in, number_in, printable, server_address
 from sme_registry.io.files import (
-    MAX_DOCUMENT_BYTES,
     TEMPORARY,
     Arrays,
     Lock,
@@ -34,9 +33,7 @@ from sme_registry.io.system import (
 )
 
 __all__ = [
-    "MAX_DOCUMENT_BYTES",
     "TEMPORARY",
-    "Address",
     "Arrays",
     "Lock",
     "atomic_file",

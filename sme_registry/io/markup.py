@@ -9,13 +9,15 @@ import io
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from rich.console import Console
 from rich.text import Text
 
 from sme_registry.io.tables import Table
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 # Notebooks have rules of their own for tables.
 _STYLE = (
@@ -90,10 +92,12 @@ def escape_latex(text: str) -> str:
 
 def environment(folder: Path, *, autoescape: bool) -> Environment:
     """The templates of a folder, with the filters of this module."""
-    templates = Environment(
-        loader=FileSystemLoader(folder),
+    import jinja2  # on first use: cards need none
+
+    templates = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(folder),
         autoescape=autoescape,
-        undefined=StrictUndefined,
+        undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )

@@ -34,6 +34,7 @@ from rich.markup import escape
 from scipy.special import ndtr
 
 from sme_registry.io import integer_in
+from sme_registry.io.markup import card, table_html
 from sme_registry.io.tables import Table
 from sme_registry.spec import SpecLike
 from sme_registry.task.draw import Array, Layer, uniform
@@ -185,8 +186,6 @@ class Certificate:
 
     def _repr_html_(self) -> str:
         """A card for notebooks: the outcome, and every check with its meaning."""
-        from sme_registry.io.markup import card, table_html  # loads Jinja
-
         return card(table_html(self.table(f"{self.digest}\n{self.outcome}", meanings=True)))
 
     def to_dict(self) -> dict[str, Any]:
