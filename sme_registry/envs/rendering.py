@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import warnings
 from collections.abc import Iterable, Sequence
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -62,10 +61,9 @@ class Renderer:
     In mode "human" each step is shown in a window, paced by `render_fps` of the metadata.
     """
 
-    def __init__(self, task: Task, mode: str, metadata: dict[str, Any]) -> None:
+    def __init__(self, mode: str, metadata: dict[str, Any], rescaled: bool) -> None:
         self._pygame = _import_pygame()
-        self._spec, self._mode, self._fps = task.spec, mode, metadata["render_fps"]
-        self._owned = task.owned if task.spec.team else ()
+        self._mode, self._fps, self._rescaled = mode, metadata["render_fps"], rescaled
         self._window: pygame.Surface | None = None
         self._begun = False
 
@@ -77,10 +75,13 @@ class Renderer:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state, _pygame=_import_pygame(), _window=None)
 
-    def record(self, env: Any, last: tuple[Any, dict[str, Any]] | None) -> None:
-        """Record a reset (`last` is None), or a step: its action, as it was given, and its info."""
-        self._state, self._spec = env.state, env.sme_spec  # a stream's spec may change
-        if last is None:
+    def record(
+        self, state: Array, task: Task, unit: Array | None, info: dict[str, Any] | None
+    ) -> None:
+        """Record a step, its action `[A]` of the unit range and its info; or (None) a reset."""
+        self._state, self._spec = state, task.spec  # a stream's task may change
+        self._owned = task.owned if task.spec.team else ()
+        if unit is None or info is None:
             self._begun = True
             self._similarities: list[float] = []
             self._regrets: list[float] = [0.0]
@@ -88,10 +89,7 @@ class Renderer:
             self._action: npt.NDArray[np.float64] | None = None
             self._optimal: npt.NDArray[np.float64] | None = None
         else:
-            action, info = last
-            space: Any = env.action_space
-            self._low = float(space.low[0])
-            self._action = np.clip(np.asarray(action, np.float64), space.low, space.high)
+            self._action = arguments.from_unit(np.clip(unit, 0.0, 1.0), self._rescaled)
             self._optimal = info["optimal_action"].copy()
             self._similarities.append(info["similarity"])
             self._regrets.append(self._regrets[-1] + info["regret"])
@@ -101,12 +99,10 @@ class Renderer:
         if self._mode == "human":
             self._show()
 
-    def frame(self) -> Frame | None:
-        """The present frame: `[H, W, 3]` uint8 for "rgb_array"; None for "human"."""
+    def frame(self) -> Frame:
+        """The present frame, `[H, W, 3]` uint8."""
         if not self._begun:
             raise EpisodeError("render: the episode has not begun. Call reset() first.")
-        if self._mode == "human":
-            return None
         surface = self._pygame.Surface((WIDTH, HEIGHT))
         self._draw(surface)
         # pygame's arrays are [W, H, 3].
@@ -187,15 +183,16 @@ class Renderer:
         if self._action is None or self._optimal is None:
             return
         x = right
-        legend = (f"{self._low:.0f} … 1", _FAINT), ("optimal", _OPTIMAL), ("taken", _ACTION)
+        low = -1.0 if self._rescaled else 0.0
+        legend = (f"{low:.0f} … 1", _FAINT), ("optimal", _OPTIMAL), ("taken", _ACTION)
         for word, colour in legend:
             x -= self._text(word, (x, top), colour, self._small, align=1.0) + 10
-        scale = height / (1.0 - self._low)
+        scale = height / (1.0 - low)
         actions = self._action[:_CHANNELS_SHOWN].tolist()
         for (x, width, _), a, best in zip(columns, actions, self._optimal.tolist(), strict=False):
             middle = x + width // 2
-            y = bottom - round((a - self._low) * scale)
-            y_best = bottom - round((best - self._low) * scale)
+            y = bottom - round((a - low) * scale)
+            y_best = bottom - round((best - low) * scale)
             wide = max(1, min(6, width // 2))
             self._rect(_REGRET, (middle - wide // 2, min(y, y_best), wide, abs(y - y_best)))
             self._rect(_OPTIMAL, (x, y_best - 2, width, 4))
@@ -289,19 +286,22 @@ class RenderMixin(ScheduleMixin):
 
     metadata: dict[str, Any]
     render_mode: str | None
-    _renderer: Any = None
+    _rescaled: bool
+    _renderer: Renderer | None = None
 
     def _set_render_mode(self, render_mode: str | None) -> None:
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise OptionError(f"render_mode={render_mode!r}: must be None, 'human' or 'rgb_array'.")
         self.render_mode = render_mode
 
-    def _record(self, env: Any, last: tuple[Any, dict[str, Any]] | None) -> None:
+    def _record(
+        self, state: Array, unit: Array | None = None, info: dict[str, Any] | None = None
+    ) -> None:
         """Record in an environment with a render mode; see `Renderer.record`."""
         if self._renderer is None:
             assert self.render_mode is not None
-            self._renderer = Renderer(self.task, self.render_mode, self.metadata)
-        self._renderer.record(env, last)
+            self._renderer = Renderer(self.render_mode, self.metadata, self._rescaled)
+        self._renderer.record(state, self.task, unit, info)
 
     def render(self) -> Any:
         """The frame of this step: `[H, W, 3]` uint8 for "rgb_array"; None for "human"."""
@@ -313,7 +313,7 @@ class RenderMixin(ScheduleMixin):
             return None
         if self._renderer is None:
             raise EpisodeError("render: the episode has not begun. Call reset() first.")
-        return self._renderer.frame()
+        return None if self.render_mode == "human" else self._renderer.frame()
 
     def close(self) -> None:
         """Close the window, if there is one."""
@@ -325,17 +325,13 @@ class RenderMixin(ScheduleMixin):
 class BatchRenderer:
     """Draws the present episodes of some environments of a batch, a team's as one; None: of all."""
 
-    def __init__(
-        self, batch: Batch, envs: Sequence[int] | None, space: gymnasium.spaces.Box
-    ) -> None:
+    def __init__(self, batch: Batch, envs: Sequence[int] | None, rescaled: bool) -> None:
         chosen = range(batch.num_envs) if envs is None else envs
         if not isinstance(chosen, list | tuple | range | np.ndarray) or len(chosen) == 0:
             raise OptionError(f"render_lanes={envs!r}: must be a list of lanes, such as [0, 1].")
         chosen = [integer_in("render_lanes", env, 0, batch.num_envs - 1) for env in chosen]
-        self._batch, self._space = batch, space
-        self._renderers = {
-            env: Renderer(batch.task_of(env), "rgb_array", METADATA) for env in chosen
-        }
+        self._batch, self._rescaled = batch, rescaled
+        self._renderers = {env: Renderer("rgb_array", METADATA, rescaled) for env in chosen}
 
     def record(
         self, began: Iterable[int], unit: Array | None = None, step: BatchStep | None = None
@@ -346,22 +342,16 @@ class BatchRenderer:
         """
         states, reset = self._batch.state, set(began)
         for env, renderer in self._renderers.items():
-            view: Any = SimpleNamespace(
-                state=states[env],
-                action_space=self._space,
-                sme_spec=self._batch.task_of(env).spec,
-            )
+            task = self._batch.task_of(env)
             if env in reset:
-                renderer.record(view, None)
+                renderer.record(states[env], task, None, None)
             elif unit is not None and step is not None:
-                rescaled = bool(self._space.low[0] < 0.0)
-                action = arguments.from_unit(unit[env], rescaled)
-                renderer.record(view, (action, self._batch.info_of(step, env, rescaled)))
+                info = self._batch.info_of(step, env, self._rescaled)
+                renderer.record(states[env], task, unit[env], info)
 
     def frames(self) -> tuple[Frame, ...]:
         """The present frames of those drawn, each `[H, W, 3]` uint8."""
-        frames = (renderer.frame() for renderer in self._renderers.values())
-        return tuple(frame for frame in frames if frame is not None)  # None is for windows only
+        return tuple(renderer.frame() for renderer in self._renderers.values())
 
     def frame_of_each(self) -> tuple[Frame, ...]:
         """A frame of each environment; those not drawn are the same white frame."""
@@ -374,7 +364,7 @@ def batch_renderer(
     render_mode: str | None,
     envs: Sequence[int] | None,
     batch: Batch,
-    space: gymnasium.spaces.Box,
+    rescaled: bool,
 ) -> BatchRenderer | None:
     """The renderer of a batch's `render_mode` and `render_lanes`; None without a mode."""
     if render_mode not in (None, "rgb_array"):
@@ -384,7 +374,7 @@ def batch_renderer(
         )
     if render_mode is None and envs is not None:
         raise OptionError("render_lanes: needs render_mode='rgb_array'. Add it.")
-    return None if render_mode is None else BatchRenderer(batch, envs, space)
+    return None if render_mode is None else BatchRenderer(batch, envs, rescaled)
 
 
 def html_card(

@@ -64,11 +64,6 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
       render_mode: None, "rgb_array" or "human".
       **overrides: fields of a task's spec to change; the environment then runs the derived spec.
 
-    Raises:
-      SpecError, UnknownNameError: no such task, or a field out of range.
-      ResourceLimitError: the task would not fit in memory.
-      OptionError: another argument is outside its range.
-
     Examples:
       >>> from sme_registry.envs import SMEEnv
       >>> env = SMEEnv("Default")
@@ -168,13 +163,8 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             distractors `{"distractors": d}` at d `[m]`; and of a stream `{"lifetime": n}` begins a
             life after n steps.
 
-        Returns:
-          The observation, and an info of NaN.
-
-        Raises:
-          StateError: the state or the distractors have the wrong shape or lie outside the cube.
-          OptionError: an unknown option, or a seed that is no integer of at least 0.
-          WrapperError: an outer TimeLimit would end the episode before the horizon.
+        Returns the observation, and an info of NaN. A WrapperError says that an outer TimeLimit
+        would end the episode before the horizon.
         """
         arguments.check_outer_time_limit(self.document.horizon)
         arguments.check_options(options, self._schedule.reset_options)
@@ -195,7 +185,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         self._status = "running"
         self._step = self._fast_step()
         if self.render_mode is not None:
-            self._record(self, None)
+            self._record(self.state)
         return observation, {**self._schedule.columns.at_reset(self._action_shape[0]), **life}
 
     def _begin_seeing(self, s: Array, distractors: Array | None) -> npt.NDArray[Any]:
@@ -241,17 +231,10 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             self._numbers[:] = numbers
 
     def step(self, action: Action) -> _Result:
-        """One step.
+        """One step, from an action `[A]`, finite; clipped to the action range.
 
-        Args:
-          action: `[A]`, finite; clipped to the action range.
-
-        Returns:
-          Observation, reward R (the payout, in [0, k]), terminated, truncated, and info.
-
-        Raises:
-          ActionError: wrong shape, not numbers, or not finite; the state is unchanged then.
-          EpisodeError: no episode is running.
+        Returns observation, reward R (the payout, in [0, k]), terminated, truncated, and info. An
+        ActionError leaves the state unchanged; an EpisodeError says that no episode is running.
         """
         return self._step(self, action)
 
@@ -322,7 +305,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         self._rows.extend(zip(optimal, observations, strict=True))
 
     def _after(
-        self, end: float, action: Action, info: dict[str, Any], observation: Observation
+        self, end: float, action: Any, info: dict[str, Any], observation: Observation
     ) -> None:
         """What the fast path leaves out: actions not taken, switches, safety, the end, frames."""
         if end < 0.0:
@@ -340,7 +323,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         if end:
             self._status, self._step = "ended", _check_running
         if self.render_mode is not None:
-            self._record(self, (arguments.from_unit(action, self._rescaled), info))
+            self._record(self.state, action, info)
 
     def _go_on(self, lifetime: int, observation: Observation) -> None:
         """Look further ahead; where a segment ends within an episode, put the next in force."""

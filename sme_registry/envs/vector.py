@@ -78,12 +78,8 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
       autoreset_mode: Gymnasium's: "NextStep" (default), "SameStep" or "Disabled".
       render_mode: None or "rgb_array".
       render_lanes: the environments to draw, such as `[0, 1]`; None draws each of them.
-      max_episode_steps: refused below the horizon (Gymnasium passes it on).
+      max_episode_steps: refused below the horizon, as WrapperError (Gymnasium passes it on).
       **overrides: fields of a task's spec to change.
-
-    Raises:
-      SpecError, UnknownNameError, ResourceLimitError, OptionError: as `SMEEnv`.
-      WrapperError: `max_episode_steps` is below the horizon.
 
     Examples:
       >>> from sme_registry.envs import SMEVectorEnv
@@ -121,9 +117,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         self.single_observation_space = gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._renderer = batch_renderer(
-            render_mode, render_lanes, self._batch, self.single_action_space
-        )
+        self._renderer = batch_renderer(render_mode, render_lanes, self._batch, self._rescaled)
         self._begun = np.zeros(num_envs, bool)
         self._ended = np.zeros(num_envs, bool)
         self._all_begun, self._any_ended = False, False
@@ -166,9 +160,6 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
 
         Returns:
           Observations `[B, S + m + 2]`, and infos of NaN where an episode begins.
-
-        Raises:
-          StateError, OptionError: as `SMEEnv.reset`.
         """
         known = (*self._schedule.reset_options, "reset_mask")
         arguments.check_options(options, known)
@@ -202,17 +193,11 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
     def step(  # type: ignore[override]  # Gymnasium types all three arrays alike; ends are bool
         self, actions: Any
     ) -> tuple[Observation, Array, Mask, Mask, dict[str, Any]]:
-        """One step of every environment.
+        """One step of every environment, from actions `[B, A]`, finite; clipped.
 
-        Args:
-          actions: `[B, A]`, finite; clipped to the action range.
-
-        Returns:
-          Observations `[B, S + m + 2]`, rewards `[B]`, terminated `[B]`, truncated `[B]`, infos.
-
-        Raises:
-          ActionError: wrong shape, not numbers, or not finite; the states are unchanged then.
-          EpisodeError: before the first reset, or (mode "Disabled") where episodes have ended.
+        Returns observations `[B, S + m + 2]`, rewards `[B]`, terminated `[B]`, truncated `[B]` and
+        infos. An ActionError leaves the states unchanged; an EpisodeError is raised before the
+        first reset, and in mode "Disabled" where episodes have ended.
         """
         B, A = self.num_envs, self.document.action_dim
         if not self._all_begun:

@@ -153,8 +153,7 @@ class _BatchVecEnv(LanesVecEnv):
         super().__init__(
             [self._lane_type(self, team, agent=a, **shared) for team in teams for a in self.agents]
         )
-        joint_space, _ = arguments.action_space(action_range, task.spec.action_dim)
-        self._renderer = batch_renderer(render_mode, render_lanes, self._batch, joint_space)
+        self._renderer = batch_renderer(render_mode, render_lanes, batch, self._rescaled)
         self.metadata = {**self.metadata, "render_fps": METADATA["render_fps"]}
 
     def __repr__(self) -> str:
