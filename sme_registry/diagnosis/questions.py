@@ -95,6 +95,9 @@ COMPARISON_REASONS: dict[str, Answer] = {
 }
 """Of the questions about single fields of the spec, in place of the rule's own reasons."""
 
+_OF_CAUSES = ("solved", "learnt_little", "few_updates", "difference", "no_difference")
+"""Thresholds of every question about a cause."""
+
 _FIELD_IS_OFF = {"paid_every_step", "no_reward_threshold", "no_survival_threshold"}
 """Reasons that hold by definition: no other run can contradict them."""
 
@@ -124,7 +127,7 @@ class Verdict(StrictModel):
       answer: "cannot tell" if the evidence does not separate the causes.
       reason: the rule's branch that decided.
       evidence: the numbers that the branch compared or reports.
-      thresholds: those that the numbers were compared with.
+      thresholds: those of the question, with which the numbers were compared.
       error_share: part of the error that a "yes" explains; null if it is not measured.
     """
 
@@ -212,7 +215,6 @@ class Decision(NamedTuple):
     reason: Any  # one of the question's; of a rule also a bool, for the first that says yes or no
     evidence: dict[str, Any]
     error_share: float | None = None  # that a "yes" explains
-    thresholds: tuple[str, ...] = ()  # beside those of the question
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,7 +260,7 @@ class Question(NamedTuple, Generic[C]):
 
     kind: Kind
     rule: Callable[[C], Decision]
-    thresholds: tuple[str, ...]  # that the rule uses
+    thresholds: tuple[str, ...]  # that decide on its answer
     reasons: dict[str, Answer]
     needs: str = ""  # the field of `Measurements` without which it is not asked
     is_cause: bool = False  # whether "yes" names a cause, which a run can leave open
@@ -285,6 +287,7 @@ def add_to(
     is_cause: bool = False,
 ) -> Callable[[Callable[[C], Decision]], Callable[[C], Decision]]:
     """Decorate a rule: add the question of its name, with the reasons for each answer."""
+    used = (*thresholds.split(), *(_OF_CAUSES if is_cause else ()))
     reasons: dict[str, Answer] = {
         **dict.fromkeys(yes.split(), "yes"),
         **dict.fromkeys(no.split(), "no"),
@@ -293,7 +296,6 @@ def add_to(
 
     def add(rule: Callable[[C], Decision]) -> Callable[[C], Decision]:
         name = rule.__name__.removeprefix("_")
-        used = tuple(thresholds.split())
         questions[name] = Question(kind, rule, used, reasons, needs, is_cause)
         return rule
 
@@ -308,7 +310,7 @@ def answer_all(questions: Mapping[str, Question[C]], case: C) -> tuple[Verdict, 
 def _verdict(name: str, question: Question[C], case: C) -> Verdict:
     answers = {**question.reasons, **COMPARISON_REASONS, **SOLVED, **OPEN_REASONS}
     if question.kind == "why" and case.solved:
-        decision = Decision("solved", {"normalised_regret": case.learnt}, thresholds=("solved",))
+        decision = Decision("solved", {"normalised_regret": case.learnt})
     else:
         own = question.decide(case)
         own_answer = answers[own.reason]
@@ -321,14 +323,13 @@ def _verdict(name: str, question: Question[C], case: C) -> Verdict:
             kept = {**own.evidence, "own_answer": own_answer, "own_reason": own.reason}
             decision = other._replace(evidence=kept | other.evidence)
     answer, share = answers[decision.reason], decision.error_share
-    thresholds = dict.fromkeys((*question.thresholds, *decision.thresholds))
     return Verdict(
         question=name,
         kind=question.kind,
         answer=answer,
         reason=decision.reason,
         evidence=decision.evidence,
-        thresholds={threshold: THRESHOLDS[threshold] for threshold in thresholds},
+        thresholds={threshold: THRESHOLDS[threshold] for threshold in question.thresholds},
         error_share=None if answer != "yes" or share is None else min(max(share, 0.0), 1.0),
     )
 
@@ -336,9 +337,9 @@ def _verdict(name: str, question: Question[C], case: C) -> Verdict:
 def _doubt(case: Case) -> Decision | None:
     """Why the run cannot name a cause; None if it can."""
     if case.updates is not None and case.updates < THRESHOLDS["few_updates"]:
-        return Decision("few_updates", {"updates": case.updates}, thresholds=("few_updates",))
+        return Decision("few_updates", {"updates": case.updates})
     if case.learnt >= THRESHOLDS["learnt_little"]:
-        return Decision("learnt_little", {"learnt": case.learnt}, thresholds=("learnt_little",))
+        return Decision("learnt_little", {"learnt": case.learnt})
     return None
 
 
@@ -354,7 +355,7 @@ def _comparison(
     if not asked or not _is_harder(value, other_value):
         return None
     regret = other.differences[0]
-    difference = regret.value - regret.other
+    difference = regret.difference
     if difference >= THRESHOLDS["difference"]:
         reason, decides = "field_raises_regret", own_answer != "yes" or is_open
     elif regret.other < THRESHOLDS["learnt_little"] and difference <= THRESHOLDS["no_difference"]:
@@ -371,8 +372,7 @@ def _comparison(
         "normalised_regret": regret.value,
         "other_normalised_regret": regret.other,
     }
-    thresholds = ("difference", "no_difference", "learnt_little")
-    return Decision(reason, evidence, thresholds=thresholds) if decides else None
+    return Decision(reason, evidence) if decides else None
 
 
 def _is_harder(value: JsonValue, other_value: JsonValue) -> bool:
