@@ -12,7 +12,7 @@ pytest.importorskip("matplotlib")
 
 from sme_registry.studies.report import figures
 from sme_registry.studies.report.figures import curves, draw_figures
-from sme_registry.studies.report.figures.panels import Scale, spacing
+from sme_registry.studies.report.figures.panels import positions, spacing
 from tests.geometry import assert_readable
 from tests.studies.report.test_report import FIGURES
 
@@ -125,8 +125,7 @@ def test_an_axis_has_the_scale_on_which_its_values_are_evenly_spaced(values, exp
     assert spacing(values) == expected
 
 
-def test_marks_next_to_each_other_have_equal_distances_everywhere():
-    scale = Scale.of([1, 2, 5, 10], 4)
-    ratios = scale.shifted(np.array(scale.at), 0.5) / np.array(scale.at)
-    assert np.allclose(ratios, np.sqrt(2.0))
-    assert Scale.of(["a", "b"], 2).at == (0.0, 1.0)
+def test_classes_have_equal_distances_on_their_scale():
+    assert np.allclose(positions([1, 2, 4, 8], 4), np.log([1, 2, 4, 8]))
+    assert list(positions([0.25, 0.5, 0.75], 3)) == [0.25, 0.5, 0.75]
+    assert list(positions(["a", "b"], 2)) == [0.0, 1.0]

@@ -53,12 +53,13 @@ def draw_regret(analysis: Analysis) -> Drawn:
     remark, groups = epsilon_remark(analysis), _axis_groups(analysis)
     if len(groups) == 1 and groups[0].axis not in ("", SEVERAL):
         (group,) = groups
+        log = ", log scale" if panels.spacing(group.values) == "log" else ""
         items = [(heading, group, metric) for metric, heading in HEADINGS.items()]
         yield Picture(
             f"regret-{group.axis.replace('.', '-')}",
             f"Normalised regret along the {group.name}",
             caption + remark,
-            _regret_panels(analysis, items, x=literal(group.name)),
+            _regret_panels(analysis, items, x=literal(group.name) + log),
         )
         return
     for metric, heading in HEADINGS.items():
@@ -92,24 +93,22 @@ def _draw_axis(
     axes: Axes, analysis: Analysis, group: Group, metric: str, looks: Mapping[str, Look]
 ) -> None:
     """The classes of one axis, in the order of its values."""
-    ordered = group.axis not in ("", SEVERAL)
-    scale = panels.Scale.of(group.values, len(group.classes))
-    x = dict(zip(group.classes, scale.at, strict=True))
+    kind = panels.spacing(group.values)
+    places = panels.positions(group.values, len(group.classes))
+    labels = [literal(label) for label in _class_labels(group)]
+    distance = panels.tick_classes(axes, places, labels, nominal=kind == "nominal")
+    x = dict(zip(group.classes, places, strict=True))
     levels = analysis.tables["levels"]
     levels = levels[(levels.metric == metric) & levels.class_name.isin(x)]
-    levels = levels.assign(at=levels.class_name.map(x))
-    levels = levels.sort_values("at", kind="stable")
+    levels = levels.assign(at=levels.class_name.map(x)).sort_values("at", kind="stable")
     linear = levels.drop_duplicates("class_name", keep="last")
-    look = LINEAR if ordered else new_look(GREY, "_", "none")
+    look = LINEAR if group.axis not in ("", SEVERAL) else new_look(GREY, "_", "none")
     axes.plot(linear["at"], linear.linear, **look, linewidth=1.2, markersize=14, zorder=1.6)
     axes.axhline(1.0, color=GREY, linewidth=1.2, linestyle=CONSTANT["linestyle"], zorder=1.6)
-    for name, look, shift in side_by_side(looks, 0.5):
+    for name, look, shift in side_by_side(looks, 0.5 * distance):
         rows = levels[levels.algorithm == name]
-        joined = ordered and scale.spacing != "nominal"
-        at = scale.shifted(rows["at"], shift)
-        marks(axes, rows, "iqm", at, look, upright=True, joined=joined)
-    scale.apply(axes, [literal(label) for label in _class_labels(group)])
-    axes.grid(visible=False, axis="x")
+        joined = kind != "nominal"
+        marks(axes, rows, "iqm", rows["at"] + shift, look, upright=True, joined=joined)
 
 
 def draw_profiles(analysis: Analysis) -> Drawn:

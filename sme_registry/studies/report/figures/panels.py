@@ -27,6 +27,7 @@ from sme_registry.plots.style import (
     new_figure,
     wrapped,
 )
+from sme_registry.statistics import Array
 from sme_registry.studies.report.analysis import ENOUGH_RUNS, Analysis
 from sme_registry.studies.report.classes import is_numeric
 
@@ -319,34 +320,21 @@ def _variation(values: Any) -> float:
     return float(distances.std() / distances.mean())
 
 
-@dataclass(frozen=True)
-class Scale:
-    """The places of classes along x."""
+def positions(values: Sequence[Any], classes: int) -> Array:
+    """Where classes are along x; `classes` in all, which may have no values."""
+    kind = spacing(values)
+    if kind == "nominal":
+        return np.arange(classes, dtype=np.float64)
+    return np.log(values) if kind == "log" else np.array(values, dtype=np.float64)
 
-    spacing: Spacing
-    at: tuple[float, ...]
 
-    @classmethod
-    def of(cls, values: Sequence[Any], classes: int) -> Scale:
-        """The scale of an axis' values; `classes` in all, which may have no values."""
-        kind = spacing(values)
-        places = range(classes) if kind == "nominal" else values
-        return cls(kind, tuple(float(place) for place in places))
-
-    def shifted(self, x: Any, shift: float) -> Any:
-        """Places moved by a share of the smallest distance between two classes."""
-        if self.spacing == "log":
-            return x * np.exp(shift * np.diff(np.log(self.at)).min())
-        distance = np.diff(self.at).min() if len(self.at) > 1 else 1.0
-        return x + shift * distance
-
-    def apply(self, axes: Axes, labels: Sequence[str]) -> None:
-        """Give an axes this scale, with a tick at each class."""
-        if self.spacing == "log":
-            axes.set_xscale("log")
-            axes.minorticks_off()
-        longest = max(map(len, labels))
-        crowded = len(labels) > 7 or longest > 12 or self.spacing == "nominal"
-        turned: Any = {"rotation": 30, "ha": "right", "fontsize": 8}
-        axes.set_xticks(self.at, labels, **(turned if crowded and longest > 4 else {}))
-        axes.set_xlim(self.shifted(self.at[0], -0.5), self.shifted(self.at[-1], 0.5))
+def tick_classes(axes: Axes, at: Array, labels: Sequence[str], *, nominal: bool) -> float:
+    """A tick at each class; the smallest distance between two."""
+    distance = float(np.diff(at).min()) if len(at) > 1 else 1.0
+    longest = max(map(len, labels))
+    crowded = len(labels) > 7 or longest > 12 or nominal
+    turned: Any = {"rotation": 30, "ha": "right", "fontsize": 8}
+    axes.set_xticks(at, labels, **(turned if crowded and longest > 4 else {}))
+    axes.set_xlim(at[0] - distance / 2, at[-1] + distance / 2)
+    axes.grid(visible=False, axis="x")
+    return distance
