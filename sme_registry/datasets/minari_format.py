@@ -154,7 +154,7 @@ def read_columns(folder: Path, *, visible: bool) -> Arrays:
     path = folder / "data" / DATA
     try:
         return _read_hdf5(path, visible)
-    except (OSError, KeyError, ValueError, RuntimeError, MemoryError) as error:
+    except (OSError, KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
         raise MalformedDocumentError(
             f"{path}: cannot be read: {str(error).strip(chr(39))}. Download the data set again, or "
             "generate it again (--force)."
@@ -170,7 +170,7 @@ def _read_hdf5(path: Path, visible: bool) -> Arrays:
         source = _Source(path)
         episodes = []
         for number in range(len(file)):
-            group = source.member(file, f"episode_{number}")
+            group = source.group(file, f"episode_{number}")
             columns = _visible_columns(source, group)
             if not visible:
                 columns |= _hidden_columns(source, group)
@@ -197,7 +197,7 @@ def _visible_columns(source: _Source, group: Any) -> Arrays:
 
 
 def _hidden_columns(source: _Source, group: Any) -> Arrays:
-    infos, columns = source.member(group, "infos"), {}
+    infos, columns = source.group(group, "infos"), {}
     for info, (before, after) in _INFOS.items():
         if before in _REQUIRED or info in infos:
             column = source.array(infos, info)
@@ -217,18 +217,15 @@ class _Source:
     def __init__(self, path: Path) -> None:
         self._left = path.stat().st_size
 
-    def member(self, group: Any, name: str) -> Any:
-        """What a group holds under a name."""
+    def group(self, parent: Any, name: str) -> Any:
         import h5py
 
-        if not isinstance(group.get(name, getlink=True), h5py.HardLink):  # to another file
-            raise ValueError(f"{name}: is a link")
-        return group[name]
+        return self._member(parent, name, h5py.Group)
 
-    def array(self, group: Any, name: str) -> npt.NDArray[Any]:
+    def array(self, parent: Any, name: str) -> npt.NDArray[Any]:
         import h5py
 
-        stored = self.member(group, name).id
+        stored = self._member(parent, name, h5py.Dataset).id
         plan, dtype, shape = stored.get_create_plist(), stored.dtype, stored.shape
         size = math.prod(shape) * dtype.itemsize
         self._left -= size
@@ -245,3 +242,15 @@ class _Source:
         array = np.empty(shape, dtype)
         stored.read(h5py.h5s.ALL, h5py.h5s.ALL, array)
         return array
+
+    @staticmethod
+    def _member(parent: Any, name: str, kind: type) -> Any:
+        import h5py
+
+        if name not in parent:
+            raise KeyError(f"{name} is missing")
+        if not isinstance(parent.get(name, getlink=True), h5py.HardLink):  # to another file
+            raise ValueError(f"{name}: is a link")
+        if not issubclass(parent.get(name, getclass=True), kind):
+            raise ValueError(f"{name}: is no {kind.__name__.lower()}")
+        return parent[name]

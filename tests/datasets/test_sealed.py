@@ -157,6 +157,8 @@ def stranger(folder):
         (_made(data=np.zeros((7, 4), "f4")), "observations are float32"),
         (_made(data=np.zeros((2, 4), "f8")), "observations are float64"),
         (_linked, "observations: is a link"),
+        (lambda group, _: group.create_group("observations"), "observations: is no dataset"),
+        (lambda group, _: None, "observations is missing"),
         (_made(data=np.zeros((2, 4), "f4")), None),
     ],
 )
@@ -181,6 +183,13 @@ def test_an_episode_that_is_a_link_is_not_followed(dataset, tmp_path):
     with stranger(tmp_path) as file:
         file["episode_0"] = h5py.ExternalLink(str(private), "episode_0")
     with pytest.raises(MalformedDocumentError, match="episode_0: is a link"):
+        SealedDataset.read(tmp_path)
+
+
+def test_an_episode_that_is_no_group_is_named(tmp_path):
+    with stranger(tmp_path) as file:
+        file["episode_0"] = np.zeros(3)
+    with pytest.raises(MalformedDocumentError, match="episode_0: is no group"):
         SealedDataset.read(tmp_path)
 
 
