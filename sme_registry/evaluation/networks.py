@@ -151,6 +151,12 @@ class OfflinePolicy(Perceptron):
 
     Attributes:
       about: what it was trained on and how, plain JSON data; "algorithm" names it in reports.
+
+    Examples:
+      >>> from sme_registry.evaluation import OfflinePolicy
+      >>> policy = OfflinePolicy([(np.zeros((4, 10), np.float32), np.zeros(4, np.float32))])
+      >>> policy(np.ones((1, 10), np.float32)).tolist()
+      [[0.5, 0.5, 0.5, 0.5]]
     """
 
     def __init__(
