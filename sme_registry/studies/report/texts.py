@@ -92,8 +92,14 @@ def text_tables(analysis: Analysis) -> list[TextTable]:
 
 
 def _task_tables(analysis: Analysis) -> Iterator[TextTable]:
-    tables, names = analysis.tables, analysis.algorithms
     yield from offline_tables(analysis)
+    yield from _metric_tables(analysis)
+    yield from _overview_tables(analysis)
+
+
+def _metric_tables(analysis: Analysis) -> Iterator[TextTable]:
+    """Levels, differences and contrasts of each metric, and what the layers keep."""
+    tables, names = analysis.tables, analysis.algorithms
     for metric, rows in _by_metric(tables["levels"]):
         yield _text(
             f"levels-{slug(metric.key)}", f"{_sentence(metric.label)} by class",
@@ -125,6 +131,11 @@ def _task_tables(analysis: Analysis) -> Iterator[TextTable]:
             rows.assign(setting=rows.class_name.map(setting)), _BY_CLASS | {"setting": "setting"},
             "algorithm", _change, names,
         )  # fmt: skip
+
+
+def _overview_tables(analysis: Analysis) -> Iterator[TextTable]:
+    """Regions of each algorithm, aggregates over classes, and numbers of runs."""
+    tables = analysis.tables
     for name, rows in tables["regions"].groupby("algorithm", sort=False):
         yield _text(
             f"regions-{slug(name)}", f"Similarity r̃ of {name} by region",
