@@ -33,7 +33,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv
 
 from sme_registry.envs.arguments import check_has_limits
-from sme_registry.envs.episodes import Episodes, info_of_lanes
+from sme_registry.envs.episodes import Episodes, info_of_envs
 from sme_registry.errors import OptionError
 from sme_registry.io import check_new
 from sme_registry.spec import SMESpec
@@ -210,7 +210,7 @@ class RecordVectorRegret(VectorWrapper):
 
 
 def _numbers(info: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: np.array(column, float)[0] for key, column in info_of_lanes([info]).items()}
+    return {key: np.array(column, float)[0] for key, column in info_of_envs([info]).items()}
 
 
 class StepWithCost(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):

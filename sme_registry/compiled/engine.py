@@ -19,6 +19,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtr
 
 from sme_registry.compiled.arrays import (
     ACCUMULATED_REWARD,
@@ -43,7 +44,6 @@ from sme_registry.compiled.arrays import (
 from sme_registry.io import choice, is_installed, require_packages
 from sme_registry.task import Layer, Task, step
 from sme_registry.task.draw import counted
-from sme_registry.task.task import through
 
 Backend = Literal["numba", "numpy"]
 BACKEND_VARIABLE = "SME_BACKEND"
@@ -302,9 +302,8 @@ def _next_distractors(task: Task, own: Array, action: Array) -> Array:
 
 def _network_with_numpy(layers: Sequence[Layer], uniform: bool, x: Array) -> Array:
     rows = np.ascontiguousarray(x.T)[:, None, :]  # each environment a product of its own
-    if uniform:
-        rows = through(layers, rows)
-    else:
-        for W, b in layers:
-            rows = rows @ W.T + b
+    for W, b in layers:
+        rows = rows @ W.T + b
+        if uniform:
+            rows = ndtr(rows)
     return np.ascontiguousarray(rows[:, 0, :].T)

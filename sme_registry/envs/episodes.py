@@ -1,7 +1,7 @@
 """`Episodes`: the exact regret of every episode, summed from the steps of parallel environments.
 
 A training loop, a callback or a wrapper adds rewards and infos; a team's episode is one of all its
-agents. `B` lanes, `n` agents of each, `N` steps. Sums are `[7, B, n]`:
+agents. `B` environments, `n` agents of each, `N` steps. Sums are `[7, B, n]`:
 
     return, length, regret, similarity;  and of a task with `safety`: cost, violations, safe regret
 """
@@ -77,17 +77,17 @@ class Episode(NamedTuple):
 
 
 class Episodes:
-    """The present episode of each lane, and the finished ones.
+    """The present episode of each environment, and the finished ones.
 
     Attributes:
       finished: the episodes, oldest first.
-      steps: environment steps so far, over all lanes.
+      steps: environment steps so far, over all environments.
       sums: `[7, B, n]` over the present episodes; a program can save and restore them.
     """
 
     def __init__(
         self,
-        lanes: int = 1,
+        envs: int = 1,
         agents: int = 1,
         spec: Callable[[], SMESpec] | None = None,
         *,
@@ -97,7 +97,7 @@ class Episodes:
         """`spec` is called once, where infos have costs; `clock` gives an episode's seconds."""
         self.finished: list[Episode] = []
         self.steps = steps
-        self.sums = np.zeros((7, lanes, agents))
+        self.sums = np.zeros((7, envs, agents))
         self._spec = cache(spec) if spec is not None else None
         self._start, self._clock = time.monotonic(), clock
         self._counted, self._total_regret = 0, 0.0
@@ -107,9 +107,9 @@ class Episodes:
         """Mean regret over all steps that were added; NaN before the first."""
         return self._total_regret / self._counted if self._counted else float("nan")
 
-    def begin(self, lanes: Any = slice(None)) -> None:
-        """Forget the present episodes of some lanes."""
-        self.sums[:, lanes] = 0.0
+    def begin(self, envs: Any = slice(None)) -> None:
+        """Forget the present episodes of some environments."""
+        self.sums[:, envs] = 0.0
 
     def add(
         self,
@@ -118,11 +118,11 @@ class Episodes:
         terminated: npt.ArrayLike,
         ended: npt.ArrayLike,
     ) -> list[Episode]:
-        """Add one or more steps of every lane; returns the episodes that ended in them.
+        """Add one or more steps of every environment; returns the episodes that ended in them.
 
-        Each argument, and each entry of `info`, has an entry for each step, lane and agent:
-        `[B]`, `[N, B]` or `[N, B, n]`, or flat in that order. Where the regret is NaN, the lane
-        began an episode instead.
+        Each argument, and each entry of `info`, has an entry for each step, environment and agent:
+        `[B]`, `[N, B]` or `[N, B, n]`, or flat in that order. The regret is NaN where
+        an episode began instead.
         """
         shape = (-1, *self.sums.shape[1:])
         try:
@@ -147,8 +147,8 @@ class Episodes:
         for row in np.flatnonzero(ends.any(axis=1)).tolist():
             self._sum(values[:, begin : row + 1])
             self.steps, begin = int(steps[row]), row + 1
-            for lane in np.flatnonzero(ends[row]).tolist():
-                self._finish(lane, bool(failures[row, lane]), "cost" in info)
+            for env in np.flatnonzero(ends[row]).tolist():
+                self._finish(env, bool(failures[row, env]), "cost" in info)
         self._sum(values[:, begin:])
         self.steps = int(steps[-1])
         return self.finished[before:]
@@ -168,10 +168,13 @@ class Episodes:
         if self._spec is None:
             raise OptionError("Episodes: the task has safety. Give spec, such as lambda: env.spec.")
         cost, safe_regret = (_numbers(info[key], shape) for key in _SAFETY)
-        return cost, _violations(cost, self._spec()), safe_regret
+        spec = self._spec()
+        excess = cost * (2.0 * spec.tightness * spec.action_dim)
+        violations = excess > max(_TOLERANCE, _ROUNDING * spec.action_dim)
+        return cost, violations.astype(np.float64), safe_regret
 
-    def _finish(self, lane: int, terminated: bool, has_safety: bool) -> None:
-        sums = self.sums[:, lane]
+    def _finish(self, env: int, terminated: bool, has_safety: bool) -> None:
+        sums = self.sums[:, env]
         episode_return, length, regret, similarity = sums[:4].mean(axis=1).tolist()
         by_agent = sums[_REGRET] / length if sums.shape[1] > 1 else ()
         safety = (sums[_SAFETY_SUMS, 0] / length).tolist()
@@ -190,21 +193,14 @@ class Episodes:
                 safety=EpisodeSafety(*safety) if has_safety else None,
             )
         )
-        self.begin(lane)
+        self.begin(env)
 
 
-def info_of_lanes(infos: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """What `Episodes.add` reads of infos of single lanes, as the info of all of them."""
+def info_of_envs(infos: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """What `Episodes.add` reads of infos of single environments, as the info of all of them."""
     keys = [key for key in (*_PLAIN, *_SAFETY) if key in infos[0]]
     return {key: [info[key] for info in infos] for key in keys}
 
 
 def _numbers(values: Any, shape: tuple[int, ...]) -> Array:
     return np.asarray(values, np.float64).reshape(shape)
-
-
-def _violations(cost: Array, spec: SMESpec) -> Array:
-    """1 where a step's action was above its limits, from its cost."""
-    assert spec.safety is not None  # the infos have costs
-    excess = cost * (2.0 * spec.safety.tightness * spec.action_dim)
-    return (excess > max(_TOLERANCE, _ROUNDING * spec.action_dim)).astype(np.float64)

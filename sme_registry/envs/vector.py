@@ -167,19 +167,20 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         lifetime = arguments.lifetime_in(options)
         mask = self._mask(options["reset_mask"]) if "reset_mask" in options else None
         envs = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
-        seeds = self._seeds(seed)[envs]
-        widths = {"state": self.document.state_dim, "distractors": self._batch.distractors.shape[1]}
-        given = {
-            name: arguments.initial_values(name, options, (width,), self.num_envs)
+        seeds, spec = self._seeds(seed), self._batch.task.spec
+        widths = {"state": spec.state_dim, "distractors": spec.distractors}
+        given = [
+            arguments.initial_values(name, options, (width,), self.num_envs)
             for name, width in widths.items()
-        }
-        states, distractors = (None if value is None else value[envs] for value in given.values())
+        ]
+        states, distractors = (None if value is None else value[envs] for value in given)
         # Every argument is checked: from here on, the state changes.
-        for env, env_seed in zip(envs, seeds, strict=True):
+        for env in envs.tolist():
+            env_seed = seeds[env]
             if env_seed is not None:
-                self._batch.seed(int(env), env_seed)
+                self._batch.seed(env, env_seed)
             if lifetime is not None:
-                self._batch.live(int(env), lifetime)
+                self._batch.live(env, lifetime)
         observation = self._batch.observe()
         self._batch.begin(envs, observation, states, distractors)
         self._ended[envs] = False
@@ -309,29 +310,26 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         for key, value in info.items():
             value[envs] = life[key][envs] if key in life else np.nan
 
-    def _seeds(self, seed: int | Sequence[int | None] | None) -> npt.NDArray[Any]:
-        """One seed or None for each environment, `[B]`."""
-        seeds = np.full(self.num_envs, None, dtype=object)
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        """One seed or None for each environment."""
         if not isinstance(seed, list | tuple | np.ndarray) or np.ndim(seed) == 0:
             first = arguments.checked_seed(seed)
-            if first is not None:
-                seeds[:] = [first + env for env in range(self.num_envs)]
-            return seeds
+            return [None if first is None else first + env for env in range(self.num_envs)]
         if len(seed) != self.num_envs:
             raise OptionError(
                 f"seed={seed!r:.60}: must be an integer, None, or a list of one for each of the "
                 f"{self.num_envs} environments."
             )
-        seeds[:] = [arguments.checked_seed(env_seed) for env_seed in seed]
-        return seeds
+        return [arguments.checked_seed(env_seed) for env_seed in seed]
 
     def _mask(self, mask: Any) -> Mask:
         if not (isinstance(mask, np.ndarray) and mask.dtype == bool):
             raise OptionError("reset_mask: must be a NumPy array of dtype bool.")
-        if mask.shape != (self.num_envs,):
-            raise OptionError(f"reset_mask of shape {mask.shape}: must be ({self.num_envs},).")
-        if not mask.any():
-            raise OptionError("reset_mask: must be True for at least one environment.")
+        if mask.shape != (self.num_envs,) or not mask.any():
+            raise OptionError(
+                f"reset_mask of shape {mask.shape}: must be ({self.num_envs},), and True for at "
+                "least one environment."
+            )
         return mask
 
 

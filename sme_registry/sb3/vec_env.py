@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from sme_registry.compiled.arrays import REWARD, Array, Mask, Observation
 from sme_registry.envs import SMEEnv, arguments
 from sme_registry.envs.batch import Batch
-from sme_registry.envs.episodes import Episode, Episodes, info_of_lanes
+from sme_registry.envs.episodes import Episode, Episodes, info_of_envs
 from sme_registry.envs.rendering import METADATA, Frame, batch_renderer, html_card
 from sme_registry.envs.schedule import Schedule, renamed_by_content
 from sme_registry.envs.team import shared_action_dim, shared_observation, shared_observation_dim
@@ -408,7 +408,7 @@ def finished_in(
 ) -> list[Episode]:
     """Add a step of a `VecEnv`; returns the episodes that ended in it."""
     terminated = [not info.get("TimeLimit.truncated", False) for info in infos]
-    return episodes.add(rewards, info_of_lanes(infos), terminated, dones)
+    return episodes.add(rewards, info_of_envs(infos), terminated, dones)
 
 
 class RegretCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped without SB3

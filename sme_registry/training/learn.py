@@ -27,7 +27,7 @@ from rich.console import Console
 
 from sme_registry.compiled.arrays import Array
 from sme_registry.envs import SMEEnv
-from sme_registry.envs.episodes import Episode, Episodes, info_of_lanes
+from sme_registry.envs.episodes import Episode, Episodes, info_of_envs
 from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation import Policy, TeamPolicy, as_policy
 from sme_registry.evaluation.models import saved_sb3
@@ -330,7 +330,7 @@ class FunctionLearner(Learner):
         """Add the last step to sums; returns the episode that ended in it."""
         reward, terminated, truncated, info = self.env.last
         ended = [terminated or truncated]
-        return sums.add([reward], info_of_lanes([info]), [terminated], ended)
+        return sums.add([reward], info_of_envs([info]), [terminated], ended)
 
     def save(self, path: Path) -> None:
         """Write a model of Stable-Baselines3, and nothing of another policy."""

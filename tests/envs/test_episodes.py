@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import sme_registry
-from sme_registry.envs.episodes import Episodes, info_of_lanes
+from sme_registry.envs.episodes import Episodes, info_of_envs
 from sme_registry.errors import OptionError
 
 
@@ -37,7 +37,7 @@ def test_steps_at_once_have_the_bits_of_steps_one_by_one(agents):
 
 
 def test_an_episode_is_the_mean_over_its_steps_and_a_teams_over_its_agents():
-    episodes = Episodes(lanes=1, agents=2, steps=10, clock=lambda: 5.0)
+    episodes = Episodes(envs=1, agents=2, steps=10, clock=lambda: 5.0)
     info = {"regret": [0.25, 0.75], "similarity": [0.5, 0.5]}
     assert episodes.add([1.0, 3.0], info, [False] * 2, [False] * 2) == []
     [episode] = episodes.add([1.0, 3.0], info, [True] * 2, [True] * 2)
@@ -48,7 +48,7 @@ def test_an_episode_is_the_mean_over_its_steps_and_a_teams_over_its_agents():
 
 
 def test_lanes_that_began_an_episode_count_no_step():
-    episodes = Episodes(lanes=2)
+    episodes = Episodes(envs=2)
     info = {"regret": [0.5, np.nan], "similarity": [0.5, np.nan]}
     [episode] = episodes.add([1.0, 0.0], info, [False, False], [True, False])
     assert (episode.step, episode.length, episode.terminated) == (1, 1, 0)
@@ -63,7 +63,7 @@ def test_costs_are_means_and_violations_a_share():
         {"regret": 0.5, "similarity": 0.5, "cost": cost, "safe_regret": -0.5} for cost in (0.0, 0.5)
     ]
     for step, info in enumerate(lanes):
-        finished = episodes.add([0.0], info_of_lanes([info]), [False], [step == 1])
+        finished = episodes.add([0.0], info_of_envs([info]), [False], [step == 1])
     assert finished[0].safety == (0.25, 0.5, -0.5)
 
 
