@@ -211,15 +211,10 @@ Digest = Annotated[
 ]
 
 
-class _Abbreviated:
-    """A long field in the `repr` of a model."""
+class _Unquoted(str):
+    """A text that `repr` shows as it is."""
 
-    def __init__(self, value: Any) -> None:
-        self._value = value
-
-    def __repr__(self) -> str:
-        size = f" of {len(self._value)}" if isinstance(self._value, Sized) else ""
-        return f"<{type(self._value).__name__}{size}>"
+    __repr__ = str.__str__
 
 
 class StrictModel(BaseModel):
@@ -298,7 +293,11 @@ class StrictModel(BaseModel):
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
         """The fields; a long one is shown by its type and length, so that none fills a screen."""
         for name, value in super().__repr_args__():
-            yield name, value if len(repr(value)) <= _LONGEST_FIELD else _Abbreviated(value)
+            if len(repr(value)) <= _LONGEST_FIELD:
+                yield name, value
+            else:
+                size = f" of {len(value)}" if isinstance(value, Sized) else ""
+                yield name, _Unquoted(f"<{type(value).__name__}{size}>")
 
     @classmethod
     def from_dict(cls, data: Any, source: str = "") -> Self:
