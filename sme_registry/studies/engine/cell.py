@@ -35,7 +35,7 @@ from sme_registry.studies.engine.result import (
     CellFailure,
     CellResult,
     LearningCurve,
-    OfflineResult,
+    OfflineCell,
     Record,
     Timing,
     life_report,
@@ -308,7 +308,7 @@ def _run_offline(cell: Cell, name: str, progress: ReportSteps) -> CellResult:
             length=(float(T),) * len(evaluations),
         ),
         report=result.report,
-        offline=OfflineResult(
+        offline=OfflineCell(
             nu=nu,
             transitions=recipe.transitions,
             dataset_digest=record.dataset_digest,

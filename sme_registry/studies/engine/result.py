@@ -86,7 +86,7 @@ class ProgramResult(StrictModel):
     shape: Annotated[tuple[Integer, Integer, Integer, Integer], Field(strict=False)]
 
 
-class OfflineResult(StrictModel):
+class OfflineCell(StrictModel):
     """What an offline cell adds: its data set, and the similarity of behaviour and learner.
 
     Attributes:
@@ -131,7 +131,7 @@ class CellResult(StrictModel):
     online_regret: Real | None = None
     online_cost: Real | None = None
     agents_online_regret: dict[str, Real] = Field(default_factory=dict)
-    offline: OfflineResult | None = None
+    offline: OfflineCell | None = None
     program: ProgramResult | None = None
     timing: Timing
     versions: dict[str, str]

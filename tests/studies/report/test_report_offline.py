@@ -6,7 +6,7 @@ import pytest
 from sme_registry.io.markup import fixed
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.engine.result import OfflineResult
+from sme_registry.studies.engine.result import OfflineCell
 from sme_registry.studies.report.classes import ALL
 from sme_registry.studies.report.tables import analyse
 from sme_registry.studies.report.texts import offline_tables
@@ -48,7 +48,7 @@ def results(file):
         nu = float(str(cell.hyperparameters["nu"]))
         behaviour = 1.0 - nu / 6.0 + 0.001 * place.run
         change = CHANGES[place.algorithm.split()[0], place.class_name] + 0.0005 * (place.run - 2)
-        scores = OfflineResult(
+        scores = OfflineCell(
             nu=nu,
             transitions=1000,
             dataset_digest=f"sha256:{hash_of(place.class_name, nu, place.run):064x}",
