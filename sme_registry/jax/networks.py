@@ -24,20 +24,14 @@ Weights = dict[str, jax.Array]
 HostWeights = dict[str, npt.NDArray[np.float32]]
 
 
-def perceptron(
-    weights: Weights,
-    prefix: str,
-    x: jax.Array,
-    layers: int,
-    activation: Callable[[jax.Array], jax.Array],
-) -> jax.Array:
-    """Outputs `[..., out]` of a `torch.nn.Sequential` of linear layers with activations between.
+def perceptron(weights: Weights, prefix: str, x: jax.Array) -> jax.Array:
+    """Outputs `[..., out]` of a `torch.nn.Sequential` of linear layers with ReLU between them.
 
     Layer i is at index 2 i of the sequence: `<prefix>.0.weight`, `<prefix>.0.bias`, `<prefix>.2…`.
-    The last one is linear; apply an output activation outside.
     """
-    *_, x = x, *hidden_layers(weights, prefix, x, layers - 1, activation)
-    return linear(weights, f"{prefix}.{2 * (layers - 1)}", x)
+    last = sum(name.startswith(f"{prefix}.") for name in weights) // 2 - 1
+    *_, x = x, *hidden_layers(weights, prefix, x, last, jax.nn.relu)
+    return linear(weights, f"{prefix}.{2 * last}", x)
 
 
 def hidden_layers(

@@ -17,15 +17,37 @@ from __future__ import annotations
 
 import functools
 from abc import abstractmethod
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from sme_registry.jax.env import EnvState, observe, reset, step, to_unit
-from sme_registry.jax.networks import Adam, Weights, network
+from sme_registry.jax.networks import (
+    Adam,
+    Count,
+    CountFromZero,
+    Share,
+    Updates,
+    Weights,
+    network,
+)
 from sme_registry.jax.program import PIECE, Array, Program, StepLog
 from sme_registry.jax.task import TaskParams
+
+
+@dataclass(frozen=True)
+class OffPolicySettings:
+    """Hyperparameters of both; `net_arch` is in the `policy_kwargs` of Stable-Baselines3."""
+
+    buffer_size: Count = 1_000_000
+    learning_starts: CountFromZero = 100
+    batch_size: Count = 256
+    tau: Share = 0.005
+    gamma: Share = 0.99
+    train_freq: Count = 1
+    gradient_steps: Updates = 1
 
 
 class ReplayRows(NamedTuple):
@@ -138,7 +160,7 @@ class OffPolicyProgram(Program):
         step from 0; both are the same in all runs.
         """
 
-    def __init__(self, settings: Any, *arguments: Any, **options: Any) -> None:
+    def __init__(self, settings: OffPolicySettings, *arguments: Any, **options: Any) -> None:
         self.rollout = settings.train_freq
         super().__init__(settings, *arguments, **options)
 
@@ -215,7 +237,7 @@ def _initial(
 )  # donated, or the replay buffer would be copied at each call
 def _steps(
     kind: type[OffPolicyProgram],
-    settings: Any,
+    settings: OffPolicySettings,
     state: OffPolicyState,
     params: TaskParams,
     begin: jax.Array,
@@ -256,7 +278,7 @@ def _switched(
 
 def _updated(
     kind: type[OffPolicyProgram],
-    settings: Any,
+    settings: OffPolicySettings,
     state: OffPolicyState,
     channels: jax.Array,
     n: jax.Array,
@@ -291,7 +313,7 @@ def _updated(
 
 def _acted(
     kind: type[OffPolicyProgram],
-    settings: Any,
+    settings: OffPolicySettings,
     state: OffPolicyState,
     params: TaskParams,
     channels: jax.Array,

@@ -385,7 +385,7 @@ class PPOProgram(Program):
             self.state, log = _collect(
                 self.settings,
                 self.symmetric,
-                self.separable and params.inner is not None,
+                self.lives.separable and params.inner is not None,
                 params,
                 self.state,
                 self.lives.phase_after(self.steps),

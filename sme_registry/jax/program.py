@@ -98,8 +98,8 @@ class Lives:
     once, and what a program keeps of its runs does not depend on their tasks, so a switch passes
     other `TaskParams` to the same code, compiled once for each `Form`.
 
-    `separable` says whether rewards change no observation and end no episode: k = 1 and D = 0 in
-    all tasks.
+    `separable` says whether rewards change no observation and end no episode, k = 1 and D = 0 in
+    all tasks: then the oracle can be asked later, for many steps at once.
     """
 
     def __init__(self, documents: Sequence[Document], device: Any) -> None:
@@ -141,8 +141,7 @@ class Program(ABC):
     """The runs of one algorithm: `advance` until the budget is used, then `finish`.
 
     `specs` are those of the runs without the copies of the first that fill the program up to
-    `runs`; `steps` and `budget` are of each run. `separable` (k = 1 and D = 0 in all tasks) says
-    that the oracle can be asked later, for many steps at once.
+    `runs`; `steps` and `budget` are of each run.
     """
 
     buffer = ""
@@ -181,7 +180,6 @@ class Program(ABC):
         seeds = [*seeds, *[seeds[0]] * copies]
         self.device = find_device(device)
         self.lives, self.steps = Lives(specs, self.device), 0
-        self.separable = self.lives.separable
         widths = specs[0].observation_dim, specs[0].action_dim
         rngs = map(np.random.default_rng, seeds)
         weights = [self.initial_weights(settings, rng, *widths) for rng in rngs]
@@ -234,7 +232,7 @@ class Program(ABC):
             type(self).act,
             self.settings,
             self.symmetric,
-            self.separable,
+            self.lives.separable,
             self.state.weights,
             self.lives.at(self.steps if lifetime is None else lifetime),
             jax.device_put(np.asarray(states, np.float64), self.device),

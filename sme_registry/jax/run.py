@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
 from typing import Any
@@ -286,9 +287,7 @@ def _lifetime(step: int) -> int:
 
 def _most_at_once(due: Sequence[int], rollout: int) -> int:
     """The greatest number of evaluations with the same weights, at least 1."""
-    return int(
-        max(np.unique([-(-step // rollout) for step in due], return_counts=True)[1], default=1)
-    )
+    return max(Counter(-(-step // rollout) for step in due).values(), default=1)
 
 
 def _stacked(program: Program, groups: Sequence[Sequence[Array]]) -> Array:

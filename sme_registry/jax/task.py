@@ -302,10 +302,7 @@ def next_distractors(
     """The distractors `[m]` of the next state, from the action and those random numbers."""
     if d is None or params.form.dynamics == "noise":
         return numbers
-    moving = params.observing
-    assert moving is not None
-    assert moving.W is not None
-    assert moving.b is not None
+    moving: Any = params.observing
     return transition(moving.W, moving.b, d, a if numbers is None else numbers)
 
 

@@ -21,12 +21,9 @@ from sme_registry.jax.networks import (
     Adam,
     Coefficient,
     Count,
-    CountFromZero,
     HostWeights,
     NotNegative,
     Positive,
-    Share,
-    Updates,
     Weights,
     Widths,
     adam,
@@ -36,7 +33,12 @@ from sme_registry.jax.networks import (
     network,
     perceptron,
 )
-from sme_registry.jax.off_policy import OffPolicyLearner, OffPolicyProgram, ReplayRows
+from sme_registry.jax.off_policy import (
+    OffPolicyLearner,
+    OffPolicyProgram,
+    OffPolicySettings,
+    ReplayRows,
+)
 
 _CRITICS = 2
 _LEAST_LOG_STD, _GREATEST_LOG_STD = -20.0, 2.0
@@ -44,20 +46,10 @@ _ENTROPY = "log_ent_coef"  # an attribute of SB3's model, not of its policy
 
 
 @dataclass(frozen=True)
-class TD3:
-    """Hyperparameters, with the names and defaults of `stable_baselines3.TD3`; no action noise.
-
-    `net_arch` is the widths of the hidden layers of actor and critics (`policy_kwargs.net_arch`).
-    """
+class TD3(OffPolicySettings):
+    """Hyperparameters, with the names and defaults of `stable_baselines3.TD3`; no action noise."""
 
     learning_rate: Positive = 1e-3
-    buffer_size: Count = 1_000_000
-    learning_starts: CountFromZero = 100
-    batch_size: Count = 256
-    tau: Share = 0.005
-    gamma: Share = 0.99
-    train_freq: Count = 1
-    gradient_steps: Updates = 1
     policy_delay: Count = 2
     target_policy_noise: NotNegative = 0.2
     target_noise_clip: NotNegative = 0.5
@@ -65,22 +57,14 @@ class TD3:
 
 
 @dataclass(frozen=True)
-class SAC:
+class SAC(OffPolicySettings):
     """Hyperparameters, with the names and defaults of `stable_baselines3.SAC`.
 
-    `ent_coef` is "auto", "auto_" and the initial value, or a constant. `net_arch` is the widths of
-    the hidden layers of actor and critics (`policy_kwargs.net_arch`). Without generalised
+    `ent_coef` is "auto", "auto_" and the initial value, or a constant. Without generalised
     state-dependent exploration and action noise, as is SB3's default.
     """
 
     learning_rate: Positive = 3e-4
-    buffer_size: Count = 1_000_000
-    learning_starts: CountFromZero = 100
-    batch_size: Count = 256
-    tau: Share = 0.005
-    gamma: Share = 0.99
-    train_freq: Count = 1
-    gradient_steps: Updates = 1
     ent_coef: str | Coefficient = "auto"
     target_update_interval: Count = 1
     target_entropy: str | Coefficient = "auto"
@@ -178,7 +162,7 @@ class TD3Program(OffPolicyProgram):
 
 def _deterministic(weights: Weights, observation: jax.Array, policy: str = "actor") -> jax.Array:
     """Actions `[..., A]` of TD3's actor, or of `actor_target`."""
-    return jnp.tanh(relu_perceptron(weights, f"{policy}.mu", observation))
+    return jnp.tanh(perceptron(weights, f"{policy}.mu", observation))
 
 
 def _improved_policy(
@@ -305,7 +289,7 @@ def _sample(
 
 def _gaussian(weights: Weights, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Mean and log σ before the tanh, `[..., A]` each."""
-    x = jax.nn.relu(relu_perceptron(weights, "actor.latent_pi", observation))
+    x = jax.nn.relu(perceptron(weights, "actor.latent_pi", observation))
     log_std = linear(weights, "actor.log_std", x)
     mean = linear(weights, "actor.mu", x)
     return mean, jnp.clip(log_std, _LEAST_LOG_STD, _GREATEST_LOG_STD)
@@ -338,12 +322,6 @@ def _in_range(action: jax.Array, symmetric: bool) -> jax.Array:
     return action if symmetric else to_unit(action, symmetric=True, dtype=jnp.float32)
 
 
-def relu_perceptron(weights: Weights, prefix: str, x: jax.Array) -> jax.Array:
-    """Outputs of a perceptron with ReLU between its layers, as many as it has weights for."""
-    layers = sum(name.startswith(f"{prefix}.") for name in weights) // 2
-    return perceptron(weights, prefix, x, layers, jax.nn.relu)
-
-
 def initial_critics(
     rng: np.random.Generator, observation_dim: int, action_dim: int, net_arch: Sequence[int]
 ) -> HostWeights:
@@ -371,7 +349,7 @@ def critic_value(
 ) -> jax.Array:
     """Q(observation, action) `[B]` of one critic, such as `critic.qf0`."""
     x = jnp.concatenate([observation, action], axis=-1)
-    return relu_perceptron(weights, critic, x)[..., 0]
+    return perceptron(weights, critic, x)[..., 0]
 
 
 def smallest_value(

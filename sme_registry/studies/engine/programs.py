@@ -69,14 +69,10 @@ _SNAPSHOT = "snapshot/"  # prefix of the records of lives: weights before traini
 class SharedProgram:
     """How the cells of a job run as runs of one program.
 
-    Attributes:
-      runs: their number; those without a cell repeat the first.
-      device: "cpu", "gpu" or "tpu"; None for JAX's default.
-      state: the file of its state, written every few minutes; None to write none.
-      build_key: what a state must have been made with for others to go on from it.
-      cells: those of the runs of a state to go on from, in order. Each keeps its own task, also if
-        it is none of the job's: another job may go on from the state that this one writes. Empty
-        for those of the job.
+    `runs` is their number; those without a cell repeat the first. Programs go on from states with
+    the same `build_key`. `cells` are those of the runs of such a state, in order; each keeps its
+    own task, also if it is none of the job's: another job may go on from the state that this one
+    writes. They are empty for those of the job.
     """
 
     runs: int
