@@ -7,7 +7,7 @@ import functools
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rich.console import Console
 from rich.markup import escape
@@ -87,13 +87,10 @@ def run_study(
     plan_file = with_sources(plan_file)
     planned = first_places(selected(plan_file.plan.cells, only))
     console = console or Console(stderr=True)
-    if run is run_cell:
-        _check(plan_file.plan, planned.values(), console if progress else None)
+    checked = planned.values() if run is run_cell else ()
+    _check(plan_file.plan, checked, console if progress else None)
     on_ray = executor == "ray" or isinstance(executor, OnRay)
-    with_jax = run is run_cell and any(in_jax(cell.cell.uses) for cell in planned.values())
-    programs = _programs(plan_file.plan, device, lanes, on_ray=on_ray) if with_jax else None
-    if not with_jax:
-        _check_no_jax_options(device=device, lanes=lanes)
+    programs = _programs(plan_file.plan, checked, device, lanes, on_ray=on_ray)
     runs_on = _executor(executor, jobs, ray, run, keep_models)
     ledger = Ledger(folder)
     earlier_plan = ledger.plan_file()
@@ -134,18 +131,23 @@ def _check(plan: StudyPlan, planned: Collection[PlannedCell], console: Console |
         find(cell.cell.uses).check_task(cell.cell.document)
 
 
-def _check_no_jax_options(**options: Any) -> None:
-    """Raise OptionError if an option is given that is for agents in JAX alone."""
-    for name, value in options.items():
-        if value is not None:
-            raise OptionError(
-                f"{name}={value!r}: is for agents in JAX, and no cell to run has one. Leave it "
-                'out, or use --agents jax (in a plan, "uses": "jax:PPO").'
-            )
-
-
-def _programs(plan: StudyPlan, device: str | None, lanes: int | None, *, on_ray: bool) -> Programs:
-    """The programs of a plan; on Ray each has one core of its node, and no GPU."""
+def _programs(
+    plan: StudyPlan,
+    planned: Collection[PlannedCell],
+    device: str | None,
+    lanes: int | None,
+    *,
+    on_ray: bool,
+) -> Programs | None:
+    """The programs of a plan, if any of these cells runs in one; on Ray each has one core."""
+    if not any(in_jax(cell.cell.uses) for cell in planned):
+        for name, value in (("device", device), ("lanes", lanes)):
+            if value is not None:
+                raise OptionError(
+                    f"{name}={value!r}: is for agents in JAX, and no cell to run has one. Leave it "
+                    'out, or use --agents jax (in a plan, "uses": "jax:PPO").'
+                )
+        return None
     if on_ray and device not in (None, CPU):
         raise OptionError(
             f"device={device!r}: must be cpu on Ray, where a program has one core. Leave out "
