@@ -79,9 +79,8 @@ class Envelope(StrictModel):
     folder: ClassVar[str]
     # How to write a changed or a bare document as a file, `{source}`.
     remedy: ClassVar[str] = (
-        "write the changed {content} as a new file, in Python "
-        "`sme_registry.spec.{kind}(name=…, digest={content}.digest, {content}={content})"
-        ".write(path)`"
+        "write the changed {content} as a new file, in Python `sme_registry.spec.{kind}"
+        "(name=…, digest={content}.digest, {content}={content}).write(path)`"
     )
 
     name: Name
@@ -257,11 +256,12 @@ def spec_folder() -> Path:
 
 def paths(kind: type[Envelope]) -> list[Path]:
     """The catalogue's files of one kind, in natural order (`StateDim4` before `StateDim16`)."""
-    return sorted((spec_folder() / kind.folder).glob("*.json"), key=_natural)
+    files = (spec_folder() / kind.folder).glob("*.json")
+    return sorted(files, key=lambda path: [*map(_number, re.split(r"(\d+)", path.stem))])
 
 
-def _natural(path: Path) -> list[Any]:
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.stem)]
+def _number(text: str) -> int | str:
+    return int(text) if text.isdigit() else text
 
 
 def names(kind: type[Envelope]) -> list[str]:
@@ -296,12 +296,10 @@ def find(kind: type[_E], name: str, others: Iterable[str] = ()) -> _E:
     if newest := _newest(kind, name):
         return cast(_E, _read(kind, spec_folder() / kind.folder / f"{newest}.json"))
     known = [*names(kind), *others]
-    short = [_VERSION.sub("", full) for full in known]
-    raise UnknownNameError(
-        f"{name!r}: no {kind.content} has this name."
-        + (did_you_mean(name, known) or did_you_mean(name, short))
-        + " `sme list` shows the names."
-    )
+    near = did_you_mean(name, known)
+    near = near or did_you_mean(name, [_VERSION.sub("", full) for full in known])
+    message = f"{name!r}: no {kind.content} has this name.{near} `sme list` shows the names."
+    raise UnknownNameError(message)
 
 
 def _newest(kind: type[Envelope], name: str) -> str:
@@ -463,7 +461,7 @@ def is_path(name: str) -> bool:
 
 
 def _of_name(short: str, kind: Any) -> Resolved[Any]:
-    """The document of a name; the error about an unknown one is about tasks, or about the kind."""
+    """The document of a name; an error is about tasks, or about the kind."""
     kinds = (StreamSpec,) if kind is StreamSpec else (SMESpec, StreamSpec)
     if short.startswith(("sha256:", "sha256-")):
         return _of_digest(short, kinds)
@@ -473,8 +471,8 @@ def _of_name(short: str, kind: Any) -> Resolved[Any]:
             return Resolved(document)
     for one in kinds:
         name = short.removeprefix(STREAM) if one is StreamSpec else short
-        if newest := _newest(_FILES[one], name):
-            return cast(Resolved[Any], find(_FILES[one], newest).published)
+        if _newest(_FILES[one], name):
+            return cast(Resolved[Any], find(_FILES[one], name).published)
     task = _VERSION.sub("", short).removesuffix(SYMMETRIC)
     if task != _VERSION.sub("", short):
         raise UnknownNameError(
