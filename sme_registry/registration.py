@@ -12,12 +12,23 @@ from gymnasium.envs.registration import EnvSpec
 from pettingzoo.env_registry import registration as pettingzoo
 
 from sme_registry.errors import NameTakenError, OptionError
+from sme_registry.spec import SMESpec, SpecLike, StreamLike, StreamSpec
+from sme_registry.spec.catalogue import (
+    NAMESPACE,
+    STREAM,
+    SYMMETRIC,
+    as_document,
+    file_of,
+    registered,
+    released,
+    resolve,
+    symmetric_name,
+)
 
 if TYPE_CHECKING:
     from pettingzoo import AECEnv
 
     from sme_registry.envs.team import SMETeamEnv
-    from sme_registry.spec import SMESpec, SpecLike, StreamLike, StreamSpec
 
 _S = TypeVar("_S")
 
@@ -27,20 +38,18 @@ _ENTRY_POINTS: dict[str, Any] = {
 }
 
 
-def _register(env_id: str, argument: str, document: dict[str, Any] | str) -> None:
-    from sme_registry.spec.catalogue import symmetric_name
-
-    kwargs = {argument: document}
+def _register(env_id: str, kind: str, document: dict[str, Any] | str) -> None:
+    """Register a document by an id; `kind` is "team", or its keyword, "spec" or "stream"."""
+    if kind == "team":
+        kwargs = {"spec": document}
+        pettingzoo.register("parallel", env_id, "sme_registry.teams:parallel_env", kwargs=kwargs)
+        pettingzoo.register("aec", env_id, "sme_registry.teams:env", kwargs=kwargs)
+        return
+    kwargs = {kind: document}
     gymnasium.register(env_id, **_ENTRY_POINTS, kwargs=kwargs)
     if "/sha256-" not in env_id:
         symmetric = {**kwargs, "action_range": "symmetric"}
         gymnasium.register(symmetric_name(env_id), **_ENTRY_POINTS, kwargs=symmetric)
-
-
-def _register_team(env_id: str, spec: dict[str, Any] | str) -> None:
-    kwargs = {"spec": spec}
-    pettingzoo.register("parallel", env_id, "sme_registry.teams:parallel_env", kwargs=kwargs)
-    pettingzoo.register("aec", env_id, "sme_registry.teams:env", kwargs=kwargs)
 
 
 def _is_registered(env_id: str) -> bool:
@@ -55,19 +64,13 @@ def register_catalogue() -> None:
 
     Gymnasium's `register` scans its whole registry each time: keep this to the catalogue.
     """
-    from sme_registry.spec.catalogue import NAMESPACE, STREAM, released
-
     for kind, versioned_name, content_name in released():
         version = versioned_name.rsplit("-v", 1)[1]
         names = [versioned_name, f"{content_name}-v{version}"]
         if kind == "stream":
             names.append(f"{STREAM}{versioned_name}")
         for env_id in (f"{NAMESPACE}/{name}" for name in names):
-            if _is_registered(env_id):
-                continue
-            if kind == "team":
-                _register_team(env_id, versioned_name)
-            else:
+            if not _is_registered(env_id):
                 _register(env_id, kind, versioned_name)
 
 
@@ -84,8 +87,6 @@ def register(spec: SMESpec | StreamSpec, name: str) -> str:
       >>> sme_registry.load("EveryThird").k
       3
     """
-    from sme_registry.spec import SMESpec
-    from sme_registry.spec.catalogue import NAMESPACE, SYMMETRIC, as_document, registered
     from sme_registry.task.draw import DYNAMICS_VERSION
 
     document = as_document(spec)
@@ -102,7 +103,7 @@ def register(spec: SMESpec | StreamSpec, name: str) -> str:
         )
     env_id = f"{NAMESPACE}/{short}-v{DYNAMICS_VERSION}"
     if _is_registered(env_id):
-        existing = _document_of(env_id)
+        existing = resolve(env_id).document
         if existing == document:
             return env_id
         raise NameTakenError(
@@ -110,17 +111,9 @@ def register(spec: SMESpec | StreamSpec, name: str) -> str:
             "Choose another name: a released id never changes its numbers."
         )
     registered[env_id] = document.named(env_id)
-    if isinstance(document, SMESpec) and document.team is not None:
-        _register_team(env_id, document.to_dict())
-        return env_id
-    _register(env_id, document.kind, document.to_dict())
+    kind = "team" if document.specs[0].team else document.kind
+    _register(env_id, kind, document.to_dict())
     return env_id
-
-
-def _document_of(name: str) -> SMESpec | StreamSpec:
-    from sme_registry.spec.catalogue import resolve
-
-    return resolve(name).document
 
 
 @overload
@@ -173,7 +166,6 @@ def save(
       >>> sme_registry.load(path) == spec
       True
     """
-    from sme_registry.spec.catalogue import as_document, file_of
     from sme_registry.task import materialize_together
     from sme_registry.task.loading import fingerprint_of
 
@@ -205,7 +197,6 @@ def env_spec(spec: SpecLike | StreamLike, **kwargs: Any) -> EnvSpec:
     """
     from sme_registry.envs import SMEEnv, arguments
     from sme_registry.envs.schedule import content_id
-    from sme_registry.spec import SMESpec
     from sme_registry.task import load
 
     document = load(spec)
