@@ -74,22 +74,30 @@ class RunRecord(StrictModel):
     many transitions.
 
     Attributes:
+      schema_version: version of the record's format.
       status: whether it is finished; "running" also after a kill.
       failure: why it failed.
       spec: the task; of a life in a stream that of its first phase.
+      spec_digest: the task's digest.
       stream: the stream that the agent lives in; null for a single task.
+      stream_digest: the stream's digest; empty for a single task.
       task: what the task's file calls it.
       algorithm: its name, as in `sme train`.
       hyperparameters: those that differ from the algorithm's defaults. Training sets some for
         several environments and for teams; see `models.for_lanes`.
       device: of agents in JAX: "cpu", "gpu" or "tpu".
       source: of `train:module:function`, the SHA-256 of the module's source; empty for any other.
+      seed: of training.
+      action_range: of the environment that the agent acts in.
       num_envs: environments that step together.
       agents: of a team; 1 for a single agent.
       independent: whether it is a team with one model for each agent.
       steps: requested, of the environment, over all environments.
       steps_done: at the last checkpoint, and at the end. On-policy algorithms finish their last
         rollout, so it can exceed `steps`.
+      checkpoint_every: steps between checkpoints.
+      protocol: of the final evaluation.
+      protocol_digest: the protocol's digest.
       episodes: finished ones, which episodes.csv lists.
       sessions: 1 plus the number of times the run was resumed.
       wall_seconds: over all sessions, without evaluation.

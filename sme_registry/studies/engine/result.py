@@ -109,6 +109,8 @@ class CellResult(StrictModel):
 
     Attributes:
       key: the cell's digest.
+      cell: the complete cell.
+      curve: its learning curve.
       report: its evaluation in and out of distribution, with the references; None of a life in a
         stream.
       stream_report: of a life in a stream what the agent retains, and its dynamic regret, still
@@ -119,6 +121,7 @@ class CellResult(StrictModel):
       agents_online_regret: the same of each agent of a team, by name.
       offline: of an offline cell.
       program: of a cell that uses `jax:…`.
+      timing: CPU seconds by task.
       versions: of the packages that the numbers depend on.
     """
 
