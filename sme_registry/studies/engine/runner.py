@@ -19,13 +19,7 @@ from sme_registry.spec import Cell, PlannedCell, StudyFile, StudyPlan
 from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.budget import Pace, first_places, selected, with_sources
 from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.executors import (
-    Executor,
-    InProcess,
-    OnRay,
-    Processes,
-    RunCell,
-)
+from sme_registry.studies.engine.executors import Executor, InProcess, OnRay, Processes, RunCell
 from sme_registry.studies.engine.ledger import Ledger, SavedState, StudyStatus, label, plan_status
 from sme_registry.studies.engine.programs import CPU, Job, Programs, platform_of
 from sme_registry.studies.engine.result import CellFailure, CellResult, Outcome
