@@ -475,6 +475,7 @@ def _of_name(short: str, kind: Any) -> Resolved[Any]:
             return cast(Resolved[Any], find(_FILES[one], name).published)
     task = _VERSION.sub("", short).removesuffix(SYMMETRIC)
     if task != _VERSION.sub("", short):
+        _of_name(task, kind)  # raises where it is unknown, too
         raise UnknownNameError(
             f"{short!r}: stands for environments of the task {task!r} with actions in [−1, 1], not "
             f"for a task. Use {task!r}, and action_range='symmetric' where actions are meant."
