@@ -149,9 +149,9 @@ class TaskParams(NamedTuple):
 
     @property
     def channels(self) -> jax.Array:
-        """`[A]`, all true, which XLA cannot know: it keeps the order of sums over action channels.
+        """`[A]`, all true, which XLA cannot know: a mask that keeps the bits of sums over channels.
 
-        Without it the same losses are compiled otherwise, and trained weights get other last bits.
+        Without it the same sums are compiled otherwise, and get other last bits.
         """
         return jnp.arange(self.form.action_dim) < self.action_dim
 
@@ -259,13 +259,15 @@ def cost(params: TaskParams, a: jax.Array, limits: jax.Array) -> jax.Array:
     """The cost of actions, clipped to [0, 1], under limits, `[..., A]` each: `[...]` in [0, 1]."""
     tightness = _limits(params).tightness
     excess = jnp.maximum(0.0, jnp.clip(a, 0.0, 1.0).astype(limits.dtype) - limits)
-    return excess.sum(axis=-1) / (2.0 * tightness * params.action_dim.astype(limits.dtype))
+    total = jnp.where(params.channels, excess, 0.0).sum(axis=-1)
+    return total / (2.0 * tightness * params.action_dim.astype(limits.dtype))
 
 
 def similarity(params: TaskParams, a: jax.Array, optimal: jax.Array) -> jax.Array:
     """r̃ of actions, clipped to [0, 1], and the optimal ones, `[..., A]` each: `[...]`."""
     distance = jnp.abs(jnp.clip(a, 0.0, 1.0).astype(optimal.dtype) - optimal)
-    return 1.0 - distance.sum(axis=-1) / params.action_dim.astype(optimal.dtype)
+    total = jnp.where(params.channels, distance, 0.0).sum(axis=-1)
+    return 1.0 - total / params.action_dim.astype(optimal.dtype)
 
 
 def step_reward(params: TaskParams, similarity: jax.Array) -> jax.Array:
