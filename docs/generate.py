@@ -15,7 +15,8 @@ from leaderboard.documents.result import ClassScore, Result, RunScore, Scores
 from leaderboard.documents.season import Season, SeasonClass
 from leaderboard.documents.submission import Artefact, Method, Run, Submission, Submitter, Training
 from leaderboard.errors import CODES
-from sme_registry.datasets import Behaviour, DatasetRecipe
+from sme_registry.datasets import DatasetRecipe
+from sme_registry.datasets.documents import Behaviour
 from sme_registry.io import write_atomically
 from sme_registry.spec import (
     AgentSpec,
@@ -29,7 +30,6 @@ from sme_registry.spec import (
     SMESpec,
     StreamClass,
     StreamSpec,
-    StrictModel,
     StudyAlgorithm,
     StudyPlan,
     Suite,
@@ -39,7 +39,7 @@ from sme_registry.spec import (
 )
 from sme_registry.spec.cards import symbol
 from sme_registry.spec.catalogue import entries
-from sme_registry.spec.document import WORDED, short_repr, summary
+from sme_registry.spec.document import WORDED, StrictModel, short_repr, summary
 
 FOLDER = Path(__file__).resolve().parent
 sys.path[:0] = [str(FOLDER)]

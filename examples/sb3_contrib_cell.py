@@ -21,7 +21,8 @@ import sys
 from typing import Any
 
 from sme_registry import SMEError, load
-from sme_registry.spec import Cell, EvaluationProtocol
+from sme_registry.spec import EvaluationProtocol
+from sme_registry.spec.study import Cell
 from sme_registry.studies import run_cell
 
 ALGORITHMS: dict[str, tuple[str, dict[str, Any]]] = {

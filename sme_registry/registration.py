@@ -12,7 +12,7 @@ from gymnasium.envs.registration import EnvSpec
 from pettingzoo.env_registry import registration as pettingzoo
 
 from sme_registry.errors import NameTakenError, OptionError
-from sme_registry.spec import SMESpec, SpecLike, StreamLike, StreamSpec
+from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.catalogue import (
     NAMESPACE,
     STREAM,
@@ -24,6 +24,8 @@ from sme_registry.spec.catalogue import (
     resolve,
     symmetric_name,
 )
+from sme_registry.spec.sme_spec import SpecLike
+from sme_registry.spec.stream import StreamLike
 
 if TYPE_CHECKING:
     from pettingzoo import AECEnv
@@ -166,8 +168,7 @@ def save(
       >>> sme_registry.load(path) == spec
       True
     """
-    from sme_registry.task import materialize_together
-    from sme_registry.task.loading import fingerprint_of
+    from sme_registry.task.loading import fingerprint_of, materialize_together
 
     document = as_document(spec)
     fingerprints = [fingerprint_of(task) for task in materialize_together(document.specs)]

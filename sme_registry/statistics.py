@@ -35,9 +35,6 @@ Array = npt.NDArray[np.float64]
 Statistic = Callable[[npt.ArrayLike], Array]  # of [n, …] over the first axis: […]
 
 __all__ = [
-    "DRAWS",
-    "LEVEL",
-    "Array",
     "Estimate",
     "Statistic",
     "aggregate",
@@ -47,9 +44,6 @@ __all__ = [
     "optimality_gap",
     "performance_profile",
     "probability_of_improvement",
-    "running_median",
-    "smoothed",
-    "smoothing_window",
     "stratified_bootstrap",
 ]
 

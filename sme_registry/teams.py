@@ -20,7 +20,7 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 from sme_registry.compiled.arrays import Observation
 from sme_registry.envs.team import SMETeamEnv
 from sme_registry.errors import EpisodeError, OptionError
-from sme_registry.spec import SpecLike
+from sme_registry.spec.sme_spec import SpecLike
 
 __all__ = ["SMETeamEnv", "env", "parallel_env"]
 

@@ -9,8 +9,9 @@ import pytest
 
 from sme_registry import SMESpec, evaluate, materialize
 from sme_registry.errors import OptionError, PolicyError
-from sme_registry.spec import Cell
-from sme_registry.training import RunRecord, check_hyperparameters, read_episodes, train
+from sme_registry.spec.study import Cell
+from sme_registry.training import RunRecord, read_episodes, train
+from sme_registry.training.algorithms import check_hyperparameters
 
 pytest.importorskip("stable_baselines3")
 

@@ -17,7 +17,8 @@ from leaderboard.errors import Rejection
 from sme_registry import SMESpec, load
 from sme_registry.errors import OptionError, SMEError, SpecError
 from sme_registry.io import read_json, to_json
-from sme_registry.spec import Integer, StrictModel, SuiteFile
+from sme_registry.spec import SuiteFile
+from sme_registry.spec.document import Integer, StrictModel
 from sme_registry.training import RunRecord, model_of_cell
 
 if TYPE_CHECKING:

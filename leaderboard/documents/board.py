@@ -28,17 +28,8 @@ from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, SuiteReference,
 from leaderboard.errors import BoardError
 from sme_registry.errors import SMEError, SpecError
 from sme_registry.io import parse_json
-from sme_registry.spec import (
-    Document,
-    EvaluationProtocol,
-    Integer,
-    Name,
-    SchemaVersion,
-    SMESpec,
-    StrictModel,
-    Suite,
-    SuiteFile,
-)
+from sme_registry.spec import EvaluationProtocol, SMESpec, Suite, SuiteFile
+from sme_registry.spec.document import Document, Integer, Name, SchemaVersion, StrictModel
 
 RULES: Final = 2
 """The rules of new boards."""

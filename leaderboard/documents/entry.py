@@ -23,7 +23,7 @@ from leaderboard.documents.submission import (
     SignedManifest,
 )
 from sme_registry.seasons.wire import Signer, Statement
-from sme_registry.spec import Digest, matching
+from sme_registry.spec.document import Digest, matching
 
 
 class SealedManifest(Manifest):

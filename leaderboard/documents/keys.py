@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from leaderboard.documents.secret_files import parse_secret, write_secret
 from leaderboard.errors import BoardError
 from sme_registry.io import require_packages
-from sme_registry.spec import matching
+from sme_registry.spec.document import matching
 
 if TYPE_CHECKING:
     from nacl import signing

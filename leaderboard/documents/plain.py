@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from sme_registry.spec import Document
+from sme_registry.spec.document import Document
 
 
 def plain_json(value: Any) -> bytes:

@@ -22,7 +22,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 
 from leaderboard.documents.sketch import TEXT
 from leaderboard.errors import CODES
-from sme_registry.spec import (
+from sme_registry.spec.document import (
     Digest,
     Document,
     Integer,

@@ -20,15 +20,14 @@ from pydantic import Field, field_validator, model_validator
 
 from leaderboard.documents.master import Master
 from leaderboard.documents.submission import UtcTime
-from sme_registry.spec import (
+from sme_registry.spec import EvaluationProtocol, Setting
+from sme_registry.spec.document import (
     Digest,
     Document,
-    EvaluationProtocol,
     Integer,
     Name,
     Real,
     SchemaVersion,
-    Setting,
     StrictModel,
     matching,
 )

@@ -21,7 +21,7 @@ from leaderboard.documents.plain import PlainDocument
 from leaderboard.errors import Rejection
 from sme_registry.errors import MalformedDocumentError, SpecError
 from sme_registry.io import parse_json, sha256_of, to_json
-from sme_registry.spec import (
+from sme_registry.spec.document import (
     Digest,
     Document,
     Integer,

@@ -25,7 +25,7 @@ from leaderboard.store.index import Index, IndexUnusable
 from leaderboard.store.log import EMPTY, Event, Head, Log
 from leaderboard.store.objects import Objects
 from sme_registry.io import sync_folder, temporary_beside
-from sme_registry.spec import StrictModel
+from sme_registry.spec.document import StrictModel
 
 _EPOCH = datetime.datetime.fromtimestamp(0, datetime.UTC)
 

@@ -19,7 +19,7 @@ from leaderboard.documents.reading import read_regular
 from leaderboard.errors import BoardError, TamperedError
 from sme_registry import io
 from sme_registry.errors import SMEError
-from sme_registry.spec import StrictModel
+from sme_registry.spec.document import StrictModel
 
 try:
     import fcntl

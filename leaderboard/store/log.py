@@ -22,7 +22,7 @@ from leaderboard.documents.plain import PlainDocument, plain_json
 from leaderboard.documents.submission import UtcTime, now
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.store.files import MAX_LOG_ENTRY_BYTES, read_document, write_document
-from sme_registry.spec import Digest, Integer, SchemaVersion
+from sme_registry.spec.document import Digest, Integer, SchemaVersion
 
 SealedEvent = Literal["season", "entry", "ticket", "ended", "ranked", "revealed"]
 """Of a season: announced, an entry, a ticket started, their results, the master published."""

@@ -19,7 +19,8 @@ from leaderboard.store.queue import Queue
 from leaderboard.store.rows import EntryRow
 from leaderboard.store.sealed import SealedStore
 from sme_registry.io import build_folder
-from sme_registry.spec import EvaluationProtocol, StrictModel, Suite
+from sme_registry.spec import EvaluationProtocol, Suite
+from sme_registry.spec.document import StrictModel
 
 LAST_TIME = "9999-12-31T23:59:59Z"
 _Model = TypeVar("_Model", bound=StrictModel)

@@ -36,7 +36,6 @@ from sme_registry.io import (
 from sme_registry.io.tables import Table
 from sme_registry.io.terminal import err, out, print_json
 from sme_registry.spec import (
-    Document,
     EnvFile,
     ProtocolFile,
     SMESpec,
@@ -49,6 +48,7 @@ from sme_registry.spec import (
     catalogue,
 )
 from sme_registry.spec.catalogue import Envelope, is_path, resolve
+from sme_registry.spec.document import Document
 from sme_registry.spec.study import sweep
 from sme_registry.task import load
 

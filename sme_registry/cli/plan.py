@@ -30,15 +30,9 @@ from sme_registry.io import read_json
 from sme_registry.io.system import available_cores
 from sme_registry.io.tables import Table
 from sme_registry.io.terminal import duration_range, err, out, print_json
-from sme_registry.spec import (
-    PlannedCell,
-    StudyAlgorithm,
-    StudyFile,
-    StudyPlan,
-    catalogue,
-)
+from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan, catalogue
 from sme_registry.spec.catalogue import is_path
-from sme_registry.spec.study import parse_uses
+from sme_registry.spec.study import PlannedCell, parse_uses
 from sme_registry.studies.engine.budget import (
     Estimator,
     Span,

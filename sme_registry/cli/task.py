@@ -37,9 +37,10 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
-from sme_registry.task import load, materialize_segments
+from sme_registry.task import load
 from sme_registry.task.certificate import MARKS, Certificate, short
 from sme_registry.task.certificate import certify as certify_task
+from sme_registry.task.loading import materialize_segments
 
 _MOST_AGENTS = 2**12  # the spec allows far fewer; a list of billions would fill the memory
 _NO_OPTION = ("schema_version", "team")

@@ -46,8 +46,9 @@ from sme_registry.spec import (
 from sme_registry.spec.study import INDEPENDENT
 from sme_registry.studies.engine.runner import run_study
 from sme_registry.task import load
+from sme_registry.training import algorithms
 from sme_registry.training.record import CHECKPOINT
-from sme_registry.training.run import REPORT
+from sme_registry.training.run import DEFAULT_STEPS, REPORT
 
 RUNS = 10
 """Runs on each class by default: those that a leaderboard requires for a rank."""
@@ -117,21 +118,21 @@ class Settings:
         values = changes(self.set_)
         fields = {name: value for name, value in values.items() if name in SMESpec.model_fields}
         flat = {name: value for name, value in values.items() if name not in fields}
-        settings = training.nested_hyperparameters(flat)
+        settings = algorithms.nested_hyperparameters(flat)
         path = self.hyperparameters
-        from_file = {} if path is None else training.read_hyperparameters(path)
+        from_file = {} if path is None else algorithms.read_hyperparameters(path)
         for name in settings.keys() & from_file.keys():
             raise OptionError(f"--set {name}: {path} sets it, too. Remove one.")
         return fields, {**from_file, **settings}
 
     def uses(self, document: SMESpec | StreamSpec) -> str:
         """The full name of the algorithm, by default that for such a task."""
-        algorithm = self.algorithm or training.default_algorithm(document)
-        return training.full_name(algorithm, self.agents)
+        algorithm = self.algorithm or algorithms.default_algorithm(document)
+        return algorithms.full_name(algorithm, self.agents)
 
     def folder(self, label: str, uses: str, suffix: str = "") -> Path:
         """The output folder, by default under runs."""
-        name = f"{'independent-' * self.independent}{training.folder_name(uses)}"
+        name = f"{'independent-' * self.independent}{algorithms.folder_name(uses)}"
         return self.out_folder or Path("runs") / f"{label}-{name}{suffix}"
 
 
@@ -232,7 +233,7 @@ def train(
         overrides |= {name: settings[name] for name in settings if name in StreamSpec.model_fields}
     document = changed(document, task, overrides)
     uses = options.uses(document)
-    training.check_hyperparameters(uses, settings, others=SMESpec.model_fields)
+    algorithms.check_hyperparameters(uses, settings, others=SMESpec.model_fields)
     folder = options.folder(_label(task, document, changed=bool(overrides)), uses, f"-seed{seed}")
     try:
         result = training.train(
@@ -303,7 +304,7 @@ def _train_suite(
     uses = options.uses(first)
     folder = options.folder(file.name, uses)
     algorithm = {
-        "name": training.short_name(uses),
+        "name": algorithms.short_name(uses),
         "uses": f"{INDEPENDENT}{uses}" if options.independent else uses,
         "hyperparameters": settings,
         "action_range": options.action_range,
@@ -317,7 +318,7 @@ def _train_suite(
             },
             "algorithms": [algorithm],
             "seeds": equal_runs(suite) if seeds is None else integer_in("seeds", seeds, 1),
-            "steps": training.DEFAULT_STEPS if options.steps is None else options.steps,
+            "steps": DEFAULT_STEPS if options.steps is None else options.steps,
             "evaluations": _EVALUATIONS,
             "protocol": resolve_protocol(options.protocol).to_dict(),
         },

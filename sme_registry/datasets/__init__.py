@@ -9,15 +9,8 @@ Importing this module does not import PyTorch.
 """
 
 from sme_registry.datasets.collect import collect
-from sme_registry.datasets.documents import (
-    BCHyperparameters,
-    Behaviour,
-    DatasetRecipe,
-    DatasetRecord,
-    IQLHyperparameters,
-    OfflineRecord,
-)
-from sme_registry.datasets.offline import OfflineResult, train_offline, train_sealed
+from sme_registry.datasets.documents import BCHyperparameters, DatasetRecipe, IQLHyperparameters
+from sme_registry.datasets.offline import train_offline, train_sealed
 from sme_registry.datasets.storage import (
     Dataset,
     SealedDataset,
@@ -26,7 +19,6 @@ from sme_registry.datasets.storage import (
     open_dataset,
 )
 from sme_registry.datasets.transitions import (
-    ExactReturn,
     Transitions,
     exact_return,
     positions,
@@ -37,15 +29,10 @@ from sme_registry.evaluation import OfflinePolicy
 
 __all__ = [
     "BCHyperparameters",
-    "Behaviour",
     "Dataset",
     "DatasetRecipe",
-    "DatasetRecord",
-    "ExactReturn",
     "IQLHyperparameters",
     "OfflinePolicy",
-    "OfflineRecord",
-    "OfflineResult",
     "SealedDataset",
     "Transitions",
     "collect",

@@ -29,18 +29,19 @@ from pydantic import Field, model_validator
 
 from sme_registry.errors import PolicyError, SpecError, UnknownNameError
 from sme_registry.io import choice, read_json, sha256_of
-from sme_registry.spec import (
+from sme_registry.spec import EvaluationProtocol, SMESpec
+from sme_registry.spec.document import (
     Digest,
     Document,
-    EvaluationProtocol,
     Integer,
     Real,
     SchemaVersion,
-    SMESpec,
     StrictModel,
     TupleOf,
+    check_digest,
+    plain_number,
+    short_repr,
 )
-from sme_registry.spec.document import check_digest, plain_number, short_repr
 from sme_registry.spec.sme_spec import Seed
 
 KEY = "sme"  # of the record in Minari's metadata

@@ -44,7 +44,9 @@ from sme_registry.io import (
     write_atomically,
 )
 from sme_registry.plots import reports as plot_files
-from sme_registry.spec import ProtocolLike, SMESpec, SpecLike
+from sme_registry.spec import SMESpec
+from sme_registry.spec.sme_spec import SpecLike
+from sme_registry.spec.suite import ProtocolLike
 from sme_registry.task import Task, load, materialize
 
 if TYPE_CHECKING:

@@ -60,7 +60,9 @@ from sme_registry.io import (
     versions,
     write_atomically,
 )
-from sme_registry.spec import ACTION_RANGES, ProtocolLike, SMESpec, SpecLike, catalogue
+from sme_registry.spec import SMESpec, catalogue
+from sme_registry.spec.sme_spec import ACTION_RANGES, SpecLike
+from sme_registry.spec.suite import ProtocolLike
 from sme_registry.task import load, materialize
 
 _NAMESPACE = "namespace_metadata.json"

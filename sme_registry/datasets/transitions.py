@@ -37,8 +37,10 @@ from sme_registry.evaluation.regions import expansion
 from sme_registry.evaluation.rollouts import MOST_ENVS
 from sme_registry.evaluation.rollouts import rollouts as run_rollouts
 from sme_registry.io import integer_in, number_in
-from sme_registry.spec import SMESpec, SpecLike
-from sme_registry.task import Step, Task, load_task, step
+from sme_registry.spec import SMESpec
+from sme_registry.spec.sme_spec import SpecLike
+from sme_registry.task import Task, load_task, step
+from sme_registry.task.task import Step
 
 Arrays = dict[str, npt.NDArray[Any]]
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from sme_registry.diagnosis.document import Diagnosis
 from sme_registry.diagnosis.questions import Verdict
-from sme_registry.diagnosis.stream import StreamDiagnosis, diagnose_stream
+from sme_registry.diagnosis.stream import diagnose_stream
 from sme_registry.diagnosis.subject import (
     AnySubject,
     StreamSubject,
@@ -16,19 +16,16 @@ from sme_registry.diagnosis.subject import (
     load_policy,
     load_run,
 )
-from sme_registry.diagnosis.task import TaskDiagnosis, diagnose_task
-from sme_registry.diagnosis.team import TeamDiagnosis, diagnose_team
+from sme_registry.diagnosis.task import diagnose_task
+from sme_registry.diagnosis.team import diagnose_team
 from sme_registry.errors import OptionError
 from sme_registry.io import integer_in
 
 __all__ = [
     "AnySubject",
     "Diagnosis",
-    "StreamDiagnosis",
     "StreamSubject",
     "Subject",
-    "TaskDiagnosis",
-    "TeamDiagnosis",
     "Verdict",
     "diagnose",
     "load_cell",

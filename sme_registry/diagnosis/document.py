@@ -27,8 +27,8 @@ from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.io import read_json, versions
 from sme_registry.io.markup import fixed, percent, plural
 from sme_registry.io.tables import Table
-from sme_registry.spec import Integer, Real, SMESpec, StreamSpec, StrictModel, TupleOf, catalogue
-from sme_registry.spec.document import check_digest
+from sme_registry.spec import SMESpec, StreamSpec, catalogue
+from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf, check_digest
 
 Level = Literal["solved", "better_than_linear", "worse_than_linear", "no_better_than_constant"]
 

@@ -35,8 +35,8 @@ from sme_registry.diagnosis.measurements import (
     TimeDependence,
     Violations,
 )
-from sme_registry.evaluation import Policy, SafetyReport, SafetyScore, references, regions
-from sme_registry.evaluation.regions import TOLERANCE, SafetyStats, States, Uniform
+from sme_registry.evaluation import Policy, SafetyReport, references, regions
+from sme_registry.evaluation.regions import TOLERANCE, SafetyScore, SafetyStats, States, Uniform
 from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.task import Task
 from sme_registry.task.draw import Array, gaussian, uniform

@@ -6,8 +6,9 @@ from typing import Any, Literal, Self
 
 from pydantic import SerializerFunctionWrapHandler, model_serializer
 
-from sme_registry.evaluation import ObservationReport, SafetyReport, SafetyScore
-from sme_registry.spec import Integer, Real, StrictModel, TupleOf
+from sme_registry.evaluation import ObservationReport, SafetyReport
+from sme_registry.evaluation.regions import SafetyScore
+from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf
 
 PhaseOutcome = Literal["retained", "forgotten", "not_learnt"]
 POLICY = "policy"  # the key of the diagnosed policy among the names of the references

@@ -17,7 +17,8 @@ from pydantic import JsonValue
 
 from sme_registry.diagnosis.measurements import Measurements
 from sme_registry.io.markup import environment
-from sme_registry.spec import Real, SMESpec, StrictModel, TupleOf
+from sme_registry.spec import SMESpec
+from sme_registry.spec.document import Real, StrictModel, TupleOf
 
 if TYPE_CHECKING:
     from jinja2 import Environment

@@ -40,7 +40,8 @@ from sme_registry.diagnosis.questions import (
 from sme_registry.diagnosis.subject import StreamSubject
 from sme_registry.evaluation import regions
 from sme_registry.evaluation.networks import Perceptron
-from sme_registry.spec import Digest, Real, StreamSpec, TupleOf
+from sme_registry.spec import StreamSpec
+from sme_registry.spec.document import Digest, Real, TupleOf
 
 
 class StreamDiagnosis(Diagnosis):

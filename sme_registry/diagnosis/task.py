@@ -30,7 +30,8 @@ from sme_registry.diagnosis.subject import Subject, perceptron_of
 from sme_registry.evaluation import Policy, evaluate
 from sme_registry.evaluation.references import LABELS
 from sme_registry.evaluation.report import SAFETY_REFERENCES
-from sme_registry.spec import Digest, EvaluationProtocol, SMESpec
+from sme_registry.spec import EvaluationProtocol, SMESpec
+from sme_registry.spec.document import Digest
 from sme_registry.task import Task, materialize
 
 TASK_QUESTIONS = {**WHERE, **WHY}

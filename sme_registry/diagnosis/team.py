@@ -42,7 +42,8 @@ from sme_registry.diagnosis.task import level
 from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.evaluation import Policy, TeamPolicy
 from sme_registry.io.markup import percent
-from sme_registry.spec import Digest, Integer, Real, SMESpec, StrictModel, TupleOf
+from sme_registry.spec import SMESpec
+from sme_registry.spec.document import Digest, Integer, Real, StrictModel, TupleOf
 from sme_registry.task import Task, materialize
 from sme_registry.task.draw import Array
 

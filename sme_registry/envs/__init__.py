@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
     SMEStreamVectorEnv = SMEVectorEnv
 
-__all__ = ["SMEEnv", "SMEStreamEnv", "SMEStreamVectorEnv", "SMEVectorEnv"]
+__all__ = ["SMEEnv", "SMEVectorEnv"]
 
 SMEStreamEnv = SMEEnv  # this and SMEStreamVectorEnv are names in the `EnvSpec`s that users have
 

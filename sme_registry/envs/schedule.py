@@ -31,10 +31,13 @@ from sme_registry.compiled.arrays import (
     Observation,
 )
 from sme_registry.envs import arguments
-from sme_registry.spec import SMESpec, SpecLike, StreamLike, StreamSpec
+from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.catalogue import NAMESPACE, Resolved, resolve
-from sme_registry.task import Task, materialize_segments
+from sme_registry.spec.sme_spec import SpecLike
+from sme_registry.spec.stream import StreamLike
+from sme_registry.task import Task
 from sme_registry.task.draw import DYNAMICS_VERSION
+from sme_registry.task.loading import materialize_segments
 
 _NAN = np.float64(np.nan)
 

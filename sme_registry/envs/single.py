@@ -25,8 +25,9 @@ from sme_registry.envs.batch import Distractors
 from sme_registry.envs.rendering import RENDER_MODES, RenderMixin, html_card
 from sme_registry.envs.schedule import GymnasiumMixin, Schedule
 from sme_registry.errors import EpisodeError
-from sme_registry.spec import ActionRange, SpecLike, StreamLike
 from sme_registry.spec.catalogue import title
+from sme_registry.spec.sme_spec import ActionRange, SpecLike
+from sme_registry.spec.stream import StreamLike
 from sme_registry.task import Task
 
 _FLOAT32 = np.dtype(np.float32)

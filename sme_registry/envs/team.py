@@ -31,8 +31,8 @@ from sme_registry.envs.batch import Batch
 from sme_registry.envs.rendering import RENDER_MODES, RenderMixin, html_card
 from sme_registry.envs.schedule import Schedule
 from sme_registry.errors import ActionError, EpisodeError, OptionError, did_you_mean
-from sme_registry.spec import ActionRange, SpecLike
 from sme_registry.spec.catalogue import title
+from sme_registry.spec.sme_spec import ActionRange, SpecLike
 from sme_registry.task import Task
 
 _ONLY: Indices = np.zeros(1, np.int64)

@@ -18,8 +18,10 @@ from sme_registry.envs.rendering import METADATA, Frame, batch_renderer, html_ca
 from sme_registry.envs.schedule import GymnasiumMixin, Schedule
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.io import choice, integer_in
-from sme_registry.spec import ActionRange, SMESpec, SpecLike, StreamLike
+from sme_registry.spec import SMESpec
 from sme_registry.spec.catalogue import title
+from sme_registry.spec.sme_spec import ActionRange, SpecLike
+from sme_registry.spec.stream import StreamLike
 from sme_registry.task import Task
 
 _NONE: Indices = np.empty(0, np.int64)

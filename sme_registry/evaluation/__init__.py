@@ -15,16 +15,8 @@ from sme_registry.evaluation.models import load_sb3
 from sme_registry.evaluation.networks import OfflinePolicy, Perceptron
 from sme_registry.evaluation.policies import Policy, TeamPolicy, as_policy, interface_of
 from sme_registry.evaluation.references import reference_policy
-from sme_registry.evaluation.regions import (
-    ChannelReport,
-    Invariance,
-    LayerProbe,
-    ObservationReport,
-    RegionReport,
-    SafetyReport,
-    SafetyScore,
-)
-from sme_registry.evaluation.report import AgentReport, EvaluationReport
+from sme_registry.evaluation.regions import ObservationReport, RegionReport, SafetyReport
+from sme_registry.evaluation.report import EvaluationReport
 from sme_registry.evaluation.streams import (
     StreamReport,
     across_seeds,
@@ -34,18 +26,13 @@ from sme_registry.evaluation.streams import (
 )
 
 __all__ = [
-    "AgentReport",
-    "ChannelReport",
     "EvaluationReport",
-    "Invariance",
-    "LayerProbe",
     "ObservationReport",
     "OfflinePolicy",
     "Perceptron",
     "Policy",
     "RegionReport",
     "SafetyReport",
-    "SafetyScore",
     "StreamReport",
     "TeamPolicy",
     "across_seeds",

@@ -35,11 +35,13 @@ from sme_registry.evaluation.policies import Policy, check_count, stream_policy
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import integer_in
-from sme_registry.spec import Integer, Real, StreamLike, StreamSpec, TupleOf
+from sme_registry.spec import StreamSpec
 from sme_registry.spec.catalogue import resolve
-from sme_registry.spec.document import StrictModel
-from sme_registry.task import load, materialize_segments
+from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf
+from sme_registry.spec.stream import StreamLike
+from sme_registry.task import load
 from sme_registry.task.draw import Array
+from sme_registry.task.loading import materialize_segments
 
 EPISODES = 5000
 _POINTS = 400  # of the curve; more would not be visible in a figure

@@ -47,14 +47,9 @@ from sme_registry.evaluation.regions import (
 )
 from sme_registry.evaluation.report import AgentReport, EvaluationReport
 from sme_registry.io import versions
-from sme_registry.spec import (
-    EvaluationProtocol,
-    ProtocolFile,
-    ProtocolLike,
-    SMESpec,
-    SpecLike,
-    catalogue,
-)
+from sme_registry.spec import EvaluationProtocol, ProtocolFile, SMESpec, catalogue
+from sme_registry.spec.sme_spec import SpecLike
+from sme_registry.spec.suite import ProtocolLike
 from sme_registry.task import Task, load, materialize
 from sme_registry.task.draw import Array
 

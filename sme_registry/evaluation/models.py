@@ -27,7 +27,7 @@ import numpy as np
 from sme_registry.compiled.arrays import Observation
 from sme_registry.errors import PolicyError, did_you_mean
 from sme_registry.io import import_object, require_packages
-from sme_registry.spec import ACTION_RANGES, ActionRange
+from sme_registry.spec.sme_spec import ACTION_RANGES, ActionRange
 
 Act = Callable[[Observation], Any]
 

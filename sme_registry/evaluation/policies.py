@@ -34,7 +34,8 @@ from sme_registry.evaluation.models import Interface, ModelFunctions, load_onnx,
 from sme_registry.evaluation.networks import OfflinePolicy, Perceptron
 from sme_registry.evaluation.references import POLICIES, reference_policy
 from sme_registry.io import choice, import_object
-from sme_registry.spec import ACTION_RANGES, ActionRange, SMESpec, StreamSpec
+from sme_registry.spec import SMESpec, StreamSpec
+from sme_registry.spec.sme_spec import ACTION_RANGES, ActionRange
 
 
 @dataclass(frozen=True)

@@ -42,8 +42,8 @@ from pydantic import Field
 
 from sme_registry.compiled.arrays import Observation
 from sme_registry.errors import OptionError, PolicyError
-from sme_registry.spec import EvaluationProtocol, Integer, Real, SMESpec, TupleOf
-from sme_registry.spec.document import StrictModel
+from sme_registry.spec import EvaluationProtocol, SMESpec
+from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf
 from sme_registry.task import Task
 from sme_registry.task.certificate import held_out_r2
 from sme_registry.task.draw import Array, bit_generator, to_uniform

@@ -48,10 +48,10 @@ from sme_registry.evaluation.regions import (
     region_name,
     states,
 )
-from sme_registry.spec import EvaluationProtocol, Integer, Real, SMESpec, StreamSpec, TupleOf
-from sme_registry.spec.document import StrictModel
-from sme_registry.task import materialize_together
+from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
+from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf
 from sme_registry.task.draw import Array
+from sme_registry.task.loading import materialize_together
 
 _Optional = TupleOf[Real | None]
 

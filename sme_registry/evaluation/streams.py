@@ -31,17 +31,11 @@ from sme_registry.evaluation.retention import (
     with_shells,
 )
 from sme_registry.io.tables import Table
-from sme_registry.spec import (
-    ActionRange,
-    EvaluationProtocol,
-    Integer,
-    ProtocolLike,
-    StreamLike,
-    StreamSpec,
-    TupleOf,
-    catalogue,
-)
-from sme_registry.spec.document import StrictModel
+from sme_registry.spec import EvaluationProtocol, StreamSpec, catalogue
+from sme_registry.spec.document import Integer, StrictModel, TupleOf
+from sme_registry.spec.sme_spec import ActionRange
+from sme_registry.spec.stream import StreamLike
+from sme_registry.spec.suite import ProtocolLike
 from sme_registry.statistics import (
     DRAWS,
     Array,

@@ -40,8 +40,8 @@ from sme_registry.statistics import smoothed
 from sme_registry.task import Task, draw, materialize
 from sme_registry.task.draw import Array
 from sme_registry.task.loading import parameter_bytes
-from sme_registry.training import EXPLORER, short_name
-from sme_registry.training.run import EVALUATION
+from sme_registry.training.algorithms import short_name
+from sme_registry.training.run import EVALUATION, EXPLORER
 from sme_registry.version import __version__
 
 FILE = EXPLORER

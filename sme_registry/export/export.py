@@ -29,7 +29,8 @@ from sme_registry.export.networks import (
     torch_network,
 )
 from sme_registry.io import check_writable, choice, require_packages, write_atomically
-from sme_registry.spec import ACTION_RANGES, ActionRange, SMESpec, SpecLike
+from sme_registry.spec import SMESpec
+from sme_registry.spec.sme_spec import ACTION_RANGES, ActionRange, SpecLike
 from sme_registry.task import load
 
 TOLERANCE = 1e-6

@@ -29,7 +29,7 @@ from sme_registry.errors import PolicyError
 from sme_registry.evaluation import Perceptron
 from sme_registry.evaluation.models import Interface, device_of, evaluating
 from sme_registry.io import require_packages
-from sme_registry.spec import ActionRange
+from sme_registry.spec.sme_spec import ActionRange
 
 if TYPE_CHECKING:
     import torch

@@ -23,8 +23,8 @@ from sme_registry.io import choice
 from sme_registry.jax import env
 from sme_registry.jax.env import EnvState, Info
 from sme_registry.jax.task import TaskParams, task_params
-from sme_registry.spec import ACTION_RANGES, ActionRange, SpecLike
 from sme_registry.spec.catalogue import title
+from sme_registry.spec.sme_spec import ACTION_RANGES, ActionRange, SpecLike
 from sme_registry.task import load_task
 
 Step = tuple[jax.Array, EnvState, jax.Array, jax.Array, jax.Array, Info]

@@ -36,7 +36,7 @@ from sme_registry.jax.task import (
     stacked_params,
 )
 from sme_registry.spec import SMESpec, StreamSpec
-from sme_registry.task import materialize_segments
+from sme_registry.task.loading import materialize_segments
 
 Array = npt.NDArray[Any]
 Document = SMESpec | StreamSpec

@@ -23,7 +23,7 @@ from sme_registry.jax.networks import Weights, hidden_layers
 from sme_registry.jax.ppo import PPO, PPOProgram
 from sme_registry.jax.program import PIECE, Array, Document, Evaluation, Program, StepLog
 from sme_registry.jax.td3_sac import SAC, TD3, SACProgram, TD3Program
-from sme_registry.spec import ACTION_RANGES
+from sme_registry.spec.sme_spec import ACTION_RANGES
 from sme_registry.spec.study import JAX
 
 ALGORITHMS: dict[str, tuple[Any, type[Program]]] = {

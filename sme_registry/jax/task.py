@@ -31,8 +31,9 @@ import numpy as np
 from jax import lax
 
 from sme_registry.errors import OptionError, SpecError
-from sme_registry.spec import SMESpec, SpecLike, StreamSpec
+from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.document import short_repr
+from sme_registry.spec.sme_spec import SpecLike
 from sme_registry.task import Task, load_task
 
 SUPPORTED_FIELDS = frozenset(

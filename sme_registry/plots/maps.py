@@ -17,7 +17,8 @@ from sme_registry.evaluation.retention import Retention
 from sme_registry.evaluation.streams import check_same_stream
 from sme_registry.io import integer_in, number_in
 from sme_registry.plots.style import canvas, figure_of, read_reports
-from sme_registry.spec import ActionRange, SMESpec, SpecLike, catalogue
+from sme_registry.spec import SMESpec, catalogue
+from sme_registry.spec.sme_spec import ActionRange, SpecLike
 from sme_registry.statistics import iqm
 from sme_registry.task import load, materialize
 from sme_registry.task.draw import Array

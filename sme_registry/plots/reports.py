@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 import numpy as np
 
 from sme_registry.errors import OptionError
-from sme_registry.evaluation import EvaluationReport, SafetyReport, SafetyScore, StreamReport
+from sme_registry.evaluation import EvaluationReport, SafetyReport, StreamReport
 from sme_registry.evaluation.references import LABELS
+from sme_registry.evaluation.regions import SafetyScore
 from sme_registry.evaluation.report import SAFETY_REFERENCES
 from sme_registry.evaluation.streams import Visit
 from sme_registry.plots.curves import (

@@ -18,7 +18,7 @@ from sme_registry.io import require_packages
 try:
     from sme_registry.sb3 import safety
     from sme_registry.sb3.safety import PPOLagrangian, PPOProjection
-    from sme_registry.sb3.vec_env import LanesVecEnv, RegretCallback, SMETeamVecEnv, SMEVecEnv
+    from sme_registry.sb3.vec_env import RegretCallback, SMETeamVecEnv, SMEVecEnv
 except ImportError:
     require_packages("sme_registry.sb3", {"stable_baselines3": "Stable-Baselines3"}, "train")
     raise
@@ -26,7 +26,6 @@ except ImportError:
 sys.modules["sme_registry.sb3.ppo_projection"] = safety  # where older models look for their policy
 
 __all__ = [
-    "LanesVecEnv",
     "PPOLagrangian",
     "PPOProjection",
     "RegretCallback",

@@ -26,8 +26,10 @@ from sme_registry.envs.vector import EnvView
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.io import integer_in
 from sme_registry.registration import registered_or_new
-from sme_registry.spec import ActionRange, SMESpec, SpecLike, StreamLike, StreamSpec
+from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.catalogue import title
+from sme_registry.spec.sme_spec import ActionRange, SpecLike
+from sme_registry.spec.stream import StreamLike
 
 StepResult: TypeAlias = tuple[Observation, npt.NDArray[np.float32], Mask, list[dict[str, Any]]]
 """Observations, rewards, dones and infos."""

@@ -54,7 +54,8 @@ from sme_registry.seasons.wire import (
     ticket_path,
     unpack_table,
 )
-from sme_registry.spec import Setting, SMESpec, StrictModel
+from sme_registry.spec import Setting, SMESpec
+from sme_registry.spec.document import StrictModel
 
 PATIENCE = 900.0
 _FIRST_PATIENCE = 5.0  # a mistyped URL shall not wait for a server that does not exist

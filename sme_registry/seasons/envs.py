@@ -14,7 +14,7 @@ from sme_registry.envs import arguments
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.seasons.client import PATIENCE, Instance, TicketLike
 from sme_registry.seasons.wire import Float32
-from sme_registry.spec import ActionRange
+from sme_registry.spec.sme_spec import ActionRange
 
 
 class SealedVectorEnv(VectorEnv[Observation, Array, Array]):

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 
 from sme_registry.compiled.arrays import Observation
-from sme_registry.sb3 import LanesVecEnv
-from sme_registry.sb3.vec_env import StepResult
+from sme_registry.sb3.vec_env import LanesVecEnv, StepResult
 from sme_registry.seasons.client import PATIENCE, Instance, TicketLike
 from sme_registry.seasons.envs import SealedVectorEnv
-from sme_registry.spec import ActionRange
+from sme_registry.spec.sme_spec import ActionRange
 
 
 class SealedVecEnv(LanesVecEnv):

@@ -53,12 +53,12 @@ from sme_registry.compiled.arrays import Mask, Observation
 from sme_registry.errors import ActionError, OptionError, WireError
 from sme_registry.io import integer_in, read_json, require_packages, to_json
 from sme_registry.io.files import atomic_file, unwritable
-from sme_registry.spec import (
+from sme_registry.spec import Setting
+from sme_registry.spec.document import (
     Digest,
     Document,
     Integer,
     Name,
-    Setting,
     StrictModel,
     TupleOf,
     matching,

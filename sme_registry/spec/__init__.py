@@ -1,70 +1,32 @@
 """Documents: specs, suites, protocols and plans, frozen and hashed, and their files."""
 
-from sme_registry.spec.catalogue import (
-    EnvFile,
-    Fingerprint,
-    ProtocolFile,
-    StreamFile,
-    StudyFile,
-    SuiteFile,
-)
-from sme_registry.spec.document import (
-    Digest,
-    Document,
-    Integer,
-    Name,
-    Real,
-    SchemaVersion,
-    StrictModel,
-    TupleOf,
-    matching,
-)
+from sme_registry.spec.catalogue import EnvFile, ProtocolFile, StreamFile, StudyFile, SuiteFile
 from sme_registry.spec.sme_spec import (
-    ACTION_RANGES,
-    ActionRange,
     AgentSpec,
     ObservationSpec,
     SafetySpec,
-    Segment,
     Setting,
     SMESpec,
-    SpecLike,
     TeamSpec,
 )
-from sme_registry.spec.stream import Drift, Phase, StreamLike, StreamSpec
-from sme_registry.spec.study import Cell, PlannedCell, StudyAlgorithm, StudyPlan
-from sme_registry.spec.suite import EvaluationProtocol, ProtocolLike, StreamClass, Suite, SuiteClass
+from sme_registry.spec.stream import Drift, Phase, StreamSpec
+from sme_registry.spec.study import StudyAlgorithm, StudyPlan
+from sme_registry.spec.suite import EvaluationProtocol, StreamClass, Suite, SuiteClass
 
 __all__ = [
-    "ACTION_RANGES",
-    "ActionRange",
     "AgentSpec",
-    "Cell",
-    "Digest",
-    "Document",
     "Drift",
     "EnvFile",
     "EvaluationProtocol",
-    "Fingerprint",
-    "Integer",
-    "Name",
     "ObservationSpec",
     "Phase",
-    "PlannedCell",
     "ProtocolFile",
-    "ProtocolLike",
-    "Real",
     "SMESpec",
     "SafetySpec",
-    "SchemaVersion",
-    "Segment",
     "Setting",
-    "SpecLike",
     "StreamClass",
     "StreamFile",
-    "StreamLike",
     "StreamSpec",
-    "StrictModel",
     "StudyAlgorithm",
     "StudyFile",
     "StudyPlan",
@@ -72,6 +34,4 @@ __all__ = [
     "SuiteClass",
     "SuiteFile",
     "TeamSpec",
-    "TupleOf",
-    "matching",
 ]

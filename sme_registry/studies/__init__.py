@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sme_registry.spec.study import sweep
     from sme_registry.studies.engine.cell import run_cell
-    from sme_registry.studies.engine.ledger import CellStatus, StudyStatus, study_status
+    from sme_registry.studies.engine.ledger import CellStatus, study_status
     from sme_registry.studies.engine.result import CellResult
     from sme_registry.studies.engine.runner import run_study
     from sme_registry.studies.report.frames import StreamFrames, StudyFrames, load, load_streams
@@ -27,7 +27,6 @@ __all__ = [
     "CellStatus",
     "StreamFrames",
     "StudyFrames",
-    "StudyStatus",
     "compare",
     "load",
     "load_streams",
@@ -44,7 +43,6 @@ _LAZY = {
     "CellStatus": "studies.engine.ledger",
     "StreamFrames": "studies.report.frames",
     "StudyFrames": "studies.report.frames",
-    "StudyStatus": "studies.engine.ledger",
     "compare": "studies.report.write",
     "load": "studies.report.frames",
     "load_streams": "studies.report.frames",

@@ -18,9 +18,10 @@ from typing import Any, TypeVar, overload
 import numpy as np
 
 from sme_registry.errors import FingerprintMismatchError, OptionError, ResourceLimitError
-from sme_registry.spec import Fingerprint, SMESpec, SpecLike, StreamSpec
-from sme_registry.spec.catalogue import as_document, resolve
+from sme_registry.spec import SMESpec, StreamSpec
+from sme_registry.spec.catalogue import Fingerprint, as_document, resolve
 from sme_registry.spec.document import NamedDocument
+from sme_registry.spec.sme_spec import SpecLike
 from sme_registry.task import draw
 from sme_registry.task.task import Task
 
@@ -100,12 +101,6 @@ def materialize_segments(
 
     With `fingerprints`, of the spec or of each phase's, other numbers are a
     `FingerprintMismatchError`.
-
-    Examples:
-      >>> from sme_registry.task import load, materialize_segments
-      >>> tasks = materialize_segments(load("Switch5"))
-      >>> len(tasks)
-      5
     """
     tasks = materialize_together([segment.spec for segment in document.segments])
     drawn = {task.spec: task for task in tasks}
@@ -116,15 +111,7 @@ def materialize_segments(
 
 
 def materialize_together(specs: Sequence[SMESpec]) -> tuple[Task, ...]:
-    """Draw the tasks of some specs, all of which must fit in memory; equal specs share one.
-
-    Examples:
-      >>> from sme_registry import SMESpec
-      >>> from sme_registry.task import materialize_together
-      >>> first, again = materialize_together([SMESpec(seed=1), SMESpec(seed=1)])
-      >>> first is again
-      True
-    """
+    """Draw the tasks of some specs, all of which must fit in memory; equal specs share one."""
     different = dict.fromkeys(specs)
     if len(different) > 1:
         check_memory(

@@ -8,36 +8,16 @@ Importing this module imports neither PyTorch nor JAX.
 """
 
 from sme_registry.envs.episodes import Episode
-from sme_registry.training.algorithms import (
-    ALGORITHMS,
-    check_hyperparameters,
-    default_algorithm,
-    folder_name,
-    full_name,
-    nested_hyperparameters,
-    read_hyperparameters,
-    short_name,
-)
 from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.record import RunRecord, model_of_cell, read_episodes
-from sme_registry.training.run import DEFAULT_STEPS, EXPLORER, TrainingResult, train
+from sme_registry.training.run import TrainingResult, train
 
 __all__ = [
-    "ALGORITHMS",
-    "DEFAULT_STEPS",
-    "EXPLORER",
     "Episode",
     "RunRecord",
     "TrainingResult",
-    "check_hyperparameters",
-    "default_algorithm",
-    "folder_name",
-    "full_name",
     "model_of_cell",
-    "nested_hyperparameters",
     "numpy_policy",
     "read_episodes",
-    "read_hyperparameters",
-    "short_name",
     "train",
 ]

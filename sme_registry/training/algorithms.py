@@ -167,13 +167,7 @@ def find(uses: str, field: str = "uses") -> Entry:
 
 
 def default_algorithm(document: SMESpec | StreamSpec) -> str:
-    """The algorithm used by default: TD3, and PPO for a team.
-
-    Examples:
-      >>> from sme_registry.training import default_algorithm
-      >>> default_algorithm(sme_registry.load("Team4"))
-      'PPO'
-    """
+    """The algorithm used by default: TD3, and PPO for a team."""
     return "TD3" if document.specs[0].team is None else "PPO"
 
 
@@ -181,11 +175,6 @@ def full_name(uses: str, agents: str | None = None) -> str:
     """The exact name of an algorithm in any case; the names of others' algorithms unchanged.
 
     `agents` is whose implementation, "sb3" or "jax"; None for the one that the name says.
-
-    Examples:
-      >>> from sme_registry.training import full_name
-      >>> full_name("ppo", agents="jax")
-      'jax:PPO'
     """
     if agents is not None and choice("agents", agents, AGENTS) == "sb3" and in_jax(uses):
         raise OptionError(
@@ -196,24 +185,12 @@ def full_name(uses: str, agents: str | None = None) -> str:
 
 
 def short_name(uses: str) -> str:
-    """What figures and reports call an algorithm: `TQC` for `sb3_contrib:TQC`.
-
-    Examples:
-      >>> from sme_registry.training import short_name
-      >>> short_name("sb3_contrib:TQC")
-      'TQC'
-    """
+    """What figures and reports call an algorithm: `TQC` for `sb3_contrib:TQC`."""
     return uses.rpartition(":")[2]
 
 
 def folder_name(uses: str) -> str:
-    """What default folders call an algorithm: its short name, and `jax-PPO` for `jax:PPO`.
-
-    Examples:
-      >>> from sme_registry.training import folder_name
-      >>> folder_name("jax:PPO")
-      'jax-PPO'
-    """
+    """What default folders call an algorithm: its short name, and `jax-PPO` for `jax:PPO`."""
     return f"{'jax-' * in_jax(uses)}{short_name(uses)}"
 
 
@@ -338,13 +315,7 @@ def default_num_envs(spec: SMESpec, algorithm: Any) -> int:
 
 
 def nested_hyperparameters(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Hyperparameters whose dotted names are resolved: `policy_kwargs.net_arch` is in a dict.
-
-    Examples:
-      >>> from sme_registry.training import nested_hyperparameters
-      >>> nested_hyperparameters({"policy_kwargs.net_arch": [64, 64], "gamma": 0.9})
-      {'policy_kwargs': {'net_arch': [64, 64]}, 'gamma': 0.9}
-    """
+    """Hyperparameters whose dotted names are resolved: `policy_kwargs.net_arch` is in a dict."""
     nested: dict[str, Any] = {}
     for name, value in flat.items():
         *parents, last = name.split(".")
@@ -361,15 +332,7 @@ def nested_hyperparameters(flat: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_hyperparameters(path: Path) -> dict[str, Any]:
-    """The hyperparameters in a JSON file: an object of names and values.
-
-    Examples:
-      >>> from pathlib import Path
-      >>> from sme_registry.training import read_hyperparameters
-      >>> _ = Path("ppo.json").write_text('{"n_steps": 256}')
-      >>> read_hyperparameters(Path("ppo.json"))
-      {'n_steps': 256}
-    """
+    """The hyperparameters in a JSON file: an object of names and values."""
     values = read_json(path)
     if not isinstance(values, dict):
         raise OptionError(
@@ -389,13 +352,6 @@ def check_hyperparameters(
 
     Names are those of the constructor or function, and in `policy_kwargs` those of the policy's
     constructor. Messages call them `field`, and may suggest one of `others`, which the caller has.
-
-    Examples:
-      >>> from sme_registry.training import check_hyperparameters
-      >>> check_hyperparameters("PPO", {"learning_rat": 1e-4})
-      Traceback (most recent call last):
-      ...
-      sme_registry.errors.OptionError: hyperparameters.learning_rat: PPO has no such ...
     """
     if not hyperparameters:
         return

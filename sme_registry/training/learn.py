@@ -34,7 +34,8 @@ from sme_registry.evaluation.models import saved_sb3
 from sme_registry.io import write_atomically
 from sme_registry.io.system import defer_interrupts, working_directory_importable
 from sme_registry.io.terminal import Progress
-from sme_registry.spec import ActionRange, SMESpec
+from sme_registry.spec import SMESpec
+from sme_registry.spec.sme_spec import ActionRange
 from sme_registry.training.algorithms import load_function, short_name
 from sme_registry.training.record import (
     CHECKPOINT,

@@ -32,8 +32,7 @@ from sme_registry.envs.episodes import Episode, Episodes
 from sme_registry.errors import OptionError
 from sme_registry.evaluation.models import saved_sb3
 from sme_registry.io import is_installed, read_arrays, write_arrays, write_atomically
-from sme_registry.sb3 import LanesVecEnv
-from sme_registry.sb3.vec_env import log_episode
+from sme_registry.sb3.vec_env import LanesVecEnv, log_episode
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.study import parse_uses
 from sme_registry.task import materialize

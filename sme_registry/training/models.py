@@ -42,7 +42,8 @@ from sme_registry.evaluation.models import saved_sb3, torch_policy
 from sme_registry.io import import_object, is_installed, write_atomically
 from sme_registry.sb3 import SMETeamVecEnv, SMEVecEnv
 from sme_registry.sb3.vec_env import SingleVecEnv, finished_in, log_episode
-from sme_registry.spec import ActionRange, SMESpec, StreamSpec
+from sme_registry.spec import SMESpec, StreamSpec
+from sme_registry.spec.sme_spec import ActionRange
 from sme_registry.spec.study import parse_uses
 from sme_registry.training.algorithms import (
     check_names,

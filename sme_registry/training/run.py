@@ -49,18 +49,13 @@ from sme_registry.io import (
 from sme_registry.io.terminal import Progress
 from sme_registry.plots import reports as plot_files
 from sme_registry.plots.maps import STREAM
-from sme_registry.spec import (
-    ACTION_RANGES,
-    ActionRange,
-    ProtocolLike,
-    SMESpec,
-    SpecLike,
-    StreamLike,
-    StreamSpec,
-    catalogue,
-)
+from sme_registry.spec import SMESpec, StreamSpec, catalogue
+from sme_registry.spec.sme_spec import ACTION_RANGES, ActionRange, SpecLike
+from sme_registry.spec.stream import StreamLike
 from sme_registry.spec.study import INDEPENDENT, parse_uses
-from sme_registry.task import load, materialize_segments
+from sme_registry.spec.suite import ProtocolLike
+from sme_registry.task import load
+from sme_registry.task.loading import materialize_segments
 from sme_registry.training.algorithms import (
     Entry,
     default_algorithm,

@@ -11,7 +11,8 @@ from pydantic import BaseModel
 
 import leaderboard
 import sme_registry
-from sme_registry.spec import Real, StrictModel, StudyFile, catalogue
+from sme_registry.spec import StudyFile, catalogue
+from sme_registry.spec.document import Real, StrictModel
 from tests.vocabulary import QUANTITIES, SYNONYMS
 
 

@@ -11,7 +11,6 @@ from sme_registry import EvaluationReport, SMESpec, materialize, save
 from sme_registry.datasets import (
     DatasetRecipe,
     OfflinePolicy,
-    OfflineRecord,
     SealedDataset,
     Transitions,
     collect,
@@ -19,6 +18,7 @@ from sme_registry.datasets import (
     train_offline,
     train_sealed,
 )
+from sme_registry.datasets.documents import OfflineRecord
 from sme_registry.errors import (
     DigestMismatchError,
     MissingDependencyError,

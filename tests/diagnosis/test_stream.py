@@ -8,20 +8,14 @@ import numpy as np
 import pytest
 
 from sme_registry import SMESpec, StreamSpec
-from sme_registry.diagnosis import (
-    StreamDiagnosis,
-    StreamSubject,
-    diagnose,
-    load_cell,
-    load_policy,
-    load_run,
-)
+from sme_registry.diagnosis import StreamSubject, diagnose, load_cell, load_policy, load_run
 from sme_registry.diagnosis.behaviour import network_state
 from sme_registry.diagnosis.measurements import NetworkState, PhaseDiagnosis, VisitDiagnosis
 from sme_registry.diagnosis.questions import OPEN_REASONS, answer_all
 from sme_registry.diagnosis.stream import (
     STREAM_QUESTIONS,
     StreamCase,
+    StreamDiagnosis,
     outcome_of,
 )
 from sme_registry.errors import OptionError, UnknownNameError

@@ -6,17 +6,10 @@ import numpy as np
 import pytest
 
 from sme_registry import SMESpec, evaluate, load
-from sme_registry.diagnosis import (
-    Diagnosis,
-    TeamDiagnosis,
-    diagnose,
-    load_cell,
-    load_policy,
-    load_run,
-)
+from sme_registry.diagnosis import Diagnosis, diagnose, load_cell, load_policy, load_run
 from sme_registry.diagnosis.measurements import LINEAR, POLICY
 from sme_registry.diagnosis.questions import answer_all
-from sme_registry.diagnosis.team import TEAM_QUESTIONS, TeamCase
+from sme_registry.diagnosis.team import TEAM_QUESTIONS, TeamCase, TeamDiagnosis
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.spec import StudyFile, StudyPlan

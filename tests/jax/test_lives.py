@@ -20,7 +20,8 @@ from sme_registry.jax.ppo import PPO, PPOProgram
 from sme_registry.jax.program import Lives, StepLog
 from sme_registry.jax.td3_sac import TD3, TD3Program
 from sme_registry.spec import StreamSpec
-from sme_registry.task import materialize_segments, observe, step
+from sme_registry.task import observe, step
+from sme_registry.task.loading import materialize_segments
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 

@@ -15,7 +15,8 @@ from leaderboard.public_view import PublicView, public_view
 from sme_registry.errors import SpecError
 from tests.leaderboard.web.site import boards
 
-SHARED = "sme_registry.io"  # private to the two packages: its modules are imported by name
+# Private to the two packages: their modules are imported by name.
+SHARED = ("sme_registry.io.", "sme_registry.spec.")
 PROTOCOL = "sme_registry.seasons.wire"  # what servers and clients send each other
 
 
@@ -31,7 +32,7 @@ def private_imports(source):
             module = importlib.import_module(node.module)
             public = {*getattr(module, "__all__", dir(module)), *submodules(module)}
             top_level = node.module.count(".") < 2 or node.module == PROTOCOL
-            top_level |= node.module.startswith(f"{SHARED}.")
+            top_level |= node.module.startswith(SHARED)
             private += [
                 f"{node.module}.{alias.name}"
                 for alias in node.names

@@ -14,15 +14,8 @@ from sme_registry.errors import (
     OptionError,
     SpecError,
 )
-from sme_registry.spec import (
-    EnvFile,
-    Fingerprint,
-    ProtocolFile,
-    SMESpec,
-    StudyFile,
-    SuiteFile,
-    catalogue,
-)
+from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, StudyFile, SuiteFile, catalogue
+from sme_registry.spec.catalogue import Fingerprint
 from sme_registry.task import load, load_task, materialize
 from sme_registry.task.loading import _draw_cached, check_fingerprint, fingerprint_of
 from tests.strategies import specs

@@ -15,17 +15,9 @@ import sme_registry
 from sme_registry import load
 from sme_registry.cli.arguments import sweep_axes
 from sme_registry.errors import MalformedDocumentError, SMEError, SpecError, UnknownNameError
-from sme_registry.spec import (
-    EnvFile,
-    Integer,
-    SMESpec,
-    StreamFile,
-    StrictModel,
-    SuiteFile,
-    catalogue,
-)
+from sme_registry.spec import EnvFile, SMESpec, StreamFile, SuiteFile, catalogue
 from sme_registry.spec.catalogue import resolve
-from sme_registry.spec.document import summary
+from sme_registry.spec.document import Integer, StrictModel, summary
 from sme_registry.spec.study import sweep
 
 DEFAULT = catalogue.find(EnvFile, "Default-v1")

@@ -24,7 +24,8 @@ from sme_registry.errors import (
 )
 from sme_registry.spec import SMESpec, StreamFile, StreamSpec, catalogue
 from sme_registry.spec.sme_spec import NEVER
-from sme_registry.task import materialize, materialize_segments
+from sme_registry.task import materialize
+from sme_registry.task.loading import materialize_segments
 
 SMALL = {"state_dim": 4, "action_dim": 2}
 DRIFT = {"rotation": 1.0, "increments": 4}

@@ -9,7 +9,8 @@ import pytest
 
 from sme_registry import SMESpec, save
 from sme_registry.errors import OptionError, PolicyError, SpecError
-from sme_registry.spec import Cell, StudyFile, StudyPlan
+from sme_registry.spec import StudyFile, StudyPlan
+from sme_registry.spec.study import Cell
 from sme_registry.studies import load as load_frames
 from sme_registry.studies import run_study, study_status
 from sme_registry.studies.engine.cell import run_cell

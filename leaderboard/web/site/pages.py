@@ -36,7 +36,7 @@ from leaderboard.web.site.rows import SHORT, TABS
 from leaderboard.web.site.seasons import season_page
 from sme_registry import SMESpec
 from sme_registry.io import to_json
-from sme_registry.spec import StrictModel
+from sme_registry.spec.document import StrictModel
 
 STATIC = Path(__file__).parent / "static"
 LOG_ROWS = 200  # entries on a page of the log; a full page never changes again

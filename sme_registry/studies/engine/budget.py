@@ -28,8 +28,8 @@ from typing import Any, NamedTuple, cast
 
 from sme_registry.errors import OptionError, SMEError, UnknownNameError, did_you_mean
 from sme_registry.io import choice
-from sme_registry.spec import Cell, PlannedCell, StudyAlgorithm, StudyFile, StudyPlan
-from sme_registry.spec.study import JAX, in_jax, parse_uses
+from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan
+from sme_registry.spec.study import JAX, Cell, PlannedCell, in_jax, parse_uses
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.training.algorithms import (
     AGENTS,

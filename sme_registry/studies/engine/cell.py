@@ -40,7 +40,8 @@ from sme_registry.studies.engine.result import (
     Timing,
     life_report,
 )
-from sme_registry.task import materialize, materialize_segments
+from sme_registry.task import materialize
+from sme_registry.task.loading import materialize_segments
 from sme_registry.training.algorithms import Entry, check_hyperparameters, find, one_thread, quiet
 from sme_registry.training.learn import FunctionLearner, Watch
 from sme_registry.training.record import Snapshots

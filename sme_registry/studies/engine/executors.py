@@ -35,7 +35,7 @@ from sme_registry.io.system import (
     defer_interrupts,
     end_with_parent,
 )
-from sme_registry.spec import Cell
+from sme_registry.spec.study import Cell
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.programs import CPU, Job, Report, run_program
 from sme_registry.studies.engine.result import CellResult, Outcome, failed

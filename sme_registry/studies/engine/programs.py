@@ -37,8 +37,7 @@ from sme_registry.evaluation.models import saved_sb3
 from sme_registry.evaluation.rollouts import start_states
 from sme_registry.io import Arrays, to_json
 from sme_registry.io.system import available_cores, child_environment, end_with_parent
-from sme_registry.spec import Cell
-from sme_registry.spec.study import in_jax
+from sme_registry.spec.study import Cell, in_jax
 from sme_registry.studies.engine.ledger import read_header, read_state, write_state
 from sme_registry.studies.engine.result import (
     EVALUATION,

@@ -25,9 +25,15 @@ from sme_registry.evaluation import EvaluationReport, StreamReport, evaluate_str
 from sme_registry.evaluation.dynamic_regret import DynamicRegret, RegretBlocks, reference_regret
 from sme_registry.evaluation.policies import stream_policy
 from sme_registry.io import Arrays
-from sme_registry.spec import Cell, Digest, Integer, Real, SchemaVersion, StrictModel
-from sme_registry.spec.document import without_empty
-from sme_registry.spec.study import parse_uses
+from sme_registry.spec.document import (
+    Digest,
+    Integer,
+    Real,
+    SchemaVersion,
+    StrictModel,
+    without_empty,
+)
+from sme_registry.spec.study import Cell, parse_uses
 from sme_registry.training.record import versions_for
 
 _Numbers = Annotated[tuple[Real, ...], Field(strict=False)]

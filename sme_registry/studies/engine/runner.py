@@ -15,8 +15,8 @@ from rich.markup import escape
 from sme_registry.errors import OptionError, ResourceLimitError, UnknownNameError
 from sme_registry.io import Lock, integer_in
 from sme_registry.io.terminal import Progress, duration
-from sme_registry.spec import Cell, PlannedCell, StudyFile, StudyPlan
-from sme_registry.spec.study import in_jax
+from sme_registry.spec import StudyFile, StudyPlan
+from sme_registry.spec.study import Cell, PlannedCell, in_jax
 from sme_registry.studies.engine.budget import Pace, first_places, selected, with_sources
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.executors import Executor, InProcess, OnRay, Processes, RunCell

@@ -21,7 +21,8 @@ import pandas as pd
 from sme_registry import statistics
 from sme_registry.evaluation import retention
 from sme_registry.evaluation.dynamic_regret import DynamicRegret
-from sme_registry.spec import PlannedCell, StudyFile, StudyPlan
+from sme_registry.spec import StudyFile, StudyPlan
+from sme_registry.spec.study import PlannedCell
 from sme_registry.statistics import Array, Statistic
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.report.classes import ALL, ClassInfo, Group, StreamInfo

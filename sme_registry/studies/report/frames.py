@@ -122,7 +122,8 @@ import pandas as pd
 
 from sme_registry.evaluation import EvaluationReport, StreamReport
 from sme_registry.evaluation.retention import BY_VISIT, METRICS, StreamRegion
-from sme_registry.spec import PlannedCell, StudyPlan
+from sme_registry.spec import StudyPlan
+from sme_registry.spec.study import PlannedCell
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellResult
 

@@ -20,7 +20,7 @@ from leaderboard.documents.submission import (
 )
 from leaderboard.errors import Rejection
 from leaderboard.store import LogEntry
-from sme_registry.spec import Document
+from sme_registry.spec.document import Document
 from tests.leaderboard.conftest import tiny_submission
 
 KEY, BOARD = SigningKey.generate(), "a" * 64

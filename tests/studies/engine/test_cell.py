@@ -16,7 +16,8 @@ from sme_registry.errors import (
     SpecError,
     UnknownNameError,
 )
-from sme_registry.spec import Cell, EvaluationProtocol
+from sme_registry.spec import EvaluationProtocol
+from sme_registry.spec.study import Cell
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.task import materialize

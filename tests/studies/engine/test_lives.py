@@ -10,7 +10,8 @@ from rich.console import Console
 from sme_registry import SMESpec, StreamSpec, materialize
 from sme_registry.errors import PolicyError, SMEError, SpecError
 from sme_registry.evaluation import evaluate_stream, expected_regret
-from sme_registry.spec import Cell, StudyFile, StudyPlan
+from sme_registry.spec import StudyFile, StudyPlan
+from sme_registry.spec.study import Cell
 from sme_registry.studies.engine import programs
 from sme_registry.studies.engine.budget import Estimator
 from sme_registry.studies.engine.cell import run_cell
