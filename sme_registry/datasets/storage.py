@@ -39,7 +39,7 @@ from sme_registry.datasets.minari_format import (
     require_minari,
     to_hdf5,
 )
-from sme_registry.datasets.transitions import Arrays, Columns, Transitions
+from sme_registry.datasets.transitions import AlignedArrays, Arrays, Transitions
 from sme_registry.errors import (
     DigestMismatchError,
     MalformedDocumentError,
@@ -106,7 +106,7 @@ class Dataset:
 
 
 @dataclass(frozen=True, eq=False)
-class SealedDataset(Columns):
+class SealedDataset(AlignedArrays):
     """What entrants of a season get of a data set: aligned arrays, and nothing that tells its task.
 
     The columns are those of `Transitions`. `truncations` `[N]` are true where an episode ended at

@@ -51,7 +51,7 @@ _ROUNDED = 1e-6
 _CONFIDENCE = 0.95
 
 
-class Columns:
+class AlignedArrays:
     """A base of dataclasses of aligned arrays, of which some may be None."""
 
     def columns(self) -> dict[str, npt.NDArray[Any]]:
@@ -74,7 +74,7 @@ class Columns:
 
 
 @dataclass(frozen=True, eq=False)
-class Transitions(Columns):
+class Transitions(AlignedArrays):
     """Aligned arrays of a data set; every first axis is N.
 
     A trajectory is an episode or a part of one: a data set restricted to a sub-cube of the states,
@@ -231,7 +231,9 @@ def _expected(
     for which, time in (("", t), ("next_", t + 1)):
         seen = task.seen(columns[f"{which}states"], columns.get(f"{which}distractors"))
         seen = np.concatenate([seen, (time / spec.horizon)[:, None]], axis=1).astype(np.float32)
-        expected[f"{which}observations"] = seen, _ROUNDED if task.mixing else 0.0
+        of_seen = np.full(seen.shape[1], _ROUNDED if task.mixing else 0.0)
+        of_seen[-1] = 0.0  # of t/T, which no mixing touches
+        expected[f"{which}observations"] = seen, of_seen
     if spec.safety is not None:
         limit = task.limit(s)
         safe_reward = task.safe_reward_of(optimal, limit)[:, None]

@@ -315,3 +315,12 @@ def test_replay_detects_a_change_in_any_array_and_row(driven, row):
     shifted = dataclasses.replace(data, actions=np.roll(data.actions, 1, axis=0))
     with pytest.raises(FingerprintMismatchError, match="row 0"):
         replay(shifted, of, task)
+
+
+def test_replay_compares_the_time_beside_a_mixing_to_the_bit(driven):
+    of, data, task = driven
+    assert task.mixing
+    observations = data.observations.copy()
+    observations[0, -2] = np.nextafter(observations[0, -2], np.float32(1))
+    with pytest.raises(FingerprintMismatchError, match="observations, row 0"):
+        replay(dataclasses.replace(data, observations=observations), of, task)
