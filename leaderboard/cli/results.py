@@ -13,7 +13,7 @@ from leaderboard.cli.options import BoardFolder, BoardOrUrl, Json, is_url, open_
 from leaderboard.documents.result import Metric
 from leaderboard.errors import BoardError
 from sme_registry.errors import OptionError
-from sme_registry.io.tables import Table
+from sme_registry.io.markup import Table
 from sme_registry.io.terminal import Progress, err, fixed, out, print_json, print_pairs
 
 if TYPE_CHECKING:

@@ -16,8 +16,7 @@ from leaderboard.documents.season import Reveal
 from leaderboard.errors import Rejection
 from sme_registry.errors import OptionError
 from sme_registry.io import check_new, read_json
-from sme_registry.io.markup import plural
-from sme_registry.io.tables import Table
+from sme_registry.io.markup import Table, plural
 from sme_registry.io.terminal import Progress, err, fixed, out, print_json, print_pairs
 
 if TYPE_CHECKING:

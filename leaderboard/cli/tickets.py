@@ -28,7 +28,7 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import Rejection
 from sme_registry.errors import OptionError
 from sme_registry.io import check_new, check_writable, choice, write_atomically
-from sme_registry.io.tables import Table
+from sme_registry.io.markup import Table
 from sme_registry.io.terminal import Progress, err, out
 
 if TYPE_CHECKING:

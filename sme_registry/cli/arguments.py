@@ -33,7 +33,7 @@ from sme_registry.io import (
     parse_json,
     read_json,
 )
-from sme_registry.io.tables import Table
+from sme_registry.io.markup import Table
 from sme_registry.io.terminal import err, out, print_json
 from sme_registry.spec import (
     EnvFile,

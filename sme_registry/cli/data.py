@@ -36,7 +36,7 @@ from sme_registry.datasets.documents import PolicyScore, check_algorithm
 from sme_registry.datasets.storage import check_location, datasets_folder
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.io import check_new
-from sme_registry.io.tables import Table
+from sme_registry.io.markup import Table
 from sme_registry.io.terminal import Progress, err, failure, out, print_json, print_pairs
 from sme_registry.spec import catalogue
 from sme_registry.task import materialize

@@ -27,8 +27,8 @@ from sme_registry.cli.show import number_of_cells, study_table, summary
 from sme_registry.errors import MissingDependencyError, OptionError, SMEError
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.io import read_json
+from sme_registry.io.markup import Table
 from sme_registry.io.system import available_cores
-from sme_registry.io.tables import Table
 from sme_registry.io.terminal import duration_range, err, out, print_json
 from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan, catalogue
 from sme_registry.spec.catalogue import is_path

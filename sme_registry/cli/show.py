@@ -14,7 +14,7 @@ from rich.markup import escape
 from sme_registry.cli.arguments import KINDS, Json, find_any, kind_of, print_tables
 from sme_registry.envs.schedule import content_id
 from sme_registry.errors import OptionError, UnknownNameError
-from sme_registry.io.tables import Table
+from sme_registry.io.markup import Table
 from sme_registry.io.terminal import out, print_json, print_pairs
 from sme_registry.spec import (
     EnvFile,

@@ -22,8 +22,8 @@ from sme_registry.cli.plan import (
     plan,
 )
 from sme_registry.errors import OptionError
+from sme_registry.io.markup import Table
 from sme_registry.io.system import available_cores
-from sme_registry.io.tables import Table
 from sme_registry.io.terminal import duration_range, err, out, print_json
 from sme_registry.spec import StudyFile, catalogue
 from sme_registry.studies.engine.ledger import (

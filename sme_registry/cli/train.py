@@ -29,8 +29,7 @@ from sme_registry.cli.study import print_status
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, resolve_protocol
 from sme_registry.io import integer_in, write_atomically
-from sme_registry.io.markup import environment
-from sme_registry.io.tables import Table
+from sme_registry.io.markup import Table, environment
 from sme_registry.io.terminal import err, out
 from sme_registry.spec import (
     EnvFile,

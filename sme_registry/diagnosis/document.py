@@ -25,8 +25,7 @@ from sme_registry.diagnosis.questions import OPEN_REASONS, Verdict, label, templ
 from sme_registry.diagnosis.subject import AnySubject
 from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.io import read_json, versions
-from sme_registry.io.markup import fixed, percent, plural
-from sme_registry.io.tables import Table
+from sme_registry.io.markup import Table, fixed, percent, plural
 from sme_registry.spec import SMESpec, StreamSpec, catalogue
 from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf, check_digest
 

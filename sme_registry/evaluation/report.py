@@ -34,8 +34,7 @@ from sme_registry.evaluation.regions import (
     SafetyScore,
 )
 from sme_registry.io import read_json, require_packages, to_json, write_atomically
-from sme_registry.io.markup import card, table_html
-from sme_registry.io.tables import Table
+from sme_registry.io.markup import Table, card, table_html
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
 from sme_registry.spec.document import StrictModel, check_digest
 

@@ -30,7 +30,7 @@ from sme_registry.evaluation.retention import (
     stream_regrets,
     with_shells,
 )
-from sme_registry.io.tables import Table
+from sme_registry.io.markup import Table
 from sme_registry.spec import EvaluationProtocol, StreamSpec, catalogue
 from sme_registry.spec.document import Integer, StrictModel, TupleOf
 from sme_registry.spec.sme_spec import ActionRange

@@ -1,23 +1,175 @@
-"""HTML for notebooks, text for LaTeX, and Jinja2 templates; all text is escaped.
+"""Tables for terminals and notebooks, text for LaTeX, and Jinja2 templates; all text is escaped.
 
-Cards have no scripts; their colours and fonts are those of the page, light or dark.
+No cell of a table is cut and no column dropped. In a narrow terminal Rich wraps columns of text,
+then a table loses its lines, and at last each row becomes a block. Output that is no terminal has
+one line per row, for `grep` and `awk`. Cards for notebooks have no scripts.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rich.console import Console
+from rich import box
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.padding import Padding
+from rich.segment import Segment
+from rich.table import Table as RichTable
 from rich.text import Text
 
-from sme_registry.io.tables import Table
+from sme_registry.io.checks import printable
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+
+
+class CleanConsole(Console):
+    """Prints no control characters of a text, such as escape sequences in a name from elsewhere."""
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterator[Segment]:
+        for segment in super().render(renderable, options):
+            if segment.control or segment.text.replace("\n", "").isprintable():
+                yield segment
+            else:
+                lines = (printable(line, longest=None) for line in segment.text.split("\n"))
+                yield segment._replace(text="\n".join(lines))
+
+
+class Column(NamedTuple):
+    """A column, and how it is set: as a name, a number or a text."""
+
+    heading: str
+    kind: str
+
+
+class Row(NamedTuple):
+    """A row's cells, and Rich's style of all of them."""
+
+    cells: tuple[Text, ...]
+    style: str
+
+
+class Table:
+    """A table that fits its console."""
+
+    def __init__(
+        self,
+        title: str,
+        columns: Mapping[str, str],
+        rows: Iterable[Sequence[str]] = (),
+        *,
+        caption: str = "",
+    ) -> None:
+        self.title, self.caption = title, caption
+        self.columns = [Column(heading, kind) for heading, kind in columns.items()]
+        self.rows: list[Row | None] = []
+        """None separates sections."""
+        for row in rows:
+            self.add_row(*row)
+
+    def add_row(self, *cells: str, style: str | None = None) -> None:
+        """Add a row; missing cells are empty."""
+        missing = ("",) * (len(self.columns) - len(cells))
+        texts = tuple(Text.from_markup(cell, emoji=False) for cell in (*cells, *missing))
+        self.rows.append(Row(texts, style or ""))
+
+    def add_section(self) -> None:
+        """Separate the rows so far from the next ones."""
+        self.rows.append(None)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        if self.title:
+            yield Text.from_markup(self.title, style="italic", emoji=False)
+        if console.is_terminal:
+            yield from self._fitted(options.max_width)
+        else:
+            yield Text("\n".join(self._lines()), no_wrap=True, overflow="ignore")
+        if self.caption:
+            yield Text.from_markup(self.caption, style="dim italic", emoji=False)
+
+    def _fitted(self, width: int) -> RenderResult:
+        """The table with lines or without, where no word is broken; else blocks."""
+        least, n = sum(map(self._least_width, range(len(self.columns)))), len(self.columns)
+        if least + 3 * n + 1 <= width:
+            yield self._drawn(box.HEAVY_HEAD)
+        elif least + n <= width:
+            yield self._drawn(None)
+        else:
+            yield from self._blocks()
+
+    def _cells(self, i: int) -> list[str]:
+        return [row.cells[i].plain for row in self.rows if row is not None]
+
+    def _least_width(self, i: int) -> int:
+        """The width of a column in which no word of its texts is broken, and no name or number."""
+        heading, kind = self.columns[i]
+        texts = [heading, *self._cells(i)]
+        if kind == "text":
+            texts = [word for text in texts for word in text.split()]
+        return max(map(_width, texts), default=0)
+
+    def _drawn(self, lines: box.Box | None) -> RichTable:
+        padding = (0, 1) if lines else (0, 1, 0, 0)
+        table = RichTable(box=lines, padding=padding, pad_edge=bool(lines))
+        for i, (heading, kind) in enumerate(self.columns):
+            table.add_column(
+                heading,
+                justify="right" if kind == "number" else "left",
+                no_wrap=kind != "text",
+                min_width=self._least_width(i),
+            )
+        for row in self.rows:
+            if row is not None:
+                table.add_row(*row.cells, style=row.style)
+            elif lines:
+                table.add_section()
+            else:
+                table.add_row()
+        return table
+
+    def _blocks(self) -> RenderResult:
+        """Each row as a block: its name, and a line for each other cell."""
+        for row in filter(None, self.rows):
+            yield Text.assemble(row.cells[0], style=f"bold {row.style}")
+            for (heading, _), text in zip(self.columns[1:], row.cells[1:], strict=True):
+                if text:
+                    name = Text(f"{' '.join(heading.split())} ", style="dim")
+                    line = Text.assemble(name, Text(", ").join(text.split("\n")))
+                    yield Padding(line, (0, 0, 0, 2))
+
+    def _lines(self) -> Iterator[str]:
+        """The lines of the table as plain text of full width."""
+        widths = [
+            max(map(_width, [heading, *self._cells(i)]))
+            for i, (heading, _) in enumerate(self.columns)
+        ]
+        header = tuple(Text(heading) for heading, _ in self.columns)
+        for row in (Row(header, ""), *self.rows):
+            if row is None:
+                yield ""
+                continue
+            parts = [cell.plain.split("\n") for cell in row.cells]
+            for line in itertools.zip_longest(*parts, fillvalue=""):
+                cells = zip(line, widths, self.columns, strict=True)
+                padded = (_padded(text, width, column.kind) for text, width, column in cells)
+                yield "  ".join(padded).rstrip()
+
+
+def _width(text: str) -> int:
+    return max(map(cell_len, text.split("\n")))
+
+
+def _padded(text: str, width: int, kind: str) -> str:
+    space = " " * (width - cell_len(text))
+    return space + text if kind == "number" else text + space
+
 
 # Notebooks have rules of their own for tables.
 _STYLE = (

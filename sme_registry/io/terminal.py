@@ -27,8 +27,8 @@ from typer.core import TyperGroup
 
 from sme_registry.errors import SMEError
 from sme_registry.io.files import to_json
+from sme_registry.io.markup import CleanConsole
 from sme_registry.io.system import missing_dependency
-from sme_registry.io.tables import CleanConsole
 
 _SECONDS_PER_DAY = 86_400
 

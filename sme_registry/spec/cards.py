@@ -9,8 +9,7 @@ from typing import Any
 from pydantic import BaseModel
 from rich.markup import escape
 
-from sme_registry.io.markup import card, pairs_html, table_html
-from sme_registry.io.tables import Table
+from sme_registry.io.markup import Table, card, pairs_html, table_html
 from sme_registry.spec import catalogue
 from sme_registry.spec.sme_spec import ObservationSpec, SafetySpec, Setting, SMESpec
 from sme_registry.spec.stream import StreamSpec

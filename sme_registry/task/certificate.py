@@ -34,8 +34,7 @@ from rich.markup import escape
 from scipy.special import ndtr
 
 from sme_registry.io import integer_in
-from sme_registry.io.markup import card, table_html
-from sme_registry.io.tables import Table
+from sme_registry.io.markup import Table, card, table_html
 from sme_registry.spec.sme_spec import SpecLike
 from sme_registry.task.draw import Array, Layer, uniform
 from sme_registry.task.loading import check_memory, load_task

@@ -10,8 +10,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from sme_registry.cli import app
-from sme_registry.io.markup import card, folded, pairs_html, table_html
-from sme_registry.io.tables import Table
+from sme_registry.io.markup import Table, card, folded, pairs_html, table_html
 from sme_registry.io.terminal import failure, out, print_json, print_pairs
 
 WIDTHS = (60, 80, 200)
