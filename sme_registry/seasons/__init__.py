@@ -9,8 +9,17 @@
 `seasons.sb3.SealedVecEnv` is for Stable-Baselines3. `wire` says what server and client send.
 """
 
-from sme_registry.seasons.client import WITHOUT_TASK, Instance, actions_in, answer, prepare_policy
-from sme_registry.seasons.envs import SealedEnv, SealedVectorEnv, make, make_vec
+from sme_registry.seasons.client import (
+    WITHOUT_TASK,
+    Instance,
+    SealedEnv,
+    SealedVectorEnv,
+    actions_in,
+    answer,
+    make,
+    make_vec,
+    prepare_policy,
+)
 from sme_registry.seasons.wire import Ticket
 
 __all__ = [

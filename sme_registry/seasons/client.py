@@ -1,29 +1,27 @@
-"""`Instance`: one hidden task of a ticket, stepped and answered over the network.
+"""A hidden task of a ticket, stepped and answered over the network; as Gymnasium's environments.
 
-Its `Connection` repeats requests until they are answered. No request of this protocol has a further
-effect when it is repeated (`wire`), so a lost connection or a server that is being restarted costs
-time and nothing else.
+No request of this protocol has a further effect when it is repeated (`wire`), so a lost connection
+or a server that is being restarted costs time and nothing else.
 """
 
 from __future__ import annotations
 
 import hashlib
-import http.client
-import logging
 import os
-import random
-import ssl
-import time
-from typing import Any, TypeVar
-from urllib.parse import urlsplit
-from urllib.request import getproxies, proxy_bypass
+from typing import Any, TypeVar, cast
 
+import gymnasium
 import numpy as np
 import numpy.typing as npt
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
 
+from sme_registry.compiled.arrays import Action, Array, Mask, Observation
+from sme_registry.envs import arguments
 from sme_registry.errors import (
-    BudgetSpentError,
+    EpisodeError,
     MalformedDocumentError,
+    OptionError,
     PolicyError,
     SealedError,
     SpecError,
@@ -31,15 +29,10 @@ from sme_registry.errors import (
 from sme_registry.evaluation import Policy, as_policy
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.evaluation.regions import batch_rows
-from sme_registry.io import (
-    integer_in,
-    number_in,
-    parse_json,
-    printable,
-    server_address,
-    sha256_of,
-)
+from sme_registry.io import integer_in, parse_json, sha256_of
 from sme_registry.seasons.wire import (
+    PATIENCE,
+    Connection,
     Float32,
     JournalDigest,
     Statement,
@@ -47,7 +40,6 @@ from sme_registry.seasons.wire import (
     StepsAnswer,
     Ticket,
     TicketStatus,
-    bearer,
     instance_path,
     pack_table,
     require_signatures,
@@ -56,17 +48,7 @@ from sme_registry.seasons.wire import (
 )
 from sme_registry.spec import Setting, SMESpec
 from sme_registry.spec.document import StrictModel
-
-PATIENCE = 900.0
-_FIRST_PATIENCE = 5.0  # a mistyped URL shall not wait for a server that does not exist
-_TIMEOUT = 300.0  # to accept a connection, or send more: a restarted server replays all steps
-_FIRST_WAIT, _LONGEST_WAIT = 0.1, 15.0
-_TRANSIENT = frozenset({408, 502, 503, 504, 507})
-_JSON_BYTES = 2**20
-_TYPE = "application/octet-stream"
-
-_log = logging.getLogger(__name__)
-_now, _sleep = time.monotonic, time.sleep
+from sme_registry.spec.sme_spec import ActionRange
 
 TicketLike = Ticket | str | os.PathLike[str]
 _Document = TypeVar("_Document", bound=StrictModel)
@@ -75,118 +57,11 @@ WITHOUT_TASK = ("constant", "constant_half", "random", "uniform_random")
 """Reference policies that are the same on each task."""
 
 
-class Connection:
-    """An HTTP connection to a server, kept open between requests. Not for several threads.
-
-    A request is repeated for `patience` seconds after the first answer has shown that the server
-    exists. `insecure` allows plain http to other machines, in a network that you trust.
-    """
-
-    def __init__(
-        self, url: str, token: str, *, insecure: bool = False, patience: float = PATIENCE
-    ) -> None:
-        self._http: http.client.HTTPConnection | None = None
-        self._address = server_address(url, insecure=insecure)
-        self._patience = number_in("patience", patience, 0.0)
-        self._headers = {"Authorization": bearer(token), "Content-Type": _TYPE}
-        self._answered = False
-
-    def request(self, method: str, path: str, body: bytes = b"", *, most: int) -> bytes:
-        """The body of the answer to a request, of at most `most` bytes.
-
-        A refusal, no answer, and a longer one are SealedErrors; BudgetSpentError if it is for
-        steps and the instance has none left.
-        """
-        wait, started = _FIRST_WAIT, _now()
-        while True:
-            reused = self._http is not None
-            try:
-                status, data = self._exchange(method, path, body, most)
-            except ssl.SSLCertVerificationError as error:
-                raise SealedError("unreachable", f"{self._address.url}: {error}.") from None
-            except (OSError, http.client.HTTPException) as error:
-                reason = str(error) or type(error).__name__
-                if reused:  # a server closes connections that have been idle
-                    continue
-            else:
-                self._answered = True
-                if status in (200, 201):
-                    return data
-                code, message = _reason_in(data, status)
-                if status not in _TRANSIENT:
-                    kind = BudgetSpentError if code == "budget_spent" else SealedError
-                    raise kind(code, message)
-                reason = f"{code}: {message}"
-            patience = self._patience if self._answered else min(self._patience, _FIRST_PATIENCE)
-            if _now() + wait > started + patience:
-                raise SealedError(
-                    "unreachable",
-                    f"{self._address.url}: gives no answer: {reason:.500} Check the URL and try "
-                    "again: no step is lost, or taken twice.",
-                )
-            _log.warning("%s: no answer, trying again: %.200s", self._address.url, reason)
-            # Clients that lost the same server do not all come back at the same moment.
-            _sleep(wait * random.uniform(0.5, 1.0))
-            wait = min(2 * wait, _LONGEST_WAIT)
-
-    def close(self) -> None:
-        if self._http is not None:
-            self._http.close()
-            self._http = None
-
-    def __del__(self) -> None:  # few users close their environments
-        self.close()
-
-    def _exchange(self, method: str, path: str, body: bytes, most: int) -> tuple[int, bytes]:
-        if self._http is None:
-            self._http = self._new()
-        try:
-            self._http.request(method, self._address.path + path, body, self._headers)
-            with self._http.getresponse() as answer:
-                data = answer.read(max(most, _JSON_BYTES) + 1)
-                if len(data) > max(most, _JSON_BYTES):
-                    raise SealedError(
-                        "wire", f"{self._address.url}: answered with more than {most:,} bytes."
-                    )
-                if answer.length:  # `read` does not raise where the connection was lost
-                    raise http.client.IncompleteRead(data, answer.length)
-        except BaseException:  # an interrupt, too: the rest of this answer is none to the next
-            self.close()
-            raise
-        if answer.will_close:
-            self.close()
-        return answer.status, data
-
-    def _new(self) -> http.client.HTTPConnection:
-        """A new connection, through the proxy that the environment names, if there is one."""
-        address = self._address
-        if not address.is_https:
-            return http.client.HTTPConnection(address.host, address.port, timeout=_TIMEOUT)
-        proxy = urlsplit(getproxies().get("https", ""))
-        if address.is_local or not proxy.hostname or proxy_bypass(address.host):
-            return http.client.HTTPSConnection(address.host, address.port, timeout=_TIMEOUT)
-        connection = http.client.HTTPSConnection(proxy.hostname, proxy.port, timeout=_TIMEOUT)
-        connection.set_tunnel(address.host, address.port)
-        return connection
-
-
-def _reason_in(data: bytes, status: int) -> tuple[str, str]:
-    """The code and the message in a refusal."""
-    try:
-        plain: Any = parse_json(data, "answer")
-    except MalformedDocumentError:
-        plain = None
-    match plain:
-        case {"code": str(code), "message": str(message)}:
-            return printable(code), printable(message)
-    return "http", f"answered with HTTP status {status}. Check the URL."
-
-
 class Instance:
     """A hidden task of a ticket, as its server shows it: observations, rewards and ends.
 
-    Whoever holds the ticket may stop at any time and go on elsewhere: the server knows the present
-    states. But only one process at a time can step an instance.
+    Whoever holds the ticket may stop at any time and go on elsewhere, but only one process at a
+    time can step an instance.
 
     Attributes:
       setting: all of the task's spec but its seed.
@@ -223,15 +98,10 @@ class Instance:
 
     @property
     def steps_left(self) -> int:
-        """Steps of the budget that are left, over all lanes."""
         return self.budget - self.number * self.lanes
 
     def begin(self) -> Float32:
-        """Begin, or go on: the present observations `[L, S + 2]`.
-
-        They are those of the first episodes, or those after the last steps that the server took for
-        this instance, whichever process asked for them.
-        """
+        """Begin, or go on after the last steps of any process: observations `[L, S + 2]`."""
         data = self._request("POST", f"start?lanes={self.lanes}", most=self._format.answer_bytes)
         number, observation = self._format.unpack_start(data)
         if number == 0:
@@ -268,11 +138,7 @@ class Instance:
         return unpack_table(data, self.setting.state_dim + 2)
 
     def send_answers(self, actions: npt.NDArray[np.floating]) -> None:
-        """Sign and send the actions `[rows, A]`; the last instance's end the ticket.
-
-        The server refuses others than those it has. Nothing is signed if its journal has other
-        steps than this object has taken.
-        """
+        """Sign and send the actions `[rows, A]`; the last instance's end the ticket."""
         data, signer = pack_table(actions), self._ticket.signer
         if signer is None:
             self._request("PUT", "answers", data)
@@ -287,7 +153,6 @@ class Instance:
         self._request("PUT", f"answers?signature={signer.sign(statement)}", data)
 
     def status(self) -> TicketStatus:
-        """The status of the whole ticket."""
         path = ticket_path(self._ticket.season, self._ticket.ticket)
         data = self._connection.request("GET", path, most=2**22)
         return _parse_answer(TicketStatus, data)
@@ -302,7 +167,6 @@ class Instance:
         self._connection.close()
 
     def _journal_digest(self) -> str:
-        """That of the server's journal, compared with the steps as far as they are known here."""
         digest = _parse_answer(JournalDigest, self._request("GET", "journal")).journal
         if self._taken is not None and digest != f"sha256:{self._taken.hexdigest()}":
             raise SealedError(
@@ -317,6 +181,163 @@ class Instance:
         ticket = self._ticket
         path = instance_path(ticket.season, ticket.ticket, self._instance, action)
         return self._connection.request(method, path, body, most=most)
+
+
+class SealedVectorEnv(VectorEnv[Observation, Array, Array]):
+    """The lanes of a hidden task, stepped together by the season's server.
+
+    Spaces, rewards and ends of episodes are those of `SMEVectorEnv` in the autoreset mode
+    "SameStep"; seeds and resets are as in `SealedEnv`. `instance` has the budget and the answers.
+
+    Examples:
+      >>> from sme_registry.seasons import Instance, SealedVectorEnv
+      >>> envs = SealedVectorEnv(Instance("https://board.example", "ticket.json", lanes=4))
+      >>> envs.num_envs
+      4
+    """
+
+    def __init__(self, instance: Instance, action_range: ActionRange = "unit") -> None:
+        self.instance = instance
+        self.num_envs = instance.lanes
+        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+        A, width = instance.setting.action_dim, instance.setting.state_dim + 2
+        self.single_action_space, self._rescaled = arguments.action_space(action_range, A)
+        self.single_observation_space = gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self._has_begun = False
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        first = arguments.checked_seed(seed[0] if isinstance(seed, list) else seed)
+        if options:
+            raise OptionError(
+                f"options={options!r:.60}: must be None: the server draws the states at which "
+                "episodes begin. Leave it out."
+            )
+        observation = self.instance.begin()
+        self._has_begun = True
+        super().reset(seed=first)
+        return observation, {}
+
+    def step(  # type: ignore[override]  # Gymnasium types all three arrays alike; ends are bool
+        self, actions: Any
+    ) -> tuple[Observation, Float32, Mask, Mask, dict[str, Any]]:
+        if not self._has_begun:
+            raise EpisodeError("step: the episodes have not begun. Call reset() first.")
+        shape = self.num_envs, self.instance.setting.action_dim
+        unit = arguments.to_unit(actions, shape, self._rescaled)
+        if not np.isfinite(unit).all():
+            raise arguments.not_finite_error()
+        steps = self.instance.step(unit)
+        ended: Mask = steps.terminated | steps.truncated
+        infos: dict[str, Any] = {}
+        if ended.any():
+            final = np.full(self.num_envs, None, dtype=object)
+            for lane in np.flatnonzero(ended):
+                final[lane] = steps.last_observation[lane]
+            infos = {"final_obs": final, "_final_obs": ended.copy()}
+            infos |= {"final_info": {}, "_final_info": ended.copy()}
+        return steps.observation, steps.reward, steps.terminated, steps.truncated, infos
+
+    def close_extras(self, **kwargs: Any) -> None:
+        self.instance.close()
+
+
+class SealedEnv(gymnasium.Env[Observation, Action]):
+    """A hidden task of a ticket, stepped by the season's server.
+
+    Spaces, rewards and ends of episodes are those of `SMEEnv`; infos are empty. The server draws
+    the initial states: `seed` seeds `np_random` only. `reset` within an episode does not end it: it
+    returns the present observation, also in a new process that goes on where another one stopped.
+
+    Examples:
+      >>> from sme_registry.seasons import Instance, SealedEnv
+      >>> env = SealedEnv(Instance("https://board.example", "ticket.json"), "symmetric")
+      >>> float(env.action_space.low[0])
+      -1.0
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, instance: Instance, action_range: ActionRange = "unit") -> None:
+        self.instance = instance
+        self._lane = SealedVectorEnv(instance, action_range)
+        self.action_space = cast("gymnasium.Space[Action]", self._lane.single_action_space)
+        self.observation_space = self._lane.single_observation_space
+        self._next: Observation | None = None  # the first of the next episode
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin the next episode, or go on with the present one."""
+        if self._next is None or options or seed is not None:
+            [self._next] = self._lane.reset(seed=seed, options=options)[0]
+        super().reset(seed=seed)
+        observation, self._next = self._next, None
+        return observation, {}
+
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """One step; an action that is not finite, or not `[A]`, is never sent."""
+        if self._next is not None:
+            raise EpisodeError("step: the episode has ended. Call reset() first.")
+        [observation], [reward], [terminated], [truncated], infos = self._lane.step([action])
+        if infos:
+            self._next, observation = observation, infos["final_obs"][0]
+        return observation, float(reward), bool(terminated), bool(truncated), {}
+
+    def close(self) -> None:
+        """Close the connection. The ticket stays valid."""
+        self.instance.close()
+
+
+def make(
+    url: str,
+    ticket: TicketLike,
+    instance: int = 0,
+    *,
+    action_range: ActionRange = "unit",
+    insecure: bool = False,
+    patience: float = PATIENCE,
+) -> SealedEnv:
+    """An environment of a hidden task: that of the ticket with the number `instance`, from 0.
+
+    `ticket` may be the path of its file. `insecure` allows plain http to other machines, in a
+    network that you trust. A request without an answer is repeated for `patience` seconds.
+
+    Examples:
+      >>> from sme_registry import seasons
+      >>> env = seasons.make("https://board.example", "ticket.json")
+      >>> env.observation_space.shape
+      (10,)
+    """
+    hidden = Instance(url, ticket, instance, insecure=insecure, patience=patience)
+    return SealedEnv(hidden, action_range)
+
+
+def make_vec(
+    url: str,
+    ticket: TicketLike,
+    instance: int = 0,
+    num_envs: int = 1,
+    *,
+    action_range: ActionRange = "unit",
+    insecure: bool = False,
+    patience: float = PATIENCE,
+) -> SealedVectorEnv:
+    """A vector environment of a hidden task: `num_envs` lanes in one request.
+
+    They are at most the ticket's `lanes`, and fixed after the first step. The rest is as in `make`.
+
+    Examples:
+      >>> from sme_registry import seasons
+      >>> envs = seasons.make_vec("https://board.example", "ticket.json", num_envs=4)
+      >>> envs.observation_space.shape
+      (4, 10)
+    """
+    hidden = Instance(url, ticket, instance, num_envs, insecure=insecure, patience=patience)
+    return SealedVectorEnv(hidden, action_range)
 
 
 def answer(
@@ -390,7 +411,6 @@ def actions_in(states: Float32, policy: Any, setting: Setting) -> Float32:
 
 
 def _any_spec(setting: Setting) -> SMESpec:
-    """A task of this setting, for its widths: that of the hidden ones."""
     return SMESpec.from_dict({**setting.to_dict(), "seed": 0})
 
 

@@ -1,10 +1,4 @@
-"""`SealedVecEnv`: a hidden task for Stable-Baselines3's algorithms.
-
-from stable_baselines3 import PPO
-from sme_registry.seasons.sb3 import SealedVecEnv
-env = SealedVecEnv("https://board.example", "ticket.json", instance=0, num_envs=8)
-PPO("MlpPolicy", env).learn(env.instance.steps_left)
-"""
+"""`SealedVecEnv`: a hidden task for Stable-Baselines3's algorithms."""
 
 from __future__ import annotations
 
@@ -15,17 +9,15 @@ import numpy as np
 
 from sme_registry.compiled.arrays import Observation
 from sme_registry.sb3.vec_env import LanesVecEnv, StepResult
-from sme_registry.seasons.client import PATIENCE, Instance, TicketLike
-from sme_registry.seasons.envs import SealedVectorEnv
+from sme_registry.seasons.client import Instance, SealedVectorEnv, TicketLike
+from sme_registry.seasons.wire import PATIENCE
 from sme_registry.spec.sme_spec import ActionRange
 
 
 class SealedVecEnv(LanesVecEnv):
     """The lanes of a hidden task, as SB3's `VecEnv`; arguments as in `seasons.make_vec`.
 
-    As in `SMEVecEnv`, a finished lane begins its next episode at once. The server draws the initial
-    states: seeds have no effect on them. `reset` within an episode does not end it. The default
-    action range, "symmetric", suits SB3's Gaussian policies.
+    A finished lane begins its next episode at once. Resets are as in `SealedEnv`.
     """
 
     def __init__(
@@ -51,7 +43,6 @@ class SealedVecEnv(LanesVecEnv):
         super().__init__([SimpleNamespace(**shared) for _ in range(num_envs)])
 
     def reset(self) -> Observation:
-        """Begin, or go on with the present episodes: observations, a row for each lane, float32."""
         observation, _ = self._hidden.reset(options=next(filter(None, self._options), None))
         self.reset_infos = [{} for _ in range(self.num_envs)]
         self._clear_reset_arguments()
@@ -68,5 +59,4 @@ class SealedVecEnv(LanesVecEnv):
         return observation, reward, dones, infos
 
     def close(self) -> None:
-        """Close the connection. The ticket stays valid."""
         self.instance.close()

@@ -1,4 +1,4 @@
-"""What a sealed-online season's server and its clients send each other: documents and raw arrays.
+"""What a sealed-online season's server and its clients send each other, and a client's connection.
 
     POST /api/seasons/{id}/tickets                                       a ticket
     GET  /api/seasons/{id}/tickets/{n}                                   its status
@@ -38,20 +38,43 @@ ticket's file has the private half, so that a machine can step and answer withou
 from __future__ import annotations
 
 import contextlib
+import http.client
+import logging
 import os
+import random
 import re
+import ssl
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
+from urllib.parse import urlsplit
+from urllib.request import getproxies, proxy_bypass
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
 from sme_registry.compiled.arrays import Mask, Observation
-from sme_registry.errors import ActionError, OptionError, WireError
-from sme_registry.io import integer_in, read_json, require_packages, to_json
+from sme_registry.errors import (
+    ActionError,
+    BudgetSpentError,
+    MalformedDocumentError,
+    OptionError,
+    SealedError,
+    WireError,
+)
+from sme_registry.io import (
+    integer_in,
+    number_in,
+    parse_json,
+    printable,
+    read_json,
+    require_packages,
+    server_address,
+    to_json,
+)
 from sme_registry.io.files import atomic_file, unwritable
 from sme_registry.spec import Setting
 from sme_registry.spec.document import (
@@ -109,8 +132,6 @@ def require_signatures() -> None:
 
 
 class TicketClass(StrictModel):
-    """A class of the season, as far as an entrant knows it."""
-
     name: Name
     setting: Setting  # all of a spec but its seed
     instances: Annotated[Integer, Field(ge=1)]  # number of hidden tasks
@@ -123,8 +144,6 @@ def instance_name(class_name: str, instance: int) -> str:
 
 
 class TicketPlace(NamedTuple):
-    """An instance of a ticket: its class, and its number in it, from 0."""
-
     member: TicketClass
     instance: int
 
@@ -166,7 +185,6 @@ class Ticket(StrictModel):
                 yield TicketPlace(member, instance)
 
     def place(self, instance: int) -> TicketPlace:
-        """Instance i of the ticket."""
         places = list(self.places)
         return places[integer_in("instance", instance, 0, len(places) - 1)]
 
@@ -194,8 +212,6 @@ class Ticket(StrictModel):
 
 
 class InstanceStatus(StrictModel):
-    """How far a ticket is on one of its instances."""
-
     phase: Literal["waiting", "stepping", "answering", "answered"]
     lanes: Annotated[Integer, Field(ge=1)] | None  # null before `start`
     requests: _Count  # number of the last steps that were taken
@@ -218,7 +234,6 @@ class TicketStatus(StrictModel):
 
 
 def tickets_path(season: str) -> str:
-    """Where tickets of a season are requested."""
     return f"/api/seasons/{season}/tickets"
 
 
@@ -232,13 +247,10 @@ def instance_path(season: str, ticket: int, instance: int, action: str) -> str:
 
 
 def bearer(token: str) -> str:
-    """The value of the header `Authorization`."""
     return f"Bearer {token}"
 
 
 class StepsAnswer(NamedTuple):
-    """The answer to `steps`."""
-
     observation: Observation  # `[L, S + 2]`, of the next episode in lanes whose episode ended
     reward: Float32  # `[L]`
     terminated: Mask  # `[L]`
@@ -292,7 +304,6 @@ class StepFormat:
         return table.tobytes()
 
     def unpack_steps(self, data: bytes) -> StepsAnswer:
-        """The answer to `steps` in these bytes, as fresh arrays."""
         _check_size("steps", data, self.answer_bytes)
         width = self._width
         table = np.array(np.frombuffer(data, _FLOAT).reshape(self.lanes, -1), np.float32)
@@ -327,10 +338,7 @@ def table_bytes(rows: int, columns: int) -> int:
 
 
 def unpack_table(data: bytes, columns: int, rows: int | None = None) -> Float32:
-    """The table `[rows, columns]` in the bytes of an .npy file, whose reading runs no code.
-
-    A fresh array of float32, every entry finite; `rows` None accepts any number of them.
-    """
+    """The table `[rows, columns]` in the bytes of an .npy file, finite; `rows` None accepts any."""
     start = len(_MAGIC) + 2
     size = int.from_bytes(data[len(_MAGIC) : start], "little")
     header = _HEADER.fullmatch(data, start, start + size) if size <= _MAX_HEADER else None
@@ -371,3 +379,116 @@ def _check_size(what: str, data: bytes, expected: int) -> None:
 def _check_finite(numbers: Float32) -> None:
     if not np.isfinite(numbers).all():
         raise ActionError("array: has NaN or infinite entries. Give finite numbers.")
+
+
+PATIENCE = 900.0
+_FIRST_PATIENCE = 5.0  # a mistyped URL shall not wait for a server that does not exist
+_TIMEOUT = 300.0  # to accept a connection, or send more: a restarted server replays all steps
+_FIRST_WAIT, _LONGEST_WAIT = 0.1, 15.0
+_TRANSIENT = frozenset({408, 502, 503, 504, 507})
+_JSON_BYTES = 2**20
+_TYPE = "application/octet-stream"
+
+_log = logging.getLogger(__name__)
+_now, _sleep = time.monotonic, time.sleep
+
+
+class Connection:
+    """An HTTP connection to a server, kept open between requests. Not for several threads.
+
+    From the first answer on, a request is repeated for `patience` seconds.
+    """
+
+    def __init__(
+        self, url: str, token: str, *, insecure: bool = False, patience: float = PATIENCE
+    ) -> None:
+        self._http: http.client.HTTPConnection | None = None
+        self._address = server_address(url, insecure=insecure)
+        self._patience = number_in("patience", patience, 0.0)
+        self._headers = {"Authorization": bearer(token), "Content-Type": _TYPE}
+        self._answered = False
+
+    def request(self, method: str, path: str, body: bytes = b"", *, most: int) -> bytes:
+        """The body of the answer, of at most `most` bytes."""
+        wait, started = _FIRST_WAIT, _now()
+        while True:
+            reused = self._http is not None
+            try:
+                status, data = self._exchange(method, path, body, most)
+            except ssl.SSLCertVerificationError as error:
+                raise SealedError("unreachable", f"{self._address.url}: {error}.") from None
+            except (OSError, http.client.HTTPException) as error:
+                reason = str(error) or type(error).__name__
+                if reused:  # a server closes connections that have been idle
+                    continue
+            else:
+                self._answered = True
+                if status in (200, 201):
+                    return data
+                code, message = _reason_in(data, status)
+                if status not in _TRANSIENT:
+                    kind = BudgetSpentError if code == "budget_spent" else SealedError
+                    raise kind(code, message)
+                reason = f"{code}: {message}"
+            patience = self._patience if self._answered else min(self._patience, _FIRST_PATIENCE)
+            if _now() + wait > started + patience:
+                raise SealedError(
+                    "unreachable",
+                    f"{self._address.url}: gives no answer: {reason:.500} Check the URL and try "
+                    "again: no step is lost, or taken twice.",
+                )
+            _log.warning("%s: no answer, trying again: %.200s", self._address.url, reason)
+            # Clients that lost the same server do not all come back at the same moment.
+            _sleep(wait * random.uniform(0.5, 1.0))
+            wait = min(2 * wait, _LONGEST_WAIT)
+
+    def close(self) -> None:
+        if self._http is not None:
+            self._http.close()
+            self._http = None
+
+    def __del__(self) -> None:  # few users close their environments
+        self.close()
+
+    def _exchange(self, method: str, path: str, body: bytes, most: int) -> tuple[int, bytes]:
+        if self._http is None:
+            self._http = self._new()
+        try:
+            self._http.request(method, self._address.path + path, body, self._headers)
+            with self._http.getresponse() as answer:
+                data = answer.read(max(most, _JSON_BYTES) + 1)
+                if len(data) > max(most, _JSON_BYTES):
+                    raise SealedError(
+                        "wire", f"{self._address.url}: answered with more than {most:,} bytes."
+                    )
+                if answer.length:  # `read` does not raise where the connection was lost
+                    raise http.client.IncompleteRead(data, answer.length)
+        except BaseException:  # an interrupt, too: the rest of this answer is none to the next
+            self.close()
+            raise
+        if answer.will_close:
+            self.close()
+        return answer.status, data
+
+    def _new(self) -> http.client.HTTPConnection:
+        """A connection, through the proxy that the environment names, if there is one."""
+        address = self._address
+        if not address.is_https:
+            return http.client.HTTPConnection(address.host, address.port, timeout=_TIMEOUT)
+        proxy = urlsplit(getproxies().get("https", ""))
+        if address.is_local or not proxy.hostname or proxy_bypass(address.host):
+            return http.client.HTTPSConnection(address.host, address.port, timeout=_TIMEOUT)
+        connection = http.client.HTTPSConnection(proxy.hostname, proxy.port, timeout=_TIMEOUT)
+        connection.set_tunnel(address.host, address.port)
+        return connection
+
+
+def _reason_in(data: bytes, status: int) -> tuple[str, str]:
+    try:
+        plain: Any = parse_json(data, "answer")
+    except MalformedDocumentError:
+        plain = None
+    match plain:
+        case {"code": str(code), "message": str(message)}:
+            return printable(code), printable(message)
+    return "http", f"answered with HTTP status {status}. Check the URL."

@@ -21,7 +21,7 @@ from sme_registry.errors import (
     SealedError,
 )
 from sme_registry.evaluation.references import NAMES, SHORT_NAMES
-from sme_registry.seasons import Instance, Ticket, actions_in, client, wire
+from sme_registry.seasons import Instance, Ticket, actions_in, wire
 from sme_registry.spec import Setting
 from tests.leaderboard.sealed.playing import ROWS
 from tests.seasons.server import BUDGET, serving_season
@@ -33,7 +33,7 @@ WAYS_TO_FAIL = ["lose request", "lose answer", "cut answer", "503", "507"]
 def waits(monkeypatch):
     """How long the client would have waited between attempts."""
     waited = []
-    monkeypatch.setattr(client, "_sleep", waited.append)
+    monkeypatch.setattr(wire, "_sleep", waited.append)
     return waited
 
 
@@ -218,8 +218,8 @@ def test_a_server_that_cannot_be_reached_is_reported_soon(
         raise error
 
     clock = iter(range(1000))
-    monkeypatch.setattr(client, "_now", lambda: float(next(clock)))
-    monkeypatch.setattr(client.http.client.HTTPConnection, "connect", fails)
+    monkeypatch.setattr(wire, "_now", lambda: float(next(clock)))
+    monkeypatch.setattr(http.client.HTTPConnection, "connect", fails)
     with pytest.raises(SealedError, match=message):
         seasons.make(server.url, server.ticket).reset()
     assert least <= len(waits) <= most
@@ -240,7 +240,7 @@ def test_a_server_that_stops_is_waited_for_until_patience_ends(server, waits, mo
     hidden = seasons.make(server.url, server.ticket, patience=3.0)
     hidden.reset()
     clock = iter(range(1000))
-    monkeypatch.setattr(client, "_now", lambda: float(next(clock)))
+    monkeypatch.setattr(wire, "_now", lambda: float(next(clock)))
     server.faults = ["503"] * 20
     with pytest.raises(SealedError, match="unreachable"):
         hidden.step(np.zeros(2))
@@ -250,10 +250,10 @@ def test_a_server_that_stops_is_waited_for_until_patience_ends(server, waits, mo
 
 
 def test_an_answer_that_is_too_long_is_not_read_to_its_end(server, monkeypatch):
-    monkeypatch.setattr(client, "_JSON_BYTES", 10)
+    monkeypatch.setattr(wire, "_JSON_BYTES", 10)
     path = wire.ticket_path(server.ticket.season, server.ticket.ticket)
     with pytest.raises(SealedError, match=r"wire: .* answered with more than 20 bytes"):
-        client.Connection(server.url, server.ticket.token).request("GET", path, most=20)
+        wire.Connection(server.url, server.ticket.token).request("GET", path, most=20)
 
 
 def test_answers_are_the_policy_s_actions_in_the_challenge_states(server, tmp_path):
