@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,6 @@ from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import write_atomically
 from sme_registry.spec.study import Cell
-from sme_registry.studies.engine.programs import SharedProgram, run_program
 from sme_registry.studies.engine.result import (
     EVALUATION,
     TRAINING,
@@ -36,7 +35,10 @@ from sme_registry.studies.engine.result import (
     CellResult,
     LearningCurve,
     OfflineCell,
+    Outcome,
     Record,
+    Report,
+    SharedProgram,
     Timing,
     life_report,
 )
@@ -122,6 +124,15 @@ def _train(cell: Cell, entry: Entry, progress: ReportSteps, model_path: Path | N
     if model_path is not None:
         learner.save(model_path)
     return training.result()
+
+
+def run_program(
+    cells: Sequence[Cell], shared: SharedProgram, progress: Report, keep_models: bool = False
+) -> Iterator[Outcome]:
+    """Run cells that use JAX as runs of one program."""
+    from sme_registry.studies.engine import programs
+
+    return programs.run_program(cells, shared, progress, keep_models)
 
 
 def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> CellResult:

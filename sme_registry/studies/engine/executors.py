@@ -36,9 +36,8 @@ from sme_registry.io.system import (
     end_with_parent,
 )
 from sme_registry.spec.study import Cell
-from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.programs import CPU, Job, Report, run_program
-from sme_registry.studies.engine.result import CellResult, Outcome, failed
+from sme_registry.studies.engine.cell import run_cell, run_program
+from sme_registry.studies.engine.result import CPU, CellResult, Job, Outcome, Report, failed
 
 RunCell = Callable[[Cell, Callable[[int, int], None] | None, Path | None], CellResult]
 ReportProgress = Callable[..., None]  # called with a job and the arguments of `Report`

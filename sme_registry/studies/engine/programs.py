@@ -22,11 +22,11 @@ import multiprocessing
 import signal
 import time
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -37,63 +37,35 @@ from sme_registry.evaluation.models import saved_sb3
 from sme_registry.evaluation.rollouts import start_states
 from sme_registry.io import Arrays, to_json
 from sme_registry.io.system import available_cores, child_environment, end_with_parent
+from sme_registry.jax import find_device
+from sme_registry.jax.program import Evaluation, Program, StepLog, check_room
+from sme_registry.jax.run import hidden_of, new_program, policy_of
+from sme_registry.jax.run import run as run_to_end
+from sme_registry.jax.task import Form
 from sme_registry.spec.study import Cell, in_jax
 from sme_registry.studies.engine.ledger import read_header, read_state, write_state
 from sme_registry.studies.engine.result import (
+    CPU,
     EVALUATION,
     TRAINING,
     Outcome,
     ProgramResult,
     Record,
+    Report,
+    SharedProgram,
     check_forms,
     failed,
     life_report,
 )
 from sme_registry.training.record import Snapshots, versions_for
 
-if TYPE_CHECKING:
-    from sme_registry.jax.program import Evaluation, Program, StepLog
-
 _Returned = TypeVar("_Returned")
 _Shape = tuple[int, int, int, int]
-CPU = "cpu"
 SECONDS_BETWEEN_STATES = 180.0
 _MOST_RUNS = 10  # on a CPU: more save little time, and the last of a study would run alone longer
 _MOST_RUNS_ELSEWHERE = 256
 _PROGRAM, _RECORDS = "program/", "records/"  # prefixes of arrays in a state
 _SNAPSHOT = "snapshot/"  # prefix of the records of lives: weights before training and of visits
-
-
-@dataclass(frozen=True)
-class SharedProgram:
-    """How the cells of a job run as runs of one program.
-
-    `runs` is their number; those without a cell repeat the first. Programs go on from states with
-    the same `build_key`. `cells` are those of the runs of such a state, in order; each keeps its
-    own task, also if it is none of the job's: another job may go on from the state that this one
-    writes. They are empty for those of the job.
-    """
-
-    runs: int
-    device: str | None = None
-    state: Path | None = None
-    build_key: Mapping[str, Any] = field(default_factory=dict)
-    cells: tuple[Cell, ...] = ()
-
-
-@dataclass(frozen=True)
-class Job:
-    """Cells that run together: any number as runs of a program, or a single one by itself."""
-
-    cells: tuple[Cell, ...]
-    program: SharedProgram | None = None
-
-
-class Report(Protocol):
-    """What a job calls while it runs."""
-
-    def __call__(self, done: int, total: int, note: str = "", /) -> None:
-        """Report how far a job is."""
 
 
 class Programs:
@@ -169,8 +141,6 @@ class Programs:
 
 def _forms(cell: Cell) -> tuple[Any, ...]:
     """The `Form` of each of a cell's tasks."""
-    from sme_registry.jax.task import Form
-
     return tuple(map(Form.of, cell.specs))
 
 
@@ -183,8 +153,6 @@ def shape_of(cell: Cell) -> _Shape:
 
 def _new_program(cells: Sequence[Cell], shared: SharedProgram, at_once: int = 1) -> Program:
     """The program of cells of one group, of which `at_once` are to share the memory."""
-    from sme_registry.jax.run import new_program
-
     cell = cells[0]
     return new_program(
         cell.uses,
@@ -213,14 +181,10 @@ def _beside_the_gpu(function: Callable[..., _Returned], *arguments: Any) -> _Ret
 
 
 def _platform(device: str | None) -> str:
-    from sme_registry.jax import find_device
-
     return str(find_device(device).platform)
 
 
 def _without_room(programs: Sequence[tuple[Cell, SharedProgram]], at_once: int) -> dict[str, str]:
-    from sme_registry.jax.program import check_room
-
     reasons = {}
     for cell, shared in programs:
         try:
@@ -268,9 +232,7 @@ class _ProgramRun:
 
     def train(self) -> None:
         """Go on to the end of the budget, with every evaluation."""
-        from sme_registry.jax.run import run
-
-        run(
+        run_to_end(
             self._program,
             due=self._record.due,
             start_states=self._start_states,
@@ -376,9 +338,7 @@ class _ProgramRun:
 
     def _models(self, run: int) -> tuple[bytes, dict[str, bytes]]:
         """A run's model as Stable-Baselines3 saves it; of a life also those of its visits."""
-        from sme_registry.training.models import set_weights
-
-        cell = self._cells[run]
+        cell, set_weights = self._cells[run], _sb3_models().set_weights
         model = _new_model(cell)
 
         def saved(weights: Arrays, steps: int) -> bytes:
@@ -432,11 +392,16 @@ def _named(arrays: Arrays, prefix: str) -> Arrays:
     return {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)}
 
 
+def _sb3_models() -> Any:
+    """What makes models of Stable-Baselines3, which is needed only where models are kept."""
+    from sme_registry.training import models
+
+    return models
+
+
 def _new_model(cell: Cell) -> Any:
     """The untrained model of Stable-Baselines3 of a cell."""
-    from sme_registry.training.models import new_sb3_model
-
-    return new_sb3_model(
+    return _sb3_models().new_sb3_model(
         cell.uses,
         cell.document,
         seed=cell.seed,
@@ -474,8 +439,6 @@ def _evaluate(groups: list[list[_Trained]], processes: int) -> Iterator[_Evaluat
 
 
 def _evaluate_together(group: list[_Trained]) -> _Evaluated:
-    from sme_registry.jax.run import hidden_of
-
     start = time.process_time()
     first = group[0]
     reports: Sequence[_Report | PolicyError]
@@ -498,8 +461,6 @@ def _evaluate_together(group: list[_Trained]) -> _Evaluated:
 
 
 def _policy(cell: Cell, weights: Arrays) -> Any:
-    from sme_registry.jax.run import policy_of
-
     options: dict[str, Any] = {"action_range": cell.action_range}
     return policy_of(cell.uses, weights, hyperparameters=cell.hyperparameters, **options)
 

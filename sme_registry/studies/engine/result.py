@@ -15,7 +15,9 @@ STUDY/report/                 what `sme study report` writes
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, NamedTuple, Self
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, Protocol, Self
 
 import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
@@ -36,6 +38,7 @@ from sme_registry.spec.document import (
 from sme_registry.spec.study import Cell, parse_uses
 from sme_registry.training.record import versions_for
 
+CPU = "cpu"
 _Numbers = Annotated[tuple[Real, ...], Field(strict=False)]
 
 
@@ -185,6 +188,38 @@ class CellFailure(StrictModel):
     traceback: str
     attempts: Annotated[Integer, Field(ge=1)] = 1
     versions: dict[str, str]
+
+
+@dataclass(frozen=True)
+class SharedProgram:
+    """How the cells of a job run as runs of one program.
+
+    `runs` is their number; those without a cell repeat the first. Programs go on from states with
+    the same `build_key`. `cells` are those of the runs of such a state, in order; each keeps its
+    own task, also if it is none of the job's: another job may go on from the state that this one
+    writes. They are empty for those of the job.
+    """
+
+    runs: int
+    device: str | None = None
+    state: Path | None = None
+    build_key: Mapping[str, Any] = field(default_factory=dict)
+    cells: tuple[Cell, ...] = ()
+
+
+@dataclass(frozen=True)
+class Job:
+    """Cells that run together: any number as runs of a program, or a single one by itself."""
+
+    cells: tuple[Cell, ...]
+    program: SharedProgram | None = None
+
+
+class Report(Protocol):
+    """What a job calls while it runs."""
+
+    def __call__(self, done: int, total: int, note: str = "", /) -> None:
+        """Report how far a job is."""
 
 
 class Outcome(NamedTuple):

@@ -7,7 +7,7 @@ import functools
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from rich.console import Console
 from rich.markup import escape
@@ -21,10 +21,12 @@ from sme_registry.studies.engine.budget import Pace, first_places, selected, wit
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.executors import Executor, InProcess, OnRay, Processes, RunCell
 from sme_registry.studies.engine.ledger import Ledger, SavedState, StudyStatus, label, plan_status
-from sme_registry.studies.engine.programs import CPU, Job, Programs, platform_of
-from sme_registry.studies.engine.result import CellFailure, CellResult, Outcome
+from sme_registry.studies.engine.result import CPU, CellFailure, CellResult, Job, Outcome
 from sme_registry.training.algorithms import check_algorithm, code_notice, find
 from sme_registry.training.record import versions_for
+
+if TYPE_CHECKING:
+    from sme_registry.studies.engine.programs import Programs
 
 EXECUTORS = ("processes", "in-process", "ray")
 
@@ -148,6 +150,8 @@ def _programs(
             "--device, or leave out --ray on a machine that has such a device."
         )
     device = CPU if on_ray else device
+    from sme_registry.studies.engine.programs import Programs, platform_of
+
     return Programs((cell.cell for cell in plan.cells), platform_of(device), device, lanes)
 
 

@@ -114,7 +114,7 @@ class Bootstrap:
         return float(low[0]), float(high[0])
 
 
-class Part(NamedTuple):
+class RunKind(NamedTuple):
     """The runs on single tasks, or the lives in streams with their metrics in WD: a row each."""
 
     streams: bool
@@ -186,16 +186,16 @@ class Analysis:
         return metrics_of(self.runs)
 
     @property
-    def parts(self) -> tuple[Part, ...]:
+    def parts(self) -> tuple[RunKind, ...]:
         """Single tasks, and streams where the plan has any."""
         axes = {name: info.axis for name, info in self.classes.items()}
-        tasks = Part(False, self.runs, axes, self.algorithms, self.metrics, "spec_digest")
+        tasks = RunKind(False, self.runs, axes, self.algorithms, self.metrics, "spec_digest")
         if not self.streams:
             return (tasks,)
         lives = self.tables["stream_lives"]
         lives = lives[lives.region == WITHIN].reset_index(drop=True)
         axes = {name: info.axis for name, info in self.streams.items()}
-        return tasks, Part(True, lives, axes, self.stream_algorithms, OF_LIVES, "stream_digest")
+        return tasks, RunKind(True, lives, axes, self.stream_algorithms, OF_LIVES, "stream_digest")
 
     def state(self, key: str) -> str:
         """Of a cell by its digest: `finished`, `failed`, `missing`, or `left out` by `--only`."""
@@ -236,7 +236,7 @@ class Analysis:
         return sum(result.timing.total for result in self.cells.values())
 
 
-class Table(NamedTuple):
+class TableMaker(NamedTuple):
     """A table of every study with its kind of runs; of those with rows if `optional`."""
 
     columns: str
@@ -245,7 +245,7 @@ class Table(NamedTuple):
     both: bool
 
 
-TABLES: dict[str, Table] = {}
+TABLES: dict[str, TableMaker] = {}
 Make = Callable[..., Any]
 
 
@@ -255,11 +255,11 @@ def table(
     """Register a function of the analysis that makes the rows of a table, in order.
 
     `columns` are as those of `frame`; those of tables of streams begin with `stream_`. A function
-    for `both` kinds of runs is called with a `Part` as well.
+    for `both` kinds of runs is called with a `RunKind` as well.
     """
 
     def register(make: Make) -> Make:
-        TABLES[name] = Table(columns, make, optional, both)
+        TABLES[name] = TableMaker(columns, make, optional, both)
         return make
 
     return register

@@ -62,7 +62,7 @@ from sme_registry.studies.report.analysis import (
     PLACE_COLUMNS,
     Analysis,
     Bootstrap,
-    Part,
+    RunKind,
     by_place,
     change_verdict,
     differences,
@@ -146,7 +146,7 @@ def analyse(
 
 
 @table("missing", "", both=True)
-def _missing(analysis: Analysis, part: Part) -> pd.DataFrame:
+def _missing(analysis: Analysis, part: RunKind) -> pd.DataFrame:
     """Each requested run that has not finished."""
     rows = [
         (*place(c).values(), c.phase, analysis.errors.get(c.cell.digest, ""), c.cell.digest)
@@ -163,7 +163,7 @@ def _missing(analysis: Analysis, part: Part) -> pd.DataFrame:
     "verdict:str",
     both=True,
 )
-def _contrasts(analysis: Analysis, part: Part) -> Iterator[tuple[Any, ...]]:
+def _contrasts(analysis: Analysis, part: RunKind) -> Iterator[tuple[Any, ...]]:
     """What each class changes compared with the first one, between runs of equal number."""
     first, keys = next(iter(part.axes), ""), [metric.key for metric in part.metrics]
     runs = part.runs
@@ -186,13 +186,13 @@ def _contrasts(analysis: Analysis, part: Part) -> Iterator[tuple[Any, ...]]:
 
 
 @table("differences", DIFFERENCES, both=True)
-def _differences(analysis: Analysis, part: Part) -> Iterator[tuple[Any, ...]]:
+def _differences(analysis: Analysis, part: RunKind) -> Iterator[tuple[Any, ...]]:
     pairs, draws = itertools.combinations(part.algorithms, 2), analysis.bootstrap.draws
     return differences(part.runs, pairs, part.metrics, draws, part.instance)
 
 
 @table("learning_curves", "", both=True)
-def _learning_curves(analysis: Analysis, part: Part) -> pd.DataFrame:
+def _learning_curves(analysis: Analysis, part: RunKind) -> pd.DataFrame:
     """Median and quartiles over runs, then the running median over a window of evaluations."""
     columns = f"{PLACE_COLUMNS} measure:str step:int64 median q25 q75 runs:int64 window:int64"
     tables = [frame([], columns)]

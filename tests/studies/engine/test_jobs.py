@@ -13,13 +13,13 @@ from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies.engine import budget
 from sme_registry.studies.engine.ledger import Ledger, write_state
-from sme_registry.studies.engine.programs import Job, Programs
-from sme_registry.studies.engine.result import failed
+from sme_registry.studies.engine.result import Job, failed
 from sme_registry.studies.engine.runner import run_study
 
 pytest.importorskip("jax")
 
 from sme_registry.jax import program
+from sme_registry.studies.engine.programs import Programs
 
 
 def plan_file(seeds=3, **fields):

@@ -16,7 +16,6 @@ from rich.console import Console
 
 from sme_registry.evaluation import evaluate
 from sme_registry.spec import StudyFile, StudyPlan
-from sme_registry.studies.engine import programs
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.executors import InProcess
 from sme_registry.studies.engine.ledger import Ledger, read_header, read_state, write_state
@@ -29,6 +28,8 @@ from tests.studies.cells import numbers
 
 pytest.importorskip("jax")
 pytest.importorskip("stable_baselines3")
+
+from sme_registry.studies.engine import programs
 
 ROOT = Path(__file__).resolve().parents[3]
 STEPS = 96

@@ -26,8 +26,8 @@ from sme_registry.studies.report.figures.panels import (
     HEADINGS,
     INDICATION,
     WIDTH,
-    Column,
     Drawn,
+    MarkColumn,
     Picture,
     dims,
     epsilon_remark,
@@ -86,7 +86,7 @@ def draw_contrasts(analysis: Analysis) -> Drawn:
         if rows.empty:
             continue
         columns = [
-            Column(m.key, f"change of\n{m.label}\n(worse to the {sides[m.worse]})", neutral=0.0)
+            MarkColumn(m.key, f"change of\n{m.label}\n(worse to the {sides[m.worse]})", neutral=0.0)
             for m in metrics
         ]
         labels = [metric.label.partition(",")[0] for metric in metrics]
@@ -270,7 +270,7 @@ def draw_differences(analysis: Analysis) -> Drawn:
         f"{FEW} pairs, {INDICATION}",
         mark_rows(
             rows.assign(algorithm=rows.second), "difference",
-            [Column(metric.key, label, metric.label, 0.0) for metric in drawn],
+            [MarkColumn(metric.key, label, metric.label, 0.0) for metric in drawn],
             "class_name", places, looks, share_x=True,
         ),
     )  # fmt: skip
@@ -334,9 +334,9 @@ def _kept_maps(
     return kept, problem
 
 
-def _both(label: str, **options: Any) -> list[Column]:
+def _both(label: str, **options: Any) -> list[MarkColumn]:
     """Columns of WD and OOD regret side by side."""
-    return [Column(metric, label, heading, **options) for metric, heading in HEADINGS.items()]
+    return [MarkColumn(metric, label, heading, **options) for metric, heading in HEADINGS.items()]
 
 
 def _spaced(names: Iterable[str] | Mapping[str, str]) -> dict[str, float]:

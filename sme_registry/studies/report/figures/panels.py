@@ -247,7 +247,7 @@ def tick_steps(axes: Axes) -> None:
     axes.xaxis.set_major_formatter(step_text)
 
 
-class Column(NamedTuple):
+class MarkColumn(NamedTuple):
     """A panel of rows of marks: the rows' metric, labels, and a line at the neutral value."""
 
     metric: str
@@ -259,7 +259,7 @@ class Column(NamedTuple):
 def mark_rows(
     rows: pd.DataFrame,
     value: str,
-    columns: Sequence[Column],
+    columns: Sequence[MarkColumn],
     place: str,
     places: Mapping[str, float],
     looks: Mapping[str, Look],
@@ -271,7 +271,7 @@ def mark_rows(
     `place` is the column that says in which row a mark is.
     """
 
-    def draw(axes: Axes, column: Column) -> None:
+    def draw(axes: Axes, column: MarkColumn) -> None:
         of_metric = rows[rows.metric == column.metric]
         at = of_metric[place].map(places)
         for name, look, shift in side_by_side(looks, 0.7):

@@ -48,7 +48,7 @@ def draw_metrics(analysis: Analysis) -> Iterator[Picture]:
     """The metrics of whole lives, one panel a metric and one row a stream."""
     rows = _within(analysis.tables["stream_metrics"])
     columns = [
-        panels.Column(
+        panels.MarkColumn(
             metric.key,
             f"{metric.label}\n({'less' if metric.worse > 0 else 'more'} is better)",
             neutral=1.0 if metric.key == "plasticity_ratio" else 0.0,
