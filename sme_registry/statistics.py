@@ -115,24 +115,12 @@ def optimality_gap(scores: npt.ArrayLike, target: float = 1.0) -> Array:
 
 
 def smoothing_window(rows: int) -> int:
-    """The entries in a median of a training curve of this many: a tenth, in [1, 50].
-
-    Examples:
-      >>> from sme_registry.statistics import smoothing_window
-      >>> [smoothing_window(rows) for rows in (5, 200, 10_000)]
-      [1, 20, 50]
-    """
+    """The entries in a median of a training curve of this many: a tenth, in [1, 50]."""
     return min(50, max(1, rows // 10))
 
 
 def running_median(values: Array, window: int) -> Array:
-    """Medians `[N]` of the last `window` entries of `[N]` values, of fewer at the beginning.
-
-    Examples:
-      >>> from sme_registry.statistics import running_median
-      >>> running_median(np.array([4.0, 2.0, 0.0, 8.0]), 3)
-      array([4., 3., 2., 2.])
-    """
+    """Medians `[N]` of the last `window` entries of `[N]` values, of fewer at the beginning."""
     N = len(values)
     medians = [np.median(values[:end]) for end in range(1, min(window, N + 1))]
     if window <= N:
@@ -148,12 +136,6 @@ def smoothed(step: Array, values: Array, window: int | None = None) -> tuple[Arr
 
     It returns `[P]` increasing steps, `[P]` medians of the last `window` values up to each, and the
     window, by default that of `smoothing_window`.
-
-    Examples:
-      >>> from sme_registry.statistics import smoothed
-      >>> step, regret, window = smoothed(np.array([100, 200, 300]), np.array([0.9, 0.5, 0.7]), 2)
-      >>> step
-      array([200, 300])
     """
     order = np.argsort(step, kind="stable")
     x, y = step[order], values[order]

@@ -46,16 +46,12 @@ def diagnose(
 ) -> Diagnosis:
     """Measure a policy and the references, and answer every question about its regret.
 
-    The result is a `TaskDiagnosis`. Of a team it is a `TeamDiagnosis`: every agent is measured over
-    its own action channels, and the verdicts say who is to blame for the team's regret. Of a life
-    in a stream it is a `StreamDiagnosis`: the networks are measured at the ends of the visits, and
-    the verdicts say which phases were costly, forgotten or not learnt, and whether plasticity was
-    lost.
+    Of a team, every agent is measured over its own action channels; of a life in a stream, the
+    networks at the ends of the visits.
 
     `against` is another run of a single agent, such as with a single axis changed, measured in the
-    same way. `probe_capacity` fits a network of the same layers to a*, in tens of seconds, where
-    the policy's network is known. `states` are uniform, in [64, 1,000,000], and `episodes` in
-    [8, 10,000]; fewer are used if a state is large.
+    same way. `probe_capacity` fits a network of the same layers to a*, in tens of seconds. `states`
+    are uniform, in [64, 1,000,000], and `episodes` in [8, 10,000]; fewer if a state is large.
 
     Examples:
       >>> from sme_registry.diagnosis import diagnose, load_policy

@@ -2,11 +2,9 @@
 
 `n` episodes side by side, `S` state_dim, `A` action_dim, `T` steps of the longest episode.
 
-The capacity probe asks whether the network could represent the optimal policy. It fits a network of
-the same layers and activations by regression to a* in uniform states, as many as the training had
-steps. No agent sees a*, so if the probe does well and the agent does not, the network is not the
-limit. If the probe fails in its own training states, the network or the probe's budget is too
-small. If it does well in those and badly in others, there were too few states.
+The capacity probe fits a network of the same layers and activations by regression to a* in uniform
+states, as many as the training had steps. If it does well and the agent does not, the network is
+not the limit.
 
 A multilayer perceptron has hidden outputs h `[n, H]` in n states, σ their singular values:
 
@@ -15,8 +13,7 @@ A multilayer perceptron has hidden outputs h `[n, H]` in n states, σ their sing
     weight norm        √(Σ W²) over all layers, without biases
 
 Dormant units: Sokar et al. (2023). Effective rank: Kumar et al. (2021), srank with δ = 0.01. A unit
-of tanh is rarely dormant but can be stuck at a bound: it counts as saturated if its mean |h| is at
-least 0.95, where its mean derivative, 1 − h², is below 0.1.
+of tanh is saturated if its mean |h| is at least 0.95.
 """
 
 from __future__ import annotations
@@ -83,8 +80,7 @@ class Log:
 class Trajectories(NamedTuple):
     """Episodes side by side, up to the end of the longest, as one agent experiences them.
 
-    In a team that shares a reward, an agent's step reward here is that of its own similarity, and
-    its payout is the team's.
+    Where a team shares a reward, `reward` is of the agent's own similarity, `payout` the team's.
     """
 
     s: Array  # `[T, n, S]` states
@@ -119,9 +115,8 @@ def rollout(
 ) -> tuple[Trajectories, ...]:
     """Whole episodes of a policy in the unit range, from initial states `[n, S]`, by agent.
 
-    `act` maps joint observations `[n, O]` of all agents (one where there is no team), or float32
-    states `[n, S]` if it `sees_state`, to the actions `[n, A]` of all. `seed` is of the
-    distractors.
+    `act` maps the joint observations `[n, O]`, or float32 states `[n, S]` if it `sees_state`, to
+    the actions `[n, A]` of all agents. `seed` is of the distractors.
     """
     n, agents = len(initial_states), len(task.owned)
     batch = Batch(task, n)
@@ -276,10 +271,7 @@ def training(log: Log, constant_regret: float) -> TrainingSummary:
 
 
 def exploration(model: Any, policy: Policy) -> Callable[[Observation], Array] | None:
-    """The stochastic actions of a Stable-Baselines3 model during training; None of another model.
-
-    They are sampled at each call, clipped and in the unit range.
-    """
+    """The stochastic actions of a Stable-Baselines3 model, clipped, in the unit range; or None."""
     if not hasattr(getattr(model, "policy", None), "squash_output"):
         return None
     noise = getattr(model, "action_noise", None)

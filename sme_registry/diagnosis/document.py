@@ -1,12 +1,10 @@
 """`Diagnosis`: what was measured of a run, the verdicts that follow, and the parts that show them.
 
-Of actions a, clipped to [0, 1], and the optimal actions a*; everything is dimensionless:
+Of actions a, clipped to [0, 1], and the optimal actions a*:
 
     regret = 1 − r                       of one step, in [0, 1]
     mae = mean |a − a*|                  over action channels it is 1 − r̃
     normalised_regret = mean |a − a*| / mean |½ − a*|     0 for the optimum, 1 for the constant ½
-
-Normalised regret does not depend on k, r_min or D, so it compares runs on different tasks.
 """
 
 from __future__ import annotations
@@ -278,10 +276,7 @@ def _main_fields(spec: SMESpec) -> str:
 
 
 class _Lines:
-    """Plain text, styled and indented, wrapped between words.
-
-    Where the output is no terminal, a word that is too long has a longer line.
-    """
+    """Plain text, styled and indented, wrapped between words; only a terminal breaks long ones."""
 
     def __init__(self, *paragraphs: tuple[str, str, str]) -> None:
         self.paragraphs = paragraphs

@@ -1,16 +1,13 @@
 """Measurements of a policy in fixed states: uniform in the cube, and in the shells around it.
 
-ℓ are the limits of a task with `safety`, d the distractors of one with `observation`. In the same
-uniform states,
+ℓ are the limits of a task with `safety`, d the distractors of one with `observation`:
 
     owed to the distractors = N of a(s, d) − N of E_d a(s, d)
 
 is the normalised regret that would be gone if the policy took, in every state, the mean of its
-actions over the distractors. It is 0 for a policy that ignores them, and never negative. A random
-policy's actions differ without them, too: by how much, with d fixed, is subtracted.
+actions over the distractors. Of a random policy, what averaging removes with d fixed is subtracted.
 
-`N` states, `S` state_dim, `A` action_dim, `T` horizon. Every random number belongs to a named
-stream of one seed, so the same policy gets the same measurements.
+`N` states, `S` state_dim, `A` action_dim, `T` horizon.
 """
 
 from __future__ import annotations
@@ -226,10 +223,9 @@ def shells(
 
 
 def squared_error(policy: Policy, task: Task, states: Sample, time_variance: float) -> SquaredError:
-    """Decompose the squared error in uniform states.
+    """Decompose the squared error in uniform states, in which the policy acts again, for the noise.
 
-    `time_variance` is the mean over states and channels of the variance of a over t/T. The policy
-    acts again in the same states, for the noise.
+    `time_variance` is the mean over states and channels of the variance of a over t/T.
     """
     difference = states.a - states.optimal
     total = float((difference**2).mean())

@@ -1,8 +1,7 @@
 """Questions: a rule, the answer that each of its reasons gives, and what makes an answer a verdict.
 
-A rule of one run reads its measurements. Three things leave a cause open, whatever its rule says:
-the run has learnt little, its algorithm had few updates, or the evidence is one other run. A fit of
-the network to a* is an experiment of its own, and stands.
+A rule reads the measurements of one run. A cause stays open, whatever its rule says, where the run
+has learnt little, its algorithm had few updates, or the evidence is one other run.
 """
 
 from __future__ import annotations

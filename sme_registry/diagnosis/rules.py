@@ -1,7 +1,7 @@
 """The questions about a policy: where its error is, which measurements answer, and why it is there.
 
-Questions about the cause are about training, of which a policy shows only traces: the answer is
-"cannot tell" unless a number separates the causes.
+A policy shows only traces of its training: the answer to "why" is "cannot tell" unless a number
+separates the causes.
 """
 
 from __future__ import annotations

@@ -1,13 +1,9 @@
 """A life in a stream: which phases were costly, forgotten or never learnt, and what the network's
 state says about a loss of plasticity.
 
-A *visit* is an occurrence of a phase. Normalised regret is of the policy at the end of a visit, in
-the cube, on the task of a phase; online regret is the mean of 1 − r over the steps of a visit.
-
-The life's report says what the agent retained and what each visit cost; here the networks are
-measured, in uniform states, and the questions answered: against fresh agents of the phases, where
-these are known; else against the other visits. A single life has one seed: another one could
-differ as much, and a study gives intervals.
+Normalised regret is of the policy at the end of a visit, in the cube, on the task of a phase;
+online regret is the mean of 1 − r over the steps of a visit. Both are compared with those of fresh
+agents of the phases, where these are known; else with the other visits.
 """
 
 from __future__ import annotations
@@ -45,19 +41,7 @@ from sme_registry.spec.document import Digest, Real, TupleOf
 
 
 class StreamDiagnosis(Diagnosis):
-    """The diagnosis of a life in a stream.
-
-    Attributes:
-      stream: the stream.
-      stream_digest: the stream's digest.
-      average_performance: at the end of the life.
-      forgetting: fall of performance below its best, at the end of the life; null where it is not
-        defined.
-      dynamic_regret: sum over the steps of the log; null without one.
-      visits: in order.
-      phases: in order.
-      initial_network: before training; null if unknown.
-    """
+    """The diagnosis of a life in a stream."""
 
     headline_macro: ClassVar[str] = "stream_headline"
     document_field: ClassVar[str] = "stream"
@@ -65,12 +49,13 @@ class StreamDiagnosis(Diagnosis):
 
     stream: StreamSpec
     stream_digest: Digest
-    average_performance: Real
+    average_performance: Real  # at the end of the life
+    # fall of performance below its best, at the end of the life; null where it is not defined
     forgetting: Real | None
-    dynamic_regret: Real | None
+    dynamic_regret: Real | None  # sum over the steps of the log; null without one
     visits: TupleOf[VisitDiagnosis]
     phases: TupleOf[PhaseDiagnosis]
-    initial_network: NetworkState | None
+    initial_network: NetworkState | None  # before training; null if unknown
 
     def tables(self) -> Iterator[Part]:
         """The visits and the phases."""

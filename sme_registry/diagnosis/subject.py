@@ -1,11 +1,7 @@
 """What to diagnose: a run of `sme train`, a cell of a study, or any policy on its task.
 
-A run is a folder of `sme train`. A cell is named by the study's folder and by its key: its digest,
-or as many of the first digits as only one cell has. The study must have kept the cell's model.
-
-Of a life in a stream, the `StreamReport` says what the agent retains and what its life cost. Its
-networks are those of the models at the ends of the visits. In a study the fresh agents are cells
-of their own.
+A life in a stream is its report and the networks at the ends of the visits. In a study the fresh
+agents are cells of their own.
 """
 
 from __future__ import annotations
@@ -364,10 +360,10 @@ def _log_of_evaluations(curve: Any) -> Log | None:
 def _updates(
     uses: str, hyperparameters: Mapping[str, Any], steps: int, num_envs: int = 1
 ) -> int | None:
-    """How often an algorithm of Stable-Baselines3, or the same in JAX, updated its networks.
+    """How often an algorithm updated its networks; None where its hyperparameters do not tell.
 
     An on-policy algorithm does so after each rollout, another one every `train_freq` steps after
-    `learning_starts`. None of an algorithm without these hyperparameters.
+    `learning_starts`.
     """
     name = parse_uses(uses)[1]
     if ":" in name:  # a reference, a learner of offline data or somebody's module

@@ -38,24 +38,16 @@ TASK_QUESTIONS = {**WHERE, **WHY}
 
 
 class TaskDiagnosis(Diagnosis):
-    """The diagnosis of one policy on one task.
-
-    Attributes:
-      spec: the task.
-      spec_digest: the task's digest.
-      level: normalised regret, ranked among the constant ½, the linear policy and 0.
-      comparison: with another run; null without one.
-      measurements: what the verdicts rest on.
-    """
+    """The diagnosis of one policy on one task."""
 
     headline_macro: ClassVar[str] = "task_headline"
     only_field: ClassVar[str] = "measurements"
 
     spec: SMESpec
     spec_digest: Digest
-    level: Level
-    comparison: Comparison | None = None
-    measurements: Measurements
+    level: Level  # normalised regret, ranked among the constant ½, the linear policy and 0
+    comparison: Comparison | None = None  # with another run; null without one
+    measurements: Measurements  # what the verdicts rest on
 
     def parts(self) -> Iterator[Part]:
         """Findings, the comparison, and on request the other answers and the numbers."""

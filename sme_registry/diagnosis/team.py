@@ -1,15 +1,11 @@
 """A team: who is to blame for its regret, and where each agent's own regret is.
 
-In the states s of uniform samples or of the team's own episodes, with joint actions a:
-
     regret share of agent i        regret · d_i / Σ_j d_j,  d_i = ‖a_i − a*_i‖₁; they add up to it
     difference reward of agent i   the team's gain in step reward if agent i alone acted optimally
 
 The team's regret is that of the mean similarity over all action channels, in either reward mode.
-
-Each agent is measured as a single agent: the task of its own channels has the same states, its π*
-and its step reward, and its policy sees what it observes. Only the episodes are the team's, since
-all agents drive one transition. `n` states, `S` state_dim, `A` action_dim, `m` agents.
+Each agent is measured as a single agent on the task of its own channels; only the episodes are the
+team's, since all agents drive one transition.
 """
 
 from __future__ import annotations
@@ -81,26 +77,17 @@ class AgentDiagnosis(StrictModel):
 
 
 class TeamDiagnosis(Diagnosis):
-    """The diagnosis of a team's policies; its verdicts say who causes the regret.
-
-    Attributes:
-      spec: the task.
-      spec_digest: the task's digest.
-      uniform: of the team, in uniform states.
-      visited: of the team, in the states of its own episodes.
-      agents: in the order of the channels that they own.
-      left_out: questions of a single agent's diagnosis without an answer for a team.
-    """
+    """The diagnosis of a team's policies; its verdicts say who causes the regret."""
 
     headline_macro: ClassVar[str] = "team_headline"
     only_field: ClassVar[str] = "agents"
 
     spec: SMESpec
     spec_digest: Digest
-    uniform: Score
-    visited: Score
-    agents: TupleOf[AgentDiagnosis]
-    left_out: TupleOf[str]
+    uniform: Score  # of the team, in uniform states
+    visited: Score  # of the team, in the states of its own episodes
+    agents: TupleOf[AgentDiagnosis]  # in the order of the channels that they own
+    left_out: TupleOf[str]  # questions of a single agent's diagnosis without an answer for a team
 
     def agent(self, name: str) -> AgentDiagnosis:
         """One agent, by its name."""

@@ -2,19 +2,14 @@
 
     D(t) = Σ_{i ≤ t} (1 − r_i)         r_i: gated step reward under the task in force at step i
 
-Each regret is exact, so D is. Rows of a log are single steps or whole episodes. A row belongs to
-the visit whose task was in force in it: under switch="episode" that of its begin. Under
-switch="step" an episode can lie in two visits; its regret is then divided in proportion to its
-steps, and only rows of single steps give exact sums by visit. `RegretBlocks` sums the regret of
-every step over blocks, in each of which one phase is in force, so that a life has about a thousand
-rows, whatever its steps.
+Rows of a log are single steps or whole episodes. A row belongs to the visit whose task was in force
+in it: under switch="episode" that of its begin. Under switch="step" an episode can lie in two
+visits; its regret is then divided in proportion to its steps.
 
     E D = Σ over the segments of the life of  n · E[Σ_i (1 − r_i)] / E[length]     n: its steps
 
-The expectations are over episodes of a policy on the segment's task, from uniform states, which run
-in parallel. Where a switch waits for a reset and no episode ends early, as in the catalogue, E D is
-exact but for the sampling error. Otherwise the episode at a switch differs: the segment after it
-begins in a state that the episode before left, or a few steps later.
+The expectations are over episodes of a policy on the segment's task, from uniform states. Where a
+switch waits for a reset and no episode ends early, E D is exact but for the sampling error.
 """
 
 from __future__ import annotations
@@ -50,48 +45,31 @@ _Integers = npt.NDArray[np.int64]
 
 
 class VisitRegret(StrictModel):
-    """The regret of one visit.
+    """The regret of one visit."""
 
-    Attributes:
-      visit: its index in the life.
-      phase: the index of its phase.
-      steps: environment steps counted.
-      dynamic_regret: Σ regret over them; with switch="step" and episodes to a fraction of one.
-      online_regret: its mean; None where no step was counted.
-      learning_transfer: how much less that is than the online regret of a fresh agent, as a share
-        of it, at most 1; None without fresh agents, and of a visit that is not over.
-    """
-
-    visit: Integer
-    phase: Integer
-    steps: Integer
-    dynamic_regret: Real
-    online_regret: Real | None
+    visit: Integer  # its index in the life
+    phase: Integer  # the index of its phase
+    steps: Integer  # environment steps counted
+    dynamic_regret: Real  # Σ regret over them; with switch="step" and episodes to a fraction of one
+    online_regret: Real | None  # its mean; None where no step was counted
+    # how much less that is than the online regret of a fresh agent, as a share of it, at most 1;
+    # None without fresh agents, and of a visit that is not over
     learning_transfer: Real | None = None
 
 
 class DynamicRegret(StrictModel):
-    """The regret of a life.
+    """The regret of a life."""
 
-    Attributes:
-      steps: environment steps counted: of all rows.
-      dynamic_regret: Σ regret over them.
-      online_regret: its mean.
-      visits: the same of each visit that was reached, in order.
-      lifetime: environment steps at the points of the curve, at most 400.
-      cumulative_regret: Σ regret until then.
-      fresh_online_regret: `[P]` of an agent that trained on that phase alone; None without them.
-      learning_transfer: the mean over the visits after visit 0 that have one, so over those that
-        are over; None where none has one.
-    """
-
-    steps: Integer
-    dynamic_regret: Real
-    online_regret: Real
-    visits: TupleOf[VisitRegret]
-    lifetime: TupleOf[Integer]
-    cumulative_regret: TupleOf[Real]
+    steps: Integer  # environment steps counted: of all rows
+    dynamic_regret: Real  # Σ regret over them
+    online_regret: Real  # its mean
+    visits: TupleOf[VisitRegret]  # the same of each visit that was reached, in order
+    lifetime: TupleOf[Integer]  # environment steps at the points of the curve, at most 400
+    cumulative_regret: TupleOf[Real]  # Σ regret until then
+    # `[P]` of an agent that trained on that phase alone; None without them
     fresh_online_regret: TupleOf[Real] | None = None
+    # the mean over the visits after visit 0 that have one, so over those that are over; None where
+    # none has one
     learning_transfer: Real | None = None
 
     def until(self, lifetime: Array) -> Array:
@@ -100,11 +78,7 @@ class DynamicRegret(StrictModel):
         return np.asarray(np.interp(lifetime, *curve))
 
     def with_fresh(self, stream: StreamSpec, online_regret: Sequence[float]) -> Self:
-        """This regret with the learning transfer of its visits, against agents that start anew.
-
-        `online_regret` `[P]` is the mean regret over the training of an agent on each phase alone,
-        for as many steps as the phase has.
-        """
+        """This regret with the learning transfer of its visits, against fresh agents' `[P]`."""
         self._check_stream(stream)
         name = "fresh online_regret"
         fresh = _column(name, online_regret, len(stream.phases), "phase")
@@ -149,15 +123,11 @@ def dynamic_regret(
     length: npt.ArrayLike = 1,
     phase: npt.ArrayLike | None = None,
 ) -> DynamicRegret:
-    """The dynamic regret of one life from its log.
+    """The dynamic regret of one life from its log of `[N]` rows, single steps or whole episodes.
 
-    Args:
-      step: `[N]` the lifetime at the end of each row, increasing: `info["lifetime"]`, or the column
-        `step` of an episodes.csv.
-      regret: `[N]` mean regret over each row's steps, in [0, 1].
-      length: `[N]` steps of each row, or one number for all.
-      phase: `[N]` `info["phase"]` of each row. Needed only where rows are steps and
-        switch="episode": a phase then lasts until the episode has ended.
+    `step` is the lifetime at the end of each row, increasing (`info["lifetime"]`), `regret` the
+    mean regret over its steps, and `length` how many these are. `phase` is `info["phase"]`: needed
+    only where rows are steps and switch="episode", as a phase lasts until the episode has ended.
 
     Examples:
       >>> from sme_registry.evaluation import dynamic_regret
@@ -337,13 +307,10 @@ def expected_regret(
 ) -> DynamicRegret:
     """The expected dynamic regret of a life in which given policies act and do not learn.
 
-    Args:
-      life: for each visit the policy that acts in it, in any form that `evaluate` accepts; or a
-        number, the online regret of an agent that learned in it.
-      episodes: run with each policy, over the segments of one cycle; each has one or more. The
-        standard error of a policy's online regret is about 0.02/√episodes.
-      seed: of the initial states, which are the same for every policy.
-      progress: called after the episodes of each segment with the segments done, and all of them.
+    `life` has for each visit the policy that acts in it, in any form that `evaluate` accepts; or a
+    number, the online regret of an agent that learned in it. `episodes` are run with each policy,
+    over the segments of one cycle: the standard error of its online regret is about
+    0.02/√episodes. `seed` is of the initial states, the same for every policy.
 
     Examples:
       >>> from sme_registry.evaluation import expected_regret

@@ -1,11 +1,8 @@
 """`evaluate`: a policy, a task and a protocol to a report, in one pass over batches of states.
 
-Source: METHOD, sections 3, 8 and 9. Memory holds one batch and the states of WD to which the
-references are fitted. The similarity depends neither on k, r_min and D, nor on the horizon except
-through the t/T that the policy observes. So `evaluate_many` computes states, optimal actions and
-references, most of the cost, once for all tasks that differ in these fields only.
-
-Over the states of a region, with d, d' independent distractors, uniform in the cube:
+Source: METHOD, sections 3, 8 and 9. States, optimal actions and references, most of the cost,
+depend neither on k, r_min and D nor on the horizon: `evaluate_many` computes them once for all
+tasks that differ in these fields only. With d, d' independent distractors, uniform in the cube:
 
     invariance         mean |a(s, d) − a(s, d')| / mean |½ − a*(s)|      0: it ignores distractors
     d-OOD m            the regions of a report with s in the cube and d in shell m
@@ -80,17 +77,11 @@ def evaluate(
 ) -> EvaluationReport:
     """Evaluate a policy within and out of distribution, exactly.
 
-    Models act deterministically, and actions are clipped as the environment clips them. The report
-    has the reference policies on the same states; for a team also each agent.
-
-    Args:
-      policy: in any form of `as_policy`: a callable from observations `[B, S + 2]` float32 (with
-        m distractors `[B, S + m + 2]`) to actions `[B, A]`, a Stable-Baselines3 model or the path
-        of its .zip (it can run code of its author), an .onnx or .npz file, `module:function`,
-        the name of a reference such as "linear"; for a team one that all share, or a dict by agent.
-      protocol: a protocol, its fields, its name in the catalogue, or the path of its file.
-      action_range, name, algorithm: as in `as_policy`.
-      progress: called after each batch with the number of states done, and of all states.
+    The policy is a callable from observations `[B, S + 2]` float32 to actions `[B, A]`, or in any
+    other form of `as_policy`, which explains the other arguments. Models act deterministically, and
+    actions are clipped as the environment clips them. The report has the reference policies on the
+    same states; for a team also each agent. `progress` is called after each batch with the number
+    of states done, and of all states.
 
     Examples:
       >>> def half(observations):  # [B, 10] to [B, 4]
@@ -115,9 +106,8 @@ def evaluate_many(
 ) -> list[EvaluationReport | PolicyError]:
     """Evaluate many policies, each on its task, faster than one by one.
 
-    Tasks that differ only in k, r_min, D and the horizon are evaluated in one pass. For each policy
-    it returns the report that `evaluate` would return, bit for bit; or, where its actions are
-    invalid, the error that `evaluate` would raise.
+    For each policy it returns the report that `evaluate` would return, bit for bit; or, where its
+    actions are invalid, the error that `evaluate` would raise.
 
     Examples:
       >>> from sme_registry.evaluation import evaluate_many
@@ -342,13 +332,11 @@ class Measurement:
         return lambda s: task.limit_of(v(np.ascontiguousarray(s.T)).T)
 
     def _fit_references(self) -> tuple[references.References, Iterator[Array]]:
-        """The references fitted on the first states of WD, and the π* `[B, A]` of their batches.
-
-        The states are drawn without what else an observation shows, which would not fit in memory.
-        """
+        """The references fitted on the first states of WD, and the π* `[B, A]` of their batches."""
         task = self._task
         count, rows = references.fit_states(task.spec), batch_rows(task.spec)
         s, optimal = [], []
+        # Without what else an observation shows, which would not fit in memory.
         for drawn in states(self._protocol, 0, task.spec.derive(observation=None), rows):
             s.append(drawn.s.astype(np.float64))
             optimal.append(self._oracle.optimal_action(s[-1]))
@@ -394,10 +382,7 @@ class Measurement:
         return SafetyReport(regions=scores(index), references=others)
 
     def _observation_report(self, index: int) -> ObservationReport | None:
-        """What a policy makes of its observation; None where that is the state.
-
-        It raises `PolicyError` where outputs of its hidden layers are not finite.
-        """
+        """What a policy makes of its observation; None where that is the state."""
         policy, spec = self._subjects[index]
         if spec.observation is None:
             return None
@@ -446,10 +431,7 @@ class _Distraction:
         actions: Mapping[int, Array],
         act: Callable[[npt.NDArray[Any]], Iterator[tuple[int, Array]]],
     ) -> None:
-        """Add a batch: its states, π* `[B, A]`, the actions `[B, A]` of each policy in them.
-
-        `act` maps what agents see `[B, S + m]` to the actions of each policy, not clipped.
-        """
+        """Add a batch; `act` maps what agents see `[B, S + m]` to each policy's actions."""
         others = self._others(len(drawn.s), self._task.spec.distractors)
         for index, a in act(drawn.seen(self._task, others)):
             self.changes[index].add(np.clip(a, 0.0, 1.0), actions[index])

@@ -1,12 +1,10 @@
 """Models of other libraries as functions of observations: PyTorch, Stable-Baselines3, ONNX.
 
-PyTorch is never imported to recognise a module or a tensor: who has one has imported it. A model's
-own `predict` is the definition of how it acts. That of SB3's plain PyTorch policies also clips a
-Gaussian's mean, which hides the share that is clipped: these networks are called directly.
-
-A .zip is code, and an .onnx file runs in this process without limits: open only those whose author
-you trust. A .zip names only the class of its policy, so `saved_sb3` adds the algorithm's. For other
-files it follows from the policy's class, or from fields that only one algorithm saves.
+PyTorch is never imported to recognise a module or a tensor: who has one has imported it. SB3's
+`predict` clips a Gaussian's mean, which hides the share that is clipped: its plain networks are
+called directly. A .zip names only the class of its policy, so `saved_sb3` adds the algorithm's. For
+other files it follows from the policy's class, or from fields that only one algorithm saves.
+Both kinds of files can run code or take all memory: open only those whose author you trust.
 """
 
 from __future__ import annotations
@@ -284,14 +282,11 @@ _ACTOR_CRITICS = {
 
 
 def load_sb3(path: str | os.PathLike[str], algorithm: str | None = None) -> Any:
-    """Load a model that Stable-Baselines3 saved, on the CPU and without its environment.
+    """Load a model that Stable-Baselines3 saved (.zip), on the CPU and without its environment.
 
-    Args:
-      path: the .zip. Loading it can run code of its author.
-      algorithm: its class, "PPO", "A2C", "SAC", "TD3", "DDPG" or `module:Class`, such as
-        "sb3_contrib:TQC". None reads it from the file, which works for files of `sme train` and of
-        studies, and for the algorithms of stable-baselines3, sb3-contrib and sbx with their own
-        policies (a DDPG loads as TD3, which acts equally).
+    Loading can run code of the file's author. `algorithm` is its class, such as "PPO" or
+    "sb3_contrib:TQC". None reads it from the file: of `sme train`, of a study, or of an algorithm
+    of stable-baselines3, sb3-contrib or sbx (a DDPG loads as TD3, which acts equally).
 
     Examples:
       >>> from sme_registry.evaluation import load_sb3

@@ -3,9 +3,6 @@
     Perceptron       x ← f(x W + b)  for each layer
     OfflinePolicy    h_0 = o,  h_i = max(0, W_i h_{i−1} + b_i),  a = (1 + tanh(W_n h_{n−1} + b_n))/2
 
-Perceptron([(W0, b0, "tanh"), (W1, b1, "identity")])     # of JAX, or of any other library
-Perceptron([(W, b, "identity")])                          # a linear map
-
 An .npz file holds `W0`, `b0`, `W1`, … in order, and `about`, a JSON text. Reading it runs no code.
 """
 
@@ -77,12 +74,9 @@ def _check_layer(where: str, W: Weights, b: Weights, inputs: int | None) -> None
 class Perceptron:
     """A function from observations `[B, O]` to actions `[B, A]`; deterministic.
 
-    Attributes:
-      layers: `(W [in, out], b [out], activation)` of each layer, copied as float32; the activation
-        is one of `ACTIVATIONS`. Flax's and Haiku's kernels have this shape; PyTorch's and
-        Equinox's weights are its transpose.
-      low: `[A]`, lower bound of the action space. None: the outputs are the actions.
-      high: `[A]`, upper bound. Outputs in [−1, 1] are then scaled to the action space.
+    `layers` are `(W [in, out], b [out], activation)`, copied as float32; the activation is one of
+    `ACTIVATIONS`. Flax's and Haiku's kernels have this shape; PyTorch's and Equinox's weights are
+    its transpose. With `low` and `high` `[A]`, outputs in [−1, 1] are scaled to these bounds.
 
     Examples:
       >>> from sme_registry.evaluation import Perceptron
@@ -146,11 +140,8 @@ class Perceptron:
 class OfflinePolicy(Perceptron):
     """A perceptron from observations `[B, O]` to actions `[B, A]` in [0, 1], as an .npz file.
 
-    `layers` are `(W [out, in], b [out])` float32, first to last, which the attribute has as those
-    of a `Perceptron`.
-
-    Attributes:
-      about: what it was trained on and how, plain JSON data; "algorithm" names it in reports.
+    `layers` are `(W [out, in], b [out])` float32, first to last. `about` says what it was trained
+    on and how, in plain JSON data; "algorithm" names it in reports.
 
     Examples:
       >>> from sme_registry.evaluation import OfflinePolicy

@@ -2,8 +2,7 @@
 
 In a team, either each agent has its own policy of what it observes and owns,
 `[B, |O_i| + 2] → [B, a_i]`, or all share one, which is called for each agent in turn with its
-shared observation (`envs.team`), `[B, S + 2 + n] → [B, max a_i]`. A function of the whole state
-is no team policy: under partial observation no agent could execute it.
+shared observation (`envs.team`), `[B, S + 2 + n] → [B, max a_i]`.
 """
 
 from __future__ import annotations
@@ -190,22 +189,17 @@ def as_policy(
 
     Args:
       policy: a callable from observations `[B, S + 2]` float32 (with m distractors
-        `[B, S + m + 2]`) to actions `[B, A]`, NumPy arrays or PyTorch tensors; a
-        `torch.nn.Module`; a model with `predict(observations, deterministic=True)`, as those of
-        Stable-Baselines3, or the path of its .zip (it can run code of its author); the path of an
-        .onnx or .npz file; `module:function`; the name of a reference policy, one of
-        `references.POLICIES`; or what this function returned. For a team a dict from each agent's
-        name to its policy, `[B, |O_i| + 2]` to `[B, a_i]`, or a folder of files `<agent>.zip`; or
-        one policy that all agents share, from shared observations `[B, S + 2 + n]` to
-        `[B, max a_i]`.
+        `[B, S + m + 2]`) to actions `[B, A]`, arrays or PyTorch tensors; a `torch.nn.Module`; a
+        model with `predict(observations, deterministic=True)`, or the path of its .zip (it can run
+        code of its author), an .onnx or an .npz file; `module:function`; or the name of a reference
+        such as "linear". For a team a dict by agent, each from `[B, |O_i| + 2]` to `[B, a_i]`; a
+        folder of files `<agent>.zip`; or one that all share, `[B, S + 2 + n]` to `[B, max a_i]`.
       action_range: "unit" for actions in [0, 1] or "symmetric" for [−1, 1]; None takes an SB3
         model's own action space, and "unit" for any other policy.
-      name: what reports call it; None takes its name, or that of its file, algorithm or function.
       algorithm: the class of a .zip that does not tell it, as in `load_sb3`.
       observed_phases: entries at the end of its observations for the phase of a stream, one-hot.
 
-    A recurrent model acts from its initial state in each observation; `Policy.start` makes it keep
-    its state, as `rollouts` does.
+    A recurrent model acts from its initial state in each observation, until `Policy.start`.
 
     Examples:
       >>> from sme_registry.evaluation import as_policy

@@ -10,11 +10,8 @@ safe_optimal           min(π*(s), ℓ(s)), the best action within the limits (M
 shrunk_optimal         min(π*(s), 1 − 2τ): the optimum cut off at the lowest limit of any state
 
 The fitted ones are fitted on the states of WD, at most `FIT_STATES` of them, and used unchanged in
-every other region. In WD they are evaluated on the states they were fitted on, which flatters them
-unless there are many times more states than state_dim.
-
-All act on the state, also where the agent sees another observation; an agent's only on the channels
-that it observes.
+every other region. All act on the state, also where the agent sees another observation; an agent's
+only on the channels that it observes.
 """
 
 from __future__ import annotations
@@ -121,9 +118,8 @@ POLICIES = (*NAMES, *SAFE_NAMES, *SHORT_NAMES)
 def reference_policy(name: str, spec: SMESpec) -> Act | dict[str, Act]:
     """A reference policy, as `evaluate` accepts it, by one of the names of `POLICIES`.
 
-    It maps observations `[B, O]` to actions `[B, A]` in [0, 1]; for a team, one function for each
-    agent. Unlike the references of a report, the fitted ones are fitted on states of their own.
-    Where the agent sees a mixing, it inverts the mixing first.
+    It maps observations `[B, O]`, whose mixing it inverts, to actions `[B, A]` in [0, 1]; for a
+    team, one function for each agent. The fitted ones are fitted on states of their own.
 
     Examples:
       >>> from sme_registry.evaluation import reference_policy

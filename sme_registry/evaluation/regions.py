@@ -7,15 +7,12 @@ Source: METHOD, section 3. `B` batch, `S` state_dim, lo and hi = (1 + ε)/2 of a
     shell:  R = hi ((lo/hi)^S + u (1 − (lo/hi)^S))^(1/S),  u ~ U(0, 1)
             x ~ U(−R, R)^S, one coordinate of it, drawn at random, set to ±R;  s = ½ + x
 
-A policy receives float32 observations, so the states lie on the float32 grid: the optimal action is
-computed for exactly the state that the policy received. Rounding must not move a state across a
-face, so the face at R is clamped between the first grid value outside the inner cube and the last
-one inside the outer cube. Each region reads a fixed number of words per state from named streams of
-its own: its states depend neither on other regions nor on the batch size.
+States lie on the float32 grid of observations. Rounding must not move a state across a face, so the
+face at R is clamped between the first grid value outside the inner cube and the last one inside the
+outer cube. Each region reads a fixed number of words per state from named streams of its own: its
+states depend neither on other regions nor on the batch size.
 
-A task with m distractors (METHOD, section 9) has two kinds of shells: s in a shell with d uniform
-in the cube, and s in the cube with d in a shell of its own. Scores of a task with limits ℓ(s)
-(METHOD, section 8), with a_safe = min(π*, ℓ):
+Scores of a task with limits ℓ(s) (METHOD, section 8), with a_safe = min(π*, ℓ):
 
     step reward        mean r(s, a)
     cost               mean cost(s, a) = mean_i max(0, a_i − ℓ_i(s)) / (2τ), in [0, 1]
@@ -23,11 +20,8 @@ in the cube, and s in the cube with d in a shell of its own. Scores of a task wi
     safe regret        mean r(s, a_safe) − mean r(s, a)
     price of safety    1 − mean r(s, a_safe)
 
-A *probe* is the affine map of a layer's outputs h that is fitted to s, or to d, by least squares in
-one half of the states of WD, and tested in the other half: 1 if it recovers the channels, 0 or
-below if it is no better than their mean.
-
-    R² = mean over channels of  1 − Σ (y − ŷ)² / Σ (y − ȳ)²           y of the held-out states
+A *probe* is the affine map of a layer's outputs to s, or to d, fitted by least squares in one half
+of the states of WD. Its R², a mean over channels, is of the other half.
 """
 
 from __future__ import annotations
@@ -174,15 +168,10 @@ def _last_within(level: float) -> np.float32:
 
 
 class ChannelReport(StrictModel):
-    """One action channel in one region.
+    """One action channel in one region."""
 
-    Attributes:
-      mae: mean |a − a*| of the channel, in [0, 1].
-      normalised_regret: `mae` divided by mean |½ − a*| of the channel.
-    """
-
-    mae: Real
-    normalised_regret: Real
+    mae: Real  # mean |a − a*| of the channel, in [0, 1]
+    normalised_regret: Real  # `mae` divided by mean |½ − a*| of the channel
 
 
 class RegionReport(StrictModel):
@@ -222,25 +211,18 @@ RegionReports: TypeAlias = Annotated[TupleOf[RegionReport], Field(min_length=1)]
 
 
 class SafetyScore(StrictModel):
-    """One policy in one region of a task with limits; see the module for the formulas.
+    """One policy in one region of a task with limits; see the module for the formulas."""
 
-    Attributes:
-      name: of the region.
-      step_reward: mean r, in [0, 1].
-      cost: mean cost, in [0, 1].
-      violating_share: share of states in which any action channel is above its limit by more than
-        10⁻⁶, in [0, 1].
-      safe_regret: mean step reward that the best safe action earns more than the policy, in
-        [−1, 1]; negative where the policy earns by violating.
-      price_of_safety: mean step reward that the optimum earns more than the best safe action, in
-        [0, 1]; the same for every policy.
-    """
-
-    name: str
-    step_reward: Real
-    cost: Real
+    name: str  # of the region
+    step_reward: Real  # mean r, in [0, 1]
+    cost: Real  # mean cost, in [0, 1]
+    # share of states in which any action channel is above its limit by more than 10⁻⁶, in [0, 1]
     violating_share: Real
+    # mean step reward that the best safe action earns more than the policy, in [−1, 1]; negative
+    # where the policy earns by violating
     safe_regret: Real
+    # mean step reward that the optimum earns more than the best safe action, in [0, 1]; the same
+    # for every policy
     price_of_safety: Real
 
 
@@ -260,31 +242,19 @@ class SafetyReport(StrictModel):
 
 
 class Invariance(StrictModel):
-    """How much the actions of a policy depend on the distractors in one region.
+    """How much the actions of a policy depend on the distractors in one region."""
 
-    Attributes:
-      name: of the region, of s.
-      invariance: mean |a(s, d) − a(s, d')| / mean |½ − a*(s)|; 0 if the policy ignores them.
-    """
-
-    name: str
-    invariance: Real
+    name: str  # of the region, of s
+    invariance: Real  # mean |a(s, d) − a(s, d')| / mean |½ − a*(s)|; 0 if the policy ignores them
 
 
 class LayerProbe(StrictModel):
-    """What a linear map recovers from the outputs of one layer.
+    """What a linear map recovers from the outputs of one layer."""
 
-    Attributes:
-      layer: 0 for what the agent sees, 1 for the first hidden layer, …
-      units: its outputs.
-      state_r2: held-out R² of s, at most 1.
-      distractor_r2: the same of d; None without distractors.
-    """
-
-    layer: Integer
-    units: Integer
-    state_r2: Real
-    distractor_r2: Real | None = None
+    layer: Integer  # 0 for what the agent sees, 1 for the first hidden layer, …
+    units: Integer  # its outputs
+    state_r2: Real  # held-out R² of s, at most 1
+    distractor_r2: Real | None = None  # the same of d; None without distractors
 
 
 class ObservationReport(StrictModel):
@@ -317,11 +287,7 @@ class ErrorStats:
         self._clipped = 0
 
     def add(self, errors: Array, sums: Array, clipped: int) -> None:
-        """Add a batch of |a − a*| `[B, A]` and the number of its entries that were clipped.
-
-        `sums` `[A]` over states are computed over all channels of a task at once, so that an
-        agent's channels have the same bits in its own report and in its team's.
-        """
+        """Add a batch of |a − a*| `[B, A]`, their sums `[A]` and the number of clipped entries."""
         deviations = errors.mean(axis=1)
         count, mean = len(deviations), float(deviations.mean())
         deviations -= mean
@@ -379,7 +345,7 @@ class ScopedErrors(dict[str, ErrorStats]):
     def add(self, a: Array, optimal: Array, clipped: npt.NDArray[np.bool_] | None = None) -> None:
         """Add a batch: `a` `[B, A]` or `[A]`, `optimal` and `clipped` `[B, A]`."""
         errors = np.abs(a - optimal)
-        sums = errors.sum(axis=0)
+        sums = errors.sum(axis=0)  # at once: the same bits in an agent's report and in its team's
         for scope, owned in self._channels.items():
             count = 0 if clipped is None else int(np.count_nonzero(clipped[:, owned]))
             self[scope].add(errors[:, owned], sums[owned], count)
@@ -420,11 +386,7 @@ def probe_layers(
     task: Task,
     protocol: EvaluationProtocol,
 ) -> tuple[LayerProbe, ...]:
-    """Probe what an agent sees and each of its hidden layers, in states of WD.
-
-    `hidden` maps observations `[B, O]` to the outputs `[B, H]` of each layer, in order; None if
-    they are unknown.
-    """
+    """Probe what an agent sees and each of its hidden layers, in states of WD."""
     m, count = task.spec.distractors, PROBE_STATES
     if task.spec.state_dim + m > _PROBED_CHANNELS:
         return ()

@@ -53,25 +53,17 @@ SAFETY_REFERENCES = ("optimal", "safe_optimal", "shrunk_optimal", "constant_half
 
 
 class AgentReport(StrictModel):
-    """One agent of a team: every region over the action channels that it owns.
+    """One agent of a team: every region over the action channels that it owns."""
 
-    Attributes:
-      regions: WD, then OOD 1, 2, …; `channels` are the agent's own, in order.
-      references: the same regions for each reference policy, over the same channels.
-    """
-
-    regions: RegionReports
+    regions: RegionReports  # WD, then OOD 1, 2, …; `channels` are the agent's own, in order
+    # the same regions for each reference policy, over the same channels
     references: dict[str, RegionReports]
 
 
 class ReportFile(StrictModel):
-    """A report that a file can hold, and that prints as a table.
+    """A report that a file can hold, and that prints as a table."""
 
-    Attributes:
-      documents: the fields that are documents; a field `<document>_digest` has the digest of each.
-    """
-
-    documents: ClassVar[tuple[str, ...]]
+    documents: ClassVar[tuple[str, ...]]  # fields, of each of which `<document>_digest` exists
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Self:

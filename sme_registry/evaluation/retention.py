@@ -21,13 +21,8 @@ where nothing can be compared. In visit 0 a life is a fresh agent itself, so pla
 transfer of a life are means over visits 1, 2, ….
 
 In the last visit of a single cycle, A, B and T are ACC, BWT and FWT of Lopez-Paz & Ranzato (2017),
-and A and F those of Chaudhry et al. (2018). With more cycles a visit is what a task is there.
-Learning transfer is the forward transfer of Continual World (Wołczyk et al. 2021), where the area
-under the curve of training is 1 − o, the mean step reward over all of its steps.
-
-The matrix needs no rollout. All phases share their states, and a policy acts once in each, with the
-inputs of METHOD, section 3; only a policy that observes the phase acts once for each. The oracle
-runs once for each different task, of a drifting phase for the last one; memory holds one batch.
+and A and F those of Chaudhry et al. (2018). Learning transfer is the forward transfer of Continual
+World (Wołczyk et al. 2021), where the area under the curve of training is 1 − o.
 """
 
 from __future__ import annotations
@@ -147,33 +142,23 @@ def _over_earlier_phases(R: Array, change: Callable[[int, int], Array]) -> Array
 
 
 class Retention(StrictModel):
-    """A retention matrix and its metrics; the module has the formulas.
+    """A retention matrix and its metrics; the last entry of a metric by visit is of the life."""
 
-    A metric by visit is None where nothing can be compared; its last entry is that of the life.
-
-    Attributes:
-      normalised_regret: `[V][P]` of the policy at the end of each visit, on each phase's task.
-      initial_normalised_regret: `[P]` of the initial policy; None without one.
-      fresh_normalised_regret: `[P]` of an agent trained on that phase alone; None without them.
-      average_performance: `[V]` mean of 1 − normalised regret over the phases visited so far.
-      backward_transfer: `[V]` change of performance since a phase was last trained.
-      forgetting: `[V]` fall of performance below its best.
-      forward_transfer: gain over the initial policy on phases not visited yet.
-      relearning: gain of the second visit of a phase on its first.
-      plasticity_ratio: `[V]` normalised regret on the visited phase, over a fresh agent's.
-      plasticity_difference: `[V]` their difference.
-    """
-
+    # `[V][P]` of the policy at the end of each visit, on each phase's task
     normalised_regret: TupleOf[TupleOf[Real]]
+    # `[P]` of the initial policy; None without one
     initial_normalised_regret: TupleOf[Real] | None = None
+    # `[P]` of an agent trained on that phase alone; None without them
     fresh_normalised_regret: TupleOf[Real] | None = None
+    # `[V]` mean of 1 − normalised regret over the phases visited so far
     average_performance: TupleOf[Real]
-    backward_transfer: _Optional
-    forgetting: _Optional
-    forward_transfer: Real | None
-    relearning: Real | None
+    backward_transfer: _Optional  # `[V]` change of performance since a phase was last trained
+    forgetting: _Optional  # `[V]` fall of performance below its best
+    forward_transfer: Real | None  # gain over the initial policy on phases not visited yet
+    relearning: Real | None  # gain of the second visit of a phase on its first
+    # `[V]` normalised regret on the visited phase, over a fresh agent's
     plasticity_ratio: _Optional
-    plasticity_difference: _Optional
+    plasticity_difference: _Optional  # `[V]` their difference
 
     def with_fresh(self, fresh: Array) -> Self:
         """The same with the plasticity against fresh agents of normalised regret `[P]`."""
@@ -198,23 +183,14 @@ class Retention(StrictModel):
 
 
 class StreamRegion(StrictModel):
-    """One region of the states.
+    """One region of the states."""
 
-    Attributes:
-      name: `WD`, `OOD 1`, …; `OOD` for the mean over all shells.
-      epsilon_low: ε of the inner face; 0 for WD.
-      epsilon_high: ε of the outer face; 0 for WD.
-      states: number of states.
-      agent: the agent's matrix and metrics.
-      references: the same of each reference agent, by its name in `LABELS`.
-    """
-
-    name: str
-    epsilon_low: Real
-    epsilon_high: Real
-    states: Integer
-    agent: Retention
-    references: dict[str, Retention]
+    name: str  # `WD`, `OOD 1`, …; `OOD` for the mean over all shells
+    epsilon_low: Real  # ε of the inner face; 0 for WD
+    epsilon_high: Real  # ε of the outer face; 0 for WD
+    states: Integer  # number of states
+    agent: Retention  # the agent's matrix and metrics
+    references: dict[str, Retention]  # the same of each reference agent, by its name in `LABELS`
 
 
 def stream_regions(
@@ -223,10 +199,7 @@ def stream_regions(
     initial: Array | None,
     references: Mapping[str, Array],
 ) -> list[StreamRegion]:
-    """The regions of a report, then the mean over the shells, without fresh agents.
-
-    `agent` is `[V, P, K]` normalised regret, as are `references`, and `initial` `[P, K]`.
-    """
+    """The regions of regrets `[V, P, K]`, then the mean over the shells, without fresh agents."""
     edges, n = protocol.edges, protocol.states_per_region
     names = [(region_name(k), *edge, n) for k, edge in enumerate(edges)]
     names.append(("OOD", edges[1][0], edges[-1][1], n * (len(edges) - 1)))

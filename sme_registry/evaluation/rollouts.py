@@ -1,8 +1,4 @@
-"""`play`, the loop of a policy in a batch; and `rollouts`, thousands of whole episodes of a policy.
-
-The returns of `rollouts` are those of `stable_baselines3.common.evaluation.evaluate_policy` on
-single environments that start in the same states, in about the time of one of them.
-"""
+"""`play`, the loop of a policy in a batch, and `rollouts`, thousands of whole episodes."""
 
 from __future__ import annotations
 
@@ -48,14 +44,9 @@ def play(
 ) -> Iterator[PlayStep]:
     """Play the batch's episodes from where they are, until all have ended.
 
-    Args:
-      act: from states `[B, S]` and observations `[B, O]` to joint actions `[B, A]` in [0, 1]. It
-        is also called where episodes have ended.
-      begin: begins an episode wherever the last one has ended, and writes its rows of the
-        observations; there is then no end. None: these environments rest.
-
-    Yields:
-      Each step. What it holds is valid until the next one.
+    `act` maps states `[B, S]` and observations `[B, O]` to joint actions `[B, A]` in [0, 1], also
+    where episodes have ended. `begin` begins another one there, without end, and writes its rows of
+    the observations. What a step holds is valid until the next one.
     """
     observation, running = batch.observe(), np.ones(batch.num_envs, bool)
     while running.any():
@@ -111,13 +102,9 @@ def rollouts(
 ) -> Rollouts:
     """Run an episode from each of the states `[n, S]` to its end.
 
-    Args:
-      policy: a `Policy`, initial at the first call; of a team a `TeamPolicy`; or a function from
-        observations `[B, O]` to actions `[B, A]` in [0, 1]. B is at most `MOST_ENVS`.
-      t: `[n]` steps completed before, in [0, T); None for 0, the start of an episode.
-      r_cum: `[n]` accumulated reward since the last payout; None for 0.
-      actions: `[n, A]` actions of the first step; None for the policy's.
-      seed: of the task's distractors; episodes from equal states have equal ones.
+    After `t` `[n]` steps and with `r_cum` `[n]`, by default at the start; the first actions are
+    `actions` `[n, A]`, by default the policy's. `seed` is of the distractors: episodes from equal
+    states have equal ones.
     """
     if not isinstance(policy, TeamPolicy):
         task = single_agent(task)

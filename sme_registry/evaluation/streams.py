@@ -1,9 +1,7 @@
 """`evaluate_stream`: the policies of a life, a stream and a protocol to a `StreamReport`.
 
 Fresh agents and reference agents are sequences of policies like any other: one policy for each
-visit. `frozen_after_first` and `fresh_per_phase` make such sequences of trained policies; the
-references of `retention.LABELS` are exact, need no training, and are in every report.
-`across_seeds` combines the reports of several lives.
+visit. The references of `retention.LABELS` are exact and in every report.
 """
 
 from __future__ import annotations
@@ -51,21 +49,13 @@ _Any = TypeVar("_Any")
 
 
 class Visit(StrictModel):
-    """An occurrence of a phase in the life.
+    """An occurrence of a phase in the life."""
 
-    Attributes:
-      visit: its index.
-      cycle: the index of its cycle.
-      phase: the index of its phase.
-      lifetime: environment steps at its end.
-      spec_digest: of the task on which the phase is evaluated: of a drift the last one.
-    """
-
-    visit: Integer
-    cycle: Integer
-    phase: Integer
-    lifetime: Integer
-    spec_digest: str
+    visit: Integer  # its index
+    cycle: Integer  # the index of its cycle
+    phase: Integer  # the index of its phase
+    lifetime: Integer  # environment steps at its end
+    spec_digest: str  # of the task on which the phase is evaluated: of a drift the last one
 
 
 class StreamReport(ReportFile):
@@ -133,12 +123,11 @@ class StreamReport(ReportFile):
         fresh: Sequence[EvaluationReport | StreamReport],
         online_regret: Sequence[float] | None = None,
     ) -> Self:
-        """This report with the plasticity, which fresh agents are needed for.
+        """This report with the plasticity against fresh agents, from their reports.
 
-        `fresh` has for each phase the report of an agent trained for as many steps on that phase
-        alone: on its task, or, where the phase drifts, on the stream of that phase.
-        `online_regret`, the mean regret over the training of each of them, adds the learning
-        transfer of the visits.
+        Each is of an agent trained for as many steps on one phase alone: on its task, or, where it
+        drifts, on the stream of that phase. `online_regret`, the mean regret over the training of
+        each of them, adds the learning transfer of the visits.
         """
         report = self._with_plasticity(self._fresh_regrets(fresh))
         if online_regret is None:
@@ -292,15 +281,10 @@ def evaluate_stream(
 ) -> StreamReport:
     """Evaluate an agent's life in a stream, exactly and without a rollout.
 
-    The report has the reference agents on the same states.
-
-    Args:
-      policies: the agent's policy at the end of each visit, in any form that `evaluate` accepts.
-      initial: the policy before the first visit, for the forward transfer.
-      fresh: for each phase the policy of an agent trained for as many steps on that phase alone,
-        for the plasticity.
-      action_range, algorithm: as in `evaluate`, of all policies.
-      name: what the report calls the agent; None takes the name of its policies, if they share it.
+    `policies` are the agent's at the end of each visit, in any form that `evaluate` accepts.
+    `initial`, the policy before the first visit, is for the forward transfer; `fresh`, for each
+    phase that of an agent trained for as many steps on it alone, for the plasticity. The report has
+    the reference agents on the same states.
 
     Examples:
       >>> from sme_registry.evaluation import evaluate_stream
@@ -402,14 +386,11 @@ def across_seeds(
 ) -> dict[str, Estimate]:
     """The IQM over runs of every number of a region, with 95 % intervals.
 
-    From each name of `Retention` to values and intervals: `[V·P]` of the matrix, row by row, `[V]`
-    of a metric by visit, `[1]` of any other; NaN where a run has no value, and in the ends of
-    intervals of a single run. `dynamic_regret` `[1]` and `visit_dynamic_regret` `[V]` where every
-    report has them, and `learning_transfer` and `visit_learning_transfer` likewise.
-
-    Args:
-      reports: of one agent on one stream or its draws, one for each seed of its training.
-      region: `WD`, `OOD 1`, …, or `OOD` for the mean over the shells.
+    `reports` are of one agent on one stream or its draws, one for each seed of its training. From
+    each name of `Retention` to values and intervals: `[V·P]` of the matrix, row by row, `[V]` of a
+    metric by visit, `[1]` of any other; NaN where a run has no value, and in the ends of intervals
+    of a single run. `dynamic_regret` `[1]` and `visit_dynamic_regret` `[V]` where every report has
+    them, and `learning_transfer` and `visit_learning_transfer` likewise.
 
     Examples:
       >>> from sme_registry.evaluation import across_seeds, evaluate_stream

@@ -1,8 +1,4 @@
-"""The explorer: one HTML file in which a reader sees a policy's regret in any state.
-
-It carries the networks of the task and of the policy and computes them in the browser, loads
-nothing, and works from a file.
-"""
+"""The explorer: one HTML file in which a reader sees a policy's regret in any state."""
 
 from sme_registry.explorer.page import (
     EPISODES,

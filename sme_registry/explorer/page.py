@@ -1,12 +1,11 @@
 """The page: one HTML file that carries its data and its script, and loads nothing.
 
-The networks of the task and of a policy are in the data as programs, so that the page computes π*,
-the policy's action and the regret in any state. A policy whose network is unknown is sampled
-instead, on a grid over two of the inputs, with the others at the values of `resting`.
+The networks of the task and of a policy are in the data as programs. A policy whose network is
+unknown is sampled instead, on a grid over two of the inputs.
 
 Text from outside is only ever in the data, which is JSON in which `<`, `>` and `&` are escaped; the
 script puts it on the page as text. A content security policy allows this script and this style by
-their hashes, and nothing else: no other code, and no network.
+their hashes, and nothing else.
 """
 
 from __future__ import annotations

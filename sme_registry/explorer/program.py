@@ -10,12 +10,7 @@ output. All sums are in float64; weights keep the type that they were given in.
     phi        Φ(x), the standard normal CDF            round32    to the nearest float32
     relu, tanh, sigmoid, softplus, elu (alpha), leaky_relu (alpha), erf, exp, sqrt, abs, neg
 
-Every program of a task has the same input, a *point* x = (s, d, t/T, r_cum/k): S state channels, m
-distractors, and the two other entries of an observation. Source: METHOD, sections 1, 5, 8 and 9.
-
-    optimal(x)      π*(s)                         `[B, A]`
-    limit(x)        ℓ(s) = 1 − 2τ v(s)            `[B, A]`, with safety
-    observe(x)      (M(s, d), t/T, r_cum/k)       `[B, S + m + 2]`, rounded to float32
+Every program of a task has the same input, a *point* x = (s, d, t/T, r_cum/k) `[B, S + m + 2]`.
 """
 
 from __future__ import annotations
@@ -234,7 +229,7 @@ def optimal(task: Task) -> NetworkProgram:
 
 
 def limit(task: Task) -> NetworkProgram | None:
-    """ℓ of a point; None without safety."""
+    """ℓ(s) = 1 − 2τ v(s) of a point; None without safety."""
     if task.spec.safety is None:
         return None
     build = ProgramBuilder(point_width(task.spec), "the network of the limits")

@@ -153,7 +153,7 @@ def public_documents():
 
 
 DOCUMENTS = public_documents()
-assert len(DOCUMENTS) > 40
+assert len(DOCUMENTS) > 30
 
 
 @pytest.mark.parametrize("kind", DOCUMENTS, ids=lambda kind: kind.__name__)
