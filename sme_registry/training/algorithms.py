@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import importlib
 import importlib.metadata
 import importlib.util
 import inspect
@@ -30,6 +29,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any, cast
 
 from sme_registry.datasets import documents
@@ -61,11 +61,9 @@ class Entry:
 
     @property
     def uses(self) -> str:
-        """The exact name in `uses`."""
         return self.name if self.kind == "sb3" else f"{self.kind}:{self.name}"
 
     def load(self, field: str = "uses") -> Any:
-        """The class or function that makes a model."""
         if self.kind == "train":
             return load_function(self.name, field)[0]
         if self.kind not in ("sb3", "independent"):
@@ -77,7 +75,7 @@ class Entry:
         if self.place:
             # It imports the deprecated `gym` if that is installed, which prints a long notice.
             with contextlib.redirect_stderr(io.StringIO()), quiet():
-                return getattr(importlib.import_module(self.place), self.name)
+                return import_object(f"{self.place}:{self.name}", field, OptionError)
         with quiet():
             if ":" not in self.name:
                 return _entry_point(self.name, field)
@@ -92,7 +90,7 @@ class Entry:
     def check_installed(self) -> None:
         """Check that what learns is installed here, where that can be told in little time."""
         if self.kind == "jax":
-            importlib.import_module("sme_registry.jax")  # raises where JAX is missing
+            jax_package()
         elif self.kind == "sb3" and self.place:
             require_sb3()
         elif self.kind in ("sb3", "train"):
@@ -109,9 +107,7 @@ class Entry:
         if self.needs_limits:
             check_has_limits(self.name, document.specs[0])
         if self.kind == "jax":
-            from sme_registry.jax.task import check_supported
-
-            check_supported(document)
+            jax_package().task.check_supported(document)
         if self.kind == "train" and (isinstance(document, StreamSpec) or document.team):
             raise SpecError(
                 f"{self.uses}: is for a task of a single agent, and this is a "
@@ -172,10 +168,7 @@ def default_algorithm(document: SMESpec | StreamSpec) -> str:
 
 
 def full_name(uses: str, agents: str | None = None) -> str:
-    """The exact name of an algorithm in any case; the names of others' algorithms unchanged.
-
-    `agents` is whose implementation, "sb3" or "jax"; None for the one that the name says.
-    """
+    """The exact name of an algorithm in any case, of `agents`: "sb3", "jax", or as it says."""
     if agents is not None and choice("agents", agents, AGENTS) == "sb3" and in_jax(uses):
         raise OptionError(
             f"agents='sb3': must be left out for {uses!r}, which is in JAX. Leave it out, or train "
@@ -224,9 +217,9 @@ def source_of(uses: str, field: str = "uses") -> str | None:
 
 
 def load_function(name: str, field: str = "uses") -> tuple[Callable[..., Any], str]:
-    """The function `module:function` of the source that is there now, and the source's digest.
+    """The function `module:function` of the present source, and the source's digest.
 
-    The source is run again where it has changed since, so what runs is what the digest says.
+    The source is run again where it has changed, so what runs is what the digest says.
     """
     module_name, _, attribute = name.partition(":")
     with working_directory_importable():
@@ -234,9 +227,9 @@ def load_function(name: str, field: str = "uses") -> tuple[Callable[..., Any], s
         module = sys.modules.get(module_name)
         try:
             if module is None or _loaded.get(module_name) != digest:
-                importlib.import_module(module_name.rpartition(".")[0] or "sys")
-                spec = importlib.util.spec_from_file_location(module_name, path)
-                module = module or importlib.util.module_from_spec(spec)  # type: ignore[arg-type]
+                if module is None:
+                    spec: Any = importlib.util.find_spec(module_name)
+                    module = importlib.util.module_from_spec(spec)
                 sys.modules[module_name] = module
                 exec(compile(source, path, "exec"), vars(module))
                 _loaded[module_name] = digest
@@ -258,7 +251,7 @@ def load_function(name: str, field: str = "uses") -> tuple[Callable[..., Any], s
 
 
 def _source(name: str, field: str) -> tuple[str, str, bytes]:
-    """The path, the digest and the bytes of a module's source. Imports nothing."""
+    """The path, the digest and the bytes of a module's source, which is not imported."""
     module = name.partition(":")[0]
     path = module_file(module)
     if not path or not path.endswith(".py"):
@@ -277,6 +270,13 @@ def require_sb3() -> None:
     )
 
 
+def jax_package() -> ModuleType:
+    """Our package of agents in JAX, with its modules; raises where JAX is missing."""
+    import sme_registry.jax.run
+
+    return sme_registry.jax
+
+
 def is_on_policy(algorithm: Any) -> bool:
     """Whether this is an on-policy class of Stable-Baselines3, such as PPO."""
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -285,7 +285,7 @@ def is_on_policy(algorithm: Any) -> bool:
 
 
 def is_sb3(algorithm: Any) -> bool:
-    """Whether this is a subclass of Stable-Baselines3's base class, or an instance of one."""
+    """Whether this is a class of Stable-Baselines3's kind, or a model of one."""
     from stable_baselines3.common.base_class import BaseAlgorithm
 
     return issubclass(algorithm if isinstance(algorithm, type) else type(algorithm), BaseAlgorithm)
@@ -310,7 +310,6 @@ def one_thread() -> Iterator[None]:
 
 
 def default_num_envs(spec: SMESpec, algorithm: Any) -> int:
-    """The default number of parallel environments: 8 for a team and an on-policy class, or 1."""
     return 8 if spec.team is not None and is_on_policy(algorithm) else 1
 
 
@@ -332,7 +331,6 @@ def nested_hyperparameters(flat: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_hyperparameters(path: Path) -> dict[str, Any]:
-    """The hyperparameters in a JSON file: an object of names and values."""
     values = read_json(path)
     if not isinstance(values, dict):
         raise OptionError(
@@ -365,17 +363,14 @@ def check_hyperparameters(
         of_learner = {n: v for n, v in hyperparameters.items() if n not in _OF_DATA_SET}
         documents.check_algorithm(entry.name, of_learner)
     elif entry.kind == "jax":
-        from sme_registry.jax.run import settings_of
-
         if others:  # where Stable-Baselines3 is needed anyway
             check_names(find(entry.name).load(), entry.name, hyperparameters, field, others)
-        settings_of(uses, hyperparameters, field)
+        jax_package().run.settings_of(uses, hyperparameters, field)
     else:
         check_names(entry.load(field), uses, hyperparameters, field, others)
 
 
 def check_algorithm(algorithm: StudyAlgorithm) -> None:
-    """Check that an algorithm of a plan has hyperparameters of these names."""
     field = f"algorithm {algorithm.name!r}: hyperparameters"
     check_hyperparameters(algorithm.uses, algorithm.hyperparameters, field)
 
@@ -409,7 +404,6 @@ def _check_names(
     reserved: Iterable[str],
     others: Iterable[str] = (),
 ) -> None:
-    """Raise OptionError if a function has no argument of a name that a user may set."""
     parameters = parameters_of(function)
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
         return

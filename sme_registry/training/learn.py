@@ -186,15 +186,12 @@ class RunLog(Watch):
 
     @property
     def episodes(self) -> list[Episode]:
-        """All finished episodes, also those of earlier sessions."""
         return self._log.episodes
 
     def prepare(self, note: str) -> None:
-        """Show what precedes the first steps; see `Progress.prepare`."""
         self._progress.prepare(note)
 
     def on_steps(self) -> None:
-        """Log the episodes that ended, and show how far the run is."""
         finished = self._learner.add_to(self._sums)
         for episode in finished:
             by_agent = (episode.agents_regret or (episode.regret,)) if self._agents else ()
@@ -206,12 +203,10 @@ class RunLog(Watch):
         self._progress.update(self._sums.steps, self._note)
 
     def on_visit(self, visit: int) -> None:
-        """Write the model of the visit."""
         assert self._snapshots is not None  # a task has no visits
         self._learner.save(self._snapshots.visits[visit])
 
     def on_pause(self) -> None:
-        """Write a checkpoint if enough steps have passed since the last, or at the end."""
         steps = self._sums.steps
         due = steps - self._last_checkpoint >= self._record.checkpoint_every
         if not due and steps < self._learner.total:
@@ -223,7 +218,6 @@ class RunLog(Watch):
         self._last_checkpoint = steps
 
     def write_record(self) -> RunRecord:
-        """Write the record with its present progress."""
         seconds, steps = self._wall_seconds, self._sums.steps
         record = self._record.updated(
             steps_done=steps,
@@ -251,7 +245,6 @@ class RunLog(Watch):
 
     @property
     def _wall_seconds(self) -> float:
-        """Seconds of training over all sessions."""
         return self._wall_before + time.monotonic() - self._start
 
     def _progress_note(self) -> str:
@@ -270,13 +263,7 @@ class RunLog(Watch):
 
 
 class FunctionLearner(Learner):
-    """A function `train(env, steps, seed) -> policy` in its environment.
-
-    Attributes:
-      env: the environment, which counts its steps.
-      model: the policy that the function returned.
-      source: the digest of the module's source.
-    """
+    """A function `train(env, steps, seed) -> policy` in its environment."""
 
     def __init__(
         self,
@@ -305,11 +292,9 @@ class FunctionLearner(Learner):
 
     @property
     def steps(self) -> int:
-        """Environment steps so far."""
         return self.env.steps
 
     def learn(self, watch: Watch) -> None:
-        """Call the function; after each step, `watch.on_steps`."""
         self.env.after_step = watch.on_steps
         self.env.reset(seed=self._seed)  # so that episodes without a seed are reproducible
         with working_directory_importable():
@@ -324,35 +309,26 @@ class FunctionLearner(Learner):
             )
 
     def policy(self) -> Policy | TeamPolicy:
-        """The policy that the function returned."""
         return as_policy(self.model, self._spec, action_range=self._action_range)
 
     def add_to(self, sums: Episodes) -> list[Episode]:
-        """Add the last step to sums; returns the episode that ended in it."""
         reward, terminated, truncated, info = self.env.last
         ended = [terminated or truncated]
         return sums.add([reward], info_of_envs([info]), [terminated], ended)
 
     def save(self, path: Path) -> None:
-        """Write a model of Stable-Baselines3, and nothing of another policy."""
         kinds = sys.modules.get("stable_baselines3.common.base_class")
         if kinds is not None and isinstance(self.model, kinds.BaseAlgorithm):
             write_atomically(path, saved_sb3(self.model))
 
     def close(self) -> None:
-        """Close the environment."""
         self.env.close()
 
 
 class CountedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     """An environment that takes no more than its steps, and counts their regret and CPU seconds.
 
-    Attributes:
-      steps: taken so far.
-      seconds: of this thread, in these steps.
-      regret: the sum over them, `[1]`.
-      cost: of a task with `safety`, the sum over them; None of any other.
-      last: reward, terminated, truncated and info of the last one.
+    `cost` is None without `safety`; `last` is the last step without its observation.
     """
 
     def __init__(self, env: SMEEnv, budget: int, named: str) -> None:
@@ -364,7 +340,6 @@ class CountedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.after_step: Callable[[], None] = lambda: None
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """One step; PolicyError beyond the budget."""
         if self.steps >= self._budget:
             raise PolicyError(
                 f"{self._named}: takes more than {self._budget:,} steps: must stop at the steps "

@@ -36,6 +36,7 @@ from sme_registry.sb3.vec_env import LanesVecEnv, log_episode
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.study import parse_uses
 from sme_registry.task import materialize
+from sme_registry.training.algorithms import jax_package
 from sme_registry.training.learn import Learner, Watch
 from sme_registry.training.models import (
     SB3Learner,
@@ -103,7 +104,6 @@ class IndependentLearner(SB3Learner):
 
     @property
     def model(self) -> Any:
-        """The models by agent, as `evaluate` takes them."""
         return self.models
 
     def _learn(self, watch: Watch, first_step: int) -> None:
@@ -129,7 +129,6 @@ class IndependentLearner(SB3Learner):
             write_atomically(path / _MODEL.format(name), saved_sb3(model))
 
     def save_checkpoint(self, path: Path, sums: Any = None) -> None:
-        """Write all models into one file, whole or not at all."""
         archive = io.BytesIO()
         with zipfile.ZipFile(archive, "w") as members:
             for name, model in self.models.items():
@@ -137,7 +136,6 @@ class IndependentLearner(SB3Learner):
         write_atomically(path, archive.getvalue())
 
     def restore(self, checkpoint: Path) -> None:
-        """Go on from the models in a file, with random numbers of its own."""
         try:
             with zipfile.ZipFile(checkpoint) as members:
                 for name, model in self.models.items():
@@ -150,7 +148,6 @@ class IndependentLearner(SB3Learner):
         self._seed = random_seed(self._seed, self.env.steps)
 
     def log(self, episodes: Sequence[Episode]) -> None:
-        """Log the regret of each agent in finished episodes."""
         for episode in episodes:
             by_agent = episode.agents_regret or (episode.regret,)
             for model, regret in zip(self.models.values(), by_agent, strict=True):
@@ -216,7 +213,6 @@ def _act(model: Any, observations: Floats) -> tuple[Floats, Any, Any, Floats]:
 
 
 def _check(model: Any, uses: str) -> None:
-    """Raise OptionError if a model does not collect rollouts as this module does."""
     kind = type(model)
     usual = isinstance(model, OnPolicyAlgorithm) and (
         kind.collect_rollouts is OnPolicyAlgorithm.collect_rollouts
@@ -233,9 +229,9 @@ _EPISODE = "episode"  # of the checkpoint: the sums of the present episode
 
 
 class JAXLearner(Learner):
-    """Agents in JAX: a program of one run, and the model of SB3 that gets its weights.
+    """A program of one run in JAX, and the model of SB3 that gets its weights.
 
-    Its checkpoint holds everything, so a run that is resumed continues with the same bits.
+    Its checkpoint holds everything: a resumed run continues with the same bits.
     """
 
     def __init__(self, record: RunRecord) -> None:
@@ -245,9 +241,7 @@ class JAXLearner(Learner):
             "steps": record.steps,
         }
         uses, document, seed = record.algorithm, record.document, record.seed
-        from sme_registry.jax.run import new_program
-
-        self._program: Program = new_program(
+        self._program: Program = jax_package().run.new_program(
             uses, [document], [seed], device=record.device or None, **options
         )
         self._model = new_sb3_model(uses, document, seed=seed, **options)
@@ -260,25 +254,19 @@ class JAXLearner(Learner):
 
     @property
     def steps(self) -> int:
-        """Environment steps so far."""
         return int(self._program.steps)
 
     @property
     def total(self) -> int:
-        """Environment steps at the end: PPO collects whole rollouts."""
         rollout = self._program.rollout
         return -(-max(self._steps, self.steps) // rollout) * rollout
 
     @property
     def model(self) -> Any:
-        """The model of Stable-Baselines3, with the present weights."""
         set_weights(self._model, self._program.weights(0), self.steps)
         return self._model
 
     def learn(self, watch: Watch) -> None:
-        """Take the steps that are left; after each piece of them, `watch.on_steps`."""
-        from sme_registry.jax.run import run
-
         watch.prepare("compiling …")
 
         def on_log(log: StepLog) -> None:
@@ -286,7 +274,7 @@ class JAXLearner(Learner):
             self._log = log
             watch.on_steps()
 
-        run(
+        jax_package().run.run(
             self._program,
             on_log=on_log,
             on_visit=(lambda visit, _: watch.on_visit(visit)) if self._in_stream else None,
@@ -300,7 +288,6 @@ class JAXLearner(Learner):
             raise ValueError("The weights are not finite.")
 
     def add_to(self, sums: Episodes) -> list[Episode]:
-        """Add the last piece to sums; returns the episodes that ended in it."""
         log = self._log
         assert log is not None
         ended = np.logical_or(log.terminated, log.truncated)
@@ -308,11 +295,9 @@ class JAXLearner(Learner):
         return sums.add(log.reward, info, log.terminated, ended)
 
     def is_finite(self) -> bool:
-        """Whether all weights are finite."""
         return not self._program.failed()[0]
 
     def restore(self, checkpoint: Path) -> Array:
-        """Go on from a checkpoint; returns the sums of the present episode."""
         sums = np.zeros((7, 1, 1))
         try:
             arrays = read_arrays(checkpoint)
@@ -323,20 +308,16 @@ class JAXLearner(Learner):
         return sums
 
     def save_checkpoint(self, path: Path, sums: Array) -> None:
-        """Write a checkpoint, with the sums of the present episode."""
         write_arrays(path, {**self._program.save(), _EPISODE: sums[: self._sums, 0, 0]})
 
     def save(self, path: Path) -> None:
-        """Write the model of Stable-Baselines3."""
         write_atomically(path, saved_sb3(self.model))
 
     def begin_log(self, folder: Path) -> None:
-        """Log to TensorBoard in a folder if it is installed."""
         if is_installed("tensorboard"):
             self._logger = configure(str(folder), ["tensorboard"])
 
     def log(self, episodes: Sequence[Episode]) -> None:
-        """Log the means of the episodes that ended in a piece."""
         for episode in episodes:
             self._logger.record_mean("rollout/ep_rew_mean", episode.episode_return)
             self._logger.record_mean("rollout/ep_len_mean", episode.length)
@@ -344,5 +325,4 @@ class JAXLearner(Learner):
         self._logger.dump(self.steps)
 
     def close(self) -> None:
-        """Close the log."""
         self._logger.close()

@@ -157,7 +157,6 @@ def save_checkpoint(model: Any, path: Path) -> None:
 
 
 def load_checkpoint(algorithm: Any, path: Path, env: Any, **kwargs: Any) -> Any:
-    """The model of a checkpoint, with its replay buffer."""
     try:
         with zipfile.ZipFile(path) as members:
             if _MEMBER not in members.namelist():
@@ -206,7 +205,6 @@ def resolved(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def is_off_policy(algorithm: Any) -> bool:
-    """Whether this is an off-policy class of Stable-Baselines3, such as TD3."""
     return isinstance(algorithm, type) and issubclass(algorithm, OffPolicyAlgorithm)
 
 
@@ -242,8 +240,8 @@ def random_seed(*numbers: int) -> int:
 class CountedVecEnv(VecEnvWrapper):  # type: ignore[misc, unused-ignore]  # untyped without SB3
     """Environments that count their steps, regret, cost and CPU seconds of this thread.
 
-    Every model steps its environment, so counting here needs no hook in the model. `after_step` is
-    called with `steps` after each step, for example to evaluate the model; its time is not counted.
+    Every model steps its environment, so counting here needs no hook in it. `after_step` is called
+    with `steps` after each step; its time is not counted.
     """
 
     def __init__(self, venv: Any) -> None:
@@ -256,13 +254,11 @@ class CountedVecEnv(VecEnvWrapper):  # type: ignore[misc, unused-ignore]  # unty
         self.after_step: Callable[[int], None] = lambda steps: None
 
     def reset(self) -> Any:
-        """Begin an episode in every lane."""
         observations = self.venv.reset()
         self.reset_infos = self.venv.reset_infos
         return observations
 
     def step_wait(self) -> Any:
-        """One step of every lane."""
         begun = time.thread_time()
         result = self.venv.step_wait()
         self.last = result[1:]
@@ -283,10 +279,7 @@ class SB3Learner(Learner):
     A single agent learns in one environment, as its algorithm is defined. A shared model gets the
     transitions of each agent. A step of a team is one step of all its agents.
 
-    Attributes:
-      env: the environments, which count the steps of the task.
-      models: what learns in them, by agent; one that is shared has no name.
-      hyperparameters: those that differ from the algorithm's defaults.
+    `models` are by agent; one that is shared has no name.
     """
 
     def __init__(
@@ -337,24 +330,20 @@ class SB3Learner(Learner):
 
     @property
     def model(self) -> Any:
-        """The model, as `evaluate` takes it."""
         return self.models[""]
 
     @property
     def steps(self) -> int:
-        """Environment steps so far."""
         return int(self.env.steps)
 
     @property
     def total(self) -> int:
-        """Environment steps at the end: on-policy algorithms collect whole rollouts."""
         first = next(iter(self.models.values()))
         rollout: int = first.n_steps if hasattr(first, "rollout_buffer") else 1
         chunk: int = rollout * self.env.num_envs // len(self.env.names)
         return self.steps + -(-max(0, self._steps - self.steps) // chunk) * chunk
 
     def learn(self, watch: Watch) -> None:
-        """Take at least the steps that are left; after each of them, `watch.on_steps`."""
         stream, first_step = self._document, self.steps
         visits = None
         if isinstance(stream, StreamSpec):
@@ -380,11 +369,9 @@ class SB3Learner(Learner):
             self.model.learn(left)
 
     def add_to(self, sums: Episodes) -> list[Episode]:
-        """Add the last step to sums; returns the episodes that ended in it."""
         return finished_in(sums, *self.env.last)
 
     def policy(self) -> Policy | TeamPolicy:
-        """The present policy. Training may change it."""
         range_ = self._action_range
         if self.env.sme_spec.team is None:
             return numpy_policy(self.model, self._document, action_range=range_)
@@ -407,13 +394,11 @@ class SB3Learner(Learner):
         return numpy_policy(copied, self._document, action_range=self._action_range)
 
     def is_finite(self) -> bool:
-        """Whether all weights are finite."""
         weights = (weight for model in self.models.values() for weight in model.policy.parameters())
         # Squared: products of weights that are finite and huge are not, and nor are the actions.
         return all(bool(torch.isfinite(weight.square()).all()) for weight in weights)
 
     def restore(self, checkpoint: Path) -> None:
-        """Go on from a checkpoint, with random numbers of its own."""
         changes: dict[str, Any] = {}
         if hasattr(self.model, "buffer_size"):
             changes["buffer_size"] = self.model.buffer_size
@@ -430,7 +415,6 @@ class SB3Learner(Learner):
         save_checkpoint(self.model, path)
 
     def save(self, path: Path) -> None:
-        """Write the model; nothing of one that cannot be saved."""
         if is_sb3(self.model):
             write_atomically(path, saved_sb3(self.model))
         elif hasattr(self.model, "save"):
@@ -439,31 +423,24 @@ class SB3Learner(Learner):
             write_atomically(path, archive.getvalue())
 
     def begin_log(self, folder: Path) -> None:
-        """Log to TensorBoard in a folder if it is installed, each agent's model in its own."""
         for name, model in self.models.items():
             silence(model)
             if is_installed("tensorboard"):
                 model.set_logger(configure(str(folder / name), ["tensorboard"]))
 
     def log(self, episodes: Sequence[Episode]) -> None:
-        """Log finished episodes."""
         names = self.env.names
         for episode in episodes:
             log_episode(self.model.logger, episode, names if len(names) > 1 else ())
 
     def close(self) -> None:
-        """Close the logs and the environments."""
         for model in self.models.values():
             model.logger.close()
         self.env.close()
 
 
 class _Pauses(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped without SB3
-    """Calls `watch.on_pause` between rollouts.
-
-    There the model is consistent: it has learnt from all transitions, and they are in its replay
-    buffer. For off-policy algorithms that is after each environment step.
-    """
+    """Calls `watch.on_pause` where a model has learnt from all transitions: between rollouts."""
 
     def __init__(self, watch: Watch) -> None:
         super().__init__()

@@ -37,7 +37,6 @@ def numpy_policy(
     Maps observations `[B, O]` (of a stream that shows the phase, with its one-hot) to actions
     `[B, A]` of the unit range, which the environment clips. The network of a model is copied, so
     later training does not change it; what is no such model is called directly.
-    `action_range` is that of its actions; None takes the model's own action space.
 
     Examples:
       >>> from sme_registry.evaluation import load_sb3
@@ -115,7 +114,7 @@ def _perceptron(network: Any) -> Perceptron | None:
 
 
 def _is_of_sb3(network: Any) -> bool:
-    """Whether a policy acts as its layers say, without a `_predict` of its own."""
+    """Whether a policy acts as its layers say."""
     packages = ("stable_baselines3.", "sb3_contrib.")
     return type(network)._predict.__module__.startswith(packages)  # type: ignore[no-any-return]
 

@@ -141,17 +141,14 @@ class RunRecord(StrictModel):
 
     @classmethod
     def read(cls, folder: Path) -> RunRecord | None:
-        """The record of a folder; None if it contains no run."""
         path = folder / RECORD
         return cls.from_dict(read_json(path), str(path)) if path.exists() else None
 
     def write(self, folder: Path) -> None:
-        """Write the record into the run's folder; raises OptionError if that fails."""
         write_atomically(folder / RECORD, to_json(self.to_dict()))
 
     @property
     def document(self) -> SMESpec | StreamSpec:
-        """What the agent lives in: the stream, or the task."""
         return self.stream or self.spec
 
     @property
@@ -160,7 +157,6 @@ class RunRecord(StrictModel):
         return MODELS if self.independent else MODEL
 
     def updated(self, **changes: Any) -> RunRecord:
-        """This record with some fields changed."""
         return self.model_copy(update=changes)
 
     def continuing(self, previous: RunRecord, folder: Path) -> RunRecord:
@@ -193,7 +189,6 @@ class RunRecord(StrictModel):
 
 
 def _difference(one: RunRecord, other: RunRecord) -> str:
-    """Where the streams of two runs differ first; nothing where one of them has none."""
     if one.stream is None or other.stream is None:
         return ""
     before, now = one.stream.to_dict(), other.stream.to_dict()
@@ -256,7 +251,6 @@ class EpisodeLog:
         self._write()
 
     def _write(self) -> None:
-        """Write the head and the rows so far, and open the file for more."""
         text = io.StringIO()
         safety = SAFETY if self.episodes and self.episodes[0].safety is not None else ()
         head = [*COLUMNS, *safety, *(f"{_AGENT_PREFIX}{agent}" for agent in self.agents)]
@@ -266,7 +260,6 @@ class EpisodeLog:
         self._writer = csv.writer(self._stream, lineterminator="\n")
 
     def add(self, episode: Episode) -> None:
-        """Append one row."""
         self.episodes.append(episode)
         if len(self.episodes) == 1 and episode.safety is not None:  # which has columns of its own
             self.close()
@@ -276,7 +269,6 @@ class EpisodeLog:
         self._stream.flush()
 
     def close(self) -> None:
-        """Close the file."""
         self._stream.close()
 
 

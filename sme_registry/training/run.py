@@ -63,6 +63,7 @@ from sme_registry.training.algorithms import (
     find,
     full_name,
     is_sb3,
+    jax_package,
     nested_hyperparameters,
     one_thread,
     quiet,
@@ -116,7 +117,6 @@ class TrainingResult:
         return self.folder / self.record.model_name
 
     def _repr_html_(self) -> str:
-        """The report's table, for notebooks."""
         return self.report._repr_html_()
 
 
@@ -250,7 +250,6 @@ def train(
 
 
 def _steps(document: SMESpec | StreamSpec, steps: int | None) -> int:
-    """The steps of a run; those of a stream are its own."""
     if isinstance(document, SMESpec):
         return integer_in("steps", DEFAULT_STEPS if steps is None else steps, 1, MAX_STEPS)
     if steps not in (None, document.steps):
@@ -265,7 +264,6 @@ def _steps(document: SMESpec | StreamSpec, steps: int | None) -> int:
 
 
 def _num_envs(document: SMESpec | StreamSpec, entry: Entry, num_envs: int | None) -> int:
-    """The parallel environments of a run, whose algorithm can learn in them."""
     if entry.kind == "independent":
         raise OptionError(
             f"algorithm={entry.uses!r}: is a name for studies. Train {entry.name!r} with "
@@ -294,11 +292,8 @@ def _num_envs(document: SMESpec | StreamSpec, entry: Entry, num_envs: int | None
 
 
 def _device(entry: Entry, device: str | None) -> str:
-    """The platform on which an agent in JAX trains; empty for any other."""
     if entry.kind == "jax":
-        from sme_registry.jax import find_device
-
-        return str(find_device(device).platform)
+        return str(jax_package().find_device(device).platform)
     if device is not None:
         raise OptionError(
             f"device={device!r}: is for agents in JAX; all others train on the CPU. Leave it out, "
@@ -308,7 +303,6 @@ def _device(entry: Entry, device: str | None) -> str:
 
 
 def _learner(record: RunRecord) -> Learner:
-    """What a run trains, new."""
     kind, name = parse_uses(record.algorithm)
     options: dict[str, Any] = {
         "seed": record.seed,
@@ -336,7 +330,6 @@ def _learner(record: RunRecord) -> Learner:
 
 
 def _new_or_continued(folder: Path, plan: RunRecord, *, resume: bool, force: bool) -> RunRecord:
-    """The plan, with the progress of a run that is resumed."""
     if is_locked(folder / _LOCK):
         raise _in_use(folder)
     previous = None if force else RunRecord.read(folder)
@@ -399,7 +392,6 @@ def _report(
     progress: bool,
     console: Console | None,
 ) -> tuple[EvaluationReport | StreamReport, tuple[Path, ...]]:
-    """Evaluate a finished run; write its report, and its figures if Matplotlib is installed."""
     states = record.protocol.states_per_region * len(record.protocol.edges)
     options: dict[str, Any] = {
         "action_range": record.action_range,
