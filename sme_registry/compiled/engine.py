@@ -70,33 +70,20 @@ Network: TypeAlias = Callable[[Array], Array]
 
 @dataclass(frozen=True, eq=False)
 class Engine:
-    """A task's step and oracle, ready to call.
-
-    Attributes:
-      backend: "numba" or "numpy".
-      new_buffer: makes the buffer of a single environment at t = 0, to pass to its steps, and a
-        view of its entries in `compiled.arrays`, `[BUFFER_STATE + S + 2 + m]`.
-      step_float32: one step of one environment, for float32 actions.
-      step_float64: the same for float64 actions.
-      step_many: one step of a batch.
-      seen: what agents see, `[S + m, B]`, of states and distractors `[S + m, B]`.
-      optimal_action: π* of `[B, S]` states, any number of them, in blocks.
-    """
+    """A task's step and oracle, ready to call."""
 
     backend: Backend
+    # The buffer of a single environment at t = 0, for its steps, and a view of its own entries.
     new_buffer: Callable[[], tuple[Array, Array]]
     step_float32: StepOne
     step_float64: StepOne
     step_many: StepMany
-    seen: Network
-    optimal_action: Callable[[Array], Array]
+    seen: Network  # what agents see, of states and distractors
+    optimal_action: Callable[[Array], Array]  # π* `[B, A]` of states `[B, S]`, in blocks
 
 
 def chosen_backend() -> Backend:
-    """The back-end of the environment variable SME_BACKEND; by default Numba where it is installed.
-
-    Raises OptionError where the variable names none, MissingDependencyError without Numba.
-    """
+    """That of the environment variable SME_BACKEND; by default Numba where it is installed."""
     asked = os.environ.get(BACKEND_VARIABLE, "auto")
     choice(BACKEND_VARIABLE, asked, ("auto", "numba", "numpy"))
     if asked == "numba":
@@ -106,10 +93,7 @@ def chosen_backend() -> Backend:
 
 
 def engine(task: Task, backend: Backend | None = None) -> Engine:
-    """The engine of a task, by `chosen_backend()` unless one is given.
-
-    Cheap, as engines of one task share its packed numbers.
-    """
+    """The engine of a task. Cheap, as engines of one task share its packed numbers."""
     make = _numba_engine if (backend or chosen_backend()) == "numba" else _numpy_engine
     return make(task)
 
@@ -151,8 +135,7 @@ def draw(own: Array, count: int) -> Array:
 def compiling() -> Iterator[None]:
     """Say on stderr that Numba compiles, if it takes long and a terminal or notebook shows it.
 
-    Without it, the first environment looks like a hanging program. Numba keeps what it compiled
-    next to this package or in NUMBA_CACHE_DIR: once for each version.
+    Numba keeps what it compiled next to this package or in NUMBA_CACHE_DIR: once for each version.
     """
     timer = threading.Timer(_PATIENCE, print, [_NOTICE], {"file": sys.stderr, "flush": True})
     timer.daemon = True
@@ -292,7 +275,6 @@ def _entries(task: Task) -> int:
 
 
 def _next_distractors(task: Task, own: Array, action: Array) -> Array:
-    """The next distractors of each environment, `[B, m]`."""
     if task.distractor_transition is None:
         return draw(own, task.spec.distractors)
     if task.spec.dynamics == "autonomous":

@@ -1,8 +1,7 @@
 """Checks of the arguments of environments: documents, actions, seeds, options, states, limits.
 
-The action range "unit" is [0, 1], the paper's; "symmetric" is [−1, 1], rescaled by a = (u + 1)/2,
-which SB3 prefers. The range changes learning, not the task: it belongs to a run's record, not to
-the task's digest.
+The action range "unit" is [0, 1]; "symmetric" is [−1, 1], rescaled by a = (u + 1)/2. It belongs to
+a run's record, not to the task's digest.
 """
 
 from __future__ import annotations
@@ -104,11 +103,7 @@ def action_space(action_range: str, action_dim: int) -> tuple[gymnasium.spaces.B
 def to_unit(
     action: Any, shape: tuple[int, ...], rescaled: bool, ignored: Mask | None = None
 ) -> Array:
-    """Actions of an environment `[…]` as contiguous float64 of the unit range; not clipped.
-
-    Rows `ignored` `[B]` become zero. Whether actions are finite is checked by the step, which reads
-    each of them anyway.
-    """
+    """Actions `[…]` as float64 of the unit range, not clipped; rows `ignored` `[B]` become zero."""
     try:
         array = np.asarray(action)
     except ValueError:
@@ -127,7 +122,6 @@ def to_unit(
 
 
 def from_unit(unit: npt.NDArray[Any], rescaled: bool) -> npt.NDArray[Any]:
-    """Actions of the unit range in the environment's range."""
     if not rescaled:
         return unit
     symmetric = 2.0 * unit
@@ -146,7 +140,6 @@ def checked_seed(seed: Any) -> int | None:
 
 
 def check_options(options: dict[str, Any] | None, known: tuple[str, ...]) -> None:
-    """Raise OptionError on an option that does not exist."""
     for name in options or {}:
         if name not in known:
             raise OptionError(
@@ -168,8 +161,7 @@ def initial_values(
 ) -> Array | None:
     """The option `state` or `distractors` of a reset, as float64 of `shape`; None without it.
 
-    With `num_envs` B, a value of `shape` is for each of them, and one of `[B, *shape]` has one for
-    each; the result is `[B, *shape]`. StateError outside [0, 1].
+    With `num_envs` B, one value for all or one for each; the result is `[B, *shape]`.
     """
     if name not in options:
         return None
@@ -198,7 +190,6 @@ def initial_states(state: Any, shape: tuple[int, ...], name: str = "state") -> A
 
 
 def single_agent(task: Task) -> Task:
-    """The task; SpecError if it is for a team."""
     if len(task.policies) > 1:
         raise SpecError(
             f"team: this task is for {len(task.policies)} agents and Gymnasium's environments are "
@@ -208,7 +199,6 @@ def single_agent(task: Task) -> Task:
 
 
 def check_has_limits(who: str, spec: SMESpec) -> None:
-    """Raise OptionError if a task has no `safety`, which an algorithm or a wrapper needs."""
     if spec.safety is None:
         raise OptionError(
             f"{who}: needs a task with limits, and this one has none. Give a task with safety, "
@@ -217,13 +207,9 @@ def check_has_limits(who: str, spec: SMESpec) -> None:
 
 
 def check_outer_time_limit(horizon: int) -> None:
-    """Raise where the `reset` that calls this was called by a TimeLimit below the horizon.
-
-    Such a wrapper ends an episode before its last payout. An environment has no reference to its
-    wrappers, which may be added at any time; but each calls the `reset` of the environment inside
-    it, so the callers' frames up to the first that is no reset belong to the wrappers (and to
-    Gymnasium's function that checks a first reset).
-    """
+    """Raise where the `reset` that calls this was called by a TimeLimit below the horizon."""
+    # An environment has no reference to its wrappers; but each calls the `reset` of the environment
+    # inside it, so the callers' frames up to the first that is no reset are theirs.
     frame = sys._getframe(2)
     while frame is not None and "reset" in frame.f_code.co_name:
         wrapper = frame.f_locals.get("self")
@@ -233,7 +219,6 @@ def check_outer_time_limit(horizon: int) -> None:
 
 
 def check_time_limit(max_episode_steps: int, horizon: int) -> None:
-    """Raise WrapperError on a time limit below the horizon."""
     if max_episode_steps < horizon:
         raise WrapperError(
             f"max_episode_steps={max_episode_steps}: must be at least the horizon, {horizon}: a "

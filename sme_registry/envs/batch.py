@@ -1,8 +1,7 @@
 """`Batch`: parallel episodes of a single agent or a team, the core of all batched environments.
 
 It holds the state, completed steps and r_cum of `B` environments, and steps them with the compiled
-engine. The environments on top decide what their agents observe, and what happens at the end of an
-episode. A team of n agents is stepped as one: its joint observation is s, t/T and every r_cum/k.
+engine. A team of n agents is stepped as one: its joint observation is s, t/T and every r_cum/k.
 """
 
 from __future__ import annotations
@@ -40,28 +39,16 @@ _KEY_SHIFT = np.uint64(12)  # keys of 52 bits, which a float64 holds exactly
 
 
 class BatchStep(NamedTuple):
-    """The result of one step of a batch; no later step writes to an array that is still held.
+    """One step of a batch, of the states acted in; no later step writes to an array still held."""
 
-    Attributes:
-      observation: `[B, S + 1 + n]` float32: s, t/T, and each agent's r_cum/k. Of a stream that
-        shows its phase, one-hot behind them. With `observation`, M(s, d) `[S + m]` in place of s.
-      actions: `[1 or 3, B, A]` in the unit range, of the states acted in: π*, and with `safety` the
-        limits and the safe action.
-      values: `[5 or 7, n, B]` the rows of `compiled.arrays`: similarity, step reward, regret,
-        reward, and r_cum after a payout; with `safety` also cost and safe regret.
-      terminated: `[B]`.
-      truncated: `[B]`.
-    """
-
-    observation: Observation
-    actions: Array
-    values: Array
+    observation: Observation  # `[B, …]`: s or M(s, d), t/T, each agent's r_cum/k, a shown phase
+    actions: Array  # `[1 or 3, B, A]` of the unit range: π*; with `safety` limits and safe actions
+    values: Array  # `[5 or 7, n, B]`: the rows of `compiled.arrays`
     terminated: Mask
     truncated: Mask
 
     @property
     def optimal(self) -> Array:
-        """π*, `[B, A]`."""
         optimal: Array = self.actions[0]
         return optimal
 
@@ -73,14 +60,9 @@ _Arrays: TypeAlias = tuple[Observation, Array, Array, Mask]
 class _Results:
     """Arrays for the results of steps, written again once nobody holds them.
 
-    They are too large for NumPy's cache of small arrays: fresh ones at each step can make the heap
-    shrink and grow each time, for half as much time again with 1,024 environments and three times
-    as much with 4,096. So the last few are kept, and used again when their reference counts show
-    that they are alone.
-
-    Views of them are handed out, never they themselves. A view holds its array, as do a view or
-    slice of it, its memoryview, and a tensor that shares its memory; and what a user does to a
-    view, such as setting its shape, does not outlive it.
+    Fresh ones at each step can make the heap shrink and grow: three times the time of a step with
+    4,096 environments. Views of them are handed out, which hold their array, as do slices and
+    tensors of it; what a user does to a view does not outlive it.
     """
 
     def __init__(self, num_envs: int, observation_dim: int, actions: Any, values: Any) -> None:
@@ -105,7 +87,6 @@ class _Results:
 
 
 def _references(arrays: _Arrays) -> list[int]:
-    """How often each array is referenced."""
     return [*map(sys.getrefcount, arrays)]
 
 
@@ -114,11 +95,9 @@ _ALONE = _references(_Results(1, 1, (1, 1, 1), (1, 1, 1))._allocate())
 
 
 class InitialStates:
-    """The initial states of a batch: uniform in the cube, drawn in advance, each by a generator.
+    """The initial states of a batch: uniform in the cube, from each environment's own generator.
 
-    Environment i draws what a single one with its seed would draw, in the same order. Drawing one
-    state from each of 1,024 generators costs as much as six steps of the whole batch. Drawing
-    sixteen states at once costs little more and gives the same numbers.
+    Drawn sixteen at once, which costs little more than one and gives the same numbers.
     """
 
     def __init__(self, num_envs: int, state_dim: int) -> None:
@@ -145,18 +124,14 @@ class InitialStates:
 
 
 class Distractors:
-    """The distractors of `B` environments, and the random numbers that move them.
+    """The distractors of `B` environments, and the random numbers that move them; often m = 0.
 
-    Both come from streams of their own, so that the initial states are those of the task without
-    `observation`. An environment that is never seeded has a random stream. Most tasks have m = 0.
-
-    Attributes:
-      own: `[2 + m, B]` each environment's key, numbers drawn, and distractors; see
-        `compiled.arrays`.
+    Both come from streams of their own, so that initial states are as without `observation`.
     """
 
     def __init__(self, count: int, num_envs: int) -> None:
         self._count = count
+        # `[2 + m, B]`: each environment's key, numbers drawn, and distractors.
         self.own = np.zeros((OWN_DISTRACTORS + count, num_envs))
         if count:
             words = np.random.SeedSequence().generate_state(num_envs, np.uint64)
@@ -164,7 +139,6 @@ class Distractors:
 
     @property
     def values(self) -> Array:
-        """The distractors, `[B, m]` float64 in [0, 1] (a copy)."""
         return self.own[OWN_DISTRACTORS:].T.copy()
 
     def seed(self, env: int, seed: int) -> None:
@@ -196,15 +170,8 @@ class Batch:
 
     Each environment has its own lifetime and segment of a stream. While one task is in force in all
     of them, as it nearly always is, it steps the batch; else those of each segment are a group.
-
-    Args:
-      schedule: what is run; or a task.
-      num_envs: B, at least 1.
-      reuse: write each step into the arrays of the step before the last, for environments that
-        copy their results anyway; a small batch spends a third of its time on handing out arrays.
-
-    Attributes:
-      lived: what infos say of each life in the last step; nothing, of a task.
+    With `reuse`, for environments that copy their results, steps write into two sets of arrays in
+    turn.
     """
 
     def __init__(self, schedule: Schedule | Task, num_envs: int, *, reuse: bool = False) -> None:
@@ -231,13 +198,12 @@ class Batch:
         self._segment, self._lifetime = np.zeros((2, num_envs), np.int64)
         self._next_switch = np.zeros(num_envs, np.int64)  # at the first `begin` each may switch
         self._soonest = 0  # so many steps at least until a segment is over
-        self.lived: dict[str, Indices] = {}
+        self.lived: dict[str, Indices] = {}  # what infos say of each life in the last step
         self._reuse = reuse
         self._load_engine()
 
     @property
     def document(self) -> SMESpec | StreamSpec:
-        """What is run: a spec, or a stream."""
         return self.schedule.document
 
     @property
@@ -252,12 +218,10 @@ class Batch:
 
     @property
     def state(self) -> Array:
-        """The states, `[B, S]` float64 in [0, 1] (a copy)."""
         return self._s.T.copy()  # a copy even where the transpose is contiguous
 
     @property
     def distractors(self) -> Array:
-        """The distractors, `[B, m]` float64 in [0, 1] (a copy)."""
         return self._distractors.values
 
     def _load_engine(self) -> None:
@@ -281,7 +245,6 @@ class Batch:
         self._load_engine()
 
     def task_of(self, env: int) -> Task:
-        """The task in force in an environment."""
         return self.schedule.tasks[int(self._segment[env])]
 
     def life(self) -> dict[str, Indices]:
@@ -304,11 +267,7 @@ class Batch:
         self.live(env, 0)
 
     def seed_by_states(self, envs: Indices, states: Array, seed: int = 0) -> None:
-        """Restart the distractors of environments from initial states `[len(envs), S]` and a seed.
-
-        Equal states and seeds give equal distractors, anywhere: so episodes whose states come from
-        a named stream need no other random numbers to be reproducible.
-        """
+        """Restart distractors from initial states `[len(envs), S]` and a seed, alike anywhere."""
         if self.task.spec.distractors:
             for env, s in zip(envs.tolist(), states, strict=True):
                 word = int.from_bytes(s.astype("<f8").tobytes(), "little")
@@ -336,8 +295,7 @@ class Batch:
     ) -> None:
         """Put environments at the start of an episode, and write their rows of `observation`.
 
-        `states` are `[len(envs), S]` and `distractors` `[len(envs), m]`; None draws them from
-        each one's generators. Of a stream, in the segment in force after the steps lived.
+        `states` are `[len(envs), S]` and `distractors` `[len(envs), m]`; None draws them.
         """
         self._switch(envs)
         if states is None:
@@ -359,8 +317,8 @@ class Batch:
     ) -> None:
         """Put every environment at any point of an episode; `observe` gives what is seen there.
 
-        States are `[B, S]`, completed steps t `[B]` in [0, T), each agent's r_cum `[B, n]`, and
-        distractors `[B, m]`; None draws them.
+        States `[B, S]`, steps t `[B]` in [0, T), r_cum `[B, n]`, distractors `[B, m]`; None draws
+        them.
         """
         self._s[:] = states.T
         self._t[:] = t
@@ -368,12 +326,9 @@ class Batch:
         self._distractors.begin(self._envs, distractors)
 
     def advance(self, actions: Array, resting: Mask | None = None) -> BatchStep:
-        """One step of every environment; ActionError changes none of them.
+        """One step, from actions `[B, A]` of the unit range, clipped; ActionError changes nothing.
 
-        Args:
-          actions: `[B, A]` float64 of the unit range; clipped.
-          resting: `[B]` those whose episode has ended, and whose step does not count: they neither
-            live nor draw numbers; None: none.
+        Environments `resting` `[B]`, whose episode has ended, neither live nor draw numbers.
         """
         # Machine code does not check shape, dtype and layout: any other would be misread.
         if actions.shape != self._shape:
@@ -422,7 +377,6 @@ class Batch:
             self._put_in_force()
 
     def _until_switch(self) -> int:
-        """So many steps at least until the next segment is over."""
         return int((self._next_switch - self._lifetime).min())
 
     def _put_in_force(self) -> None:

@@ -1,9 +1,6 @@
 """`Episodes`: the exact regret of every episode, summed from the steps of parallel environments.
 
-A training loop, a callback or a wrapper adds rewards and infos; a team's episode is one of all its
-agents. `B` environments, `n` agents of each, `N` steps. Sums are `[7, B, n]`:
-
-    return, length, regret, similarity;  and of a task with `safety`: cost, violations, safe regret
+`B` environments, `n` agents of each, `N` steps. A team's episode is one of all its agents.
 """
 
 from __future__ import annotations
@@ -25,6 +22,7 @@ from sme_registry.spec import SMESpec
 _TOLERANCE, _ROUNDING = 1e-6, 6e-8
 
 _PLAIN, _SAFETY = ("regret", "similarity"), ("cost", "safe_regret")
+# Sums are return, length, regret, similarity; with `safety` cost, violations, safe regret.
 _REGRET, _SAFETY_SUMS = 2, slice(4, 7)
 
 

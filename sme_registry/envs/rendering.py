@@ -1,9 +1,4 @@
-"""`Renderer`: frames of an episode.
-
-A frame shows the state, the action and the optimal action, channel by channel, and below them the
-similarity of each step and the accumulated regret. For a team it shows all channels, each agent's
-underlined, and the means over the agents.
-"""
+"""`Renderer`: frames of an episode, with state, actions, similarity and regret."""
 
 from __future__ import annotations
 
@@ -56,10 +51,7 @@ def _import_pygame() -> Any:
 
 
 class Renderer:
-    """Draws the present episode. Recording is cheap; a frame is drawn on request.
-
-    In mode "human" each step is shown in a window, paced by `render_fps` of the metadata.
-    """
+    """Draws the episode, a team's as one: recording is cheap, frames are drawn on request."""
 
     def __init__(self, mode: str, metadata: dict[str, Any], rescaled: bool) -> None:
         self._pygame = _import_pygame()
@@ -100,7 +92,6 @@ class Renderer:
             self._show()
 
     def frame(self) -> Frame:
-        """The present frame, `[H, W, 3]` uint8."""
         if not self._begun:
             raise EpisodeError("render: the episode has not begun. Call reset() first.")
         surface = self._pygame.Surface((WIDTH, HEIGHT))
@@ -109,7 +100,6 @@ class Renderer:
         return np.ascontiguousarray(self._pygame.surfarray.pixels3d(surface).swapaxes(0, 1))
 
     def close(self) -> None:
-        """Close the window, if there is one."""
         if self._window is not None:
             self._window = None
             self._pygame.display.quit()
@@ -336,10 +326,7 @@ class BatchRenderer:
     def record(
         self, began: Iterable[int], unit: Array | None = None, step: BatchStep | None = None
     ) -> None:
-        """Record a reset in the environments that began an episode, and a step in the others.
-
-        `unit` are the actions `[B, A]` of the unit range; None after a reset, which has no step.
-        """
+        """Record a reset in environments that began, in others a step with actions `[B, A]`."""
         states, reset = self._batch.state, set(began)
         for env, renderer in self._renderers.items():
             task = self._batch.task_of(env)
@@ -350,7 +337,6 @@ class BatchRenderer:
                 renderer.record(states[env], task, unit[env], info)
 
     def frames(self) -> tuple[Frame, ...]:
-        """The present frames of those drawn, each `[H, W, 3]` uint8."""
         return tuple(renderer.frame() for renderer in self._renderers.values())
 
     def frame_of_each(self) -> tuple[Frame, ...]:
@@ -385,11 +371,7 @@ def html_card(
     status: str = "",
     autoreset: str = "",
 ) -> str:
-    """A card of an environment for notebooks; a team's has its agents in place of the spaces.
-
-    The spaces are those of a single environment, or of any agent in a team. `status` is that of its
-    episode, such as "running"; a batch has none.
-    """
+    """A card of an environment, whose spaces are of a single one or of any agent in a team."""
     document: SMESpec | StreamSpec = env.document
     seen = cards.observation_text(document)
     span = f"float32 in [{action.low.flat[0]:g}, {action.high.flat[0]:g}]"

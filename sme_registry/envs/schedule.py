@@ -1,9 +1,8 @@
 """`Schedule`: which task is in force after how many environment steps; METHOD, section 7.
 
 A task is a stream of one segment that is never over, so every environment runs a schedule. It also
-says what infos hold. At a step these are the values of `SMEEnv`, float64 of NumPy, since some
-libraries ask for a dtype. At a reset no action was taken: the same keys hold NaN, so that every
-info has one structure. A stream's also has `phase` and `lifetime`, int64, at a reset as well.
+says what infos hold: NumPy's float64 at a step, and NaN under the same keys at a reset. A stream's
+also has `phase` and `lifetime`, int64.
 """
 
 from __future__ import annotations
@@ -43,17 +42,11 @@ _NAN = np.float64(np.nan)
 
 
 class Columns(NamedTuple):
-    """What a step computes of a task.
+    """What a step computes of a task."""
 
-    Attributes:
-      rows: how many `values` there are; see `compiled.arrays`.
-      numbers: the keys of infos whose values are numbers, and the row of `values` that each is.
-      actions: the keys whose values are `[A]`, in the environment's action range.
-    """
-
-    rows: int
-    numbers: dict[str, int]
-    actions: tuple[str, ...]
+    rows: int  # of `values`; see `compiled.arrays`
+    numbers: dict[str, int]  # keys of infos whose values are numbers, and their rows
+    actions: tuple[str, ...]  # keys whose values are `[A]`, in the environment's action range
 
     @classmethod
     def of(cls, spec: SMESpec) -> Columns:
@@ -96,25 +89,15 @@ _WITH_SAFETY = Columns(
 
 
 class Schedule:
-    """The tasks of a spec or a stream, and when each of them is in force.
-
-    Attributes:
-      document: the spec or the stream.
-      is_stream: whether it is a stream; infos then tell where in a life they are.
-      tasks: the task of each segment of a cycle; segments with equal specs share one.
-      columns: what a step computes of each of them.
-      phases: the phase of each segment, `[segments]`.
-      k: the k of each segment, `[segments]`.
-      switches_within: whether a segment may end within an episode, rather than at the next reset.
-      reset_options: the options of a reset of its environments.
-    """
+    """The tasks of a spec or a stream, and when each of them is in force."""
 
     def __init__(self, document: SMESpec | StreamSpec, tasks: Sequence[Task]) -> None:
-        self.document, self.tasks = document, tuple(tasks)
+        self.document, self.tasks = document, tuple(tasks)  # of each segment of a cycle
         self.columns = Columns.of(tasks[0].spec)
         self.is_stream = isinstance(document, StreamSpec)
         self.phases = np.array([segment.phase for segment in document.segments])
         self.k = np.array([task.spec.k for task in tasks])
+        # Whether a segment may end within an episode, rather than at the next reset.
         self.switches_within = document.switch == "step"
         optional = ("lifetime", self.is_stream), ("distractors", tasks[0].spec.distractors > 0)
         self.reset_options = ("state", *(name for name, exists in optional if exists))
@@ -123,7 +106,6 @@ class Schedule:
 
     @classmethod
     def of(cls, task: Task) -> Schedule:
-        """The schedule of a task: one segment."""
         return cls(task.spec, [task])
 
     @classmethod
@@ -132,8 +114,7 @@ class Schedule:
     ) -> Schedule:
         """The schedule of an environment class that is called with a document and overrides.
 
-        `stream=` among the overrides takes the place of the document, as in the `EnvSpec` of a
-        stream. Others are fields of a spec; a stream has none to change.
+        `stream=` among the overrides takes the place of the document, as in a stream's `EnvSpec`.
         """
         overrides = dict(overrides)
         kind = StreamSpec if "stream" in overrides else None
@@ -164,8 +145,6 @@ class Schedule:
 
 
 class ScheduleMixin:
-    """What an environment runs."""
-
     _schedule: Schedule
 
     @property
@@ -217,9 +196,8 @@ def content_id(document: SMESpec | StreamSpec) -> str:
 def renamed_by_content(env_spec: EnvSpec | None, document: SMESpec | StreamSpec) -> EnvSpec | None:
     """Gymnasium's spec of an environment, as plain JSON; a derived task gets the id of its content.
 
-    `SME/Default-v1` with `complexity=10` is another task, and must not be recorded under the name
-    from which it was derived. Its `max_episode_steps` is the horizon, which wrappers ask for; a
-    TimeLimit that Gymnasium makes of it changes nothing, as the environment ends by itself.
+    Its `max_episode_steps` is the horizon, which wrappers ask for; a TimeLimit that Gymnasium makes
+    of it changes nothing, as the environment ends by itself.
     """
     if env_spec is None:
         return None

@@ -198,10 +198,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         return self._engine.seen(self._distractors.beside(s[:, None], _ONLY))[:, 0]
 
     def _distractors_seed(self) -> int:
-        """The seed of the generator, or a number that follows from one that the user has set.
-
-        That number is drawn from a copy, so that initial states are as without `observation`.
-        """
+        """The seed of the generator, or a number from a copy of one that the user has set."""
         # −1 where the user has set the generator; Gymnasium before 1.0 has no such attribute.
         seed: int = getattr(self, "np_random_seed", -1)
         return seed if seed >= 0 else int(copy.deepcopy(self.np_random).integers(2**63))
@@ -240,9 +237,8 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         return self._step(self, action)
 
     def _fast_step(self) -> Callable[[Any, Any], _Result]:
-        """A step of the present segment, as a closure over all that it reads.
+        """A step of the present segment, as a closure over all that it reads, written for speed.
 
-        Written for speed: each look-up of an attribute and each branch costs a percent of a step.
         It takes the environment as an argument, as a closure over it would be a circle.
         """
         more_to_do = self._rescaled or self.render_mode is not None
@@ -336,11 +332,9 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             observation[S + 1], observation[S + 2 :] = min(waiting, 1.0), self._one_hot
 
     def _checked(self, action: Any) -> Array:
-        """The action as `[A]` float64 in the unit range."""
         return arguments.to_unit(action, self._action_shape, self._rescaled)
 
     def _repr_html_(self) -> str:
-        """A card for notebooks: spaces, episode and task."""
         return html_card(self, self.observation_space, self.action_space, status=self._status)
 
     def __repr__(self) -> str:

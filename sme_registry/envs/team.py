@@ -104,10 +104,8 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         self.state_space = gymnasium.spaces.Box(0.0, 1.0, (self.sme_spec.state_dim,), np.float64)
 
     def _allocate(self) -> None:
-        """The joint action `[1, A]` and a step's values `[5, n]`, and each agent's views of them.
-
-        Views of no dimension make NumPy's numbers in a third of the time of any other way.
-        """
+        """The joint action `[1, A]`, a step's values `[5, n]`, and each agent's views of them."""
+        # Views of no dimension make NumPy's numbers in a third of the time of any other way.
         task, columns = self.task, self._schedule.columns
         self._joint_action = np.zeros((1, task.spec.action_dim))
         self._values = np.zeros((columns.rows, len(task.names)))
@@ -268,7 +266,6 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         return agent
 
     def _repr_html_(self) -> str:
-        """A card for notebooks: agents, episode and task."""
         status = "running" if self.agents else "ended" if self._begun else "not begun"
         first = self.possible_agents[0]
         spaces = self._observation_spaces[first], self._action_spaces[first]
@@ -291,10 +288,7 @@ def shared_action_dim(task: Task) -> int:
 
 
 def shared_observation(task: Task, joint: Observation) -> Observation:
-    """Each agent's shared observation, `[B, n, S + 2 + n]` float32, a fresh array.
-
-    `joint` is `[B, S + 1 + n]` float32: s, t/T, and each agent's r_cum/k.
-    """
+    """Each agent's, `[B, n, S + 2 + n]` float32, of the joint observation `[B, S + 1 + n]`."""
     S, n = task.spec.state_dim, len(task.observed)
     shared = np.empty((len(joint), n, shared_observation_dim(task)), np.float32)
     single = joint[:, : S + 2].copy()
@@ -307,10 +301,7 @@ def shared_observation(task: Task, joint: Observation) -> Observation:
 def shared_observation_of(
     agent: int, agents: int, observed: Sequence[int], single: Observation
 ) -> Observation:
-    """The shared observation of one agent of `agents`, `[B, S + 2 + n]` float32, a fresh array.
-
-    `single` is `[B, S + 2]` float32: s, t/T, and this agent's r_cum/k.
-    """
+    """One agent's, `[B, S + 2 + n]` float32, of s, t/T and its r_cum/k, `[B, S + 2]`."""
     width = single.shape[1]
     visible = [*observed, width - 2, width - 1]
     shared = np.zeros((len(single), width + agents), np.float32)

@@ -36,13 +36,11 @@ class EnvView:
 
     @property
     def state(self) -> Array:
-        """The state s, `[S]` float64 in [0, 1] (a copy)."""
         state: Array = self._owner._batch.state[self._index]
         return state
 
     @property
     def distractors(self) -> Array:
-        """The distractors, `[m]` float64 in [0, 1] (a copy)."""
         distractors: Array = self._owner._batch.distractors[self._index]
         return distractors
 
@@ -54,12 +52,10 @@ class EnvView:
 
     @property
     def sme_spec(self) -> SMESpec:
-        """Its spec."""
         return self.task.spec
 
     @property
     def unwrapped(self) -> EnvView:
-        """Itself, as environments without a wrapper have it."""
         return self
 
 
@@ -295,7 +291,6 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         return self._views
 
     def _repr_html_(self) -> str:
-        """A card for notebooks: spaces, episodes and task."""
         spaces = self.single_observation_space, self.single_action_space
         return html_card(self, *spaces, autoreset=self.autoreset_mode.value)
 
@@ -336,10 +331,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
 
 
 def _masked(info: Mapping[str, npt.NDArray[Any]], mask: Mask | None = None) -> dict[str, Any]:
-    """Gymnasium's form of batched info: each key with its mask `_key`; None is all.
-
-    Copies arrays only where there is a mask, and writes 0 where it is False.
-    """
+    """Gymnasium's form of batched info: each key with its mask `_key`, 0 where that is False."""
     infos: dict[str, Any] = {}
     if mask is None:
         everywhere = np.ones(len(info["similarity"]), bool)

@@ -60,19 +60,12 @@ def choice(
 
 
 class Address(NamedTuple):
-    """Where a server is reached.
-
-    Attributes:
-      url: without a final slash.
-      is_https: whether what is sent is encrypted.
-      host, port: without brackets; None is the usual port.
-      path: of the URL, without a final slash; often empty.
-    """
+    """Where a server is reached; `url` and `path` end in no slash."""
 
     url: str
     is_https: bool
-    host: str
-    port: int | None
+    host: str  # without brackets
+    port: int | None  # None is the usual one
     path: str
 
     @property
@@ -85,7 +78,6 @@ class Address(NamedTuple):
 
 
 def server_address(url: str, *, insecure: bool = False) -> Address:
-    """The address in a URL."""
     try:
         parts = urlsplit(url)
         port = parts.port

@@ -1,7 +1,6 @@
 """Files and folders written completely or not at all, strict JSON, named arrays, digests and locks.
 
-A temporary path next to the target is renamed to the target: a killed process leaves the old target
-and at most temporary paths that `TEMPORARY` matches.
+A killed process leaves the old target and at most temporary paths that `TEMPORARY` matches.
 """
 
 from __future__ import annotations
@@ -155,7 +154,6 @@ def sync_folder(folder: str | os.PathLike[str]) -> None:
 
 
 def unwritable(path: Path, error: Exception) -> OptionError:
-    """The error for a file or folder that cannot be written."""
     reason = getattr(error, "strerror", None) or str(error)
     return OptionError(
         f"{path}: cannot be written: {reason}. Give a path in a folder that you may write to."
@@ -178,7 +176,6 @@ def _replace(building: Path, target: Path, replaced: Path) -> None:
 
 
 def _flush(folder: Path) -> None:
-    """Flush a folder and everything in it to disk."""
     if os.name != "posix":
         return
     for parent, _, names in os.walk(folder):
@@ -230,7 +227,6 @@ def _reason(error: ValueError | RecursionError) -> str:
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:
-    """Read a strict JSON file."""
     path = Path(path)
     try:
         if path.is_file() and path.stat().st_size > MAX_DOCUMENT_BYTES:
@@ -293,7 +289,6 @@ class Lock:
         self._lock = lock
 
     def release(self) -> None:
-        """Release the lock. Releasing twice does nothing."""
         self._lock.release()
 
     def __enter__(self) -> Lock:

@@ -81,7 +81,6 @@ class Table:
         self.rows.append(Row(texts, style or ""))
 
     def add_section(self) -> None:
-        """Separate the rows so far from the next ones."""
         self.rows.append(None)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -210,7 +209,6 @@ def table_html(table: Table) -> str:
 
 
 def pairs_html(title: str, pairs: Mapping[str, Any]) -> str:
-    """Names and values, one per row, under a title."""
     rows = "".join(
         f"<tr><th>{escape(name)}</th><td>{escape(str(value))}</td></tr>"
         for name, value in pairs.items()

@@ -64,7 +64,6 @@ def missing_dependency(
 
 
 def install_command(extra: str) -> str:
-    """The command that adds an extra to the package, wherever it was installed from."""
     return f"pip install '{_NAME}[{extra}]'"
 
 
@@ -121,19 +120,17 @@ def working_directory_importable() -> Iterator[None]:
 
 
 def module_file(module: str) -> str | None:
-    """The file of a module or a package, also in the working directory; None if there is none.
-
-    Imports nothing, as `importlib.util.find_spec` would import the packages that it is in.
-    """
+    """The file of a module, also in the working directory; imports nothing."""
+    # `importlib.util.find_spec` would import the packages that it is in.
     places: Any = None
-    found: Any = None
+    spec: Any = None
     with working_directory_importable():
         for end in (i for i, letter in enumerate(f"{module}.") if letter == "."):
-            found = importlib.machinery.PathFinder.find_spec(module[:end], places)
-            if found is None:
+            spec = importlib.machinery.PathFinder.find_spec(module[:end], places)
+            if spec is None:
                 return None
-            places = found.submodule_search_locations
-    path: str | None = found.origin
+            places = spec.submodule_search_locations
+    path: str | None = spec.origin
     return path
 
 
@@ -189,7 +186,6 @@ def _limit_and_use(
 
 
 def available_cores() -> int:
-    """Cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

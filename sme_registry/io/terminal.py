@@ -60,14 +60,11 @@ _UNLIMITED = 100_000  # columns: lines of a file or a pipe are never wrapped
 
 
 class _Console(CleanConsole):
-    """Wraps no lines of output that is no terminal, and leaves broken pipes to `CommandGroup`.
-
-    With FORCE_COLOR, which Jupyter sets for shell cells, Rich would draw bars into a pipe: colours
-    are possible there, but nothing that moves the cursor.
-    """
+    """Wraps no lines of output that is no terminal, and leaves broken pipes to `CommandGroup`."""
 
     def __init__(self, file: TextIO) -> None:
         super().__init__(file=file, highlight=False)
+        # FORCE_COLOR, which Jupyter sets: colours in a pipe, but nothing that moves the cursor.
         if self.is_terminal and os.environ.get("FORCE_COLOR") and not file.isatty():
             super().__init__(
                 file=file, highlight=False, force_terminal=False, color_system="standard"
@@ -85,12 +82,10 @@ def out() -> Console:
 
 
 def err() -> Console:
-    """Standard error, for progress and errors."""
     return _Console(sys.stderr)
 
 
 def failure(message: str) -> None:
-    """One red line on standard error."""
     err().print(f"[bold red]error:[/] {escape(message)}", soft_wrap=True)
 
 
@@ -289,22 +284,16 @@ def _rate(rate: float, unit: str) -> str:
 
 
 class CommandGroup(TyperGroup):
-    """Commands that report invalid input as one line on standard error and an exit code.
+    """Commands that report invalid input as one line on standard error and an exit code."""
 
-    Attributes:
-      exit_codes: exit codes of error types; the first match counts. Any other `SMEError` is 2.
-      extra: the extra of our package that these commands need, if there is one.
-    """
-
-    exit_codes: tuple[tuple[type[SMEError], int], ...] = ()
-    extra: str = ""
+    exit_codes: tuple[tuple[type[SMEError], int], ...] = ()  # the first match; else 2
+    extra: str = ""  # of our package, which these commands need
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
         _show_literally(self)
 
     def main(self, *args: Any, **options: Any) -> Any:
-        """Run the command line, and exit with its exit code."""
         options |= {"standalone_mode": False, "prog_name": self.name}
         _use_utf8()
         try:

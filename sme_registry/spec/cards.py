@@ -22,12 +22,10 @@ _BLOCKS: dict[str, type[BaseModel]] = {"safety": SafetySpec, "observation": Obse
 
 
 def html(document: SMESpec | StreamSpec) -> str:
-    """A card of a task or a stream."""
     return card(*parts(document))
 
 
 def parts(document: SMESpec | StreamSpec) -> list[str]:
-    """The parts of that card."""
     if isinstance(document, StreamSpec):
         table = stream_table(document, escape(catalogue.title(document)))
         return [table_html(table), pairs_html("", stream_facts(document))]
@@ -87,7 +85,6 @@ def agents(spec: SMESpec) -> list[dict[str, Any]]:
 
 
 def agents_table(agents: list[dict[str, Any]]) -> Table:
-    """Each agent's channels and what it is rewarded for, a row for each."""
     wrapped = ("action channels", "observed state channels", "observation", "rewarded for")
     rows = [
         (
@@ -128,7 +125,6 @@ def stream_table(stream: StreamSpec, title: str) -> Table:
 
 
 def stream_facts(stream: StreamSpec) -> dict[str, Any]:
-    """What a stream has besides its phases."""
     return {
         "cycles": stream.cycles,
         "steps": f"{stream.steps:,}",

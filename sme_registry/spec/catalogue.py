@@ -1,8 +1,7 @@
 """Files, the catalogue, and from a name (an id, a path, a digest) to its `SMESpec` or `StreamSpec`.
 
-A file is a document in an envelope of name, version, description, tags and digest. The digest is of
-the document alone, so renaming a file or describing it better changes nothing; a file with another
-digest is refused. The catalogue is the files under `specs/`, with no other list of them.
+A file is a document in an envelope. Its digest is of the document alone, so renaming a file or
+describing it better changes nothing. The catalogue is the files under `specs/`.
 """
 
 from __future__ import annotations
@@ -287,7 +286,6 @@ def completion(*kinds: type[Envelope]) -> Callable[[str], list[str]]:
 
 
 def entries(kind: type[_E]) -> list[_E]:
-    """Every file of one kind, read and checked."""
     return [_read(kind, path) for path in paths(kind)]
 
 
@@ -363,15 +361,10 @@ registered: dict[str, SMESpec | StreamSpec] = {}
 
 
 class Resolved(NamedTuple, Generic[_D]):
-    """A spec or a stream, and what its file publishes about the numbers drawn from it.
-
-    Attributes:
-      document: the spec or stream.
-      fingerprints: of the spec, or of each phase's spec; empty where there is no file.
-    """
+    """A spec or a stream, and what its file publishes about the numbers drawn from it."""
 
     document: _D
-    fingerprints: tuple[Fingerprint, ...] = ()
+    fingerprints: tuple[Fingerprint, ...] = ()  # of each phase's spec; none where there is no file
 
 
 @overload
@@ -401,7 +394,6 @@ def resolve(name: Any, kind: Any = None) -> Any:
 
 
 def _check_kind(document: SMESpec | StreamSpec, name: Any, kind: Any) -> None:
-    """Raise StreamError on a stream where a task is needed."""
     if kind is SMESpec and isinstance(document, StreamSpec):
         raise StreamError(
             f"{short_repr(name)}: is a stream, and this needs a single task. Use that of a phase, "
@@ -451,12 +443,10 @@ def known(kind: type[NamedDocument]) -> dict[str, Resolved[Any]]:
 
 @functools.cache
 def _instances() -> list[SMESpec | StreamSpec]:
-    """Of the catalogue's suites."""
     return [document for file in entries(SuiteFile) for document in file.suite.documents]
 
 
 def is_path(name: str) -> bool:
-    """Whether text is the path of a file rather than a name."""
     return name.endswith(".json") or (os.sep in name and Path(name).is_file())
 
 

@@ -1,7 +1,4 @@
-"""The base of every document: frozen, strict, hashed by its canonical JSON.
-
-digest = "sha256:" + hex(SHA-256(RFC 8785 canonical JSON of all fields)), so equal documents have
-equal digests on every machine, regardless of key order and of how a number was written.
+"""The base of every document: frozen, strict, hashed by its canonical JSON (RFC 8785).
 
 Each field has one text, its entry under "Attributes:" in the docstring of the class or of its base:
 `help`, the JSON Schema and the pages of `docs/` show it.
@@ -181,18 +178,7 @@ SchemaVersion = Annotated[
 
 
 def matching(pattern: str, allowed: str, **limits: Any) -> Any:
-    """The `Field` of a text that matches a pattern.
-
-    Examples:
-      >>> from typing import Annotated
-      >>> from sme_registry.spec import StrictModel, matching
-      >>> class Colour(StrictModel):
-      ...     code: Annotated[str, matching("^#[0-9a-f]{6}$", "'#' and 6 hex digits")]
-      >>> Colour(code="red")
-      Traceback (most recent call last):
-      ...
-      sme_registry.errors.SpecError: Colour: code='red': must be '#' and 6 hex digits. Correct it.
-    """
+    """The `Field` of a text that matches a pattern; `allowed` says in words what that is."""
     _words[pattern] = allowed
     return Field(pattern=pattern, json_schema_extra={WORDED: allowed}, **limits)
 
@@ -212,8 +198,6 @@ Digest = Annotated[
 
 
 class _Unquoted(str):
-    """A text that `repr` shows as it is."""
-
     __repr__ = str.__str__
 
 
@@ -313,7 +297,6 @@ class StrictModel(BaseModel):
 
 
 def check_digest(stated: str, document: Document, where: str, remedy: str) -> None:
-    """Raise `DigestMismatchError` if a document has another digest than a file states."""
     if stated != document.digest:
         raise DigestMismatchError(
             f"{where}={stated!r:.90}: its document has the digest {document.digest!r}. One of them "
@@ -345,10 +328,7 @@ class Document(StrictModel):
 
 
 class NamedDocument(Document):
-    """A document that a file or a registration may give a name, which is presentation.
-
-    The name is in no JSON, and makes no two documents unequal.
-    """
+    """A document that a file or registration may name; the name is in no JSON and no comparison."""
 
     _name: str = PrivateAttr("")
 
@@ -369,13 +349,11 @@ class NamedDocument(Document):
         return self.digest.replace(":", "-")[: len("sha256-") + 12]
 
     def _repr_html_(self) -> str:
-        """A card for notebooks: the fields, and what is changed from the default."""
         from sme_registry.spec import cards  # which knows every kind of document
 
         return cards.html(cast(Any, self))
 
     def __eq__(self, other: object) -> bool:
-        """Whether all fields are equal; the name is none of them."""
         if type(other) is not type(self):
             return NotImplemented
         return self.__dict__ == other.__dict__
@@ -396,7 +374,6 @@ def find_named(kind: type[NamedDocument], value: Any) -> Any:
 
 
 def check_names(field: str, members: Sequence[Any]) -> None:
-    """Raise ValueError, which Pydantic reports, where two members have the same name."""
     names = [member.name for member in members]
     for name in names:
         if names.count(name) > 1:

@@ -1,8 +1,4 @@
-"""`SMESpec`: the numbers from which a Synthetic Monitoring Environment is generated.
-
-Fields and their symbols in METHOD: N_s `state_dim` (S), N_a `action_dim` (A), k, r_min, D,
-C_π* `complexity` (L), T `horizon`, H `hidden_width`, θ `rotation` (METHOD, section 6).
-"""
+"""`SMESpec`: the numbers from which a Synthetic Monitoring Environment is generated."""
 
 from __future__ import annotations
 
@@ -385,29 +381,17 @@ NEVER = 2**63 - 1
 
 
 class Segment(NamedTuple):
-    """A part of a cycle in which one spec is in force.
+    """A part of a cycle in which one spec is in force."""
 
-    Attributes:
-      phase: the index of its phase; 0 where there are none.
-      spec: the spec.
-      start: environment steps of the cycle before it.
-    """
-
-    phase: int
+    phase: int  # its index; 0 where there are none
     spec: SMESpec
-    start: int
+    start: int  # environment steps of the cycle before it
 
 
 class SegmentTimes(NamedTuple):
-    """Which segment is in force after how many environment steps.
+    """Which segment is in force after how many environment steps."""
 
-    Attributes:
-      starts: environment steps of a cycle before each segment.
-      cycle_steps: environment steps of one cycle.
-      cycles: how often the segments are gone through.
-    """
-
-    starts: list[int]
+    starts: list[int]  # environment steps of a cycle before each segment
     cycle_steps: int
     cycles: int
 

@@ -221,10 +221,7 @@ class StreamSpec(NamedDocument):
         return segments, self.cycle_steps, self.cycles, self.switch, self.observes_phase
 
     def visit_ends(self, after: int = 0) -> Iterator[tuple[int, int]]:
-        """Visits of phases that end later than a lifetime: the index of each, and its end.
-
-        Visit v is of phase v mod P, in cycle v div P. The last one goes on at its end.
-        """
+        """The index v of each visit, of phase v mod P, that ends after a lifetime, and its end."""
         ends, length = [*accumulate(phase.steps for phase in self.phases)], self.cycle_steps
         P = len(ends)
         first = after // length * P + bisect_right(ends, after % length)

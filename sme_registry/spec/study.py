@@ -1,11 +1,8 @@
 """`StudyPlan`: algorithms × classes of tasks × seeds, the budget of each run and its evaluation.
 
-A plan holds everything that its results depend on, so a colleague can run a study from one file.
-Its cells are its runs: cell i of an algorithm and a class trains with seed i on instance i of the
-class (modulo the number of instances); in the paper, too, a seed determines both.
-
-On a stream an algorithm lives once, and for each phase a fresh agent trains on that phase alone,
-with which its plasticity is compared.
+Cell i of an algorithm and a class trains with seed i on instance i of the class (modulo the number
+of instances). On a stream an algorithm lives once, and for each phase a fresh agent trains on that
+phase alone, with which its plasticity is compared.
 """
 
 from __future__ import annotations
@@ -48,11 +45,7 @@ KINDS = ("offline", "reference", "independent", "jax", "train")
 
 
 def parse_uses(uses: str) -> tuple[str, str]:
-    """The kind of a learner and its name: `("jax", "PPO")` for "jax:PPO".
-
-    A name without a prefix is of kind "sb3": of Stable-Baselines3, or written for its environments.
-    Of "train:module:function" the name is `module:function`.
-    """
+    """Kind and name of a learner: `("jax", "PPO")` for "jax:PPO"; without a prefix "sb3"."""
     kind, colon, name = uses.partition(":")
     # `train:make` is a function of a module `train` that returns a model.
     if colon and kind in KINDS and (kind != "train" or ":" in name):
@@ -61,12 +54,10 @@ def parse_uses(uses: str) -> tuple[str, str]:
 
 
 def in_jax(uses: str) -> bool:
-    """Whether an algorithm runs in a program of JAX."""
     return parse_uses(uses)[0] == "jax"
 
 
 def _check_task(uses: str, setting: Setting, field: str) -> None:
-    """Raise ValueError, which Pydantic reports, if an algorithm cannot learn a task."""
     kind, name = parse_uses(uses)
     if setting.team is None:
         if kind == "independent":
@@ -89,7 +80,6 @@ def _check_task(uses: str, setting: Setting, field: str) -> None:
 
 
 def _check_stream(uses: str, field: str) -> None:
-    """Raise ValueError, which Pydantic reports, if an algorithm cannot live in a stream."""
     if parse_uses(uses)[0] not in ("sb3", "jax"):
         raise ValueError(
             f"{field}={uses!r}: cannot live in a stream. Use an algorithm that learns online and "
@@ -98,7 +88,6 @@ def _check_stream(uses: str, field: str) -> None:
 
 
 def _check_source(uses: str, source: str | None) -> None:
-    """Raise ValueError, which Pydantic reports, if an algorithm has no source of its own."""
     if source is not None and parse_uses(uses)[0] != "train":
         raise ValueError(f"source={source!r}: is for uses='train:module:function'. Leave it out.")
 
@@ -190,10 +179,7 @@ class Cell(Document):
 
     @property
     def fresh(self) -> tuple[Cell, ...]:
-        """Of a life: for each phase the run of an agent that trains on that phase alone.
-
-        None of a life that is such a run itself.
-        """
+        """Of a life, for each phase the run of an agent on that phase alone."""
         if self.stream is None:
             return ()
         documents = [_alone(phase) for phase in self.stream.phases]

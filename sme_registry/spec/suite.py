@@ -1,10 +1,7 @@
 """`Suite`, a list of classes, and `EvaluationProtocol`, the states to evaluate a policy in.
 
 A class is one setting with its instances (seeds), so a method is evaluated on a kind of task, not
-on one draw of it. A class of streams is one stream with its draws.
-
-Protocols: METHOD, section 3. Nested cubes X_ε = {s : ‖s − ½‖_∞ ≤ (1+ε)/2}; region 0 is the cube X_0
-(WD), region m the half-open shell X_{ε_m} \\ X_{ε_{m−1}} (OOD m); states uniform by volume in each.
+on one draw of it. Protocols: METHOD, section 3.
 """
 
 from __future__ import annotations
@@ -151,7 +148,6 @@ class Suite(Document):
 
 
 def check_classes(classes: tuple[SuiteClass, ...], streams: tuple[StreamClass, ...]) -> None:
-    """Raise ValueError, which Pydantic reports, without a class, or where names are equal."""
     if not classes and not streams:
         raise ValueError(
             "classes: must have at least 1 entry, unless there are streams. Add a class, or a "

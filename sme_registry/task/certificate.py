@@ -1,25 +1,17 @@
 """`certify`: checks of a drawn task, to reject a bad draw before training.
 
 Source: METHOD, sections 1, 2, 8 and 9. Axis letters: `S` state_dim, `A` action_dim, `N` lanes or
-states, `m` distractors.
-
-A check passes inside one range, warns inside a wider one, and refuses outside both. A warning means
-that a task is correct but easy: the constant action ½ is near its optimum, as METHOD says of
-`semi_orthogonal` policies of 2 to 5 layers. A broken or trivial task is refused.
+states, `m` distractors. A check passes inside one range, warns inside a wider one (a correct but
+easy task), and refuses outside both.
 
 The ranges of difficulty come from 4,560 draws (40 seeds of 114 settings; S 1..64, A 1..16,
 L 1..20). Mean r̃ of ½ is 0.716 to 0.752 where L = 1 and 0.646 to 0.848 with `unit_variance` and
 S ≥ 8, of which 97 % pass; 0.824 to 0.891 with `semi_orthogonal`, S = 8, A = 4, L = 2, which all
 warn; and 0.878 to 0.975 at S = A = 2, L = 2, of which 95 % are refused.
 
-Limits: with π*_i and v_i uniform and independent, the optimum is above ℓ_i = 1 − 2τ v_i in a share
-τ of states and channels. Of 40 draws at S = 8, A = 4, τ = 0.2, the share over τ is 0.79 to 1.31 for
-L = 1 and for 10 layers with `unit_variance`, and 0.04 to 0.51 for 2 `semi_orthogonal` ones, which
-stay near ½ where layers widen. At τ = ½ the share is ½ for any networks, even constant ones, by
-symmetry; there the KS distance decides.
-
-Mixings are undone from float32 observations, whose rounding the inverse multiplies: the condition
-number is 5.7 at 8 channels and depth 1, 661 at 40 and 2,840 at 128 channels and depth 3.
+At S = 8, A = 4, τ = 0.2, the share of broken limits over τ is 0.79 to 1.31 in 40 draws for L = 1
+and for 10 layers with `unit_variance`, and 0.04 to 0.51 for 2 `semi_orthogonal` ones. A mixing's
+condition number is 5.7 at 8 channels and depth 1, 2,840 at 128 channels and depth 3.
 """
 
 from __future__ import annotations
@@ -184,7 +176,6 @@ class Certificate:
         return table
 
     def _repr_html_(self) -> str:
-        """A card for notebooks: the outcome, and every check with its meaning."""
         return card(table_html(self.table(f"{self.digest}\n{self.outcome}", meanings=True)))
 
     def to_dict(self) -> dict[str, Any]:
@@ -256,7 +247,6 @@ def _not_measured(name: str, reason: str) -> Check:
 
 
 def _constant(name: str, similarity: Any, detail: str = "") -> Check:
-    """The mean r̃ of ½."""
     return _check(name, similarity, 0.65, 0.80, warns=(0.60, 0.90), detail=detail)
 
 
@@ -296,11 +286,7 @@ def _orthogonality_error(layer: Layer, unit_rows: bool) -> float:
 
 
 def _mixing(task: Task, seed: int, lanes: int) -> Iterator[Check]:
-    """Where random actions lead an ensemble of uniform starts, and one of a single start.
-
-    The second need not become uniform within an episode: a channel into which the actions put
-    little may stay in a nearly invariant set. So it has no range.
-    """
+    """Where random actions lead an ensemble of uniform starts, and one of a single start."""
     S, A = task.spec.state_dim, task.spec.action_dim
     s = _numbers(task, seed, "states", lanes, S)
     together = np.repeat(_numbers(task, seed, "start", 1, S), _TOGETHER, axis=0)
@@ -309,6 +295,7 @@ def _mixing(task: Task, seed: int, lanes: int) -> Iterator[Check]:
         s, together = task.transition(s, a), task.transition(together, a[:_TOGETHER])
     yield _check("uniform_states", _distance_from_uniform(s), high=_uniform_bound(S))
     yield _check("coverage", _coverage(s, pairs=S > 1), low=0.95 if lanes == _LANES else 0.5)
+    # No range: a channel into which the actions put little may stay in a nearly invariant set.
     yield _check("coverage_from_one_start", _coverage(together, pairs=False))
 
 
@@ -352,7 +339,6 @@ def _linear_policy(task: Task, s: Array, optimal: Array) -> Check:
 
 
 def _limits(task: Task, seed: int, states: int) -> Iterator[Check]:
-    """The checks of a task with `safety`; none without."""
     tau = task.spec.tightness
     if not tau:
         return
@@ -369,7 +355,6 @@ def _limits(task: Task, seed: int, states: int) -> Iterator[Check]:
 
 
 def _observation(task: Task, seed: int, states: int) -> Iterator[Check]:
-    """The checks of a task with `observation`; none without."""
     if task.distractor_transition is not None:
         yield from _distractors(task, seed, task.distractor_transition[0])
     if task.mixing:
@@ -454,12 +439,9 @@ def _uniform_bound(channels: int) -> float:
 def _no_collapse(
     task: Task, seed: int, transition: Callable[[Array, Array], Array], channels: int, name: str
 ) -> Check:
-    """The smallest share of distinct values of a channel under constant actions.
-
-    Every lane takes `_CONSTANT_STEPS` steps of a random action, of 0, of ½ and of 1. A channel must
-    neither merge its lanes nor fall into a short cycle: a dyadic b with a dyadic action merges all
-    lanes within 52 steps; float32 states cycle within about 2,000.
-    """
+    """The smallest share of distinct values of a channel under four constant actions."""
+    # A dyadic b with a dyadic action would merge all lanes within 52 steps; float32 states would
+    # cycle within about 2,000.
     A = task.spec.action_dim
     stream = "distractors/" if name == "distinct_distractors" else ""
     lanes = max(8, min(64, 2**20 // (channels * A)))
@@ -477,16 +459,12 @@ def _no_collapse(
 
 
 def _distinct(values: Array) -> float:
-    """The smallest share of distinct values along the first axis."""
     ranked = np.sort(values, axis=0)
     return float((1 + (np.diff(ranked, axis=0) > 0).sum(axis=0)).min()) / len(values)
 
 
 def held_out_r2(h: Array, y: Array) -> Array:
-    """How much of each column of y `[n, c]` an affine map recovers from h `[n, H]`: R² `[c]`.
-
-    1 − Σ (y − ŷ)² / Σ (y − ȳ)² of the held-out half; ŷ is fitted to the other half.
-    """
+    """R² `[c]` of y `[n, c]` by an affine map of h `[n, H]`: fitted on one half, of the other."""
     half = len(h) // 2
     design = np.concatenate([h, np.ones((len(h), 1))], axis=1)
     solution = np.linalg.lstsq(design[:half], y[:half])[0]

@@ -37,10 +37,7 @@ def raw_bits(seed: int | str, name: str, count: int) -> Bits:
 
 
 def to_uniform(bits: Bits) -> Array:
-    """64-bit words as uniform numbers in the open interval (0, 1), of the same shape.
-
-    u = (⌊bits / 2¹²⌋ + ½) · 2⁻⁵², which is exact, symmetric about ½ and never 0 or 1.
-    """
+    """64-bit words as numbers in (0, 1), exact and symmetric about ½: (⌊bits / 2¹²⌋ + ½) · 2⁻⁵²."""
     return ((bits >> np.uint64(12)).astype(np.float64) + 0.5) * 2.0**-52
 
 
@@ -60,12 +57,11 @@ SECOND_MIX = np.uint64(0x94D049BB133111EB)
 
 
 def counted(key: Bits, first: Bits, count: int) -> Array:
-    """Uniform numbers `[n, count]` in (0, 1) of counter-based streams, for environments.
+    """Uniform numbers `[n, count]` in (0, 1) of counter-based streams, from place `first` `[n]` on.
 
-    Of each stream from place `first` `[n]` on, 1 at the beginning: the word at place n is
-    SplitMix64's n-th from the seed mix(`key`). Any place can be computed alone, by machine code as
-    well, so that an environment's only state is the place.
-    Source: Steele, Lea & Flood (2014), Fast splittable pseudorandom number generators.
+    The word at place n, from 1, is SplitMix64's n-th from the seed mix(`key`): an environment's
+    only state is the place. Source: Steele, Lea & Flood (2014), Fast splittable pseudorandom number
+    generators.
     """
     with np.errstate(over="ignore"):  # arithmetic is modulo 2⁶⁴
         places = first[:, None] + np.arange(count, dtype=np.uint64)
@@ -121,10 +117,7 @@ def transition_offset(spec: SMESpec) -> Array:
 
 
 def optimal_policies(spec: SMESpec, stream: str = "policy") -> tuple[tuple[Layer, ...], ...]:
-    """The layers of each agent's optimal policy; a single agent is a team of one.
-
-    Another `stream` gives policies of the same shape and distribution, independent of these.
-    """
+    """Each agent's layers of π*; another `stream` gives independent policies of the same kind."""
     return tuple(
         _optimal_policy(spec, f"{stream}/{index}", observed, agent.action_dim)
         for index, (agent, observed) in enumerate(
@@ -151,10 +144,10 @@ def distractor_transition(spec: SMESpec) -> tuple[Array, Array] | None:
 
 
 def mixing_layers(spec: SMESpec) -> tuple[Layer, ...]:
-    """The layers of the map from state and distractors `[S + m]` to what the agent sees.
+    """The layers of the map from state and distractors `[S + m]` to what the agent sees; or none.
 
-    x ↦ W x + b where the mixing is orthogonal, with W = Q/c, b = ½ − W ½ and the least c that keeps
-    the cube's image in the cube. Uniform layers where it is nonlinear. None without mixing.
+    An orthogonal mixing is x ↦ W x + b, with W = Q/c, b = ½ − W ½ and the least c that keeps the
+    cube's image in the cube; a nonlinear one has uniform layers.
     """
     if spec.observation is None or spec.mixing == "none":
         return ()
@@ -206,8 +199,8 @@ def _uniform_matrix(spec: SMESpec, name: str, inputs: int, outputs: int) -> Arra
 def _rotation(spec: SMESpec, name: str, channels: int) -> Array:
     """R(θ) = B · diag(rot θ, …, rot θ[, 1]) · Bᵀ `[S, S]`, with B Haar orthogonal.
 
-    Source: METHOD, section 6. π*_θ(s) = π*(½ + R (s − ½)). As the first layer's b is −½ W 1, that
-    is the policy whose first layer has W R in place of W: every back-end reads it from the layers.
+    METHOD, section 6: π*_θ(s) = π*(½ + R (s − ½)) is the policy whose first layer has W R in place
+    of W, as b is −½ W 1.
     """
     B = _haar(spec.seed, name, channels, channels)
     u, v = B[:, 0 : channels - 1 : 2], B[:, 1:channels:2]  # the two axes of each plane

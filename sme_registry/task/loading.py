@@ -1,11 +1,8 @@
 """From a name or a spec to a drawn task: `load`, `load_task`, `materialize`; and of streams.
 
-A digest fixes a spec, but random streams and LAPACK may differ between machines and versions. So a
-file also publishes a fingerprint: π*(s), T(s, a) and the like at three fixed probes. `load` and
-`load_task` draw the task that a file names, and refuse one that differs by more than 1e-6. A spec
-alone has no published numbers, so `materialize(spec)` checks only a fingerprint passed to it.
-
-A task too large for the memory is refused before it is drawn.
+Random streams and LAPACK may differ between machines, so a file also publishes a fingerprint:
+π*(s), T(s, a) and the like at three fixed probes. A file's task that differs by more than 1e-6 is
+refused, as is one too large for the memory, before it is drawn.
 """
 
 from __future__ import annotations
@@ -97,11 +94,7 @@ def load_task(task: SpecLike, **overrides: Any) -> Task:
 def materialize_segments(
     document: SMESpec | StreamSpec, fingerprints: Sequence[Fingerprint] = ()
 ) -> tuple[Task, ...]:
-    """Draw the task of each segment of a cycle; a spec has one. Equal specs share a task.
-
-    With `fingerprints`, of the spec or of each phase's, other numbers are a
-    `FingerprintMismatchError`.
-    """
+    """Draw and check the task of each segment of a cycle; equal specs share one."""
     tasks = materialize_together([segment.spec for segment in document.segments])
     drawn = {task.spec: task for task in tasks}
     for index, (spec, published) in enumerate(zip(document.specs, fingerprints, strict=False)):
@@ -170,7 +163,6 @@ def fingerprint_of(task: Task) -> Fingerprint:
 
 
 def check_fingerprint(published: Fingerprint, task: Task, where: str = "") -> None:
-    """Raise FingerprintMismatchError where a task differs from a published fingerprint."""
     for (field, here), (_, rows) in zip(fingerprint_of(task), published, strict=True):
         if difference := _difference(here, rows):
             raise FingerprintMismatchError(
@@ -214,10 +206,7 @@ def peak_bytes(spec: SMESpec) -> int:
 
 
 def check_memory(needed: int, what: str, remedy: str) -> None:
-    """Raise ResourceLimitError, with both sizes, if `needed` bytes exceed the limit.
-
-    The limit is 4 GiB, or the value of the environment variable SME_MEMORY_LIMIT_GIB.
-    """
+    """Raise ResourceLimitError above 4 GiB, or the environment variable SME_MEMORY_LIMIT_GIB."""
     text = os.environ.get(_LIMIT_VARIABLE, str(_DEFAULT_LIMIT_GIB))
     try:
         limit = float(text)
@@ -252,7 +241,6 @@ def _shapes(spec: SMESpec) -> Iterator[tuple[int, int, int]]:
 
 
 def _network_shapes(spec: SMESpec, inputs: int, outputs: int) -> Iterator[tuple[int, int, int]]:
-    """The same of a network of the spec's complexity and width."""
     H, inner = spec.hidden_width, spec.complexity - 1
     if inner == 0:
         yield inputs, outputs, 1

@@ -149,10 +149,7 @@ class Task:
         return self.limit_of(through(self.limiting, s))
 
     def safe_action(self, s: npt.ArrayLike) -> Array:
-        """min(π*, ℓ), `[B, A]` or `[A]`: of all actions of cost 0 the nearest to π* in L1.
-
-        Unique as such, since each channel has its own limit. None of cost 0 earns more.
-        """
+        """min(π*, ℓ), `[B, A]` or `[A]`: the action of cost 0 nearest to π*; none earns more."""
         s = self._states(s)
         return np.minimum(self.policy(s), self.limit(s))
 
@@ -179,8 +176,7 @@ class Task:
     def distractor_step(self, d: npt.ArrayLike, u: npt.ArrayLike) -> Array:
         """The next distractors ψ(d + u W + b), `[B, m]` or `[m]`, as `transition` computes it.
 
-        `u` `[B, A]` or `[A]` drives them: uniform random numbers, or the agent's actions. SpecError
-        where the task has no distractors, or they are noise, drawn anew each step.
+        `u` `[B, A]` or `[A]` drives them: uniform random numbers, or the agent's actions.
         """
         if self.distractor_transition is None:
             has = "has noise, drawn anew each step" if self.spec.distractors else "has none"
@@ -193,10 +189,7 @@ class Task:
         return _moved(d, u, *self.distractor_transition)
 
     def seen(self, s: npt.ArrayLike, d: npt.ArrayLike | None = None) -> Array:
-        """M(s, d), what the agent sees of the state: `[B, S + m]` or `[S + m]`.
-
-        One state may be given with a batch of distractors, and the other way round.
-        """
+        """M(s, d), what the agent sees: `[B, S + m]` or `[S + m]`; one of s and d may be single."""
         x, d = self._states(s), self._distractors(np.empty(0) if d is None else d)
         _check_equal_length("distractors", d, x, "one row for each of the {} states", StateError)
         if self.spec.distractors:
@@ -211,13 +204,13 @@ class Task:
     def unmixed(self, x: npt.ArrayLike) -> Array:
         """The state and distractors behind what the agent sees, M⁻¹(x): `[B, S + m]` or `[S + m]`.
 
-        `x` is an observation without t/T and r_cum/k. Exact up to rounding: of float32
-        observations to about 1e-7 times the condition number of M. A uniform layer's outputs of 0
-        or 1, which rounding can give, count as 2⁻²⁵ from them.
+        `x` is an observation without t/T and r_cum/k. Of float32 observations, exact to about 1e-7
+        times the condition number of M.
         """
         y = _checked(x, self.spec.state_dim + self.spec.distractors, "observation", StateError)
         for W, b in reversed(self.mixing):
             if self.spec.mixing == "nonlinear":
+                # Rounding can give 0 or 1, of which Φ⁻¹ is infinite.
                 y = ndtri(np.clip(y, 2.0**-25, 1.0 - 2.0**-25))
             y = np.asarray(np.linalg.solve(W, (y - b).T).T, dtype=np.float64)
         return y
@@ -245,8 +238,7 @@ class Task:
     def regret_shares(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
         """Each agent's share of the team's regret, `[B, n]` or `[n]`; they add up to it.
 
-        regret · d_i / Σ_j d_j, with d_i the L1 distance of agent i's action from its optimal one:
-        the team's 1 − r̃ is the sum of all d_i / A. All are 0 at the optimum.
+        regret · d_i / Σ_j d_j, with d_i the L1 distance of agent i's action from its optimal one.
         """
         s, a = self._pairs(s, a)
         optimal = self.policy(s)
@@ -257,11 +249,7 @@ class Task:
         return cast(Array, shares * np.asarray(regret)[..., None])
 
     def difference_rewards(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
-        """The team's gain if one agent acted optimally, `[B, n]` or `[n]`, in [0, 1].
-
-        The team's step reward with agent i's action replaced by its optimal one, minus that as it
-        is.
-        """
+        """The team's gain if one agent acted optimally, `[B, n]` or `[n]`, in [0, 1]."""
         s, a = self._pairs(s, a)
         optimal = self.policy(s)
         as_is = self.reward_of(self.similarity_of(a, optimal))
