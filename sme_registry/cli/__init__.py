@@ -22,9 +22,7 @@ app = application(
     To start:
 
       sme list
-
       sme show Default
-
       sme demo
 
     Your own task:
@@ -34,7 +32,6 @@ app = application(
     An agent of Stable-Baselines3, and the same in JAX, which is faster:
 
       sme train mine.json -a PPO
-
       sme train mine.json -a PPO --agents jax
     """,
 )
@@ -48,7 +45,6 @@ app.add_typer(offline, name="offline")
 
 
 def main() -> None:
-    """The entry point of the command `sme`."""
     app()
 
 

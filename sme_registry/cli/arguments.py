@@ -101,7 +101,6 @@ _File = TypeVar("_File", bound=Envelope)
 
 
 def kind_of(file: Envelope) -> str:
-    """The kind of a file: `env`, `stream`, `suite`, `protocol` or `study`."""
     return next(kind for kind, model in KINDS.items() if isinstance(file, model))
 
 
@@ -118,7 +117,6 @@ def read_any(path: str | os.PathLike[str]) -> Envelope:
 
 
 def find_file(kind: type[_File], name: str) -> _File:
-    """The file of one kind with a name or path."""
     return kind.read(name) if is_path(name) else catalogue.find(kind, name)
 
 
@@ -160,7 +158,6 @@ def changes(pairs: list[str] | None) -> dict[str, Any]:
 def changed(
     document: SMESpec | StreamSpec, name: str, fields: dict[str, Any]
 ) -> SMESpec | StreamSpec:
-    """A task with some fields changed."""
     if isinstance(document, SMESpec):
         return document.derive(**fields)
     for field in fields:
@@ -178,7 +175,6 @@ def json_or_text(text: str) -> Any:
 
 
 def check_document_path(path: Path, *, force: bool) -> None:
-    """Check the path of a document that a command is about to write."""
     if path.suffix != ".json":
         raise OptionError(f"{path}: must end in .json, so that commands recognise it as a path.")
     check_new(path, force=force)
@@ -221,8 +217,6 @@ def with_options(options: type) -> Callable[[Callable[..., None]], Callable[...,
 
 @dataclass(frozen=True, kw_only=True)
 class ClassOptions:
-    """Options of a command that describe classes of tasks and streams, each with its help."""
-
     suite: Annotated[
         str | None,
         typer.Option(
@@ -321,7 +315,6 @@ def only_with(context: typer.Context, names: Iterable[str], reason: str) -> None
 
 
 def can_draw() -> bool:
-    """Whether figures can be drawn; prints a warning if not."""
     if is_installed("matplotlib"):
         return True
     err().print(
@@ -332,10 +325,7 @@ def can_draw() -> bool:
 
 
 def write_run_explorer(folder: Path) -> list[Path]:
-    """Write the explorer of a finished run on one task, where a page can show it.
-
-    Where it cannot, that is printed: the run is complete without.
-    """
+    """Write the explorer of a run; where that cannot be, say so: the run is complete without."""
     try:
         path, report = folder / explorer.FILE, explorer.run_report(folder)
         return [explorer.write_explorer(path, load_run(folder), report=report)]
@@ -357,7 +347,6 @@ def print_training(
 
 
 def print_tables(tables: Iterable[Table]) -> None:
-    """Print tables with an empty line between them."""
     for index, table in enumerate(tables):
         if index:
             out().print()
@@ -365,11 +354,9 @@ def print_tables(tables: Iterable[Table]) -> None:
 
 
 def print_written(paths: Iterable[Path]) -> None:
-    """List the files that were written, on standard error."""
     for path in paths:
         err().print(f"wrote {escape(str(path))}", soft_wrap=True)
 
 
 def unique(values: Iterable[str]) -> list[str]:
-    """The different values, in order of appearance."""
     return list(dict.fromkeys(values))

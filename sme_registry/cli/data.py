@@ -50,7 +50,6 @@ dataset = typer.Typer(
     Examples:
 
       sme dataset make Default --nu 0.5
-
       sme dataset list
     """,
 )
@@ -106,9 +105,7 @@ def make(
     Examples:
 
       sme dataset make Default --nu 0.5 --transitions 50000 --seed 7
-
       sme dataset make Complexity10 --mix nu=0.5:0.7 --mix random:0.1 --mix policy=model.zip:0.2
-
       sme dataset make Plane1 --nu 0.25 --coverage -0.2 --name sme/inner-v0 --out data
     """
     spec = load(task, SMESpec).derive(**changes(set_))
@@ -157,7 +154,6 @@ def list_(folder: DatasetsFolder = None, json: Json = False) -> None:
     Examples:
 
       sme dataset list
-
       sme dataset list --datasets data --json
     """
     datasets, broken = list_datasets(folder)
@@ -182,7 +178,6 @@ def show(name: Name, folder: DatasetsFolder = None, json: Json = False) -> None:
     Examples:
 
       sme dataset show sme/Default-v1-nu50-seed7-v0
-
       sme dataset show data/sme/inner-v0 --json
     """
     _print(open_dataset(name, folder), json)
@@ -199,7 +194,6 @@ def validate(
     Examples:
 
       sme dataset validate sme/Default-v1-nu50-seed7-v0
-
       sme dataset validate data/sme/inner-v0
     """
     results: list[dict[str, Any]] = []
@@ -255,7 +249,6 @@ def _summary(dataset: Dataset) -> dict[str, Any]:
 
 
 def _print(dataset: Dataset, json: bool) -> None:
-    """Print a data set's facts and scores."""
     if json:
         print_json(_summary(dataset))
         return
@@ -339,11 +332,8 @@ def train(
     Examples:
 
       sme dataset make Default --nu 0.5 --seed 7
-
       sme offline train sme/Default-v1-nu50-seed7-v0 --algorithm bc --seed 1
-
       sme offline train sme/Default-v1-nu50-seed7-v0 -a iql --set expectile=0.9
-
       sme evaluate runs/Default-v1-nu50-seed7-v0-iql-seed0/policy.npz Default
     """
     algorithm, _ = check_algorithm(algorithm)

@@ -59,7 +59,6 @@ class SubjectOptions:
     set_: SpecChanges = None
 
     def check(self, what: str) -> None:
-        """Check that no option of a policy is given where there is none."""
         if self.task is not None:
             if self.cell is not None:
                 raise OptionError("--cell: names a cell of a study, --task a policy's task.")
@@ -162,17 +161,11 @@ def diagnose(
     Examples:
 
       sme diagnose runs/Default-TD3-seed0 --out runs/Default-TD3-seed0/diagnosis
-
       sme diagnose runs/k10 --against runs/k1 --probe-capacity
-
       sme diagnose mypolicy:act --task Complexity10
-
       sme diagnose actor.onnx --task Default --log runs/mine/episodes.csv
-
       sme diagnose runs/smoke --cell 3f2a91c4
-
       sme diagnose runs/Team4-PPO-seed0 --out runs/Team4-PPO-seed0/diagnosis
-
       sme diagnose runs/Switch5-PPO-seed0 --out runs/Switch5-PPO-seed0/diagnosis
     """
     if out_folder is not None:
@@ -251,13 +244,9 @@ def explore(
     Examples:
 
       sme explore runs/demo --open
-
       sme explore Complexity10
-
       sme explore actor.onnx --task Default
-
       sme explore mypolicy:act --task Complexity10 --channels 1,2 --channels 3,7
-
       sme explore runs/smoke --cell 3f2a91c4 --out cell.html
     """
     integer_in("--episodes", episodes, 1, 10_000)
@@ -296,7 +285,6 @@ def _target(what: str, options: SubjectOptions, out: Path | None, *, force: bool
 
 
 def _channels(text: str) -> tuple[int, int]:
-    """Two channels, as text `I,J`."""
     parts = text.split(",")
     if len(parts) != 2 or not all(part.strip().isdecimal() for part in parts):
         raise OptionError(f"--channels {text}: must be two channels, such as --channels 1,2.")

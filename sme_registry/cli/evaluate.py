@@ -104,17 +104,11 @@ def evaluate(
     Examples:
 
       sme evaluate linear Complexity10
-
       sme evaluate runs/demo/model.zip Default --out runs/demo-again
-
       sme evaluate actor.onnx Default --action-range symmetric
-
       sme evaluate mypolicy:act Default --protocol quick-v1 --json
-
       sme evaluate runs/Team4-PPO-seed0/model.zip Team4
-
       sme evaluate runs/Team4-independent-PPO-seed0/model Team4
-
       sme evaluate runs/life/snapshots/visit-*.zip Switch5 --initial runs/life/snapshots/initial.zip
     """
     document = changed(load(task), task, changes(set_))

@@ -55,8 +55,6 @@ from sme_registry.training.algorithms import (
 
 @dataclass(frozen=True, kw_only=True)
 class PlanOptions(ClassOptions):
-    """Options of a command that describe a plan, each with its help."""
-
     algorithm: Annotated[
         list[str] | None,
         typer.Option(
@@ -243,11 +241,8 @@ def plan(
     Examples:
 
       sme study plan
-
       sme study plan paper-ablations --cores 64
-
       sme study plan paper-ablations --steps 20000 --seeds 3 --only algorithm=PPO --only "class=k-*"
-
       sme study plan smoke --folder runs/smoke --json
     """
     if plan is None:
@@ -359,7 +354,6 @@ def check_algorithms(algorithms: Iterable[StudyAlgorithm], errors: type[SMEError
 
 
 def warn_of_uneven_rollouts(plan: StudyPlan) -> None:
-    """Print which rollouts do not end where the phases of streams do."""
     for warning in uneven_rollouts(plan):
         err().print(f"[yellow]uneven rollouts:[/] {escape(warning)}", soft_wrap=True)
 
@@ -396,19 +390,12 @@ def new(
     Examples:
 
       sme study new mine.json --suite smoke -a PPO -a TD3 -a reference:linear --seeds 5 -n 20000
-
       sme study new deep.json -t Default -t Complexity10 -a TQC=sb3_contrib:TQC -n 10000
-
       sme study new ranges.json -t Default -a PPO --action-range symmetric --action-range unit
-
       sme study new intervals.json -t Default --sweep k=1,2,5,10 -a PPO --seeds 5 -n 20000
-
       sme study new two.json --suite smoke -a PPO -a slow=PPO --set slow.learning_rate=0.0001
-
       sme study new teams.json --suite teams -a PPO -a independent:PPO --seeds 3 -n 20000
-
       sme study new lives.json -t Switch5 -t Related5 -a PPO --seeds 3 --instances 3
-
       sme study new wider.json --from edited.json
     """
     check_document_path(path, force=force)

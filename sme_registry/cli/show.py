@@ -49,9 +49,7 @@ def list_(
     Examples:
 
       sme list
-
       sme list --kind env --tag paper
-
       sme list --json | jq '.[].id'
     """
     tags = set(tag or ())
@@ -160,7 +158,6 @@ def number_of_cells(plan: StudyPlan) -> int:
 def _rows(
     files: Sequence[Envelope], values: Iterable[tuple[int | str, ...]]
 ) -> Iterator[tuple[str, ...]]:
-    """Each file's name, values and description."""
     for file, row in zip(files, values, strict=True):
         texts = (f"{value:,}" if isinstance(value, int) else value for value in row)
         yield file.versioned_name, *texts, escape(file.description)
@@ -219,13 +216,9 @@ def show(
     Examples:
 
       sme show Default
-
       sme show mine.json --json
-
       sme show sha256:66e9b7a9a266
-
       for task in $(sme show smoke --digests); do sme train $task; done
-
       sme show --json-schema env-file > env-file.schema.json
     """
     if json_schema is not None:
@@ -305,13 +298,11 @@ def _facts(spec: SMESpec) -> dict[str, Any]:
 
 
 def _env_id(spec: SMESpec) -> str:
-    """The environment's id: its released name, or its name by content."""
     name = catalogue.unique_name(spec)
     return content_id(spec) if name == spec.content_name else f"{catalogue.NAMESPACE}/{name}"
 
 
 def _spaces(spec: SMESpec) -> dict[str, str]:
-    """Descriptions of the observation and action spaces."""
     if spec.team is None:
         size = f"[{spec.observation_dim}] float32 in [0, 1]"
         return {

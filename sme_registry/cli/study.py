@@ -47,15 +47,10 @@ app = typer.Typer(
     Examples:
 
       sme study run smoke --folder runs/smoke
-
       sme study sweep -t Default --sweep k=1,2,5,10 -a PPO -n 20000 -f runs/k
-
       sme study plan paper-ablations --cores 64
-
       sme study status runs/smoke
-
       sme study report runs/smoke
-
       sme study compare runs/smoke PPO TD3
     """,
 )
@@ -120,13 +115,9 @@ def run(
     Examples:
 
       sme study run smoke --folder runs/smoke
-
       sme study run paper-ablations -f runs/k --only "class=k-*" --only class=default --seeds 3
-
       sme study run paper-ablations -f runs/short --steps 20000 --steps PPO=100000 --jobs 8
-
       sme study run paper-ablations -f runs/jax --agents jax --only algorithm=PPO
-
       sme study run paper-ablations -f runs/all --ray 10.0.0.1:6379
     """
     if ray is not None and executor not in (None, "ray"):
@@ -169,7 +160,6 @@ def status(
     Examples:
 
       sme study status runs/smoke
-
       sme study status runs/all --only "class=k-*" --json
     """
 
@@ -203,9 +193,7 @@ def report(
     Examples:
 
       sme study report runs/smoke
-
       sme study report runs/all --out paper/study --format pdf,latex
-
       sme study report runs/smoke --explorers
     """
     from sme_registry.studies import write_report
@@ -221,7 +209,6 @@ def report(
 
 
 def print_status(status: StudyStatus, json: bool) -> None:
-    """Print how many cells of a study are done, running, failed and waiting, or all as JSON."""
     if json:
         print_json(status.to_dict())
         return
@@ -312,9 +299,7 @@ def compare(
     Examples:
 
       sme study compare runs/smoke PPO TD3
-
       sme study compare runs/mine slow fast --metric wd_regret --out paper/slow-fast
-
       sme study compare runs/smoke PPO TD3 --json
     """
     from sme_registry.studies.report import write
@@ -357,9 +342,7 @@ def sweep(
     Examples:
 
       sme study sweep -t Default --sweep k=1,2,5,10 -a PPO -n 20000 --seeds 5 -f runs/k
-
       sme study sweep -t Team4 --sweep team.reward=individual,team -a PPO --seeds 3 -f runs/reward
-
       sme study sweep -t Default --sweep k=1,5 --sweep D=0,0.25 -a PPO -a reference:linear -f runs/2
     """
     from sme_registry.studies import write_report

@@ -127,13 +127,9 @@ def new(
     Examples:
 
       sme new deep.json --complexity 20 --policy-init unit_variance --seed 7
-
       sme new sparse.json --from HardDeep --k 25 --description "Paid every 25 steps."
-
       sme new safe.json --safety '{"tightness": 0.2}' --policy-init unit_variance
-
       sme new sealed.json --seed 0x9f86d081884c7d659a2feaa0c55ad015
-
       sme new team.json --agents 4 --channels-each 2 --team-reward team
     """
     check_document_path(path, force=force)
@@ -159,7 +155,6 @@ def new(
 def _equal_team(
     start: SMESpec, action_dim: Any, agents: int, channels_each: int | None
 ) -> dict[str, Any]:
-    """The fields `team` and `action_dim` of a team of equal agents."""
     integer_in("--agents", agents, 1)
     if channels_each is None:
         A = start.action_dim if action_dim is None else action_dim
@@ -205,7 +200,6 @@ suite = typer.Typer(
     Examples:
 
       sme suite new mine.json -t Default -t HardSparse --instances 5
-
       sme suite new more.json --suite smoke -t Complexity50
     """,
 )
@@ -229,11 +223,8 @@ def new_suite(
     Examples:
 
       sme suite new mine.json -t Default -t HardSparse -t k2.json --instances 5
-
       sme suite new intervals.json -t Default --sweep k=1,5,25 --instances 3
-
       sme suite new more.json --suite smoke -t Complexity50
-
       sme suite new lives.json -t Switch5 -t Related5 --instances 5
     """
     check_document_path(path, force=force)
@@ -261,7 +252,6 @@ def validate(
     Examples:
 
       sme validate mine.json
-
       sme validate specs/envs specs/suites
     """
     results = [_check(file) for path in paths for file in _files(path)]
@@ -330,7 +320,6 @@ def certify(
     Examples:
 
       sme certify mine.json
-
       sme certify core smoke
     """
     specs = [entry for name in tasks for entry in _tasks(name)]
@@ -350,7 +339,6 @@ def certify(
 
 
 def _tasks(name: str) -> list[tuple[str, SMESpec]]:
-    """The label and spec of each task that a name stands for."""
     document = find_any(name)
     if isinstance(document, SMESpec):
         return [(name, document)]

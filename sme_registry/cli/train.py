@@ -125,12 +125,10 @@ class Settings:
         return fields, {**from_file, **settings}
 
     def uses(self, document: SMESpec | StreamSpec) -> str:
-        """The full name of the algorithm, by default that for such a task."""
         algorithm = self.algorithm or algorithms.default_algorithm(document)
         return algorithms.full_name(algorithm, self.agents)
 
     def folder(self, label: str, uses: str, suffix: str = "") -> Path:
-        """The output folder, by default under runs."""
         name = f"{'independent-' * self.independent}{algorithms.folder_name(uses)}"
         return self.out_folder or Path("runs") / f"{label}-{name}{suffix}"
 
@@ -200,23 +198,14 @@ def train(
     Examples:
 
       sme train Default --steps 20000 --seed 1
-
       sme train Default -a PPO -n 100000 --agents jax
-
       sme train Default -a PPO -n 100000 --num-envs 8 --set complexity=10 --set learning_rate=1e-4
-
       sme train Default -a sb3_contrib:TQC --set top_quantiles_to_drop_per_net=5
-
       sme train mine.json --out runs/mine --resume
-
       sme train Team4 --steps 40000
-
       sme train Team4 --independent --steps 40000
-
       sme train Switch5 -a PPO --agents jax
-
       sme train Safety20 -a PPOLagrangian -n 100000 --set cost_limit=0.02
-
       sme train --suite mine.json -a PPO --out runs/mine
     """
     if suite is not None:
@@ -336,7 +325,6 @@ def _train_suite(
 
 
 def _next_step(name: str, suite: Suite, plan: StudyPlan, folder: Path) -> str:
-    """What to do with the models of a suite."""
     if suite.streams:
         return f"To see what the agents retain: sme study report {folder}"
     instances = max(suite.runs.values())
@@ -381,7 +369,6 @@ def demo(
     Examples:
 
       sme demo
-
       sme demo --full --out runs/full
     """
     if steps is None:

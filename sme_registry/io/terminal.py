@@ -346,9 +346,9 @@ def _show_literally(command: Any) -> None:
 
 
 def _in_paragraphs(text: str) -> str:
-    """Text with one line per paragraph; indented ones, the examples, follow without empty lines."""
-    paragraphs = [re.sub(r"\n\s*", " ", part) for part in re.split(r"\n\s*\n", text)]
-    return re.sub(r"(?m)^( .*)\n\n(?= )", r"\1\n", "\n\n".join(paragraphs))
+    """Text with one line per paragraph; indented lines, the examples, stay lines of their own."""
+    joined = re.sub(r"(?<!\n)\n(?![\n ])", " ", text)
+    return re.sub(r"(?m)^( .*)\n\n(?= )", r"\1\n", joined)
 
 
 def _show_version(context: typer.Context, wanted: bool) -> None:
