@@ -99,18 +99,6 @@ def _png(figure: Figure) -> bytes:
     return encoded(figure, ["png"])["png"]
 
 
-@contextlib.contextmanager
-def drawing(
-    size: tuple[float, float], formats: Iterable[str]
-) -> Iterator[tuple[Figure, dict[str, bytes]]]:
-    """A figure in the style of this package, and a dict of its files, filled after the block."""
-    files: dict[str, bytes] = {}
-    with styled():
-        figure = new_figure(size)
-        yield figure, files
-        files |= encoded(figure, formats)
-
-
 def encoded(figure: Figure, formats: Iterable[str]) -> dict[str, bytes]:
     """The bytes of a figure in each format; equal figures give equal bytes."""
     files = {}

@@ -88,7 +88,6 @@ class Estimator:
         return cell.uses in self._ratios
 
     def seconds(self, cell: Cell) -> Span:
-        """Estimate a cell."""
         start = _START / _RUNS_IN_JAX if in_jax(cell.uses) else _START
         low, high = _work(cell, _FASTEST), _SLOW_CORE * _work(cell, _SLOWEST)
         if cell.uses in self._ratios:
@@ -136,7 +135,6 @@ class Pace:
         self._reported: dict[str, _Reported] = {}  # by a job's first cell
 
     def report(self, cells: Sequence[Cell], share: float) -> None:
-        """The cells of a job have done this share of their steps."""
         key, now = cells[0].digest, time.monotonic()
         first = self._reported.get(key, _Reported(cells, now, share, now, share))
         self._reported[key] = first._replace(now=now, share=share)
@@ -242,7 +240,6 @@ def _renamed(file: StudyFile, plan: StudyPlan, suffix: str) -> StudyFile:
 
 
 def first_places(cells: Iterable[PlannedCell]) -> dict[str, PlannedCell]:
-    """Each cell once, by its digest, in its first place in the plan."""
     places: dict[str, PlannedCell] = {}
     for planned in cells:
         places.setdefault(planned.cell.digest, planned)

@@ -61,14 +61,10 @@ def run_cell(
     """Train, evaluate during training, and evaluate in and out of distribution at the end.
 
     The evaluations' episodes are deterministic and start in states that depend only on the seed and
-    on the evaluation's number. Times are CPU seconds of this thread, so that other jobs on the
-    machine do not count.
-
-    Args:
-      cell: the cell to run.
-      progress: called after each step with the steps done and the steps in all.
-      model_path: where to save the trained model, if it has a `save` method. Of a life in a
-        stream, the folder of the same name without suffix gets those at the ends of its visits.
+    on the evaluation's number. Times are CPU seconds of this thread. `progress` is called after
+    each step with the steps done and the steps in all. A trained model that has a `save` method is
+    saved at `model_path`; of a life in a stream, those at the ends of its visits go into the
+    folder of the same name without suffix.
 
     Examples:
       >>> from sme_registry.spec import StudyFile
@@ -92,7 +88,6 @@ def run_cell(
 
 
 def _train(cell: Cell, entry: Entry, progress: ReportSteps, model_path: Path | None) -> CellResult:
-    """Train what learns online, and evaluate it whenever an evaluation is due."""
     options: dict[str, Any] = {
         "seed": cell.seed,
         "steps": cell.steps,
@@ -136,8 +131,6 @@ def run_program(
 
 
 def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> CellResult:
-    """Run a cell that uses JAX as the only run of a program."""
-
     def report(done: int, total: int, note: str = "", /) -> None:
         progress(done, total)
 
@@ -153,7 +146,6 @@ def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> Ce
 
 
 def _run_reference(cell: Cell, name: str, progress: ReportSteps) -> CellResult:
-    """Evaluate a policy that learns nothing as often as a learner."""
     evaluations = _Evaluations(cell, progress)
     policy = as_policy(reference_policy(name, cell.spec), cell.spec)
     for steps in evaluations.record.due:
@@ -178,7 +170,6 @@ class _Evaluations(Watch):
             self._progress(steps, self.cell.steps)
 
     def evaluate(self, steps: int, policy: Policy | TeamPolicy) -> None:
-        """Run the next evaluation, after `steps` steps of training."""
         cell, k = self.cell, self.record.evaluated
         number = k + cell.evaluations - len(self.record.due)  # a function has only the last
         states = start_states(cell.seed, number, cell.evaluation_episodes, cell.spec.state_dim)
@@ -204,7 +195,6 @@ class _Evaluations(Watch):
     def result_of(
         self, policy: Policy | TeamPolicy, steps: int, environment: float = 0.0
     ) -> CellResult:
-        """The result with the report of a policy, which learnt from so many steps."""
         cell = self.cell
         return self._result(
             evaluate(policy, cell.spec, cell.protocol, name=cell.uses), steps, environment
@@ -233,7 +223,6 @@ class _Training(_Evaluations):
             self.on_visit(-1)
 
     def run(self) -> None:
-        """Train, with every evaluation."""
         env, record = self._learner.env, self.record
         self._evaluate_due(0)
         self.report(0)
@@ -261,7 +250,6 @@ class _Training(_Evaluations):
             self._learner.save(self._files.initial if visit < 0 else self._files.visits[visit])
 
     def result(self) -> CellResult:
-        """The result of the trained policy, or of the life."""
         learner, blocks = self._learner, self.record.blocks
         if blocks is None:
             return self.result_of(learner.policy(), learner.steps, learner.env.seconds)

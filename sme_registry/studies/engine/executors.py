@@ -126,7 +126,6 @@ class InProcess:
     workers: int = 1
 
     def map(self, jobs: Jobs, progress: ReportProgress) -> Generator[Outcome, None, None]:
-        """See `Executor.map`."""
         for job in jobs:
             if job is None:
                 time.sleep(POLL_SECONDS)
@@ -145,8 +144,7 @@ class ConcurrentExecutor(ABC):
 
     @property
     @abstractmethod
-    def workers(self) -> int:
-        """Jobs that can run at once."""
+    def workers(self) -> int: ...
 
     @abstractmethod
     def _session(self) -> AbstractContextManager[None]:
@@ -161,7 +159,6 @@ class ConcurrentExecutor(ABC):
         """Wait up to `POLL_SECONDS`, report progress, and remove the jobs that have ended."""
 
     def map(self, jobs: Jobs, progress: ReportProgress) -> Generator[Outcome, None, None]:
-        """See `Executor.map`."""
         exhausted = False
         with self._session():
             while not exhausted or self._running:
@@ -183,15 +180,13 @@ _END = object()
 class Processes(ConcurrentExecutor):
     """A new process (`spawn`) with one thread for each job.
 
-    Not a pool of workers. With `concurrent.futures`, one dead worker fails every cell that is
-    running. The workers of `pebble` survive a killed driver and would go on with cells whose locks
-    are free again. Here each process has its own pipe, so its death fails only its cells, and it
-    ends with this one, however that ends. It ignores Ctrl-C, which this process handles.
+    Not a pool of `concurrent.futures`, in which one dead worker fails every cell that is running:
+    each process has its own pipe, so its death fails only its cells. It ends with this one,
+    however that ends, and ignores Ctrl-C, which this process handles.
     """
 
     @property
     def workers(self) -> int:
-        """Processes at once."""
         return available_cores() if self._jobs is None else self._jobs
 
     @contextlib.contextmanager
@@ -234,8 +229,6 @@ class Processes(ConcurrentExecutor):
 
 @dataclass(frozen=True)
 class _JobProcess:
-    """A job in a process of its own."""
-
     job: Job
     process: Any
     pipe: Any  # a Connection, on Windows a PipeConnection
@@ -263,7 +256,6 @@ class _JobProcess:
         self.pipe.close()
 
     def death(self, cell: Cell) -> Outcome:
-        """The failure of a cell whose process has died."""
         code = self.process.exitcode
         killed_by = next((each.name for each in signal.Signals if each == -code), None)
         how = f"was killed by {killed_by}" if killed_by else f"ended with exit code {code}"
@@ -338,7 +330,6 @@ class OnRay(ConcurrentExecutor):
             yield from self._outcomes(reference, self._running.pop(reference))
 
     def _connect(self) -> None:
-        """Connect, unless this process is connected already."""
         if self._ray.is_initialized():
             return
         options: dict[str, Any] = {"address": self._address}

@@ -97,7 +97,6 @@ class Ledger:
         return None
 
     def study_file(self) -> StudyFile:
-        """The plan in the folder of a study; OptionError if it holds none."""
         file = self.plan_file()
         if file is None:
             raise OptionError(
@@ -106,7 +105,6 @@ class Ledger:
         return file
 
     def write_plan(self, file: StudyFile) -> None:
-        """Write the plan; results of earlier plans stay."""
         file.write(self.folder / PLAN)
 
     def write_request(self, file: StudyFile, only: Sequence[str]) -> None:
@@ -127,7 +125,6 @@ class Ledger:
         return requests
 
     def result(self, key: str) -> CellResult | None:
-        """A cell's result; None if there is no valid one."""
         return self.results([key]).get(key)
 
     def results(self, keys: Iterable[str] | None = None) -> dict[str, CellResult]:
@@ -135,11 +132,9 @@ class Ledger:
         return self._read(CellResult, CELLS, keys)
 
     def failure(self, key: str) -> CellFailure | None:
-        """A cell's failure; None if it has not failed."""
         return self.failures([key]).get(key)
 
     def failures(self, keys: Iterable[str] | None = None) -> dict[str, CellFailure]:
-        """Failures by key, as `results`."""
         return self._read(CellFailure, FAILED, keys)
 
     def write(
@@ -162,7 +157,6 @@ class Ledger:
             self.failure_path(entry.key).unlink()
 
     def model_path(self, key: str) -> Path:
-        """Where a cell's trained model is, if it was kept."""
         return model_of_cell(self.folder, key)
 
     def snapshots_path(self, key: str) -> Path:
@@ -170,7 +164,6 @@ class Ledger:
         return folder_of_cell(self.folder, key)
 
     def failure_path(self, key: str) -> Path:
-        """Where a cell's failure is, if it failed."""
         return self._path(FAILED, key)
 
     def lock(self, key: str) -> Lock | None:
@@ -266,7 +259,6 @@ _HEADER = "header"
 
 
 def write_state(path: Path, header: Mapping[str, Any], arrays: Arrays) -> None:
-    """Write a state; raises OptionError as `write_arrays` does."""
     write_arrays(path, {_HEADER: np.array(to_json(header)), **arrays})
 
 
@@ -293,7 +285,6 @@ STATES: tuple[State, ...] = ("done", "running", "failed", "waiting")
 
 
 def label(planned: PlannedCell) -> str:
-    """A cell's name for people; see `run_label`."""
     return run_label(planned.class_name, planned.algorithm, planned.run, planned.phase)
 
 
@@ -320,12 +311,9 @@ class CellStatus:
 class StudyStatus:
     """The state of a study.
 
-    Attributes:
-      places: the selected cells of the plan, in its order; see `study_status`. Streams may share
-        fresh agents, which run once and count once, except in `counts`.
-      seconds_left: of one core, for the unfinished cells; running ones count in full.
-      other_results: results in the folder that belong to no cell of the plan.
-      never_requested: waiting cells of the plan that no run asked for, where these are left out.
+    `places` are the selected cells of the plan, in its order. Streams may share fresh agents, which
+    run once and count once, except in `counts`. `seconds_left` are of one core; running cells count
+    in full. `other_results` belong to no cell of the plan; no run asked for `never_requested` ones.
     """
 
     folder: Path
@@ -421,7 +409,6 @@ def study_status(
 
 
 def plan_status(ledger: Ledger, file: StudyFile, only: Sequence[str] | None) -> StudyStatus:
-    """The state of a plan's selected cells in a folder; see `study_status`."""
     every = file.plan.cells
     keys = {id(planned): planned.cell.digest for planned in every}
     results, failures = ledger.results(), ledger.failures()

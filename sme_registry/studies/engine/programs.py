@@ -140,7 +140,6 @@ class Programs:
 
 
 def _forms(cell: Cell) -> tuple[Any, ...]:
-    """The `Form` of each of a cell's tasks."""
     return tuple(map(Form.of, cell.specs))
 
 
@@ -209,8 +208,6 @@ def run_program(
 
 
 class _ProgramRun:
-    """A program, the cells of its runs, and the records of what they did."""
-
     def __init__(
         self, cells: Sequence[Cell], shared: SharedProgram, progress: Report, keep_models: bool
     ) -> None:
@@ -231,7 +228,6 @@ class _ProgramRun:
         self._last_state = time.monotonic()
 
     def train(self) -> None:
-        """Go on to the end of the budget, with every evaluation."""
         run_to_end(
             self._program,
             due=self._record.due,
@@ -244,7 +240,6 @@ class _ProgramRun:
         self._note_failures()
 
     def results(self) -> Iterator[Outcome]:
-        """Evaluate the trained policies within and out of distribution."""
         groups: dict[Hashable, list[int]] = defaultdict(list)  # runs that are evaluated together
         for run, cell in enumerate(self._cells):
             step = int(self._record.arrays["failed_at"][run])
@@ -388,7 +383,6 @@ class _ProgramRun:
 
 
 def _named(arrays: Arrays, prefix: str) -> Arrays:
-    """The arrays with this prefix, without it."""
     return {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)}
 
 
@@ -400,7 +394,6 @@ def _sb3_models() -> Any:
 
 
 def _new_model(cell: Cell) -> Any:
-    """The untrained model of Stable-Baselines3 of a cell."""
     return _sb3_models().new_sb3_model(
         cell.uses,
         cell.document,
@@ -412,8 +405,6 @@ def _new_model(cell: Cell) -> Any:
 
 
 class _Trained(NamedTuple):
-    """A cell and what it learned."""
-
     cell: Cell
     weights: list[Arrays]
     regret: DynamicRegret | None = None

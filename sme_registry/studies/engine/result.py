@@ -45,13 +45,9 @@ _Numbers = Annotated[tuple[Real, ...], Field(strict=False)]
 class LearningCurve(StrictModel):
     """Evaluations during training, evenly spaced; all lists have the same length.
 
-    Attributes:
-      steps: environment steps before the evaluation, or gradient steps of an offline learner.
-      episode_return: mean return of its episodes, in [0, T].
-      regret: mean of 1 − step reward over all steps of its episodes, in [0, 1].
-      similarity: mean r̃ over them, in [0, 1].
-      length: mean length of its episodes in steps, in [1, T].
-      agents_regret: for a team, `regret` of each agent; the other numbers are means over them.
+    `steps` are gradient steps of an offline learner. `episode_return` is in [0, T], `length` in
+    steps; `regret`, the mean of 1 − step reward, and `similarity` are means over all steps of the
+    episodes, in [0, 1]. `agents_regret` is of each agent of a team.
     """
 
     steps: Annotated[tuple[Integer, ...], Field(strict=False)] = ()
@@ -82,12 +78,9 @@ class Timing(StrictModel):
 
 
 class ProgramResult(StrictModel):
-    """In what program a cell of JAX ran: its bits depend on all of it.
+    """In what program a cell of JAX ran, with so many runs as `lanes`: its bits depend on it all.
 
-    Attributes:
-      device: its kind, such as "cpu" or "NVIDIA H200".
-      lanes: the number of its runs.
-      shape: S, A, L and H of the tasks, of a stream the greatest; H is 0 where L = 1.
+    `shape` is S, A, L and H of the tasks, of a stream the greatest; H is 0 where L = 1.
     """
 
     device: str
@@ -96,12 +89,9 @@ class ProgramResult(StrictModel):
 
 
 class OfflineCell(StrictModel):
-    """What an offline cell adds: its data set, and the similarity of behaviour and learner.
+    """What an offline cell adds: its data set, and the mean r̃ of behaviour and learner, in [0, 1].
 
-    Attributes:
-      nu: ν of the behaviour policy, in [0, 1].
-      behaviour_similarity: mean r̃ over the transitions of the data set, in [0, 1].
-      similarity: mean r̃ over all steps of the last evaluation's episodes, in [0, 1].
+    That of the learner is over all steps of the last evaluation's episodes.
     """
 
     nu: Real
@@ -114,24 +104,11 @@ class OfflineCell(StrictModel):
 
 
 class CellResult(StrictModel):
-    """A finished run.
+    """A finished run; its `key` is the digest of its cell.
 
-    Attributes:
-      key: the cell's digest.
-      cell: the complete cell.
-      curve: its learning curve.
-      report: its evaluation in and out of distribution, with the references; None of a life in a
-        stream.
-      stream_report: of a life in a stream what the agent retains, and its dynamic regret, still
-        without fresh agents, which are cells of their own; None of any other.
-      online_regret: mean regret over all training steps, in [0, 1]; None of references and offline
-        learners.
-      online_cost: mean cost over them, in [0, 1], of a task with `safety`.
-      agents_online_regret: the same of each agent of a team, by name.
-      offline: of an offline cell.
-      program: of a cell that uses `jax:…`.
-      timing: CPU seconds by task.
-      versions: of the packages that the numbers depend on.
+    A life in a stream has a `stream_report`, still without fresh agents, which are cells of their
+    own; any other run has a `report`. `online_regret` and `online_cost` are means over all steps
+    of training, in [0, 1]; references and offline learners have none.
     """
 
     schema_version: SchemaVersion = 1
@@ -160,7 +137,6 @@ class CellResult(StrictModel):
 
     @property
     def any_report(self) -> EvaluationReport | StreamReport:
-        """The report that it has."""
         report = self.report or self.stream_report
         assert report is not None  # validated
         return report
@@ -194,10 +170,8 @@ class CellFailure(StrictModel):
 class SharedProgram:
     """How the cells of a job run as runs of one program.
 
-    `runs` is their number; those without a cell repeat the first. Programs go on from states with
-    the same `build_key`. `cells` are those of the runs of such a state, in order; each keeps its
-    own task, also if it is none of the job's: another job may go on from the state that this one
-    writes. They are empty for those of the job.
+    Runs without a cell repeat the first. Programs go on from states with the same `build_key`.
+    `cells` are those of such a state, which another job may go on from; empty for the job's.
     """
 
     runs: int
@@ -254,13 +228,7 @@ class Record:
     One of Stable-Baselines3 is a program with one run. The k-th evaluation follows
     round(steps · k / evaluations) steps, the last one the end of training: on-policy algorithms
     finish their last rollout, so it can be later. A function is evaluated at the end alone.
-
-    Attributes:
-      due: steps of the evaluations.
-      evaluated: how many of them are done.
-      arrays: by name, with the runs as last axis; of a team's only run, `regret` is by agent.
-        `failed_at` is the step at which a run was seen to have failed, or −1.
-      blocks: the regret of lives; None for tasks.
+    The last axis of `arrays` is runs; of a team's only run, `regret` is by agent.
     """
 
     def __init__(
@@ -280,7 +248,7 @@ class Record:
         self.arrays: Arrays = {
             "rows": np.zeros((n, 5, runs)),  # the fields of a `LearningCurve`
             "regret": np.zeros(len(agents) or runs),  # over all steps of training
-            "failed_at": np.full(runs, -1),
+            "failed_at": np.full(runs, -1),  # the step at which a run was seen to have failed
             "seconds": np.zeros(2),
         }
         if agents:
@@ -293,7 +261,6 @@ class Record:
         self._clock, self._mark = clock, clock()
 
     def restore(self, arrays: Arrays) -> None:
-        """Go on from the arrays of a record of the same form."""
         self.arrays = arrays
         if self.blocks is not None:
             self.blocks.steps = arrays["block_steps"]

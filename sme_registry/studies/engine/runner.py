@@ -49,22 +49,15 @@ def run_study(
 ) -> StudyStatus:
     """Run the cells of a plan that have no result in the folder, and return their state.
 
-    Each result is written as soon as its cell ends. If this process ends early, for any reason, the
-    same call continues. Cells that another process is running are waited for at the end. The plan
-    becomes the folder's, and results of earlier plans stay.
-
-    Cells that use `jax:…` run together in one program, in any executor: on a CPU a program on each
-    core, on another device one at a time.
+    Each result is written as soon as its cell ends. If this process ends early, the same call
+    continues. Cells that another process is running are waited for. Results of earlier plans stay.
 
     Args:
       executor: "processes", one for each cell; "in-process"; "ray"; or an `Executor`.
       jobs: cells or programs at once; None for one per core, of this machine or of the cluster.
       ray: "local", or the address of a Ray cluster.
-      retry_failed: also run the cells that failed before.
-      keep_models: keep the trained models of the cells that run now. Finished cells without a model
-        are reported and not run again.
-      only: `class=GLOB`, `algorithm=GLOB`: the cells to run now. A cell must match any of the
-        patterns of each kind.
+      keep_models: of the cells that run now. Finished cells without a model do not run again.
+      only: `class=GLOB`, `algorithm=GLOB`: a cell must match any of the patterns of each kind.
       device: where programs of JAX run, "cpu", "gpu" or "tpu"; None for JAX's default.
       lanes: most runs of a program; None for a number that suits the device.
       run: runs a cell; for processes and Ray importable by name.
@@ -114,7 +107,6 @@ def run_study(
 
 
 def _check(plan: StudyPlan, planned: Collection[PlannedCell], console: Console | None) -> None:
-    """Check the algorithms of these cells, and that they have such tasks."""
     names = {cell.algorithm for cell in planned}
     algorithms = [algorithm for algorithm in plan.algorithms if algorithm.name in names]
     notice = code_notice(algorithm.uses for algorithm in algorithms)
@@ -182,8 +174,6 @@ def _check_room(programs: Programs, queue: Queue, workers: int) -> None:
 
 
 class _RunningCell(NamedTuple):
-    """A cell that runs: its lock and its job."""
-
     lock: Lock
     job: Job
 
@@ -191,10 +181,8 @@ class _RunningCell(NamedTuple):
 class Queue:
     """The cells of one `run_study`: what waits, what runs, and what could not be written.
 
-    Any number of runs may share a folder at once, on one machine or on several that share it: the
-    lock of a cell decides who runs it, and its result file says that it is done. Cells are claimed
-    when a worker is free: one, or as many as a program has runs, so that the others are left to
-    other processes.
+    Any number of processes may share a folder: the lock of a cell decides who runs it. Cells are
+    claimed when a worker is free, so that the others are left to other processes.
     """
 
     def __init__(
@@ -246,7 +234,6 @@ class Queue:
             yield job
 
     def keep(self, outcome: Outcome) -> None:
-        """Keep an outcome that could not be written."""
         self._unwritten.append(outcome)
 
     def write(self, outcome: Outcome) -> None:
@@ -264,7 +251,6 @@ class Queue:
             self._ledger.remove_states(job.program.state)
 
     def release(self) -> None:
-        """Release the locks of all cells that run."""
         for running in self._running.values():
             running.lock.release()
 
@@ -381,7 +367,6 @@ class _StudyRun:
         self._shown: dict[str, Job] = {}  # running jobs, by name
 
     def run(self) -> None:
-        """Run every waiting cell."""
         if not self._queue.waiting:
             return
         outcomes = self._executor.map(self._jobs(), self._report)
@@ -395,7 +380,6 @@ class _StudyRun:
                 self._queue.release()
 
     def seconds_left(self) -> float:
-        """Seconds to the end, as estimated now."""
         waiting = ((planned.cell,) for planned in self._queue.waiting.values())
         running = (job.cells for job in self._queue.running)
         return self._pace.seconds_left([*running, *waiting], self._executor.workers)
@@ -444,7 +428,6 @@ class _StudyRun:
         self._progress.update(self._queue.finished, f"{failed} failed" if failed else "")
 
     def announce(self) -> None:
-        """Print what is done, what is reused, and what will run."""
         queue, cells = self._queue, len(self._planned)
         parts = [f"{cells:,} cells"]
         if queue.finished:

@@ -1,8 +1,7 @@
 """`Analysis`: a study's finished runs and its tables, and what tables are made of.
 
-A table is a function of the analysis, registered under its name with `table`. The run is the unit:
-its regions and evaluations are no further evidence, and missing runs are part of no number but
-counts. Of streams the life is the unit; each may be in another draw of its stream.
+The run is the unit, or in streams the life: its regions and evaluations are no further evidence.
+Missing runs are part of no number but counts.
 """
 
 from __future__ import annotations
@@ -89,7 +88,6 @@ OF_VISITS = (
 
 
 def metrics_of(runs: pd.DataFrame) -> tuple[Metric, ...]:
-    """The metrics that a study's runs have."""
     return (*METRICS, *(metric for metric in SPECIAL_METRICS if metric.key in runs.columns))
 
 
@@ -132,17 +130,11 @@ class RunKind(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """A study's finished runs, lives and tables.
+    """A study's finished runs, lives and tables, which the module `tables` documents.
 
-    Attributes:
-      cells: finished cells of the plan, by digest.
-      models: those that the study kept, by the digests of their cells.
-      classes: every class of the plan, by name; the first one first. `streams` likewise.
-      algorithms: those with a finished run on a single task, in the plan's order.
-      learners: those of the algorithms that learn.
-      lives: the finished ones in streams.
-      reference_costs: (class of streams, reference) → its expected regret in each draw.
-      tables: every table by name; the module `tables` documents the columns.
+    `cells`, `errors` and `models` are by the digests of cells, `classes` and `streams` by name, the
+    first one first. `algorithms` have a finished run on a single task; `learners` are those of them
+    that learn. `reference_costs` are by class of streams and reference, one for each draw.
     """
 
     file: StudyFile
@@ -182,12 +174,10 @@ class Analysis:
 
     @property
     def metrics(self) -> tuple[Metric, ...]:
-        """The metrics of runs on single tasks."""
         return metrics_of(self.runs)
 
     @property
     def parts(self) -> tuple[RunKind, ...]:
-        """Single tasks, and streams where the plan has any."""
         axes = {name: info.axis for name, info in self.classes.items()}
         tasks = RunKind(False, self.runs, axes, self.algorithms, self.metrics, "spec_digest")
         if not self.streams:
@@ -252,11 +242,7 @@ Make = Callable[..., Any]
 def table(
     name: str, columns: str, *, optional: bool = False, both: bool = False
 ) -> Callable[[Make], Make]:
-    """Register a function of the analysis that makes the rows of a table, in order.
-
-    `columns` are as those of `frame`; those of tables of streams begin with `stream_`. A function
-    for `both` kinds of runs is called with a `RunKind` as well.
-    """
+    """Register a function of the analysis, and with `both` of a `RunKind`, that makes a table."""
 
     def register(make: Make) -> Make:
         TABLES[name] = TableMaker(columns, make, optional, both)
@@ -293,9 +279,8 @@ def summary(
 ) -> Iterator[tuple[Any, ...]]:
     """A statistic over runs of each metric, for each place and value of the columns `by`.
 
-    A row is the place, the values of `by`, the metric, the number of runs that have it, the
-    statistic, and its 95 % interval from `fewest` runs on. `seed` is called with the place, the
-    metric and the values of `by`.
+    A row has the number of runs that have the metric, the statistic, and its 95 % interval from
+    `fewest` runs on. `seed` is called with the place, the metric and the values of `by`.
     """
     for at, of_place in rows.groupby([*place], sort=False):
         for where, group in of_place.groupby([*by], sort=False) if by else [((), of_place)]:
@@ -323,7 +308,6 @@ def differences(
 
     Two runs of equal number on a class have the same instance and seed, and form a pair. The
     intervals depend only on the runs and the names, and those of B − A mirror those of A − B.
-    `instance` is the column that says on which instance a run is.
     """
     on = ["class_name", instance, "seed"]
     for (first, second), metric in itertools.product(pairs, metrics):
@@ -362,7 +346,6 @@ def change_verdict(worsening: float, low: float, high: float) -> str:
 
 
 def by_place(rows: pd.DataFrame) -> dict[tuple[str, str], pd.DataFrame]:
-    """The rows of each (class, algorithm), in their order."""
     return dict(iter(rows.groupby(PLACE, sort=False)))
 
 

@@ -35,13 +35,9 @@ AXES = {field: (symbol(field), f"{words} {symbol(field)}") for field, words in _
 class ClassInfo:
     """A class of the plan, compared with the first one.
 
-    Attributes:
-      axis: the field in which it differs from the first class, dotted within a team
-        (`team.reward`) or an observation; "" for the first; `SEVERAL`. `policy_init` counts only
-        if nothing else differs: deep tasks need another one.
-      label: `k = 25`; for several axes each of them.
-      setting: the value of every field, those within other fields by their dotted names. The
-        tightness is 0 without safety, where no limit is ever broken.
+    `axis` is the field in which it differs, dotted within a team (`team.reward`) or an observation;
+    "" for the first; `SEVERAL`. `policy_init` counts only if nothing else differs: deep tasks need
+    another one. `setting` has every field; the tightness is 0 without safety.
     """
 
     name: str
@@ -70,14 +66,9 @@ class StreamInfo:
 
 @dataclass(frozen=True)
 class Group:
-    """Classes that are compared with each other.
+    """The classes with runs along one axis, in the order of its values; or all, with axis "".
 
-    Attributes:
-      name: `ALL`, or the label of an axis.
-      axis: the field; "" for all classes.
-      classes: those with runs, in the order of the axis' values, the plan's first class among them.
-      values: those of the axis, of each class; empty where they have no common axis.
-      compared: the classes where every algorithm has finished runs.
+    `values` are empty without a common axis. In `compared` every algorithm has finished runs.
     """
 
     name: str
@@ -88,12 +79,10 @@ class Group:
 
 
 def class_infos(plan: StudyPlan) -> dict[str, ClassInfo]:
-    """Every class of the plan by its name."""
     return {member.name: _class_info(member, plan.classes[0]) for member in plan.classes}
 
 
 def stream_infos(plan: StudyPlan) -> dict[str, StreamInfo]:
-    """Every class of streams of the plan by its name."""
     infos: dict[str, StreamInfo] = {}
     for member in plan.streams:
         stream = member.instances[0]
@@ -135,7 +124,6 @@ def axis_label(axis: str) -> str:
 
 
 def is_numeric(values: Sequence[Any]) -> bool:
-    """Whether values are numbers, so that they have an order and distances."""
     return bool(values) and all(type(value) in (int, float) for value in values)
 
 

@@ -134,7 +134,6 @@ def _no_worst(about: Any, name: str, contrasts: Rows) -> Found:
 
 
 def _worst(about: Any, name: str, contrasts: Rows, worst: Any) -> Found:
-    """The largest change for the worse, and its certainty."""
     larger = _of_each_axis(c for c in contrasts if c.change > worst.change)
     size = [worst.change >= THRESHOLDS["broken"], worst.change >= THRESHOLDS["hurt"], True]
     severity = ("broken", "hurt", "slightly_hurt")[size.index(True)]
@@ -201,7 +200,6 @@ def _other_axes(about: Any, contrasts: Rows, worst: Any) -> Found:
 
 
 def _outside(about: Any, contrasts: Rows, worst: Any) -> Found:
-    """The largest change for the worse out of distribution."""
     far = _largest(c for c in contrasts if c.verdict == "worse")
     if far is not None:
         larger = _of_each_axis(c for c in contrasts if c.change > far.change)
@@ -264,7 +262,6 @@ def _rivals(analysis: Analysis, best: str, among: set[str]) -> Found:
 
 @finder
 def _caveats(analysis: Analysis) -> Found:
-    """What limits all findings on single tasks."""
     rows = analysis.tables["contrasts"]
     rows = rows[rows.algorithm.isin(analysis.learners)]
     yield from missing_runs("caveats", analysis.counts(streams=False))
@@ -294,7 +291,6 @@ def _caveats(analysis: Analysis) -> Found:
 
 
 def _contrasts(analysis: Analysis, algorithm: str, metric: str) -> Rows:
-    """Rows of the contrasts, with the setting of their class."""
     rows = analysis.tables["contrasts"]
     rows = rows[(rows.algorithm == algorithm) & (rows.metric == metric)]
     setting = rows.class_name.map({name: c.label for name, c in analysis.classes.items()})
@@ -366,7 +362,6 @@ def few_runs(section: str, fewest: int, one: str, many: str) -> Found:
 
 
 def change_text(row: Any) -> str:
-    """The change of a row with its interval and the number of pairs."""
     if math.isnan(row.low):
         return f"{signed(row.change)}, a single pair, no interval"
     ends = f"95 % interval {signed(row.low)} to {signed(row.high)}"

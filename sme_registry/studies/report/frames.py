@@ -284,7 +284,6 @@ def _result_rows(
 
 
 def curve_rows(cell: PlannedCell, result: CellResult) -> Iterator[dict[str, Any]]:
-    """The rows of `curves` of one run."""
     curve = result.curve
     columns = {
         "step": curve.steps,
@@ -297,7 +296,6 @@ def curve_rows(cell: PlannedCell, result: CellResult) -> Iterator[dict[str, Any]
 
 
 def place(cell: PlannedCell) -> dict[str, Any]:
-    """The columns `RUN` of a cell."""
     return {name: getattr(cell, name) for name in RUN}
 
 
@@ -339,7 +337,6 @@ def _run_columns(result: CellResult, report: EvaluationReport) -> dict[str, Any]
 
 
 def _of_cell(result: CellResult) -> dict[str, Any]:
-    """Columns of runs and of lives."""
     names = ("uses", "action_range", "steps", "seed")
     return {
         **{name: getattr(result.cell, name) for name in names},
@@ -367,8 +364,6 @@ class StreamFrames(NamedTuple):
 
 
 class FinishedLife(NamedTuple):
-    """A finished life."""
-
     planned: PlannedCell
     result: CellResult
     report: StreamReport
@@ -406,7 +401,6 @@ def finished_lives(plan: StudyPlan, results: Mapping[str, CellResult]) -> list[F
 
 
 def stream_frames(lives: Sequence[FinishedLife]) -> StreamFrames:
-    """The frames of lives."""
     return StreamFrames(
         frame([row for life in lives for row in _life_rows(life)], _LIVES),
         frame([row for life in lives for row in _visit_rows(life)], _VISITS),
@@ -465,7 +459,6 @@ def _visit_rows(life: FinishedLife) -> Iterator[dict[str, Any]]:
 
 
 def _visit_regret(report: StreamReport, visit: int, phase: int) -> dict[str, Any]:
-    """What the training of a visit cost."""
     regret = report.dynamic_regret
     if regret is None or visit >= len(regret.visits):
         return {}

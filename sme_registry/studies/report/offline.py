@@ -44,7 +44,6 @@ _NEAR = THRESHOLDS["near"]
     optional=True,
 )
 def _offline(analysis: Analysis) -> Iterator[dict[str, Any]]:
-    """Each offline learner on each class at each ν."""
     runs = analysis.offline_runs
     intervals = summary(
         runs, ["nu"], [Metric("improvement", "improvement", -1)], analysis.bootstrap,

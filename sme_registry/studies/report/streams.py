@@ -87,7 +87,6 @@ Costs = Mapping[tuple[str, str], Sequence[DynamicRegret]]
     "planned_fresh_agents:int64 failed:int64",
 )
 def _counts(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
-    """How many lives and fresh agents have finished, are planned, and failed."""
     states: dict[tuple[str, str], list[tuple[bool, str]]] = defaultdict(list)
     for planned in ordered(analysis.plan):
         if planned.in_stream:
@@ -158,7 +157,6 @@ def _reference_regret(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
 def _summary(
     analysis: Analysis, rows: pd.DataFrame, at: list[str], metrics: Sequence[Metric]
 ) -> Iterator[tuple[Any, ...]]:
-    """All metrics of an algorithm in a stream, of one seed."""
     return summary(
         rows, at, metrics, analysis.bootstrap, lambda name, algorithm, *_: (algorithm, name, *at)
     )
@@ -214,7 +212,6 @@ def _until(logs: Sequence[DynamicRegret], lifetime: Array) -> Array:
 
 @finder
 def _stream_findings(analysis: Analysis) -> Found:
-    """What is found in each stream, what its relatedness changes, and what limits that."""
     if analysis.streams:
         yield from _streams(analysis)
         yield from _changes(analysis)
@@ -222,7 +219,6 @@ def _stream_findings(analysis: Analysis) -> Found:
 
 
 def _streams(analysis: Analysis) -> Found:
-    """What is forgotten, is plasticity lost, and what transfers, in each stream."""
     rows = analysis.tables["stream_metrics"]
     of_place = by_place(rows[rows.region == WITHIN])
     for name, info in analysis.streams.items():
@@ -326,7 +322,6 @@ def _forgets_more(analysis: Analysis, name: str, metrics: Rows) -> Found:
 
 
 def _life(metrics: dict[str, Any], *, single_visit: bool) -> Found:
-    """What one agent learns, forgets and transfers in a stream."""
     visited = metrics["visited_regret"]
     name, unlearnt = visited.algorithm, visited.iqm >= _UNLEARNT
     about = functools.partial(finding, "streams", algorithm=name, class_name=visited.class_name)

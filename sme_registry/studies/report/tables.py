@@ -107,12 +107,8 @@ def analyse(
 ) -> Analysis:
     """Every table of a study; equal for equal results.
 
-    Args:
-      finished: results by the digests of their cells; cells outside the plan are ignored.
-      errors: of failed runs, by the digests of their cells.
-      requested: digests of the cells that count as missing without a result; None for all.
-      models: kept by the study, by the digests of their cells.
-      draws: bootstrap samples of each interval.
+    Results, errors and models are by the digests of their cells, of which those that are
+    `requested`, None for all, count as missing without a result.
     """
     plan = file.plan
     results, curves = study_frames(plan, finished)
@@ -147,7 +143,6 @@ def analyse(
 
 @table("missing", "", both=True)
 def _missing(analysis: Analysis, part: RunKind) -> pd.DataFrame:
-    """Each requested run that has not finished."""
     rows = [
         (*place(c).values(), c.phase, analysis.errors.get(c.cell.digest, ""), c.cell.digest)
         for c in analysis.missing(streams=part.streams)
@@ -218,7 +213,6 @@ def _learning_curves(analysis: Analysis, part: RunKind) -> pd.DataFrame:
 
 @table("counts", f"{PLACE_COLUMNS} done:int64 failed:int64 planned:int64")
 def _counts(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
-    """How many runs of each algorithm on each class have finished and failed."""
     states: dict[tuple[str, str], list[str]] = defaultdict(list)
     for planned in ordered(analysis.plan):
         state = analysis.state(planned.cell.digest)
@@ -230,7 +224,6 @@ def _counts(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
 
 @table("regions", "")
 def _regions(analysis: Analysis) -> pd.DataFrame:
-    """Each algorithm on each class in each region, over its runs."""
     by = analysis.tables["results"].groupby([*PLACE, "region"], sort=False)
     return by.agg(
         epsilon_high=("epsilon_high", "first"),
@@ -245,7 +238,6 @@ def _regions(analysis: Analysis) -> pd.DataFrame:
 
 @table("levels", f"{PLACE_COLUMNS} metric:str {INTERVAL} linear")
 def _levels(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
-    """The IQM of every metric."""
     results = analysis.tables["results"]
     linear = {place: _linear_medians(rows) for place, rows in by_place(results).items()}
     rows = summary(

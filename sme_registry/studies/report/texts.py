@@ -98,7 +98,6 @@ def _task_tables(analysis: Analysis) -> Iterator[TextTable]:
 
 
 def _metric_tables(analysis: Analysis) -> Iterator[TextTable]:
-    """Levels, differences and contrasts of each metric, and what the layers keep."""
     tables, names = analysis.tables, analysis.algorithms
     for metric, rows in _by_metric(tables["levels"]):
         yield _text(
@@ -134,7 +133,6 @@ def _metric_tables(analysis: Analysis) -> Iterator[TextTable]:
 
 
 def _overview_tables(analysis: Analysis) -> Iterator[TextTable]:
-    """Regions of each algorithm, aggregates over classes, and numbers of runs."""
     tables = analysis.tables
     for name, rows in tables["regions"].groupby("algorithm", sort=False):
         yield _text(
@@ -168,7 +166,6 @@ def _overview_tables(analysis: Analysis) -> Iterator[TextTable]:
 
 
 def offline_tables(analysis: Analysis) -> list[TextTable]:
-    """The behaviour policies next to the learners, and the differences."""
     rows = analysis.tables["offline"].assign(nu=lambda rows: rows.nu.map("{:g}".format))
     at = _BY_CLASS | {"nu": "ν"}
     similarity = _text(
@@ -232,7 +229,6 @@ def difference_caveats(rows: pd.DataFrame) -> list[str]:
 
 
 def _stream_tables(analysis: Analysis) -> Iterator[TextTable]:
-    """Metrics of each stream, retention, metrics by visit, differences, contrasts, and counts."""
     tables, names = analysis.tables, analysis.stream_algorithms
     for name in analysis.streams:
         yield _life_table(analysis, name)
@@ -283,7 +279,6 @@ def _stream_tables(analysis: Analysis) -> Iterator[TextTable]:
 
 
 def _life_table(analysis: Analysis, name: str) -> TextTable:
-    """The metrics of whole lives in one stream, next to agents that need no training."""
     rows = analysis.tables["stream_metrics"]
     rows = rows[(rows.class_name == name) & rows.region.isin((WITHIN, OUTSIDE))]
     everywhere = rows.metric.isin(_OF_TRAINING)
@@ -376,7 +371,6 @@ def _sentence(label: str) -> str:
 
 
 def _level(row: Any, digits: int) -> str:
-    """The IQM of a row with its interval, and the number of runs where these are few."""
     return _with_interval(row.iqm, row, digits) + _few(row)
 
 

@@ -102,10 +102,8 @@ def write_report(
     The maps of the plane and the explorers need the models that the study kept, and loading a model
     can run code of its author. All other files of the folder are read as data.
 
-    Args:
-      out: the folder to write; None for FOLDER/report.
-      formats: of "html", "png", "pdf", "csv" and "latex".
-      explorers: whether to write an explorer of each kept model, to which the page links.
+    `out` is FOLDER/report by default, and `formats` are of "html", "png", "pdf", "csv" and "latex".
+    With `explorers` the page links to one of each kept model.
 
     Examples:
       >>> from sme_registry import studies
@@ -224,7 +222,6 @@ def _kinds(analysis: Analysis) -> list[str]:
 
 
 def _missing(analysis: Analysis) -> list[tuple[str, str]]:
-    """What each missing run is, and its error."""
     missing = [*analysis.missing(streams=False), *analysis.missing(streams=True)]
     return [(label(planned), analysis.errors.get(planned.cell.digest, "")) for planned in missing]
 
@@ -301,12 +298,10 @@ def compare(
         "distractor_regret", "wd_invariance".
 
     Returns:
-      One row for each metric and class, and one for "all classes": first_level and second_level,
-      IQM over the paired runs; difference, the IQM of the paired differences, with the ends low
-      and high of its 95 % bootstrap interval (NaN for a single pair); pairs; instances, the
-      different ones among the pairs; enough_pairs; and the verdict on the first algorithm: better,
-      worse, open, or indication: the interval excludes 0 but rests on fewer than 5 pairs.
-      `sme_registry.statistics` has the formulas.
+      One row for each metric and class, and one for "all classes": the IQM over the paired runs of
+      both, that of their differences with its 95 % bootstrap interval (NaN for a single pair), the
+      number of pairs and of their instances, and the verdict on the first algorithm: better, worse,
+      open, or indication: the interval excludes 0 but rests on fewer than 5 pairs.
 
     Examples:
       >>> from sme_registry import studies
@@ -360,10 +355,7 @@ def write_comparison(
     second: str,
     metrics: Sequence[str] = DEFAULT_METRICS,
 ) -> list[Path]:
-    """Write a comparison into the folder `out`, and return the files.
-
-    They are differences.csv and .json, a .tex for each metric, and the figures `differences` and
-    `learning-curves-by-class` as PNG and PDF.
+    """Write a comparison into a folder: differences.csv and .json, a .tex for each metric, figures.
 
     Examples:
       >>> from sme_registry import studies

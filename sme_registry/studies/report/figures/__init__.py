@@ -1,8 +1,4 @@
-"""The figures of a study's report, drawn from its tables.
-
-They have the width of a printed page. An algorithm has one colour, marker and dash in all
-of them; a hollow marker stands for fewer than `ENOUGH_RUNS` runs, bars for 95 % intervals.
-"""
+"""The figures of a study's report, drawn from its tables at the width of a printed page."""
 
 from __future__ import annotations
 
@@ -67,7 +63,6 @@ def draw(
 
 
 def draw_figures(analysis: Analysis, formats: Sequence[str]) -> tuple[list[Picture], list[str]]:
-    """Draw every figure that the finished runs allow."""
     from_tasks = TASK_FIGURES if analysis.algorithms else ()
     from_streams = streams.FIGURES if analysis.lives else ()
     return draw((*from_tasks, *from_streams), analysis, formats)

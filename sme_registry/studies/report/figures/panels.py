@@ -146,7 +146,6 @@ def by(rows: pd.DataFrame, column: str) -> list[tuple[str, pd.DataFrame]]:
 
 
 def legend(figure: Figure, looks: Mapping[str, Look], across: int = 6) -> None:
-    """The legend below a figure, with at most `across` entries in a row."""
     first = figure.axes[0]
     handles = [
         first.plot([], [], label=literal(name), markersize=4.5, linewidth=1.4, **look)[0]
@@ -156,7 +155,6 @@ def legend(figure: Figure, looks: Mapping[str, Look], across: int = 6) -> None:
 
 
 def colour_bar(figure: Figure, image: Any, label: str, ticks: Any = None) -> None:
-    """The scale of the colours of all panels, below them."""
     panels = [axes for axes in figure.axes if axes.get_visible()]
     place: Any = {"location": "bottom", "shrink": 0.5, "aspect": 40, "pad": 0.02}
     bar = figure.colorbar(image, ax=panels, label=label, ticks=ticks, **place)
@@ -226,7 +224,6 @@ def curves_caption(rows: pd.DataFrame) -> str:
 
 
 def dims(analysis: Analysis) -> list[int]:
-    """The different state dimensions of the runs, in rising order."""
     return sorted(set(analysis.tables["results"].state_dim))
 
 
@@ -241,7 +238,6 @@ def step_text(value: float, _: Any) -> str:
 
 
 def tick_steps(axes: Axes) -> None:
-    """Few ticks of steps, from 0."""
     axes.set_xlim(left=0)
     axes.locator_params(axis="x", nbins=4)
     axes.xaxis.set_major_formatter(step_text)

@@ -247,5 +247,4 @@ def _lived(analysis: Analysis) -> list[str]:
 
 
 def _visits(analysis: Analysis, name: str) -> Sequence[Visit]:
-    """The visits of a stream's lives."""
     return next(life.report.visits for life in analysis.lives if life.planned.class_name == name)
