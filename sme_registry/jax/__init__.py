@@ -4,19 +4,8 @@
     observation, state = reset(key, params)
     observation, state, reward, done, info = step(key, state, action, params)   # gymnax's signature
 
-Every module below imports JAX, which nothing outside this folder does. Importing the package turns
-64-bit numbers on for the whole process: states are float64, as METHOD, section 1 defines them.
-
-    task        a drawn task as a pytree, and its equations
-    env         reset and step of one environment; vmap them
-    gymnax      the same as a class with gymnax's methods
-    networks    perceptrons and twin critics whose weights have Stable-Baselines3's names; Adam
-    program     what all programs have: runs, their tasks, evaluation, saving, runs that failed
-    ppo         PPO: hyperparameters, updates, program
-    off_policy  TD3 and SAC, and what they share: replay, and when they act and update
-    run         a program from its start to its end, evaluated where a study's cell is
-
-Here is the process's JAX: its configuration, and its devices by name.
+Importing the package configures the process's JAX, and turns 64-bit numbers on: states are float64,
+as METHOD, section 1 defines them. Nothing outside this folder imports JAX.
 """
 
 from __future__ import annotations
@@ -33,10 +22,7 @@ CACHE_VARIABLE = "SME_JAX_CACHE"  # a folder, or "off"
 
 
 def prepare() -> None:
-    """Configure JAX for exact states and for agents equal to Stable-Baselines3's.
-
-    Prints a line on standard error if compiled programs cannot be kept: JAX itself says nothing.
-    """
+    """Configure JAX for exact states, for agents equal to SB3's, and to keep compiled programs."""
     require_packages("tasks and agents on the accelerator", {"jax": "JAX"}, "jax")
     import jax
 

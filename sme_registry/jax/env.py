@@ -36,10 +36,7 @@ class EnvState(NamedTuple):
 
 
 def reset(key: jax.Array, params: TaskParams) -> tuple[jax.Array, EnvState]:
-    """Begin an episode at a uniform state, on the grid 2⁻³².
-
-    Neither `safety` nor `observation` changes the state that a key draws.
-    """
+    """Begin an episode at a uniform state, on the grid 2⁻³²; safety does not change it."""
     s = task.uniform_states(key, params.form.state_dim)
     return start(s, params, task.first_distractors(key, params))
 
@@ -60,9 +57,8 @@ def step(
 ) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, Info]:
     """One step; where the episode ends, the observation and state are those of a new one.
 
-    The action `[A]` is of the unit range, and clipped. The key draws the new episode's start, and
-    what moves distractors at random. Returns the observation, the state, the reward R, done
-    (terminated or truncated), and the info of `step_env` with the ended episode's
+    The action `[A]` is of the unit range, and clipped. Returns the observation, the state, the
+    reward R, done (terminated or truncated), and the info of `step_env` with the ended episode's
     `final_observation`.
     """
     last, after, reward, done, info = step_env(key, state, action, params)
@@ -117,7 +113,6 @@ def advance(
 def moved(
     state: EnvState, action: jax.Array, numbers: jax.Array | None, params: TaskParams
 ) -> EnvState:
-    """The episode one step later, with r_cum as it was; see `advance`."""
     return state._replace(
         s=task.next_state(params, state.s, action),
         t=state.t + 1,
@@ -128,8 +123,8 @@ def moved(
 def observe(state: EnvState, params: TaskParams) -> jax.Array:
     """The observation of an episode at one point.
 
-    s, distractors and t/T have the bits of NumPy's; see `task.seen` for a mixing. r_cum/k is at
-    most 1, also where r_cum was carried over from a task of a larger k.
+    s, distractors and t/T have the bits of NumPy's; r_cum/k is at most 1, also after a switch from
+    a task of a larger k.
     """
     x = task.seen(params, state.s, state.distractors)
     # XLA turns a division by a constant, or by one scalar of all runs, into a product, which is
@@ -142,10 +137,7 @@ def observe(state: EnvState, params: TaskParams) -> jax.Array:
 
 
 def to_unit(action: jax.Array, symmetric: bool, dtype: Any = jnp.float64) -> jax.Array:
-    """Actions of an agent in the unit range, not clipped: a = (u + 1) / 2 of a symmetric range.
-
-    In float64 for exact rewards. The transition rounds to float32, and gets the same bits from it.
-    """
+    """Actions in the unit range, not clipped: a = (u + 1) / 2 of a symmetric one, in float64."""
     action = action.astype(dtype)
     return (action + 1.0) / 2.0 if symmetric else action
 

@@ -4,9 +4,8 @@
     observation, state = env.reset(key)
     observation, state, reward, terminated, truncated, info = env.step(key, state, action)
 
-gymnax is not required; where it is installed, the spaces are its own. Agents written for gymnax
-before 1.0 expect `done` in place of `terminated` and `truncated`: wrap this environment in gymnax's
-`LegacyStepAPIWrapper`, or use the functions of `sme_registry.jax.env`, which return that.
+gymnax is not required; where it is installed, the spaces are its own. For agents written for an
+older gymnax, wrap this environment in gymnax's `LegacyStepAPIWrapper`.
 """
 
 from __future__ import annotations
@@ -68,10 +67,7 @@ class Environment:
     def step(
         self, key: jax.Array, state: EnvState, action: jax.Array, params: TaskParams | None = None
     ) -> Step:
-        """One step; where the episode ends, a new one begins. See `sme_registry.jax.env.step`.
-
-        Returns the observation, the state, the reward, terminated, truncated and info.
-        """
+        """One step; where the episode ends, a new one begins. See `sme_registry.jax.env.step`."""
         return self._step(env.step, key, state, action, params)
 
     def reset_env(

@@ -1,9 +1,8 @@
-"""Perceptrons whose weights have Stable-Baselines3's names; Adam and clipping as in Torch.
+"""Perceptrons whose weights have Stable-Baselines3's names; Adam; types of hyperparameters.
 
 Weights are a flat dict from the names of SB3's `state_dict` to arrays in Torch's layout,
 `[out, in]` for a layer, so that exchanging a model with SB3 is a copy. Only `initial_…` run on the
-host, in NumPy; all other functions are pure, of one run, and vmapped over the runs of a program.
-At the end are the types of hyperparameters.
+host; all other functions are pure, of one run, and vmapped over the runs of a program.
 """
 
 from __future__ import annotations
@@ -25,10 +24,7 @@ HostWeights = dict[str, npt.NDArray[np.float32]]
 
 
 def perceptron(weights: Weights, prefix: str, x: jax.Array) -> jax.Array:
-    """Outputs `[..., out]` of a `torch.nn.Sequential` of linear layers with ReLU between them.
-
-    Layer i is at index 2 i of the sequence: `<prefix>.0.weight`, `<prefix>.0.bias`, `<prefix>.2…`.
-    """
+    """Outputs `[..., out]` of linear layers with ReLU between them; layer i is `<prefix>.<2 i>`."""
     last = sum(name.startswith(f"{prefix}.") for name in weights) // 2 - 1
     *_, x = x, *hidden_layers(weights, prefix, x, last, jax.nn.relu)
     return linear(weights, f"{prefix}.{2 * last}", x)
@@ -50,7 +46,6 @@ def hidden_layers(
 
 
 def linear(weights: Weights, name: str, x: jax.Array) -> jax.Array:
-    """W x + b of a `torch.nn.Linear`, `[..., out]`."""
     return x @ weights[f"{name}.weight"].T + weights[f"{name}.bias"]
 
 

@@ -53,9 +53,8 @@ class OffPolicySettings:
 class ReplayRows(NamedTuple):
     """Transitions, in any batch shape.
 
-    The next observation at an episode's end is its last one, not the next one's first. As in
-    Stable-Baselines3's `handle_timeout_termination`, done is 1.0 only where the episode terminated:
-    where it was truncated, its last state has a value.
+    The next observation at an episode's end is its last one. done is 1.0 only where the episode
+    terminated: where it was truncated, its last state has a value.
     """
 
     observation: jax.Array
@@ -76,10 +75,7 @@ def write_row(buffer: jax.Array, row: jax.Array, new: ReplayRows, writes: jax.Ar
 def rewrite_next(
     buffer: jax.Array, row: jax.Array, following: jax.Array, ended: jax.Array, phase: jax.Array
 ) -> jax.Array:
-    """Store s' of a row again, `following` `[runs, O]`, as it is observed after a switch of tasks.
-
-    Where the episode `ended` there, s' stays as it was, but for the phase with which it ends.
-    """
+    """Store s' of a row again, as observed after a switch; of an ended episode only its phase."""
     row, end = row % buffer.shape[0], buffer.shape[-1] - 2
     begin = end - following.shape[-1]
     last = jnp.concatenate([buffer[row, :, begin : end - phase.shape[-1]], phase], axis=-1)
@@ -105,11 +101,7 @@ class OffPolicyLearner(NamedTuple):
 
 
 class OffPolicyState(NamedTuple):
-    """All that changes; each array has a leading axis of runs, but for the buffer and `updated`.
-
-    Keys of a step follow from those of the runs and the step's number. `updated` is the number of
-    steps before the last update.
-    """
+    """All that changes; a leading axis of runs, but for the buffer and `updated`, a step."""
 
     learner: OffPolicyLearner
     buffer: jax.Array
@@ -156,8 +148,7 @@ class OffPolicyProgram(Program):
     ) -> OffPolicyLearner:
         """One run's learner after an update with a batch `[B]` and noise `[A, draws, B]`.
 
-        `count` is the number of this update from 1, `index` that among the `gradient_steps` of this
-        step from 0; both are the same in all runs.
+        `count` is the number of this update from 1, `index` that in this step from 0.
         """
 
     def __init__(self, settings: OffPolicySettings, *arguments: Any, **options: Any) -> None:
@@ -165,13 +156,11 @@ class OffPolicyProgram(Program):
         super().__init__(settings, *arguments, **options)
 
     def initial_state(self, weights: Weights, keys: jax.Array) -> OffPolicyState:
-        """New runs: random episodes, an empty buffer."""
         capacity = min(self.settings.buffer_size, self._whole(self.budget))
         state: OffPolicyState = _initial(type(self), capacity, weights, keys, self.params)
         return state
 
     def advance(self, limit: int) -> StepLog:
-        """Go on to step `limit`, or to the end of its `train_freq` steps; see `Program.advance`."""
         logs: list[StepLog] = []
         end = self._whole(limit)
         while self.steps < end or not logs:
@@ -206,7 +195,6 @@ class OffPolicyProgram(Program):
         return log
 
     def _whole(self, steps: int) -> int:
-        """At least these steps, in whole multiples of `train_freq`."""
         return -(-steps // self.rollout) * self.rollout
 
 
@@ -244,10 +232,7 @@ def _steps(
     end: jax.Array,
     acts: jax.Array,
 ) -> tuple[OffPolicyState, StepLog]:
-    """Each step from `begin` to `end`, after the update that is pending; no step if not `acts`.
-
-    Of the log `[PIECE, runs]`, the first `end − begin` rows are used.
-    """
+    """The steps from `begin` to `end`, each after its pending update; none if not `acts`."""
 
     channels = jax.vmap(lambda task: task.channels)(params)
 
@@ -348,10 +333,8 @@ def _acted(
 
 
 def _normal(keys: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """Standard normal numbers of each run, `[runs, *shape]` float32."""
     return jax.vmap(lambda key: jax.random.normal(key, shape, jnp.float32))(keys)
 
 
 def _keys(keys: jax.Array, n: jax.Array, use: int | jax.Array) -> jax.Array:
-    """The key of each run for one use in step n."""
     return jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, n), use))(keys)

@@ -49,10 +49,7 @@ _JUDGED_AT_ONCE = 25  # steps of an episode
 
 
 class StepLog(NamedTuple):
-    """What happened in the steps of one `advance`; each array is `[steps, runs]`.
-
-    `reward` is R, the payout; `cost` and `safe_regret` are None without `safety`.
-    """
+    """What happened in the steps of one `advance`, `[steps, runs]` each; R is the payout."""
 
     reward: Any
     regret: Any
@@ -64,7 +61,6 @@ class StepLog(NamedTuple):
 
     @classmethod
     def of(cls, reward: jax.Array, info: Info) -> StepLog:
-        """The log of what `env.step` returned."""
         return cls(reward, *(info.get(name) for name in cls._fields[1:]))
 
     @classmethod
@@ -94,10 +90,7 @@ class Evaluation(NamedTuple):
 class Lives:
     """Which tasks the runs of a program are on, by the steps that each has taken: its lifetime.
 
-    A run lives through a stream, or is on one task for ever. All runs switch at the same steps, at
-    once, and what a program keeps of its runs does not depend on their tasks, so a switch passes
-    other `TaskParams` to the same code, compiled once for each `Form`.
-
+    All runs switch at the same steps, and a switch passes other `TaskParams` to the same code.
     `separable` says whether rewards change no observation and end no episode, k = 1 and D = 0 in
     all tasks: then the oracle can be asked later, for many steps at once.
     """
@@ -129,7 +122,6 @@ class Lives:
         return self._params[self._times.segment_at(lifetime)]
 
     def until(self, lifetime: int, limit: int) -> int:
-        """The step before which these tasks are left, at most `limit`."""
         return min(limit, self._times.next_switch(lifetime))
 
     def phase_after(self, lifetime: int) -> jax.Array:
@@ -213,9 +205,7 @@ class Program(ABC):
     def advance(self, limit: int) -> StepLog:
         """Go on to at most step `limit`, and stop *before* the update that follows the last step.
 
-        An evaluation that is due at a step precedes that step's update, as in a study's cell.
-        On-policy programs always collect a whole rollout, also beyond `limit`: the weights are the
-        same in all of it.
+        On-policy programs always collect a whole rollout, also beyond `limit`.
         """
 
     @abstractmethod
@@ -225,8 +215,7 @@ class Program(ABC):
     def evaluate(self, states: Array, lifetime: int | None = None) -> Evaluation:
         """Run an episode from each of `states` `[runs, episodes, S]` with the present weights.
 
-        Of a stream, the tasks are those after `lifetime` steps; None for now. Equal states give
-        equal distractors, as in `evaluation.rollouts`.
+        Of a stream, the tasks are those after `lifetime` steps; None for now.
         """
         sums = _episodes(
             type(self).act,
@@ -240,7 +229,6 @@ class Program(ABC):
         return Evaluation(*(np.asarray(sum_of) for sum_of in sums))
 
     def weights(self, run: int) -> dict[str, Array]:
-        """A run's weights, by SB3's names, as NumPy arrays."""
         return {name: np.asarray(weight[run]) for name, weight in self.state.weights.items()}
 
     def failed(self) -> Array:
@@ -248,16 +236,12 @@ class Program(ABC):
         return np.asarray(_not_finite(self.state.weights))
 
     def save(self) -> dict[str, Array]:
-        """All state, as named arrays."""
         leaves = jax.tree_util.tree_leaves_with_path(self.state)
         arrays = {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves}
         return {"steps": np.asarray(self.steps), **arrays}
 
     def restore(self, arrays: dict[str, Array]) -> None:
-        """Go on from saved state, bit for bit; a replay buffer may be that of a smaller budget.
-
-        Raises OptionError, and changes nothing, if the state is damaged or another program's.
-        """
+        """Go on from saved state, bit for bit; a replay buffer may be that of a smaller budget."""
         leaves, structure = jax.tree_util.tree_flatten_with_path(self.state)
         names = [jax.tree_util.keystr(path) for path, _ in leaves]
         if {"steps", *names} != arrays.keys():
@@ -289,7 +273,6 @@ class Program(ABC):
         return np.concatenate([saved, np.zeros_like(present[len(saved) :])])
 
     def _check_room(self, state: Any, at_once: int) -> None:
-        """Raise ResourceLimitError if such a state would not fit in its share of the memory."""
         leaves = jax.tree.leaves(state)
         needed = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in leaves)
         room = memory_of(self.device)
@@ -306,12 +289,11 @@ class Program(ABC):
 
 
 def check_room(new_program: Callable[[], Program]) -> None:
-    """Raise ResourceLimitError if a program would not fit in memory; makes and compiles none."""
+    """Raise ResourceLimitError if a program would not fit in memory; compiles nothing."""
     jax.eval_shape(lambda: new_program().state)
 
 
 def _check_alike(documents: Sequence[Document]) -> None:
-    """Raise OptionError unless all runs switch at the same steps, in the same way."""
     first, *others = (document.switches for document in documents)
     for index, other in enumerate(others, 1):
         if other != first:
@@ -353,7 +335,6 @@ def _episodes(
         return _of_each(random_numbers, steps, params=params)
 
     def chosen(state: EnvState) -> jax.Array:
-        """Actions `[runs, episodes, A]` of the unit range."""
         observations = _of_each(observe, state, params=params)
         actions = jax.vmap(lambda w, o: act(settings, w, o, symmetric))(weights, observations)
         return to_unit(actions, symmetric)

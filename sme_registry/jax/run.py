@@ -56,11 +56,7 @@ def full_name(uses: str, field: str = "uses") -> str:
 def settings_of(
     uses: str, hyperparameters: Mapping[str, Any], field: str = "hyperparameters"
 ) -> Any:
-    """The hyperparameters of an algorithm, with its defaults for those that are left out.
-
-    JSON values by the names of Stable-Baselines3; `net_arch` is in `policy_kwargs`. Error messages
-    call them `field`.
-    """
+    """An algorithm's hyperparameters, JSON values by SB3's names; errors call them `field`."""
     kind, _ = _algorithm(uses)
     names = sorted(each.name for each in dataclasses.fields(kind))
     known = {f"{POLICY}.{name}" if name in _OF_POLICY else name: name for name in names}
@@ -102,17 +98,9 @@ def new_program(
 ) -> Program:
     """A program of new runs, `jax:PPO`, `jax:TD3` or `jax:SAC`.
 
-    Args:
-      uses: the algorithm.
-      specs: the task or the stream of each run, of equal shapes; streams that switch at the same
-        steps.
-      seeds: of each run, in [0, 2**32): of its weights, its starts and its noise.
-      hyperparameters: see `settings_of`.
-      action_range: of the policies' actions, "symmetric" or "unit".
-      steps: that each run is to take.
-      runs: fill up to this number with copies of the first run; None for none.
-      device: "cpu", "gpu" or "tpu"; None for JAX's default.
-      at_once: programs that are to share what the device has of memory.
+    Tasks or streams are of equal shapes, and streams switch at the same steps. `seeds` in
+    [0, 2**32) are of weights, starts and noise, and `steps` those of each run. Copies of the first
+    run fill up to `runs`; `at_once` programs share what the device has of memory.
     """
     integer_in("len(specs)", len(specs), 1)
     integer_in("len(seeds)", len(seeds), len(specs), len(specs), advice="Give a seed of each task.")
@@ -142,10 +130,7 @@ def policy_of(
     hyperparameters: Mapping[str, Any] | None = None,
     action_range: str = "symmetric",
 ) -> Callable[[Array], Array]:
-    """The deterministic policy of weights.
-
-    It maps observations `[B, O]` float32 to actions `[B, A]` in the action range, or beyond it.
-    """
+    """The deterministic policy of weights, from observations `[B, O]` to actions `[B, A]`."""
     choice("action_range", action_range, ACTION_RANGES)
     _, program = _algorithm(uses)
     settings, symmetric = settings_of(uses, hyperparameters or {}), action_range == "symmetric"
@@ -199,24 +184,15 @@ def run(
     """Run a program to its end, from its start or from where it was restored.
 
     Evaluations are those of a study's cell: the k-th one has the weights of step `due[k]`, before
-    an update that follows it; the last one waits for the end and the last update. Those whose
-    weights are the same, as in PPO's rollouts, run together. In a stream they are of the task on
-    which that step was taken.
-
-    The policy at the end of a visit of a stream's phase has learned from all that it collected in
-    it: with TD3 and SAC up to the update that follows the last step, with PPO up to that of the
-    last rollout that was over by then. The last visit ends with the training: PPO finishes its last
-    rollout in it.
+    an update that follows it; the last one waits for the end and the last update. Visits of a
+    stream's phases end as in `training.record`.
 
     Args:
-      program: whose state is saved only in `after_piece`, or before.
       due: steps of the evaluations, increasing.
-      start_states: the initial states of the k-th evaluation, `[episodes, S]` of each run that is
-        no copy; equally many in all runs.
+      start_states: the initial states of the k-th evaluation, `[episodes, S]` of each run.
       on_log: called with the steps after each piece.
       on_evaluation: called with k, the step, and the evaluation of all runs.
-      on_visit: called with the index of a visit and the weights of each run that is no copy, at
-        the end of each visit of a phase; after the evaluations that are due there.
+      on_visit: called with the index of a visit that has ended and the weights of each run.
       after_piece: called after each piece and its evaluations, when the state may be saved.
       piece: most steps between two calls; on-policy programs finish their rollout.
     """
@@ -272,7 +248,6 @@ def _end_visits(
     after: int,
     on_visit: _OnVisit | None,
 ) -> None:
-    """End the visits whose last step is later than `after`, and done."""
     for visit, end in visits:
         if on_visit is not None and after < end <= program.steps:
             if end == program.steps:
@@ -301,7 +276,6 @@ def _algorithm(uses: str) -> tuple[Any, type[Program]]:
 
 
 def _flat(hyperparameters: Mapping[str, Any], field: str) -> dict[str, Any]:
-    """Those of the policy by dotted names."""
     flat: dict[str, Any] = {}
     for name, value in hyperparameters.items():
         if name.startswith(f"{POLICY}."):

@@ -53,11 +53,7 @@ _OF_START, _OF_STEP = 2**32 - 1, 2**32 - 2
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Form:
-    """What decides how a task is compiled: all tasks of a program have the same.
-
-    `hidden_width` is 0 where L = 1. m distractors move by `dynamics`, "noise", "autonomous" or
-    "driven"; `mixing_depth` is None unless the mixing is nonlinear.
-    """
+    """What decides how a task is compiled: all tasks of a program have the same."""
 
     state_dim: int
     action_dim: int
@@ -71,7 +67,6 @@ class Form:
 
     @classmethod
     def of(cls, spec: SMESpec) -> Form:
-        """The form of a spec's task."""
         width = spec.hidden_width if spec.complexity > 1 else 0
         form = cls(spec.state_dim, spec.action_dim, spec.complexity, width, spec.safety is not None)
         seen = spec.observation
@@ -111,8 +106,7 @@ class Limits(NamedTuple):
 class Observing(NamedTuple):
     """What the agent of a task with `observation` sees in place of the state.
 
-    `W [A, m]` and `b [m]` move the distractors and are None where no action does; `mixing` has the
-    layers from state and distractors to what the agent sees, `W [layers, S + m, S + m]`.
+    `W [A, m]` and `b [m]` move the distractors, None where no action does; `mixing` is M.
     """
 
     W: jax.Array | None
@@ -124,9 +118,8 @@ class TaskParams(NamedTuple):
     """A task; of several tasks, each array has a leading axis.
 
     `W [A, S]` and `b [S]` are float64; r_min, D and the layers have the dtype of rewards. `inner`
-    is None where L = 1, `limits` without `safety`, and `observing` without `observation`. `phase`
-    is the one-hot `[P]` with which observations end in a stream that has `observes_phase`;
-    elsewhere P = 0. A is data: XLA would turn a division by a constant into a product, an ulp off.
+    is None where L = 1. `phase` is the one-hot `[P]` with which observations of some streams end. A
+    is data: XLA would turn a division by a constant into a product, an ulp off.
     """
 
     action_dim: jax.Array
@@ -150,18 +143,12 @@ class TaskParams(NamedTuple):
 
     @property
     def channels(self) -> jax.Array:
-        """`[A]`, all true, which XLA cannot know: a mask that keeps the bits of sums over channels.
-
-        Without it the same sums are compiled otherwise, and get other last bits.
-        """
+        """`[A]`, all true, which XLA cannot know: sums over channels keep their bits by it."""
         return jnp.arange(self.form.action_dim) < self.action_dim
 
 
 class StepOutcome(NamedTuple):
-    """What actions are worth in their states, `[...]` each; the last two are None without `safety`.
-
-    `safe_regret` is r of the best safe action, minus r.
-    """
+    """What actions are worth in their states, `[...]` each; safe_regret is r of π_safe minus r."""
 
     similarity: jax.Array
     step_reward: jax.Array
@@ -170,10 +157,7 @@ class StepOutcome(NamedTuple):
 
 
 def task_params(specs: SpecLike | Sequence[SpecLike], *, dtype: Any = jnp.float64) -> TaskParams:
-    """Draw a task, or several of one `Form` for `jax.vmap`: specs, ids, digests or paths.
-
-    `dtype` is that of the oracle and of rewards, float64 or float32.
-    """
+    """Draw a task, or several of one `Form` for `jax.vmap`; `dtype` is that of rewards."""
     if np.dtype(dtype) not in (np.float64, np.float32):
         raise OptionError(f"dtype={np.dtype(dtype).name}: must be float64 or float32.")
     if isinstance(specs, SMESpec | dict | str | os.PathLike):
@@ -193,7 +177,6 @@ def stacked_params(tasks: Sequence[Task], dtype: Any = np.float64) -> TaskParams
 
 
 def check_supported(document: SMESpec | StreamSpec) -> None:
-    """Raise SpecError where JAX does not have a field, or agents in it cannot live in a stream."""
     for index, spec in enumerate(document.specs):
         try:
             _check_fields(spec)
@@ -212,8 +195,7 @@ def next_state(params: TaskParams, s: jax.Array, a: jax.Array) -> jax.Array:
 def transition(W: jax.Array, b: jax.Array, s: jax.Array, a: jax.Array) -> jax.Array:
     """ψ(s + a W + b) of states `[..., S]`, or distractors, and actions `[..., A]`.
 
-    Actions are clipped to [0, 1] and rounded to float32. The sum runs in the order of the
-    definition, s + b and then W_i a_i for i = 1…A; each product is exact, so that it does not
+    The sum runs in the order of the definition, and each product is exact, so that it does not
     matter whether a compiler fuses it with its sum.
     """
     a = jnp.clip(a, 0.0, 1.0).astype(jnp.float32).astype(jnp.float64)

@@ -88,7 +88,6 @@ class SAC(OffPolicySettings):
 
     @property
     def learns_entropy(self) -> bool:
-        """Whether the entropy coefficient α is learned."""
         return isinstance(self.ent_coef, str)
 
     @property
@@ -168,7 +167,7 @@ def _deterministic(weights: Weights, observation: jax.Array, policy: str = "acto
 def _improved_policy(
     settings: TD3, learner: OffPolicyLearner, observation: jax.Array
 ) -> OffPolicyLearner:
-    """Move TD3's actor up the first critic's value, then all targets towards their"""
+    """Move TD3's actor up the first critic's value, then all targets."""
     weights = learner.weights
 
     def loss(actor: Weights) -> jax.Array:
@@ -239,7 +238,6 @@ class SACProgram(OffPolicyProgram):
         count: jax.Array,
         index: jax.Array,
     ) -> OffPolicyLearner:
-        """Noise is for actions at the observations and at the next ones."""
         weights, rate = learner.weights, settings.learning_rate
         now, later = noise.transpose(1, 2, 0)
 
@@ -347,7 +345,6 @@ def with_targets(weights: HostWeights, networks: Sequence[str]) -> HostWeights:
 def critic_value(
     weights: Weights, critic: str, observation: jax.Array, action: jax.Array
 ) -> jax.Array:
-    """Q(observation, action) `[B]` of one critic, such as `critic.qf0`."""
     x = jnp.concatenate([observation, action], axis=-1)
     return perceptron(weights, critic, x)[..., 0]
 
@@ -370,10 +367,7 @@ def fit_critics(
     learning_rate: float,
     scale: float,
 ) -> tuple[Adam, Weights]:
-    """One update of both critics towards the values `target` `[B]`.
-
-    Minimises `scale` times the sum over critics of their mean squared errors.
-    """
+    """One update of both critics towards `target` `[B]`, by `scale` times their squared errors."""
 
     def loss(critic: Weights) -> jax.Array:
         errors = [
