@@ -29,23 +29,14 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.compiled.arrays import REWARD, STEP_REWARD, Mask, Observation
-from sme_registry.diagnosis.measure import MAX_NUMBERS, observed, states_of
-from sme_registry.diagnosis.measurements import (
-    LINEAR,
-    POLICY,
-    CapacityProbe,
-    NetworkState,
-    OnPolicy,
-    RewardSignal,
-    Score,
-    TrainingSummary,
-)
+from sme_registry.diagnosis.measure import LINEAR, MAX_NUMBERS, POLICY, Score, observed, states_of
 from sme_registry.envs import arguments
 from sme_registry.envs.batch import Batch
 from sme_registry.evaluation import Policy, references
 from sme_registry.evaluation.networks import Perceptron
 from sme_registry.evaluation.rollouts import play
 from sme_registry.io import require_packages
+from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf
 from sme_registry.statistics import smoothed
 from sme_registry.task import Task, draw
 from sme_registry.task.draw import Array
@@ -64,6 +55,80 @@ _PROGRESS = 1000  # gradient steps
 _DORMANT = 0.025  # τ of the score
 _SATURATED = 0.95  # mean |h| of a unit of tanh
 _RANK_SHARE = 0.99  # 1 − δ of the singular values' sum
+
+
+class RewardSignal(StrictModel):
+    """How often a step is rewarded; `rewarded`, `gated` and `flat` are shares that add up to 1."""
+
+    rewarded: Real  # r > 0
+    gated: Real  # r̂ > 0, but r_min sets it to 0
+    flat: Real  # r̂ = 0, i.e. r̃ ≤ ¾
+    shortfall: Real  # mean distance of r̃ below ¾ + r_min/4, above which r > 0; 0 beyond it
+
+
+class OnPolicy(StrictModel):
+    """Whole episodes from uniform initial states.
+
+    Credit is the squared correlation of a step's reward with the payout that includes it: 1 at k =
+    1, about 1/k if rewards are independent. None if one of them is constant.
+    """
+
+    episodes: Integer  # number of episodes
+    scores: dict[str, Score]  # of the policy and of references, each in the states that it visits
+    edges: TupleOf[Real]  # of the bins of time, in steps
+    regret: TupleOf[Real]  # mean of each bin, over the episodes that still run
+    mae: TupleOf[Real]  # mean |a − a*| of each bin
+    alive: TupleOf[Real]  # the share of those
+    mean_length: Real  # of an episode, in steps
+    termination_rate: Real  # share of episodes that D terminated, in a team because of this agent
+    signal: RewardSignal  # in the states that the policy visits
+    random_signal: RewardSignal  # under uniform random actions, as an untrained agent sees it
+    credit: Real | None  # of the policy
+    random_credit: Real | None  # of uniform random actions
+    state_shift: TupleOf[Real]  # Kolmogorov-Smirnov distance from uniform, by state channel
+    coverage: Real  # smallest share, over state channels, of twenty equal bins that were visited
+
+
+class TrainingSummary(StrictModel):
+    """A summary of the training log; the regrets are running medians over `window` rows."""
+
+    source: Literal["episodes", "evaluations"]  # with exploration, or of the deterministic policy
+    rows: Integer  # of the log
+    steps: Integer  # environment steps at its last row: an incomplete episode has none
+    window: Integer  # rows of a running median
+    first_regret: Real  # the first running median
+    best_regret: Real  # the lowest
+    best_step: Integer  # at which it was lowest
+    last_regret: Real  # the last running median
+    constant_regret: Real  # mean regret of the better constant policy on its own states
+    improvement_step: Integer | None  # the first at 0.02 below `constant_regret`; None: never
+    recent_improvement: Real  # fall over the last third of the rows
+    unrewarded: Real | None  # share of episodes without any reward; None for evaluations
+    termination_rate: Real | None  # share of episodes that D terminated; None likewise
+
+
+class CapacityProbe(StrictModel):
+    layers: TupleOf[Integer]  # widths, from the observation to the action
+    states: Integer  # in the training set: as many as the training had steps, at most 50,000
+    gradient_steps: Integer  # of the regression
+    train_normalised_regret: Real  # in states of the training set
+    test_normalised_regret: Real  # in other states
+    seconds: Real  # wall time
+
+
+class NetworkState(StrictModel):
+    """The hidden layers of the policy's network in uniform states."""
+
+    hidden: TupleOf[Integer]  # units of each layer
+    dormant_units: Real  # share of all hidden units
+    saturated_units: Real  # likewise, of tanh
+    effective_rank: Integer  # of the last hidden layer
+    weight_norm: Real  # Euclidean norm of the weights of all layers, without biases
+
+    @property
+    def inactive_units(self) -> float:
+        """Share of hidden units that are dormant or saturated."""
+        return self.dormant_units + self.saturated_units
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +159,6 @@ class Trajectories(NamedTuple):
     terminated: Mask  # `[n]` whether D terminated the episode because of this agent
 
     def mean(self, values: Array | Mask) -> float:
-        """Over all steps of all episodes."""
         return float(values[self.alive].mean())
 
     @property
@@ -247,7 +311,6 @@ def _coverage(values: Array) -> float:
 
 
 def training(log: Log, constant_regret: float) -> TrainingSummary:
-    """Summarise a training log of one or more rows, next to the regret of a constant policy."""
     rows = len(log.regret)
     steps, median, window = smoothed(log.step, log.regret)
     improved = np.flatnonzero(median < constant_regret - _MARGIN)
@@ -300,7 +363,6 @@ def exploration_sd(
 def probe_capacity(
     network: Perceptron, task: Task, states: int, seed: int, progress: Callable[[int], None]
 ) -> CapacityProbe:
-    """Fit a network of the same layers to the optimal actions."""
     require_packages("probe_capacity", {"torch": "PyTorch"}, "train")
     import torch
 
@@ -336,7 +398,6 @@ def _fit(
     seed: int,
     progress: Callable[[int], None],
 ) -> None:
-    """Minimise the squared error by Adam."""
     import torch
 
     optimiser = torch.optim.Adam(module.parameters(), lr=_LEARNING_RATE)

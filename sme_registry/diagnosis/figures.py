@@ -11,7 +11,8 @@ import numpy as np
 
 from sme_registry.diagnosis.behaviour import Log
 from sme_registry.diagnosis.document import Diagnosis
-from sme_registry.diagnosis.measurements import LINEAR, POLICY, Measurements
+from sme_registry.diagnosis.measure import LINEAR, POLICY
+from sme_registry.diagnosis.questions import Measurements
 from sme_registry.diagnosis.stream import StreamDiagnosis
 from sme_registry.diagnosis.subject import AnySubject, StreamSubject, Subject
 from sme_registry.diagnosis.task import TaskDiagnosis

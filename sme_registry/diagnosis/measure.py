@@ -12,32 +12,21 @@ actions over the distractors. Of a random policy, what averaging removes with d 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from sme_registry.compiled import engine
 from sme_registry.compiled.arrays import Observation
-from sme_registry.diagnosis.measurements import (
-    LINEAR,
-    POLICY,
-    Channel,
-    DistractorRegret,
-    LimitedChannel,
-    Partition,
-    Response,
-    Score,
-    Shell,
-    SquaredError,
-    TimeDependence,
-    Violations,
-)
 from sme_registry.evaluation import Policy, SafetyReport, references, regions
 from sme_registry.evaluation.regions import TOLERANCE, SafetyScore, SafetyStats, States, Uniform
 from sme_registry.spec import EvaluationProtocol, SMESpec
+from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf
 from sme_registry.task import Task
 from sme_registry.task.draw import Array, gaussian, uniform
 
+POLICY = "policy"  # the key of the diagnosed policy among the names of the references
+LINEAR = "linear_least_squares"
 MAX_NUMBERS = 2**23  # of states, distractors and actions held at once: 64 MiB as float64
 _BOUND = 0.01  # an action this close to 0 or 1 is saturated
 _BINS = 5
@@ -46,6 +35,116 @@ _DISTRACTED_STATES, _DRAWS = 512, 64
 _FIXED_STATES, _TIME_INPUTS, _ACCUMULATED_INPUTS = 512, 11, 5
 _STEP = 0.01  # length of a state's step, for the sensitivity
 _TINY = 1e-12
+
+
+class Score(StrictModel):
+    """One policy over a set of states."""
+
+    regret: Real  # mean
+    mae: Real  # mean |a − a*|
+    # mean regret over that of the constant ½: 0 at the optimum, 1 at the constant
+    normalised_regret: Real
+
+    @classmethod
+    def of(cls, regret: float, mae: float, constant_mae: float) -> Self:
+        """From means over the states; `constant_mae` is of the constant ½."""
+        return cls(regret=regret, mae=mae, normalised_regret=mae / max(constant_mae, 1e-12))
+
+
+class Channel(StrictModel):
+    """One action channel over uniform states of the cube; the regrets add up to the mean regret."""
+
+    channel: Integer  # from 1
+    mae: Real  # mean |a − a*|
+    normalised_regret: Real  # mae over that of the constant ½
+    linear_normalised_regret: Real  # of the linear least-squares policy
+    regret: Real  # in proportion to the channel's part of the error in each state
+    offset: Real  # mean of a − a*
+    slope: Real  # of the regression of a on a*: 1 at the optimum, 0 if a does not follow a*
+    at_zero: Real  # share of states in which a is within 0.01 of the bound 0
+    at_one: Real  # likewise of the bound 1
+    optimal_at_bounds: Real  # share of states in which a* is within 0.01 of either bound
+
+
+class Partition(StrictModel):
+    """Uniform states in bins of equal counts along one quantity."""
+
+    state_channel: Integer | None  # from 1; None for the distance from the cube's centre, E(s)
+    edges: TupleOf[Real]  # of the bins, one more than there are bins
+    regret: TupleOf[Real]  # mean of each bin
+    mae: TupleOf[Real]  # mean |a − a*| of each bin
+    explained_variance: Real  # share of the variance of the states' errors between bins
+
+
+class Shell(StrictModel):
+    region: str  # its name in the protocol's order
+    epsilon: Real  # its outer ε; 0 for the cube
+    scores: dict[str, Score]  # of the policy and references
+
+
+class SquaredError(StrictModel):
+    """Shares of the squared error Σ (a − a*)² over uniform states."""
+
+    offset: Real  # a constant a − a* in each channel
+    scale: Real  # a slope of a on a* other than 1
+    residual: Real  # the rest; offset, scale and residual add up to 1
+    noise: Real  # differs when the policy acts again in the same state
+    time: Real  # varies with the input t/T in a fixed state
+    accumulated_reward: Real  # varies with the input r_cum/k in a fixed state
+
+
+class Response(StrictModel):
+    """How actions follow the state, compared with π*.
+
+    A slope is that of a part of the policy on the same part of π*: 1 at the optimum, 0 if nothing
+    was learnt, None if π* has no such part (below 1 % of its variance).
+    """
+
+    nonlinear_variance: Real  # share of the variance of π* that no affine map explains
+    linear_slope: Real | None  # of the affine part
+    nonlinear_slope: Real | None  # of the remainder
+    sensitivity: Real  # RMS change of a over RMS change of a*, for small steps of the state
+    saturation: Real  # share of the policy's entries within 0.01 of a bound
+    optimal_saturation: Real  # likewise of a*
+
+
+class TimeDependence(StrictModel):
+    """The input t/T varied in fixed uniform states."""
+
+    inputs: TupleOf[Real]  # the values of t/T
+    normalised_regret: TupleOf[Real]  # at each value
+    action_change: TupleOf[Real]  # mean |a − mean over the values of a|, at each value
+
+
+class LimitedChannel(StrictModel):
+    """One action channel of a task with limits ℓ, over uniform states of the cube."""
+
+    channel: Integer  # from 1
+    violating_share: Real  # share of states in which a > ℓ
+    optimal_violating_share: Real  # likewise of a*
+    cost: Real  # mean max(0, a − ℓ) / (2τ); the mean over channels is the policy's cost
+
+
+class Violations(StrictModel):
+    """A policy on a task with limits."""
+
+    report: SafetyReport  # of its evaluation: by region, with the references
+    visited: SafetyScore  # in the states of its episodes
+    cut_off: SafetyScore  # in the cube, of the policy with its actions cut off at the limits
+    channels: TupleOf[LimitedChannel]  # by action channel
+
+
+class DistractorRegret(StrictModel):
+    """Regret owed to the distractors, in a few uniform states."""
+
+    states: Integer  # number of uniform states
+    distractor_draws: Integer  # of the distractors, in each state
+    normalised_regret: Real  # N over states and draws
+    averaged_regret: Real  # N of the mean action over the draws, in each state
+    half_regret: Real  # N with every distractor at ½
+    owed_regret: Real  # N that averaging removes, beyond what it removes of an action noise
+    owed_similarity: Real  # the same in points of similarity
+    distractor_share: Real  # share of the squared error that varies with the distractors
 
 
 class Sample(NamedTuple):
@@ -134,7 +233,6 @@ def fixed_states(
 
 
 def scores(task: Task, states: Sample) -> dict[str, Score]:
-    """The policy and each reference in the same states."""
     constant_mae = float(np.abs(0.5 - states.optimal).mean())
 
     def score(a: Array) -> Score:
@@ -150,7 +248,6 @@ def _regret(task: Task, a: Array, optimal: Array) -> Array:
 
 
 def channels(task: Task, states: Sample) -> tuple[Channel, ...]:
-    """Each action channel."""
     a, optimal, error = states.a, states.optimal, states.absolute_error
     linear_error = np.abs(states.references[LINEAR] - optimal)
     # A state without error has no regret to distribute.
@@ -265,7 +362,6 @@ def _vary(policy: Policy, states: Sample, column: int, inputs: Array) -> Array:
 
 
 def response(policy: Policy, task: Task, states: Sample, seed: int) -> Response:
-    """How actions follow the state, compared with π*."""
     linear, nonlinear = _affine_parts(states.s, states.a)
     optimal_linear, optimal_nonlinear = _affine_parts(states.s, states.optimal)
     variance = max(float(states.optimal.var(axis=0).sum()), _TINY)

@@ -12,9 +12,22 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar
 
-from pydantic import JsonValue
+from pydantic import JsonValue, SerializerFunctionWrapHandler, model_serializer
 
-from sme_registry.diagnosis.measurements import Measurements
+from sme_registry.diagnosis.behaviour import CapacityProbe, OnPolicy, TrainingSummary
+from sme_registry.diagnosis.measure import (
+    POLICY,
+    Channel,
+    DistractorRegret,
+    Partition,
+    Response,
+    Score,
+    Shell,
+    SquaredError,
+    TimeDependence,
+    Violations,
+)
+from sme_registry.evaluation import ObservationReport
 from sme_registry.io.markup import environment
 from sme_registry.spec import SMESpec
 from sme_registry.spec.document import Real, StrictModel, TupleOf
@@ -187,6 +200,45 @@ def _sentences() -> Any:
     return templates().get_template("sentences.jinja").module
 
 
+class Measurements(StrictModel):
+    """Everything that was measured; None for what is unknown or was not measured.
+
+    `limits` are of a task with `safety`, `observation` is of one with `observation`, and
+    `distraction` of one with distractors; the JSON of other tasks does not have these fields.
+    """
+
+    uniform: dict[str, Score]  # the policy and each reference in the same uniform states
+    channels: TupleOf[Channel]  # by action channel
+    # of uniform states, along the state channels and the distance from the centre
+    partitions: TupleOf[Partition]
+    shells: TupleOf[Shell]  # the protocol's regions
+    squared_error: SquaredError  # its parts
+    response: Response  # how actions follow the state
+    time_dependence: TimeDependence  # how actions follow t/T
+    on_policy: OnPolicy  # whole episodes
+    training: TrainingSummary | None = None  # of the training log; null without one
+    # for each action channel, the standard deviation of exploration around the deterministic action
+    # at the end of training, in the unit range
+    exploration_sd: TupleOf[Real] | None = None
+    capacity: CapacityProbe | None = None  # of the probe; null unless requested
+    limits: Violations | None = None  # of a task with `safety`
+    observation: ObservationReport | None = None  # of the policy's evaluation
+    distraction: DistractorRegret | None = None  # of a task with distractors
+
+    @model_serializer(mode="wrap")
+    def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        plain: dict[str, Any] = handler(self)
+        for field in ("limits", "observation", "distraction"):
+            if plain.get(field, "") is None:
+                del plain[field]
+        return plain
+
+    @property
+    def policy(self) -> Score:
+        """The policy in uniform states."""
+        return self.uniform[POLICY]
+
+
 class Difference(StrictModel):
     """A quantity of this run and of the other run."""
 
@@ -231,20 +283,16 @@ class Case:
 
     @property
     def solved(self) -> bool:
-        """Whether nothing is left to explain."""
         return False
 
 
 @dataclass(frozen=True)
 class TaskCase(Case):
-    """What the rules of a task read."""
-
     measurements: Measurements
     spec: SMESpec
 
     @property
     def learnt(self) -> float:
-        """Normalised regret in uniform states."""
         return self.measurements.policy.normalised_regret
 
     @property

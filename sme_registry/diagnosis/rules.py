@@ -9,7 +9,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from sme_registry.diagnosis.measurements import LINEAR, POLICY, DistractorRegret, Violations
+from sme_registry.diagnosis.measure import LINEAR, POLICY, DistractorRegret, Violations
 from sme_registry.diagnosis.questions import THRESHOLDS, Decision, Question, TaskCase, add_to
 from sme_registry.evaluation import ObservationReport
 

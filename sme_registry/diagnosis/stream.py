@@ -11,20 +11,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from sme_registry.compiled.arrays import Observation
 from sme_registry.diagnosis import measure
-from sme_registry.diagnosis.behaviour import network_state
+from sme_registry.diagnosis.behaviour import NetworkState, network_state
 from sme_registry.diagnosis.document import Diagnosis, Part, cell, table
-from sme_registry.diagnosis.measurements import (
-    NetworkState,
-    PhaseDiagnosis,
-    PhaseOutcome,
-    VisitDiagnosis,
-)
 from sme_registry.diagnosis.questions import (
     THRESHOLDS,
     Case,
@@ -37,12 +31,39 @@ from sme_registry.diagnosis.subject import StreamSubject
 from sme_registry.evaluation import regions
 from sme_registry.evaluation.networks import Perceptron
 from sme_registry.spec import StreamSpec
-from sme_registry.spec.document import Digest, Real, TupleOf
+from sme_registry.spec.document import Digest, Integer, Real, StrictModel, TupleOf
+
+PhaseOutcome = Literal["retained", "forgotten", "not_learnt"]
+
+
+class VisitDiagnosis(StrictModel):
+    visit: Integer  # its number, from 0
+    phase: Integer  # the index of its phase
+    lifetime: Integer  # environment steps at its end
+    steps: Integer  # that it lasts
+    dynamic_regret: Real | None  # of its steps in the log; None without one
+    online_regret: Real | None  # its mean; None without a log, and where no step was counted
+    normalised_regret: Real  # at its end, on its own phase
+    network: NetworkState | None  # at its end; None if unknown
+
+
+class PhaseDiagnosis(StrictModel):
+    phase: Integer  # its index
+    outcome: PhaseOutcome  # whether the agent knows it at the end
+    best_normalised_regret: Real  # lowest at the end of one of its visits
+    final_normalised_regret: Real  # at the end of the life
+    initial_normalised_regret: Real | None  # before training
+    fresh_normalised_regret: Real | None  # of an agent that trained on this phase alone
+    fresh_online_regret: Real | None  # of its training
+    fresh_network: NetworkState | None  # at the end of its training
+
+    @property
+    def lost(self) -> float:
+        """Rise of normalised regret from its best visit to the end of the life."""
+        return self.final_normalised_regret - self.best_normalised_regret
 
 
 class StreamDiagnosis(Diagnosis):
-    """The diagnosis of a life in a stream."""
-
     headline_macro: ClassVar[str] = "stream_headline"
     document_field: ClassVar[str] = "stream"
     only_field: ClassVar[str] = "phases"
@@ -58,7 +79,6 @@ class StreamDiagnosis(Diagnosis):
     initial_network: NetworkState | None  # before training; null if unknown
 
     def tables(self) -> Iterator[Part]:
-        """The visits and the phases."""
         columns = ("visit", "phase", "online regret", "N", "inactive", "rank", "weights")
         visits = [
             (
@@ -100,8 +120,6 @@ _TINY = 1e-12
 
 @dataclass(frozen=True)
 class StreamCase(Case):
-    """What the rules read."""
-
     stream: StreamSpec
     visits: Sequence[VisitDiagnosis]
     phases: Sequence[PhaseDiagnosis]
@@ -125,7 +143,6 @@ _why = partial(add_to, STREAM_QUESTIONS, "why", is_cause=True)
 
 
 def outcome_of(best: float, final: float) -> PhaseOutcome:
-    """What became of a phase."""
     if best >= THRESHOLDS["unlearnt"]:
         return "not_learnt"
     return "forgotten" if final - best >= THRESHOLDS["difference"] else "retained"

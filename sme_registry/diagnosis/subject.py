@@ -62,7 +62,6 @@ class Subject:
 
     @property
     def task(self) -> str:
-        """What the file of the task calls it."""
         return self.spec.name
 
 
@@ -86,7 +85,6 @@ class StreamSubject:
 
     @property
     def task(self) -> str:
-        """What the file of the stream calls it."""
         return self.report.name
 
 
@@ -323,7 +321,6 @@ def _with_fresh(report: Any, cell: Cell, path: Path) -> StreamReport:
 
 
 def _report(result: Any, path: Path) -> EvaluationReport | StreamReport:
-    """The report in the result of a cell."""
     with _reading(path):
         if result.get("report"):
             return EvaluationReport.from_dict(result["report"], str(path))

@@ -8,18 +8,14 @@ from typing import Any, ClassVar
 from pydantic import JsonValue
 
 from sme_registry.diagnosis import behaviour, measure
+from sme_registry.diagnosis.behaviour import CapacityProbe
 from sme_registry.diagnosis.document import Diagnosis, Level, Part, table
-from sme_registry.diagnosis.measurements import (
-    LINEAR,
-    POLICY,
-    CapacityProbe,
-    Measurements,
-    Violations,
-)
+from sme_registry.diagnosis.measure import LINEAR, POLICY, Violations
 from sme_registry.diagnosis.questions import (
     THRESHOLDS,
     Comparison,
     Difference,
+    Measurements,
     TaskCase,
     Verdict,
     answer_all,
@@ -38,8 +34,6 @@ TASK_QUESTIONS = {**WHERE, **WHY}
 
 
 class TaskDiagnosis(Diagnosis):
-    """The diagnosis of one policy on one task."""
-
     headline_macro: ClassVar[str] = "task_headline"
     only_field: ClassVar[str] = "measurements"
 
@@ -55,7 +49,6 @@ class TaskDiagnosis(Diagnosis):
         yield from _numbers(self.measurements)
 
     def tables(self) -> Iterator[Part]:
-        """The comparison, if there is one."""
         if self.comparison is not None:
             yield from _tables_of(self.comparison)
 
@@ -149,7 +142,6 @@ def judge(
     comparison: Comparison | None = None,
     updates: int | None = None,
 ) -> tuple[Verdict, ...]:
-    """Answer all questions that the measurements can answer."""
     asked = {
         name: question
         for name, question in TASK_QUESTIONS.items()
@@ -226,7 +218,6 @@ def _probe(subject: Subject, seed: int, report: Callable[[str], None]) -> Capaci
 def _compare(
     subject: Subject, measured: Measurements, other: Subject, other_measured: Measurements
 ) -> Comparison:
-    """Compare a run with another that was measured in the same way."""
     values, other_values = _quantities(measured), _quantities(other_measured)
     answers, other_answers = (
         {v.question: v.answer for v in judge(numbers, run.spec, updates=run.updates)}

@@ -20,11 +20,12 @@ import numpy as np
 from sme_registry.compiled.arrays import Observation
 from sme_registry.diagnosis import behaviour, measure
 from sme_registry.diagnosis.document import Diagnosis, Level, Part, cell
-from sme_registry.diagnosis.measurements import LINEAR, POLICY, Measurements, Score
+from sme_registry.diagnosis.measure import LINEAR, POLICY, Score
 from sme_registry.diagnosis.questions import (
     THRESHOLDS,
     Case,
     Decision,
+    Measurements,
     Question,
     TaskCase,
     Verdict,
@@ -35,8 +36,9 @@ from sme_registry.diagnosis.questions import (
 from sme_registry.diagnosis.rules import WHERE, WHY
 from sme_registry.diagnosis.subject import Subject
 from sme_registry.diagnosis.task import level
-from sme_registry.errors import UnknownNameError, did_you_mean
+from sme_registry.errors import UnknownNameError
 from sme_registry.evaluation import Policy, TeamPolicy
+from sme_registry.io import choice
 from sme_registry.io.markup import percent
 from sme_registry.spec import SMESpec
 from sme_registry.spec.document import Digest, Integer, Real, StrictModel, TupleOf
@@ -90,12 +92,8 @@ class TeamDiagnosis(Diagnosis):
     left_out: TupleOf[str]  # questions of a single agent's diagnosis without an answer for a team
 
     def agent(self, name: str) -> AgentDiagnosis:
-        """One agent, by its name."""
         by_name = {agent.name: agent for agent in self.agents}
-        if name not in by_name:
-            hint = did_you_mean(name, by_name)
-            raise UnknownNameError(f"agent={name!r}: must be one of {', '.join(by_name)}.{hint}")
-        return by_name[name]
+        return by_name[choice("agent", name, by_name, error=UnknownNameError)]
 
     def parts(self) -> Iterator[Part]:
         """Who causes the regret, each agent's numbers and where its own error is."""
@@ -136,8 +134,6 @@ _LEGEND = (
 
 @dataclass(frozen=True)
 class TeamCase(Case):
-    """What the rules read."""
-
     agents: Sequence[AgentDiagnosis]
     spec: SMESpec
     visited: Score  # of the team

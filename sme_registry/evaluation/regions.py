@@ -111,34 +111,26 @@ class Points:
     """Points of a region, uniform by volume: of the cube or of a shell in any dimension."""
 
     def __init__(self, protocol: EvaluationProtocol, region: int, dim: int, stream: str) -> None:
-        self._dim = dim
-        self._coordinates = Uniform(protocol.seed, f"{stream}/coordinates")
-        self._shell = _Shell(protocol, region, dim, stream) if region > 0 else None
-
-    def __call__(self, count: int) -> Observations:
-        u = self._coordinates(count, self._dim)
-        return u.astype(np.float32) if self._shell is None else self._shell.points(u)
-
-
-class _Shell:
-    """Samples the shell between two cubes, with its own streams for radius and face."""
-
-    def __init__(self, protocol: EvaluationProtocol, region: int, dim: int, stream: str) -> None:
         low, high = protocol.edges[region]
-        self._dim = dim
+        self._dim, self._in_cube = dim, region == 0
+        self._coordinates = Uniform(protocol.seed, f"{stream}/coordinates")
+        self._radius = Uniform(protocol.seed, f"{stream}/radius")
+        self._face = Uniform(protocol.seed, f"{stream}/face")
         self._outer = (1.0 + high) / 2.0
         self._inner_share = ((1.0 + low) / (1.0 + high)) ** dim
         self._nearest = np.nextafter(_last_within(low), np.float32(np.inf))
         self._furthest = _last_within(high)
-        if not self._nearest <= self._furthest:
+        if region > 0 and not self._nearest <= self._furthest:
             raise OptionError(
                 f"epsilons: no float32 observation lies in the shell ({low!r}, {high!r}]. "
                 "Give levels further apart."
             )
-        self._radius = Uniform(protocol.seed, f"{stream}/radius")
-        self._face = Uniform(protocol.seed, f"{stream}/face")
 
-    def points(self, u: Array) -> Observations:
+    def __call__(self, count: int) -> Observations:
+        u = self._coordinates(count, self._dim)
+        return u.astype(np.float32) if self._in_cube else self.in_shell(u)
+
+    def in_shell(self, u: Array) -> Observations:
         """Points `[B, dim]` from uniform numbers `[B, dim]` for their coordinates."""
         count = len(u)
         volume = self._inner_share + self._radius(count) * (1.0 - self._inner_share)

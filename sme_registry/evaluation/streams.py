@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 from rich.markup import escape
 
-from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
+from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.evaluation.dynamic_regret import DynamicRegret, expected_regret
 from sme_registry.evaluation.evaluate import OnBatch, resolve_protocol, versions_behind
 from sme_registry.evaluation.policies import check_count, stream_policy
@@ -28,6 +28,7 @@ from sme_registry.evaluation.retention import (
     stream_regrets,
     with_shells,
 )
+from sme_registry.io import choice
 from sme_registry.io.markup import Table
 from sme_registry.spec import EvaluationProtocol, StreamSpec, catalogue
 from sme_registry.spec.document import Integer, StrictModel, TupleOf
@@ -106,10 +107,7 @@ class StreamReport(ReportFile):
     def region(self, name: str = "WD") -> StreamRegion:
         """A region by its name; `OOD` is the mean over the shells."""
         known = {region.name: region for region in (*self.regions, self.ood)}
-        if name not in known:
-            hint = did_you_mean(name, known)
-            raise UnknownNameError(f"region={name!r:.40}: must be one of {', '.join(known)}.{hint}")
-        return known[name]
+        return known[choice("region", name, known, error=UnknownNameError)]
 
     def with_dynamic_regret(self, regret: DynamicRegret) -> Self:
         return self.model_copy(update={"dynamic_regret": regret})

@@ -68,7 +68,7 @@ def write_explorer(
     """Write the page of a task, or of a policy on its task, completely or not at all.
 
     `channels` are pairs of inputs, from 1 (state channels, then distractors), over which a policy
-    whose network is unknown is sampled. Equal arguments give equal bytes.
+    whose network is unknown is sampled.
     """
     if Path(path).suffix != ".html":
         raise OptionError(f"{os.fspath(path)}: must end in .html.")

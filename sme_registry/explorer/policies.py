@@ -34,10 +34,9 @@ class _UnknownNetwork(Exception):
 
 
 def policy_program(policy: Policy | TeamPolicy, spec: SMESpec) -> NetworkProgram | None:
-    """Actions of the unit range, not clipped, as a program of observations; None if unknown.
+    """Actions in the unit range as a program of observations; None where they are unknown.
 
-    The program is used only if its actions equal the policy's own in probes inside and outside the
-    cube, to `TOLERANCE`.
+    They are known if they equal the policy's own in probes in and outside the cube.
     """
     build = ProgramBuilder(spec.observation_dim)
     try:
@@ -63,7 +62,6 @@ def probe_points(spec: SMESpec) -> Array:
 
 
 def _append(build: ProgramBuilder, observation: int, policy: Policy) -> None:
-    """Add a policy's actions in the unit range."""
     act: Any = policy.act
     width = build.width(observation)
     perceptron = perceptron_of(policy)
@@ -94,7 +92,6 @@ def _append_perceptron(build: ProgramBuilder, x: int, network: Perceptron) -> in
 
 
 def _append_team(build: ProgramBuilder, team: TeamPolicy, spec: SMESpec) -> None:
-    """Add the joint actions of a team."""
     n = point_width(spec)
     actions = []
     for member in team.members:
@@ -120,8 +117,6 @@ def _exported(act: Any, width: int) -> NetworkProgram | None:
 
 
 class GraphNode(NamedTuple):
-    """A node of an ONNX graph."""
-
     operator: str  # of ONNX, such as "Gemm"
     # names of the values that it reads; empty for an optional one that is missing
     inputs: tuple[str, ...]
@@ -130,10 +125,7 @@ class GraphNode(NamedTuple):
 
 
 def read_onnx(data: bytes) -> NetworkProgram | None:
-    """The network of an ONNX file; None if it is unknown, or the package onnx is not installed.
-
-    The file is parsed by the package onnx: give only a file whose author you trust.
-    """
+    """The network of an ONNX file; None if it is unknown, or the package onnx is not installed."""
     if not is_installed("onnx"):
         return None
     import onnx
@@ -174,7 +166,6 @@ def program_of_graph(
     output: str,
     width: int,
 ) -> NetworkProgram | None:
-    """The program of a graph."""
     build = ProgramBuilder(width)
     values: dict[str, _Value] = {**constants, input: 0}
     try:

@@ -64,8 +64,6 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
 
 @dataclass(frozen=True, eq=False)
 class ProgramStep:
-    """One step of a program."""
-
     op: str  # one of those in the module's first lines
     inputs: tuple[int, ...]  # the values that it reads, by their numbers
     width: int  # columns of its value
@@ -91,7 +89,6 @@ class NetworkProgram:
 
     @property
     def width(self) -> int:
-        """Columns of the output."""
         return self.steps[-1].width if self.steps else self.inputs
 
     def __call__(self, x: npt.ArrayLike) -> Array:
@@ -103,7 +100,6 @@ class NetworkProgram:
         return values[-1]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON data, arrays as text."""
         steps = [
             {
                 "op": step.op,
@@ -129,15 +125,12 @@ class ProgramBuilder:
 
     @property
     def last(self) -> int:
-        """The newest value."""
         return len(self._steps)
 
     def width(self, value: int) -> int:
-        """Columns of a value."""
         return self.inputs if value == 0 else self._steps[value - 1].width
 
     def dense(self, x: int, W: npt.NDArray[Any], b: npt.NDArray[Any]) -> int:
-        """x Wᵀ + b of weights `[out, in]` and `[out]`."""
         return self._add("dense", (x,), len(b), W=W, b=b)
 
     def layers(self, x: int, layers: tuple[Layer, ...]) -> int:
@@ -147,7 +140,6 @@ class ProgramBuilder:
         return x
 
     def constant(self, v: npt.NDArray[Any]) -> int:
-        """The same row in every row."""
         return self._add("constant", (), len(v), v=v)
 
     def columns(self, x: int, columns: tuple[int, ...]) -> int:
@@ -157,7 +149,6 @@ class ProgramBuilder:
         return self._add("columns", (x,), len(columns), columns=columns)
 
     def concat(self, *values: int) -> int:
-        """Columns side by side."""
         if len(values) == 1:
             return values[0]
         return self._add("concat", values, sum(map(self.width, values)))
@@ -174,11 +165,9 @@ class ProgramBuilder:
         return self._add(op, (left,), max(widths), v=right)
 
     def unary(self, op: str, x: int, **numbers: float) -> int:
-        """A function of each entry, or of each row."""
         return self._add(op, (x,), self.width(x), **numbers)
 
     def affine(self, x: int, scale: float, shift: float) -> int:
-        """x scale + shift."""
         return self.binary("add", self.binary("mul", x, np.array([scale])), np.array([shift]))
 
     def append(self, program: NetworkProgram, x: int) -> int:
@@ -190,7 +179,6 @@ class ProgramBuilder:
         return numbers[-1]
 
     def build(self) -> NetworkProgram:
-        """The program; its output is the newest value."""
         return NetworkProgram(self.inputs, tuple(self._steps))
 
     def _add(self, op: str, inputs: tuple[int, ...], width: int, **parameters: Any) -> int:

@@ -8,7 +8,7 @@ import pytest
 from sme_registry import evaluate
 from sme_registry.diagnosis import Diagnosis, behaviour, diagnose, load_policy
 from sme_registry.diagnosis.figures import draw
-from sme_registry.diagnosis.measurements import POLICY
+from sme_registry.diagnosis.measure import POLICY
 from sme_registry.diagnosis.questions import THRESHOLDS
 from sme_registry.evaluation.references import reference_policy
 from tests.diagnosis.policies import (

@@ -7,7 +7,7 @@ import pytest
 
 from sme_registry import evaluate, materialize
 from sme_registry.diagnosis import behaviour, measure
-from sme_registry.diagnosis.measurements import POLICY
+from sme_registry.diagnosis.measure import POLICY
 from tests.diagnosis.policies import (
     DEEP,
     SPEC,

@@ -8,8 +8,8 @@ from jinja2 import UndefinedError
 
 from sme_registry import SMESpec
 from sme_registry.diagnosis import Diagnosis, diagnose, load_policy, questions
-from sme_registry.diagnosis.measurements import CapacityProbe, Measurements, TrainingSummary
-from sme_registry.diagnosis.questions import Comparison, Difference, label
+from sme_registry.diagnosis.behaviour import CapacityProbe, TrainingSummary
+from sme_registry.diagnosis.questions import Comparison, Difference, Measurements, label
 from sme_registry.diagnosis.task import TASK_QUESTIONS, TaskDiagnosis, judge
 from tests.diagnosis.policies import (
     EXTENDED,

@@ -9,13 +9,14 @@ import pytest
 
 from sme_registry import SMESpec, StreamSpec
 from sme_registry.diagnosis import StreamSubject, diagnose, load_cell, load_policy, load_run
-from sme_registry.diagnosis.behaviour import network_state
-from sme_registry.diagnosis.measurements import NetworkState, PhaseDiagnosis, VisitDiagnosis
+from sme_registry.diagnosis.behaviour import NetworkState, network_state
 from sme_registry.diagnosis.questions import OPEN_REASONS, answer_all
 from sme_registry.diagnosis.stream import (
     STREAM_QUESTIONS,
+    PhaseDiagnosis,
     StreamCase,
     StreamDiagnosis,
+    VisitDiagnosis,
     outcome_of,
 )
 from sme_registry.errors import OptionError, UnknownNameError

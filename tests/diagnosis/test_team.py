@@ -7,7 +7,7 @@ import pytest
 
 from sme_registry import SMESpec, evaluate, load
 from sme_registry.diagnosis import Diagnosis, diagnose, load_cell, load_policy, load_run
-from sme_registry.diagnosis.measurements import LINEAR, POLICY
+from sme_registry.diagnosis.measure import LINEAR, POLICY
 from sme_registry.diagnosis.questions import answer_all
 from sme_registry.diagnosis.team import TEAM_QUESTIONS, TeamCase, TeamDiagnosis
 from sme_registry.errors import OptionError, UnknownNameError
@@ -60,7 +60,7 @@ def test_an_unknown_question_or_agent_of_a_team_is_refused(one_fails):
     assert one_fails.verdict("unequal agents") is one_fails.verdict("unequal_agents")
     with pytest.raises(UnknownNameError, match="Did you mean 'blame'"):
         one_fails.verdict("blam")
-    with pytest.raises(UnknownNameError, match=r"must be one of scout_0, .* Did you mean 'driver_"):
+    with pytest.raises(UnknownNameError, match=r"must be 'scout_0', .* Did you mean 'driver_"):
         one_fails.agent("driver_2")
 
 

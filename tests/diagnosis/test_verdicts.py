@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from sme_registry.diagnosis import Subject, diagnose, load_policy
-from sme_registry.diagnosis.behaviour import Log
-from sme_registry.diagnosis.measurements import CapacityProbe
+from sme_registry.diagnosis.behaviour import CapacityProbe, Log
 from sme_registry.diagnosis.questions import Comparison, Difference, label
 from sme_registry.diagnosis.task import judge
 from sme_registry.errors import SMEError, UnknownNameError

@@ -6,7 +6,7 @@ from scipy import stats
 
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import references
-from sme_registry.evaluation.regions import _Shell, expansion, region_name
+from sme_registry.evaluation.regions import Points, expansion, region_name
 from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.task import materialize
 from tests.evaluation.kinds import observations
@@ -55,9 +55,9 @@ def test_states_within_distribution_fill_the_unit_cube_uniformly():
 def test_a_state_beside_the_opposite_face_is_not_rounded_over_it():
     # The float32 grid is finer below 0 than above 1, so both faces must be brought to the same E.
     epsilons = (0.2, 0.2000005)
-    shell = _Shell(EvaluationProtocol(epsilons=epsilons), 2, 8, "a stream")
+    points = Points(EvaluationProtocol(epsilons=epsilons), 2, 8, "a stream")
     for u in (2.0**-53, 1.0 - 2.0**-53):
-        E = expansion(shell.points(np.full((20_000, 8), u)).astype(np.float64))
+        E = expansion(points.in_shell(np.full((20_000, 8), u)).astype(np.float64))
         assert in_their_shell(E, epsilons, 2)
 
 
