@@ -136,7 +136,6 @@ class RecordRegret(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
         return observation, reward, terminated, truncated, info
 
     def close(self) -> None:
-        """Close the file and the environment."""
         self._recorder.close()
         self.env.close()
 
@@ -166,7 +165,6 @@ class RecordVectorRegret(VectorWrapper):
 
     @property
     def online_regret(self) -> float:
-        """Mean regret over all steps so far, in [0, 1]; NaN before the first."""
         return self._recorder.online_regret
 
     def reset(
@@ -179,7 +177,6 @@ class RecordVectorRegret(VectorWrapper):
         return result
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """One step of every environment."""
         observations, rewards, terminated, truncated, info = self.env.step(actions)
         numbers = _numbers(info)
         if "final_info" in info:  # SAME_STEP: `info` is of the next episode where one ended
@@ -204,7 +201,6 @@ class RecordVectorRegret(VectorWrapper):
         return spec
 
     def close(self, **kwargs: Any) -> None:
-        """Close the file and the environments."""
         self._recorder.close()
         self.env.close(**kwargs)
 
@@ -236,7 +232,6 @@ class StepWithCost(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
     def step(  # type: ignore[override]
         self, action: Any
     ) -> tuple[Any, Any, float, bool, bool, dict[str, Any]]:
-        """Observation, reward, cost, whether terminated, whether truncated, info."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         return observation, reward, float(info["cost"]), terminated, truncated, info
 
@@ -264,9 +259,8 @@ class VectorStepWithCost(VectorWrapper):
     ) -> tuple[Any, Any, Any, Any, Any, dict[str, Any]]:
         """Observations, rewards, costs, whether terminated, whether truncated, infos.
 
-        A cost is 0 where the step began an episode. In `SAME_STEP` mode, where `info` is of the
-        next episode, costs are those of the last step, and the last observations are also under
-        Safety-Gymnasium's name, `final_observation`.
+        A cost is 0 where the step began an episode. In `SAME_STEP` mode costs are those of the last
+        step, and last observations are also under Safety-Gymnasium's name, `final_observation`.
         """
         observations, rewards, terminated, truncated, info = self.env.step(actions)
         costs = np.nan_to_num(np.array(info["cost"], np.float64))

@@ -126,7 +126,6 @@ def behaviour_policy(
 
 
 def constant_policy(task: Task) -> BehaviourPolicy:
-    """a = ½ in every channel."""
     return lambda episodes: lambda s, observation: np.full((len(s), task.spec.action_dim), 0.5)
 
 
@@ -192,9 +191,9 @@ def collect(
 ) -> Transitions:
     """Generate the transitions of a recipe, one behaviour after another.
 
-    `task` is the recipe's, materialised; `policies` are the user's by the index of their behaviour.
-    `num_envs` episodes run at once (at most 512 by default); the numbers do not depend on it.
-    `progress` is called after each step with the transitions collected and their total.
+    `policies` are the user's by the index of their behaviour. `num_envs` episodes run at once (at
+    most 512 by default); the numbers do not depend on it. `progress` is called with the transitions
+    collected and their total.
 
     Examples:
       >>> from sme_registry.datasets import DatasetRecipe, collect
@@ -346,9 +345,8 @@ def reference_scores(
 ) -> ReferenceScores:
     """The scores of a data set's behaviour, of the constant ½ and of the optimum.
 
-    In the data set's own states they are exact, because π* is known there. By rollouts they are
-    means over whole episodes with their own starts, with standard errors; the optimum's return is
-    T. Numbers of a team are means over its agents. `policies` as in `collect`.
+    In the data set's own states they are exact. By rollouts they are means over whole episodes with
+    their own starts, with standard errors; the optimum's return is T.
     """
     stream, T = "dataset/reference", recipe.spec.horizon
     count = min(_SCORED_EPISODES, _MAX_SCORED_STEPS // T)

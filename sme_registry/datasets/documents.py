@@ -91,7 +91,6 @@ class Behaviour(StrictModel):
 
     @property
     def label(self) -> str:
-        """Its label in tables: `ν = 0.5`, `random`, or the policy's name."""
         return f"ν = {self.nu:g}" if self.nu is not None else self.policy or self.kind
 
 
@@ -136,7 +135,6 @@ class DatasetRecipe(Document):
 
     @property
     def shares(self) -> tuple[int, ...]:
-        """The number of transitions of each behaviour."""
         weights = itertools.accumulate(behaviour.weight for behaviour in self.behaviours)
         boundaries = [0, *(round(self.transitions * min(w, 1.0)) for w in weights)]
         boundaries[-1] = self.transitions
@@ -259,7 +257,7 @@ class DatasetRecord(StrictModel):
 
     @classmethod
     def from_dict(cls, data: Any, source: str = "") -> Self:
-        """Validate plain data, and the digests of its documents; errors call it `source`."""
+        """Validate plain data, and the digests of its documents."""
         version = data.get("schema_version") if isinstance(data, dict) else None
         if type(version) is int and version != 1:
             age = "an older" if version < 1 else "a newer"
@@ -391,7 +389,6 @@ class OfflineRecord(StrictModel):
 
     @property
     def similarity(self) -> float:
-        """Mean r̃ of the final policy's episodes."""
         return self.evaluations[-1].similarity
 
     @property

@@ -93,10 +93,7 @@ def weights(network: nn.Sequential) -> list[OfflineLayer]:
 def minibatches(
     data: Transitions | SealedDataset, batch_size: int, generator: torch.Generator
 ) -> Iterator[Minibatch]:
-    """Shuffled rows of a data set without end; every row is used once before any repeats.
-
-    The data set is one matrix, so that one gather gets all columns of a batch.
-    """
+    """Shuffled rows of a data set without end, from one matrix; all are used before any repeats."""
     columns = (
         data.observations,
         2.0 * data.actions - 1.0,
@@ -117,8 +114,6 @@ def minibatches(
 
 
 class BC(Networks):
-    """A policy from observations `[B, O]` to actions `[B, A]`, and its optimiser."""
-
     def __init__(
         self, observation_dim: int, action_dim: int, hyperparameters: BCHyperparameters
     ) -> None:
@@ -132,8 +127,6 @@ class BC(Networks):
 
 
 class IQL(Networks):
-    """A policy, two critics with their targets, a value function, and their optimiser."""
-
     def __init__(
         self, observation_dim: int, action_dim: int, hyperparameters: IQLHyperparameters
     ) -> None:
@@ -190,7 +183,7 @@ class OfflineLearner:
     """A policy that learns from the rows of a data set by gradient steps, on one thread.
 
     `about` is of the policy; its seed is that of initial weights and shuffles. PyTorch's own number
-    of threads and global generator are unchanged. `steps` and `cpu_seconds` are of all so far.
+    of threads and global generator are unchanged.
     """
 
     def __init__(
@@ -218,7 +211,6 @@ class OfflineLearner:
 
     @property
     def layers(self) -> list[OfflineLayer]:
-        """Copies of the policy's layers."""
         return weights(self._networks.actor)
 
     def advance(self, until: int, report: Callable[[int], None]) -> None:

@@ -120,7 +120,7 @@ def about_task(record: DatasetRecord) -> dict[str, Any]:
 def to_hdf5(columns: Arrays) -> bytes:
     """The content of `main_data.hdf5` with these columns; the same arrays give the same bytes.
 
-    Built in memory, so that a full disk fails one write instead of HDF5 in the middle of its work.
+    Built in memory, so that a full disk fails one write.
     """
     import h5py
 
@@ -146,10 +146,7 @@ def to_hdf5(columns: Arrays) -> bytes:
 
 
 def read_columns(folder: Path, *, visible: bool) -> Arrays:
-    """The columns of a data set, or only those that an agent sees.
-
-    The file may be a stranger's: it is read only as far as it is what `to_hdf5` writes.
-    """
+    """The columns of a data set; of a stranger's file, only what `to_hdf5` writes."""
     require_minari()
     path = folder / "data" / DATA
     try:

@@ -90,25 +90,17 @@ def train_offline(
 ) -> OfflineResult:
     """Train BC or IQL on a data set, on the CPU and one thread.
 
-    The same arguments give the same bits on one machine; other processors and builds of PyTorch
-    round differently.
+    The same arguments give the same bits on one machine. Every transition is used once before any
+    repeats. `progress` is called with the steps taken, their total, and a note.
 
     Args:
       data: a data set, its id or its path; or its arrays, with `spec`.
-      algorithm: "bc" or "iql", in any case.
-      steps: gradient steps, at least 1.
-      batch_size: transitions in each, in [1, N]. Every transition is used once before any repeats.
       seed: in [0, 2**53): of initial weights, shuffles, and the starts of evaluation episodes,
-        which depend on nothing else, so they are the same for both algorithms.
-      evaluations: number of evaluations during training, evenly spaced, in [1, steps]; the last one
-        is at the end.
-      episodes: of each evaluation, in [1, 4096].
+        which are the same for both algorithms.
+      evaluations: evenly spaced during training, in [1, steps]; the last one is at the end.
       hyperparameters: changes to the defaults, see `BCHyperparameters` and `IQLHyperparameters`.
-      spec: the task of arrays: a spec, its fields, an id, a digest or a path.
       protocol: of the final evaluation; None takes the data set's, and "paper-v1" for arrays.
-      folder: output folder, created if it is missing. None writes nothing.
-      force: replace an earlier training in the folder.
-      progress: called with the steps done, their total, and a note.
+      folder: output folder; None writes nothing, and `force` replaces an earlier training in it.
 
     Examples:
       >>> from sme_registry.datasets import train_offline
@@ -200,10 +192,9 @@ def train_sealed(
     hyperparameters: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> OfflinePolicy:
-    """Train BC or IQL on a sealed data set, on the CPU and one thread.
+    """Train BC or IQL on a sealed data set, or that in a folder, on the CPU and one thread.
 
-    The learners and arguments are those of `train_offline`. Nothing is evaluated: only the season's
-    board can. `data` may be the path of its folder; the policy's `save` writes an .npz file.
+    As `train_offline`, but nothing is evaluated: only the season's board can.
 
     Examples:
       >>> from sme_registry.datasets import DatasetRecipe, SealedDataset, train_sealed

@@ -87,7 +87,6 @@ class Dataset:
         return sum(file.stat().st_size for file in (self.path / "data").iterdir())
 
     def minari(self) -> Any:
-        """The data set as a `minari.MinariDataset`."""
         return minari_dataset(self.path / "data")
 
     def transitions(self) -> Transitions:
@@ -132,10 +131,7 @@ class SealedDataset(AlignedArrays):
         return cls(**read_columns(Path(path), visible=True))
 
     def agrees_with(self, other: Self) -> bool:
-        """Whether the other has the same transitions, up to what machines round differently.
-
-        Numbers may differ by 1e-6, the rounding of float32; the ends of episodes must be the same.
-        """
+        """Whether the other has the same transitions, up to 1e-6, which machines round differently."""
         columns = other.columns()
         return all(
             mine.shape == columns[name].shape and np.allclose(mine, columns[name], 0, 1e-6)
@@ -143,10 +139,7 @@ class SealedDataset(AlignedArrays):
         )
 
     def write(self, dataset_id: str, folder: str | os.PathLike[str]) -> Path:
-        """Write the data set in Minari's format, completely or not at all; returns its folder.
-
-        `dataset_id` is Minari's, `[namespace/]name-v<number>`; `folder` the root of all data sets.
-        """
+        """Write the data set in Minari's format, completely or not at all; returns its folder."""
         require_minari()
         target = Path(folder) / check_id(dataset_id)
         if os.path.lexists(target):
@@ -174,10 +167,9 @@ def make_dataset(
     """Generate a data set of a chosen quality and write it in Minari's HDF5 format.
 
     It is written completely or not at all. The same arguments give the same bits of every array and
-    the same bytes of the file.
+    the same bytes of the file. `progress` is called with the transitions collected and their total.
 
     Args:
-      spec_or_id: the task: a spec, its fields, an id, a digest or a path.
       nu: ν in [0, 1] of the mixture that acts: 0 is the optimum, 1 the worst. The default is 0.5
         unless `mix` is given.
       mix: several behaviour policies instead of `nu`: pairs of a policy (ν as a number; "random"; a
@@ -186,15 +178,12 @@ def make_dataset(
       transitions: N, the exact number; the last episode of each behaviour is truncated.
       seed: of the starts, each α, ã and random actions; independent of the task's. An integer in
         [0, 2⁵³), or hexadecimal text such as '0x9f86'.
-      coverage: ε in (−1, 0]: keeps only transitions from {s : ‖s − ½‖_∞ ≤ (1 + ε)/2}, so that
-        E(s) − ε of a state is its distance from the data.
-      protocol: for the evaluation of policies that learn from the data set; stored in its record.
+      coverage: ε in (−1, 0]: keeps only transitions from {s : ‖s − ½‖_∞ ≤ (1 + ε)/2}.
+      protocol: for the evaluation of policies that learn from the data set.
       action_range: of the policies' actions in `mix`; None takes their own.
       name: Minari's id, `[namespace/]name-v<number>`; None generates a descriptive one. A name that
-        is taken is a NameTakenError, which compares the two recipes.
+        is taken is a NameTakenError, unless `force` replaces a data set of this package.
       folder: the root of all data sets; None for Minari's folder.
-      force: replace an existing data set of this package.
-      progress: called after each step with the transitions collected and their total.
 
     Examples:
       >>> from sme_registry.datasets import make_dataset
@@ -306,7 +295,7 @@ def _check_target(target: Path, root: Path, recipe: DatasetRecipe, force: bool) 
 
 
 def _comparison(target: Path, recipe: DatasetRecipe) -> str:
-    """How an existing data set differs from a new one; empty if it cannot be opened."""
+    """How an existing data set differs from a new one."""
     try:
         existing = open_dataset(target).recipe
     except SMEError:
@@ -326,7 +315,6 @@ def _write(
     *,
     force: bool = False,
 ) -> Path:
-    """Write the files of a data set; with `force` an old one remains until then."""
     target = root / dataset_id
     content = to_hdf5(columns)
     metadata = metadata_of(dataset_id, columns, len(content))
@@ -405,11 +393,7 @@ def _open(path: Path) -> Dataset | None:
 
 
 def check_location(dataset: Dataset, folder: str | os.PathLike[str] | None = None) -> None:
-    """Raise SpecError if the path of a data set disagrees with its id, which would open another.
-
-    Inside the root of all data sets (None for Minari's folder), the path relative to it must equal
-    the id, as in Minari; elsewhere the path must end with the id.
-    """
+    """Raise SpecError if the path of a data set disagrees with its id, which would open another."""
     # Not resolved: a symbolic link in the right place is correct.
     path, root = Path(os.path.abspath(dataset.path)), Path(os.path.abspath(datasets_folder(folder)))
     inside = path.is_relative_to(root)

@@ -126,7 +126,7 @@ class Transitions(AlignedArrays):
 
     @property
     def ends(self) -> Indices:
-        """`[E]` the index after the last row of each of the `E` trajectories."""
+        """`[E]` the index after the last row of each trajectory."""
         return np.flatnonzero(self.terminations | self.timeouts) + 1
 
     @property
@@ -180,10 +180,9 @@ def replay(transitions: Transitions, recipe: DatasetRecipe, task: Task) -> None:
     """Check a data set against its recipe's task, as materialised on this machine.
 
     The next state must agree to the bit; π*, r̃, r, the reward, limits and costs to 1e-12; what an
-    agent sees through a mixing to 1e-6, as float32; and the rows of a trajectory must follow one
-    another. Driven distractors must agree to the bit. Others must lie in the cube: the random
-    numbers that move them are not in the data set. A FingerprintMismatchError names the first array
-    and row that differ from the task's.
+    agent sees through a mixing to 1e-6, as float32. Driven distractors must agree to the bit;
+    others must lie in the cube, as the random numbers that move them are not in the data set. A
+    FingerprintMismatchError names the first array and row that differ from the task's.
 
     Examples:
       >>> from sme_registry.datasets import open_dataset, replay
@@ -315,8 +314,7 @@ class ExactReturn:
     def over_states(self) -> tuple[ReturnEstimate, ReturnEstimate]:
         """The mean over all states, undiscounted and discounted, with its interval.
 
-        The interval assumes that the states are independent draws from a distribution. For rows of
-        the same trajectories it is too narrow.
+        The states must be independent draws: for rows of the same trajectories it is too narrow.
         """
         if len(self.lengths) < 2:
             raise OptionError("states: an interval over states requires at least 2 of them.")
@@ -338,9 +336,6 @@ def exact_return(
     """Run a policy from `M` states of a single-agent task to the end of the episode.
 
     Args:
-      policy: anything that `evaluate` accepts: a callable `[B, O] → [B, A]`, a model, or the
-        path of one.
-      spec: a spec, its fields, an id, a digest or a path.
       states: `[M, S]` in [0, 1]; `Transitions.states` are exact, its observations are rounded.
       t: `[M]` or one number, steps completed before, in [0, T).
       r_cum: `[M]` or one number, the rewards since the last payout, in [0, t mod k].
@@ -348,8 +343,7 @@ def exact_return(
         is then Q(s, a) instead of V(s).
       gamma: γ in [0, 1] of the discounted return.
       rollouts: episodes from each state: 1 for a deterministic policy, whose return is exact; more
-        for a stochastic one, whose mean gets a 95 % interval (Student's t). On a task with
-        distractors also more than 1: each episode draws them anew, at its start too.
+        for a stochastic one or distractors, whose mean gets a 95 % interval (Student's t).
       action_range: of the policy's actions; None takes its own, and "unit" for a callable.
 
     Examples:

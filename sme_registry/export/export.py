@@ -55,17 +55,14 @@ def export_onnx(
     names the operators that boards do not accept, if it has any.
 
     Args:
-      policy: a network from the task's observations `[B, O]` to actions `[B, A]`, one of
-        a `torch.nn.Module`, or a function of PyTorch tensors such as `lambda o: actor(o).mean`;
-        a `Perceptron` of arrays: a JAX network's parameters, or a linear map;
-        a Stable-Baselines3 model, or the path of its .zip (loading it can run code of its author);
-        an offline policy, or the path of its .npz.
-        Modules are exported in evaluation mode. For a team, the policy that all agents share.
+      policy: a `torch.nn.Module`, or a function of PyTorch tensors such as
+        `lambda o: actor(o).mean`; a `Perceptron` of arrays; a Stable-Baselines3 model, or the path of its .zip (loading it can
+        run code of its author); an offline policy, or the path of its .npz. For a team, the policy
+        that all agents share.
       action_range: of the policy's actions, "unit" for [0, 1] or "symmetric" for [−1, 1]; None
         takes an SB3 model's own action space, and "unit" for any other policy.
       vec_normalize: of an SB3 model, the `VecNormalize` of its training, or the path of its saved
-        file (which can run code too). None takes that of the model's environment, if any. A
-        model's .zip does not contain it.
+        file (which can run code too). None takes that of the model's environment, if any.
 
     Examples:
       >>> from sme_registry.evaluation import Perceptron
@@ -158,7 +155,6 @@ def _network(
 
 
 def _loaded(policy: Any) -> Any:
-    """The policy itself, from its path."""
     if not isinstance(policy, str | os.PathLike):
         return policy
     path = Path(policy)
@@ -194,7 +190,6 @@ def _finished(data: bytes, observation_dim: int, *, folded: bool) -> bytes:
 
 
 def _refused_by_boards(data: bytes) -> list[str]:
-    """The operators of a model that boards do not accept."""
     import onnx
 
     model = onnx.load_model_from_string(data)
@@ -236,10 +231,9 @@ _SIZES = "Shape", "Size"  # of their input they read the shape alone
 def _fold_shapes(model: Any, observation_dim: int) -> None:
     """Replace what is computed from shapes alone by the numbers that it computes, in place.
 
-    PyTorch writes `x.chunk(2, -1)` and `x.view(x.shape[0], -1)` with `Shape`, and computes sizes
-    from it, although only the batch size varies. Values that depend on no entry of the observations
-    are computed for two batch sizes; those that are equal, or that have equal rows, become
-    constants.
+    PyTorch computes sizes from `Shape`, although only the batch size varies. What depends on no
+    entry of the observations is computed for two batch sizes; what is equal, or has equal rows,
+    becomes a constant.
     """
     import onnx
 

@@ -90,8 +90,6 @@ def _to_onnx(perceptron: Perceptron, symmetric: bool) -> bytes:
 
 
 class _Graph:
-    """Nodes and constants of a graph, named by their order."""
-
     def __init__(self) -> None:
         self.nodes: list[Any] = []
         self.constants: list[Any] = []
@@ -283,7 +281,6 @@ def _policy_of(model: Any) -> Any:
 
 
 def _is_symmetric(network: Any) -> bool:
-    """Whether the action space is [−1, 1] and not [0, 1]; others are rejected."""
     space = network.action_space
     for low in (0.0, -1.0):
         if np.all(getattr(space, "low", None) == low) and np.all(space.high == 1.0):
@@ -295,7 +292,6 @@ def _is_symmetric(network: Any) -> bool:
 
 
 def _normaliser(model: Any, vec_normalize: Any, width: int) -> Any:
-    """The VecNormalize that rescales observations, or None."""
     from stable_baselines3.common.vec_env import VecNormalize
 
     normaliser = vec_normalize

@@ -51,7 +51,6 @@ _Array = npt.NDArray[np.float32]
 
 
 def _spec_with_limits(algorithm: str, env: Any) -> SMESpec:
-    """The spec of an environment's task, which must have `safety`."""
     try:
         spec: SMESpec = env.get_attr("sme_spec")[0]
     except AttributeError:
@@ -65,11 +64,8 @@ def _spec_with_limits(algorithm: str, env: Any) -> SMESpec:
 class PPOLagrangian(PPO):  # type: ignore[misc, unused-ignore]  # an untyped class without SB3
     """PPO with a limit on the mean cost of a step, for tasks with `safety`; see the module.
 
-    `cost_limit` is d, the mean cost of a step that is allowed while exploring, in [0, 1];
-    `multiplier` λ at the start; `multiplier_learning_rate` η, where 0 keeps λ.
-
-    Attributes:
-      multiplier: the present λ.
+    `cost_limit` is d in [0, 1], `multiplier` λ, at the start and then at present, and
+    `multiplier_learning_rate` η, where 0 keeps λ.
 
     Examples:
       >>> from sme_registry.sb3 import PPOLagrangian, SMEVecEnv
@@ -120,7 +116,6 @@ class PPOLagrangian(PPO):  # type: ignore[misc, unused-ignore]  # an untyped cla
         return [*super()._excluded_save_params(), "_costs", "_cut"]  # the last rollout
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> bool:
-        """Collect a rollout as PPO does, and its costs."""
         self._costs: list[_Array] = []  # [lanes] of each step
         self._cut: list[tuple[int, int, Any]] = []  # step, lane and last observation, if truncated
         return bool(super().collect_rollouts(*args, **kwargs))
@@ -188,7 +183,6 @@ class PPOLagrangian(PPO):  # type: ignore[misc, unused-ignore]  # an untyped cla
         return np.asarray(values.cpu().numpy().reshape(-1))
 
     def _train_cost_critic(self, observations: Any, returns: _Array) -> None:
-        """Fit the critic to returns, in as many minibatches as PPO's critic."""
         inputs = torch.as_tensor(observations.reshape(-1, *observations.shape[2:]))
         targets = torch.as_tensor(returns.reshape(-1))
         self._update_learning_rate(self.cost_critic.optimizer)
@@ -245,16 +239,13 @@ class ProjectedVecEnv(VecEnvWrapper):  # type: ignore[misc, unused-ignore]  # un
         self._observations: Any = None
 
     def reset(self) -> Any:
-        """Begin an episode in every lane."""
         self._observations = self.venv.reset()
         return self._observations
 
     def step_async(self, actions: Any) -> None:
-        """Store the projected actions for `step_wait`."""
         self.venv.step_async(self._projection(actions, self._observations))
 
     def step_wait(self) -> Any:
-        """One step of every lane."""
         result = self.venv.step_wait()
         self._observations = result[0]
         return result

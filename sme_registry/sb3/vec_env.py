@@ -36,15 +36,7 @@ StepResult: TypeAlias = tuple[Observation, npt.NDArray[np.float32], Mask, list[d
 
 
 class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped class without SB3
-    """The part of a `VecEnv` that does not depend on how its lanes are stepped.
-
-    Each of `lanes` has its attributes, such as its spaces.
-
-    Examples:
-      >>> from sme_registry.sb3 import LanesVecEnv, SMEVecEnv
-      >>> isinstance(SMEVecEnv("Default"), LanesVecEnv)
-      True
-    """
+    """A `VecEnv` apart from how its lanes are stepped; `lanes` have their attributes."""
 
     def __init__(self, lanes: list[Any]) -> None:
         self._lanes = lanes
@@ -53,23 +45,19 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped cl
 
     @property
     def sme_spec(self) -> SMESpec:
-        """The spec of the task that is run, overrides included."""
         spec: SMESpec = self._lanes[0].sme_spec
         return spec
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
-        """Store the actions, a row for each lane, for `step_wait`."""
         self._actions = actions
 
     def _take_actions(self) -> npt.NDArray[Any]:
-        """The actions stored by `step_async`, which are then cleared."""
         if self._actions is None:
             raise EpisodeError("step_wait: there are no actions. Call step_async(actions) first.")
         actions, self._actions = self._actions, None
         return actions
 
     def _clear_reset_arguments(self) -> None:
-        """Forget seeds and options: every lane has begun an episode with them."""
         self._reset_seeds()
         self._reset_options()
 
@@ -81,7 +69,6 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped cl
         return [getattr(self._lanes[i], attr_name) for i in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of each lane."""
         for i in self._get_indices(indices):
             setattr(self._lanes[i], attr_name, value)
 
@@ -92,7 +79,6 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped cl
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """Call a method of each lane, such as `reset` of a single agent's."""
         methods = self.get_attr(method_name, indices)
         return [method(*method_args, **method_kwargs) for method in methods]
 
@@ -106,8 +92,6 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped cl
 
 
 class _Start(NamedTuple):
-    """How an episode begins; None for the lane's own."""
-
     seed: int | None
     state: Array | None
     distractors: Array | None
@@ -120,7 +104,6 @@ class _SingleLane(EnvView):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode in this lane alone; see `SMEEnv.reset`."""
         start = self._owner._start(seed, [options or {}])
         observations = self._owner._begin({self._index: start})
         return observations[self._index], self._owner._info_at_reset(self._index)
@@ -170,7 +153,6 @@ class _BatchVecEnv(LanesVecEnv):
         return self._batch.document
 
     def _repr_html_(self) -> str:
-        """A card for notebooks: spaces, episodes and task."""
         spaces = self.observation_space, self.action_space
         return html_card(self, *spaces, autoreset=AutoresetMode.SAME_STEP.value)
 
@@ -191,7 +173,6 @@ class _BatchVecEnv(LanesVecEnv):
         return self._seeds
 
     def reset(self) -> Observation:
-        """Begin an episode in every lane, with the seeds and options set before."""
         n = len(self.agents)
         options = [self._options[team * n : (team + 1) * n] for team in range(self.num_teams)]
         starts = [*map(self._start, self._seeds[::n], options)]
@@ -201,7 +182,6 @@ class _BatchVecEnv(LanesVecEnv):
         return observations
 
     def _begin(self, teams: dict[int, _Start]) -> Observation:
-        """Begin an episode in these teams."""
         joint = self._batch.observe()
         for team, start in teams.items():
             if start.seed is not None:
@@ -231,7 +211,6 @@ class _BatchVecEnv(LanesVecEnv):
         return _Start(arguments.checked_seed(seed), state, distractors, lifetime)
 
     def step_wait(self) -> StepResult:
-        """One step of every lane."""
         actions = self._take_actions()
         if not self._begun.all():
             raise EpisodeError("step: the episodes have not begun. Call reset() first.")
@@ -268,11 +247,9 @@ class _BatchVecEnv(LanesVecEnv):
         return self._observations(step.observation), reward, dones, lane_infos
 
     def _observations(self, joint: Observation) -> Observation:
-        """Each lane's observation, from joint observations `[teams, S + 1 + n]`."""
         return joint
 
     def _joint_actions(self, unit: Array) -> Array:
-        """Joint actions `[teams, A]`, from those of all lanes in the unit range."""
         return unit
 
 
@@ -371,14 +348,12 @@ class SingleVecEnv(LanesVecEnv):
         super().__init__([self._env])
 
     def reset(self) -> Observation:
-        """Begin an episode with the seed and options set before; observations `[1, …]`."""
         observation, info = self._env.reset(seed=self._seeds[0], options=self._options[0] or None)
         self.reset_infos = [info]
         self._clear_reset_arguments()
         return observation[None]
 
     def step_wait(self) -> StepResult:
-        """One step; see `SMEVecEnv.step_wait`."""
         observation, reward, terminated, truncated, info = self._env.step(self._take_actions()[0])
         ended = terminated or truncated
         info["TimeLimit.truncated"] = truncated and not terminated
