@@ -131,7 +131,7 @@ class SealedDataset(AlignedArrays):
         return cls(**read_columns(Path(path), visible=True))
 
     def agrees_with(self, other: Self) -> bool:
-        """Whether the other has the same transitions, up to 1e-6, which machines round differently."""
+        """Whether the other has the same transitions, up to 1e-6: machines round differently."""
         columns = other.columns()
         return all(
             mine.shape == columns[name].shape and np.allclose(mine, columns[name], 0, 1e-6)

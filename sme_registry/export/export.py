@@ -56,9 +56,9 @@ def export_onnx(
 
     Args:
       policy: a `torch.nn.Module`, or a function of PyTorch tensors such as
-        `lambda o: actor(o).mean`; a `Perceptron` of arrays; a Stable-Baselines3 model, or the path of its .zip (loading it can
-        run code of its author); an offline policy, or the path of its .npz. For a team, the policy
-        that all agents share.
+        `lambda o: actor(o).mean`; a `Perceptron` of arrays; a Stable-Baselines3 model, or the path
+        of its .zip (loading it can run code of its author); an offline policy, or the path of its
+        .npz. For a team, the policy that all agents share.
       action_range: of the policy's actions, "unit" for [0, 1] or "symmetric" for [−1, 1]; None
         takes an SB3 model's own action space, and "unit" for any other policy.
       vec_normalize: of an SB3 model, the `VecNormalize` of its training, or the path of its saved
