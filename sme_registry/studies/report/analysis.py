@@ -6,10 +6,10 @@ Missing runs are part of no number but counts.
 
 from __future__ import annotations
 
-import itertools
+import json
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,11 +20,11 @@ import pandas as pd
 from sme_registry import statistics
 from sme_registry.evaluation import retention
 from sme_registry.evaluation.dynamic_regret import DynamicRegret
-from sme_registry.spec import StudyFile, StudyPlan
+from sme_registry.spec import ObservationSpec, StreamSpec, StudyFile, StudyPlan, SuiteClass
+from sme_registry.spec.cards import symbol
 from sme_registry.spec.study import PlannedCell
 from sme_registry.statistics import Array, Statistic
 from sme_registry.studies.engine.result import CellResult
-from sme_registry.studies.report.classes import ALL, ClassInfo, Group, StreamInfo
 from sme_registry.studies.report.frames import FinishedLife, frame
 
 # With fewer runs an interval is an indication only. Of normal, exponential and two-humped runs, a
@@ -35,12 +35,179 @@ OFFLINE_INTERVAL = 4  # with fewer runs a mean improvement has no interval at al
 PLACE = ["class_name", "algorithm"]
 PLACE_COLUMNS = "class_name:str algorithm:str "
 INTERVAL = "runs:int64 iqm low high"
-DIFFERENCES = (
-    "first:str second:str metric:str class_name:str first_level second_level difference low high "
-    "pairs:int64 instances:int64 enough_pairs:bool verdict:str"
-)
 CURVES = {"episode_return": "return, % of optimum", "regret": "mean regret per step"}
 WITHIN, OUTSIDE = "WD", "OOD"
+ALL = "all classes"
+SEVERAL = "several axes"
+TASKS, SCHEDULE = "tasks", "schedule"  # axes of streams
+_AXES = {
+    "state_dim": "state dimension",
+    "action_dim": "action dimension",
+    "k": "reward interval",
+    "r_min": "minimum reward",
+    "D": "survival threshold",
+    "complexity": "complexity",
+    "horizon": "horizon",
+    "hidden_width": "hidden width",
+    "rotation": "rotation",
+    "safety.tightness": "tightness",
+}
+AXES = {field: (symbol(field), f"{words} {symbol(field)}") for field, words in _AXES.items()} | {
+    field: (field, field) for field in ("observation", "policy_init")
+}
+"""Symbol and name of each field that studies vary, in the order of reports."""
+
+
+@dataclass(frozen=True)
+class ClassInfo:
+    """A class of the plan, compared with the first one.
+
+    `axis` is the field in which it differs, dotted within a team (`team.reward`) or an observation;
+    "" for the first; `SEVERAL`. `policy_init` counts only if nothing else differs: deep tasks need
+    another one. `setting` has every field; the tightness is 0 without safety.
+    """
+
+    name: str
+    axis: str
+    label: str
+    setting: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class StreamInfo:
+    """A class of streams, by its first draw.
+
+    Its axis is what differs from the plan's first stream: "" for itself, `TASKS` if nothing else
+    differs, or `SCHEDULE`.
+    """
+
+    name: str
+    stream: StreamSpec
+    axis: str
+
+    @property
+    def related(self) -> bool:
+        """Whether all phases are rotations of one task."""
+        return len({phase.spec.derive(rotation=0.0) for phase in self.stream.phases}) == 1
+
+
+@dataclass(frozen=True)
+class Group:
+    """The classes with runs along one axis, in the order of its values; or all, with axis "".
+
+    `values` are empty without a common axis. In `compared` every algorithm has finished runs.
+    """
+
+    name: str
+    axis: str
+    classes: tuple[str, ...]
+    values: tuple[Any, ...]
+    compared: tuple[str, ...]
+
+
+def class_infos(plan: StudyPlan) -> dict[str, ClassInfo]:
+    return {member.name: _class_info(member, plan.classes[0]) for member in plan.classes}
+
+
+def stream_infos(plan: StudyPlan) -> dict[str, StreamInfo]:
+    infos: dict[str, StreamInfo] = {}
+    for member in plan.streams:
+        stream = member.instances[0]
+        base = next(iter(infos.values()), None)
+        alike = base is not None and stream.switches == base.stream.switches
+        axis = "" if base is None else TASKS if alike else SCHEDULE
+        infos[member.name] = StreamInfo(member.name, stream, axis)
+    return infos
+
+
+def groups(
+    classes: Mapping[str, ClassInfo],
+    algorithms: Sequence[str],
+    finished: Collection[tuple[str, str]],
+) -> tuple[Group, ...]:
+    """All classes, then for each axis its classes together with the first one."""
+    if not classes:
+        return ()
+    first, *others = classes.values()
+    unnamed = [c.axis for c in others if c.axis not in ("", *AXES, SEVERAL)]
+    result = []
+    for axis in dict.fromkeys(("", *AXES, *unnamed, SEVERAL)):
+        members = [first, *(c for c in others if axis in ("", c.axis))]
+        values = [] if axis in ("", SEVERAL) else [c.setting.get(axis) for c in members]
+        if is_numeric(values):
+            members.sort(key=lambda c: c.setting[axis])
+        present = [c for c in members if any((c.name, a) in finished for a in algorithms)]
+        if present and (not axis or len(members) > 1):
+            names = tuple(c.name for c in present)
+            compared = (n for n in names if all((n, a) in finished for a in algorithms))
+            known = tuple(c.setting.get(axis) for c in present) if values else ()
+            result.append(Group(axis_label(axis) or ALL, axis, names, known, tuple(compared)))
+    return tuple(result)
+
+
+def axis_label(axis: str) -> str:
+    """What an axis is called: `reward interval k`."""
+    return AXES[axis][1] if axis in AXES else axis
+
+
+def is_numeric(values: Sequence[Any]) -> bool:
+    return bool(values) and all(type(value) in (int, float) for value in values)
+
+
+def setting_label(field: str, value: Any, *, with_symbol: bool = True) -> str:
+    """`k = 25`, or `25` without the symbol of the field."""
+    text = value
+    if not isinstance(value, str):
+        text = f"{value:g}" if is_numeric([value]) else _json(value)
+    return f"{AXES.get(field, (field,))[0]} = {text}" if with_symbol else text
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, separators=(",", ":"), ensure_ascii=False)
+
+
+def _class_info(member: SuiteClass, first: SuiteClass) -> ClassInfo:
+    setting, base = _setting(member), _setting(first)
+    differing = [name for name in AXES if name != "observation" and setting[name] != base[name]]
+    for block in ("observation", "team"):
+        within = [n for n in dict.fromkeys((*base, *setting)) if n.partition(".")[0] == block]
+        within = [name for name in within if setting.get(name) != base.get(name)]
+        both = getattr(member.setting, block) and getattr(first.setting, block)
+        differing += within if len(within) == 1 and both else [block] * bool(within)
+    if len(differing) > 1 and "policy_init" in differing:
+        differing.remove("policy_init")
+    agents = 0 if member.setting.team is None else len(member.setting.team.agents)
+    setting["team"] = f"{agents} agents" if agents else "none"
+    setting["observation"] = _observation(member.setting.observation)
+    axis = differing[0] if len(differing) == 1 else SEVERAL if differing else ""
+    label = ", ".join(setting_label(name, setting[name]) for name in differing)
+    return ClassInfo(member.name, axis, label, setting)
+
+
+def _setting(member: SuiteClass) -> dict[str, Any]:
+    return {"safety.tightness": 0.0} | _flat(member.setting.every_field())
+
+
+def _observation(observation: ObservationSpec | None) -> str:
+    """An observation in words: `32 driven, nonlinear 1`."""
+    if observation is None:
+        return "state"
+    distractors = f"{observation.distractors} {observation.dynamics}"
+    mixing = " ".join(str(part) for part in (observation.mixing, observation.mixing_depth) if part)
+    parts = [distractors] * bool(observation.distractors) + [mixing] * (mixing != "none")
+    return ", ".join(parts)
+
+
+def _flat(fields: Any, prefix: str = "") -> dict[str, Any]:
+    """The values of nested plain data by their dotted names; lists of numbers are values."""
+    flat: dict[str, Any] = {}
+    for key, value in fields.items() if isinstance(fields, dict) else enumerate(fields):
+        name = f"{prefix}{key}"
+        nested = isinstance(value, dict) or (
+            isinstance(value, list) and any(isinstance(item, dict) for item in value)
+        )
+        flat |= _flat(value, f"{name}.") if nested else {name: value}
+    return flat
 
 
 @dataclass(frozen=True)
@@ -295,47 +462,6 @@ def summary(
                 yield (
                     *at, *where, metric.key, len(values), float(statistic(values)[0]), *ends
                 )  # fmt: skip
-
-
-def differences(
-    runs: pd.DataFrame,
-    pairs: Iterable[tuple[str, str]],
-    metrics: Sequence[Metric],
-    draws: int = statistics.DRAWS,
-    instance: str = "spec_digest",
-) -> Iterator[tuple[Any, ...]]:
-    """How the first algorithm of each pair differs from the second, on each class and on all.
-
-    Two runs of equal number on a class have the same instance and seed, and form a pair. The
-    intervals depend only on the runs and the names, and those of B − A mirror those of A − B.
-    """
-    on = ["class_name", instance, "seed"]
-    for (first, second), metric in itertools.product(pairs, metrics):
-        left, right = (
-            runs.loc[runs.algorithm == name, [*on, metric.key]] for name in (first, second)
-        )
-        merged = left.merge(right, on=on, suffixes=("_1", "_2")).dropna()
-        groups = dict(iter(merged.groupby("class_name", sort=False)))
-        bootstrap = Bootstrap(" ".join(("difference", *sorted((first, second)))), draws)
-        parts: list[tuple[str, dict[Any, pd.DataFrame], tuple[str, ...]]] = [
-            (str(name), {"": group}, (str(name),)) for name, group in groups.items()
-        ]
-        if len(groups) > 1:
-            parts.append((ALL, groups, ()))
-        for name, part, place in parts:
-            columns = [f"{metric.key}_1", f"{metric.key}_2"]
-            both = {key: group[columns].to_numpy() for key, group in part.items()}
-            change = {key: x[:, :1] - x[:, 1:] for key, x in both.items()}
-            ends = bootstrap.interval(change, *place, metric.key)
-            middle = float(statistics.aggregate(change)[0])
-            enough = min(map(len, both.values())) >= ENOUGH_RUNS
-            verdict = change_verdict(middle * metric.worse, *ends)
-            yield (
-                first, second, metric.key, name, *statistics.aggregate(both), middle, *ends,
-                sum(map(len, both.values())),
-                sum(group[instance].nunique() for group in part.values()), enough,
-                verdict if enough or verdict == "open" else "indication",
-            )  # fmt: skip
 
 
 def change_verdict(worsening: float, low: float, high: float) -> str:

@@ -42,6 +42,7 @@ from sme_registry.studies.report.analysis import (
     OF_VISITS,
     PLACE_COLUMNS,
     RETENTION,
+    TASKS,
     WITHIN,
     Analysis,
     Metric,
@@ -49,7 +50,6 @@ from sme_registry.studies.report.analysis import (
     summary,
     table,
 )
-from sme_registry.studies.report.classes import TASKS
 from sme_registry.studies.report.findings import (
     THRESHOLDS,
     Found,

@@ -1,5 +1,4 @@
-"""`analyse`: the tables of a study's runs on single tasks; `offline` and
-`streams` have others.
+"""`analyse`: the tables of a study's runs on single tasks; `offline` and `streams` have others.
 
 An unknown interval end is NaN.
 
@@ -40,7 +39,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,8 +52,8 @@ from sme_registry.spec.study import parse_uses
 from sme_registry.statistics import Array, Statistic
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.report.analysis import (
+    ALL,
     CURVES,
-    DIFFERENCES,
     ENOUGH_RUNS,
     INTERVAL,
     METRICS,
@@ -62,16 +61,18 @@ from sme_registry.studies.report.analysis import (
     PLACE_COLUMNS,
     Analysis,
     Bootstrap,
+    Metric,
     RunKind,
     by_place,
     change_verdict,
-    differences,
+    class_infos,
+    groups,
+    stream_infos,
     summary,
     table,
     training_data,
     with_tables,
 )
-from sme_registry.studies.report.classes import class_infos, groups, stream_infos
 from sme_registry.studies.report.frames import (
     RUN,
     finished_lives,
@@ -92,6 +93,10 @@ STATISTICS: dict[str, Statistic] = {
     "median": statistics.median,
     "optimality_gap": statistics.optimality_gap,
 }
+DIFFERENCES = (
+    "first:str second:str metric:str class_name:str first_level second_level difference low high "
+    "pairs:int64 instances:int64 enough_pairs:bool verdict:str"
+)
 AGENT_METRICS = (*METRICS[:2], METRICS[4])
 _GROUP = "group:str metric:str "
 
@@ -184,6 +189,47 @@ def _contrasts(analysis: Analysis, part: RunKind) -> Iterator[tuple[Any, ...]]:
 def _differences(analysis: Analysis, part: RunKind) -> Iterator[tuple[Any, ...]]:
     pairs, draws = itertools.combinations(part.algorithms, 2), analysis.bootstrap.draws
     return differences(part.runs, pairs, part.metrics, draws, part.instance)
+
+
+def differences(
+    runs: pd.DataFrame,
+    pairs: Iterable[tuple[str, str]],
+    metrics: Sequence[Metric],
+    draws: int = statistics.DRAWS,
+    instance: str = "spec_digest",
+) -> Iterator[tuple[Any, ...]]:
+    """How the first algorithm of each pair differs from the second, on each class and on all.
+
+    Two runs of equal number on a class have the same instance and seed, and form a pair. The
+    intervals depend only on the runs and the names, and those of B − A mirror those of A − B.
+    """
+    on = ["class_name", instance, "seed"]
+    for (first, second), metric in itertools.product(pairs, metrics):
+        left, right = (
+            runs.loc[runs.algorithm == name, [*on, metric.key]] for name in (first, second)
+        )
+        merged = left.merge(right, on=on, suffixes=("_1", "_2")).dropna()
+        groups = dict(iter(merged.groupby("class_name", sort=False)))
+        bootstrap = Bootstrap(" ".join(("difference", *sorted((first, second)))), draws)
+        parts: list[tuple[str, dict[Any, pd.DataFrame], tuple[str, ...]]] = [
+            (str(name), {"": group}, (str(name),)) for name, group in groups.items()
+        ]
+        if len(groups) > 1:
+            parts.append((ALL, groups, ()))
+        for name, part, seed in parts:
+            columns = [f"{metric.key}_1", f"{metric.key}_2"]
+            both = {key: group[columns].to_numpy() for key, group in part.items()}
+            change = {key: x[:, :1] - x[:, 1:] for key, x in both.items()}
+            ends = bootstrap.interval(change, *seed, metric.key)
+            middle = float(statistics.aggregate(change)[0])
+            enough = min(map(len, both.values())) >= ENOUGH_RUNS
+            verdict = change_verdict(middle * metric.worse, *ends)
+            yield (
+                first, second, metric.key, name, *statistics.aggregate(both), middle, *ends,
+                sum(map(len, both.values())),
+                sum(group[instance].nunique() for group in part.values()), enough,
+                verdict if enough or verdict == "open" else "indication",
+            )  # fmt: skip
 
 
 @table("learning_curves", "", both=True)

@@ -19,13 +19,13 @@ from sme_registry.studies.report.analysis import (
     OF_VISITS,
     OFFLINE_INTERVAL,
     OUTSIDE,
+    SCHEDULE,
     SPECIAL_METRICS,
     TABLES,
     WITHIN,
     Analysis,
     Metric,
 )
-from sme_registry.studies.report.classes import SCHEDULE
 
 _ABSENT = "–"
 _STATISTICS = {"iqm": "IQM", "median": "median", "optimality_gap": "optimality gap"}

@@ -37,12 +37,10 @@ from sme_registry.spec import StudyFile
 from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.ledger import REPORT, Ledger, label, requested
 from sme_registry.studies.report.analysis import (
-    DIFFERENCES,
     METRICS,
     SPECIAL_METRICS,
     Analysis,
     Metric,
-    differences,
     metrics_of,
 )
 from sme_registry.studies.report.figures import (
@@ -54,7 +52,7 @@ from sme_registry.studies.report.figures.curves import draw_class_curves
 from sme_registry.studies.report.figures.panels import Picture
 from sme_registry.studies.report.findings import THRESHOLDS, findings
 from sme_registry.studies.report.frames import StudyFrames, frame, load, records, runs_of
-from sme_registry.studies.report.tables import analyse
+from sme_registry.studies.report.tables import DIFFERENCES, analyse, differences
 from sme_registry.studies.report.texts import TextTable, csv_tables, difference_table, text_tables
 
 DEFAULT_METRICS = ("wd_regret", "ood_regret")  # of comparisons

@@ -14,9 +14,8 @@ from sme_registry.errors import SMEError
 from sme_registry.evaluation import as_policy
 from sme_registry.plots import maps, style
 from sme_registry.plots.style import GREY, literal, new_figure
-from sme_registry.studies.report.analysis import METRICS, Analysis, by_place
-from sme_registry.studies.report.classes import ALL
-from sme_registry.studies.report.figures import curves, panels, streams
+from sme_registry.studies.report.analysis import ALL, METRICS, Analysis, by_place
+from sme_registry.studies.report.figures import curves, panels
 from sme_registry.studies.report.figures.panels import (
     FEW,
     HEADINGS,
@@ -64,7 +63,7 @@ def draw(
 
 def draw_figures(analysis: Analysis, formats: Sequence[str]) -> tuple[list[Picture], list[str]]:
     from_tasks = TASK_FIGURES if analysis.algorithms else ()
-    from_streams = streams.FIGURES if analysis.lives else ()
+    from_streams = curves.STREAM_FIGURES if analysis.lives else ()
     return draw((*from_tasks, *from_streams), analysis, formats)
 
 

@@ -28,8 +28,7 @@ from sme_registry.plots.style import (
     wrapped,
 )
 from sme_registry.statistics import Array
-from sme_registry.studies.report.analysis import ENOUGH_RUNS, Analysis
-from sme_registry.studies.report.classes import is_numeric
+from sme_registry.studies.report.analysis import ENOUGH_RUNS, Analysis, is_numeric
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
