@@ -15,14 +15,12 @@ from typing import TYPE_CHECKING, Any
 from sme_registry.errors import SMEError
 from sme_registry.registration import (
     env_spec,
-    load,
     make,
     make_aec,
     make_parallel,
     make_vec,
     register,
     register_catalogue,
-    save,
 )
 from sme_registry.version import __version__ as __version__
 
@@ -51,7 +49,8 @@ if TYPE_CHECKING:
     from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
     from sme_registry.studies import compare, run_study
     from sme_registry.studies import load as load_study
-    from sme_registry.task import Task, materialize
+    from sme_registry.task import Task, load, materialize
+    from sme_registry.task.loading import save
     from sme_registry.training import train
 
 __all__ = [
@@ -93,10 +92,12 @@ _LAZY = {
     "diagnose": "sme_registry.diagnosis.diagnose",
     "evaluate": "sme_registry.evaluation.evaluate",
     "export_onnx": "sme_registry.export.export_onnx",
+    "load": "sme_registry.task.load",
     "load_study": "sme_registry.studies.load",
     "make_dataset": "sme_registry.datasets.make_dataset",
     "materialize": "sme_registry.task.materialize",
     "run_study": "sme_registry.studies.run_study",
+    "save": "sme_registry.task.loading.save",
     "train": "sme_registry.training.train",
     "train_offline": "sme_registry.datasets.train_offline",
 }

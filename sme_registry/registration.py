@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, overload
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
@@ -18,7 +16,6 @@ from sme_registry.spec.catalogue import (
     STREAM,
     SYMMETRIC,
     as_document,
-    file_of,
     registered,
     released,
     resolve,
@@ -31,8 +28,6 @@ if TYPE_CHECKING:
     from pettingzoo import AECEnv
 
     from sme_registry.envs.team import SMETeamEnv
-
-_S = TypeVar("_S")
 
 _ENTRY_POINTS: dict[str, Any] = {
     "entry_point": "sme_registry.envs:SMEEnv",
@@ -60,9 +55,6 @@ def _is_registered(env_id: str) -> bool:
 
 def register_catalogue() -> None:
     """Register every task and stream of `specs/` by its name and by its content, unvalidated.
-
-    The name of a single agent's task or of a stream is registered once more with actions in
-    [−1, 1]: `SME/DefaultSymmetric-v1`. A stream also has the name `SME/StreamSwitch5-v1`.
 
     Gymnasium's `register` scans its whole registry each time: keep this to the catalogue.
     """
@@ -116,72 +108,6 @@ def register(spec: SMESpec | StreamSpec, name: str) -> str:
     kind = "team" if document.specs[0].team else document.kind
     _register(env_id, kind, document.to_dict())
     return env_id
-
-
-@overload
-def load(id_or_path_or_digest: str | os.PathLike[str]) -> SMESpec | StreamSpec: ...
-@overload
-def load(id_or_path_or_digest: str | os.PathLike[str], kind: type[_S]) -> _S: ...
-def load(id_or_path_or_digest: str | os.PathLike[str], kind: Any = None) -> Any:
-    """The spec or stream of an id, a file's path, or a digest.
-
-    The task of a file is drawn here, to check that this machine draws its published numbers
-    (FingerprintMismatchError). UnknownNameError suggests the nearest name.
-
-    Args:
-      id_or_path_or_digest: the name.
-      kind: `SMESpec` or `StreamSpec`, to accept no other and to tell a type checker which it is;
-        None takes what the name stands for.
-
-    Examples:
-      >>> sme_registry.load("Complexity10").complexity
-      10
-      >>> sme_registry.load("sha256:66e9b7a9a266").content_name
-      'sha256-66e9b7a9a266'
-    """
-    from sme_registry import task
-
-    return task.load(id_or_path_or_digest, kind)
-
-
-def save(
-    spec: SMESpec | StreamSpec,
-    path: str | os.PathLike[str],
-    name: str | None = None,
-    *,
-    description: str = "",
-    tags: tuple[str, ...] = (),
-) -> Path:
-    """Write a spec or a stream as a file that a colleague can `load`, with digest and fingerprint.
-
-    Args:
-      spec: the spec, or the stream.
-      path: the file to write; its folder is created. An existing file is replaced, completely
-        or not at all.
-      name: letters, digits, '_' and '-'; by default the file's name without its ending.
-      description: one or two sentences.
-      tags: keywords, for `sme list --tag`.
-
-    Examples:
-      >>> spec = sme_registry.SMESpec(state_dim=16, complexity=10, seed=7)
-      >>> path = sme_registry.save(spec, "Deep16.json", description="Sixteen channels, ten layers.")
-      >>> sme_registry.load(path) == spec
-      True
-    """
-    from sme_registry.task.loading import fingerprint_of, materialize_together
-
-    document = as_document(spec)
-    fingerprints = [fingerprint_of(task) for task in materialize_together(document.specs)]
-    file = file_of(
-        document,
-        fingerprints,
-        str(path),
-        name=Path(path).stem.removesuffix("-v1") if name is None else name,
-        description=description,
-        tags=tags,
-    )
-    file.write(path)
-    return Path(path)
 
 
 def env_spec(spec: SpecLike | StreamLike, **kwargs: Any) -> EnvSpec:
