@@ -18,10 +18,9 @@ from sme_registry.diagnosis.subject import AnySubject, StreamSubject, Subject
 from sme_registry.diagnosis.task import TaskDiagnosis
 from sme_registry.diagnosis.team import TeamDiagnosis
 from sme_registry.evaluation.references import LABELS
-from sme_registry.evaluation.report import SAFETY_REFERENCES
 from sme_registry.plots.curves import draw_training, tick_visits
 from sme_registry.plots.maps import retention_map
-from sme_registry.plots.reports import SAFETY_MARKERS
+from sme_registry.plots.reports import draw_cost
 from sme_registry.plots.style import (
     COLOURS,
     GREY,
@@ -278,30 +277,13 @@ def _limits(figure: Figure, measured: Measurements) -> None:
     limits = measured.limits
     assert limits is not None  # it is drawn only then
     left, right = figure.subplots(1, 2)
-    own = {
+    scores = {
         "this policy": limits.report.regions[0],
         "cut off at the limits": limits.cut_off,
         "in visited states": limits.visited,
     }
-    points = [
-        (LABELS[name], limits.report.references[name][0], SAFETY_MARKERS[name], GREY)
-        for name in SAFETY_REFERENCES
-    ]
-    points += [
-        (label, score, str(look(index)["marker"]), COLOURS[index])
-        for index, (label, score) in enumerate(own.items())
-    ]
-    for label, score, marker, colour in points:
-        left.plot(
-            score.cost, score.step_reward, marker, color=colour, markersize=8, linestyle="none",
-            label=label, clip_on=False,
-        )  # fmt: skip
-    left.set(
-        xlabel="mean cost  (0 = within all limits)",
-        ylabel="mean step reward  (1 = optimal)",
-        xlim=(-0.005, max(0.05, 1.1 * left.get_xlim()[1])),
-        ylim=(0.0, 1.05),
-    )
+    runs = [(name, [[score]]) for name, score in scores.items()]
+    draw_cost(left, runs, [limits.report], slice(1))
     x, channels = _tick_channels(right, limits.channels), limits.channels[:_MOST]
     shares = {
         "this policy": [c.violating_share for c in channels],

@@ -6,11 +6,10 @@ agents are cells of their own.
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 from pydantic import JsonValue
@@ -177,9 +176,8 @@ def load_cell(study: str | Path, key: str) -> AnySubject:
     """
     study = Path(study)
     path = cell_path(study, key)
-    result = read_json(path)
-    with _reading(path):
-        cell, log = Cell.from_dict(result["cell"], str(path)), _log_of_evaluations(result["curve"])
+    result = read_cell(path)
+    cell = result.cell
     if parse_uses(cell.uses)[0] == "independent":
         raise OptionError(
             f"cell={path.stem[:12]!r}: has a model for each agent. Train it with `sme train "
@@ -191,7 +189,7 @@ def load_cell(study: str | Path, key: str) -> AnySubject:
     updates = _updates(cell.uses, cell.hyperparameters, cell.steps)
     if cell.stream is not None:
         kept = run_files.Snapshots(run_files.folder_of_cell(study, path.stem), cell.stream)
-        report = _with_fresh(_report(result, path), cell, path)
+        report = _with_fresh(result, path)
         visits, initial = _networks(kept, cell.stream, cell.action_range)
         fresh = tuple(
             _network(
@@ -206,7 +204,7 @@ def load_cell(study: str | Path, key: str) -> AnySubject:
         cell.spec,
         None if parse_uses(cell.uses)[0] == "reference" else cell.action_range,
         plan=plan,
-        log=log if cell.spec.team is None else None,
+        log=result.log if cell.spec.team is None else None,
         updates=updates,
     )
 
@@ -307,31 +305,39 @@ def _report_of_life(folder: Path, record: RunRecord, kept: run_files.Snapshots) 
     return report
 
 
-def _with_fresh(report: Any, cell: Cell, path: Path) -> StreamReport:
+def _with_fresh(result: FinishedCell, path: Path) -> StreamReport:
     """The report of a cell's life, with the fresh agents of its phases once all have finished."""
+    report = result.report
     assert isinstance(report, StreamReport)
-    paths = [path.with_stem(fresh.digest.removeprefix("sha256:")) for fresh in cell.fresh]
+    paths = [path.with_stem(fresh.digest.removeprefix("sha256:")) for fresh in result.cell.fresh]
     if not paths or not all(other.exists() for other in paths):
         return report
-    results = [read_json(other) for other in paths]
-    reports = [_report(result, other) for result, other in zip(results, paths, strict=True)]
-    regrets = [result.get("online_regret") for result in results]
-    known = report.dynamic_regret is not None and None not in regrets
-    return report.with_fresh(reports, regrets if known else None)
+    fresh = [read_cell(other) for other in paths]
+    regrets = [agent.online_regret for agent in fresh if agent.online_regret is not None]
+    known = report.dynamic_regret is not None and len(regrets) == len(fresh)
+    return report.with_fresh([agent.report for agent in fresh], regrets if known else None)
 
 
-def _report(result: Any, path: Path) -> EvaluationReport | StreamReport:
-    with _reading(path):
-        if result.get("report"):
-            return EvaluationReport.from_dict(result["report"], str(path))
-        return StreamReport.from_dict(result["stream_report"], str(path))
+class FinishedCell(NamedTuple):
+    cell: Cell
+    report: EvaluationReport | StreamReport
+    log: Log | None
+    online_regret: float | None  # None where nothing was learned
 
 
-@contextlib.contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Name the file of a result that lacks something or has it in another form."""
+def read_cell(path: Path) -> FinishedCell:
+    """The result of a cell, in the file of a study."""
+    result = read_json(path)
     try:
-        yield
+        cell = Cell.from_dict(result["cell"], str(path))
+        report: EvaluationReport | StreamReport
+        if cell.stream is None:
+            report = EvaluationReport.from_dict(result["report"], str(path))
+        else:
+            report = StreamReport.from_dict(result["stream_report"], str(path))
+        step, regret = (np.array(result["curve"][name], float) for name in ("steps", "regret"))
+        log = Log("evaluations", step, regret) if len(step) else None
+        return FinishedCell(cell, report, log, result.get("online_regret"))
     except SpecError:
         raise
     except (AttributeError, KeyError, TypeError, ValueError) as error:
@@ -347,11 +353,6 @@ def _log_of_episodes(path: Path) -> Log | None:
         return None
     step, regret, ended = np.array([(e.step, e.regret, e.terminated) for e in rows], float).T
     return Log("episodes", step, regret, (regret >= 1.0).astype(float), ended)
-
-
-def _log_of_evaluations(curve: Any) -> Log | None:
-    step, regret = np.array(curve["steps"], float), np.array(curve["regret"], float)
-    return Log("evaluations", step, regret) if len(step) else None
 
 
 def _updates(

@@ -25,14 +25,14 @@ from markupsafe import Markup
 
 from sme_registry.diagnosis.behaviour import Log, rollout
 from sme_registry.diagnosis.measure import MAX_NUMBERS, fit_references
-from sme_registry.diagnosis.subject import AnySubject, StreamSubject, Subject, cell_path
+from sme_registry.diagnosis.subject import AnySubject, StreamSubject, Subject, cell_path, read_cell
 from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.evaluation import EvaluationReport, Policy, TeamPolicy
 from sme_registry.evaluation.references import LABELS, References
 from sme_registry.explorer import program as programs
 from sme_registry.explorer.policies import policy_program
 from sme_registry.explorer.program import MAX_WEIGHTS, encoded
-from sme_registry.io import read_json, write_atomically
+from sme_registry.io import write_atomically
 from sme_registry.io.markup import environment
 from sme_registry.spec import SMESpec, catalogue
 from sme_registry.statistics import smoothed
@@ -104,8 +104,8 @@ def explorer_page(data: dict[str, Any], static: str = "") -> str:
 def run_report(folder: str | os.PathLike[str], cell: str | None = None) -> EvaluationReport | None:
     """The evaluation of a run's folder, or of a finished cell of a study; None if there is none."""
     if cell is not None:
-        result = read_json(cell_path(Path(folder), cell))
-        return EvaluationReport.from_dict(result["report"]) if "report" in result else None
+        report = read_cell(cell_path(Path(folder), cell)).report
+        return report if isinstance(report, EvaluationReport) else None
     path = Path(folder) / EVALUATION
     return EvaluationReport.read(path) if path.exists() else None
 

@@ -60,7 +60,7 @@ _MEASURES = {
     "similarity": "similarity r̃  (1 = optimal)",
     "normalised_regret": "normalised regret  (1 = constant ½)",
 }
-SAFETY_MARKERS = {"optimal": "*", "safe_optimal": "P", "shrunk_optimal": "X", "constant_half": "d"}
+_SAFETY_MARKERS = {"optimal": "*", "safe_optimal": "P", "shrunk_optimal": "X", "constant_half": "d"}
 _PANELS = {  # and their regions
     "in the training cube (WD)": slice(1),
     "outside it (mean of the OOD shells)": slice(1, None),
@@ -218,37 +218,42 @@ def reward_against_cost(
       >>> figure = reward_against_cost(report, "cost.png")
     """
     methods, title = _read(reports, title)
-    safety = [[_safety(report).regions for report in method.reports] for method in methods]
+    scores = [(m.label, [_safety(report).regions for report in m.reports]) for m in methods]
     tasks = [_safety(report) for report in _first_on_task(_all_reports(methods)).values()]
     with canvas(ax, (9.0, 4.2), path, 2, title) as panels:
         for axes, (panel, part) in zip(panels, _PANELS.items(), strict=True):
-            _draw_safe_references(axes, tasks, part)
-            for index, (method, scores) in enumerate(zip(methods, safety, strict=True)):
-                x, y = _cost_and_reward(scores, part)
-                style: Any = {**look(index), "linestyle": "none"}
-                if len(x) > 1:
-                    axes.plot(x, y, **style, markersize=3.5, alpha=0.5)
-                label = counted(method.label, x)
-                axes.plot(iqm(x), iqm(y), **style, markersize=7.5, zorder=3, label=label)
+            draw_cost(axes, scores, tasks, part)
             axes.set_title(panel)
-            axes.set_xlabel("mean cost  (0 = within all limits)")
-            axes.set_ylabel("mean step reward  (1 = optimal)")
-            axes.set_xlim(left=-0.04 * axes.get_xlim()[1])
-            axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
     return figure_of(panels[0])
 
 
-def _draw_safe_references(axes: Axes, tasks: Sequence[SafetyReport], part: slice) -> None:
+def draw_cost(
+    axes: Axes,
+    scores: Iterable[tuple[str, Sequence[Sequence[SafetyScore]]]],
+    tasks: Sequence[SafetyReport],
+    part: slice,
+) -> None:
+    """Reward against cost of methods, each the scores of its runs, over a part of the regions."""
     ends = []
     for name in SAFETY_REFERENCES:
         x, y = _cost_and_reward([safety.references[name] for safety in tasks], part)
         ends.append((x.mean(), y.mean()))
         axes.plot(
-            *ends[-1], SAFETY_MARKERS[name], color=GREY, markersize=9, label=LABELS[name],
+            *ends[-1], _SAFETY_MARKERS[name], color=GREY, markersize=9, label=LABELS[name],
             linestyle="none", zorder=2,
         )  # fmt: skip
     label = "mixtures of optimal and safe optimum"
     axes.plot(*zip(*ends[:2], strict=True), color=GREY, linewidth=1.0, zorder=1.5, label=label)
+    for index, (name, runs) in enumerate(scores):
+        x, y = _cost_and_reward(runs, part)
+        style: Any = {**look(index), "linestyle": "none"}
+        if len(x) > 1:
+            axes.plot(x, y, **style, markersize=3.5, alpha=0.5)
+        axes.plot(iqm(x), iqm(y), **style, markersize=7.5, zorder=3, label=counted(name, x))
+    axes.set_xlabel("mean cost  (0 = within all limits)")
+    axes.set_ylabel("mean step reward  (1 = optimal)")
+    axes.set_xlim(left=-0.04 * axes.get_xlim()[1])
+    axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
 
 
 def _known(report: EvaluationReport, value: _Known | None, need: str) -> _Known:
