@@ -10,14 +10,15 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field, StrictBool, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
-from pydantic_core import PydanticCustomError
+from pydantic import Field
+
+from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf
 
 Weights = dict[str, jax.Array]
 HostWeights = dict[str, npt.NDArray[np.float32]]
@@ -127,24 +128,28 @@ def clipped(gradients: Weights, largest_norm: float) -> Weights:
     return {name: scale * gradient for name, gradient in gradients.items()}
 
 
-def _widths(value: Any, check: ValidatorFunctionWrapHandler) -> Any:
-    try:
-        return check(value)
-    except ValidationError:
-        raise PydanticCustomError(
-            "widths", "must be a list of widths of at least 1, such as [256, 256]"
-        ) from None
-
-
-# Strict, as Stable-Baselines3 is: a text or a truth value is no number, a number no truth value.
-Flag = StrictBool
-Count = Annotated[int, Field(ge=1, strict=True)]
-CountFromZero = Annotated[int, Field(ge=0, strict=True)]
-Updates = Annotated[int, Field(ge=-1, strict=True)]
+Count = Annotated[Integer, Field(ge=1)]
+CountFromZero = Annotated[Integer, Field(ge=0)]
+Updates = Annotated[Integer, Field(ge=-1)]
 """In one go; −1 for as many as steps before them."""
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False, strict=True)]
-NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False, strict=True)]
-Share = Annotated[float, Field(ge=0.0, le=1.0, strict=True)]
-Coefficient = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-Widths = Annotated[tuple[Count, ...], Field(min_length=1), WrapValidator(_widths)]
-"""Of hidden layers."""
+Positive = Annotated[Real, Field(gt=0)]
+NotNegative = Annotated[Real, Field(ge=0)]
+Share = Annotated[Real, Field(ge=0, le=1)]
+Widths = Annotated[TupleOf[Count], Field(min_length=1)]
+"""Of hidden layers, such as [256, 256]."""
+
+
+class PolicyKwargs(StrictModel):
+    net_arch: Widths | None = None
+
+
+class AgentSettings(StrictModel):
+    """Hyperparameters, with the names of Stable-Baselines3 and of its `policy_kwargs`."""
+
+    usual_widths: ClassVar[tuple[int, ...]]
+    policy_kwargs: PolicyKwargs = PolicyKwargs()
+
+    @property
+    def net_arch(self) -> tuple[int, ...]:
+        """The widths of the hidden layers of each network."""
+        return self.policy_kwargs.net_arch or self.usual_widths

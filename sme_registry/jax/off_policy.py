@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import functools
 from abc import abstractmethod
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -26,6 +25,7 @@ import jax.numpy as jnp
 from sme_registry.jax.env import EnvState, observe, reset, step, to_unit
 from sme_registry.jax.networks import (
     Adam,
+    AgentSettings,
     Count,
     CountFromZero,
     Share,
@@ -37,10 +37,7 @@ from sme_registry.jax.program import PIECE, Array, Program, StepLog
 from sme_registry.jax.task import TaskParams
 
 
-@dataclass(frozen=True)
-class OffPolicySettings:
-    """Hyperparameters of both; `net_arch` is in the `policy_kwargs` of Stable-Baselines3."""
-
+class OffPolicySettings(AgentSettings):
     buffer_size: Count = 1_000_000
     learning_starts: CountFromZero = 100
     batch_size: Count = 256

@@ -16,25 +16,22 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from pydantic import model_validator
 
-from sme_registry.errors import OptionError
 from sme_registry.jax.env import EnvState, advance, observe, reset, to_unit
 from sme_registry.jax.networks import (
     Adam,
-    Coefficient,
+    AgentSettings,
     Count,
-    Flag,
     HostWeights,
     Positive,
     Share,
     Weights,
-    Widths,
     adam,
     clipped,
     hidden_layers,
@@ -43,19 +40,17 @@ from sme_registry.jax.networks import (
 )
 from sme_registry.jax.program import Program, StepLog
 from sme_registry.jax.task import StepOutcome, TaskParams, judge, random_numbers
+from sme_registry.spec.document import Real
 
 _LOG_ROOT_TAU = 0.5 * math.log(2.0 * math.pi)
 _JUDGED_AT_ONCE = 256  # steps of a rollout
 _ADAM_EPSILON = 1e-5  # SB3's for on-policy algorithms
 
 
-@dataclass(frozen=True)
-class PPO:
-    """Hyperparameters, with the names and defaults of `stable_baselines3.PPO`.
+class PPO(AgentSettings):
+    """Hyperparameters, with the defaults of `stable_baselines3.PPO`."""
 
-    `net_arch` is the widths of the hidden layers of each network (`policy_kwargs.net_arch`).
-    """
-
+    usual_widths = (64, 64)
     learning_rate: Positive = 3e-4
     n_steps: Count = 2048
     batch_size: Count = 64
@@ -64,18 +59,19 @@ class PPO:
     gae_lambda: Share = 0.95
     clip_range: Positive = 0.2
     clip_range_vf: Positive | None = None
-    normalize_advantage: Flag = True
-    ent_coef: Coefficient = 0.0
-    vf_coef: Coefficient = 0.5
+    normalize_advantage: bool = True
+    ent_coef: Real = 0.0
+    vf_coef: Real = 0.5
     max_grad_norm: Positive = 0.5
-    net_arch: Widths = (64, 64)
 
-    def __post_init__(self) -> None:
+    @model_validator(mode="after")
+    def _minibatches_are_equal(self) -> Self:
         if self.batch_size < 2 or self.n_steps % self.batch_size:
-            raise OptionError(
-                f"hyperparameters.batch_size={self.batch_size}: must be at least 2 and divide "
+            raise ValueError(
+                f"batch_size={self.batch_size}: must be at least 2 and divide "
                 f"n_steps={self.n_steps}, since minibatches here are of equal size."
             )
+        return self
 
 
 class PPOLearner(NamedTuple):

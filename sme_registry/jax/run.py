@@ -6,7 +6,6 @@ run(program, due=[50_000, 100_000], start_states=..., on_log=..., on_evaluation=
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -15,9 +14,8 @@ from typing import Any
 
 import jax
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 
-from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
+from sme_registry.errors import OptionError, SpecError, UnknownNameError, did_you_mean
 from sme_registry.io import choice, integer_in
 from sme_registry.jax.networks import Weights, hidden_layers
 from sme_registry.jax.ppo import PPO, PPOProgram
@@ -35,9 +33,6 @@ ALGORITHMS: dict[str, tuple[Any, type[Program]]] = {
 
 _OnEvaluation = Callable[[int, int, Evaluation], Any]
 _OnVisit = Callable[[int, list[dict[str, Array]]], Any]
-
-POLICY = "policy_kwargs"
-_OF_POLICY = ("net_arch",)  # hyperparameters that Stable-Baselines3 has in `policy_kwargs`
 
 
 def full_name(uses: str, field: str = "uses") -> str:
@@ -58,29 +53,11 @@ def settings_of(
 ) -> Any:
     """An algorithm's hyperparameters, JSON values by SB3's names; errors call them `field`."""
     kind, _ = _algorithm(uses)
-    names = sorted(each.name for each in dataclasses.fields(kind))
-    known = {f"{POLICY}.{name}" if name in _OF_POLICY else name: name for name in names}
-    values = {}
-    for name, value in _flat(hyperparameters, field).items():
-        if name not in known:
-            raise OptionError(
-                f"{field}.{name}: {full_name(uses)} has no such hyperparameter."
-                f"{did_you_mean(name, known)} Known: {', '.join(known)}. For "
-                "others, use the algorithm of Stable-Baselines3."
-            )
-        values[known[name]] = value
     try:
-        return TypeAdapter(kind).validate_python(values)
-    except ValidationError as error:
-        fault = error.errors()[-1]  # of a text or a number: that of the number
-        of_both = fault.get("ctx", {}).get("error")
-        if isinstance(of_both, OptionError):  # of values that do not go together
-            raise of_both from None
-        place = str(fault["loc"][0])
-        name = next(name for name, own in known.items() if own == place)
+        return kind.from_dict(dict(hyperparameters), field)
+    except SpecError as error:
         raise OptionError(
-            f"{field}.{name}={values[place]!r:.60}: {fault['msg']}. Correct it, or leave it out "
-            "for the default."
+            f"{error} For other hyperparameters, use the algorithm of Stable-Baselines3."
         ) from None
 
 
@@ -273,19 +250,3 @@ def _stacked(program: Program, groups: Sequence[Sequence[Array]]) -> Array:
 
 def _algorithm(uses: str) -> tuple[Any, type[Program]]:
     return ALGORITHMS[full_name(uses).removeprefix(JAX)]
-
-
-def _flat(hyperparameters: Mapping[str, Any], field: str) -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in hyperparameters.items():
-        if name.startswith(f"{POLICY}."):
-            # Stable-Baselines3, which keeps the model, has no such name.
-            raise OptionError(
-                f"{field}.{name}: must be in the dict {POLICY}, such as "
-                f'{{"{POLICY}": {{"net_arch": [64, 64]}}}}.'
-            )
-        if name == POLICY and isinstance(value, Mapping):
-            flat |= {f"{POLICY}.{inner}": chosen for inner, chosen in value.items()}
-        else:
-            flat[name] = value
-    return flat

@@ -9,23 +9,21 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from pydantic import model_validator
 
-from sme_registry.errors import OptionError
 from sme_registry.jax.env import to_unit
 from sme_registry.jax.networks import (
     Adam,
-    Coefficient,
     Count,
     HostWeights,
     NotNegative,
     Positive,
     Weights,
-    Widths,
     adam,
     initial_linear,
     initial_perceptron,
@@ -39,52 +37,51 @@ from sme_registry.jax.off_policy import (
     OffPolicySettings,
     ReplayRows,
 )
+from sme_registry.spec.document import Real
 
 _CRITICS = 2
 _LEAST_LOG_STD, _GREATEST_LOG_STD = -20.0, 2.0
 _ENTROPY = "log_ent_coef"  # an attribute of SB3's model, not of its policy
 
 
-@dataclass(frozen=True)
 class TD3(OffPolicySettings):
-    """Hyperparameters, with the names and defaults of `stable_baselines3.TD3`; no action noise."""
+    """Hyperparameters, with the defaults of `stable_baselines3.TD3`; no action noise."""
 
+    usual_widths = (400, 300)
     learning_rate: Positive = 1e-3
     policy_delay: Count = 2
     target_policy_noise: NotNegative = 0.2
     target_noise_clip: NotNegative = 0.5
-    net_arch: Widths = (400, 300)
 
 
-@dataclass(frozen=True)
 class SAC(OffPolicySettings):
-    """Hyperparameters, with the names and defaults of `stable_baselines3.SAC`.
+    """Hyperparameters, with the defaults of `stable_baselines3.SAC`.
 
     `ent_coef` is "auto", "auto_" and the initial value, or a constant. Without generalised
     state-dependent exploration and action noise, as is SB3's default.
     """
 
+    usual_widths = (256, 256)
     learning_rate: Positive = 3e-4
-    ent_coef: str | Coefficient = "auto"
+    ent_coef: str | Real = "auto"
     target_update_interval: Count = 1
-    target_entropy: str | Coefficient = "auto"
-    net_arch: Widths = (256, 256)
+    target_entropy: str | Real = "auto"
 
-    def __post_init__(self) -> None:
+    @model_validator(mode="after")
+    def _coefficients_are_numbers_or_automatic(self) -> Self:
         forms = {"ent_coef": r"auto(_\d+(\.\d*)?(e-?\d+)?)?", "target_entropy": "auto"}
         for name, form in forms.items():
             value = getattr(self, name)
             if isinstance(value, str) and not re.fullmatch(form, value):
                 initial = ', "auto_0.1" (its initial value)' if name == "ent_coef" else ""
-                raise OptionError(
-                    f'hyperparameters.{name}={value!r:.60}: must be "auto"{initial} or a number.'
-                )
+                raise ValueError(f'{name}={value!r:.60}: must be "auto"{initial} or a number.')
         begins = self.initial_entropy_coefficient
         if not 0.0 <= begins < math.inf or (begins == 0.0 and self.learns_entropy):
-            raise OptionError(
-                f"hyperparameters.ent_coef={self.ent_coef!r}: must be finite and at least 0, and "
-                "begin above 0 where its logarithm is learned."
+            raise ValueError(
+                f"ent_coef={self.ent_coef!r}: must be finite and at least 0, and begin above 0 "
+                "where its logarithm is learned."
             )
+        return self
 
     @property
     def learns_entropy(self) -> bool:

@@ -56,9 +56,10 @@ CURRICULUM = stream_of(
     observes_phase=True,
 )
 
+NARROW = {"net_arch": (8,)}
 ALGORITHMS = {
-    "TD3": (TD3Program, TD3(learning_starts=6, batch_size=8, net_arch=(8,))),
-    "PPO": (PPOProgram, PPO(n_steps=32, batch_size=16, n_epochs=2, net_arch=(8,))),
+    "TD3": (TD3Program, TD3(learning_starts=6, batch_size=8, policy_kwargs=NARROW)),
+    "PPO": (PPOProgram, PPO(n_steps=32, batch_size=16, n_epochs=2, policy_kwargs=NARROW)),
 }
 
 

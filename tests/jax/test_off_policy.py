@@ -18,7 +18,7 @@ from sme_registry.training.algorithms import nested_hyperparameters
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 STARTS, BUDGET = 6, 30
-TINY = {"learning_starts": STARTS, "batch_size": 8, "net_arch": (8,)}
+TINY = {"learning_starts": STARTS, "batch_size": 8, "policy_kwargs": {"net_arch": (8,)}}
 # As many updates as steps before them; targets move at the first and every second one.
 RARE = {
     "train_freq": 3,
@@ -165,7 +165,7 @@ def test_a_run_that_fails_leaves_the_others_alone(new):
     ],
 )
 def test_hyperparameters_out_of_range_are_refused_by_name(uses, name, value):
-    with pytest.raises(OptionError, match=rf"^hyperparameters\.{name}="):
+    with pytest.raises(OptionError, match=rf"^hyperparameters: {name}="):
         settings_of(uses, nested_hyperparameters({name: value}))
 
 

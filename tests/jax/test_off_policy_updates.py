@@ -123,7 +123,7 @@ def _seed(seed):
     torch.manual_seed(seed)
 
 
-SETTINGS = {"net_arch": NET_ARCH, "batch_size": BATCH}
+SETTINGS = {"policy_kwargs": {"net_arch": NET_ARCH}, "batch_size": BATCH}
 KINDS = [(TD3Program, TD3(**SETTINGS)), (SACProgram, SAC(**SETTINGS))]
 
 

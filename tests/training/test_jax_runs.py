@@ -224,7 +224,7 @@ def test_a_damaged_checkpoint_is_refused_and_one_with_weights_that_are_not_finit
     [
         ({"agents": "jaxx"}, r"agents='jaxx': must be 'sb3' or 'jax'\. Did you mean 'jax'"),
         ({"algorithm": "A2C"}, "algorithm='jax:A2C': must be one of jax:PPO, jax:TD3, jax:SAC"),
-        ({"hyperparameters": {"use_sde": True}}, "use_sde: jax:PPO has no .*Known: batch_size"),
+        ({"hyperparameters": {"use_sde": True}}, "use_sde=True: unknown field.*batch_size"),
         ({"num_envs": 2}, "num_envs=2: must be 1"),
         ({"device": "abacus"}, "device='abacus': must be one of cpu"),
         (
