@@ -34,7 +34,7 @@ from sme_registry.io import (
     read_json,
 )
 from sme_registry.io.markup import Table
-from sme_registry.io.terminal import err, out, print_json
+from sme_registry.io.terminal import out, print_json, print_line, print_note
 from sme_registry.spec import (
     EnvFile,
     ProtocolFile,
@@ -317,10 +317,7 @@ def only_with(context: typer.Context, names: Iterable[str], reason: str) -> None
 def can_draw() -> bool:
     if is_installed("matplotlib"):
         return True
-    err().print(
-        f"no figures: Matplotlib is not installed ({escape(install_command('plot'))})",
-        soft_wrap=True,
-    )
+    print_note(f"no figures: Matplotlib is not installed ({escape(install_command('plot'))})")
     return False
 
 
@@ -330,7 +327,7 @@ def write_run_explorer(folder: Path) -> list[Path]:
         path, report = folder / explorer.FILE, explorer.run_report(folder)
         return [explorer.write_explorer(path, load_run(folder), report=report)]
     except SMEError as error:
-        err().print(f"no explorer: {escape(str(error))}", soft_wrap=True)
+        print_note(f"no explorer: {escape(str(error))}")
         return []
 
 
@@ -343,7 +340,7 @@ def print_training(
         print_json({"folder": str(folder), "run": record, "evaluation": report})
         return
     print_tables([*tables, *result.report.tables()])
-    out().print(f"All files are in {escape(str(folder))}{os.sep}", soft_wrap=True)
+    print_line(f"All files are in {escape(str(folder))}{os.sep}")
 
 
 def print_tables(tables: Iterable[Table]) -> None:
@@ -355,7 +352,7 @@ def print_tables(tables: Iterable[Table]) -> None:
 
 def print_written(paths: Iterable[Path]) -> None:
     for path in paths:
-        err().print(f"wrote {escape(str(path))}", soft_wrap=True)
+        print_note(f"wrote {escape(str(path))}")
 
 
 def unique(values: Iterable[str]) -> list[str]:

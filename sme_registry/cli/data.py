@@ -37,7 +37,16 @@ from sme_registry.datasets.storage import check_location, datasets_folder
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.io import check_new
 from sme_registry.io.markup import Table
-from sme_registry.io.terminal import Progress, err, failure, out, print_json, print_pairs
+from sme_registry.io.terminal import (
+    Progress,
+    err,
+    failure,
+    out,
+    print_json,
+    print_line,
+    print_note,
+    print_pairs,
+)
 from sme_registry.spec import catalogue
 from sme_registry.task import materialize
 
@@ -125,7 +134,7 @@ def make(
             progress=progress.update_of,
         )
     _print(dataset, json)
-    err().print(f"wrote {escape(str(dataset.path))}{os.sep}", soft_wrap=True)
+    print_note(f"wrote {escape(str(dataset.path))}{os.sep}")
 
 
 def _weighted(text: str) -> tuple[Any, float]:
@@ -162,13 +171,12 @@ def list_(folder: DatasetsFolder = None, json: Json = False) -> None:
     elif datasets:
         out().print(_datasets_table(datasets))
     else:
-        err().print(
+        print_note(
             f"There are no data sets in {escape(str(datasets_folder(folder)))}. "
-            "To make one, see `sme dataset make --help`.",
-            soft_wrap=True,
+            "To make one, see `sme dataset make --help`."
         )
     for reason in broken.values():
-        err().print(f"[yellow]invalid:[/] {escape(reason)}", soft_wrap=True)
+        print_note(f"[yellow]invalid:[/] {escape(reason)}")
 
 
 @dataset.command("show")
@@ -209,7 +217,7 @@ def validate(
             failure(str(error))
         else:
             if not json:
-                out().print(f"[green]valid[/] {escape(name)}", soft_wrap=True)
+                print_line(f"[green]valid[/] {escape(name)}")
         results.append(result)
     if json:
         print_json(results)
@@ -394,7 +402,7 @@ def sealed(
             progress=lambda done, _: progress.update(done),
         )
     policy.save(out_file)
-    out().print(escape(str(out_file)), soft_wrap=True)
+    print_line(escape(str(out_file)))
 
 
 def _scores(record: Any) -> Table:

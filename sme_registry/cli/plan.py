@@ -29,7 +29,14 @@ from sme_registry.evaluation import resolve_protocol
 from sme_registry.io import read_json
 from sme_registry.io.markup import Table
 from sme_registry.io.system import available_cores
-from sme_registry.io.terminal import duration_range, err, out, print_json
+from sme_registry.io.terminal import (
+    duration_range,
+    err,
+    out,
+    print_json,
+    print_line,
+    print_note,
+)
 from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan, catalogue
 from sme_registry.spec.catalogue import is_path
 from sme_registry.spec.study import PlannedCell, parse_uses
@@ -292,9 +299,8 @@ def plan(
         out().print(f"  {place + ':':32}{duration_range(*seconds(n))}")
     unmeasured = sorted({cell.uses for cell in waiting} - measured)
     if unmeasured:
-        out().print(
-            f"[dim]From a table of costs, not from results: {escape(', '.join(unmeasured))}.[/]",
-            soft_wrap=True,
+        print_line(
+            f"[dim]From a table of costs, not from results: {escape(', '.join(unmeasured))}.[/]"
         )
 
 
@@ -339,7 +345,7 @@ def check_algorithms(algorithms: Iterable[StudyAlgorithm], errors: type[SMEError
     """Check a plan's algorithms; warn about those that cannot be found here by such an error."""
     algorithms = list(algorithms)
     if notice := code_notice(algorithm.uses for algorithm in algorithms):
-        err().print(escape(notice), soft_wrap=True)
+        print_note(escape(notice))
     messages = []
     for algorithm in algorithms:
         try:
@@ -350,12 +356,12 @@ def check_algorithms(algorithms: Iterable[StudyAlgorithm], errors: type[SMEError
         else:
             check_algorithm(algorithm)
     for message in unique(messages):  # several algorithms may lack the same package
-        err().print(f"[yellow]cannot run here:[/] {escape(message)}", soft_wrap=True)
+        print_note(f"[yellow]cannot run here:[/] {escape(message)}")
 
 
 def warn_of_uneven_rollouts(plan: StudyPlan) -> None:
     for warning in uneven_rollouts(plan):
-        err().print(f"[yellow]uneven rollouts:[/] {escape(warning)}", soft_wrap=True)
+        print_note(f"[yellow]uneven rollouts:[/] {escape(warning)}")
 
 
 _ALLOWED_WITH_FROM = ("path", "name", "description", "source", "force")
@@ -416,5 +422,5 @@ def new(
     check_algorithms(file.plan.algorithms, MissingDependencyError)
     warn_of_uneven_rollouts(file.plan)
     file.write(path)
-    out().print(f"{escape(str(path))}  {file.digest}", soft_wrap=True)
+    print_line(f"{escape(str(path))}  {file.digest}")
     err().print(f"[dim]To see its runs and times: sme study plan {escape(str(path))}[/]")

@@ -15,7 +15,7 @@ from sme_registry.cli.arguments import KINDS, Json, find_any, kind_of, print_tab
 from sme_registry.envs.schedule import content_id
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.io.markup import Table
-from sme_registry.io.terminal import out, print_json, print_pairs
+from sme_registry.io.terminal import out, print_json, print_line, print_pairs
 from sme_registry.spec import (
     EnvFile,
     ProtocolFile,
@@ -234,7 +234,7 @@ def show(
         if json or not isinstance(document, SuiteFile):
             raise OptionError("--digests: applies to suites, and not with --json. Leave one out.")
         tasks = document.suite.documents
-        out().print("\n".join(each.digest for each in tasks), soft_wrap=True)
+        print_line("\n".join(each.digest for each in tasks))
     else:
         _show_document(name, document, json)
 
@@ -349,7 +349,7 @@ def _show_suite(file: SuiteFile, json: bool) -> None:
     digests = [each.digest for each in suite.documents]
     kind = "task" if suite.classes else "stream"
     if known(SMESpec).keys() | known(StreamSpec).keys() >= set(digests):
-        out().print(f"To train on a {kind}: sme train {digests[0][: cards.SHORT]}", soft_wrap=True)
+        print_line(f"To train on a {kind}: sme train {digests[0][: cards.SHORT]}")
     else:  # one outside the catalogue cannot be found by its digest
         out().print(f"To train on these {kind}s: sme study new plan.json -a PPO --suite FILE")
 

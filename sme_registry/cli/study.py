@@ -24,7 +24,14 @@ from sme_registry.cli.plan import (
 from sme_registry.errors import OptionError
 from sme_registry.io.markup import Table
 from sme_registry.io.system import available_cores
-from sme_registry.io.terminal import duration_range, err, out, print_json
+from sme_registry.io.terminal import (
+    duration_range,
+    err,
+    out,
+    print_json,
+    print_line,
+    print_note,
+)
 from sme_registry.spec import StudyFile, catalogue
 from sme_registry.studies.engine.ledger import (
     STATES,
@@ -137,10 +144,9 @@ def run(
     )
     print_status(status, json)
     if status.failed:
-        err().print(
+        print_note(
             f"[bold red]{len(status.failed)} of {len(status.cells)} cells failed.[/] Add --retry "
-            "to run them again.",
-            soft_wrap=True,
+            "to run them again."
         )
         raise typer.Exit(1)
 
@@ -202,10 +208,10 @@ def report(
     files = write_report(folder, out_folder, tuple(dict.fromkeys(chosen)), explorers=explorers)
     for path in files:
         if path.name == "index.html":
-            out().print(escape(str(path)), soft_wrap=True)
+            print_line(escape(str(path)))
     counts = Counter(path.parent for path in files if path.name != "index.html")
     for parent, count in counts.items():
-        out().print(f"{escape(str(parent))}  {count} files", soft_wrap=True)
+        print_line(f"{escape(str(parent))}  {count} files")
 
 
 def print_status(status: StudyStatus, json: bool) -> None:
@@ -248,10 +254,9 @@ def _print_failure(status: StudyStatus, cell: CellStatus) -> None:
         return
     times = f" ({failure.attempts} times)" if failure.attempts > 1 else ""
     path = Ledger(status.folder).failure_path(failure.key).as_posix()
-    out().print(
+    print_line(
         f"[red]failed{times}[/] {escape(label(cell.planned))}: {escape(failure.error)}\n"
-        f"  [dim]{escape(path)}[/]",
-        soft_wrap=True,
+        f"  [dim]{escape(path)}[/]"
     )
 
 
@@ -320,9 +325,9 @@ def compare(
         out().print(Table(f"[bold]{escape(each.title)}[/]", columns, rows))
     caveats = write.implementation_caveats(folder, first, second)
     for sentence in (*difference_caveats(differences), *caveats):
-        out().print(escape(sentence), soft_wrap=True)
+        print_line(escape(sentence))
     if files:
-        out().print(f"{escape(str(out_folder))}  {len(files)} files", soft_wrap=True)
+        print_line(f"{escape(str(out_folder))}  {len(files)} files")
 
 
 @with_options(PlanOptions)
@@ -357,7 +362,7 @@ def sweep(
         if path.name == "index.html" or path.stem.startswith(
             ("regret-", "wd-regret", "ood-regret")
         ):
-            out().print(escape(str(path)), soft_wrap=True)
+            print_line(escape(str(path)))
     if status.failed:
         failed = f"{len(status.failed)} of {len(status.cells)} cells failed"
         err().print(f"[bold red]{failed}.[/] See `sme study status {escape(str(folder))}`.")

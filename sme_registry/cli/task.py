@@ -25,7 +25,7 @@ from sme_registry.cli.arguments import (
 from sme_registry.errors import OptionError, SMEError, UnknownNameError
 from sme_registry.io import integer_in, read_json
 from sme_registry.io.markup import plural
-from sme_registry.io.terminal import CommandGroup, err, out, print_json
+from sme_registry.io.terminal import CommandGroup, err, out, print_json, print_line, print_note
 from sme_registry.spec import (
     EnvFile,
     ProtocolFile,
@@ -148,8 +148,8 @@ def new(
         fields["team"] = _with_reward(start, fields.get("team"), team_reward)
     spec = start.derive(**fields)
     save(spec, path, name, description=description, tags=tuple(tag or ()))
-    out().print(f"{escape(str(path))}  {spec.digest}", soft_wrap=True)
-    err().print(f"[dim]To check the draw: sme certify {escape(str(path))}[/]", soft_wrap=True)
+    print_line(f"{escape(str(path))}  {spec.digest}")
+    print_note(f"[dim]To check the draw: sme certify {escape(str(path))}[/]")
 
 
 def _equal_team(
@@ -235,9 +235,9 @@ def new_suite(
     file.write(path)
     classes = plural(len(members.runs), "class", "classes")
     tasks = f"{classes}, {plural(sum(members.runs.values()), 'instance')}"
-    out().print(f"{escape(str(path))}  {file.digest}", soft_wrap=True)
+    print_line(f"{escape(str(path))}  {file.digest}")
     hint = f"{tasks}. To train an algorithm on them: sme train --suite {path} -a PPO"
-    err().print(f"[dim]{escape(hint)}[/]", soft_wrap=True)
+    print_note(f"[dim]{escape(hint)}[/]")
 
 
 def validate(
@@ -264,7 +264,7 @@ def validate(
                 line = f"[green]valid[/]    {name}  {result['digest']}"
             else:
                 line = f"[red]invalid[/]  {escape(result['error'])}"
-            out().print(line, soft_wrap=True)
+            print_line(line)
     invalid = sum(not result["valid"] for result in results)
     if invalid:
         raise OptionError(
@@ -327,7 +327,7 @@ def certify(
     for label, spec in specs:
         certificates.append((label, certify_task(spec, seed=seed)))
         if not json and len(specs) > 1:
-            _print_line(*certificates[-1])
+            _print_outcome(*certificates[-1])
     if json:
         print_json(
             [{"task": label, **certificate.to_dict()} for label, certificate in certificates]
@@ -371,10 +371,10 @@ def _phases(label: str, stream: StreamSpec) -> list[tuple[str, SMESpec]]:
     return [(f"{label} phase {index}", phase.spec) for index, phase in enumerate(stream.phases)]
 
 
-def _print_line(label: str, certificate: Certificate) -> None:
+def _print_outcome(label: str, certificate: Certificate) -> None:
     notable = [*certificate.of("refused"), *certificate.of("warning")]
     reasons = ", ".join(f"{check.name} {short(check.value)}".rstrip() for check in notable)
-    out().print(f"{MARKS[certificate.outcome]}  {escape(label)}  [dim]{reasons}[/]", soft_wrap=True)
+    print_line(f"{MARKS[certificate.outcome]}  {escape(label)}  [dim]{reasons}[/]")
 
 
 def _print_certificate(label: str, certificate: Certificate) -> None:

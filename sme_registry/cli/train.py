@@ -30,7 +30,7 @@ from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, resolve_protocol
 from sme_registry.io import integer_in, write_atomically
 from sme_registry.io.markup import Table, environment
-from sme_registry.io.terminal import err, out
+from sme_registry.io.terminal import err, out, print_line, print_note
 from sme_registry.spec import (
     EnvFile,
     SMESpec,
@@ -321,7 +321,7 @@ def _train_suite(
     if status.failed:
         raise typer.Exit(1)
     if not json:
-        err().print(f"[dim]{escape(_next_step(name, suite, plan, folder))}[/]", soft_wrap=True)
+        print_note(f"[dim]{escape(_next_step(name, suite, plan, folder))}[/]")
 
 
 def _next_step(name: str, suite: Suite, plan: StudyPlan, folder: Path) -> str:
@@ -406,7 +406,7 @@ def demo(
     )
     log = out_folder / "episodes.csv"
     for path in (report, *explorer, *result.figures, result.model_path, log):
-        out().print(f"  {escape(str(path))}", soft_wrap=True)
+        print_line(f"  {escape(str(path))}")
 
 
 def regret_by_stage(result: training.TrainingResult) -> list[tuple[int, int, float]]:

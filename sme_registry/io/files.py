@@ -60,13 +60,11 @@ def atomic_file(path: Path, *, new: bool = False) -> Iterator[BinaryIO]:
 def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path:
     """Write text as UTF-8, or bytes, completely or not at all; returns the path."""
     path = Path(path)
-    try:
+    with _writing(path):
         data = content.encode("utf-8") if isinstance(content, str) else content
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(path) as stream:
             stream.write(data)
-    except (OSError, ValueError) as error:  # ValueError: a path with a null byte, broken text
-        raise unwritable(path, error) from None
     return path
 
 
@@ -83,15 +81,13 @@ def check_new(path: str | os.PathLike[str], *, force: bool = False) -> Path:
 def check_writable(path: str | os.PathLike[str]) -> Path:
     """Return a path, of a file or a folder, whose parent folders can be created and written to."""
     path = Path(path)
-    try:
+    with _writing(path):
         # As an absolute path, so that there is an existing parent. By a file rather than
         # `os.access`, which does not see read-only file systems.
-        parent = next(each for each in path.absolute().parents if os.path.lexists(each))
+        parent = next(folder for folder in path.absolute().parents if os.path.lexists(folder))
         probe = temporary_beside(parent / path.name)
         os.close(os.open(probe, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
         os.unlink(probe)
-    except (OSError, ValueError) as error:
-        raise unwritable(path, error) from None
     return path
 
 
@@ -102,12 +98,10 @@ def claim_folder(
     folder = Path(folder)
     if os.path.lexists(folder) and not folder.is_dir():
         raise OptionError(f"{folder}: is a file. Give a folder.")
-    try:
+    with _writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         # Hidden files may be locks, or writes of ours that were cut short.
         names = sorted(path.name for path in folder.iterdir() if path.name[0] != ".")
-    except (OSError, ValueError) as error:
-        raise unwritable(folder, error) from None
     others = [name for name in names if name not in files]
     if others:
         raise OptionError(
@@ -124,11 +118,9 @@ def build_folder(target: str | os.PathLike[str], *, force: bool = False) -> Iter
     """A temporary folder, renamed to `target` if the block succeeds; otherwise nothing changes."""
     target = check_new(target, force=force)
     building, replaced = temporary_beside(target), temporary_beside(target)
-    try:
+    with _writing(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         building.mkdir()
-    except (OSError, ValueError) as error:  # ValueError: a path with a null byte
-        raise unwritable(target, error) from None
     try:
         yield building
         _flush(building)
@@ -153,11 +145,25 @@ def sync_folder(folder: str | os.PathLike[str]) -> None:
         os.close(handle)
 
 
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Raise the error of a path that cannot be written where the block cannot write it."""
+    try:
+        yield
+    except (OSError, ValueError) as error:  # ValueError: a path with a null byte, broken text
+        raise unwritable(path, error) from None
+
+
 def unwritable(path: Path, error: Exception) -> OptionError:
-    reason = getattr(error, "strerror", None) or str(error)
     return OptionError(
-        f"{path}: cannot be written: {reason}. Give a path in a folder that you may write to."
+        f"{path}: cannot be written: {reason_of(error)}. Give a path in a folder that you may "
+        "write to."
     )
+
+
+def reason_of(error: Exception) -> str:
+    """Why the system refused: `Permission denied`."""
+    return getattr(error, "strerror", None) or str(error)
 
 
 def _replace(building: Path, target: Path, replaced: Path) -> None:
@@ -235,8 +241,7 @@ def read_json(path: str | os.PathLike[str]) -> Any:
             )
         text = path.read_bytes()
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise MalformedDocumentError(f"{path}: cannot be read: {reason}.") from None
+        raise MalformedDocumentError(f"{path}: cannot be read: {reason_of(error)}.") from None
     return parse_json(text, str(path))
 
 
@@ -251,15 +256,13 @@ Arrays = dict[str, npt.NDArray[Any]]
 def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, npt.NDArray[Any]]) -> None:
     """Write arrays of numbers or text, and remove what killed writes left of the file."""
     path = Path(path)
-    try:
+    with _writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         for rest in path.parent.glob(TEMPORARY):
             if rest.name.startswith(f".{path.name}."):
                 rest.unlink(missing_ok=True)
         with atomic_file(path) as stream:
             np.savez(stream, **arrays)  # type: ignore[arg-type]
-    except (OSError, ValueError) as error:
-        raise unwritable(path, error) from None
 
 
 def read_arrays(path: str | os.PathLike[str], names: Collection[str] | None = None) -> Arrays:
@@ -311,10 +314,9 @@ def file_lock(path: str | os.PathLike[str], *, timeout: float = 0.0) -> Lock | N
     except filelock.Timeout:
         return None
     except (OSError, ValueError, NotImplementedError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
         raise OptionError(
-            f"{path}: cannot be locked: {reason}. Give a folder that you may write to, on a file "
-            "system that supports locks."
+            f"{path}: cannot be locked: {reason_of(error)}. Give a folder that you may write to, "
+            "on a file system that supports locks."
         ) from None
     return Lock(lock)
 

@@ -85,8 +85,18 @@ def err() -> Console:
     return _Console(sys.stderr)
 
 
+def print_line(text: str) -> None:
+    """Print markup that is never wrapped, as it has a path or a command that people copy."""
+    out().print(text, soft_wrap=True)
+
+
+def print_note(text: str) -> None:
+    """The same on standard error."""
+    err().print(text, soft_wrap=True)
+
+
 def failure(message: str) -> None:
-    err().print(f"[bold red]error:[/] {escape(message)}", soft_wrap=True)
+    print_note(f"[bold red]error:[/] {escape(message)}")
 
 
 def print_json(value: Any) -> None:

@@ -268,8 +268,7 @@ def _parameters(task: Task) -> Iterator[Check]:
     network = "π* or v" if task.limiting else "π*"
     yield _check("transition_row_sums", _row_sum_error(task.W), high=0.0)
     yield _check("layers_orthogonal", orthogonality, high=_ROUNDING, detail=network)
-    centre = max(float(np.abs(layer.b + 0.5 * layer.W.sum(axis=1)).max()) for layer in layers)
-    yield _check("layers_centred", centre, high=_ROUNDING)
+    yield _check("layers_centred", max(map(_centre_error, layers)), high=_ROUNDING)
 
 
 def _row_sum_error(W: Array) -> float:
@@ -331,9 +330,7 @@ def _linear_policy(task: Task, s: Array, optimal: Array) -> Check:
     if S > _LINEAR_LIMIT or half < 4 * (S + 1):
         reason = f"a fit over state_dim={S} channels takes too long"
         return _not_measured("linear_policy_reward", reason)
-    affine = np.concatenate([s, np.ones((len(s), 1))], axis=1)
-    fitted, *_ = np.linalg.lstsq(affine[:half], optimal[:half], rcond=None)
-    actions = np.clip(affine[half:] @ fitted, 0.0, 1.0)
+    actions = np.clip(_held_out(s, optimal), 0.0, 1.0)
     reward = task.reward_of(task.similarity_of(actions, optimal[half:])).mean()
     return _check("linear_policy_reward", reward)
 
@@ -393,7 +390,7 @@ def _multiple_error(layer: Layer, scale: float | None) -> float:
     return float(np.abs(gram / scale - np.eye(len(gram))).max())
 
 
-def _centre_error(layer: Layer, centre: float) -> float:
+def _centre_error(layer: Layer, centre: float = 0.0) -> float:
     return float(np.abs(layer.b - (centre - 0.5 * layer.W.sum(axis=1))).max())
 
 
@@ -465,8 +462,13 @@ def _distinct(values: Array) -> float:
 
 def held_out_r2(h: Array, y: Array) -> Array:
     """R² `[c]` of y `[n, c]` by an affine map of h `[n, H]`: fitted on one half, of the other."""
+    held_out = y[len(h) // 2 :]
+    missed = ((_held_out(h, y) - held_out) ** 2).sum(axis=0)
+    return np.asarray(1.0 - missed / ((held_out - held_out.mean(axis=0)) ** 2).sum(axis=0))
+
+
+def _held_out(h: Array, y: Array) -> Array:
+    """The second half of y, by an affine map of h that is fitted to the first half."""
     half = len(h) // 2
     design = np.concatenate([h, np.ones((len(h), 1))], axis=1)
-    solution = np.linalg.lstsq(design[:half], y[:half])[0]
-    missed = ((design[half:] @ solution - y[half:]) ** 2).sum(axis=0)
-    return np.asarray(1.0 - missed / ((y[half:] - y[half:].mean(axis=0)) ** 2).sum(axis=0))
+    return np.asarray(design[half:] @ np.linalg.lstsq(design[:half], y[:half])[0])
