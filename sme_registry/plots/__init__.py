@@ -2,8 +2,7 @@
 
 Each function returns a Matplotlib `Figure`. Given a `path`, it writes that file, PNG, PDF or SVG by
 its ending. Given `ax`, one panel or several, it draws in the caller's axes, without title and
-legend, instead of in a new figure. `title` is above a new figure; None takes one from the data.
-`save_figure` writes any figure.
+legend. `title` is above a new figure; None takes one from the data.
 """
 
 from sme_registry.plots.curves import (

@@ -1,9 +1,7 @@
 """Lines over environment steps, of training, and over the lifetime or the visits of a stream.
 
-In figures of training, x is the total of environment steps over all environments, sorted: parallel
-environments end their episodes in any order, and many at one step. The line is the median of the
-last `window` episodes, or evaluations, that ended by x: `statistics.smoothed`, in every figure and
-in a diagnosis.
+In figures of training, x is the total of steps over all environments, which end their episodes in
+any order. The line is the median of the last `window` that ended by x: `statistics.smoothed`.
 """
 
 from __future__ import annotations
@@ -67,12 +65,9 @@ def training_curve(
     """Draw the exact regret of each training episode over environment steps.
 
     Each dot is an episode; the line is the median of the last `window` of them, None for a tenth of
-    all, at most 50. `visits` of a life in a stream are bands with their phases above.
-
-    Args:
-      episodes: the folder of a run of `sme train`, or its episodes.csv; columns `step` and
-        `regret`, as a mapping of `[N]` arrays or a pandas frame; or rows that have both, as
-        attributes or as keys.
+    all, at most 50. `visits` of a life in a stream are bands with their phases above. `episodes` is
+    the folder of a run of `sme train`, or its episodes.csv; columns `step` and `regret`, as a
+    mapping of `[N]` arrays or a pandas frame; or rows that have both, as attributes or as keys.
 
     Examples:
       >>> from sme_registry.plots import training_curve
@@ -125,12 +120,9 @@ def learning_curve(
     """Draw the exact regret of one or more methods over environment steps, each from several runs.
 
     A line is the median over a method's runs of their running medians, and a band their quartiles.
-
-    Args:
-      runs: from each method's name to its runs (seeds), each as in `training_curve`, where a
-        single path or table needs no list; or one table of all, a pandas frame or a mapping of
-        `[N]` arrays, with the columns `step` and `regret`, and `method` and `seed` where there
-        are several.
+    `runs` map each method's name to its runs (seeds), each as in `training_curve`, where a single
+    path or table needs no list; or are one table, a pandas frame or a mapping of `[N]` arrays, with
+    the columns `step` and `regret`, and `method` and `seed` where there are several.
 
     Examples:
       >>> from sme_registry.plots import learning_curve
@@ -424,10 +416,7 @@ def _draw_lines(
     name: str,
     **style: Any,
 ) -> None:
-    """Lines by their labels, each a statistic of the `[n, X]` values of its seeds at `[X]` places.
-
-    Quartiles are bands, unless there are more lines than colours.
-    """
+    """Lines by their labels, each a statistic of its seeds' `[n, X]` values at `[X]` places."""
     banded = len(lines) <= len(COLOURS) and any(len(values) > 1 for _, values in lines.values())
     for index, (label, (x, values)) in enumerate(lines.items()):
         draw_runs(axes, x, values, statistic, {**look(index), **style}, label, banded)

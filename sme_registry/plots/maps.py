@@ -164,12 +164,9 @@ def retention_map(
     """Draw a retention matrix: normalised regret after each visit (rows) on each phase (columns).
 
     Bright is good. The cell of the phase that was just visited is outlined. The first row is the
-    initial policy, where the reports have one.
-
-    Args:
-      runs: the report of an agent, or one for each seed: then the cells are their IQM. A report
-        may be given by its path, or by the folder that contains its stream.json.
-      region: `WD`, `OOD 1`, …, or `OOD` for the mean over the shells.
+    initial policy, where the reports have one. `runs` are the report of an agent, its path, or the
+    folder of its stream.json; or several, one for each seed, whose IQM the cells are. `region` is
+    `WD`, `OOD 1`, …, or `OOD` for the mean over the shells.
 
     Examples:
       >>> from sme_registry.plots import retention_map
@@ -198,10 +195,7 @@ def retention_map(
 def draw_matrix(
     axes: Axes, M: Array, visited: Sequence[tuple[int, int]], labels: Sequence[str], top: float
 ) -> AxesImage:
-    """Draw a retention matrix `[V, P]` in axes, with the `visited` cells outlined.
-
-    `top` is the regret at the dark end of the colours, at least that of every cell.
-    """
+    """A retention matrix `[V, P]` with `visited` cells outlined; the darkest colour is `top`."""
     image = axes.imshow(
         M, vmin=0.0, vmax=top, cmap="viridis_r", aspect="auto", interpolation="nearest"
     )

@@ -1,8 +1,4 @@
-"""Figures of evaluation reports: decay outside the cube, reward against cost, distraction.
-
-A line, bar or marker is a report, or a method: the reports of its runs. `write_training`,
-`write_evaluation` and `write_stream` write what commands write into a folder, as PNG and as PDF.
-"""
+"""Figures of evaluation reports: decay outside the cube, reward against cost, distraction."""
 
 from __future__ import annotations
 
@@ -97,9 +93,8 @@ def decay_curve(
         name to the reports of its runs (seeds or instances), each a line of their IQM, with their
         quartiles as a band. A single report of a team also has a thinner line for each agent.
         A report may be given by its path, evaluation.json, or by the folder that contains it.
-      references: whether to draw the reference policies as thin lines. In a mapping they are means
-        over its tasks; otherwise they are drawn once per task: in grey, or with several tasks in
-        the colour of the first report on each task.
+      references: whether the reference policies are thin lines: in a mapping means over its tasks,
+        otherwise one per task, of several in the colour of the first report on each.
 
     Examples:
       >>> from sme_registry.plots import decay_curve
@@ -451,11 +446,7 @@ def write_stream(report: StreamReport, folder: Path) -> list[Path]:
 
 
 def write_evaluation(report: EvaluationReport, folder: Path, policy: Any = None) -> list[Path]:
-    """Write the figures of an evaluation for which its report has the numbers.
-
-    They are the decay curve, and of a policy that observes two state channels the similarity map;
-    without a policy, or of a team's, there is no map.
-    """
+    """Write the figures for which a report has the numbers; with a policy also its map."""
     files = _write(folder, decay_curve, report)
     if report.safety is not None:
         files += _write(folder, reward_against_cost, report)

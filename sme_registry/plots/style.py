@@ -1,8 +1,7 @@
 """What all figures share: style, colours, legends below the panels, files, and reports by path.
 
-The colours are those of Okabe and Ito, which colour-blind readers can distinguish. Lines also
-differ in dash and marker, and maps in lightness, so that they remain legible in grey. Figures are
-made without pyplot: nothing global changes, and no display is needed.
+The colours are those of Okabe and Ito, which colour-blind readers can distinguish. Lines differ in
+dash and marker too, for grey prints. Without pyplot nothing global changes: no display is needed.
 """
 
 from __future__ import annotations
@@ -146,10 +145,9 @@ def canvas(
     panels: int = 1,
     title: str | None = None,
 ) -> Iterator[list[Axes]]:
-    """The panels that a public function draws in: the caller's, or those of a new figure.
+    """The caller's panels, or those of a new figure, which then gets a title and a legend.
 
-    After the block a new figure has its title, and a legend of all labelled lines below its panels;
-    the caller's axes have neither. The figure is written if there is a path.
+    The figure is written if there is a path.
     """
     if path is not None:
         _format_of(path)
@@ -241,10 +239,7 @@ def name_bands(axes: Axes, label: str) -> None:
 
 
 def draw_reference(axes: Axes, name: str, x: Any, y: Any, label: str, colour: Any = GREY) -> None:
-    """The line of a reference policy: over x, or across the panel if x is None.
-
-    `merge_coincident` may later combine it with the line of another one.
-    """
+    """The line of a reference policy: over x, or across the panel if x is None."""
     style: Any = {
         "color": colour, "linewidth": 1.1, "linestyle": REFERENCE_DASHES.get(name, "-"),
         "zorder": 1.5, "label": label, "gid": f"{_REFERENCE}{colour}",

@@ -23,7 +23,7 @@ import numpy as np
 from sme_registry.datasets import DatasetRecipe, collect, train_offline
 from sme_registry.envs.schedule import Schedule
 from sme_registry.errors import OptionError, PolicyError, SpecError
-from sme_registry.evaluation import Policy, TeamPolicy, as_policy, evaluate
+from sme_registry.evaluation import EvaluationReport, Policy, TeamPolicy, as_policy, evaluate
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import write_atomically
@@ -151,7 +151,7 @@ def _run_reference(cell: Cell, name: str, progress: ReportSteps) -> CellResult:
     for steps in evaluations.record.due:
         evaluations.evaluate(steps, policy)
         evaluations.report(steps)
-    return evaluations.result_of(policy, 0)
+    return evaluations.result_of(evaluations.report_on(policy), 0)
 
 
 class _Evaluations(Watch):
@@ -192,15 +192,10 @@ class _Evaluations(Watch):
         self.record.evaluation(k, np.array(row)[:, None], by_agent)
         self.record.spend(EVALUATION)
 
-    def result_of(
-        self, policy: Policy | TeamPolicy, steps: int, environment: float = 0.0
-    ) -> CellResult:
-        cell = self.cell
-        return self._result(
-            evaluate(policy, cell.spec, cell.protocol, name=cell.uses), steps, environment
-        )
+    def report_on(self, policy: Policy | TeamPolicy) -> EvaluationReport:
+        return evaluate(policy, self.cell.spec, self.cell.protocol, name=self.cell.uses)
 
-    def _result(self, report: Any, steps: int, environment: float) -> CellResult:
+    def result_of(self, report: Any, steps: int, environment: float = 0.0) -> CellResult:
         self.record.spend(EVALUATION)
         timing = self.record.timing(steps, environment=environment)
         return self.record.result(0, steps, report, timing)
@@ -251,12 +246,14 @@ class _Training(_Evaluations):
 
     def result(self) -> CellResult:
         learner, blocks = self._learner, self.record.blocks
+        report: Any
         if blocks is None:
-            return self.result_of(learner.policy(), learner.steps, learner.env.seconds)
-        self._count(learner.steps)
-        initial, *visits = self._policies
-        report = life_report(self.cell, visits, initial, blocks.dynamic_regret())
-        return self._result(report, learner.steps, learner.env.seconds)
+            report = self.report_on(learner.policy())
+        else:
+            self._count(learner.steps)
+            initial, *visits = self._policies
+            report = life_report(self.cell, visits, initial, blocks.dynamic_regret())
+        return self.result_of(report, learner.steps, learner.env.seconds)
 
     def _evaluate_due(self, steps: int) -> None:
         """Run the evaluations that are due during training; the last one waits for its end."""

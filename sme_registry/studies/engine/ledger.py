@@ -285,13 +285,11 @@ STATES: tuple[State, ...] = ("done", "running", "failed", "waiting")
 
 
 def label(planned: PlannedCell) -> str:
-    return run_label(planned.class_name, planned.algorithm, planned.run, planned.phase)
-
-
-def run_label(class_name: str, algorithm: str, run: int, phase: int | None = None) -> str:
     """`PPO on k-25, run 3`, or of a fresh agent `PPO on phase 2 of Switch5 alone, run 3`."""
-    alone = "" if phase is None else f"phase {phase} of "
-    return f"{algorithm} on {alone}{class_name}{alone and ' alone'}, run {run}"
+    name = planned.class_name
+    if planned.phase is not None:
+        name = f"phase {planned.phase} of {name} alone"
+    return f"{planned.algorithm} on {name}, run {planned.run}"
 
 
 @dataclass(frozen=True)

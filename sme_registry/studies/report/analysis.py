@@ -158,12 +158,9 @@ def setting_label(field: str, value: Any, *, with_symbol: bool = True) -> str:
     """`k = 25`, or `25` without the symbol of the field."""
     text = value
     if not isinstance(value, str):
-        text = f"{value:g}" if is_numeric([value]) else _json(value)
+        as_json = json.dumps(value, separators=(",", ":"), ensure_ascii=False)
+        text = f"{value:g}" if is_numeric([value]) else as_json
     return f"{AXES.get(field, (field,))[0]} = {text}" if with_symbol else text
-
-
-def _json(value: Any) -> str:
-    return json.dumps(value, separators=(",", ":"), ensure_ascii=False)
 
 
 def _class_info(member: SuiteClass, first: SuiteClass) -> ClassInfo:

@@ -16,22 +16,28 @@
     best_constant_normalised_regret, random_normalised_regret   of these references, likewise
     constant_similarity          mean r̃ of the constant ½, in [0, 1]
 
-Columns of the run, repeated in each of its regions; NaN or NA where the run has no such number:
+Columns of the run, repeated in each of its regions; NaN or NA where the run has no such number.
+Fields of the task's spec have their own names, and so do those of its observation.
 
     wd_regret, ood_regret        normalised regret in WD, and its mean over the shells
     ood_decay                    ood_regret − wd_regret
     final_return                 mean return of the last evaluations, in % of the optimum's
     online_regret                mean of 1 − step reward over training, in [0, 1]
     uses, action_range, steps    the algorithm, its action range, its training steps
-    state_dim, action_dim, k, r_min, D, complexity, horizon, hidden_width, policy_init, rotation,
-    spec_seed                    fields of the task's spec; spec_seed as text
-    spec_digest, seed            the task's digest; the seed of training
+    spec_seed, spec_digest, seed     of the task, as text; the seed of training
     nu, transitions, dataset_digest   the data set of an offline run: ν in [0, 1], its size
     behaviour_similarity, behaviour_similarity_sd    r̃ of the behaviour policy over the data set
     offline_similarity, offline_similarity_sd        r̃ of the learner over its last episodes
     improvement                  offline_similarity − behaviour_similarity
     seconds, steps_per_second    CPU time of the run, and training speed
     key                          digest of the run's cell, which names its file
+
+With safety: tightness τ of the limits; online_cost, the mean over training; wd_cost and
+wd_safe_regret, of the cube; cost, violating_share, safe_regret and price_of_safety, of the region.
+With observation: distractor_regret, the mean over the shells of d; wd_invariance, of the cube;
+invariance, of the region. The numbers of a team are means over agents or channels. Those of each
+agent have its name, in `results` normalised_regret/agent_0 of the region, and wd_regret, ood_regret
+and online_regret of the run, and in `curves` regret/agent_0.
 
 `curves`: one row per run and evaluation during training, ordered by class, algorithm, run, step.
 
@@ -40,25 +46,6 @@ Columns of the run, repeated in each of its regions; NaN or NA where the run has
     regret                       mean of 1 − step reward over their steps, in [0, 1]
     similarity                   mean r̃ over their steps, in [0, 1]
     length                       mean length of the episodes, in steps
-
-Where the plan has teams, whose other numbers are means over agents or channels, there are columns
-for each agent, NaN for tasks without it:
-
-    results: normalised_regret/<agent>                                    of the region
-             wd_regret/<agent>, ood_regret/<agent>, online_regret/<agent> of the run
-    curves:  regret/<agent>                                               of the evaluation
-
-Where the plan has tasks with safety or with observation, `results` has these columns of them, NaN
-or NA for the other tasks:
-
-    tightness                                             of the task's limits, τ
-    online_cost                                           of the run: mean cost over training
-    wd_cost, wd_safe_regret                               of the run: those of the cube
-    cost, violating_share, safe_regret, price_of_safety   of the region
-    distractors, dynamics, mixing, mixing_depth           fields of the task's observation
-    distractor_regret                                     of the run: mean over the shells of d
-    wd_invariance                                         of the run: that of the cube
-    invariance                                            of the region
 
 `load_streams` has lives in streams: an agent's training through a whole stream. Fresh agents, which
 train on one phase alone, are joined to it: a life has its plasticity and learning transfer once all
@@ -76,36 +63,29 @@ of them have finished. `evaluation.retention` has the formulas.
     plasticity_ratio, plasticity_difference   of the visited phase's regret to a fresh agent's,
                                  mean over visits ≥ 1: in visit 0 a life is a fresh agent itself
 
-Columns of the life, repeated in each of its regions; NaN where it has no such number:
+Columns of the life, repeated in each of its regions; NaN where it has no such number. Those that
+runs on single tasks have as well mean the same.
 
     learning_transfer            1 − online regret / that of the fresh agents, mean over visits ≥ 1
-    online_regret                mean of 1 − step reward over the life, in [0, 1]
-    dynamic_regret               its sum
+    online_regret, dynamic_regret    mean of 1 − step reward over the life, in [0, 1]; its sum
     frozen_online_regret         online regret of the same agent if it stops learning after visit 0,
                                  in expectation
-    uses, action_range, steps    the algorithm, its action range, environment steps of the life
     state_dim, action_dim, horizon   of every phase
-    stream_digest, seed          the stream's digest; the seed of training
+    stream_digest                the stream's digest
     fresh_agents                 number of its fresh agents that have finished; a life of one phase
                                  that drifts is a fresh agent itself, and has none
-    seconds, steps_per_second    CPU time of the life, and training speed
-    key                          digest of the life's cell, which names its file
 
 `visits`: one row per life, visit and region, with the metrics at the end of the visit.
 
     visit, cycle, phase          indices from 0; phase is that of the stream's document
     lifetime                     environment steps at the end of the visit
-    normalised_regret            on the phase just visited
-    fresh_normalised_regret      that of the phase's fresh agent
+    normalised_regret, fresh_normalised_regret   on the phase just visited; its fresh agent's
     average_performance, backward_transfer, forgetting, plasticity_ratio, plasticity_difference
     online_regret, dynamic_regret, frozen_online_regret, fresh_online_regret, learning_transfer
                                  of the visit's training, repeated in each region
 
-`retention`: the retention matrices, one row per life, region, visit and phase.
-
-    visit                        NA for the initial policy
-    phase                        on whose task the policy at the end of the visit is evaluated
-    normalised_regret            0 optimal, 1 the constant ½
+`retention`: the retention matrices, one row per life, region, visit and phase: `normalised_regret`
+on the task of `phase` at the end of `visit`, which is NA for the initial policy.
 
 `curves`: one row per life and evaluation during training, as in `load`: on the task in force.
 """
