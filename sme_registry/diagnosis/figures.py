@@ -4,20 +4,23 @@ agent; of a life by visit and phase."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from sme_registry.diagnosis.behaviour import Log
+from sme_registry.diagnosis.behaviour import Log, OnPolicy, TrainingSummary
 from sme_registry.diagnosis.document import Diagnosis
-from sme_registry.diagnosis.measure import LINEAR, POLICY
+from sme_registry.diagnosis.measure import LINEAR, POLICY, DistractorRegret, Violations
 from sme_registry.diagnosis.questions import Measurements
 from sme_registry.diagnosis.stream import StreamDiagnosis
 from sme_registry.diagnosis.subject import AnySubject, StreamSubject, Subject
 from sme_registry.diagnosis.task import TaskDiagnosis
 from sme_registry.diagnosis.team import TeamDiagnosis
+from sme_registry.evaluation import ObservationReport
 from sme_registry.evaluation.references import LABELS
+from sme_registry.evaluation.regions import LayerProbe
 from sme_registry.plots.curves import draw_training, tick_visits
 from sme_registry.plots.maps import retention_map
 from sme_registry.plots.reports import draw_cost
@@ -68,27 +71,25 @@ def _fills(
 ) -> Iterator[tuple[str, Callable[[Figure], None]]]:
     """The figures by name, and what fills each of them."""
     if isinstance(diagnosis, TeamDiagnosis):
-        yield "who_agents", lambda figure: _agents(figure, diagnosis)
+        yield "who_agents", partial(_agents, diagnosis)
     elif isinstance(diagnosis, StreamDiagnosis):
-        yield "which_phases", lambda figure: _which_phases(figure, diagnosis)
+        yield "which_phases", partial(_which_phases, diagnosis)
         if any(visit.network is not None for visit in diagnosis.visits):
-            yield "network_by_visit", lambda figure: _network_by_visit(figure, diagnosis)
+            yield "network_by_visit", partial(_network_by_visit, diagnosis)
     elif isinstance(diagnosis, TaskDiagnosis):
         measured, observation = diagnosis.measurements, diagnosis.measurements.observation
-        threshold = diagnosis.thresholds["explained_variance"]
-        yield "where_channels", lambda figure: _channels(figure, measured)
-        yield "where_states", lambda figure: _states(figure, measured, threshold)
-        yield "where_time", lambda figure: _time(figure, measured)
-        yield "what_the_error_is", lambda figure: _squared_error(figure, measured)
-        log = subject.log if isinstance(subject, Subject) else None
-        if log is not None:
-            yield "training", lambda figure: _training(figure, measured, log)
+        yield "where_channels", partial(_channels, measured)
+        yield "where_states", partial(_states, measured, diagnosis.thresholds["explained_variance"])
+        yield "where_time", partial(_time, measured)
+        yield "what_the_error_is", partial(_squared_error, measured)
+        if isinstance(subject, Subject) and subject.log is not None and measured.training:
+            yield "training", partial(_training, measured.on_policy, measured.training, subject.log)
         if measured.limits is not None:
-            yield "limits", lambda figure: _limits(figure, measured)
-        if measured.distraction is not None:
-            yield "distraction", lambda figure: _distraction(figure, measured)
+            yield "limits", partial(_limits, measured.limits)
+        if observation is not None and measured.distraction is not None:
+            yield "distraction", partial(_distraction, measured.distraction, observation)
         if observation is not None and len(observation.probes) > 1:
-            yield "layers", lambda figure: _layers(figure, measured)
+            yield "layers", partial(_layers, observation.probes)
 
 
 def _lines(axes: Axes, x: Any, series: Mapping[str, Any]) -> None:
@@ -143,7 +144,7 @@ def _legends(*panels: Axes, ncols: int = 1) -> None:
         legend_above(axes, ncols=ncols)
 
 
-def _channels(figure: Figure, measured: Measurements) -> None:
+def _channels(measured: Measurements, figure: Figure) -> None:
     channels = measured.channels[:_MOST]
     left, right = figure.subplots(1, 2)
     x, _ = (_tick_channels(axes, measured.channels) for axes in (left, right))
@@ -165,7 +166,7 @@ def _channels(figure: Figure, measured: Measurements) -> None:
     _legends(left, right)
 
 
-def _states(figure: Figure, measured: Measurements, threshold: float) -> None:
+def _states(measured: Measurements, threshold: float, figure: Figure) -> None:
     left, middle, right = figure.subplots(1, 3)
     centre, *channels = measured.partitions
     best = sorted(channels, key=lambda p: -p.explained_variance)[:2]
@@ -203,7 +204,7 @@ def _states(figure: Figure, measured: Measurements, threshold: float) -> None:
     _legends(left, middle, right)
 
 
-def _time(figure: Figure, measured: Measurements) -> None:
+def _time(measured: Measurements, figure: Figure) -> None:
     episodes, time = measured.on_policy, measured.time_dependence
     left, right = figure.subplots(1, 2)
     middles = (np.array(episodes.edges[:-1]) + np.array(episodes.edges[1:])) / 2
@@ -222,7 +223,7 @@ def _time(figure: Figure, measured: Measurements) -> None:
     _legends(left, right)
 
 
-def _squared_error(figure: Figure, measured: Measurements) -> None:
+def _squared_error(measured: Measurements, figure: Figure) -> None:
     error, episodes = measured.squared_error, measured.on_policy
     left, right = figure.subplots(1, 2)
     shares = {
@@ -251,11 +252,9 @@ def _squared_error(figure: Figure, measured: Measurements) -> None:
     legend_above(right, ncols=3, columnspacing=1.0, handlelength=1.4)
 
 
-def _training(figure: Figure, measured: Measurements, log: Log) -> None:
+def _training(episodes: OnPolicy, training: TrainingSummary, log: Log, figure: Figure) -> None:
     axes = figure.add_subplot()
     draw_training(axes, log.step, log.regret, unit=log.source.removesuffix("s"))
-    training, episodes = measured.training, measured.on_policy
-    assert training is not None  # there is a log
     for name in _REFERENCES[:3]:
         _reference(axes, episodes.scores[name].regret, name)
     regret = episodes.scores[POLICY].regret
@@ -272,10 +271,8 @@ def _training(figure: Figure, measured: Measurements, log: Log) -> None:
     legend_below(figure, axes.get_legend_handles_labels()[0])
 
 
-def _limits(figure: Figure, measured: Measurements) -> None:
+def _limits(limits: Violations, figure: Figure) -> None:
     """Reward against cost, and which action channels violate their limits."""
-    limits = measured.limits
-    assert limits is not None  # it is drawn only then
     left, right = figure.subplots(1, 2)
     scores = {
         "this policy": limits.report.regions[0],
@@ -295,11 +292,10 @@ def _limits(figure: Figure, measured: Measurements) -> None:
     _legends(left, right, ncols=2)
 
 
-def _distraction(figure: Figure, measured: Measurements) -> None:
+def _distraction(
+    distraction: DistractorRegret, observation: ObservationReport, figure: Figure
+) -> None:
     """Regret with other distractors, and how much they move the actions."""
-    distraction, observation = measured.distraction, measured.observation
-    assert distraction is not None  # it is drawn only then
-    assert observation is not None
     left, right = figure.subplots(1, 2)
     regrets = {
         "uniform": distraction.normalised_regret,
@@ -326,10 +322,9 @@ def _distraction(figure: Figure, measured: Measurements) -> None:
     legend_above(left)
 
 
-def _layers(figure: Figure, measured: Measurements) -> None:
+def _layers(probes: Sequence[LayerProbe], figure: Figure) -> None:
     """What a linear map recovers from each layer."""
-    assert measured.observation is not None  # it is drawn only then
-    axes, probes = figure.add_subplot(), measured.observation.probes
+    axes = figure.add_subplot()
     x, series = np.arange(len(probes)), {"of the state": [p.state_r2 for p in probes]}
     if probes[0].distractor_r2 is not None:
         series["of the distractors"] = [p.distractor_r2 or 0.0 for p in probes]
@@ -341,7 +336,7 @@ def _layers(figure: Figure, measured: Measurements) -> None:
     legend_above(axes, ncols=2)
 
 
-def _agents(figure: Figure, diagnosis: TeamDiagnosis) -> None:
+def _agents(diagnosis: TeamDiagnosis, figure: Figure) -> None:
     agents = diagnosis.agents[:_MOST]
     left, right = figure.subplots(1, 2)
     regret = max(diagnosis.visited.regret, 1e-12)
@@ -367,7 +362,7 @@ def _agents(figure: Figure, diagnosis: TeamDiagnosis) -> None:
         legend_above(axes)
 
 
-def _which_phases(figure: Figure, diagnosis: StreamDiagnosis) -> None:
+def _which_phases(diagnosis: StreamDiagnosis, figure: Figure) -> None:
     left, right = figure.subplots(1, 2)
     visits, phases = diagnosis.visits, diagnosis.phases
     _bars(left, range(len(visits)), {"this life": [visit.online_regret for visit in visits]})
@@ -397,7 +392,7 @@ def _draw_fresh(axes: Axes, values: Sequence[float | None]) -> None:
         axes.hlines(numbers, x - 0.45, x + 0.45, color="black", linewidth=1.6, label=_FRESH)
 
 
-def _network_by_visit(figure: Figure, diagnosis: StreamDiagnosis) -> None:
+def _network_by_visit(diagnosis: StreamDiagnosis, figure: Figure) -> None:
     quantities = {
         "inactive_units": "inactive hidden units, share",
         "effective_rank": "effective rank of the last hidden layer",
