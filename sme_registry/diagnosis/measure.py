@@ -179,8 +179,7 @@ def fit_references(task: Task, states: int, seed: int) -> references.References:
     """Fit the references on uniform states that no measurement uses."""
     count = min(4 * affordable(task, states), references.fit_states(task.spec))
     s = uniform(seed, "diagnosis/fit", count * task.spec.state_dim).reshape(count, -1)
-    agents = zip(task.observed, task.owned, strict=True)
-    return references.fit(s, engine(task).optimal_action(s), agents)
+    return references.fit(task, s, engine(task).optimal_action(s))
 
 
 def states_of(spec: SMESpec, count: int, seed: int, region: int = 0) -> States:

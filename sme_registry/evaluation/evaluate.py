@@ -342,9 +342,8 @@ class Measurement:
             optimal.append(self._oracle.optimal_action(s[-1]))
             if rows * len(s) >= count:
                 break
-        agents = zip(task.observed, task.owned, strict=True)
-        first = np.concatenate(s)[:count], np.concatenate(optimal)[:count]
-        return references.fit(*first, agents), iter(optimal)
+        fitted = references.fit(task, np.concatenate(s)[:count], np.concatenate(optimal)[:count])
+        return fitted, iter(optimal)
 
     @functools.cached_property
     def _reference_reports(self) -> dict[str, dict[str, tuple[RegionReport, ...]]]:

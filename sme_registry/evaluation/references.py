@@ -16,7 +16,7 @@ only on the channels that it observes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +26,7 @@ from sme_registry.compiled import engine
 from sme_registry.compiled.arrays import Observation
 from sme_registry.errors import SpecError
 from sme_registry.spec import SMESpec
-from sme_registry.task import materialize
+from sme_registry.task import Task, materialize
 from sme_registry.task.draw import Array
 
 Act = Callable[[Observation], Any]
@@ -90,13 +90,12 @@ def safe_actions(spec: SMESpec, optimal: Array, limit: Array) -> dict[str, Array
     }
 
 
-def fit(
-    s: Array, optimal: Array, agents: Iterable[tuple[Sequence[int], slice]] | None = None
-) -> References:
+def fit(task: Task, s: Array, optimal: Array) -> References:
+    """The references fitted on states `[n, S]` and their optimal actions `[n, A]`."""
     S, A = s.shape[1], optimal.shape[1]
     slope, intercept = np.zeros((S, A)), np.empty(A)
     owned_by_observed: dict[tuple[int, ...], list[int]] = {}
-    for observed, owned in [(range(S), slice(0, A))] if agents is None else agents:
+    for observed, owned in zip(task.observed, task.owned, strict=True):
         owned_by_observed.setdefault(tuple(observed), []).extend(range(owned.start, owned.stop))
     for observed, columns in owned_by_observed.items():
         design = np.concatenate([s[:, observed] - 0.5, np.ones((len(s), 1))], axis=1)
@@ -165,8 +164,7 @@ def _joint_policy(name: str, spec: SMESpec) -> Callable[[Array], Array]:
         optimal_action = engine(task).optimal_action
         return lambda s: safe_actions(spec, optimal_action(s), task.limit(s))[name]
     s = np.random.default_rng(0).random((fit_states(spec), spec.state_dim))
-    agents = zip(task.observed, task.owned, strict=True)
-    fitted = fit(s, engine(task).optimal_action(s), agents)
+    fitted = fit(task, s, engine(task).optimal_action(s))
     if name == "best_constant":
         return lambda s: np.tile(fitted.constant, (len(s), 1))
     return fitted.linear

@@ -136,16 +136,18 @@ def test_regions_are_named_as_in_the_paper_and_do_not_depend_on_those_outside():
     assert np.array_equal(drawn(1, 4), drawn(1, 4, epsilons=(0.2,)))
 
 
+TASK = materialize(SMESpec(state_dim=3, action_dim=2, complexity=5))
+
+
 @pytest.fixture(scope="module")
 def solved():
-    task = materialize(SMESpec(state_dim=3, action_dim=2, complexity=5))
     s = np.random.default_rng(0).random((5_000, 3))
-    return s, task.optimal_action(s)
+    return s, TASK.optimal_action(s)
 
 
 def test_best_constant_cannot_be_improved_in_any_channel(solved):
     s, optimal = solved[0], solved[1] ** 3  # skewed, so that median and mean differ
-    constant = references.fit(s, optimal).constant
+    constant = references.fit(TASK, s, optimal).constant
     least = np.abs(constant - optimal).mean(axis=0)
     for moved in (constant - 0.01, constant + 0.01, np.full(2, 0.5), optimal.mean(axis=0)):
         assert (least <= np.abs(moved - optimal).mean(axis=0)).all()
@@ -153,7 +155,7 @@ def test_best_constant_cannot_be_improved_in_any_channel(solved):
 
 def test_linear_policy_is_the_least_squares_fit_within_the_action_range(solved):
     s, optimal = solved
-    fitted = references.fit(s, optimal)
+    fitted = references.fit(TASK, s, optimal)
     residual = (s - 0.5) @ fitted.slope + fitted.intercept - optimal
     assert np.abs(residual.mean(axis=0)).max() < 1e-12
     assert np.abs(s.T @ residual / len(s)).max() < 1e-12
@@ -161,14 +163,14 @@ def test_linear_policy_is_the_least_squares_fit_within_the_action_range(solved):
     clipped = fitted.actions(far, optimal, optimal)["linear_least_squares"]
     assert (clipped.min(), clipped.max()) == (0.0, 1.0)
     affine = (s - 0.5) @ np.random.default_rng(1).uniform(-0.1, 0.1, (3, 2)) + [0.4, 0.6]
-    recovered = references.fit(s, affine).actions(s, affine, affine)["linear_least_squares"]
+    recovered = references.fit(TASK, s, affine).actions(s, affine, affine)["linear_least_squares"]
     assert np.abs(recovered - affine).max() < 1e-12
 
 
 def test_every_named_reference_acts(solved):
     s, optimal = solved
     random = np.random.default_rng(2).random(optimal.shape)
-    actions = references.fit(s, optimal).actions(s, optimal, random)
+    actions = references.fit(TASK, s, optimal).actions(s, optimal, random)
     assert tuple(actions) == references.NAMES
     assert actions["optimal"] is optimal
     assert actions["uniform_random"] is random

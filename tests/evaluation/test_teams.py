@@ -116,14 +116,17 @@ def test_the_linear_reference_of_an_agent_is_fitted_on_what_it_observes():
     rng = np.random.default_rng(0)
     s = rng.random((3_000, 4))
     best = TASK.optimal_action(s)
-    fitted = references.fit(s, best, zip(TASK.observed, TASK.owned, strict=True))
+    fitted = references.fit(TASK, s, best)
     for channels, own in zip(TASK.observed, TASK.owned, strict=True):
-        alone = references.fit(s[:, channels], best[:, own])
+        seen, optimal = s[:, channels], best[:, own]
+        single = materialize(SMESpec(state_dim=seen.shape[1], action_dim=optimal.shape[1]))
+        alone = references.fit(single, seen, optimal)
         assert fitted.slope[list(channels), own] == pytest.approx(alone.slope, abs=1e-12)
         assert fitted.intercept[own] == pytest.approx(alone.intercept, abs=1e-12)
         unseen = [channel for channel in range(4) if channel not in channels]
         assert not fitted.slope[unseen, own].any()
-    together = references.fit(s, best)
+    single = materialize(SMESpec(state_dim=4, action_dim=best.shape[1]))
+    together = references.fit(single, s, best)
     assert together.slope[1, 0] != 0.0  # one map of the whole state would not be the agents'
 
 
