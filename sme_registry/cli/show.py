@@ -329,15 +329,10 @@ def _show_stream(document: StreamSpec | StreamFile) -> None:
 
 def _show_suite(file: SuiteFile, json: bool) -> None:
     if json:
-        instances: list[dict[str, Any]] = [
-            {"class": member.name, "seed": spec.to_dict()["seed"], "digest": spec.digest}
-            for member in file.suite.classes
-            for spec in member.instances
-        ]
-        instances += [
-            {"class": member.name, "draw": number, "digest": stream.digest}
-            for member in file.suite.streams
-            for number, stream in zip(member.draws, member.instances, strict=True)
+        places = zip(file.suite.places, file.suite.documents, strict=True)
+        instances = [
+            {"class": name, kind: number, "digest": document.digest}
+            for (name, kind, number), document in places
         ]
         print_json({**file.to_dict(), "derived": {"instances": instances}})
         return

@@ -340,35 +340,27 @@ def certify(
 
 def _tasks(name: str) -> list[tuple[str, SMESpec]]:
     document = find_any(name)
-    if isinstance(document, SMESpec):
-        return [(name, document)]
-    if isinstance(document, EnvFile):
-        materialize_segments(*document.published)
-        return [(name, document.spec)]
+    if isinstance(document, ProtocolFile | StudyFile):
+        raise UnknownNameError(
+            f"{name!r}: is a {kind_of(document)}. Give a task, a stream or a suite."
+        )
     if isinstance(document, SuiteFile):
-        tasks = [
-            (f"{document.name}/{member.name} seed {spec.seed}", spec)
-            for member in document.suite.classes
-            for spec in member.instances
-        ]
-        draws = [
-            (f"{document.name}/{member.name} draw {number}", stream)
-            for member in document.suite.streams
-            for number, stream in zip(member.draws, member.instances, strict=True)
-        ]
-        return tasks + [phase for label, stream in draws for phase in _phases(label, stream)]
-    if isinstance(document, StreamSpec):
-        return _phases(name, document)
-    if isinstance(document, StreamFile):
+        suite = document.suite
+        labels = [f"{document.name}/{member} {kind} {n}" for member, kind, n in suite.places]
+        instances = zip(labels, suite.documents, strict=True)
+        return [task for label, instance in instances for task in _phases(label, instance)]
+    if isinstance(document, EnvFile | StreamFile):
         materialize_segments(*document.published)
-        return _phases(document.name, document.stream)
-    assert isinstance(document, ProtocolFile | StudyFile)
-    kind = "protocol" if isinstance(document, ProtocolFile) else "study"
-    raise UnknownNameError(f"{name!r}: is a {kind}. Give a task, a stream or a suite.")
+        return _phases(name, document.published.document)
+    assert isinstance(document, SMESpec | StreamSpec)
+    return _phases(name, document)
 
 
-def _phases(label: str, stream: StreamSpec) -> list[tuple[str, SMESpec]]:
-    return [(f"{label} phase {index}", phase.spec) for index, phase in enumerate(stream.phases)]
+def _phases(label: str, document: SMESpec | StreamSpec) -> list[tuple[str, SMESpec]]:
+    """A task, or that of each phase of a stream."""
+    if isinstance(document, SMESpec):
+        return [(label, document)]
+    return [(f"{label} phase {index}", spec) for index, spec in enumerate(document.specs)]
 
 
 def _print_outcome(label: str, certificate: Certificate) -> None:

@@ -308,22 +308,15 @@ class Batch:
         observation[envs, self._of_t : self._of_phase] = 0.0
         observation[envs, self._of_phase :] = self._one_hot[envs]
 
-    def place(
-        self,
-        states: Array,
-        t: Indices,
-        accumulated: Array,
-        distractors: Array | None = None,
-    ) -> None:
+    def place(self, states: Array, t: Indices, accumulated: Array) -> None:
         """Put every environment at any point of an episode; `observe` gives what is seen there.
 
-        States `[B, S]`, steps t `[B]` in [0, T), r_cum `[B, n]`, distractors `[B, m]`; None draws
-        them.
+        States `[B, S]`, steps t `[B]` in [0, T) and r_cum `[B, n]`; distractors are drawn.
         """
         self._s[:] = states.T
         self._t[:] = t
         self._accumulated[:] = accumulated.T
-        self._distractors.begin(self._envs, distractors)
+        self._distractors.begin(self._envs)
 
     def advance(self, actions: Array, resting: Mask | None = None) -> BatchStep:
         """One step, from actions `[B, A]` of the unit range, clipped; ActionError changes nothing.

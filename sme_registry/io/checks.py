@@ -21,7 +21,6 @@ def integer_in(
     high: int | None = None,
     *,
     advice: str = "",
-    error: type[SMEError] = OptionError,
 ) -> int:
     """Check an integer argument. NumPy's integers count, booleans and floats do not."""
     try:
@@ -30,20 +29,17 @@ def integer_in(
         number = None
     if number is None or number < low or (high is not None and number > high):
         allowed = f"of at least {low:,}" if high is None else f"in [{low:,}, {high:,}]"
-        raise error(f"{name}={value!r:.60}: must be an integer {allowed}.{advice and f' {advice}'}")
+        advice = advice and f" {advice}"
+        raise OptionError(f"{name}={value!r:.60}: must be an integer {allowed}.{advice}")
     return number
 
 
-def number_in(
-    name: str, value: Any, low: float, high: float = math.inf, *, advice: str = ""
-) -> float:
+def number_in(name: str, value: Any, low: float, high: float = math.inf) -> float:
     """Check a finite number, as `integer_in` checks an integer; booleans do not count."""
     is_number = isinstance(value, int | float | np.number) and type(value).__name__ != "bool"
     if not is_number or not (math.isfinite(value) and low <= value <= high):
         allowed = f"of at least {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
-        raise OptionError(
-            f"{name}={value!r:.60}: must be a finite number {allowed}.{advice and f' {advice}'}"
-        )
+        raise OptionError(f"{name}={value!r:.60}: must be a finite number {allowed}.")
     return float(value)
 
 

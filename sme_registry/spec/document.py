@@ -42,10 +42,10 @@ WORDED = "$comment"
 """The keyword under which our JSON Schemas say in words what a pattern allows."""
 
 
-def short_repr(value: Any, longest: int = 60) -> str:
+def short_repr(value: Any) -> str:
     """A value as an error repeats it: cut to a length that fits on a line."""
     try:
-        return _shortened(repr(value), longest)
+        return _shortened(repr(value), 60)
     except RecursionError:
         return f"a {type(value).__name__} nested too deeply"
 

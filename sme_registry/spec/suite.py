@@ -132,6 +132,13 @@ class Suite(Document):
         return (*self.instances, *self.stream_instances)
 
     @property
+    def places(self) -> list[tuple[str, str, int | str]]:
+        """Of each of the documents the class, "seed" or "draw", and which."""
+        seeds = [(member.name, "seed", seed) for member in self.classes for seed in member.seeds]
+        draws = [(member.name, "draw", draw) for member in self.streams for draw in member.draws]
+        return [*seeds, *draws]
+
+    @property
     def runs(self) -> dict[str, int]:
         """Class → number of its instances, of tasks and of streams."""
         tasks = {member.name: len(member.seeds) for member in self.classes}
