@@ -165,8 +165,8 @@ def play_episodes(
 ) -> Iterator[tuple[PlayStep, Batch]]:
     """The steps of whole episodes of a policy, and the batch after each.
 
-    The first numbers of an episode in the stream are its initial state, which determines its
-    distractors, too. Actions are exactly as the data set stores them: float32 in [0, 1].
+    The first numbers of an episode in the stream are its initial state. Actions are exactly as the
+    data set stores them: float32 in [0, 1].
     """
     batch, envs = Batch(task, len(episodes)), np.arange(len(episodes))
     states = next(episode_numbers(seed, stream, episodes, task.spec.state_dim, ahead=1))
@@ -272,7 +272,6 @@ def _first_rows(
 
 
 def _rows(kept: Mask, episodes: Indices, t: int, step: PlayStep, batch: Batch) -> Arrays:
-    """The rows of a step that are kept, by the names of their columns."""
     result = step.result
     columns: Arrays = {
         "episode": episodes,
@@ -304,7 +303,7 @@ def _concatenate(parts: list[Arrays]) -> Arrays:
 
 
 def _join(parts: list[Arrays], spec: SMESpec) -> Transitions:
-    """The rows of all behaviours as one data set, its trajectories numbered from 0."""
+    """The rows of all behaviours as one data set."""
     columns = _concatenate(parts)
     episode, t = columns.pop("episode"), columns.pop("t")
     values, limits = columns.pop("values"), columns.pop("limits")
@@ -380,7 +379,6 @@ def _score(similarity: Array, step_reward: Array, rollouts: EpisodeScores | None
 
 
 def _constant_values(task: Task, transitions: Transitions) -> tuple[Array, Array]:
-    """r̃ and r of a = ½ on the data set's states."""
     optimal = transitions.optimal_actions
     similarity = task.similarities_of(np.full_like(optimal, 0.5), optimal)
     rewarded = similarity

@@ -97,15 +97,15 @@ class Behaviour(StrictModel):
 class DatasetRecipe(Document):
     """The task, behaviour policies, size, coverage and seed of a data set.
 
-    With coverage ε it keeps only transitions from states in X_ε = {s : ‖s − ½‖_∞ ≤ (1 + ε)/2}; null
-    keeps all, as 0 does. Starts, each α and ã have a named stream of the seed each.
+    Starts, each α and ã have a named stream of the seed each.
 
     Attributes:
       spec: the task.
       behaviours: the policies that collect it, one after another; their weights add up to 1.
       transitions: N, rows of the data set.
       seed: of the data, not the task: an integer or, where nobody may guess it, hexadecimal text.
-      coverage: ε of the sub-cube of states that are kept; null keeps all.
+      coverage: ε of the sub-cube {s : ‖s − ½‖_∞ ≤ (1 + ε)/2} of states that are kept; null keeps
+        all, as 0 does.
       protocol: of the evaluation of policies that learn from the data set.
     """
 
@@ -141,7 +141,6 @@ class DatasetRecipe(Document):
         return tuple(high - low for low, high in itertools.pairwise(boundaries))
 
     def differences(self, other: DatasetRecipe) -> list[str]:
-        """The fields in which another recipe differs, such as `spec.complexity 1, requested 2`."""
         ours, theirs = _leaves(self.to_dict()), _leaves(other.to_dict())
         return [
             f"{path} {short_repr(ours.get(path))}, requested {short_repr(theirs.get(path))}"
@@ -228,31 +227,19 @@ class Seeds(StrictModel):
 
 
 class DatasetRecord(StrictModel):
-    """Provenance, reference scores and digests of a data set.
-
-    Attributes:
-      recipe: all that the data set was generated from.
-      recipe_digest, spec_digest, protocol_digest: of the recipe, its task and its protocol.
-      task: what the task's file calls it.
-      seeds: of the task and of the data.
-      nu: ν if a single mixture acted; null for other or several behaviours.
-      trajectories: E, the number of Minari episodes.
-      scores: of reference policies on the data set.
-      arrays_digest: see `Transitions.digest`.
-      versions: of Python and the packages that the numbers depend on.
-    """
+    """Provenance, reference scores and digests of a data set."""
 
     schema_version: SchemaVersion = 1
-    recipe: DatasetRecipe
+    recipe: DatasetRecipe  # all that the data set was generated from
     recipe_digest: Digest
     spec_digest: Digest
-    task: str = ""
+    task: str = ""  # what the task's file calls it
     protocol_digest: Digest
     seeds: Seeds
-    nu: float | None
-    trajectories: Annotated[Integer, Field(ge=1)]
+    nu: float | None  # if a single mixture acted
+    trajectories: Annotated[Integer, Field(ge=1)]  # the number of Minari episodes
     scores: ReferenceScores
-    arrays_digest: Digest
+    arrays_digest: Digest  # see `AlignedArrays.digest`
     versions: dict[str, str]
 
     @classmethod
@@ -347,44 +334,26 @@ class BehaviourQuality(StrictModel):
 
 
 class OfflineRecord(StrictModel):
-    """The arguments, data, evaluations and cost of an offline training.
-
-    Attributes:
-      algorithm: behaviour cloning or implicit Q-learning.
-      hyperparameters: all of them, as used.
-      seed: of initial weights, shuffles, and starts of the evaluation episodes.
-      steps, batch_size: of the gradient, and transitions in each.
-      episodes: of each evaluation.
-      dataset: id of the data set; null if only its arrays were passed.
-      dataset_digest: of its arrays.
-      recipe_digest: the recipe's; null if only the arrays were passed.
-      transitions: N, the size of the data set.
-      spec, spec_digest: the task, and its digest.
-      behaviour: of the data set's transitions.
-      evaluations: in order; last, the policy's.
-      wall_seconds, cpu_seconds: time of the training and its evaluations.
-      cpu_ms_per_step: of a gradient step, without evaluations.
-      versions: of Python and the packages that the numbers depend on.
-    """
+    """The arguments, data, evaluations and cost of an offline training."""
 
     schema_version: SchemaVersion = 1
     algorithm: Literal["bc", "iql"]
-    hyperparameters: dict[str, Any]
-    seed: Integer
-    steps: Integer
+    hyperparameters: dict[str, Any]  # all of them, as used
+    seed: Integer  # of initial weights, shuffles, and starts of the evaluation episodes
+    steps: Integer  # of the gradient
     batch_size: Integer
-    episodes: Integer
-    dataset: str | None
-    dataset_digest: str
+    episodes: Integer  # of each evaluation
+    dataset: str | None  # id of the data set; null if only its arrays were passed
+    dataset_digest: str  # of its arrays
     recipe_digest: str | None
-    transitions: Integer
+    transitions: Integer  # N, the size of the data set
     spec: SMESpec
     spec_digest: str
     behaviour: BehaviourQuality
-    evaluations: Annotated[TupleOf[OfflineEvaluation], Field(min_length=1)]
-    wall_seconds: Real
+    evaluations: Annotated[TupleOf[OfflineEvaluation], Field(min_length=1)]  # last, the policy's
+    wall_seconds: Real  # of the training and its evaluations, as is the next
     cpu_seconds: Real
-    cpu_ms_per_step: Real
+    cpu_ms_per_step: Real  # of a gradient step, without evaluations
     versions: dict[str, str]
 
     @property

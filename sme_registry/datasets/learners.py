@@ -7,13 +7,10 @@
            Q̄ ← (1 − ρ) Q̄ + ρ Q                                               after each step
 
 c is 0 after a termination and 1 otherwise, also after a timeout; σ is one number for each channel,
-in [e⁻⁵, e²]. No action outside the data set is ever evaluated. Source of IQL: Kostrikov, Nair,
-Levine, 2021, arXiv 2110.06169. Its three losses have disjoint parameters, so one backward pass at
-the same weights computes all of them, with V(o) and Q̄ evaluated once. Implementations that update
-V first weight the actions by the V of one step later.
+in [e⁻⁵, e²]. Source of IQL: Kostrikov, Nair, Levine, 2021, arXiv 2110.06169. Its three losses have
+disjoint parameters, so one backward pass at the same weights computes all of them.
 
-Actions lie in [0, 1], and the learners use u in [−1, 1], so that a critic's inputs are centred. A
-policy's mean is tanh of its last layer: always a valid action, and ½ where that is 0. The density
+A policy's mean is tanh of its last layer: always a valid action, and ½ where that is 0. The density
 that IQL requires is a normal one *around* that mean, not one squashed by tanh: actions of exactly 0
 and 1 occur in data, and their squashed density has no finite logarithm.
 """

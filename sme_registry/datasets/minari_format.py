@@ -1,12 +1,11 @@
 """Minari's layout of a data set: its columns as an HDF5 file, and the file's metadata.
 
 An episode of T steps holds `observations` `[T + 1, O]`, `infos/state` `[T + 1, S]` and, where the
-task has distractors, `infos/distractors` `[T + 1, m]`, whose last rows follow the last step. Minari
-requires length T + 1 for every info: the last row of the others repeats the row before it and has
-no meaning. A sealed data set has no infos.
+task has distractors, `infos/distractors` `[T + 1, m]`. Minari requires length T + 1 for every info:
+the last row of the others repeats the row before it. A sealed data set has no infos.
 
 Minari writes resizable HDF5 datasets, which take several times the space if episodes are short.
-These are of fixed size, so Minari cannot append steps to an existing episode.
+These are of fixed size.
 """
 
 from __future__ import annotations

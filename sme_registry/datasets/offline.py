@@ -1,14 +1,11 @@
 """`train_offline`: train BC or IQL on a data set, and evaluate the policy in the data set's task.
 
-During training, episodes of the policy are played in the task; their mean r̃ is compared with the
-exact mean r̃ of the data set. The final policy is evaluated in and out of distribution.
-
 The folder of an offline training:
     offline.json      the record, with all evaluations
     policy.npz        the policy, for `OfflinePolicy.load` and `sme evaluate`
     evaluation.json   its final evaluation; decay_curve.png, .pdf if matplotlib is installed
 
-`train_sealed` learns alike from a sealed data set. Importing this module does not import PyTorch.
+Importing this module does not import PyTorch.
 """
 
 from __future__ import annotations

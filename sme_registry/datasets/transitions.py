@@ -1,8 +1,7 @@
 """`Transitions`: a data set as aligned arrays, and what is known exactly about them and from them.
 
 `N` transitions, `S` state_dim, `A` action_dim, `n` agents (1 without a team), `m` distractors (0
-without `observation`), `O` = S + m + 1 + n entries of an observation, T horizon. Rows of one
-trajectory are contiguous and in order. `replay` checks each row against its task, by definition.
+without `observation`), `O` = S + m + 1 + n entries of an observation, T horizon.
 
 Off-policy evaluation estimates from data what a policy would earn. Here the task is known and its
 transitions are deterministic, so `exact_return` computes it, from any of `M` states:
@@ -11,9 +10,7 @@ transitions are deterministic, so `exact_return` computes it, from any of `M` st
                                            for the undiscounted return
 
 R is the reward as paid, so r_cum, k, r_min, D and the horizon all matter. Exact means up to
-rounding: the transition doubles differences at each step, so two policies whose actions differ in
-the last bit of float32 are in different states after some 25 steps, and a network rounds
-differently in batches of another size.
+rounding, which the transition doubles at each step, and networks round by the size of a batch.
 """
 
 from __future__ import annotations
@@ -297,11 +294,10 @@ class ReturnEstimate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ExactReturn:
-    """The returns of a policy from `M` states.
+    """The returns of a policy from `M` states, each with a mean, low and high of `[M]`.
 
-    `undiscounted` and, with γ, `discounted` have a mean, low and high of `[M]` each; `lengths`
-    `[M]` are the mean steps to the end of the episode, `similarity` `[M]` the mean r̃ over them,
-    and `rollouts` the episodes from each state.
+    `lengths` `[M]` are the mean steps to the end of the episode, `similarity` `[M]` the mean r̃ over
+    them, and `rollouts` the episodes from each state.
     """
 
     undiscounted: ReturnEstimate

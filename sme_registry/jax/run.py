@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from sme_registry.errors import OptionError, SpecError, UnknownNameError, did_you_mean
+from sme_registry.errors import OptionError, SpecError, UnknownNameError
 from sme_registry.io import choice, integer_in
 from sme_registry.jax.networks import Weights, hidden_layers
 from sme_registry.jax.ppo import PPO, PPOProgram
@@ -33,19 +33,6 @@ ALGORITHMS: dict[str, tuple[Any, type[Program]]] = {
 
 _OnEvaluation = Callable[[int, int, Evaluation], Any]
 _OnVisit = Callable[[int, list[dict[str, Array]]], Any]
-
-
-def full_name(uses: str, field: str = "uses") -> str:
-    """The exact name, `jax:PPO`, of an algorithm in any case."""
-    name = uses.removeprefix(JAX)
-    for known in ALGORITHMS:
-        if known.casefold() == name.casefold():
-            return JAX + known
-    names = [JAX + known for known in ALGORITHMS]
-    raise UnknownNameError(
-        f"{field}={uses!r}: must be one of {', '.join(names)}. Other algorithms run without JAX."
-        f"{did_you_mean(uses, names)}"
-    )
 
 
 def settings_of(
@@ -249,4 +236,5 @@ def _stacked(program: Program, groups: Sequence[Sequence[Array]]) -> Array:
 
 
 def _algorithm(uses: str) -> tuple[Any, type[Program]]:
-    return ALGORITHMS[full_name(uses).removeprefix(JAX)]
+    name = uses.removeprefix(JAX).upper()
+    return ALGORITHMS[choice("uses", name, ALGORITHMS, error=UnknownNameError)]

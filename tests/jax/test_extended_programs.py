@@ -128,5 +128,5 @@ def test_evaluations_are_episodes_of_numpys_task(dynamics, k):
 
 
 def test_algorithms_for_limits_are_not_in_jax():
-    with pytest.raises(UnknownNameError, match=r"'jax:PPOLagrangian': must be one of jax:PPO, "):
+    with pytest.raises(UnknownNameError, match=r"uses='PPOLAGRANGIAN': must be 'PPO', 'TD3' or "):
         new_program("jax:PPOLagrangian", [spec(MIXED["PPO"])], [0], steps=1)
