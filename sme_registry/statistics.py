@@ -114,11 +114,6 @@ def optimality_gap(scores: npt.ArrayLike, target: float = 1.0) -> Array:
     return mean(np.maximum(0.0, target - np.asarray(scores, dtype=np.float64)))
 
 
-def smoothing_window(rows: int) -> int:
-    """The entries in a median of a training curve of this many: a tenth, in [1, 50]."""
-    return min(50, max(1, rows // 10))
-
-
 def running_median(values: Array, window: int) -> Array:
     """Medians `[N]` of the last `window` entries of `[N]` values, of fewer at the beginning."""
     N = len(values)
@@ -135,13 +130,13 @@ def smoothed(step: Array, values: Array, window: int | None = None) -> tuple[Arr
     """The line of a training curve, from `[N]` values and the steps of each, in any order.
 
     It returns `[P]` increasing steps, `[P]` medians of the last `window` values up to each, and the
-    window, by default that of `smoothing_window`.
+    window, by default a tenth of the values, in [1, 50], or all that ended at one step.
     """
     order = np.argsort(step, kind="stable")
     x, y = step[order], values[order]
     last = np.flatnonzero(np.diff(x, append=np.inf))  # of all that ended at one step
     if window is None:
-        window = max(smoothing_window(len(x)), int(np.diff(last, prepend=-1).max()))
+        window = max(1, min(50, len(x) // 10), int(np.diff(last, prepend=-1).max()))
     window = min(integer_in("window", window, 1), len(x))
     last = last[last >= window - 1]
     return x[last], running_median(y, window)[last], window

@@ -406,10 +406,10 @@ def _network_by_visit(diagnosis: StreamDiagnosis, figure: Figure) -> None:
     x = np.arange(len(networks)) - initial
     panels = figure.subplots(1, len(quantities))
     for axes, (quantity, name) in zip(panels, quantities.items(), strict=True):
-        own, fresh = ([getattr(n, quantity, None) for n in group] for group in (networks, alone))
-        _lines(axes, x, {"this life": own})
+        life, fresh = ([getattr(n, quantity, None) for n in group] for group in (networks, alone))
+        _lines(axes, x, {"this life": life})
         _draw_fresh(axes, fresh)
         tick_visits(axes, cast(Any, diagnosis.visits), initial=initial)
-        highest = max(number for number in (*own, *fresh) if number is not None)
+        highest = max(number for number in (*life, *fresh) if number is not None)
         axes.set(ylabel=name, ylim=(0.0, max(0.05, 1.08 * highest)))
     legend_above(panels[0])

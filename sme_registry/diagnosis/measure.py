@@ -423,7 +423,7 @@ def limits(
     assert task.spec.safety is not None  # it is measured only then
     limit, tightest = task.limit(states.s), 2.0 * task.spec.safety.tightness
     above = [a - limit for a in (states.a, states.optimal)]
-    own, optimal = ((excess > TOLERANCE).mean(axis=0) for excess in above)
+    violating, optimal = ((excess > TOLERANCE).mean(axis=0) for excess in above)
     cost = np.maximum(0.0, above[0]).mean(axis=0) / tightest
     s, a = visited
     cut_off = np.minimum(states.a, limit)
@@ -434,7 +434,7 @@ def limits(
         channels=tuple(
             LimitedChannel(
                 channel=i + 1,
-                violating_share=float(own[i]),
+                violating_share=float(violating[i]),
                 optimal_violating_share=float(optimal[i]),
                 cost=float(cost[i]),
             )

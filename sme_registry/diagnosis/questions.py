@@ -360,15 +360,15 @@ def _verdict(name: str, question: Question[C], case: C) -> Verdict:
     if question.kind == "why" and case.solved:
         decision = Decision("solved", {"normalised_regret": case.learnt})
     else:
-        own = question.decide(case)
-        own_answer = answers[own.reason]
+        ruling = question.decide(case)
+        ruling_answer = answers[ruling.reason]
         doubt = None
-        if question.is_cause and own_answer == "yes" and own.reason not in _EXPERIMENTS:
+        if question.is_cause and ruling_answer == "yes" and ruling.reason not in _EXPERIMENTS:
             doubt = _doubt(case)
-        other = _comparison(case, name, own, own_answer, is_open=doubt is not None) or doubt
-        decision = own
+        other = _comparison(case, name, ruling, ruling_answer, is_open=doubt is not None) or doubt
+        decision = ruling
         if other is not None:
-            kept = {**own.evidence, "own_answer": own_answer, "own_reason": own.reason}
+            kept = {**ruling.evidence, "own_answer": ruling_answer, "own_reason": ruling.reason}
             decision = other._replace(evidence=kept | other.evidence)
     answer, share = answers[decision.reason], decision.error_share
     return Verdict(
@@ -392,26 +392,26 @@ def _doubt(case: Case) -> Decision | None:
 
 
 def _comparison(
-    case: Case, question: str, own: Decision, own_answer: Answer, *, is_open: bool
+    case: Case, question: str, ruling: Decision, ruling_answer: Answer, *, is_open: bool
 ) -> Decision | None:
     """What a comparison in the question's field alone decides; None where it decides nothing."""
     other = case.comparison
     if other is None or len(other.spec_fields) != 1 or other.plan_fields:
         return None
     (field, (value, other_value)), *_ = other.spec_fields.items()
-    asked = _FIELD_QUESTIONS.get(field) == question and own.reason not in _FIELD_IS_OFF
+    asked = _FIELD_QUESTIONS.get(field) == question and ruling.reason not in _FIELD_IS_OFF
     if not asked or not _is_harder(value, other_value):
         return None
     regret = other.differences[0]
     difference = regret.difference
     if difference >= THRESHOLDS["difference"]:
-        reason, decides = "field_raises_regret", own_answer != "yes" or is_open
+        reason, decides = "field_raises_regret", ruling_answer != "yes" or is_open
     elif regret.other < THRESHOLDS["learnt_little"] and difference <= THRESHOLDS["no_difference"]:
         reason, decides = "regret_same_or_lower", True
     else:
         learnt_little = regret.other >= THRESHOLDS["learnt_little"]
         reason = "other_run_learnt_little" if learnt_little else "difference_too_small"
-        decides = own_answer == "cannot tell" or own.reason in _SIGNS
+        decides = ruling_answer == "cannot tell" or ruling.reason in _SIGNS
     evidence = {
         "field": field,
         "value": value,

@@ -290,20 +290,20 @@ def _loss_of_plasticity(case: StreamCase) -> Decision:
 def _against_fresh(visits: Sequence[VisitDiagnosis], fresh: Sequence[float]) -> Decision:
     """The first visit is left out: its agent is itself a fresh one."""
     later = [(visit.normalised_regret, fresh[visit.phase]) for visit in visits[1:]]
-    own, alone = (float(np.mean(regrets)) for regrets in zip(*later, strict=True))
+    life, alone = (float(np.mean(regrets)) for regrets in zip(*later, strict=True))
     evidence = {
-        "normalised_regret": own,
+        "normalised_regret": life,
         "fresh_normalised_regret": alone,
-        "plasticity_difference": own - alone,
+        "plasticity_difference": life - alone,
         "visits": len(later),
     }
     if alone >= THRESHOLDS["unlearnt"]:
         return Decision("fresh_agents_learnt_little", evidence)
     reason = "as_fresh_agents"
-    if own - alone >= THRESHOLDS["difference"]:
+    if life - alone >= THRESHOLDS["difference"]:
         agents = len({visit.phase for visit in visits[1:]})
         reason = "below_fresh_agents" if agents > 1 else "below_one_fresh_agent"
-    return Decision(reason, evidence, 1.0 - alone / max(own, _TINY))
+    return Decision(reason, evidence, 1.0 - alone / max(life, _TINY))
 
 
 _network = partial(_why, unclear="network_unknown one_visit")
@@ -404,9 +404,9 @@ def _state(
     if network is None:
         return None
     if stream.observes_phase:
-        shown = np.zeros((len(observation), stream.observed_phases), np.float32)
-        shown[:, phase] = 1.0
-        observation = np.concatenate([observation, shown], axis=1)
+        one_hot = np.zeros((len(observation), stream.observed_phases), np.float32)
+        one_hot[:, phase] = 1.0
+        observation = np.concatenate([observation, one_hot], axis=1)
     return network_state(network, observation)
 
 

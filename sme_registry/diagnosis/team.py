@@ -297,11 +297,11 @@ def diagnose_team(
     agents = []
     for index, name in enumerate(task.names):
         report(f"{subject.name}: {name}")
-        own, alone = _alone(task, policy, index)
-        fitted = measure.fit_references(own, states, seed)
-        fields, _ = measure.fixed_states(alone, own, fitted, states, seed)
-        measured = Measurements(**fields, on_policy=behaviour.on_policy(own, runs[index]))
-        case = TaskCase(measured, own.spec, updates=subject.updates)
+        part, alone = _alone(task, policy, index)
+        fitted = measure.fit_references(part, states, seed)
+        fields, _ = measure.fixed_states(alone, part, fitted, states, seed)
+        measured = Measurements(**fields, on_policy=behaviour.on_policy(part, runs[index]))
+        case = TaskCase(measured, part.spec, updates=subject.updates)
         agents.append(
             AgentDiagnosis(
                 name=name,
@@ -341,7 +341,7 @@ def _alone(task: Task, policy: TeamPolicy, index: int) -> tuple[Task, Policy]:
     """The task of an agent's own action channels, and its policy of observations `[B, S + 2]`."""
     member, owned = policy.members[index], task.owned[index]
     fields = {**task.spec.to_dict(), "team": None, "action_dim": member.action_dim}
-    own = Task(
+    part = Task(
         spec=SMESpec.from_dict(fields),
         W=task.W[owned],
         b=task.b,
@@ -352,7 +352,7 @@ def _alone(task: Task, policy: TeamPolicy, index: int) -> tuple[Task, Policy]:
     def act(observations: Observation) -> Array:
         return member.policy(member.observe(observations))[:, : member.action_dim]
 
-    return own, Policy(member.agent, "unit", act, member.action_dim)
+    return part, Policy(member.agent, "unit", act, member.action_dim)
 
 
 def _team_in(task: Task, s: Array, a: Array) -> tuple[Score, list[Credit]]:

@@ -69,15 +69,15 @@ class Policy:
         """This policy, given the one-hot of a phase, of so many, behind each observation."""
         one_hot = np.eye(count, dtype=np.float32)[phase]
 
-        def shown(policy: Policy) -> Callable[[Observation], Array]:
+        def with_phase(policy: Policy) -> Callable[[Observation], Array]:
             return lambda o: policy(np.concatenate([o, np.tile(one_hot, (len(o), 1))], axis=1))
 
         # `policy` has converted its actions to the unit range, and named its own errors.
         return replace(
             self,
             action_range="unit",
-            act=shown(self),
-            episodes=lambda: shown(self.start()),
+            act=with_phase(self),
+            episodes=lambda: with_phase(self.start()),
             hidden=None,
         )
 

@@ -317,8 +317,8 @@ def _actions(actor: Actor, batch: Observations, stream: StreamSpec) -> Iterator[
     with prefixed_errors(where):
         if stream.observes_phase:
             for phase in phases:
-                shown = policy.in_phase(phase, stream.observed_phases)
-                yield phase, np.clip(shown(batch), 0.0, 1.0)
+                informed = policy.in_phase(phase, stream.observed_phases)
+                yield phase, np.clip(informed(batch), 0.0, 1.0)
         else:
             a = np.clip(policy(batch.copy()), 0.0, 1.0)  # a copy: a policy may write into it
             yield from ((phase, a) for phase in phases)
