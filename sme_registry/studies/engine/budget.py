@@ -208,10 +208,7 @@ def with_agents(file: StudyFile, agents: str) -> StudyFile:
 
 
 def with_sources(file: StudyFile) -> StudyFile:
-    """The plan with the digest of the source of each `train:…`; imports none of the modules.
-
-    A module that is not here is left as it is: an algorithm that does not run needs none.
-    """
+    """The plan with the digest of the source of each `train:…` that is here; imports none."""
     fields = file.plan.to_dict()
     for algorithm in fields["algorithms"]:
         name, stated = f"algorithm {algorithm['name']!r}", algorithm.get("source")

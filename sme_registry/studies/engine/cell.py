@@ -6,15 +6,14 @@
     train:…        a `FunctionLearner`, evaluated at its end alone
     any other      an `SB3Learner` in its environments
 
-Only the evaluations run as a batch. The same cell gives the same result on the same machine, except
-for `timing`.
+The same cell gives the same result on the same machine, except for `timing`.
 """
 
 from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +36,6 @@ from sme_registry.studies.engine.result import (
     OfflineCell,
     Outcome,
     Record,
-    Report,
     SharedProgram,
     Timing,
     life_report,
@@ -121,21 +119,21 @@ def _train(cell: Cell, entry: Entry, progress: ReportSteps, model_path: Path | N
     return training.result()
 
 
-def run_program(
-    cells: Sequence[Cell], shared: SharedProgram, progress: Report, keep_models: bool = False
-) -> Iterator[Outcome]:
-    """Run cells that use JAX as runs of one program."""
+def jax_programs() -> Any:
+    """The module of programs, which imports JAX: a study without agents in JAX needs none."""
     from sme_registry.studies.engine import programs
 
-    return programs.run_program(cells, shared, progress, keep_models)
+    return programs
 
 
 def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> CellResult:
-    def report(done: int, total: int, note: str = "", /) -> None:
+    def report(done: int, total: int, note: str = "") -> None:
         progress(done, total)
 
-    outcomes = run_program((cell,), SharedProgram(1), report, model_path is not None)
-    ((entry, model, snapshots),) = outcomes
+    keep_models = model_path is not None
+    outcome: Outcome
+    (outcome,) = jax_programs().run_program((cell,), SharedProgram(1), report, keep_models)
+    entry, model, snapshots = outcome
     if isinstance(entry, CellFailure):
         raise PolicyError(entry.error.removeprefix("PolicyError: "))
     if model_path is not None and model is not None:

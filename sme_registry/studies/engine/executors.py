@@ -36,7 +36,7 @@ from sme_registry.io.system import (
     end_with_parent,
 )
 from sme_registry.spec.study import Cell
-from sme_registry.studies.engine.cell import run_cell, run_program
+from sme_registry.studies.engine.cell import jax_programs, run_cell
 from sme_registry.studies.engine.result import CPU, CellResult, Job, Outcome, Report, failed
 
 RunCell = Callable[[Cell, Callable[[int, int], None] | None, Path | None], CellResult]
@@ -90,7 +90,7 @@ def run_job(run: RunCell, job: Job, keep_models: bool, progress: Report) -> Iter
 
 def _outcomes(run: RunCell, job: Job, keep_models: bool, progress: Report) -> Iterator[Outcome]:
     if job.program is not None:
-        yield from run_program(job.cells, job.program, progress, keep_models)
+        yield from jax_programs().run_program(job.cells, job.program, progress, keep_models)
         return
     (cell,) = job.cells
     with tempfile.TemporaryDirectory(prefix="sme-cell-") as folder:
@@ -107,7 +107,7 @@ def _throttled(report: Report) -> Report:
     """Pass on a report if the last one is some time ago, at the end, and with a note."""
     last = 0.0
 
-    def throttled(done: int, total: int, note: str = "", /) -> None:
+    def throttled(done: int, total: int, note: str = "") -> None:
         nonlocal last
         now = time.monotonic()
         if now - last >= _SECONDS_BETWEEN_REPORTS or done >= total or note:

@@ -175,10 +175,7 @@ class Ledger:
         return is_locked(self.folder / LOCKS / _hex(key))
 
     def claim_lock(self) -> Lock | None:
-        """A lock to hold while claiming the cells of a program; None if another run claims now.
-
-        Two runs that claim at once would divide the cells, and both would run the program.
-        """
+        """A lock to hold while claiming the cells of a program, which two runs would divide."""
         return file_lock(self.folder / LOCKS / "programs")
 
     def state_path(self, keys: Iterable[str], build_key: Mapping[str, Any] | None = None) -> Path:

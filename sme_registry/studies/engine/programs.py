@@ -5,10 +5,9 @@ their tasks have the same form: shape, limits, distractors and mixing. The numbe
 follows from the whole plan: whatever was run before, is left out by `only` or runs elsewhere, a
 cell's program has the same number of runs, and so its result the same bits.
 
-What a run learns, when it is evaluated and from which states are as in `cell.run_cell`, so curve,
-regret and report mean the same. A run whose weights are no longer finite fails, and the others go
-on. The state of the program is written every few minutes: after a kill, it goes on from there with
-the same bits.
+Curve, regret and report mean the same as in `cell.run_cell`. A run whose weights are no longer
+finite fails, and the others go on. After a kill, a program goes on from its state with the same
+bits.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, Protocol, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
@@ -39,6 +39,7 @@ from sme_registry.spec.study import Cell, parse_uses
 from sme_registry.training.record import versions_for
 
 CPU = "cpu"
+Report = Callable[..., None]  # called with the steps done, those in all, and perhaps a note
 _Numbers = Annotated[tuple[Real, ...], Field(strict=False)]
 
 
@@ -187,13 +188,6 @@ class Job:
 
     cells: tuple[Cell, ...]
     program: SharedProgram | None = None
-
-
-class Report(Protocol):
-    """What a job calls while it runs."""
-
-    def __call__(self, done: int, total: int, note: str = "", /) -> None:
-        """Report how far a job is."""
 
 
 class Outcome(NamedTuple):

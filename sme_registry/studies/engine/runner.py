@@ -18,7 +18,7 @@ from sme_registry.io.terminal import Progress, duration
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.spec.study import Cell, PlannedCell, in_jax
 from sme_registry.studies.engine.budget import Pace, first_places, selected, with_sources
-from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.engine.cell import jax_programs, run_cell
 from sme_registry.studies.engine.executors import Executor, InProcess, OnRay, Processes, RunCell
 from sme_registry.studies.engine.ledger import Ledger, SavedState, StudyStatus, label, plan_status
 from sme_registry.studies.engine.result import CPU, CellFailure, CellResult, Job, Outcome
@@ -142,9 +142,9 @@ def _programs(
             "--device, or leave out --ray on a machine that has such a device."
         )
     device = CPU if on_ray else device
-    from sme_registry.studies.engine.programs import Programs, platform_of
-
-    return Programs((cell.cell for cell in plan.cells), platform_of(device), device, lanes)
+    jax, cells = jax_programs(), (cell.cell for cell in plan.cells)
+    programs: Programs = jax.Programs(cells, jax.platform_of(device), device, lanes)
+    return programs
 
 
 def _executor(

@@ -16,15 +16,16 @@
     best_constant_normalised_regret, random_normalised_regret   of these references, likewise
     constant_similarity          mean r̃ of the constant ½, in [0, 1]
 
-Columns of the run, repeated in each of its regions; NaN or NA where the run has no such number.
-Fields of the task's spec have their own names, and so do those of its observation.
+Columns of the run, repeated in each of its regions; NaN or NA where the run has no such number:
 
     wd_regret, ood_regret        normalised regret in WD, and its mean over the shells
     ood_decay                    ood_regret − wd_regret
     final_return                 mean return of the last evaluations, in % of the optimum's
     online_regret                mean of 1 − step reward over training, in [0, 1]
     uses, action_range, steps    the algorithm, its action range, its training steps
-    spec_seed, spec_digest, seed     of the task, as text; the seed of training
+    state_dim, action_dim, k, r_min, D, complexity, horizon, hidden_width, policy_init, rotation,
+    spec_seed, spec_digest, seed   fields of the task's spec, its seed and digest as text; the seed
+                                 of training
     nu, transitions, dataset_digest   the data set of an offline run: ν in [0, 1], its size
     behaviour_similarity, behaviour_similarity_sd    r̃ of the behaviour policy over the data set
     offline_similarity, offline_similarity_sd        r̃ of the learner over its last episodes
@@ -34,10 +35,11 @@ Fields of the task's spec have their own names, and so do those of its observati
 
 With safety: tightness τ of the limits; online_cost, the mean over training; wd_cost and
 wd_safe_regret, of the cube; cost, violating_share, safe_regret and price_of_safety, of the region.
-With observation: distractor_regret, the mean over the shells of d; wd_invariance, of the cube;
-invariance, of the region. The numbers of a team are means over agents or channels. Those of each
-agent have its name, in `results` normalised_regret/agent_0 of the region, and wd_regret, ood_regret
-and online_regret of the run, and in `curves` regret/agent_0.
+With observation: its fields distractors, dynamics, mixing, mixing_depth; distractor_regret, the
+mean over the shells of d; wd_invariance, of the cube; invariance, of the region. The numbers of a
+team are means over agents or channels. Those of each agent have its name, in `results`
+normalised_regret/agent_0 of the region, and wd_regret, ood_regret and online_regret of the run, and
+in `curves` regret/agent_0.
 
 `curves`: one row per run and evaluation during training, ordered by class, algorithm, run, step.
 

@@ -46,10 +46,7 @@ _DIFFERENCE = (
 
 @dataclass(frozen=True, eq=False)
 class TextTable:
-    """A table for people, with the name of its files, a title, and a note on how to read it.
-
-    All columns of its frame are text; the first `names` of them name the rows.
-    """
+    """A table for people: all columns of its frame are text; the first `names` name the rows."""
 
     name: str
     title: str
@@ -340,9 +337,8 @@ def _text(
     order: Sequence[str] = (),
     label: str = "",
 ) -> TextTable:
-    """A long table as text: a column for each value of `across`, in the order of the rows.
+    """A long table as text: `index` names the rows, and each value of `across` is a column.
 
-    `index` has the columns that name the rows, and their headings; `order` is of the new columns.
     `entry` is called with a row and the number of digits of its metric.
     """
     metrics = _OF_LIVES if name.startswith("stream") else _OF_RUNS

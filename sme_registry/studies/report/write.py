@@ -7,11 +7,8 @@
     REPORT/tables/*.tex         the tables of a paper
     REPORT/explorers/*.html     on request, a page for each model that the study kept
 
-The same results give the same files. Other files of an earlier report are kept. The page loads
-nothing: pictures are embedded, and a content security policy forbids it. Figures are drawn on
-white; on a dark page their lightness is inverted, except for maps, whose lightness carries meaning.
-
-The runs of a pair have the same instance and seed, so what instances and seeds do to both cancels.
+The same results give the same files. The page loads nothing. On a dark page the lightness of
+figures is inverted, except for maps, whose lightness carries meaning.
 """
 
 from __future__ import annotations

@@ -109,8 +109,7 @@ def panel_grid(
 ) -> Figure:
     """A figure with a titled panel for each item, and a legend of the looks below them.
 
-    `heights` are those of a row of panels and of the rest. The labels `x` and `y` are outside
-    alone; without them `draw` labels the axes of its panel.
+    `heights` are those of the rest and of a row of panels. `x` and `y` are labels outside alone.
     """
     titles, values = zip(*items, strict=True)
     across = min(across, len(values))
@@ -261,10 +260,7 @@ def mark_rows(
     *,
     share_x: bool = False,
 ) -> Figure:
-    """A figure with a named row of marks at the height of each place, and a panel for each column.
-
-    `place` is the column that says in which row a mark is.
-    """
+    """A figure with a named row of marks at each place, and a panel for each column."""
 
     def draw(axes: Axes, column: MarkColumn) -> None:
         of_metric = rows[rows.metric == column.metric]
