@@ -101,9 +101,7 @@ class WireError(SMEError, ValueError):
 class SealedError(SMEError):
     """A sealed season's server refused a request, or gives no answer.
 
-    Args:
-      code: the board's, or "unreachable", "http" or "wire" where it sent none.
-      message: what is wrong, and what to do.
+    Its `code` is the board's, or "unreachable", "http" or "wire" where it sent none.
     """
 
     def __init__(self, code: str, message: str) -> None:

@@ -199,8 +199,6 @@ def make_parallel(spec_or_id: SpecLike, **kwargs: Any) -> SMETeamEnv:
 def make_aec(spec_or_id: SpecLike, **kwargs: Any) -> AECEnv[str, Any, Any]:
     """The same as a PettingZoo AEC environment: agents act in turn, the step is joint.
 
-    Arguments and errors are those of `make_parallel`.
-
     Examples:
       >>> team = sme_registry.make_aec("Team4")
       >>> team.reset(seed=0)

@@ -74,11 +74,8 @@ def check_env(
     go on as the original does. A batch equals single environments bit for bit in all three
     autoreset modes.
 
-    Args:
-      task: an id, a path, a digest, a spec or its fields.
-      single: creates the environment as `SMEEnv` does: `single(spec, action_range=…)`.
-      vector: creates the batch as `SMEVectorEnv` does: `vector(spec, num_envs, …)`.
-      seed: of the episodes and the actions.
+    `single(spec, action_range=…)` and `vector(spec, num_envs, …)` create the environments as
+    `SMEEnv` and `SMEVectorEnv` do; `seed` is of the episodes and the actions.
 
     Examples:
       >>> from sme_registry.testing import check_env
@@ -190,11 +187,7 @@ def _check_one(schedule: Schedule, make: Make, seed: int) -> None:
 
 
 class _Life:
-    """A life of an environment, each step of which must equal `task.step` of the segment's task.
-
-    `info` is flat and numeric, with the documented keys and ranges, and new at each step. A task
-    has such a life, too.
-    """
+    """A life of an environment, or of a task, each step of which must equal `task.step`."""
 
     def __init__(self, env: Any, schedule: Schedule, seed: int) -> None:
         self.agents, self.env, self.schedule = _Agents(env), env, schedule
@@ -209,7 +202,6 @@ class _Life:
 
     @property
     def task(self) -> Task:
-        """The task in force."""
         return self.schedule.tasks[self.segment]
 
     def _of_life(self) -> dict[str, Any]:
@@ -227,7 +219,6 @@ class _Life:
         self._check_observations("first observation", observations)
 
     def _step(self) -> bool:
-        """One step; whether it ended the episode."""
         task, s, d = self.task, self.agents.state, getattr(self.env, "distractors", _NONE)
         action = next_action(self.env, self.rng)
         unit = self.agents.unit(action)
@@ -270,7 +261,6 @@ class _Life:
         truncated: bool,
         info: dict[str, Any],
     ) -> None:
-        """One agent's reward, ends and info are those of the definition's step."""
         owned, where = self.task.owned[agent], _of(self.agents.names[agent])
         self._check_info(where, info, owned.stop - owned.start)
         optimal = from_unit(result.optimal_action[0, owned], self.agents.symmetric)
@@ -333,7 +323,6 @@ class _Life:
 
 
 def _steps(schedule: Schedule) -> int:
-    """How many steps of a life are played."""
     document = schedule.document
     if isinstance(document, StreamSpec):
         return min(document.steps + document.horizon, _LONGEST_LIFE)
@@ -341,7 +330,6 @@ def _steps(schedule: Schedule) -> int:
 
 
 def _of(name: str) -> str:
-    """The agent's name before what is wrong; nothing for a single agent."""
     return name and f"{name}: "
 
 

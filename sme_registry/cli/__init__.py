@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from sme_registry.cli import study
 from sme_registry.cli.data import dataset, offline
-from sme_registry.cli.diagnose import diagnose, explore
-from sme_registry.cli.evaluate import evaluate
+from sme_registry.cli.policy import diagnose, evaluate, explore
 from sme_registry.cli.show import list_, show
 from sme_registry.cli.task import certify, new, suite, validate
 from sme_registry.cli.train import demo, train

@@ -80,6 +80,7 @@ DatasetsFolder = Annotated[
         help="Folder of data sets; default MINARI_DATASETS_PATH, or ~/.minari/datasets.",
     ),
 ]
+NewFile = Annotated[Path, typer.Argument(help="The file to write.", dir_okay=False)]
 Out = Annotated[Path | None, typer.Option("--out", "-o", help="Output folder.")]
 ActionRange = Annotated[
     str | None,

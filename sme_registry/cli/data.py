@@ -297,6 +297,13 @@ def _score_row(policy: str, score: PolicyScore, weight: str = "") -> tuple[str, 
     return escape(policy), weight, *numbers, returns
 
 
+Algorithm = Annotated[str, typer.Option("--algorithm", "-a", help="bc or iql.")]
+GradientSteps = Annotated[int, typer.Option("--steps", "-n", help="Gradient steps.")]
+BatchSize = Annotated[int, typer.Option(help="Transitions in each gradient step.")]
+Hyperparameters = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NAME=VALUE", help="Change a hyperparameter. Repeatable."),
+]
 offline = typer.Typer(no_args_is_help=True)
 
 
@@ -310,18 +317,15 @@ def train(
     dataset: Annotated[
         str, typer.Argument(metavar="DATASET", help="An id from `sme dataset list`, or a path.")
     ],
-    algorithm: Annotated[str, typer.Option("--algorithm", "-a", help="bc or iql.")] = "iql",
-    steps: Annotated[int, typer.Option("--steps", "-n", help="Gradient steps.")] = 20_000,
-    batch_size: Annotated[int, typer.Option(help="Transitions in each gradient step.")] = 256,
+    algorithm: Algorithm = "iql",
+    steps: GradientSteps = 20_000,
+    batch_size: BatchSize = 256,
     seed: Annotated[int, typer.Option(help="Seed of weights, shuffling and episodes.")] = 0,
     evaluations: Annotated[int, typer.Option(help="Evaluations during training.")] = 20,
     protocol: Annotated[
         str | None, typer.Option(help="Protocol of the last evaluation; default the data set's.")
     ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Change a hyperparameter. Repeatable."),
-    ] = None,
+    set_: Hyperparameters = None,
     folder: DatasetsFolder = None,
     out_folder: Out = None,
     force: Force = False,
@@ -371,14 +375,11 @@ def sealed(
         Path, typer.Argument(metavar="DATASET", help="The folder of a sealed data set.")
     ],
     out_file: Annotated[Path, typer.Option("--out", "-o", help="The policy's .npz file.")],
-    algorithm: Annotated[str, typer.Option("--algorithm", "-a", help="bc or iql.")] = "iql",
-    steps: Annotated[int, typer.Option("--steps", "-n", help="Gradient steps.")] = 20_000,
-    batch_size: Annotated[int, typer.Option(help="Transitions in each gradient step.")] = 256,
+    algorithm: Algorithm = "iql",
+    steps: GradientSteps = 20_000,
+    batch_size: BatchSize = 256,
     seed: Annotated[int, typer.Option(help="Seed of weights and shuffling.")] = 0,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Change a hyperparameter. Repeatable."),
-    ] = None,
+    set_: Hyperparameters = None,
     force: Force = False,
 ) -> None:
     """Train bc or iql on a sealed data set, whose task is hidden. Nothing is evaluated here.

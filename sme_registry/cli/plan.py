@@ -15,6 +15,7 @@ from sme_registry.cli.arguments import (
     ClassOptions,
     Force,
     Json,
+    NewFile,
     Protocol,
     check_document_path,
     find_file,
@@ -370,7 +371,7 @@ _ALLOWED_WITH_FROM = ("path", "name", "description", "source", "force")
 @with_options(PlanOptions)
 def new(
     context: typer.Context,
-    path: Annotated[Path, typer.Argument(help="The file to write.", dir_okay=False)],
+    path: NewFile,
     options: PlanOptions,
     name: Annotated[str | None, typer.Option(help="Default --from's, or the file's.")] = None,
     description: Annotated[str | None, typer.Option(help="One or two sentences.")] = None,

@@ -47,6 +47,11 @@ from sme_registry.studies.engine.runner import run_study
 _FAILURES_SHOWN = 20
 ExecutorName = enum.StrEnum("ExecutorName", ["processes", "in-process", "ray"])
 
+StudyFolder = Annotated[Path, typer.Argument(help="The study's folder.")]
+NewFolder = Annotated[
+    Path, typer.Option("--folder", "-f", help="The study's folder; created if necessary.")
+]
+
 app = typer.Typer(
     no_args_is_help=True,
     help="""Studies: algorithms × classes of tasks × seeds, resumable, on a laptop or a cluster.
@@ -73,9 +78,7 @@ def run(
             autocompletion=catalogue.completion(StudyFile),
         ),
     ],
-    folder: Annotated[
-        Path, typer.Option("--folder", "-f", help="The study's folder; created if necessary.")
-    ],
+    folder: NewFolder,
     options: Budgets,
     executor: Annotated[
         ExecutorName | None, typer.Option(help="Default processes; with --ray, ray.")
@@ -153,7 +156,7 @@ def run(
 
 @with_options(Budgets)
 def status(
-    folder: Annotated[Path, typer.Argument(help="The study's folder.")],
+    folder: StudyFolder,
     options: Budgets,
     only: Only = None,
     json: Json = False,
@@ -173,7 +176,7 @@ def status(
 
 
 def report(
-    folder: Annotated[Path, typer.Argument(help="The study's folder.")],
+    folder: StudyFolder,
     out_folder: Out = None,
     formats: Annotated[
         str,
@@ -273,7 +276,7 @@ def _counts(counts: Counter[State] | None) -> str:
 
 
 def compare(
-    folder: Annotated[Path, typer.Argument(help="The study's folder.")],
+    folder: StudyFolder,
     first: Annotated[str, typer.Argument(metavar="A", help="An algorithm of the plan, by name.")],
     second: Annotated[str, typer.Argument(metavar="B", help="The one it is compared with.")],
     metric: Annotated[
@@ -332,9 +335,7 @@ def compare(
 
 @with_options(PlanOptions)
 def sweep(
-    folder: Annotated[
-        Path, typer.Option("--folder", "-f", help="The study's folder; created if necessary.")
-    ],
+    folder: NewFolder,
     options: PlanOptions,
     jobs: Jobs = None,
 ) -> None:

@@ -15,6 +15,7 @@ from sme_registry.cli.arguments import (
     ClassOptions,
     Force,
     Json,
+    NewFile,
     check_document_path,
     find_any,
     json_or_text,
@@ -82,7 +83,7 @@ FieldOptions = dataclasses.make_dataclass(
 
 @with_options(FieldOptions)
 def new(
-    path: Annotated[Path, typer.Argument(help="The file to write.", dir_okay=False)],
+    path: NewFile,
     options: Any,
     team: Annotated[
         str | None,
@@ -208,7 +209,7 @@ suite = typer.Typer(
 @suite.command("new")
 @with_options(ClassOptions)
 def new_suite(
-    path: Annotated[Path, typer.Argument(help="The file to write.", dir_okay=False)],
+    path: NewFile,
     options: ClassOptions,
     name: Annotated[str | None, typer.Option(help="By default the file's name.")] = None,
     description: Annotated[str, typer.Option(help="One or two sentences.")] = "",

@@ -59,11 +59,8 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
     phase begins within an episode: state, t and r_cum carry over. The observation has the r_cum/k
     of the k then in force, at most 1, and with `observes_phase` ends with the phase, one-hot.
 
-    Args:
-      spec: the task or stream: a document, its fields, an id, a digest or a path.
-      action_range: "unit" or "symmetric".
-      render_mode: None, "rgb_array" or "human".
-      **overrides: fields of a task's spec to change; the environment then runs the derived spec.
+    `render_mode` is None, "rgb_array" or "human". Other keywords are fields of a task's spec to
+    change; the environment then runs the derived spec.
 
     Examples:
       >>> from sme_registry.envs import SMEEnv
@@ -157,15 +154,13 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode at a state drawn uniformly from the cube, or at one of your choice.
 
-        Args:
-          seed: seeds the environment's generator; None continues its stream. Distractors follow
-            from the seed, or from `np_random` where you have set it.
-          options: `{"state": s}` begins at s `[S]`, each entry in [0, 1]; where the task has
-            distractors `{"distractors": d}` at d `[m]`; and of a stream `{"lifetime": n}` begins a
-            life after n steps.
+        `seed` seeds the environment's generator, None continues its stream. Distractors follow from
+        the seed, or from `np_random` where you have set it. `options`: `{"state": s}` begins at s
+        `[S]`, each entry in [0, 1]; where the task has distractors `{"distractors": d}` at d `[m]`;
+        and of a stream `{"lifetime": n}` begins a life after n steps.
 
-        Returns the observation, and an info of NaN. A WrapperError says that an outer TimeLimit
-        would end the episode before the horizon.
+        The info is of NaN. A WrapperError says that an outer TimeLimit would end the episode before
+        the horizon.
         """
         arguments.check_outer_time_limit(self.document.horizon)
         arguments.check_options(options, self._schedule.reset_options)

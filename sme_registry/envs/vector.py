@@ -69,15 +69,9 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
     near a switch in different phases. `get_attr("task")` gives the task in force in each
     environment, and `task` that of all of them, or EpisodeError.
 
-    Args:
-      spec: the task or stream: a document, its fields, an id, a digest or a path.
-      num_envs: B, at least 1.
-      action_range: "unit" or "symmetric".
-      autoreset_mode: Gymnasium's: "NextStep" (default), "SameStep" or "Disabled".
-      render_mode: None or "rgb_array".
-      render_lanes: the environments to draw, such as `[0, 1]`; None draws each of them.
-      max_episode_steps: refused below the horizon, as WrapperError (Gymnasium passes it on).
-      **overrides: fields of a task's spec to change.
+    `autoreset_mode` is Gymnasium's: "NextStep", "SameStep" or "Disabled". With `render_mode`
+    "rgb_array", `render_lanes` are the environments to draw, such as `[0, 1]`; None: all of them.
+    Other keywords are fields of a task's spec to change.
 
     Examples:
       >>> from sme_registry.envs import SMEVectorEnv
@@ -150,14 +144,11 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode in every environment, or in those of `options["reset_mask"]`.
 
-        Args:
-          seed: n seeds environment i with n + i; a list seeds each; None continues the streams.
-          options: those of `SMEEnv.reset`, where `state` `[S]` or `[B, S]` and `distractors` `[m]`
-            or `[B, m]`; and `{"reset_mask": mask}` resets the environments where `mask` `[B]` is
-            True and leaves the others as they are.
+        `seed` n seeds environment i with n + i, a list each; None continues the streams. `options`
+        are those of `SMEEnv.reset`, with `state` `[S]` or `[B, S]` and `distractors` `[m]` or
+        `[B, m]`; with `{"reset_mask": mask}` the environments where `mask` `[B]` is False stay.
 
-        Returns:
-          Observations `[B, S + m + 2]`, and infos of NaN where an episode begins.
+        Infos are NaN where an episode begins.
         """
         known = (*self._schedule.reset_options, "reset_mask")
         arguments.check_options(options, known)
