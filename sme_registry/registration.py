@@ -12,6 +12,7 @@ from pettingzoo.env_registry import registration as pettingzoo
 from sme_registry.errors import NameTakenError, OptionError
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.catalogue import (
+    DYNAMICS_VERSION,
     NAMESPACE,
     STREAM,
     SYMMETRIC,
@@ -81,8 +82,6 @@ def register(spec: SMESpec | StreamSpec, name: str) -> str:
       >>> sme_registry.load("EveryThird").k
       3
     """
-    from sme_registry.task.draw import DYNAMICS_VERSION
-
     document = as_document(spec)
     short = str(name).removeprefix(f"{NAMESPACE}/").removesuffix(f"-v{DYNAMICS_VERSION}")
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", short) or re.search(r"-v\d+$", short):

@@ -9,7 +9,7 @@ step happens when the last one has acted. `sme_registry.make_parallel` and `make
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -77,8 +77,7 @@ class TurnBasedTeam(OrderEnforcingWrapper):  # type: ignore[misc]
 
     def _repr_html_(self) -> str:
         """The card of the parallel environment, for notebooks."""
-        html: str = self.unwrapped._repr_html_()
-        return html
+        return cast(str, self.unwrapped._repr_html_())
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.unwrapped!r})"

@@ -17,7 +17,7 @@ import functools
 import itertools
 import pickle
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -142,16 +142,14 @@ class _Agents:
 
     @property
     def state(self) -> Array:
-        state: Array = self.env.state() if self.is_team else self.env.state
-        return state
+        return cast(Array, self.env.state() if self.is_team else self.env.state)
 
     def optimal(self) -> Array:
         """π* in the current state; in a batch, of the task in force in each environment."""
         if hasattr(self.env, "num_envs"):
             pairs = zip(self.env.get_attr("task"), self.env.state, strict=True)
             return np.stack([task.optimal_action(s) for task, s in pairs])
-        optimal: Array = self.env.task.optimal_action(self.state)
-        return optimal
+        return cast(Array, self.env.task.optimal_action(self.state))
 
     def action(self, unit: npt.NDArray[Any]) -> Any:
         """Joint actions of the unit range as the environment's `step` takes them."""

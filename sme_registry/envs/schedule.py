@@ -31,11 +31,10 @@ from sme_registry.compiled.arrays import (
 )
 from sme_registry.envs import arguments
 from sme_registry.spec import SMESpec, StreamSpec
-from sme_registry.spec.catalogue import NAMESPACE, Resolved, resolve
+from sme_registry.spec.catalogue import DYNAMICS_VERSION, NAMESPACE, Resolved, resolve
 from sme_registry.spec.sme_spec import SpecLike
 from sme_registry.spec.stream import StreamLike
 from sme_registry.task import Task
-from sme_registry.task.draw import DYNAMICS_VERSION
 from sme_registry.task.loading import materialize_segments
 
 _NAN = np.float64(np.nan)
@@ -136,8 +135,7 @@ class Schedule:
 
     def one_hot(self, phase: int | Indices) -> Observation:
         """What an observation in a phase ends with, `[…, P]`."""
-        one_hot: Observation = self._one_hot[phase]
-        return one_hot
+        return cast(Observation, self._one_hot[phase])
 
     def life(self, phase: Any, lifetime: Any) -> dict[str, Any]:
         """What infos say of a life, or of the lives of a batch; nothing of a task's."""

@@ -114,8 +114,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
     @property
     def distractors(self) -> Array:
         """The distractors d, `[m]` float64 in [0, 1] (a copy); empty where the task has none."""
-        distractors: Array = self._distractors.values[0]
-        return distractors
+        return cast(Array, self._distractors.values[0])
 
     def _put_in_force(self, segment: int) -> None:
         """Run the task of a segment; the episode, if one is running, goes on by `_load_engine`."""

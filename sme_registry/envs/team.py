@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -135,8 +135,7 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
 
     def state(self) -> Array:
         """The state s, `[S]` float64 in [0, 1] (a copy), unobserved channels included."""
-        state: Array = self._batch.state[0]
-        return state
+        return cast(Array, self._batch.state[0])
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None

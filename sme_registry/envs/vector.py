@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -36,19 +36,16 @@ class EnvView:
 
     @property
     def state(self) -> Array:
-        state: Array = self._owner._batch.state[self._index]
-        return state
+        return cast(Array, self._owner._batch.state[self._index])
 
     @property
     def distractors(self) -> Array:
-        distractors: Array = self._owner._batch.distractors[self._index]
-        return distractors
+        return cast(Array, self._owner._batch.distractors[self._index])
 
     @property
     def task(self) -> Task:
         """The task; of a stream the one in force."""
-        task: Task = self._owner._batch.task_of(self._index)
-        return task
+        return cast(Task, self._owner._batch.task_of(self._index))
 
     @property
     def sme_spec(self) -> SMESpec:

@@ -236,6 +236,7 @@ def _check_is_file(kind: type[Envelope], data: dict[str, Any], source: str, reme
 
 
 NAMESPACE = "SME"
+DYNAMICS_VERSION = 1  # of ids without another version, and of the names of random streams
 SYMMETRIC = "Symmetric"
 """Ends the name in an id of the same task with actions in [−1, 1]: `SME/DefaultSymmetric-v1`."""
 

@@ -18,11 +18,10 @@ import numpy.typing as npt
 from scipy.special import ndtri
 
 from sme_registry.spec import SMESpec
+from sme_registry.spec.catalogue import DYNAMICS_VERSION
 
 Array = npt.NDArray[np.float64]
 Bits = npt.NDArray[np.uint64]
-
-DYNAMICS_VERSION = 1
 
 
 def bit_generator(seed: int | str, name: str) -> np.random.Philox:
