@@ -20,7 +20,6 @@ from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation import OfflinePolicy, Perceptron, load_sb3
 from sme_registry.evaluation.models import ACTION_RANGE, Interface, start_session, torch_policy
 from sme_registry.evaluation.policies import interface_of
-from sme_registry.export import FEED_FORWARD
 from sme_registry.export.networks import (
     INPUT,
     Network,
@@ -32,6 +31,23 @@ from sme_registry.io import check_writable, choice, require_packages, write_atom
 from sme_registry.spec import SMESpec
 from sme_registry.spec.sme_spec import ACTION_RANGES, ActionRange, SpecLike
 from sme_registry.task import load
+
+_NAMES = """
+    Abs Acos Acosh Add And ArgMax ArgMin Asin Asinh Atan Atanh BatchNormalization Cast Ceil Celu
+    Clip Concat Constant Cos Cosh Div Elu Equal Erf Exp Flatten Floor Gather GatherElements Gelu
+    Gemm Greater GreaterOrEqual HardSigmoid HardSwish Identity LayerNormalization LeakyRelu Less
+    LessOrEqual Log LogSoftmax MatMul Max Mean Min Mish Mod Mul Neg Not Or PRelu Pow
+    RMSNormalization Reciprocal ReduceL1 ReduceL2 ReduceLogSumExp ReduceMax ReduceMean ReduceMin
+    ReduceProd ReduceSum ReduceSumSquare Relu Reshape Round Selu Sigmoid Sign Sin Sinh Slice Softmax
+    Softplus Softsign Split Sqrt Squeeze Sub Sum Tan Tanh ThresholdedRelu Transpose Unsqueeze Where
+    Xor
+"""
+FEED_FORWARD = frozenset(_NAMES.split())
+"""The operators of feed-forward networks, the only ones that boards accept.
+
+They map rows to rows with weights. Excluded: randomness, loops and branches, sequences, text, and
+arrays whose size is a number in the model, as of ConstantOfShape or Tile.
+"""
 
 TOLERANCE = 1e-6
 # Float32 networks are exact only up to rounding: trained TD3s differed from float64 by up to
@@ -222,10 +238,6 @@ def _check_difference(data: bytes, network: Network) -> None:
             f"most {TOLERANCE:g}. Check that it is deterministic and depends only on the "
             "observation, or write the ONNX file yourself."
         )
-
-
-_BATCHES = 2, 3
-_SIZES = "Shape", "Size"  # of their input they read the shape alone
 
 
 def _fold_shapes(model: Any, observation_dim: int) -> None:

@@ -383,17 +383,15 @@ def check_names(
     others: Iterable[str] = (),
 ) -> None:
     """Raise OptionError if an algorithm's class or function has no hyperparameter of a name."""
+    of_train = parse_uses(uses)[0] == "train"
+    of_sb3 = not of_train and isinstance(algorithm, type) and is_sb3(algorithm)
     first = next(iter(inspect.signature(algorithm).parameters), "env")
-    if parse_uses(uses)[0] == "train":
-        _check_names(field, uses, hyperparameters, algorithm, (first, "steps", "seed"), others)
-    elif not isinstance(algorithm, type) or not is_sb3(algorithm):
-        _check_names(field, uses, hyperparameters, algorithm, (first, "seed"), others)
-    else:
-        _check_names(field, uses, hyperparameters, algorithm, _RESERVED, others)
-        in_policy = hyperparameters.get("policy_kwargs")
-        if isinstance(in_policy, Mapping):
-            policy: Any = cast(Any, algorithm).policy_aliases[policy_alias(algorithm)]
-            _check_names(f"{field}.policy_kwargs", f"{uses}'s policy", in_policy, policy, _PASSED)
+    passed = (first, "seed", "steps") if of_train else (first, "seed")
+    _check_names(field, uses, hyperparameters, algorithm, _RESERVED if of_sb3 else passed, others)
+    in_policy = hyperparameters.get("policy_kwargs")
+    if of_sb3 and isinstance(in_policy, Mapping):
+        policy: Any = cast(Any, algorithm).policy_aliases[policy_alias(algorithm)]
+        _check_names(f"{field}.policy_kwargs", f"{uses}'s policy", in_policy, policy, _PASSED)
 
 
 def _check_names(
