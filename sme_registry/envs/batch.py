@@ -252,7 +252,6 @@ class Batch:
         return self.schedule.life(self._phase.copy(), self._lifetime.copy())
 
     def life_of(self, env: int) -> dict[str, Any]:
-        """The same of one environment, as NumPy's numbers."""
         return self.schedule.life(self._phase[env], self._lifetime[env])
 
     def info_of(self, step: BatchStep, env: int, rescaled: bool) -> dict[str, Any]:
@@ -345,7 +344,6 @@ class Batch:
         return result
 
     def _live_on(self, observation: Observation, resting: Mask | None) -> None:
-        """Count a step of each life, and switch where a segment ends within an episode."""
         self._lifetime += 1 if resting is None else ~resting
         self.lived = self.life()  # before the switch: of the task in which the action was taken
         if self._one_hot.shape[1]:
@@ -417,7 +415,6 @@ class Batch:
         return True
 
     def _write_seen(self, states: Array, envs: Indices, observation: Observation) -> None:
-        """Write what is seen of some environments' states `[S, len(envs)]` into their rows."""
         observation[envs, : self._of_t] = self._see(self._distractors.beside(states, envs)).T
 
     def _write_segment(self, envs: Indices, observation: Observation) -> None:

@@ -40,7 +40,7 @@ from sme_registry.task.loading import materialize_segments
 _NAN = np.float64(np.nan)
 
 
-class Columns(NamedTuple):
+class StepColumns(NamedTuple):
     """What a step computes of a task."""
 
     rows: int  # of `values`; see `compiled.arrays`
@@ -48,7 +48,7 @@ class Columns(NamedTuple):
     actions: tuple[str, ...]  # keys whose values are `[A]`, in the environment's action range
 
     @classmethod
-    def of(cls, spec: SMESpec) -> Columns:
+    def of(cls, spec: SMESpec) -> StepColumns:
         return _PLAIN if spec.safety is None else _WITH_SAFETY
 
     def at_reset(self, width: int) -> dict[str, Any]:
@@ -70,7 +70,7 @@ class Columns(NamedTuple):
         return info
 
 
-_PLAIN = Columns(
+_PLAIN = StepColumns(
     ROWS,
     {
         "similarity": SIMILARITY,
@@ -80,7 +80,7 @@ _PLAIN = Columns(
     },
     ("optimal_action",),
 )
-_WITH_SAFETY = Columns(
+_WITH_SAFETY = StepColumns(
     ROWS_WITH_SAFETY,
     {**_PLAIN.numbers, "cost": COST, "safe_regret": SAFE_REGRET},
     ("optimal_action", "limit", "safe_action"),
@@ -92,7 +92,7 @@ class Schedule:
 
     def __init__(self, document: SMESpec | StreamSpec, tasks: Sequence[Task]) -> None:
         self.document, self.tasks = document, tuple(tasks)  # of each segment of a cycle
-        self.columns = Columns.of(tasks[0].spec)
+        self.columns = StepColumns.of(tasks[0].spec)
         self.is_stream = isinstance(document, StreamSpec)
         self.phases = np.array([segment.phase for segment in document.segments])
         self.k = np.array([task.spec.k for task in tasks])

@@ -42,7 +42,7 @@ class CleanConsole(Console):
                 yield segment._replace(text="\n".join(lines))
 
 
-class Column(NamedTuple):
+class TableColumn(NamedTuple):
     """A column, and how it is set: as a name, a number or a text."""
 
     heading: str
@@ -68,7 +68,7 @@ class Table:
         caption: str = "",
     ) -> None:
         self.title, self.caption = title, caption
-        self.columns = [Column(heading, kind) for heading, kind in columns.items()]
+        self.columns = [TableColumn(heading, kind) for heading, kind in columns.items()]
         self.rows: list[Row | None] = []
         """None separates sections."""
         for row in rows:

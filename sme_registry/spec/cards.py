@@ -151,7 +151,6 @@ def field_values(setting: Setting) -> dict[str, Any]:
 
 
 def changed_fields(setting: Setting, default: Setting | None = None) -> dict[str, Any]:
-    """The fields whose values are not those of the default task, or of another one."""
     others = field_values(default or SMESpec())
     return {k: v for k, v in field_values(setting).items() if v != others.get(k)}
 

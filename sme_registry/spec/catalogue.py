@@ -249,7 +249,7 @@ _VERSION = re.compile(r"-v(\d+)$")
 
 
 def spec_folder() -> Path:
-    """The folder of the catalogue: inside the installed package, or next to it in a checkout."""
+    """Inside the installed package, or next to it in a checkout."""
     installed = Path(__file__).resolve().parents[1] / "specs"
     return installed if installed.is_dir() else installed.parents[1] / "specs"
 

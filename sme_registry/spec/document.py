@@ -112,7 +112,6 @@ def _interval(field: FieldInfo) -> str:
 
 
 def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> dict[str, FieldInfo]:
-    """The fields of the model at a place in a document; empty where it is no model."""
     fields = model.model_fields
     for part in location:
         if part in fields:

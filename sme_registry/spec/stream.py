@@ -258,7 +258,6 @@ class StreamSpec(NamedDocument):
             )
 
     def _moved(self, by: int) -> StreamSpec:
-        """This stream with a number added to the seed of every phase."""
         phases = [
             Phase(
                 spec=one.spec.derive(seed=_moved(one.spec.seed, by)),

@@ -302,7 +302,6 @@ class StudyPlan(Document):
     def _runs(
         self, class_name: str, document: SMESpec | StreamSpec, algorithm: StudyAlgorithm, run: int
     ) -> Iterator[PlannedCell]:
-        """A run on a task; a life in a stream, and a fresh agent for each of its phases."""
         steps = self.steps if algorithm.steps is None else algorithm.steps
         if isinstance(document, StreamSpec):
             steps = document.steps
@@ -325,7 +324,6 @@ class StudyPlan(Document):
 
 
 def _lived_in(document: SMESpec | StreamSpec) -> dict[str, Any]:
-    """The fields of a cell that say what its agent lives in."""
     stream = document if isinstance(document, StreamSpec) else None
     return {"spec": document.specs[0], "stream": stream}
 
@@ -370,7 +368,6 @@ def sweep(
 
 
 def _instance_seeds(seed: int | str, instances: int) -> tuple[int | str, ...]:
-    """The seeds of a class's instances: a task's own, and the integers that follow it."""
     if instances == 1:
         return (seed,)
     if isinstance(seed, str):

@@ -31,7 +31,6 @@ def bit_generator(seed: int | str, name: str) -> np.random.Philox:
 
 
 def raw_bits(seed: int | str, name: str, count: int) -> Bits:
-    """The first `count` 64-bit words of a stream."""
     return bit_generator(seed, name).random_raw(count)
 
 
@@ -45,7 +44,6 @@ def uniform(seed: int | str, name: str, count: int) -> Array:
 
 
 def gaussian(seed: int | str, name: str, count: int) -> Array:
-    """Standard normal numbers of a stream, `[count]`: Φ⁻¹ of its uniform numbers."""
     return np.asarray(ndtri(uniform(seed, name, count)))
 
 
@@ -91,10 +89,9 @@ def transition_matrix(spec: SMESpec) -> Array:
 
 
 def _mixing_weights(seed: int | str, name: str, rows: int, columns: int) -> Array:
-    """U(0,1) entries `[rows, columns]`, each row divided by its sum, on the grid 2⁻²⁹.
+    """U(0,1) entries `[rows, columns]`, each row divided by its sum, on the grid 2⁻²⁹, exactly.
 
-    In exact integers: each entry is rounded down to the grid, and a row's difference from exactly 1
-    is added, one grid step each, to the entries that lost most.
+    A row's difference from 1 is added, one grid step each, to the entries that lost most.
     """
     bits = raw_bits(seed, name, rows * columns).reshape(rows, columns)
     # Odd 32-bit numbers, the mid-points of 2³¹ bins. With at most 2²⁰ of them in a row, every
@@ -111,7 +108,6 @@ def _mixing_weights(seed: int | str, name: str, rows: int, columns: int) -> Arra
 
 
 def transition_offset(spec: SMESpec) -> Array:
-    """b `[S]`, entries U(0,1)."""
     return uniform(spec.seed, "transition/b", spec.state_dim)
 
 

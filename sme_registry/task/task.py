@@ -230,7 +230,6 @@ class Task:
         return 1.0 - self._distances(a, optimal) / widths
 
     def _distances(self, a: Array, optimal: Array) -> Array:
-        """The L1 distance of each agent's action from its optimal one, `[..., n]`."""
         distance = np.abs(a - optimal)
         sums = [distance[..., channels].sum(axis=-1) for channels in self.owned]
         return np.stack(sums, axis=-1)
@@ -357,7 +356,6 @@ def observe(
     """The joint observation, (s, t/T, r_cum/k of each agent), `[B, S + 1 + n]` float32.
 
     r_cum/k is at most 1: it exceeds 1 only where a stream carries r_cum over to a smaller k.
-    A single agent observes all of it, an agent of a team only its part; see `envs.team`.
 
     Examples:
       >>> from sme_registry.task import load, observe
