@@ -105,11 +105,23 @@ class OfflineCell(StrictModel):
 
 
 class CellResult(StrictModel):
-    """A finished run; its `key` is the digest of its cell.
+    """A finished run.
 
-    A life in a stream has a `stream_report`, still without fresh agents, which are cells of their
-    own; any other run has a `report`. `online_regret` and `online_cost` are means over all steps
-    of training, in [0, 1]; references and offline learners have none.
+    Attributes:
+      key: the digest of its cell.
+      cell: what it ran.
+      curve: its evaluations during training.
+      report: None of a life in a stream.
+      stream_report: of a life in a stream, still without fresh agents, which are cells of their
+        own; None of any other run.
+      online_regret: mean over all steps of training, in [0, 1]; None of references and offline
+        learners.
+      online_cost: likewise, of a task with `safety`.
+      agents_online_regret: the regret of each agent of a team.
+      offline: of an offline cell.
+      program: of a cell in JAX.
+      timing: CPU seconds by task.
+      versions: of the packages that the numbers depend on.
     """
 
     schema_version: SchemaVersion = 1
