@@ -31,6 +31,7 @@ def documents():
         kind
         for kind in below(StrictModel)
         if kind.__module__.split(".")[0] in ("sme_registry", "leaderboard")
+        and ".jax." not in kind.__module__  # hyperparameters with Stable-Baselines3's names
     }
     return sorted(ours, key=lambda kind: (kind.__module__, kind.__name__))
 
