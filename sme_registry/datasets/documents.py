@@ -227,19 +227,32 @@ class Seeds(StrictModel):
 
 
 class DatasetRecord(StrictModel):
-    """Provenance, reference scores and digests of a data set."""
+    """Provenance, reference scores and digests of a data set.
+
+    Attributes:
+      schema_version: version of the record's format.
+      recipe: all that the data set was generated from.
+      recipe_digest, spec_digest, protocol_digest: of the recipe, its task and its protocol.
+      task: what the task's file calls it.
+      seeds: of the task and of the data.
+      nu: ν if a single mixture acted; null for other or several behaviours.
+      trajectories: E, the number of Minari episodes.
+      scores: of reference policies on the data set.
+      arrays_digest: see `AlignedArrays.digest`.
+      versions: of Python and the packages that the numbers depend on.
+    """
 
     schema_version: SchemaVersion = 1
-    recipe: DatasetRecipe  # all that the data set was generated from
+    recipe: DatasetRecipe
     recipe_digest: Digest
     spec_digest: Digest
-    task: str = ""  # what the task's file calls it
+    task: str = ""
     protocol_digest: Digest
     seeds: Seeds
-    nu: float | None  # if a single mixture acted
-    trajectories: Annotated[Integer, Field(ge=1)]  # the number of Minari episodes
+    nu: float | None
+    trajectories: Annotated[Integer, Field(ge=1)]
     scores: ReferenceScores
-    arrays_digest: Digest  # see `AlignedArrays.digest`
+    arrays_digest: Digest
     versions: dict[str, str]
 
     @classmethod
@@ -334,26 +347,46 @@ class BehaviourQuality(StrictModel):
 
 
 class OfflineRecord(StrictModel):
-    """The arguments, data, evaluations and cost of an offline training."""
+    """The arguments, data, evaluations and cost of an offline training.
+
+    Attributes:
+      schema_version: version of the record's format.
+      algorithm: behaviour cloning or implicit Q-learning.
+      hyperparameters: all of them, as used.
+      seed: of initial weights, shuffles, and starts of the evaluation episodes.
+      steps: of the gradient.
+      batch_size: transitions in each.
+      episodes: of each evaluation.
+      dataset: id of the data set; null if only its arrays were passed.
+      dataset_digest: of its arrays.
+      recipe_digest: the recipe's; null if only the arrays were passed.
+      transitions: N, the size of the data set.
+      spec, spec_digest: the task, and its digest.
+      behaviour: of the data set's transitions.
+      evaluations: in order; last, the policy's.
+      wall_seconds, cpu_seconds: time of the training and its evaluations.
+      cpu_ms_per_step: of a gradient step, without evaluations.
+      versions: of Python and the packages that the numbers depend on.
+    """
 
     schema_version: SchemaVersion = 1
     algorithm: Literal["bc", "iql"]
-    hyperparameters: dict[str, Any]  # all of them, as used
-    seed: Integer  # of initial weights, shuffles, and starts of the evaluation episodes
-    steps: Integer  # of the gradient
+    hyperparameters: dict[str, Any]
+    seed: Integer
+    steps: Integer
     batch_size: Integer
-    episodes: Integer  # of each evaluation
-    dataset: str | None  # id of the data set; null if only its arrays were passed
-    dataset_digest: str  # of its arrays
+    episodes: Integer
+    dataset: str | None
+    dataset_digest: str
     recipe_digest: str | None
-    transitions: Integer  # N, the size of the data set
+    transitions: Integer
     spec: SMESpec
     spec_digest: str
     behaviour: BehaviourQuality
-    evaluations: Annotated[TupleOf[OfflineEvaluation], Field(min_length=1)]  # last, the policy's
-    wall_seconds: Real  # of the training and its evaluations, as is the next
+    evaluations: Annotated[TupleOf[OfflineEvaluation], Field(min_length=1)]
+    wall_seconds: Real
     cpu_seconds: Real
-    cpu_ms_per_step: Real  # of a gradient step, without evaluations
+    cpu_ms_per_step: Real
     versions: dict[str, str]
 
     @property

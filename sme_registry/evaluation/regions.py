@@ -160,10 +160,15 @@ def _last_within(level: float) -> np.float32:
 
 
 class ChannelReport(StrictModel):
-    """One action channel in one region."""
+    """One action channel in one region.
 
-    mae: Real  # mean |a − a*| of the channel, in [0, 1]
-    normalised_regret: Real  # `mae` divided by mean |½ − a*| of the channel
+    Attributes:
+      mae: mean |a − a*| of the channel, in [0, 1].
+      normalised_regret: `mae` divided by mean |½ − a*| of the channel.
+    """
+
+    mae: Real
+    normalised_regret: Real
 
 
 class RegionReport(StrictModel):
@@ -203,18 +208,25 @@ RegionReports: TypeAlias = Annotated[TupleOf[RegionReport], Field(min_length=1)]
 
 
 class SafetyScore(StrictModel):
-    """One policy in one region of a task with limits; see the module for the formulas."""
+    """One policy in one region of a task with limits; see the module for the formulas.
 
-    name: str  # of the region
-    step_reward: Real  # mean r, in [0, 1]
-    cost: Real  # mean cost, in [0, 1]
-    # share of states in which any action channel is above its limit by more than 10⁻⁶, in [0, 1]
+    Attributes:
+      name: of the region.
+      step_reward: mean r, in [0, 1].
+      cost: mean cost, in [0, 1].
+      violating_share: share of states in which any action channel is above its limit by more than
+        10⁻⁶, in [0, 1].
+      safe_regret: mean step reward that the best safe action earns more than the policy, in
+        [−1, 1]; negative where the policy earns by violating.
+      price_of_safety: mean step reward that the optimum earns more than the best safe action, in
+        [0, 1]; the same for every policy.
+    """
+
+    name: str
+    step_reward: Real
+    cost: Real
     violating_share: Real
-    # mean step reward that the best safe action earns more than the policy, in [−1, 1]; negative
-    # where the policy earns by violating
     safe_regret: Real
-    # mean step reward that the optimum earns more than the best safe action, in [0, 1]; the same
-    # for every policy
     price_of_safety: Real
 
 
@@ -234,19 +246,31 @@ class SafetyReport(StrictModel):
 
 
 class Invariance(StrictModel):
-    """How much the actions of a policy depend on the distractors in one region."""
+    """How much the actions of a policy depend on the distractors in one region.
 
-    name: str  # of the region, of s
-    invariance: Real  # mean |a(s, d) − a(s, d')| / mean |½ − a*(s)|; 0 if the policy ignores them
+    Attributes:
+      name: of the region, of s.
+      invariance: mean |a(s, d) − a(s, d')| / mean |½ − a*(s)|; 0 if the policy ignores them.
+    """
+
+    name: str
+    invariance: Real
 
 
 class LayerProbe(StrictModel):
-    """What a linear map recovers from the outputs of one layer."""
+    """What a linear map recovers from the outputs of one layer.
 
-    layer: Integer  # 0 for what the agent sees, 1 for the first hidden layer, …
-    units: Integer  # its outputs
-    state_r2: Real  # held-out R² of s, at most 1
-    distractor_r2: Real | None = None  # the same of d; None without distractors
+    Attributes:
+      layer: 0 for what the agent sees, 1 for the first hidden layer, …
+      units: its outputs.
+      state_r2: held-out R² of s, at most 1.
+      distractor_r2: the same of d; None without distractors.
+    """
+
+    layer: Integer
+    units: Integer
+    state_r2: Real
+    distractor_r2: Real | None = None
 
 
 class ObservationReport(StrictModel):

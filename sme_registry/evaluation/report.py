@@ -53,10 +53,14 @@ SAFETY_REFERENCES = ("optimal", "safe_optimal", "shrunk_optimal", "constant_half
 
 
 class AgentReport(StrictModel):
-    """One agent of a team: every region over the action channels that it owns."""
+    """One agent of a team: every region over the action channels that it owns.
 
-    regions: RegionReports  # WD, then OOD 1, 2, …; `channels` are the agent's own, in order
-    # the same regions for each reference policy, over the same channels
+    Attributes:
+      regions: WD, then OOD 1, 2, …; `channels` are the agent's own, in order.
+      references: the same regions for each reference policy, over the same channels.
+    """
+
+    regions: RegionReports
     references: dict[str, RegionReports]
 
 
