@@ -335,9 +335,8 @@ def diagnose(
     if out_folder is not None:
         check_new(out_folder / _JSON, force=force)
     options.check(run)
-    subject = options.subject(run)
     result = diagnosis.diagnose(
-        subject,
+        options.subject(run),
         against=None if against is None else options.other(run, against),
         probe_capacity=probe_capacity,
         states=states,
@@ -352,7 +351,7 @@ def diagnose(
             out().print(part)
     if out_folder is None:
         return
-    figures = draw(result, out_folder, subject) if can_draw() else ()
+    figures = draw(result, out_folder) if can_draw() else ()
     names = [path.name for path in figures if path.suffix == ".png"]
     text = result.markdown(names, details=all_)
     # The data last, so that the other files exist once it does.

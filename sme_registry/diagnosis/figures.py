@@ -1,29 +1,23 @@
-"""The figures of a diagnosis: of a task by channel, state, shell, time and training; of a team by
-agent; of a life by visit and phase."""
+"""The figures of a diagnosis: by channel, state and time; of a team by agent; of a life by visit.
+
+`sme evaluate` draws limits, distractors and layers, and what a life retains.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from sme_registry.diagnosis.behaviour import Log, OnPolicy, TrainingSummary
 from sme_registry.diagnosis.document import Diagnosis
-from sme_registry.diagnosis.measure import LINEAR, POLICY, DistractorRegret, Violations
-from sme_registry.diagnosis.questions import Measurements
+from sme_registry.diagnosis.measure import LINEAR, POLICY
 from sme_registry.diagnosis.stream import StreamDiagnosis
-from sme_registry.diagnosis.subject import AnySubject, StreamSubject, Subject
 from sme_registry.diagnosis.task import TaskDiagnosis
 from sme_registry.diagnosis.team import TeamDiagnosis
-from sme_registry.evaluation import ObservationReport
 from sme_registry.evaluation.references import LABELS
-from sme_registry.evaluation.regions import LayerProbe
-from sme_registry.plots.curves import draw_training, tick_visits
-from sme_registry.plots.maps import retention_map
-from sme_registry.plots.reports import draw_cost
+from sme_registry.plots.curves import tick_visits
 from sme_registry.plots.style import (
     COLOURS,
     GREY,
@@ -31,7 +25,6 @@ from sme_registry.plots.style import (
     draw_reference,
     entitle,
     legend_above,
-    legend_below,
     look,
     merge_coincident,
     new_figure,
@@ -49,47 +42,17 @@ _FRESH = "fresh agent of the phase"
 _REGRET = "normalised regret  (0 = optimal)"
 
 
-def draw(diagnosis: Diagnosis, folder: Path, subject: AnySubject | None = None) -> tuple[Path, ...]:
-    """Write the figures into a folder, as PNG and PDF.
-
-    The training is drawn where the subject has a log, and what a life retained from its report.
-    """
+def draw(diagnosis: Diagnosis, folder: Path) -> tuple[Path, ...]:
+    """Write the figures into a folder, as PNG and PDF."""
     written = []
-    for name, fill in _fills(diagnosis, subject):
+    for name, fill in _FIGURES[type(diagnosis)].items():
         with styled():
             figure = new_figure((8.2, 4.0))
             entitle(figure, diagnosis.title)
-            fill(figure)
-        written += save_figure(figure, folder / name, WRITTEN)
-    if isinstance(subject, StreamSubject):
-        written += save_figure(retention_map(subject.report), folder / "what_is_retained", WRITTEN)
+            fill(diagnosis, figure)
+        if figure.axes:
+            written += save_figure(figure, folder / name, WRITTEN)
     return tuple(written)
-
-
-def _fills(
-    diagnosis: Diagnosis, subject: AnySubject | None
-) -> Iterator[tuple[str, Callable[[Figure], None]]]:
-    """The figures by name, and what fills each of them."""
-    if isinstance(diagnosis, TeamDiagnosis):
-        yield "who_agents", partial(_agents, diagnosis)
-    elif isinstance(diagnosis, StreamDiagnosis):
-        yield "which_phases", partial(_which_phases, diagnosis)
-        if any(visit.network is not None for visit in diagnosis.visits):
-            yield "network_by_visit", partial(_network_by_visit, diagnosis)
-    elif isinstance(diagnosis, TaskDiagnosis):
-        measured, observation = diagnosis.measurements, diagnosis.measurements.observation
-        yield "where_channels", partial(_channels, measured)
-        yield "where_states", partial(_states, measured, diagnosis.thresholds["explained_variance"])
-        yield "where_time", partial(_time, measured)
-        yield "what_the_error_is", partial(_squared_error, measured)
-        if isinstance(subject, Subject) and subject.log is not None and measured.training:
-            yield "training", partial(_training, measured.on_policy, measured.training, subject.log)
-        if measured.limits is not None:
-            yield "limits", partial(_limits, measured.limits)
-        if observation is not None and measured.distraction is not None:
-            yield "distraction", partial(_distraction, measured.distraction, observation)
-        if observation is not None and len(observation.probes) > 1:
-            yield "layers", partial(_layers, observation.probes)
 
 
 def _lines(axes: Axes, x: Any, series: Mapping[str, Any]) -> None:
@@ -119,35 +82,22 @@ def _bars(
         )  # fmt: skip
 
 
-def _shares(axes: Axes, shares: Mapping[str, float], text: str, colours: Any = COLOURS[0]) -> None:
-    """A bar along each line, with its value as text behind it."""
-    bars = axes.barh(list(shares), list(shares.values()), 0.6, color=colours)
-    axes.bar_label(bars, [text.format(share) for share in shares.values()], padding=3, fontsize=8)
-    axes.invert_yaxis()
-    axes.grid(visible=False, axis="y")
-
-
-def _tick_channels(axes: Axes, channels: Sequence[Any]) -> list[int]:
-    """Label the x axis with action channels, as many as fit; returns these."""
-    numbers = [channel.channel for channel in channels[:_MOST]]
-    cut = f" (the first {_MOST})" if len(channels) > _MOST else ""
-    axes.set(xlabel=f"action channel{cut}", xticks=numbers[:: max(1, len(numbers) // 8)])
-    return numbers
-
-
-def _legends(*panels: Axes, ncols: int = 1) -> None:
+def _legends(*panels: Axes) -> None:
     """A legend above each panel, after its limits."""
     for axes in panels:
         low, high = axes.get_ylim()
         axes.set_ylim(min(0.0, low), high)
         merge_coincident([axes])
-        legend_above(axes, ncols=ncols)
+        legend_above(axes)
 
 
-def _channels(measured: Measurements, figure: Figure) -> None:
-    channels = measured.channels[:_MOST]
+def _channels(diagnosis: TaskDiagnosis, figure: Figure) -> None:
+    every = diagnosis.measurements.channels
+    channels, cut = every[:_MOST], f" (the first {_MOST})" if len(every) > _MOST else ""
+    x = [channel.channel for channel in channels]
     left, right = figure.subplots(1, 2)
-    x, _ = (_tick_channels(axes, measured.channels) for axes in (left, right))
+    for axes in (left, right):
+        axes.set(xlabel=f"action channel{cut}", xticks=x[:: max(1, len(x) // 8)])
     regrets = {
         "this policy": [c.normalised_regret for c in channels],
         LABELS[LINEAR]: [c.linear_normalised_regret for c in channels],
@@ -166,25 +116,25 @@ def _channels(measured: Measurements, figure: Figure) -> None:
     _legends(left, right)
 
 
-def _states(measured: Measurements, threshold: float, figure: Figure) -> None:
+def _states(diagnosis: TaskDiagnosis, figure: Figure) -> None:
+    measured, threshold = diagnosis.measurements, diagnosis.thresholds["explained_variance"]
     left, middle, right = figure.subplots(1, 3)
     centre, *channels = measured.partitions
     best = sorted(channels, key=lambda p: -p.explained_variance)[:2]
-    names = ["distance from the centre", *(f"state channel {p.state_channel}" for p in best)]
-    for index, part in enumerate((centre, *best)):
-        left.bar(
-            index, part.explained_variance, 0.6, color=COLOURS[index], edgecolor="white",
-            hatch=("", "////", "....")[index],
-        )  # fmt: skip
-    fifths = 1 + np.arange(len(centre.mae))
-    _lines(middle, fifths, {name: p.mae for name, p in zip(names, (centre, *best), strict=True)})
+    parts = {"distance": centre, **{f"s{p.state_channel}": p for p in best}}
+    left.bar(
+        list(parts), [part.explained_variance for part in parts.values()], 0.6,
+        color=COLOURS[: len(parts)], edgecolor="white", hatch=("", "////", "....")[: len(parts)],
+    )  # fmt: skip
     left.axhline(threshold, color=GREY, linewidth=1.1, label=f"stands out above {threshold:.0%}")
+    fifths = 1 + np.arange(len(centre.mae))
+    names = ["distance from the centre", *(f"state channel {p.state_channel}" for p in best)]
+    _lines(middle, fifths, {name: p.mae for name, p in zip(names, parts.values(), strict=True)})
     left.set(
         xlabel="quantity that explains it",
         ylabel="share of the error's\nvariance explained",
         ylim=(0.0, max(0.12, left.get_ylim()[1])),
     )
-    left.set_xticks(range(len(names)), ["distance", *(f"s{p.state_channel}" for p in best)])
     _reference(middle, measured.uniform[LINEAR].mae, LINEAR)
     middle.set(
         xlabel="fifth of the states, by quantity",
@@ -204,7 +154,8 @@ def _states(measured: Measurements, threshold: float, figure: Figure) -> None:
     _legends(left, middle, right)
 
 
-def _time(measured: Measurements, figure: Figure) -> None:
+def _time(diagnosis: TaskDiagnosis, figure: Figure) -> None:
+    measured = diagnosis.measurements
     episodes, time = measured.on_policy, measured.time_dependence
     left, right = figure.subplots(1, 2)
     middles = (np.array(episodes.edges[:-1]) + np.array(episodes.edges[1:])) / 2
@@ -223,8 +174,8 @@ def _time(measured: Measurements, figure: Figure) -> None:
     _legends(left, right)
 
 
-def _squared_error(measured: Measurements, figure: Figure) -> None:
-    error, episodes = measured.squared_error, measured.on_policy
+def _squared_error(diagnosis: TaskDiagnosis, figure: Figure) -> None:
+    error, episodes = diagnosis.measurements.squared_error, diagnosis.measurements.on_policy
     left, right = figure.subplots(1, 2)
     shares = {
         "offset": error.offset,
@@ -234,7 +185,10 @@ def _squared_error(measured: Measurements, figure: Figure) -> None:
         "· input t/T": error.time,
         "· input r_cum/k": error.accumulated_reward,
     }
-    _shares(left, shares, "{:.0%}")
+    bars = left.barh(list(shares), list(shares.values()), 0.6, color=COLOURS[0])
+    left.bar_label(bars, [f"{share:.0%}" for share in shares.values()], padding=3, fontsize=8)
+    left.invert_yaxis()
+    left.grid(visible=False, axis="y")
     left.set(xlabel="share of the squared error", xlim=(0.0, 1.15), xticks=np.linspace(0, 1, 6))
     looks = {"rewarded": ("r > 0", COLOURS[2], ""), "gated": ("0 by r_min", COLOURS[4], "////"),
              "flat": ("r̂ = 0", "#cccccc", "")}  # fmt: skip
@@ -250,90 +204,6 @@ def _squared_error(measured: Measurements, figure: Figure) -> None:
     right.set(xlabel="share of steps", xlim=(0.0, 1.0), ylim=(1.6, -0.6))
     right.grid(visible=False, axis="y")
     legend_above(right, ncols=3, columnspacing=1.0, handlelength=1.4)
-
-
-def _training(episodes: OnPolicy, training: TrainingSummary, log: Log, figure: Figure) -> None:
-    axes = figure.add_subplot()
-    draw_training(axes, log.step, log.regret, unit=log.source.removesuffix("s"))
-    for name in _REFERENCES[:3]:
-        _reference(axes, episodes.scores[name].regret, name)
-    regret = episodes.scores[POLICY].regret
-    axes.axhline(regret, color=COLOURS[1], linewidth=1.6, label="this policy")
-    if training.improvement_step is not None:
-        axes.axvline(training.improvement_step, color="black", linewidth=0.9, linestyle=":")
-        late = training.improvement_step > training.steps / 2
-        axes.annotate(
-            "better than a constant", (training.improvement_step, 0.02),
-            xytext=(-4 if late else 4, 0), textcoords="offset points", fontsize=8,
-            ha="right" if late else "left",
-        )  # fmt: skip
-    merge_coincident([axes])
-    legend_below(figure, axes.get_legend_handles_labels()[0])
-
-
-def _limits(limits: Violations, figure: Figure) -> None:
-    """Reward against cost, and which action channels violate their limits."""
-    left, right = figure.subplots(1, 2)
-    scores = {
-        "this policy": limits.report.regions[0],
-        "cut off at the limits": limits.cut_off,
-        "in visited states": limits.visited,
-    }
-    runs = [(name, [[score]]) for name, score in scores.items()]
-    draw_cost(left, runs, [limits.report], slice(1))
-    x, channels = _tick_channels(right, limits.channels), limits.channels[:_MOST]
-    shares = {
-        "this policy": [c.violating_share for c in channels],
-        LABELS["optimal"]: [c.optimal_violating_share for c in channels],
-    }
-    _bars(right, x, shares, beside=LABELS["optimal"])
-    top = max(0.1, right.get_ylim()[1])
-    right.set(ylabel="share of states above the limit", ylim=(0.0, top))
-    _legends(left, right, ncols=2)
-
-
-def _distraction(
-    distraction: DistractorRegret, observation: ObservationReport, figure: Figure
-) -> None:
-    """Regret with other distractors, and how much they move the actions."""
-    left, right = figure.subplots(1, 2)
-    regrets = {
-        "uniform": distraction.normalised_regret,
-        "averaged out": distraction.averaged_regret,
-        "all at ½": distraction.half_regret,
-        **{region.name: region.normalised_regret for region in observation.distractor_regions},
-    }
-    outside = len(observation.distractor_regions)
-    _shares(left, regrets, "{:.2f}", [COLOURS[0]] * 3 + [COLOURS[1]] * outside)
-    left.axvline(
-        1.0, color=GREY, linewidth=1.1, linestyle=(0, (4, 4)), label=LABELS["constant_half"]
-    )
-    most = max(regrets.values())
-    left.set(xlabel=_REGRET, ylabel="distractors", xlim=(0.0, max(1.15, 1.1 * most)))
-    changes = {region.name: region.invariance for region in observation.invariance}
-    bars = right.bar(list(changes), list(changes.values()), 0.7, color=COLOURS[2])
-    right.bar_label(bars, [f"{change:.2f}" for change in changes.values()], padding=2, fontsize=8)
-    right.set(
-        xlabel="region of the state",
-        ylabel="change of a by other distractors\n(unit: mean |½ − a*|)",
-        ylim=(0.0, max(0.1, 1.15 * max(changes.values()))),
-    )
-    right.grid(visible=False, axis="x")
-    legend_above(left)
-
-
-def _layers(probes: Sequence[LayerProbe], figure: Figure) -> None:
-    """What a linear map recovers from each layer."""
-    axes = figure.add_subplot()
-    x, series = np.arange(len(probes)), {"of the state": [p.state_r2 for p in probes]}
-    if probes[0].distractor_r2 is not None:
-        series["of the distractors"] = [p.distractor_r2 or 0.0 for p in probes]
-    _lines(axes, x, series)
-    layers = [f"hidden {p.layer}\n({p.units} units)" for p in probes[1:]]
-    axes.set_xticks(x, [f"observation\n({probes[0].units})", *layers])
-    bottom = min(-0.03, axes.get_ylim()[0])
-    axes.set(ylabel="held-out R²  (1 = recovered by a linear map)", ylim=(bottom, 1.03))
-    legend_above(axes, ncols=2)
 
 
 def _agents(diagnosis: TeamDiagnosis, figure: Figure) -> None:
@@ -393,12 +263,15 @@ def _draw_fresh(axes: Axes, values: Sequence[float | None]) -> None:
 
 
 def _network_by_visit(diagnosis: StreamDiagnosis, figure: Figure) -> None:
+    """Nothing where no network is known."""
     quantities = {
         "inactive_units": "inactive hidden units, share",
         "effective_rank": "effective rank of the last hidden layer",
         "weight_norm": "norm of the weights",
     }
     networks = [visit.network for visit in diagnosis.visits]
+    if not any(networks):
+        return
     initial = diagnosis.initial_network is not None
     if initial:
         networks.insert(0, diagnosis.initial_network)
@@ -413,3 +286,15 @@ def _network_by_visit(diagnosis: StreamDiagnosis, figure: Figure) -> None:
         highest = max(number for number in (*life, *fresh) if number is not None)
         axes.set(ylabel=name, ylim=(0.0, max(0.05, 1.08 * highest)))
     legend_above(panels[0])
+
+
+_FIGURES: dict[type[Diagnosis], dict[str, Callable[[Any, Figure], None]]] = {
+    TaskDiagnosis: {
+        "where_channels": _channels,
+        "where_states": _states,
+        "where_time": _time,
+        "what_the_error_is": _squared_error,
+    },
+    TeamDiagnosis: {"who_agents": _agents},
+    StreamDiagnosis: {"which_phases": _which_phases, "network_by_visit": _network_by_visit},
+}

@@ -373,9 +373,9 @@ def test_the_command_writes_a_page_its_data_and_its_figures(run, tmp_path, laid_
     assert "Phases" in result.stdout
     page = (tmp_path / "d" / "diagnosis.md").read_text()
     names = sorted(path.stem for path in (tmp_path / "d").glob("*.png"))
-    assert names == ["network_by_visit", "what_is_retained", "which_phases"]
+    assert names == ["network_by_visit", "which_phases"]
     assert all(f"]({name}.png)" in page for name in names)
-    assert len(laid_out) == 3
+    assert len(laid_out) == 2
     for figure in laid_out:
         assert_readable(figure)
     read = StreamDiagnosis.from_dict(json.loads((tmp_path / "d" / "diagnosis.json").read_text()))
