@@ -55,7 +55,16 @@ def in_process(monkeypatch):
 @pytest.mark.parametrize(
     ("name", "packages", "shorter"),
     [
-        ("own_agents", "torch matplotlib onnx onnxruntime nacl", {"STEPS = 5_000": "STEPS = 200"}),
+        (
+            "own_agents",
+            "torch matplotlib onnx onnxruntime nacl",
+            {
+                "STEPS = 5_000": "STEPS = 200",
+                'catalogue.find(SuiteFile, "smoke")': 'SuiteFile.read("two.json")',
+                "init board --practice": "init board --practice --suite two.json",
+                "new mine": "new mine --suite two.json",
+            },
+        ),
         (
             "sweep_figure",
             "torch pandas IPython",
@@ -90,6 +99,7 @@ def test_a_tutorial_works_from_top_to_bottom(name, packages, shorter, tmp_path, 
         pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "tutorials" / f"{name}.md").read_text()
+    run("sme", "suite new two.json -t Default -t Plane1 --instances 1")
     for full, short in shorter.items():
         assert full in page
         page = page.replace(full, short)
