@@ -10,22 +10,58 @@ Of actions a, clipped to [0, 1], and the optimal actions a*:
 from __future__ import annotations
 
 import os
-import textwrap
+from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, JsonValue
-from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.console import RenderableType
+from rich.constrain import Constrain
 from rich.markup import escape
+from rich.padding import Padding
 from rich.text import Text
 
-from sme_registry.diagnosis.questions import OPEN_REASONS, Verdict, label, templates, words
+from sme_registry.diagnosis.behaviour import CapacityProbe, OnPolicy, TrainingSummary
+from sme_registry.diagnosis.measure import (
+    LINEAR,
+    POLICY,
+    Channel,
+    DistractorRegret,
+    Partition,
+    Response,
+    Score,
+    Shell,
+    SquaredError,
+    TimeDependence,
+    Violations,
+)
+from sme_registry.diagnosis.questions import (
+    DOUBTS,
+    THRESHOLDS,
+    Comparison,
+    Questions,
+    Verdict,
+    judge,
+    label,
+    templates,
+    words,
+)
 from sme_registry.diagnosis.subject import AnySubject
-from sme_registry.errors import UnknownNameError, did_you_mean
-from sme_registry.io import read_json, versions
+from sme_registry.errors import UnknownNameError
+from sme_registry.evaluation import ObservationReport
+from sme_registry.evaluation.references import LABELS
+from sme_registry.evaluation.report import SAFETY_REFERENCES
+from sme_registry.io import choice, read_json, versions
 from sme_registry.io.markup import Table, fixed, percent, plural
 from sme_registry.spec import SMESpec, StreamSpec, catalogue
-from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf, check_digest
+from sme_registry.spec.document import (
+    Digest,
+    Integer,
+    Real,
+    StrictModel,
+    TupleOf,
+    check_digest,
+)
 
 Level = Literal["solved", "better_than_linear", "worse_than_linear", "no_better_than_constant"]
 
@@ -37,7 +73,8 @@ _HEADINGS = {
     "limits": "Limits",
 }
 _STYLES = {"yes": "bold red", "no": "green", "cannot tell": "yellow"}
-_COLUMNS, _INDENT = 80, " " * 4  # of lines in a file or a pipe
+_COLUMNS, _INDENT = 80, 4  # of lines of text
+_NAMES = {POLICY: "this policy", **LABELS}
 
 
 class Part(NamedTuple):
@@ -52,36 +89,37 @@ class Part(NamedTuple):
     def terminal(self) -> Iterator[RenderableType]:
         """Its lines, table and notes on a terminal or in a pipe."""
         if self.columns == _ANSWERS:
-            yield _Lines((self.heading, "italic", ""))
+            yield Text(self.heading, "italic")
             for question, answer, evidence in self.rows:
-                style = _STYLES[answer.partition(",")[0]]
-                yield _Lines((f"{question}: {answer}", style, ""), (evidence, "", _INDENT))
+                yield Text(f"{question}: {answer}", _STYLES[answer.partition(",")[0]])
+                yield Constrain(Padding.indent(Text(evidence), _INDENT), _COLUMNS)
         else:
             kinds = ["name", *["number"] * (len(self.columns) - 1)]
             rows = [[escape(cell) for cell in row] for row in self.rows]
             yield Table(self.heading, dict(zip(self.columns, kinds, strict=True)), rows)
         for note in self.notes:
-            yield _Lines((note, "dim italic", ""))
+            yield Constrain(Text(note, "dim italic"), _COLUMNS)
 
 
 def table(
     heading: str, name: str, rows: Mapping[str, Any], fields: str, *notes: str, detail: bool = False
 ) -> Part:
     """A part with one row for each of `rows`, by its name, and a column for each of its fields."""
-    names = fields.split()
-    columns = [label(field).replace("normalised regret", "N") for field in names]
-    cells = [
-        (row_name, *(cell(getattr(row, field)) for field in names))
-        for row_name, row in rows.items()
-    ]
-    return Part(heading, (name, *columns), cells, notes, detail)
+    columns = [label(field).replace("normalised regret", "N") for field in fields.split()]
+    lines = [(row_name, *cells(row, fields)) for row_name, row in rows.items()]
+    return Part(heading, (name, *columns), lines, notes, detail)
 
 
-def cell(value: float | str | None, digits: int = 3) -> str:
+def cells(row: Any, fields: str) -> tuple[str, ...]:
+    """Fields of a row of a table; of None, and where a field is None, a dash."""
+    return tuple(cell(getattr(row, field, None)) for field in fields.split())
+
+
+def cell(value: float | str | None) -> str:
     """A number or a name in a table."""
     if value is None:
         return "–"
-    return fixed(value, digits) if isinstance(value, float) else label(str(value))
+    return fixed(value, 3) if isinstance(value, float) else label(str(value))
 
 
 class Diagnosis(StrictModel):
@@ -99,9 +137,7 @@ class Diagnosis(StrictModel):
       versions: of Python and of the packages that the numbers depend on.
     """
 
-    headline_macro: ClassVar[str] = ""
     document_field: ClassVar[str] = "spec"
-    only_field: ClassVar[str] = ""  # that no other kind of diagnosis has
 
     schema_version: Annotated[
         Literal[2],
@@ -119,9 +155,8 @@ class Diagnosis(StrictModel):
     versions: dict[str, str]
 
     @classmethod
-    def about(cls, subject: AnySubject, verdicts: Sequence[Verdict], **fields: Any) -> Self:
-        """The diagnosis of a subject, with the fields of its kind."""
-        thresholds = {k: v for verdict in verdicts for k, v in verdict.thresholds.items()}
+    def about(cls, subject: AnySubject, **fields: Any) -> Self:
+        """The diagnosis of a subject, with the fields of its kind and without verdicts."""
         document: dict[str, Any] = {
             cls.document_field: subject.document,
             f"{cls.document_field}_digest": subject.document.digest,
@@ -132,12 +167,28 @@ class Diagnosis(StrictModel):
             plan=subject.plan,
             checkpoint_step=subject.checkpoint_step,
             updates=subject.updates,
-            verdicts=tuple(verdicts),
-            thresholds=thresholds,
+            verdicts=(),
+            thresholds={},
             versions=versions(("numpy", "scipy"), if_imported=("torch", "stable_baselines3")),
             **document,
             **fields,
         )
+
+    def judged(self, questions: Questions) -> Self:
+        """This diagnosis with the answers to these questions, in order."""
+        verdicts = tuple(judge(name, asked, self) for name, asked in questions.items())
+        thresholds = {k: v for each in verdicts for k, v in each.thresholds.items()}
+        return self.model_copy(update={"verdicts": verdicts, "thresholds": thresholds})
+
+    @property
+    @abstractmethod
+    def learnt(self) -> float:
+        """Normalised regret of the run, at its best."""
+
+    @property
+    def solved(self) -> bool:
+        """Whether nothing is left to explain."""
+        return self.learnt <= THRESHOLDS["solved"]
 
     @property
     def subject(self) -> tuple[SMESpec | StreamSpec, str]:
@@ -167,14 +218,8 @@ class Diagnosis(StrictModel):
     def verdict(self, question: str) -> Verdict:
         """The verdict on a question, such as "credit assignment" or "credit_assignment"."""
         by_name = {verdict.question: verdict for verdict in self.verdicts}
-        name = "_".join(question.replace("_", " ").casefold().split())
-        if name in by_name:
-            return by_name[name]
-        known = [label(other) for other in by_name]
-        wanted = label(name)
-        partial = [other for other in known if wanted and wanted in other]
-        hint = did_you_mean(partial[0] if partial else wanted, known)
-        raise UnknownNameError(f"question={question!r}: must be one of {', '.join(known)}.{hint}")
+        name = question.replace(" ", "_")
+        return by_name[choice("question", name, by_name, error=UnknownNameError)]
 
     def headline(self) -> str:
         """How good the policy is."""
@@ -182,24 +227,24 @@ class Diagnosis(StrictModel):
         if self.checkpoint_step is not None:
             step = f"{self.checkpoint_step:,}"
             checkpoint = f"The run is unfinished: this is its checkpoint at step {step}. "
-        return checkpoint + words(self.headline_macro, self)
+        return checkpoint + words(type(self).__name__, self)
 
     def parts(self) -> Iterator[Part]:
-        """Findings first, then the tables of its kind; on request the other answers."""
+        """Findings first, on request the other answers, then the tables of its kind."""
         yield self.findings("Findings", self.verdicts)
-        yield from self.tables()
         yield from self.answers(self.verdicts)
+        yield from (part for part in self.tables() if part.rows)
 
+    @abstractmethod
     def tables(self) -> Iterator[Part]:
-        """What only its kind of diagnosis shows, directly after the findings."""
-        return iter(())
+        """What only its kind of diagnosis shows."""
 
     def findings(self, heading: str, verdicts: Sequence[Verdict]) -> Part:
         """The "yes" verdicts, largest share of the error first; names of the others below."""
         findings = [verdict for verdict in verdicts if verdict.answer == "yes"]
         findings.sort(key=lambda v: -1.0 if v.error_share is None else v.error_share, reverse=True)
         notes = [] if findings else ["Nothing."]
-        doubts = (verdict for verdict in verdicts if verdict.reason in OPEN_REASONS)
+        doubts = (verdict for verdict in verdicts if verdict.reason in DOUBTS)
         notes += {verdict.reason: verdict.doubt for verdict in doubts}.values()
         for answer, text in (("cannot tell", "Cannot tell"), ("no", "Ruled out")):
             names = [label(verdict.question) for verdict in verdicts if verdict.answer == answer]
@@ -219,7 +264,7 @@ class Diagnosis(StrictModel):
     def terminal(self, *, details: bool = False) -> Iterator[RenderableType]:
         """What `sme diagnose` prints, part by part."""
         yield f"[bold]{escape(self.title)}[/]"
-        yield _Lines((self.headline(), "", ""))
+        yield Constrain(Text(self.headline()), _COLUMNS)
         for part in self.parts():
             if details or not part.detail:
                 yield ""
@@ -238,9 +283,10 @@ class Diagnosis(StrictModel):
     @classmethod
     def from_dict(cls, data: Any, source: str = "") -> Self:
         """The diagnosis in plain data, of the kind that its fields say."""
-        for kind in cls.__subclasses__() if isinstance(data, dict) else ():
-            if kind.only_field in data:
-                return kind.from_dict(data, source)
+        kinds = cls.__subclasses__()
+        if kinds and isinstance(data, dict):
+            kind = max(kinds, key=lambda kind: len(kind.model_fields.keys() & data.keys()))
+            return kind.from_dict(data, source)
         return super().from_dict(data, source)
 
     @classmethod
@@ -257,8 +303,7 @@ def _rows(verdicts: Iterable[Verdict]) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     for verdict in verdicts:
         share = "" if verdict.error_share is None else f", {percent(verdict.error_share)}"
-        answer = f"{verdict.answer}{share}"
-        rows.append((label(verdict.question), answer, verdict.sentence()))
+        rows.append((label(verdict.question), f"{verdict.answer}{share}", verdict.sentence()))
     return rows
 
 
@@ -275,20 +320,135 @@ def _main_fields(spec: SMESpec) -> str:
     return ", ".join(fields)
 
 
-class _Lines:
-    """Plain text, styled and indented, wrapped between words; only a terminal breaks long ones."""
+class Measurements(StrictModel):
+    """Everything that was measured; None for what is unknown or was not measured.
 
-    def __init__(self, *paragraphs: tuple[str, str, str]) -> None:
-        self.paragraphs = paragraphs
+    `limits` are of a task with `safety`, `observation` is of one with `observation`, and
+    `distraction` of one with distractors; the JSON of other tasks does not have these fields.
+    """
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        for text, style, indent in self.paragraphs:
-            lines = textwrap.wrap(
-                text,
-                options.max_width if console.is_terminal else _COLUMNS,
-                initial_indent=indent,
-                subsequent_indent=indent,
-                break_long_words=console.is_terminal,
-                break_on_hyphens=False,
-            )
-            yield Text("\n".join(lines), style=style)
+    fields_added_later = ("limits", "observation", "distraction")
+
+    uniform: dict[str, Score]  # the policy and each reference in the same uniform states
+    channels: TupleOf[Channel]  # by action channel
+    # of uniform states, along the state channels and the distance from the centre
+    partitions: TupleOf[Partition]
+    shells: TupleOf[Shell]  # the protocol's regions
+    squared_error: SquaredError  # its parts
+    response: Response  # how actions follow the state
+    time_dependence: TimeDependence  # how actions follow t/T
+    on_policy: OnPolicy  # whole episodes
+    training: TrainingSummary | None = None  # of the training log; null without one
+    # for each action channel, the standard deviation of exploration around the deterministic action
+    # at the end of training, in the unit range
+    exploration_sd: TupleOf[Real] | None = None
+    capacity: CapacityProbe | None = None  # of the probe; null unless requested
+    limits: Violations | None = None  # of a task with `safety`
+    observation: ObservationReport | None = None  # of the policy's evaluation
+    distraction: DistractorRegret | None = None  # of a task with distractors
+
+    @property
+    def policy(self) -> Score:
+        """The policy in uniform states."""
+        return self.uniform[POLICY]
+
+    @property
+    def linear(self) -> Score:
+        """The linear least-squares policy in uniform states."""
+        return self.uniform[LINEAR]
+
+    @property
+    def visited(self) -> Score:
+        """The policy in the states of its own episodes."""
+        return self.on_policy.scores[POLICY]
+
+    @property
+    def level(self) -> Level:
+        """The policy ranked among the optimum, the linear policy and the constant ½."""
+        regret = self.policy.normalised_regret
+        if regret <= THRESHOLDS["solved"]:
+            return "solved"
+        if regret >= THRESHOLDS["constant_level"]:
+            return "no_better_than_constant"
+        worse = regret > self.linear.normalised_regret
+        return "worse_than_linear" if worse else "better_than_linear"
+
+
+class TaskDiagnosis(Diagnosis):
+    """The diagnosis of a single agent on a task; its verdicts say where its regret is, and why."""
+
+    spec: SMESpec
+    spec_digest: Digest
+    level: Level  # normalised regret, ranked among the constant ½, the linear policy and 0
+    comparison: Comparison | None = None  # with another run; null without one
+    measurements: Measurements  # what the verdicts rest on
+
+    @property
+    def learnt(self) -> float:
+        """Normalised regret in uniform states."""
+        return self.measurements.policy.normalised_regret
+
+    def judged(self, questions: Questions) -> Self:
+        """This diagnosis with the answers to those of the questions that its task has."""
+        asked = {
+            name: question
+            for name, question in questions.items()
+            if not question.needs or getattr(self.measurements, question.needs) is not None
+        }
+        return super().judged(asked)
+
+    def tables(self) -> Iterator[Part]:
+        """The comparison; on request the references, channels, limits, distractors and layers."""
+        if self.comparison is not None:
+            yield from _tables_of(self.comparison)
+        measured = self.measurements
+        for heading, scores in (
+            ("References, uniform states", measured.uniform),
+            ("References, own episodes", measured.on_policy.scores),
+        ):
+            rows: dict[str, Any] = {_NAMES[name]: score for name, score in scores.items()}
+            yield table(heading, "policy", rows, "regret mae normalised_regret", detail=True)
+        rows = {str(channel.channel): channel for channel in measured.channels}
+        fields = "mae normalised_regret linear_normalised_regret regret offset slope at_zero at_one"
+        yield table("Action channels", "channel", rows, fields, detail=True)
+        if measured.limits is not None:
+            yield from _limits(measured.limits)
+        if measured.distraction is not None:
+            rows = {"uniform": measured.distraction}
+            fields = "normalised_regret averaged_regret half_regret owed_regret distractor_share"
+            yield table("Distractors", "states", rows, fields, detail=True)
+        if measured.observation is not None:
+            rows = {region.name: region for region in measured.observation.distractor_regions}
+            fields = "mae normalised_regret"
+            yield table("Distractors by region", "region", rows, fields, detail=True)
+            rows = {
+                str(probe.layer or "observation"): probe for probe in measured.observation.probes
+            }
+            yield table("Layers", "layer", rows, "units state_r2 distractor_r2", detail=True)
+
+
+def _tables_of(comparison: Comparison) -> Iterator[Part]:
+    pairs = {**comparison.spec_fields, **comparison.plan_fields}
+    fields = [f"{name} ({value}, there {other})" for name, (value, other) in pairs.items()]
+    note = f"Compared with {comparison.name}. Fields that differ: {', '.join(fields) or 'none'}."
+    rows = {label(row.quantity): row for row in comparison.differences}
+    yield table("Compared with another run", "quantity", rows, "value other difference", note)
+    if comparison.answers:
+        answers = [(label(question), *pair) for question, pair in comparison.answers.items()]
+        yield Part("Answers that differ", ("question", "this run", "other run"), answers)
+
+
+def _limits(limits: Violations) -> Iterator[Part]:
+    report = limits.report
+    scores = {
+        "this policy": report.regions[0],
+        "its actions cut off at the limits": limits.cut_off,
+        **{_NAMES[name]: report.references[name][0] for name in SAFETY_REFERENCES},
+        "this policy, states that it visits": limits.visited,
+        **{f"this policy, {region.name}": region for region in report.regions[1:]},
+    }
+    fields = "step_reward cost violating_share safe_regret"
+    yield table("Limits: reward and cost", "policy", scores, fields, detail=True)
+    channels = {str(channel.channel): channel for channel in limits.channels}
+    fields = "violating_share optimal_violating_share cost"
+    yield table("Limits by action channel", "channel", channels, fields, detail=True)

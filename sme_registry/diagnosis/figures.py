@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from sme_registry.diagnosis.document import Diagnosis
+from sme_registry.diagnosis.document import Diagnosis, TaskDiagnosis
 from sme_registry.diagnosis.measure import LINEAR, POLICY
 from sme_registry.diagnosis.stream import StreamDiagnosis
-from sme_registry.diagnosis.task import TaskDiagnosis
 from sme_registry.diagnosis.team import TeamDiagnosis
 from sme_registry.evaluation.references import LABELS
 from sme_registry.plots.curves import tick_visits
@@ -209,15 +208,13 @@ def _squared_error(diagnosis: TaskDiagnosis, figure: Figure) -> None:
 def _agents(diagnosis: TeamDiagnosis, figure: Figure) -> None:
     agents = diagnosis.agents[:_MOST]
     left, right = figure.subplots(1, 2)
-    regret = max(diagnosis.visited.regret, 1e-12)
+    of_team = [diagnosis.shares(agent) for agent in agents]
     shares = {
-        "share of the team's regret": [agent.visited.regret_share / regret for agent in agents],
-        "share of the action channels": [
-            len(agent.action_channels) / diagnosis.spec.action_dim for agent in agents
-        ],
+        "share of the team's regret": [share["regret_share"] for share in of_team],
+        "share of the action channels": [share["channel_share"] for share in of_team],
     }
     regrets = {
-        "uniform states": [agent.measurements.policy.normalised_regret for agent in agents],
+        "uniform states": [agent.uniform_regret for agent in agents],
         "its own episodes": [agent.visited_regret for agent in agents],
         "linear policy": [agent.linear_regret for agent in agents],
     }

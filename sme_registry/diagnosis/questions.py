@@ -6,30 +6,14 @@ has learnt little, its algorithm had few updates, or the evidence is one other r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
-from pydantic import JsonValue, SerializerFunctionWrapHandler, model_serializer
+from pydantic import JsonValue
 
-from sme_registry.diagnosis.behaviour import CapacityProbe, OnPolicy, TrainingSummary
-from sme_registry.diagnosis.measure import (
-    POLICY,
-    Channel,
-    DistractorRegret,
-    Partition,
-    Response,
-    Score,
-    Shell,
-    SquaredError,
-    TimeDependence,
-    Violations,
-)
-from sme_registry.evaluation import ObservationReport
 from sme_registry.io.markup import environment
-from sme_registry.spec import SMESpec
 from sme_registry.spec.document import Real, StrictModel, TupleOf
 
 if TYPE_CHECKING:
@@ -94,29 +78,22 @@ THRESHOLDS = {
     "weight_ratio": 2.0,  # of the weight norm to what it is compared with, at least
 }
 
-SOLVED: dict[str, Answer] = {"solved": "no"}
-"""Of every "why" question about a task."""
-
-OPEN_REASONS: dict[str, Answer] = {"learnt_little": "cannot tell", "few_updates": "cannot tell"}
-"""Of every question about a cause, in place of a reason that says yes."""
-
-COMPARISON_REASONS: dict[str, Answer] = {
-    "field_raises_regret": "cannot tell",
+COMMON_REASONS: dict[str, Answer] = {
+    "solved": "no",  # of every "why"
+    "learnt_little": "cannot tell",  # of every cause
+    "few_updates": "cannot tell",  # likewise
+    "field_raises_regret": "cannot tell",  # these are of a cause that is a field of the spec
     "regret_same_or_lower": "no",
     "difference_too_small": "cannot tell",
     "other_run_learnt_little": "cannot tell",
 }
-"""Of the questions about single fields of the spec, in place of the rule's own reasons."""
+"""In place of a rule's own reasons."""
+
+DOUBTS = ("learnt_little", "few_updates")
+"""Why a run that seems to show a cause does not."""
 
 _OF_CAUSES = ("solved", "learnt_little", "few_updates", "difference", "no_difference")
 """Thresholds of every question about a cause."""
-
-_FIELD_IS_OFF = {"paid_every_step", "no_reward_threshold", "no_survival_threshold"}
-"""Reasons that hold by definition: no other run can contradict them."""
-
-_SIGNS = {"rewards_gated", "episodes_cut_short"}
-"""Reasons of a "yes" that an inconclusive comparison leaves open. The effect is present in the
-policy's episodes, but the run without it was not clearly better."""
 
 _EXPERIMENTS = {"network_cannot_fit", "too_few_states"}
 """Reasons whose evidence is a probe, and not the run."""
@@ -165,7 +142,7 @@ class Verdict(StrictModel):
     @property
     def doubt(self) -> str:
         """Why the rule's own reason does not decide."""
-        macro = self.reason if self.reason in OPEN_REASONS else "compared"
+        macro = self.reason if self.reason in DOUBTS else "compared"
         return self._words(self.reason, macro)
 
     def _words(self, reason: str, macro: str = "") -> str:
@@ -200,43 +177,12 @@ def _sentences() -> Any:
     return templates().get_template("sentences.jinja").module
 
 
-class Measurements(StrictModel):
-    """Everything that was measured; None for what is unknown or was not measured.
+class Decision(NamedTuple):
+    """A rule's branch and its evidence."""
 
-    `limits` are of a task with `safety`, `observation` is of one with `observation`, and
-    `distraction` of one with distractors; the JSON of other tasks does not have these fields.
-    """
-
-    uniform: dict[str, Score]  # the policy and each reference in the same uniform states
-    channels: TupleOf[Channel]  # by action channel
-    # of uniform states, along the state channels and the distance from the centre
-    partitions: TupleOf[Partition]
-    shells: TupleOf[Shell]  # the protocol's regions
-    squared_error: SquaredError  # its parts
-    response: Response  # how actions follow the state
-    time_dependence: TimeDependence  # how actions follow t/T
-    on_policy: OnPolicy  # whole episodes
-    training: TrainingSummary | None = None  # of the training log; null without one
-    # for each action channel, the standard deviation of exploration around the deterministic action
-    # at the end of training, in the unit range
-    exploration_sd: TupleOf[Real] | None = None
-    capacity: CapacityProbe | None = None  # of the probe; null unless requested
-    limits: Violations | None = None  # of a task with `safety`
-    observation: ObservationReport | None = None  # of the policy's evaluation
-    distraction: DistractorRegret | None = None  # of a task with distractors
-
-    @model_serializer(mode="wrap")
-    def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        plain: dict[str, Any] = handler(self)
-        for field in ("limits", "observation", "distraction"):
-            if plain.get(field, "") is None:
-                del plain[field]
-        return plain
-
-    @property
-    def policy(self) -> Score:
-        """The policy in uniform states."""
-        return self.uniform[POLICY]
+    reason: Any  # one of the question's; of a rule also a bool, for the first that says yes or no
+    evidence: dict[str, Any]
+    error_share: float | None = None  # that a "yes" explains
 
 
 class Difference(StrictModel):
@@ -257,65 +203,58 @@ class Comparison(StrictModel):
     name: str  # of the other run
     spec_fields: dict[str, TupleOf[JsonValue]]  # those that differ
     plan_fields: dict[str, TupleOf[JsonValue]]  # likewise
-    differences: TupleOf[Difference]  # of the main quantities
+    differences: TupleOf[Difference]  # of the main quantities; the first is normalised regret
     answers: dict[str, TupleOf[Answer]]  # to each question whose answers differ
 
+    def bears_on(self, question: str) -> bool:
+        """Whether the runs differ in the question's field alone, and this one has the harder task.
 
-class Decision(NamedTuple):
-    """A rule's branch and its evidence."""
+        Each field makes a task harder at a higher value.
+        """
+        if len(self.spec_fields) != 1 or self.plan_fields:
+            return False
+        ((field, (value, other)),) = self.spec_fields.items()
+        return _FIELD_QUESTIONS.get(field) == question and value > other  # type: ignore[operator]
 
-    reason: Any  # one of the question's; of a rule also a bool, for the first that says yes or no
-    evidence: dict[str, Any]
-    error_share: float | None = None  # that a "yes" explains
+    def decide(self, answer: Answer, *, is_cause: bool, is_open: bool) -> Decision | None:
+        """What the regrets decide of a question that this bears on, where they decide anything.
 
-
-@dataclass(frozen=True, kw_only=True)
-class Case:
-    """What the rules of a question read, of a task, a team or a life."""
-
-    updates: int | None = None
-    comparison: Comparison | None = None  # of a task, with another run
-
-    @property
-    def learnt(self) -> float:
-        """Normalised regret of the run, at its best."""
-        raise NotImplementedError
-
-    @property
-    def solved(self) -> bool:
-        return False
-
-
-@dataclass(frozen=True)
-class TaskCase(Case):
-    measurements: Measurements
-    spec: SMESpec
-
-    @property
-    def learnt(self) -> float:
-        return self.measurements.policy.normalised_regret
-
-    @property
-    def solved(self) -> bool:
-        return self.learnt <= THRESHOLDS["solved"]
+        The run alone has this answer, which names a cause of which it is a sign, or leaves it open.
+        """
+        regret = self.differences[0]
+        if regret.difference >= THRESHOLDS["difference"]:
+            reason, decides = "field_raises_regret", is_open or answer != "yes"
+        elif regret.other >= THRESHOLDS["learnt_little"]:
+            reason, decides = "other_run_learnt_little", is_cause or answer == "cannot tell"
+        elif regret.difference <= THRESHOLDS["no_difference"]:
+            reason, decides = "regret_same_or_lower", True
+        else:
+            reason, decides = "difference_too_small", is_cause or answer == "cannot tell"
+        ((field, (value, other)),) = self.spec_fields.items()
+        evidence = {
+            "field": field,
+            "value": value,
+            "other_value": other,
+            "other_run": self.name,
+            "normalised_regret": regret.value,
+            "other_normalised_regret": regret.other,
+        }
+        return Decision(reason, evidence) if decides else None
 
 
-C = TypeVar("C", bound=Case)
-
-
-class Question(NamedTuple, Generic[C]):
+class Question(NamedTuple):
     """A question: its kind, its rule, and the answer that each reason gives."""
 
     kind: Kind
-    rule: Callable[[C], Decision]
+    rule: Callable[[Any], Decision]  # of a diagnosis that has no verdicts yet
     thresholds: tuple[str, ...]  # that decide on its answer
     reasons: dict[str, Answer]
     needs: str = ""  # the field of `Measurements` without which it is not asked
     is_cause: bool = False  # whether "yes" names a cause, which a run can leave open
 
-    def decide(self, case: C) -> Decision:
+    def decide(self, diagnosis: Any) -> Decision:
         """What the rule decides, with its reason by name."""
-        decision = self.rule(case)
+        decision = self.rule(diagnosis)
         if isinstance(decision.reason, str):
             return decision
         answer = "yes" if decision.reason else "no"
@@ -323,8 +262,12 @@ class Question(NamedTuple, Generic[C]):
         return decision._replace(reason=first)
 
 
+Questions = dict[str, Question]
+_Rule = TypeVar("_Rule", bound=Callable[[Any], Decision])
+
+
 def add_to(
-    questions: dict[str, Question[C]],
+    questions: Questions,
     kind: Kind,
     *,
     yes: str = "",
@@ -333,7 +276,7 @@ def add_to(
     thresholds: str = "",
     needs: str = "",
     is_cause: bool = False,
-) -> Callable[[Callable[[C], Decision]], Callable[[C], Decision]]:
+) -> Callable[[_Rule], _Rule]:
     """Decorate a rule: add the question of its name, with the reasons for each answer."""
     used = (*thresholds.split(), *(_OF_CAUSES if is_cause else ()))
     reasons: dict[str, Answer] = {
@@ -342,7 +285,7 @@ def add_to(
         **dict.fromkeys(unclear.split(), "cannot tell"),
     }
 
-    def add(rule: Callable[[C], Decision]) -> Callable[[C], Decision]:
+    def add(rule: _Rule) -> _Rule:
         name = rule.__name__.removeprefix("_")
         questions[name] = Question(kind, rule, used, reasons, needs, is_cause)
         return rule
@@ -350,27 +293,14 @@ def add_to(
     return add
 
 
-def answer_all(questions: Mapping[str, Question[C]], case: C) -> tuple[Verdict, ...]:
-    """Answer every question about a case, in order."""
-    return tuple(_verdict(name, question, case) for name, question in questions.items())
-
-
-def _verdict(name: str, question: Question[C], case: C) -> Verdict:
-    answers = {**question.reasons, **COMPARISON_REASONS, **SOLVED, **OPEN_REASONS}
-    if question.kind == "why" and case.solved:
-        decision = Decision("solved", {"normalised_regret": case.learnt})
+def judge(name: str, question: Question, diagnosis: Any) -> Verdict:
+    """The answer to a question about a diagnosis that has no verdicts yet."""
+    if question.kind == "why" and diagnosis.solved:
+        decision = Decision("solved", {"normalised_regret": diagnosis.learnt})
     else:
-        ruling = question.decide(case)
-        ruling_answer = answers[ruling.reason]
-        doubt = None
-        if question.is_cause and ruling_answer == "yes" and ruling.reason not in _EXPERIMENTS:
-            doubt = _doubt(case)
-        other = _comparison(case, name, ruling, ruling_answer, is_open=doubt is not None) or doubt
-        decision = ruling
-        if other is not None:
-            kept = {**ruling.evidence, "own_answer": ruling_answer, "own_reason": ruling.reason}
-            decision = other._replace(evidence=kept | other.evidence)
-    answer, share = answers[decision.reason], decision.error_share
+        decision = _decided(name, question, diagnosis)
+    answer = {**COMMON_REASONS, **question.reasons}[decision.reason]
+    share = decision.error_share
     return Verdict(
         question=name,
         kind=question.kind,
@@ -382,48 +312,26 @@ def _verdict(name: str, question: Question[C], case: C) -> Verdict:
     )
 
 
-def _doubt(case: Case) -> Decision | None:
+def _decided(name: str, question: Question, diagnosis: Any) -> Decision:
+    """What the rule decides, unless a comparison or a doubt overrules it."""
+    own = question.decide(diagnosis)
+    answer = question.reasons[own.reason]
+    is_cause = question.is_cause and answer == "yes" and own.reason not in _EXPERIMENTS
+    overruling = doubt = _doubt(diagnosis) if is_cause else None
+    comparison: Comparison | None = getattr(diagnosis, "comparison", None)
+    if comparison is not None and comparison.bears_on(name):
+        compared = comparison.decide(answer, is_cause=is_cause, is_open=doubt is not None)
+        overruling = compared or doubt
+    if overruling is None:
+        return own
+    evidence = {**own.evidence, "own_answer": answer, "own_reason": own.reason}
+    return overruling._replace(evidence=evidence | overruling.evidence)
+
+
+def _doubt(diagnosis: Any) -> Decision | None:
     """Why the run cannot name a cause; None if it can."""
-    if case.updates is not None and case.updates < THRESHOLDS["few_updates"]:
-        return Decision("few_updates", {"updates": case.updates})
-    if case.learnt >= THRESHOLDS["learnt_little"]:
-        return Decision("learnt_little", {"learnt": case.learnt})
+    if diagnosis.updates is not None and diagnosis.updates < THRESHOLDS["few_updates"]:
+        return Decision("few_updates", {"updates": diagnosis.updates})
+    if diagnosis.learnt >= THRESHOLDS["learnt_little"]:
+        return Decision("learnt_little", {"learnt": diagnosis.learnt})
     return None
-
-
-def _comparison(
-    case: Case, question: str, ruling: Decision, ruling_answer: Answer, *, is_open: bool
-) -> Decision | None:
-    """What a comparison in the question's field alone decides; None where it decides nothing."""
-    other = case.comparison
-    if other is None or len(other.spec_fields) != 1 or other.plan_fields:
-        return None
-    (field, (value, other_value)), *_ = other.spec_fields.items()
-    asked = _FIELD_QUESTIONS.get(field) == question and ruling.reason not in _FIELD_IS_OFF
-    if not asked or not _is_harder(value, other_value):
-        return None
-    regret = other.differences[0]
-    difference = regret.difference
-    if difference >= THRESHOLDS["difference"]:
-        reason, decides = "field_raises_regret", ruling_answer != "yes" or is_open
-    elif regret.other < THRESHOLDS["learnt_little"] and difference <= THRESHOLDS["no_difference"]:
-        reason, decides = "regret_same_or_lower", True
-    else:
-        learnt_little = regret.other >= THRESHOLDS["learnt_little"]
-        reason = "other_run_learnt_little" if learnt_little else "difference_too_small"
-        decides = ruling_answer == "cannot tell" or ruling.reason in _SIGNS
-    evidence = {
-        "field": field,
-        "value": value,
-        "other_value": other_value,
-        "other_run": other.name,
-        "normalised_regret": regret.value,
-        "other_normalised_regret": regret.other,
-    }
-    return Decision(reason, evidence) if decides else None
-
-
-def _is_harder(value: JsonValue, other_value: JsonValue) -> bool:
-    """Whether a field makes the run's task the harder one: each is harder at a higher value."""
-    numbers = isinstance(value, int | float) and isinstance(other_value, int | float)
-    return numbers and value > other_value  # type: ignore[operator]

@@ -9,13 +9,14 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
+from sme_registry.diagnosis.document import TaskDiagnosis
 from sme_registry.diagnosis.measure import LINEAR, POLICY, DistractorRegret, Violations
-from sme_registry.diagnosis.questions import THRESHOLDS, Decision, Question, TaskCase, add_to
+from sme_registry.diagnosis.questions import THRESHOLDS, Decision, Questions, add_to
 from sme_registry.evaluation import ObservationReport
 
-WHERE: dict[str, Question[TaskCase]] = {}
+WHERE: Questions = {}
 """Questions about the policy, in order."""
-WHY: dict[str, Question[TaskCase]] = {}
+WHY: Questions = {}
 """Questions about its training, in order."""
 _where = partial(add_to, WHERE, "where")
 _why = partial(add_to, WHY, "why", is_cause=True)
@@ -26,13 +27,13 @@ _TINY = 1e-9
 @_where(
     yes="some_channels_unlearnt", no="spread_over_channels", thresholds="unlearnt channel_learnt"
 )
-def _action_channels(case: TaskCase) -> Decision:
-    channels = case.measurements.channels
+def _action_channels(run: TaskDiagnosis) -> Decision:
+    channels = run.measurements.channels
     rows = [c.model_dump(include={"channel", "normalised_regret", "slope"}) for c in channels]
     unlearnt = [row for row in rows if row["normalised_regret"] >= THRESHOLDS["unlearnt"]]
     learnt = [row for row in rows if row["normalised_regret"] <= THRESHOLDS["channel_learnt"]]
     regret = sum(channels[row["channel"] - 1].regret for row in unlearnt)
-    share = regret / max(case.measurements.policy.regret, _TINY)
+    share = regret / max(run.measurements.policy.regret, _TINY)
     evidence = {
         "channels": len(channels),
         "unlearnt": unlearnt,
@@ -45,8 +46,8 @@ def _action_channels(case: TaskCase) -> Decision:
 
 
 @_where(yes="error_localised", no="error_not_localised", thresholds="explained_variance bin_ratio")
-def _state_region(case: TaskCase) -> Decision:
-    most = max(case.measurements.partitions, key=lambda p: p.explained_variance)
+def _state_region(run: TaskDiagnosis) -> Decision:
+    most = max(run.measurements.partitions, key=lambda p: p.explained_variance)
     low, high = min(most.mae), max(most.mae)
     worst_bin = most.mae.index(high)
     uneven = high >= THRESHOLDS["bin_ratio"] * low
@@ -58,13 +59,13 @@ def _state_region(case: TaskCase) -> Decision:
         "highest_mae": high,
         "worst_bin": list(most.edges[worst_bin : worst_bin + 2]),
     }
-    share = 1.0 - low / max(case.measurements.policy.mae, _TINY)  # if all were like the best bin
-    return Decision(localised and not case.solved, evidence, share)
+    share = 1.0 - low / max(run.measurements.policy.mae, _TINY)  # if all were like the best bin
+    return Decision(localised and not run.solved, evidence, share)
 
 
 @_where(yes="similarity_lost", no="similarity_kept", thresholds="similarity_loss")
-def _out_of_distribution(case: TaskCase) -> Decision:
-    inside, outside = case.measurements.shells[0], case.measurements.shells[-1]
+def _out_of_distribution(run: TaskDiagnosis) -> Decision:
+    inside, outside = run.measurements.shells[0], run.measurements.shells[-1]
     wd, ood = inside.scores[POLICY], outside.scores[POLICY]
     loss = 100.0 * (ood.mae - wd.mae)
     evidence = {
@@ -78,8 +79,8 @@ def _out_of_distribution(case: TaskCase) -> Decision:
 
 
 @_where(yes="error_changes", no="error_steady", thresholds="time_ratio time_difference")
-def _time_in_episode(case: TaskCase) -> Decision:
-    episodes = case.measurements.on_policy
+def _time_in_episode(run: TaskDiagnosis) -> Decision:
+    episodes = run.measurements.on_policy
     first, last = episodes.mae[0], episodes.mae[-1]
     low, high = sorted((first, last))
     apart = high - low >= THRESHOLDS["time_difference"]
@@ -93,8 +94,8 @@ def _time_in_episode(case: TaskCase) -> Decision:
     no="similar_regret",
     thresholds="on_policy_ratio on_policy_difference",
 )
-def _visited_states(case: TaskCase) -> Decision:
-    episodes, uniform = case.measurements.on_policy, case.learnt
+def _visited_states(run: TaskDiagnosis) -> Decision:
+    episodes, uniform = run.measurements.on_policy, run.learnt
     visited = episodes.scores[POLICY].normalised_regret
     low, high = sorted((visited, uniform))
     apart = high - low >= THRESHOLDS["on_policy_difference"]
@@ -113,21 +114,21 @@ def _visited_states(case: TaskCase) -> Decision:
 
 
 @_where(yes="offset_dominant", no="offset_minor", thresholds="dominant_share")
-def _constant_offset(case: TaskCase) -> Decision:
-    share = case.measurements.squared_error.offset
-    worst = max(case.measurements.channels, key=lambda c: abs(c.offset))
+def _constant_offset(run: TaskDiagnosis) -> Decision:
+    share = run.measurements.squared_error.offset
+    worst = max(run.measurements.channels, key=lambda c: abs(c.offset))
     evidence = {"share": share, "channel": worst.channel, "offset": worst.offset}
-    return Decision(share >= THRESHOLDS["dominant_share"] and not case.solved, evidence, share)
+    return Decision(share >= THRESHOLDS["dominant_share"] and not run.solved, evidence, share)
 
 
 @_where(yes="underreaction overreaction", no="scale_minor", thresholds="dominant_share")
-def _response_scale(case: TaskCase) -> Decision:
-    share, channels = case.measurements.squared_error.scale, case.measurements.channels
+def _response_scale(run: TaskDiagnosis) -> Decision:
+    share, channels = run.measurements.squared_error.scale, run.measurements.channels
     slope = sum(c.slope for c in channels) / len(channels)
     reason = "scale_minor"
-    if share >= THRESHOLDS["dominant_share"] and not case.solved:
+    if share >= THRESHOLDS["dominant_share"] and not run.solved:
         reason = "underreaction" if slope < 1 else "overreaction"
-    sensitivity = case.measurements.response.sensitivity
+    sensitivity = run.measurements.response.sensitivity
     return Decision(reason, {"share": share, "slope": slope, "sensitivity": sensitivity}, share)
 
 
@@ -136,8 +137,8 @@ def _response_scale(case: TaskCase) -> Decision:
     no="nonlinear_part_learnt neither_part_learnt optimum_nearly_linear",
     thresholds="nonlinear_variance slope_unlearnt slope_learnt",
 )
-def _linear_only(case: TaskCase) -> Decision:
-    response = case.measurements.response
+def _linear_only(run: TaskDiagnosis) -> Decision:
+    response = run.measurements.response
     linear, nonlinear = response.linear_slope, response.nonlinear_slope
     if response.nonlinear_variance < THRESHOLDS["nonlinear_variance"] or nonlinear is None:
         reason = "optimum_nearly_linear"
@@ -148,14 +149,14 @@ def _linear_only(case: TaskCase) -> Decision:
     else:
         reason = "neither_part_learnt"
     fields = {"nonlinear_variance", "linear_slope", "nonlinear_slope"}
-    share = case.measurements.uniform[LINEAR].normalised_regret / max(case.learnt, _TINY)
+    share = run.measurements.uniform[LINEAR].normalised_regret / max(run.learnt, _TINY)
     return Decision(reason, response.model_dump(include=fields), share)
 
 
 @_where(yes="saturated", no="not_saturated", thresholds="excess_saturation")
-def _saturation(case: TaskCase) -> Decision:
-    response = case.measurements.response
-    worst = max(case.measurements.channels, key=lambda c: c.at_zero + c.at_one)
+def _saturation(run: TaskDiagnosis) -> Decision:
+    response = run.measurements.response
+    worst = max(run.measurements.channels, key=lambda c: c.at_zero + c.at_one)
     excess = response.saturation - response.optimal_saturation
     evidence = {
         **response.model_dump(include={"saturation", "optimal_saturation"}),
@@ -165,8 +166,8 @@ def _saturation(case: TaskCase) -> Decision:
 
 
 @_where(yes="noisy", no="repeatable", thresholds="noise_or_time_share")
-def _action_noise(case: TaskCase) -> Decision:
-    share = case.measurements.squared_error.noise
+def _action_noise(run: TaskDiagnosis) -> Decision:
+    share = run.measurements.squared_error.noise
     return Decision(share >= THRESHOLDS["noise_or_time_share"], {"share": share}, share)
 
 
@@ -175,25 +176,25 @@ def _action_noise(case: TaskCase) -> Decision:
     no="independent",
     thresholds="noise_or_time_share",
 )
-def _time_dependence(case: TaskCase) -> Decision:
-    error, time = case.measurements.squared_error, case.measurements.time_dependence
+def _time_dependence(run: TaskDiagnosis) -> Decision:
+    error, time = run.measurements.squared_error, run.measurements.time_dependence
     share = max(error.time, error.accumulated_reward)
     reason = "independent"
-    if share >= THRESHOLDS["noise_or_time_share"] and not case.solved:
+    if share >= THRESHOLDS["noise_or_time_share"] and not run.solved:
         on_time = error.time >= error.accumulated_reward
         reason = "depends_on_time" if on_time else "depends_on_accumulated_reward"
     evidence = {
         "action_change": sum(time.action_change) / len(time.action_change),
         "time_share": error.time,
-        "accumulated_reward_share": error.accumulated_reward if case.spec.k > 1 else None,
+        "accumulated_reward_share": error.accumulated_reward if run.spec.k > 1 else None,
         "lowest_normalised_regret": min(time.normalised_regret),
         "highest_normalised_regret": max(time.normalised_regret),
     }
     return Decision(reason, evidence, share)
 
 
-def _limits_of(case: TaskCase) -> Violations:
-    limits = case.measurements.limits
+def _limits_of(run: TaskDiagnosis) -> Violations:
+    limits = run.measurements.limits
     assert limits is not None  # the questions are asked only then
     return limits
 
@@ -206,8 +207,8 @@ def _limits_of(case: TaskCase) -> Violations:
     thresholds="rarely_violating gain",
     needs="limits",
 )
-def _constraint_violation(case: TaskCase) -> Decision:
-    limits = _limits_of(case)
+def _constraint_violation(run: TaskDiagnosis) -> Decision:
+    limits = _limits_of(run)
     inside, outside, visited = limits.report.regions[0], limits.report.regions[-1], limits.visited
     share = max(inside.violating_share, visited.violating_share)
     gain = inside.step_reward - limits.cut_off.step_reward
@@ -240,8 +241,8 @@ def _constraint_violation(case: TaskCase) -> Decision:
     return Decision(reason, evidence)
 
 
-def _distractors_of(case: TaskCase) -> tuple[DistractorRegret, ObservationReport]:
-    distraction, observation = case.measurements.distraction, case.measurements.observation
+def _distractors_of(run: TaskDiagnosis) -> tuple[DistractorRegret, ObservationReport]:
+    distraction, observation = run.measurements.distraction, run.measurements.observation
     assert distraction is not None
     assert observation is not None
     return distraction, observation
@@ -250,14 +251,14 @@ def _distractors_of(case: TaskCase) -> tuple[DistractorRegret, ObservationReport
 @_where(
     yes="similarity_lost", no="similarity_kept", thresholds="distractor_loss", needs="distraction"
 )
-def _distractors_outside(case: TaskCase) -> Decision:
-    _, observation = _distractors_of(case)
+def _distractors_outside(run: TaskDiagnosis) -> Decision:
+    _, observation = _distractors_of(run)
     outside = observation.distractor_regions[-1]
-    loss = 100.0 * (outside.mae - case.measurements.policy.mae)
+    loss = 100.0 * (outside.mae - run.measurements.policy.mae)
     evidence = {
         "region": outside.name,
         "similarity_loss": loss,
-        "normalised_regret": case.learnt,
+        "normalised_regret": run.learnt,
         "outside_normalised_regret": outside.normalised_regret,
     }
     return Decision(loss >= THRESHOLDS["distractor_loss"], evidence)
@@ -270,8 +271,8 @@ def _distractors_outside(case: TaskCase) -> Decision:
     thresholds="kept_r2",
     needs="distraction",
 )
-def _distractors_represented(case: TaskCase) -> Decision:
-    _, observation = _distractors_of(case)
+def _distractors_represented(run: TaskDiagnosis) -> Decision:
+    _, observation = _distractors_of(run)
     if len(observation.probes) < 2:
         return Decision("layers_unknown", {})
     last = observation.probes[-1]
@@ -291,9 +292,9 @@ def _distractors_represented(case: TaskCase) -> Decision:
     unclear="no_training_log rewards_found",
     thresholds="constant_margin rarely_rewarded exploration_cost",
 )
-def _exploration(case: TaskCase) -> Decision:
-    log, episodes = case.measurements.training, case.measurements.on_policy
-    rewarded, sd = episodes.random_signal.rewarded, case.measurements.exploration_sd
+def _exploration(run: TaskDiagnosis) -> Decision:
+    log, episodes = run.measurements.training, run.measurements.on_policy
+    rewarded, sd = episodes.random_signal.rewarded, run.measurements.exploration_sd
     evidence: dict[str, Any] = {
         "random_rewarded": rewarded,
         "exploration_sd": None if sd is None else [min(sd), max(sd)],
@@ -317,8 +318,8 @@ def _exploration(case: TaskCase) -> Decision:
 
 
 @_why(no="paid_every_step", unclear="delayed_payout")
-def _credit_assignment(case: TaskCase) -> Decision:
-    k, episodes = case.spec.k, case.measurements.on_policy
+def _credit_assignment(run: TaskDiagnosis) -> Decision:
+    k, episodes = run.spec.k, run.measurements.on_policy
     evidence = {"k": k, "credit": episodes.credit, "random_credit": episodes.random_credit}
     return Decision("paid_every_step" if k == 1 else "delayed_payout", evidence)
 
@@ -329,8 +330,8 @@ def _credit_assignment(case: TaskCase) -> Decision:
     unclear="effect_unknown",
     thresholds="gated_share gated_rewarded_share rarely_unrewarded",
 )
-def _sparsity(case: TaskCase) -> Decision:
-    r_min, episodes, log = case.spec.r_min, case.measurements.on_policy, case.measurements.training
+def _sparsity(run: TaskDiagnosis) -> Decision:
+    r_min, episodes, log = run.spec.r_min, run.measurements.on_policy, run.measurements.training
     signal, random = episodes.signal, episodes.random_signal
     gated = signal.gated >= THRESHOLDS["gated_share"]
     if r_min == 0:
@@ -356,11 +357,11 @@ def _sparsity(case: TaskCase) -> Decision:
     unclear="not_probed probe_inconclusive",
     thresholds="probe_better probe_no_better",
 )
-def _capacity(case: TaskCase) -> Decision:
-    probe, regret = case.measurements.capacity, case.learnt
+def _capacity(run: TaskDiagnosis) -> Decision:
+    probe, regret = run.measurements.capacity, run.learnt
     evidence: dict[str, Any] = {
-        "complexity": case.spec.complexity,
-        "nonlinear_variance": case.measurements.response.nonlinear_variance,
+        "complexity": run.spec.complexity,
+        "nonlinear_variance": run.measurements.response.nonlinear_variance,
         "normalised_regret": regret,
     }
     if probe is None:
@@ -384,15 +385,15 @@ def _capacity(case: TaskCase) -> Decision:
     unclear="not_separated",
     thresholds="unlearnt probe_better probe_no_better",
 )
-def _dimension(case: TaskCase) -> Decision:
-    probe, regret = case.measurements.capacity, case.learnt
-    channels = case.measurements.channels
+def _dimension(run: TaskDiagnosis) -> Decision:
+    probe, regret = run.measurements.capacity, run.learnt
+    channels = run.measurements.channels
     evidence: dict[str, Any] = {
-        "state_dim": case.spec.state_dim,
-        "action_dim": case.spec.action_dim,
+        "state_dim": run.spec.state_dim,
+        "action_dim": run.spec.action_dim,
         "normalised_regret": regret,
         "unlearnt_channels": sum(c.normalised_regret >= THRESHOLDS["unlearnt"] for c in channels),
-        "random_rewarded": case.measurements.on_policy.random_signal.rewarded,
+        "random_rewarded": run.measurements.on_policy.random_signal.rewarded,
     }
     better, no_better = (THRESHOLDS[name] * regret for name in ("probe_better", "probe_no_better"))
     if probe is None or probe.train_normalised_regret > better:
@@ -409,8 +410,8 @@ def _dimension(case: TaskCase) -> Decision:
     no="episodes_long_enough no_survival_threshold",
     thresholds="termination_rate short_episode",
 )
-def _survival(case: TaskCase) -> Decision:
-    spec, episodes = case.spec, case.measurements.on_policy
+def _survival(run: TaskDiagnosis) -> Decision:
+    spec, episodes = run.spec, run.measurements.on_policy
     often = episodes.termination_rate >= THRESHOLDS["termination_rate"]
     early = episodes.mean_length <= THRESHOLDS["short_episode"] * spec.horizon
     evidence = {
@@ -428,8 +429,8 @@ def _survival(case: TaskCase) -> Decision:
     unclear="no_training_log log_too_short never_improved",
     thresholds="log_rows regressed still_improving",
 )
-def _budget(case: TaskCase) -> Decision:
-    log = case.measurements.training
+def _budget(run: TaskDiagnosis) -> Decision:
+    log = run.measurements.training
     if log is None:
         return Decision("no_training_log", {})
     if log.rows < THRESHOLDS["log_rows"]:
@@ -450,8 +451,8 @@ def _budget(case: TaskCase) -> Decision:
     thresholds="rarely_violating price_share",
     needs="limits",
 )
-def _price_of_safety(case: TaskCase) -> Decision:
-    limits, regret = _limits_of(case), case.measurements.policy.regret
+def _price_of_safety(run: TaskDiagnosis) -> Decision:
+    limits, regret = _limits_of(run), run.measurements.policy.regret
     price = limits.report.regions[0].price_of_safety
     violating = max(limits.report.regions[0].violating_share, limits.visited.violating_share)
     evidence = {"price_of_safety": price, "regret": regret, "violating_share": violating}
@@ -467,15 +468,15 @@ def _price_of_safety(case: TaskCase) -> Decision:
     thresholds="owed_to_distractors invariant",
     needs="distraction",
 )
-def _distraction(case: TaskCase) -> Decision:
-    effect, observation = _distractors_of(case)
+def _distraction(run: TaskDiagnosis) -> Decision:
+    effect, observation = _distractors_of(run)
     invariance = observation.invariance[0].invariance
     reason = "invariant" if invariance <= THRESHOLDS["invariant"] else "hardly_distracted"
     if effect.owed_regret >= THRESHOLDS["owed_to_distractors"]:
         reason = "distracted"
     evidence = {
-        "distractors": case.spec.distractors,
+        "distractors": run.spec.distractors,
         "invariance": invariance,
         **effect.model_dump(exclude={"states", "distractor_draws"}),
     }
-    return Decision(reason, evidence, effect.owed_regret / max(case.learnt, _TINY))
+    return Decision(reason, evidence, effect.owed_regret / max(run.learnt, _TINY))

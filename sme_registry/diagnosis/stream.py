@@ -9,7 +9,6 @@ agents of the phases, where these are known; else with the other visits.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, Literal
 
@@ -18,15 +17,8 @@ import numpy as np
 from sme_registry.compiled.arrays import Observation
 from sme_registry.diagnosis import measure
 from sme_registry.diagnosis.behaviour import NetworkState, network_state
-from sme_registry.diagnosis.document import Diagnosis, Part, cell, table
-from sme_registry.diagnosis.questions import (
-    THRESHOLDS,
-    Case,
-    Decision,
-    Question,
-    add_to,
-    answer_all,
-)
+from sme_registry.diagnosis.document import Diagnosis, Part, cells, table
+from sme_registry.diagnosis.questions import THRESHOLDS, Decision, Questions, add_to
 from sme_registry.diagnosis.subject import StreamSubject
 from sme_registry.evaluation import regions
 from sme_registry.evaluation.networks import Perceptron
@@ -64,10 +56,9 @@ class PhaseDiagnosis(StrictModel):
 
 
 class StreamDiagnosis(Diagnosis):
-    headline_macro: ClassVar[str] = "stream_headline"
-    document_field: ClassVar[str] = "stream"
-    only_field: ClassVar[str] = "phases"
+    """The diagnosis of a life in a stream, by visit and by phase."""
 
+    document_field: ClassVar[str] = "stream"
     stream: StreamSpec
     stream_digest: Digest
     average_performance: Real  # at the end of the life
@@ -78,18 +69,31 @@ class StreamDiagnosis(Diagnosis):
     phases: TupleOf[PhaseDiagnosis]
     initial_network: NetworkState | None  # before training; null if unknown
 
+    @property
+    def learnt(self) -> float:
+        """The lowest normalised regret of a visit on its own phase."""
+        return min(visit.normalised_regret for visit in self.visits)
+
+    @property
+    def solved(self) -> bool:
+        """Never: a life whose best visit was perfect can have lost that."""
+        return False
+
+    def fresh(self, quantity: str) -> list[Any]:
+        """A quantity of each phase's fresh agent; empty unless all of them are known."""
+        values = [getattr(phase, f"fresh_{quantity}") for phase in self.phases]
+        return [] if None in values else values
+
     def tables(self) -> Iterator[Part]:
-        columns = ("visit", "phase", "online regret", "N", "inactive", "rank", "weights")
+        """What a visit cost, what was known and the network at its end; what became of phases."""
+        fields = "phase online_regret normalised_regret"
         visits = [
-            (
-                *(str(visit.visit), str(visit.phase)),
-                *(cell(visit.online_regret), cell(visit.normalised_regret)),
-                *_cells(visit.network),
-            )
+            (str(visit.visit), *cells(visit, fields), *cells(visit.network, _NETWORK))
             for visit in self.visits
         ]
         if self.initial_network is not None:
-            visits.insert(0, ("initial", "", "", "", *_cells(self.initial_network)))
+            visits.insert(0, ("initial", "", "", "", *cells(self.initial_network, _NETWORK)))
+        columns = ("visit", "phase", "online regret", "N", "inactive", "rank", "weights")
         yield Part("Visits", columns, visits)
         rows = {str(phase.phase): phase for phase in self.phases}
         fields = (
@@ -99,6 +103,7 @@ class StreamDiagnosis(Diagnosis):
         yield table("Phases", "phase", rows, fields, *_LEGEND)
 
 
+_NETWORK = "inactive_units effective_rank weight_norm"
 _LEGEND = (
     "N: normalised regret at the end of the visit on its own phase, or of the life on each phase · "
     "online regret: mean of 1 − r over the visit · inactive: hidden units that are dormant or "
@@ -106,37 +111,9 @@ _LEGEND = (
     "Dormant units, effective rank and weights go together with lost plasticity in the literature; "
     "none of them proves it. A study gives intervals over seeds.",
 )
-
-
-def _cells(network: NetworkState | None) -> tuple[str, ...]:
-    if network is None:
-        return ("–",) * 3
-    rank = f"{network.effective_rank} of {network.hidden[-1]}"
-    return cell(network.inactive_units), rank, cell(network.weight_norm, 1)
-
-
 _TINY = 1e-12
 
-
-@dataclass(frozen=True)
-class StreamCase(Case):
-    stream: StreamSpec
-    visits: Sequence[VisitDiagnosis]
-    phases: Sequence[PhaseDiagnosis]
-    forgetting: float | None
-
-    @property
-    def learnt(self) -> float:
-        """The lowest normalised regret of a visit on its own phase."""
-        return min(visit.normalised_regret for visit in self.visits)
-
-    def fresh(self, quantity: str) -> list[Any]:
-        """A quantity of each phase's fresh agent; empty unless all of them are known."""
-        values = [getattr(phase, f"fresh_{quantity}") for phase in self.phases]
-        return [] if None in values else values
-
-
-STREAM_QUESTIONS: dict[str, Question[StreamCase]] = {}
+STREAM_QUESTIONS: Questions = {}
 """Questions about a life, in order."""
 _where = partial(add_to, STREAM_QUESTIONS, "where")
 _why = partial(add_to, STREAM_QUESTIONS, "why", is_cause=True)
@@ -154,12 +131,12 @@ def outcome_of(best: float, final: float) -> PhaseOutcome:
     unclear="no_training_log one_visit",
     thresholds="fresh_excess visit_excess",
 )
-def _costly_visits(case: StreamCase) -> Decision:
+def _costly_visits(life: StreamDiagnosis) -> Decision:
     """Whether regret during some visits was higher than elsewhere."""
-    known = [visit for visit in case.visits if visit.online_regret is not None]
+    known = [visit for visit in life.visits if visit.online_regret is not None]
     if not known:
         return Decision("no_training_log", {})
-    fresh = case.fresh("online_regret")
+    fresh = life.fresh("online_regret")
     if not fresh and len(known) == 1:
         return Decision("one_visit", {})
     total = max(sum(visit.dynamic_regret or 0.0 for visit in known), _TINY)
@@ -195,18 +172,18 @@ def _mean_of_others(visit: VisitDiagnosis, visits: Sequence[VisitDiagnosis]) -> 
     no="every_visit_learnt",
     thresholds="unlearnt difference",
 )
-def _failure_to_learn(case: StreamCase) -> Decision:
+def _failure_to_learn(life: StreamDiagnosis) -> Decision:
     """Whether some visits ended without having learnt their own phase."""
     failed: list[dict[str, Any]] = [
         {
             **visit.model_dump(include={"visit", "phase", "normalised_regret"}),
-            "fresh": case.phases[visit.phase].fresh_normalised_regret,
+            "fresh": life.phases[visit.phase].fresh_normalised_regret,
         }
-        for visit in case.visits
+        for visit in life.visits
         if visit.normalised_regret >= THRESHOLDS["unlearnt"]
     ]
-    highest = max(visit.normalised_regret for visit in case.visits)
-    evidence = {"failed": failed, "visits": len(case.visits), "highest": highest}
+    highest = max(visit.normalised_regret for visit in life.visits)
+    evidence = {"failed": failed, "visits": len(life.visits), "highest": highest}
     if not failed:
         return Decision("every_visit_learnt", evidence)
     if None in [row["fresh"] for row in failed]:
@@ -234,13 +211,13 @@ def _is_unlike_fresh(failed: dict[str, Any]) -> bool:
     unclear="one_visit nothing_to_forget",
     thresholds="unlearnt difference",
 )
-def _forgetting(case: StreamCase) -> Decision:
+def _forgetting(life: StreamDiagnosis) -> Decision:
     """Whether phases that were learnt are worse at the end of the life."""
-    if len(case.visits) == 1:
+    if len(life.visits) == 1:
         return Decision("one_visit", {})
-    recent = case.visits[-1].phase  # retained if only because it was just visited
-    forgotten = [phase for phase in case.phases if phase.outcome == "forgotten"]
-    retained = [p for p in case.phases if p.outcome == "retained" and p.phase != recent]
+    recent = life.visits[-1].phase  # retained if only because it was just visited
+    forgotten = [phase for phase in life.phases if phase.outcome == "forgotten"]
+    retained = [p for p in life.phases if p.outcome == "retained" and p.phase != recent]
     if not forgotten and not retained:
         return Decision("nothing_to_forget", {})
     fields = {"phase", "best_normalised_regret", "final_normalised_regret"}
@@ -249,10 +226,10 @@ def _forgetting(case: StreamCase) -> Decision:
     evidence = {
         "phases": [phase.model_dump(include=fields) for phase in forgotten],
         "most": most.model_dump(include=fields),
-        "forgetting": case.forgetting,
+        "forgetting": life.forgetting,
     }
     # The part of the error at the end of the life that was not there after each best visit.
-    final = sum(phase.final_normalised_regret for phase in case.phases)
+    final = sum(phase.final_normalised_regret for phase in life.phases)
     lost = sum(phase.lost for phase in forgotten)
     return Decision(bool(forgotten), evidence, lost / max(final, _TINY))
 
@@ -264,16 +241,16 @@ def _forgetting(case: StreamCase) -> Decision:
     "phases_differ too_few_visits nothing_learnt",
     thresholds="unlearnt difference visits_for_trend",
 )
-def _loss_of_plasticity(case: StreamCase) -> Decision:
+def _loss_of_plasticity(life: StreamDiagnosis) -> Decision:
     """Whether later visits learn less than fresh agents, or than earlier visits."""
-    visits = case.visits
+    visits = life.visits
     if len(visits) == 1:
         return Decision("one_visit", {})
     learnt = [visit.normalised_regret for visit in visits]
-    if fresh := case.fresh("normalised_regret"):
+    if fresh := life.fresh("normalised_regret"):
         return _against_fresh(visits, fresh)
     # Phases are equally hard if their specs differ in the draw or rotation, and not in the steps.
-    if len(case.stream.kinds) > 1 or len({phase.steps for phase in case.stream.phases}) > 1:
+    if len(life.stream.kinds) > 1 or len({phase.steps for phase in life.stream.phases}) > 1:
         return Decision("phases_differ", {})
     if len(visits) < THRESHOLDS["visits_for_trend"]:
         return Decision("too_few_visits", {"visits": len(visits)})
@@ -310,14 +287,14 @@ _network = partial(_why, unclear="network_unknown one_visit")
 
 
 def _compared(
-    case: StreamCase, quantity: str, reason_of: Callable[[float, float], str]
+    life: StreamDiagnosis, quantity: str, reason_of: Callable[[float, float], str]
 ) -> Decision:
     """The last network's quantity, compared with fresh agents' or with the first visit's."""
-    first, last = case.visits[0].network, case.visits[-1].network
+    first, last = life.visits[0].network, life.visits[-1].network
     if first is None or last is None:
         return Decision("network_unknown", {})
-    alone = case.fresh("network")
-    if not alone and len(case.visits) == 1:
+    alone = life.fresh("network")
+    if not alone and len(life.visits) == 1:
         return Decision("one_visit", {})
     value = getattr(last, quantity)
     other = float(np.mean([getattr(network, quantity) for network in alone or [first]]))
@@ -337,7 +314,7 @@ def _compared(
     no="units_active",
     thresholds="inactive_rise inactive_share",
 )
-def _dormant_units(case: StreamCase) -> Decision:
+def _dormant_units(life: StreamDiagnosis) -> Decision:
     """Whether hidden units stopped responding to the state."""
 
     def reason_of(value: float, other: float) -> str:
@@ -346,27 +323,27 @@ def _dormant_units(case: StreamCase) -> Decision:
         many = min(value, other) >= THRESHOLDS["inactive_share"]
         return "inactive_from_the_start" if many else "units_active"
 
-    return _compared(case, "inactive_units", reason_of)
+    return _compared(life, "inactive_units", reason_of)
 
 
 @_network(yes="rank_collapsed", no="rank_kept", thresholds="rank_ratio")
-def _rank_collapse(case: StreamCase) -> Decision:
+def _rank_collapse(life: StreamDiagnosis) -> Decision:
     """Whether the last hidden layer represents fewer directions."""
 
     def reason_of(value: float, other: float) -> str:
         return "rank_collapsed" if value <= THRESHOLDS["rank_ratio"] * other else "rank_kept"
 
-    return _compared(case, "effective_rank", reason_of)
+    return _compared(life, "effective_rank", reason_of)
 
 
 @_network(yes="weights_grew", no="weights_steady", thresholds="weight_ratio")
-def _weight_growth(case: StreamCase) -> Decision:
+def _weight_growth(life: StreamDiagnosis) -> Decision:
     """Whether weights became so large that steps of the optimiser change little."""
 
     def reason_of(value: float, other: float) -> str:
         return "weights_grew" if value >= THRESHOLDS["weight_ratio"] * other else "weights_steady"
 
-    return _compared(case, "weight_norm", reason_of)
+    return _compared(life, "weight_norm", reason_of)
 
 
 _MOST_STATES = 2048  # in which networks are measured; more would not change the numbers
@@ -382,19 +359,16 @@ def diagnose_stream(
     spec = life.stream.phases[0].spec
     drawn = measure.states_of(spec, min(states, _MOST_STATES, regions.batch_rows(spec)), seed)
     observation = drawn.observation(drawn.s, spec.horizon)
-    visits = tuple(_visits(subject, observation))
-    phases = tuple(_phases(subject, observation))
-    case = StreamCase(life.stream, visits, phases, agent.forgetting[-1], updates=subject.updates)
-    return StreamDiagnosis.about(
+    diagnosis = StreamDiagnosis.about(
         subject,
         average_performance=agent.average_performance[-1],
         forgetting=agent.forgetting[-1],
         dynamic_regret=None if regret is None else regret.dynamic_regret,
-        verdicts=answer_all(STREAM_QUESTIONS, case),
-        visits=visits,
-        phases=phases,
+        visits=tuple(_visits(subject, observation)),
+        phases=tuple(_phases(subject, observation)),
         initial_network=_state(subject.initial_network, observation, life.stream, 0),
     )
+    return diagnosis.judged(STREAM_QUESTIONS)
 
 
 def _state(

@@ -1,111 +1,24 @@
-"""One policy on one task: its measurements, the verdicts, and a comparison with another run."""
+"""A single agent on a task: what is measured of it, and how it compares with another run."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any, ClassVar
+from collections.abc import Callable
+from typing import Any
 
 from pydantic import JsonValue
 
 from sme_registry.diagnosis import behaviour, measure
 from sme_registry.diagnosis.behaviour import CapacityProbe
-from sme_registry.diagnosis.document import Diagnosis, Level, Part, table
-from sme_registry.diagnosis.measure import LINEAR, POLICY, Violations
-from sme_registry.diagnosis.questions import (
-    THRESHOLDS,
-    Comparison,
-    Difference,
-    Measurements,
-    TaskCase,
-    Verdict,
-    answer_all,
-    label,
-)
+from sme_registry.diagnosis.document import Measurements, TaskDiagnosis
+from sme_registry.diagnosis.measure import POLICY
+from sme_registry.diagnosis.questions import Comparison, Difference, Questions
 from sme_registry.diagnosis.rules import WHERE, WHY
 from sme_registry.diagnosis.subject import Subject, perceptron_of
 from sme_registry.evaluation import Policy, evaluate
-from sme_registry.evaluation.references import LABELS
-from sme_registry.evaluation.report import SAFETY_REFERENCES
-from sme_registry.spec import EvaluationProtocol, SMESpec
-from sme_registry.spec.document import Digest
+from sme_registry.spec import EvaluationProtocol
 from sme_registry.task import Task, materialize
 
 TASK_QUESTIONS = {**WHERE, **WHY}
-
-
-class TaskDiagnosis(Diagnosis):
-    headline_macro: ClassVar[str] = "task_headline"
-    only_field: ClassVar[str] = "measurements"
-
-    spec: SMESpec
-    spec_digest: Digest
-    level: Level  # normalised regret, ranked among the constant ½, the linear policy and 0
-    comparison: Comparison | None = None  # with another run; null without one
-    measurements: Measurements  # what the verdicts rest on
-
-    def parts(self) -> Iterator[Part]:
-        """Findings, the comparison, and on request the other answers and the numbers."""
-        yield from super().parts()
-        yield from _numbers(self.measurements)
-
-    def tables(self) -> Iterator[Part]:
-        if self.comparison is not None:
-            yield from _tables_of(self.comparison)
-
-
-def _tables_of(comparison: Comparison) -> Iterator[Part]:
-    pairs = {**comparison.spec_fields, **comparison.plan_fields}
-    fields = [f"{name} ({value}, there {other})" for name, (value, other) in pairs.items()]
-    note = f"Compared with {comparison.name}. Fields that differ: {', '.join(fields) or 'none'}."
-    rows = {label(row.quantity): row for row in comparison.differences}
-    yield table("Compared with another run", "quantity", rows, "value other difference", note)
-    if comparison.answers:
-        answers = [(label(question), *pair) for question, pair in comparison.answers.items()]
-        yield Part("Answers that differ", ("question", "this run", "other run"), answers)
-
-
-def _numbers(measured: Measurements) -> Iterator[Part]:
-    """Tables of the references, the action channels, and of limits, distractors and layers."""
-    for heading, scores in (
-        ("References, uniform states", measured.uniform),
-        ("References, own episodes", measured.on_policy.scores),
-    ):
-        rows: dict[str, Any] = {_NAMES[name]: score for name, score in scores.items()}
-        yield table(heading, "policy", rows, "regret mae normalised_regret", detail=True)
-    rows = {str(channel.channel): channel for channel in measured.channels}
-    fields = "mae normalised_regret linear_normalised_regret regret offset slope at_zero at_one"
-    yield table("Action channels", "channel", rows, fields, detail=True)
-    if measured.limits is not None:
-        yield from _limits(measured.limits)
-    distraction, observation = measured.distraction, measured.observation
-    if distraction is not None:
-        fields = "normalised_regret averaged_regret half_regret owed_regret distractor_share"
-        yield table("Distractors", "states", {"uniform": distraction}, fields, detail=True)
-    if distraction is not None and observation is not None:
-        rows = {region.name: region for region in observation.distractor_regions}
-        yield table("Distractors by region", "region", rows, "mae normalised_regret", detail=True)
-    if observation is not None and observation.probes:
-        rows = {str(probe.layer or "observation"): probe for probe in observation.probes}
-        yield table("Layers", "layer", rows, "units state_r2 distractor_r2", detail=True)
-
-
-_NAMES = {POLICY: "this policy", **LABELS}
-
-
-def _limits(limits: Violations) -> Iterator[Part]:
-    report = limits.report
-    scores = {
-        "this policy": report.regions[0],
-        "its actions cut off at the limits": limits.cut_off,
-        **{_NAMES[name]: report.references[name][0] for name in SAFETY_REFERENCES},
-        "this policy, states that it visits": limits.visited,
-        **{f"this policy, {region.name}": region for region in report.regions[1:]},
-    }
-    fields = "step_reward cost violating_share safe_regret"
-    yield table("Limits: reward and cost", "policy", scores, fields, detail=True)
-    channels = {str(channel.channel): channel for channel in limits.channels}
-    fields = "violating_share optimal_violating_share cost"
-    yield table("Limits by action channel", "channel", channels, fields, detail=True)
 
 
 def diagnose_task(
@@ -123,43 +36,20 @@ def diagnose_task(
     if probe_capacity:
         probe = _probe(subject, seed, report)
         measured = measured.model_copy(update={"capacity": probe})
-    comparison = None
-    if against is not None:
-        other = _measurements(against, states, episodes, seed, report)
-        comparison = _compare(subject, measured, against, other)
-    return TaskDiagnosis.about(
-        subject,
-        level=level(measured),
-        verdicts=judge(measured, subject.spec, comparison, subject.updates),
-        comparison=comparison,
-        measurements=measured,
-    )
+    diagnosis = diagnosed(subject, measured)
+    if against is None:
+        return diagnosis
+    other = diagnosed(against, _measurements(against, states, episodes, seed, report))
+    comparison = _compare(diagnosis, other)
+    return diagnosis.model_copy(update={"comparison": comparison}).judged(TASK_QUESTIONS)
 
 
-def judge(
-    measured: Measurements,
-    spec: SMESpec,
-    comparison: Comparison | None = None,
-    updates: int | None = None,
-) -> tuple[Verdict, ...]:
-    asked = {
-        name: question
-        for name, question in TASK_QUESTIONS.items()
-        if not question.needs or getattr(measured, question.needs) is not None
-    }
-    case = TaskCase(measured, spec, comparison=comparison, updates=updates)
-    return answer_all(asked, case)
-
-
-def level(measurements: Measurements) -> Level:
-    """Rank the policy among the optimum, the linear policy and the constant ½."""
-    regret = measurements.policy.normalised_regret
-    if regret <= THRESHOLDS["solved"]:
-        return "solved"
-    if regret >= THRESHOLDS["constant_level"]:
-        return "no_better_than_constant"
-    linear = measurements.uniform[LINEAR].normalised_regret
-    return "worse_than_linear" if regret > linear else "better_than_linear"
+def diagnosed(
+    subject: Subject, measured: Measurements, questions: Questions = TASK_QUESTIONS
+) -> TaskDiagnosis:
+    """The diagnosis that follows from measurements."""
+    diagnosis = TaskDiagnosis.about(subject, level=measured.level, measurements=measured)
+    return diagnosis.judged(questions)
 
 
 def _measurements(
@@ -215,26 +105,21 @@ def _probe(subject: Subject, seed: int, report: Callable[[str], None]) -> Capaci
     return behaviour.probe_capacity(network, materialize(subject.spec), count, seed, progress)
 
 
-def _compare(
-    subject: Subject, measured: Measurements, other: Subject, other_measured: Measurements
-) -> Comparison:
-    values, other_values = _quantities(measured), _quantities(other_measured)
-    answers, other_answers = (
-        {v.question: v.answer for v in judge(numbers, run.spec, updates=run.updates)}
-        for run, numbers in ((subject, measured), (other, other_measured))
-    )
+def _compare(run: TaskDiagnosis, other: TaskDiagnosis) -> Comparison:
+    values, other_values = (_quantities(one.measurements) for one in (run, other))
+    answers = {verdict.question: verdict.answer for verdict in other.verdicts}
     return Comparison(
         name=other.name,
-        spec_fields=_differing(subject.spec.every_field(), other.spec.every_field()),
-        plan_fields=_differing(subject.plan, other.plan),
+        spec_fields=_differing(run.spec.every_field(), other.spec.every_field()),
+        plan_fields=_differing(run.plan, other.plan),
         differences=tuple(
             Difference(quantity=name, value=value, other=other_values[name])
             for name, value in values.items()
         ),
         answers={
-            question: (answer, other_answers[question])
-            for question, answer in answers.items()
-            if question in other_answers and answer != other_answers[question]
+            verdict.question: (verdict.answer, answers[verdict.question])
+            for verdict in run.verdicts
+            if answers.get(verdict.question, verdict.answer) != verdict.answer
         },
     )
 
@@ -249,14 +134,13 @@ def _differing(
     }
 
 
-def _quantities(measurements: Measurements) -> dict[str, float]:
+def _quantities(measured: Measurements) -> dict[str, float]:
     """The quantities that are compared; normalised regret, which verdicts use, is first."""
-    on_policy = measurements.on_policy
     scores = {
-        "": measurements.policy,
-        "linear_": measurements.uniform[LINEAR],
-        "on_policy_": on_policy.scores[POLICY],
-        "outermost_shell_": measurements.shells[-1].scores[POLICY],
+        "": measured.policy,
+        "linear_": measured.linear,
+        "on_policy_": measured.visited,
+        "outermost_shell_": measured.shells[-1].scores[POLICY],
     }
     regrets = {
         f"{prefix}{quantity}": getattr(score, quantity)
@@ -264,7 +148,7 @@ def _quantities(measurements: Measurements) -> dict[str, float]:
         for quantity in ("normalised_regret", "regret")
     }
     rewarded = {
-        "rewarded_share": on_policy.signal.rewarded,
-        "random_rewarded_share": on_policy.random_signal.rewarded,
+        "rewarded_share": measured.on_policy.signal.rewarded,
+        "random_rewarded_share": measured.on_policy.random_signal.rewarded,
     }
     return regrets | rewarded

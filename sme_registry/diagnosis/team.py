@@ -10,32 +10,27 @@ team's, since all agents drive one transition.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from sme_registry.compiled.arrays import Observation
 from sme_registry.diagnosis import behaviour, measure
-from sme_registry.diagnosis.document import Diagnosis, Level, Part, cell
-from sme_registry.diagnosis.measure import LINEAR, POLICY, Score
+from sme_registry.diagnosis.document import Diagnosis, Level, Measurements, Part, cell
+from sme_registry.diagnosis.measure import POLICY, Score
 from sme_registry.diagnosis.questions import (
     THRESHOLDS,
-    Case,
     Decision,
-    Measurements,
-    Question,
-    TaskCase,
+    Questions,
     Verdict,
     add_to,
-    answer_all,
     words,
 )
 from sme_registry.diagnosis.rules import WHERE, WHY
 from sme_registry.diagnosis.subject import Subject
-from sme_registry.diagnosis.task import level
+from sme_registry.diagnosis.task import diagnosed
 from sme_registry.errors import UnknownNameError
 from sme_registry.evaluation import Policy, TeamPolicy
 from sme_registry.io import choice
@@ -70,19 +65,21 @@ class AgentDiagnosis(StrictModel):
     @property
     def visited_regret(self) -> float:
         """Normalised regret over its own channels in the states that the team visits."""
-        return self.measurements.on_policy.scores[POLICY].normalised_regret
+        return self.measurements.visited.normalised_regret
+
+    @property
+    def uniform_regret(self) -> float:
+        """The same in uniform states."""
+        return self.measurements.policy.normalised_regret
 
     @property
     def linear_regret(self) -> float:
-        """Normalised regret of the linear policy over its own channels, in uniform states."""
-        return self.measurements.uniform[LINEAR].normalised_regret
+        """The same of the linear policy."""
+        return self.measurements.linear.normalised_regret
 
 
 class TeamDiagnosis(Diagnosis):
     """The diagnosis of a team's policies; its verdicts say who causes the regret."""
-
-    headline_macro: ClassVar[str] = "team_headline"
-    only_field: ClassVar[str] = "agents"
 
     spec: SMESpec
     spec_digest: Digest
@@ -95,57 +92,10 @@ class TeamDiagnosis(Diagnosis):
         by_name = {agent.name: agent for agent in self.agents}
         return by_name[choice("agent", name, by_name, error=UnknownNameError)]
 
-    def parts(self) -> Iterator[Part]:
-        """Who causes the regret, each agent's numbers and where its own error is."""
-        yield self.findings("Who is to blame", self.verdicts)
-        yield self._agents()
-        for agent in self.agents:
-            where = self.findings("", agent.verdicts)
-            heading = f"Where the error of {agent.name} is"
-            yield where._replace(heading=heading, detail=not where.rows)
-        yield from self.answers(self.verdicts)
-        for agent in self.agents:
-            yield from self.answers(agent.verdicts, f": {agent.name}")
-
-    def _agents(self) -> Part:
-        regret = max(self.visited.regret, _LEAST_REGRET)
-        columns = ("agent", "share of regret", "of channels", "N, uniform", "N, own episodes")
-        rows = [
-            (
-                agent.name,
-                percent(agent.visited.regret_share / regret),
-                percent(len(agent.action_channels) / self.spec.action_dim),
-                cell(agent.measurements.policy.normalised_regret),
-                cell(agent.visited_regret),
-                cell(agent.linear_regret),
-                cell(agent.visited.difference_reward),
-            )
-            for agent in self.agents
-        ]
-        notes = (_LEGEND, words("left_out", self.left_out))
-        return Part("Agents", (*columns, "N, linear", "gain if optimal"), rows, notes)
-
-
-_LEGEND = (
-    "N: normalised regret over the agent's channels · gain if optimal: of the team's step reward, "
-    "if this agent alone acted optimally · the shares add up to the team's regret in its episodes"
-)
-
-
-@dataclass(frozen=True)
-class TeamCase(Case):
-    agents: Sequence[AgentDiagnosis]
-    spec: SMESpec
-    visited: Score  # of the team
-
     @property
     def learnt(self) -> float:
         """Normalised regret in the states that the team visits."""
         return self.visited.normalised_regret
-
-    @property
-    def solved(self) -> bool:
-        return self.learnt <= THRESHOLDS["solved"]
 
     @property
     def best(self) -> AgentDiagnosis:
@@ -162,39 +112,70 @@ class TeamCase(Case):
         """How much better the best agent is than the worst."""
         return self.worst.visited_regret - self.best.visited_regret
 
+    def shares(self, agent: AgentDiagnosis) -> dict[str, float]:
+        """Shares of an agent in the team's regret, and in its action channels."""
+        return {
+            "regret_share": agent.visited.regret_share / max(self.visited.regret, _LEAST_REGRET),
+            "channel_share": len(agent.action_channels) / self.spec.action_dim,
+        }
 
-TEAM_QUESTIONS: dict[str, Question[TeamCase]] = {}
+    def tables(self) -> Iterator[Part]:
+        """Each agent's numbers, and where its own error is."""
+        rows = [
+            (
+                agent.name,
+                *map(percent, self.shares(agent).values()),
+                cell(agent.uniform_regret),
+                cell(agent.visited_regret),
+                cell(agent.linear_regret),
+                cell(agent.visited.difference_reward),
+            )
+            for agent in self.agents
+        ]
+        notes = (_LEGEND, words("left_out", self.left_out))
+        yield Part("Agents", _COLUMNS, rows, notes)
+        for agent in self.agents:
+            where = self.findings("", agent.verdicts)
+            yield where._replace(heading=f"Where the error of {agent.name} is")
+            yield from self.answers(agent.verdicts, f": {agent.name}")
+
+
+_COLUMNS = (
+    *("agent", "share of regret", "of channels"),
+    *("N, uniform", "N, own episodes", "N, linear", "gain if optimal"),
+)
+_LEGEND = (
+    "N: normalised regret over the agent's channels · gain if optimal: of the team's step reward, "
+    "if this agent alone acted optimally · the shares add up to the team's regret in its episodes"
+)
+
+
+TEAM_QUESTIONS: Questions = {}
 """Questions about a team, in order."""
 _question = partial(add_to, TEAM_QUESTIONS, "who")
 
 
 @_question(yes="some_agents_to_blame", no="spread_over_agents solved", thresholds="blame_ratio")
-def _blame(case: TeamCase) -> Decision:
-    total = max(case.visited.regret, _LEAST_REGRET)
+def _blame(run: TeamDiagnosis) -> Decision:
     agents: list[dict[str, Any]] = [
-        {
-            "agent": agent.name,
-            "regret_share": agent.visited.regret_share / total,
-            "channel_share": len(agent.action_channels) / case.spec.action_dim,
-            "normalised_regret": agent.visited_regret,
-        }
-        for agent in case.agents
+        {"agent": agent.name, **run.shares(agent), "normalised_regret": agent.visited_regret}
+        for agent in run.agents
     ]
     blamed = [
         a for a in agents if a["regret_share"] >= THRESHOLDS["blame_ratio"] * a["channel_share"]
     ]
     return Decision(
-        "solved" if case.solved else bool(blamed),
-        {"agents": agents, "blamed": blamed, "regret": case.visited.regret},
+        "solved" if run.solved else bool(blamed),
+        {"agents": agents, "blamed": blamed, "regret": run.visited.regret},
         sum(a["regret_share"] for a in blamed),
     )
 
 
 @_question(yes="agents_differ", no="agents_alike", thresholds="difference")
-def _unequal_agents(case: TeamCase) -> Decision:
-    best, worst = case.best, case.worst
+def _unequal_agents(run: TeamDiagnosis) -> Decision:
+    best, worst = run.best, run.worst
     return Decision(
-        case.gap >= THRESHOLDS["difference"],
+        run.gap >= THRESHOLDS["difference"],
         {
             "best": best.name,
             "worst": worst.name,
@@ -210,17 +191,17 @@ def _unequal_agents(case: TeamCase) -> Decision:
     thresholds="difference",
     is_cause=True,
 )
-def _harder_optimum(case: TeamCase) -> Decision:
+def _harder_optimum(run: TeamDiagnosis) -> Decision:
     """Whether the worst agent's π* is harder: further from what a linear policy attains."""
-    worst = case.worst
-    regrets = [agent.linear_regret for agent in case.agents if agent is not worst]
+    worst = run.worst
+    regrets = [agent.linear_regret for agent in run.agents if agent is not worst]
     other = sum(regrets) / len(regrets) if regrets else 1.0
     harder = worst.linear_regret - other >= THRESHOLDS["difference"]
     return Decision(
-        "agents_alike" if case.gap < THRESHOLDS["difference"] else harder,
+        "agents_alike" if run.gap < THRESHOLDS["difference"] else harder,
         {
             "agent": worst.name,
-            "normalised_regret": worst.measurements.policy.normalised_regret,
+            "normalised_regret": worst.uniform_regret,
             "linear_normalised_regret": worst.linear_regret,
             "others_linear_normalised_regret": other,
             "nonlinear_variance": worst.measurements.response.nonlinear_variance,
@@ -233,28 +214,28 @@ def _harder_optimum(case: TeamCase) -> Decision:
     no="not_worse_where_visited solved",
     thresholds="on_policy_ratio difference",
 )
-def _visited_states(case: TeamCase) -> Decision:
+def _visited_states(run: TeamDiagnosis) -> Decision:
     """Whether the worst agent fails in the states that the team visits rather than everywhere."""
-    worst = case.worst
-    visited, uniform = worst.visited_regret, worst.measurements.policy.normalised_regret
+    worst = run.worst
+    visited, uniform = worst.visited_regret, worst.uniform_regret
     worse = (
         visited >= THRESHOLDS["on_policy_ratio"] * uniform
         and visited - uniform >= THRESHOLDS["difference"]
     )
     return Decision(
-        "solved" if case.solved else worse,
+        "solved" if run.solved else worse,
         {"agent": worst.name, "visited": visited, "uniform": uniform},
     )
 
 
 @_question(yes="one_agent_suffices", no="several_must_improve solved", thresholds="one_suffices")
-def _one_correction(case: TeamCase) -> Decision:
+def _one_correction(run: TeamDiagnosis) -> Decision:
     """Whether correcting one agent would remove most of the team's regret."""
-    best = max(case.agents, key=lambda agent: agent.visited.difference_reward)
-    gain, regret = best.visited.difference_reward, case.visited.regret
+    best = max(run.agents, key=lambda agent: agent.visited.difference_reward)
+    gain, regret = best.visited.difference_reward, run.visited.regret
     suffices = gain >= THRESHOLDS["one_suffices"] * regret
     return Decision(
-        "solved" if case.solved else suffices,
+        "solved" if run.solved else suffices,
         {"agent": best.name, "difference_reward": gain, "regret": regret},
         gain / max(regret, _LEAST_REGRET),
     )
@@ -265,17 +246,17 @@ def _one_correction(case: TeamCase) -> Decision:
     no="no_agent_stands_out no_survival_threshold",
     thresholds="termination_rate",
 )
-def _ended_episodes(case: TeamCase) -> Decision:
+def _ended_episodes(run: TeamDiagnosis) -> Decision:
     """Whether the threshold D ends episodes for all because of one agent."""
-    if case.spec.D == 0:
-        return Decision("no_survival_threshold", {"D": case.spec.D})
-    rates = {agent.name: agent.measurements.on_policy.termination_rate for agent in case.agents}
+    if run.spec.D == 0:
+        return Decision("no_survival_threshold", {"D": run.spec.D})
+    rates = {agent.name: agent.measurements.on_policy.termination_rate for agent in run.agents}
     shares = dict(sorted(rates.items(), key=lambda rate: -rate[1]))
     first, *rest = shares.values()
     alone = not rest or rest[0] <= first / 2
     return Decision(
         first >= THRESHOLDS["termination_rate"] and alone,
-        {"D": case.spec.D, "agent": next(iter(shares)), "shares": shares},
+        {"D": run.spec.D, "agent": next(iter(shares)), "shares": shares},
     )
 
 
@@ -301,40 +282,39 @@ def diagnose_team(
         fitted = measure.fit_references(part, states, seed)
         fields, _ = measure.fixed_states(alone, part, fitted, states, seed)
         measured = Measurements(**fields, on_policy=behaviour.on_policy(part, runs[index]))
-        case = TaskCase(measured, part.spec, updates=subject.updates)
+        agent = diagnosed(
+            Subject(name, part.spec, alone, updates=subject.updates), measured, questions
+        )
         agents.append(
             AgentDiagnosis(
                 name=name,
                 state_channels=tuple(channel + 1 for channel in task.observed[index]),
                 action_channels=tuple(i + 1 for i in range(*task.owned[index].indices(10**9))),
-                level=level(measured),
+                level=agent.level,
                 uniform=uniform_credit[index],
                 visited=visited_credit[index],
-                verdicts=answer_all(questions, case),
+                verdicts=agent.verdicts,
                 measurements=measured,
             )
         )
-    team = TeamCase(agents, subject.spec, visited, updates=subject.updates)
-    return TeamDiagnosis.about(
+    diagnosis = TeamDiagnosis.about(
         subject,
         uniform=uniform,
         visited=visited,
-        verdicts=answer_all(TEAM_QUESTIONS, team),
         agents=tuple(agents),
         left_out=tuple(name for name in WHY if name not in questions and not WHY[name].needs),
     )
+    return diagnosis.judged(TEAM_QUESTIONS)
 
 
-def _questions(spec: SMESpec) -> dict[str, Question[TaskCase]]:
+def _questions(spec: SMESpec) -> Questions:
     """The questions about a task that have an answer for an agent of a team.
 
     Those about training rest on the log, the exploration or the network of a single learner with a
     reward of its own. Sparsity needs a reward of its own as well.
     """
-    questions = {name: question for name, question in WHERE.items() if not question.needs}
-    if spec.team is not None and spec.team.reward == "individual":
-        questions["sparsity"] = WHY["sparsity"]
-    return questions
+    has_own_reward = spec.team is not None and spec.team.reward == "individual"
+    return WHERE | ({"sparsity": WHY["sparsity"]} if has_own_reward else {})
 
 
 def _alone(task: Task, policy: TeamPolicy, index: int) -> tuple[Task, Policy]:

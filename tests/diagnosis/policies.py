@@ -9,6 +9,7 @@ from rich.console import Console
 
 from sme_registry import SMESpec
 from sme_registry.diagnosis import diagnose, load_policy
+from sme_registry.diagnosis.task import TASK_QUESTIONS
 from sme_registry.evaluation import Perceptron
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.io.terminal import out
@@ -35,6 +36,15 @@ def diagnosis_of(policy, spec=SPEC, **options):
     """The diagnosis of a policy or of a reference policy by name, made once."""
     settings = {"states": 2048, "episodes": 8, **options}
     return diagnose(load_policy(policy, spec), **settings)
+
+
+def verdicts_on(measurements, spec, comparison=None, updates=None):
+    """The verdicts on a run that was measured, compared with another run or not."""
+    fields = {
+        "measurements": measurements, "spec": spec, "comparison": comparison, "updates": updates,
+    }  # fmt: skip
+    run = diagnosis_of("constant", states=64).model_copy(update=fields)
+    return run.judged(TASK_QUESTIONS).verdicts
 
 
 def markdown(diagnosis, figures=(), details=False):

@@ -7,10 +7,11 @@ import pytest
 from jinja2 import UndefinedError
 
 from sme_registry import SMESpec
-from sme_registry.diagnosis import Diagnosis, diagnose, load_policy, questions
+from sme_registry.diagnosis import Diagnosis, diagnose, load_policy
 from sme_registry.diagnosis.behaviour import CapacityProbe, TrainingSummary
-from sme_registry.diagnosis.questions import Comparison, Difference, Measurements, label
-from sme_registry.diagnosis.task import TASK_QUESTIONS, TaskDiagnosis, judge
+from sme_registry.diagnosis.document import Measurements, TaskDiagnosis
+from sme_registry.diagnosis.questions import COMMON_REASONS, DOUBTS, Comparison, Difference, label
+from sme_registry.diagnosis.task import TASK_QUESTIONS
 from tests.diagnosis.policies import (
     EXTENDED,
     SPEC,
@@ -20,16 +21,18 @@ from tests.diagnosis.policies import (
     network,
     printed,
     shrunk,
+    verdicts_on,
 )
 
+COMPARED = COMMON_REASONS.keys() - {"solved", *DOUBTS}
 DECLARED = {
     (question, reason)
     for question, rule in TASK_QUESTIONS.items()
-    for reason in (*rule.reasons, *(questions.SOLVED if rule.kind == "why" else ()))
+    for reason in (*rule.reasons, *(["solved"] if rule.kind == "why" else ()))
 } | {
     (question, reason)
     for question in ("credit_assignment", "sparsity", "capacity", "dimension", "survival")
-    for reason in questions.COMPARISON_REASONS
+    for reason in COMPARED
 }
 FIELDS = {"k": (5, 1), "r_min": (0.5, 0.0), "complexity": (10, 1), "state_dim": (16, 8),
           "action_dim": (8, 4), "D": (0.5, 0.0)}  # fmt: skip
@@ -100,13 +103,13 @@ def random_verdicts(count, policy=shrunk, specs=PLAIN):
                 name="the other", spec_fields={field: FIELDS[field]}, plan_fields={},
                 differences=(regret,), answers={},
             )  # fmt: skip
-        yield from judge(measured, spec, comparison, generator.choice((None, 10, 30)))
+        yield from verdicts_on(measured, spec, comparison, generator.choice((None, 10, 30)))
 
 
 def test_every_question_and_reason_is_reached_and_has_a_sentence():
     reached = set()
     for verdict in chain(random_verdicts(3000), random_verdicts(500, network(), (EXTENDED,))):
-        if verdict.reason not in questions.OPEN_REASONS:
+        if verdict.reason not in DOUBTS:
             reached.add((verdict.question, verdict.reason))
         else:
             assert verdict.answer == "cannot tell"
@@ -114,7 +117,7 @@ def test_every_question_and_reason_is_reached_and_has_a_sentence():
         text = verdict.sentence()
         assert text.endswith(".")
         assert not any(bad in text for bad in ("None", " ,", " .")), text
-        if verdict.reason in questions.COMPARISON_REASONS | questions.OPEN_REASONS:
+        if verdict.reason in COMPARED.union(DOUBTS):
             own = (verdict.question, verdict.evidence["own_reason"])
             assert own in DECLARED
             assert ("this run alone" in text) == (verdict.evidence["own_answer"] != "cannot tell")
@@ -196,7 +199,8 @@ def test_a_diagnosis_of_schema_1_is_read(compared):
 @pytest.mark.parametrize(("updates", "answer"), [(None, "yes"), (19, "cannot tell"), (20, "yes")])
 def test_a_cause_needs_twenty_updates_of_the_algorithm(updates, answer):
     spec = SPEC.derive(r_min=0.75)
-    verdicts = judge(diagnosis_of(shrunk, spec, states=64).measurements, spec, updates=updates)
+    measured = diagnosis_of(shrunk, spec, states=64).measurements
+    verdicts = verdicts_on(measured, spec, updates=updates)
     (sparsity,) = (verdict for verdict in verdicts if verdict.question == "sparsity")
     assert sparsity.answer == answer
     assert ("19 times" in sparsity.sentence()) == (updates == 19)

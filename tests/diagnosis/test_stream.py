@@ -1,5 +1,6 @@
 """Diagnoses of lives in streams: known faults are found, in runs, in cells and by the command."""
 
+import functools
 import json
 import random
 import shutil
@@ -10,11 +11,10 @@ import pytest
 from sme_registry import SMESpec, StreamSpec
 from sme_registry.diagnosis import StreamSubject, diagnose, load_cell, load_policy, load_run
 from sme_registry.diagnosis.behaviour import NetworkState, network_state
-from sme_registry.diagnosis.questions import OPEN_REASONS, answer_all
+from sme_registry.diagnosis.questions import DOUBTS
 from sme_registry.diagnosis.stream import (
     STREAM_QUESTIONS,
     PhaseDiagnosis,
-    StreamCase,
     StreamDiagnosis,
     VisitDiagnosis,
     outcome_of,
@@ -169,13 +169,25 @@ def phase_of(phase, best, final, fresh=None, online=None, network=None):
     )  # fmt: skip
 
 
+@functools.cache
+def plain_life():
+    return diagnosis_of(report_of([HALF], stream_of(1)))
+
+
+def life_of(stream, visits, phases, forgetting, updates=None):
+    """The diagnosis of a life with these numbers."""
+    fields = {
+        "stream": stream, "visits": visits, "phases": phases, "forgetting": forgetting,
+        "updates": updates,
+    }  # fmt: skip
+    return plain_life().model_copy(update=fields).judged(STREAM_QUESTIONS)
+
+
 def test_a_failure_that_is_hardly_worse_than_a_fresh_agent_s_is_not_blamed_on_the_life():
     visits = [visit_of(v, v, regret) for v, regret in enumerate((0.5, 0.93))]
     phases = [phase_of(j, 0.5, 0.5, fresh) for j, fresh in enumerate((0.5, 0.89))]
-    case = StreamCase(TWO, visits, phases, None)
-    verdicts = answer_all(STREAM_QUESTIONS, case)
-    reasons = {verdict.question: verdict.reason for verdict in verdicts}
-    assert reasons["failure_to_learn"] == "failed_as_fresh_agents"
+    found = life_of(TWO, visits, phases, None)
+    assert found.verdict("failure_to_learn").reason == "failed_as_fresh_agents"
 
 
 def test_forgetting_of_a_phase_that_was_never_learnt_is_said_to_be_that():
@@ -265,7 +277,7 @@ def test_a_life_of_one_visit_or_of_unknown_networks_cannot_be_compared():
 # --- words --------------------------------------------------------------------------------------
 
 
-def random_case(generator):
+def random_life(generator):
     """A life of random numbers, with and without fresh agents, a log and networks."""
     P = generator.choice((1, 1, 2, 3))
     cycles = generator.choice((1, 2, 3))
@@ -295,18 +307,16 @@ def random_case(generator):
     for j in range(P):
         online = generator.uniform(0.3, 0.7) if fresh and log else None
         phases.append(phase_of(j, number(), number(), number(fresh), online, state(fresh)))
-    return StreamCase(
-        stream, visits, phases, number(V > 1), updates=generator.choice((None, 5, 30))
-    )
+    return life_of(stream, visits, phases, number(V > 1), generator.choice((None, 5, 30)))
 
 
 def test_every_reason_is_reached_and_has_a_sentence():
     generator, reached = random.Random(0), set()
     for _ in range(300):
-        for verdict in answer_all(STREAM_QUESTIONS, random_case(generator)):
+        for verdict in random_life(generator).verdicts:
             reason = verdict.evidence.get("own_reason", verdict.reason)
             reached.add((verdict.question, reason))
-            assert (reason != verdict.reason) == (verdict.reason in OPEN_REASONS)
+            assert (reason != verdict.reason) == (verdict.reason in DOUBTS)
             text = verdict.sentence()
             assert text.endswith("."), text
             assert not any(bad in text for bad in ("None", " ,", " .", " ;", "( ", "..")), text

@@ -8,8 +8,7 @@ import pytest
 from sme_registry import SMESpec, evaluate, load
 from sme_registry.diagnosis import Diagnosis, diagnose, load_cell, load_policy, load_run
 from sme_registry.diagnosis.measure import LINEAR, POLICY
-from sme_registry.diagnosis.questions import answer_all
-from sme_registry.diagnosis.team import TEAM_QUESTIONS, TeamCase, TeamDiagnosis
+from sme_registry.diagnosis.team import TEAM_QUESTIONS, TeamDiagnosis
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.spec import StudyFile, StudyPlan
@@ -158,9 +157,8 @@ def test_a_harder_optimum_is_a_cause_only_of_a_team_that_has_learnt(
     measurements = driver.measurements.model_copy(update={"uniform": uniform})
     agents = [*others, driver.model_copy(update={"measurements": measurements})]
     visited = one_fails.visited.model_copy(update={"normalised_regret": learnt})
-    case = TeamCase(agents, SPEC, visited, updates=updates)
-    verdicts = {v.question: v for v in answer_all(TEAM_QUESTIONS, case)}
-    verdict = verdicts["harder_optimum"]
+    fields = {"agents": agents, "visited": visited, "updates": updates}
+    verdict = one_fails.model_copy(update=fields).judged(TEAM_QUESTIONS).verdict("harder_optimum")
     assert verdict.answer == answer
     assert "optimal policy is harder to learn." in verdict.sentence()
 
