@@ -47,7 +47,7 @@ def in_process(monkeypatch):
     """Cells run in this process: a page's studies are small, and a process takes two seconds."""
 
     def here(executor, jobs, progress):
-        return InProcess(executor._run, executor._keep_models).map(jobs, progress)
+        return InProcess(None, executor._run, executor._keep_models).map(jobs, progress)
 
     monkeypatch.setattr(Processes, "map", here)
 

@@ -31,6 +31,7 @@ from sme_registry.io import read_json
 from sme_registry.io.markup import Table
 from sme_registry.io.system import available_cores
 from sme_registry.io.terminal import (
+    duration,
     duration_range,
     err,
     out,
@@ -43,8 +44,6 @@ from sme_registry.spec.catalogue import is_path
 from sme_registry.spec.study import PlannedCell, parse_uses
 from sme_registry.studies.engine.budget import (
     Estimator,
-    Span,
-    makespan,
     scaled,
     selected,
     uneven_rollouts,
@@ -243,8 +242,8 @@ def plan(
 ) -> None:
     """Show what a study runs and how long it takes, before anything runs.
 
-    Times come from finished cells of the same algorithm in --folder. Without any, they are a range
-    from a fast core to a slow one.
+    Times come from finished cells of the same algorithm in --folder. Without any, they are those
+    of a fast core.
 
     Examples:
 
@@ -265,10 +264,10 @@ def plan(
     warn_of_uneven_rollouts(file.plan)
     estimator = Estimator(results.values())
     waiting = [cell for key, cell in cells.items() if key not in results]
-    spans = [estimator.seconds(cell) for cell in waiting]
+    of_cells = [estimator.seconds(cell) for cell in waiting]
 
-    def seconds(workers: int) -> Span:
-        return Span(*(makespan([span[i] for span in spans], workers) for i in (0, 1)))
+    def seconds(workers: int) -> float:
+        return max([sum(of_cells) / workers, *of_cells])
 
     here = jobs or available_cores()
     workers = {"one core": 1, f"this machine, {here} at once": here}
@@ -288,7 +287,7 @@ def plan(
                 "seeds": file.plan.seeds,
                 "estimated_from_results": sorted(measured),
                 "seconds": [
-                    {"cores": n, **seconds(n)._asdict()} for n in dict.fromkeys(workers.values())
+                    {"cores": n, "seconds": seconds(n)} for n in dict.fromkeys(workers.values())
                 ],
             }
         )
@@ -297,11 +296,13 @@ def plan(
     finished = f", {done:,} of them finished" if results else ""
     out().print(f"{len(cells):,} cells{finished}. Estimated time:")
     for place, n in workers.items():
-        out().print(f"  {place + ':':32}{duration_range(*seconds(n))}")
+        out().print(f"  {place + ':':32}about {duration(seconds(n))}")
     unmeasured = sorted({cell.uses for cell in waiting} - measured)
     if unmeasured:
+        listed = escape(", ".join(unmeasured))
         print_line(
-            f"[dim]From a table of costs, not from results: {escape(', '.join(unmeasured))}.[/]"
+            f"[dim]From a table of costs, not from results: {listed}. A slow core takes twice as "
+            "long.[/]"
         )
 
 
@@ -322,7 +323,7 @@ def _plan_table(file: StudyFile, planned: Sequence[PlannedCell], seconds: Any) -
         cells = {place.cell.digest: place for place in places}.values()
         first = places[0].cell
         steps = [each.cell.steps for each in cells]
-        spans = [seconds(each.cell) for each in cells]
+        times = [seconds(each.cell) for each in cells]
         rows.append(
             (
                 escape(name),
@@ -331,7 +332,7 @@ def _plan_table(file: StudyFile, planned: Sequence[PlannedCell], seconds: Any) -
                 " to ".join(f"{bound:,}" for bound in sorted({min(steps), max(steps)})),
                 f"{first.evaluations:,} × {first.evaluation_episodes}",
                 f"{len(cells):,}",
-                duration_range(min(span.low for span in spans), max(span.high for span in spans)),
+                duration_range(min(times), max(times)),
             )
         )
     return Table(

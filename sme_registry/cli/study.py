@@ -25,7 +25,7 @@ from sme_registry.errors import OptionError
 from sme_registry.io.markup import Table
 from sme_registry.io.system import available_cores
 from sme_registry.io.terminal import (
-    duration_range,
+    duration,
     err,
     out,
     print_json,
@@ -33,6 +33,7 @@ from sme_registry.io.terminal import (
     print_note,
 )
 from sme_registry.spec import StudyFile, catalogue
+from sme_registry.studies.engine.executors import EXECUTORS
 from sme_registry.studies.engine.ledger import (
     STATES,
     CellStatus,
@@ -45,7 +46,7 @@ from sme_registry.studies.engine.ledger import (
 from sme_registry.studies.engine.runner import run_study
 
 _FAILURES_SHOWN = 20
-ExecutorName = enum.StrEnum("ExecutorName", ["processes", "in-process", "ray"])
+ExecutorName = enum.StrEnum("ExecutorName", list(EXECUTORS))  # type: ignore[misc]
 
 StudyFolder = Annotated[Path, typer.Argument(help="The study's folder.")]
 NewFolder = Annotated[
@@ -172,7 +173,7 @@ def status(
       sme study status runs/all --only "class=k-*" --json
     """
 
-    print_status(study_status(folder, only or None, options.scaled), json)
+    print_status(study_status(folder, only or (), options.scaled), json)
 
 
 def report(
@@ -233,16 +234,10 @@ def print_status(status: StudyStatus, json: bool) -> None:
     out().print("done · [cyan]+ running[/] · [red]! failed[/] · [dim]/ all[/]")
     parts = [f"{status.count(state):,} {state}" for state in STATES if status.count(state)]
     out().print(f"{len(status.cells):,} cells: {', '.join(parts)}")
-    if status.seconds_left.high > 0:
+    if status.seconds_left > 0:
         here = available_cores()
-        one = duration_range(*status.seconds_left)
-        all_here = duration_range(*(bound / here for bound in status.seconds_left))
-        out().print(f"Time left: {one} on one core, {all_here} on the {here} cores here")
-    if status.never_requested:
-        out().print(
-            f"{status.never_requested:,} more cells of the plan were left out by --only in every "
-            "run; their time is not included"
-        )
+        one, all_here = (duration(status.seconds_left / cores) for cores in (1, here))
+        out().print(f"Time left: about {one} on one core, {all_here} on the {here} cores here")
     if status.other_results:
         out().print(f"[dim]{status.other_results:,} results in the folder belong to other plans[/]")
     for cell in status.failed[:_FAILURES_SHOWN]:

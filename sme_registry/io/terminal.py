@@ -10,7 +10,6 @@ import os
 import re
 import sys
 import time
-from collections.abc import Callable
 from importlib import metadata
 from types import TracebackType
 from typing import Annotated, Any, Self, TextIO
@@ -140,14 +139,13 @@ class Progress:
         done: int = 0,
         console: Console | None = None,
         unit: str = "steps",
-        seconds_left: Callable[[], float] | None = None,
         enabled: bool = True,
     ) -> None:
         self._title, self._unit = title, unit
         self._total, self._done_before, self._done = total, done, done
         self._rate_from: tuple[int, float] | None = None  # steps and time; None while it prepares
         self._console = console or err()
-        self._seconds_left, self._enabled = seconds_left, enabled
+        self._enabled = enabled
         self._note = ""
         self._parts: dict[str, str] = {}  # how far they are
         self._start = self._last = time.monotonic()
@@ -267,12 +265,10 @@ class Progress:
         done_before, start = self._rate_from or (self._done, now)
         rate = (self._done - done_before) / max(now - start, 1e-9)
         parts = [f"{self._done:,} of {self._total:,} {self._unit}"]
-        if rate > 0 and self._seconds_left is None:
+        if rate > 0:
             parts.append(_rate(rate, self._unit))
         if self._done >= self._total:
             parts.append("done")
-        elif self._seconds_left is not None:
-            parts.append(f"about {duration(self._seconds_left())} left")
         elif rate > 0:
             parts.append(f"about {duration((self._total - self._done) / rate)} left")
         return [*parts, self._note] if self._note else parts

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from sme_registry.errors import OptionError
-from sme_registry.io import available_memory, check_writable, require_packages
+from sme_registry.io import check_writable, require_packages
 
 CACHE_VARIABLE = "SME_JAX_CACHE"  # a folder, or "off"
 
@@ -59,16 +59,6 @@ def find_device(name: str | None = None) -> Any:
             f"device={name!r}: must be one of {', '.join(known)}, the devices that JAX finds here. "
             "For an NVIDIA GPU, install jax[cuda12] or jax[cuda13]."
         ) from None
-
-
-def memory_of(device: Any) -> int | None:
-    """Bytes of memory that a new program on a device may use; None if unknown."""
-    if device.platform == "cpu":
-        return available_memory()
-    statistics = device.memory_stats() or {}
-    if "bytes_limit" not in statistics:
-        return None
-    return int(statistics["bytes_limit"]) - int(statistics.get("bytes_in_use", 0))
 
 
 def _cache_folder() -> Path:

@@ -12,7 +12,6 @@ A subclass has one algorithm's state, `initial_state`, `advance`, `finish`, and 
 from __future__ import annotations
 
 import functools
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -23,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.errors import OptionError, ResourceLimitError
-from sme_registry.jax import find_device, memory_of
+from sme_registry.jax import find_device
 from sme_registry.jax.env import EnvState, Info, advance, moved, observe, start, to_unit
 from sme_registry.jax.networks import HostWeights, Weights
 from sme_registry.jax.task import (
@@ -161,9 +160,8 @@ class Program(ABC):
         action_range: str = "symmetric",
         runs: int | None = None,
         device: str | None = None,
-        at_once: int = 1,
     ) -> None:
-        """New runs, before their first step; `at_once` programs share the device's memory."""
+        """New runs, before their first step."""
         self.settings, self.specs, self.budget = settings, tuple(specs), steps
         self.symmetric = action_range == "symmetric"
         self.runs = len(specs) if runs is None else runs
@@ -177,8 +175,14 @@ class Program(ABC):
         weights = [self.initial_weights(settings, rng, *widths) for rng in rngs]
         stacked = {name: np.stack([run[name] for run in weights]) for name in weights[0]}
         keys = jax.vmap(jax.random.PRNGKey)(np.asarray(seeds, np.uint32))
-        self._check_room(jax.eval_shape(self.initial_state, stacked, keys), at_once)
-        self.state = self.initial_state(*jax.device_put((stacked, keys), self.device))
+        try:
+            self.state = self.initial_state(*jax.device_put((stacked, keys), self.device))
+        except jax.errors.JaxRuntimeError as error:
+            raise ResourceLimitError(
+                f"runs={self.runs:,}: their state does not fit on the {self.device.platform}: "
+                f"{str(error).splitlines()[0]}. Choose fewer runs, fewer steps, a smaller "
+                "buffer_size or a smaller n_steps."
+            ) from error
 
     @property
     def params(self) -> TaskParams:
@@ -271,26 +275,6 @@ class Program(ABC):
         if shape == present.shape:
             return saved
         return np.concatenate([saved, np.zeros_like(present[len(saved) :])])
-
-    def _check_room(self, state: Any, at_once: int) -> None:
-        leaves = jax.tree.leaves(state)
-        needed = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in leaves)
-        room = memory_of(self.device)
-        if room is not None and at_once * needed > room:
-            fit = self.runs * room // (at_once * needed)
-            sharing = f" for {at_once} programs at once" if at_once > 1 else ""
-            advice = "fewer steps or a smaller buffer_size" if self.buffer else "a smaller n_steps"
-            raise ResourceLimitError(
-                f"runs={self.runs:,}: their state takes {needed / 2**30:,.1f} GiB, and the "
-                f"{self.device.platform} has {room / 2**30:,.1f} GiB to spare{sharing}: "
-                f"{f'at most {fit:,} fit' if fit else 'not one fits'}. Choose "
-                f"{'fewer runs, ' if fit else ''}{'fewer programs, ' if sharing else ''}{advice}."
-            )
-
-
-def check_room(new_program: Callable[[], Program]) -> None:
-    """Raise ResourceLimitError if a program would not fit in memory; compiles nothing."""
-    jax.eval_shape(lambda: new_program().state)
 
 
 def _check_alike(documents: Sequence[Document]) -> None:

@@ -58,13 +58,12 @@ def new_program(
     steps: int,
     runs: int | None = None,
     device: str | None = None,
-    at_once: int = 1,
 ) -> Program:
     """A program of new runs, `jax:PPO`, `jax:TD3` or `jax:SAC`.
 
     Tasks or streams are of equal shapes, and streams switch at the same steps. `seeds` in
     [0, 2**32) are of weights, starts and noise, and `steps` those of each run. Copies of the first
-    run fill up to `runs`; `at_once` programs share what the device has of memory.
+    run fill up to `runs`.
     """
     integer_in("len(specs)", len(specs), 1)
     integer_in("len(seeds)", len(seeds), len(specs), len(specs), advice="Give a seed of each task.")
@@ -83,7 +82,6 @@ def new_program(
         action_range=action_range,
         runs=runs,
         device=device,
-        at_once=at_once,
     )
 
 

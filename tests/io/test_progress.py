@@ -105,7 +105,7 @@ def test_a_job_that_stands_still_prints_ever_less(clock):
 def test_running_parts_are_named_in_a_line(clock):
     text = io.StringIO()
     console = Console(file=text, width=200)
-    with Progress("study", 9, unit="cells", console=console, seconds_left=lambda: 61.0) as progress:
+    with Progress("study", 9, unit="cells", console=console) as progress:
         for number in range(5):
             progress.start_part(f"cell {number}", "compiling" if number == 2 else "")
         clock.now = 5.0
@@ -113,9 +113,9 @@ def test_running_parts_are_named_in_a_line(clock):
         clock.now = 10.0
         progress.end_part("cell 4")
     expected = (
-        "study: 0 of 9 cells · about 1 min 1 s left · running: cell 0 50%, cell 1 0%, cell 2 "
+        "study: 0 of 9 cells · running: cell 0 50%, cell 1 0%, cell 2 (compiling), and 2 more"
     )
-    assert expected + "(compiling), and 2 more" in text.getvalue()
+    assert expected in text.getvalue()
     assert "cell 4" not in text.getvalue().splitlines()[-1]
 
 

@@ -10,9 +10,8 @@ pytest.importorskip("jax")
 import jax.numpy as jnp
 
 from sme_registry import SMESpec
-from sme_registry.errors import OptionError, ResourceLimitError
+from sme_registry.errors import OptionError
 from sme_registry.evaluation.rollouts import rollouts, start_states
-from sme_registry.io import available_memory
 from sme_registry.jax.networks import Weights, initial_linear, linear
 from sme_registry.jax.program import Program
 from sme_registry.task import materialize
@@ -121,13 +120,3 @@ def test_the_state_of_another_program_is_refused():
         with pytest.raises(OptionError, match=r"^arrays\['steps'\]: is .*: must be int64 of shape"):
             two.restore({**program(BASE_TWICE, first_seed=7).save(), "steps": steps})
     np.testing.assert_equal(two.save(), program(BASE_TWICE).save())
-
-
-def test_too_many_runs_for_the_memory_are_refused_with_the_number_that_fits():
-    memory = available_memory()
-    assert memory is not None
-    steps = memory // 20  # of 8 bytes: 2.5 runs would fit
-    with pytest.raises(ResourceLimitError, match=r"runs=4: .* at most 2 fit\. Choose fewer runs"):
-        Linear((), BASE_TWICE, (0, 1), steps=steps, runs=4)
-    with pytest.raises(ResourceLimitError, match=r"runs=1: .* not one fits\. Choose fewer steps"):
-        Linear((), BASE_TWICE[:1], (0,), steps=4 * steps)

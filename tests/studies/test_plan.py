@@ -8,7 +8,7 @@ import pytest
 
 from sme_registry.errors import OptionError, SpecError, UnknownNameError
 from sme_registry.spec import SMESpec, StudyAlgorithm, StudyFile, StudyPlan, SuiteFile, catalogue
-from sme_registry.studies.engine.budget import Estimator, makespan, scaled, selected, with_agents
+from sme_registry.studies.engine.budget import Estimator, scaled, selected, with_agents
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.runner import run_study
 from tests import commands
@@ -151,23 +151,10 @@ class TestScaled:
 
 
 class TestEstimate:
-    @pytest.mark.parametrize(
-        ("jobs", "workers", "ends"),
-        [([], 2, 0), ([3], 4, 3), ([3, 3, 3], 1, 9), ([1, 5, 2, 2], 2, 5), ([4, 1, 1, 4], 2, 6)],
-    )
-    def test_a_job_begins_as_soon_as_somebody_is_free(self, jobs, workers, ends):
-        assert makespan(jobs, workers) == ends
-
-    def test_without_results_it_is_between_a_quick_core_and_a_slow_one(self):
+    def test_without_results_it_is_that_of_a_fast_core(self):
         by_algorithm = {cell.algorithm: cell.cell for cell in ABLATIONS.plan.cells[:3]}
         ppo, td3 = (Estimator().seconds(by_algorithm[name]) for name in ("PPO", "TD3"))
-        assert 60 < ppo.low < 80 < 120 < ppo.high < 180
-        assert 1200 < td3.low < 1250 < 2400 < td3.high < 2500
-
-    def test_a_deep_task_takes_longer_to_judge(self):
-        cells = {cell.class_name: cell.cell for cell in ABLATIONS.plan.cells}
-        low = {name: Estimator().seconds(cells[name]).low for name in ("default", "complexity-50")}
-        assert low["complexity-50"] > low["default"] + 10
+        assert (ppo, td3) == pytest.approx((62.0, 1202.0))
 
     def test_what_has_finished_replaces_the_table_for_its_algorithm_alone(self):
         few, many = (small_file(1, evaluations=n).plan.cells[0].cell for n in (10, 20))
@@ -177,9 +164,7 @@ class TestEstimate:
         )
         estimator = Estimator([slow])
         assert estimator.knows(many)
-        seconds = estimator.seconds(many)
-        assert seconds.low == seconds.high
-        assert 110 < seconds.low < 125  # twice the work, and the start
+        assert estimator.seconds(many) == pytest.approx(60.0)
         assert estimator.seconds(ABLATIONS.plan.cells[0].cell) == Estimator().seconds(
             ABLATIONS.plan.cells[0].cell
         )
@@ -190,10 +175,9 @@ class TestCommands:
         made = json.loads(good("plan", "paper-ablations", "--cores", "64", "-j", "2", "--json"))
         assert (made["cells"], made["done"]) == (780, 0)
         assert (len(made["classes"]), made["algorithms"]) == (26, ["PPO", "TD3", "SAC"])
-        seconds = {entry["cores"]: entry for entry in made["seconds"]}
+        seconds = {entry["cores"]: entry["seconds"] for entry in made["seconds"]}
         assert list(seconds) == [1, 2, 64]
-        assert seconds[1]["low"] / 2 <= seconds[2]["low"] < seconds[1]["low"] * 0.51
-        assert seconds[64]["low"] < seconds[64]["high"] < seconds[1]["high"] / 50
+        assert (seconds[2], seconds[64]) == (seconds[1] / 2, seconds[1] / 64)
         text = good("plan", "paper-ablations", "--cores", "64", "-j", "2")
         for words in ("780 cells", "cluster, 64 cores", "this machine, 2 at once", "260", "k-100"):
             assert words in text
@@ -211,11 +195,11 @@ class TestCommands:
         options = ("-f", "s", "--executor", "in-process", "--json")
         ran = json.loads(good("run", "p.json", *cut, *options))
         assert (ran["study"], ran["cells"], ran["done"]) == ("small-scaled-v1", 3, 3)
-        found = json.loads(good("status", "s", "--json"))
-        assert (found["cells"], found["done"], found["waiting"]) == (3, 3, 0)
-        assert (found["never_requested"], found["core_seconds_left"]["high"]) == (3, 0)
-        assert "3 more cells of the plan were left out by --only" in good("status", "s")
         only = ("--only", "algorithm=opt*")
+        found = json.loads(good("status", "s", *only, "--json"))
+        assert (found["cells"], found["done"], found["waiting"]) == (3, 3, 0)
+        assert found["core_seconds_left"] == 0
+        assert json.loads(good("status", "s", "--json"))["waiting"] == 3
         found = json.loads(good("status", "s", "--seeds", "4", *only, "--json"))
         assert (found["cells"], found["done"], found["waiting"]) == (4, 3, 1)
         planned = json.loads(good("plan", "p.json", *only, "--folder", "s", "--json"))

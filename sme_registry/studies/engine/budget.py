@@ -1,30 +1,17 @@
 """How long cells take, which of a plan run now, and plans with other budgets.
 
-A cell takes, in seconds of one core, with P its steps (times the agents of a team), E its
-evaluations, T the horizon, N the states of its evaluation in and out of distribution, L the layers
-of the optimal policy:
-
-    start + P · step + E · T · batch step + N · (state + layer · (L − 1))
-
-A life in a stream takes the last term for each of its tasks. `step` is the algorithm's, all others
-are the same; the ten runs of a program of JAX share the start and the evaluations. Where cells of
-the algorithm have finished, the sum after `start` is multiplied by the median ratio of their
-measured to their estimated seconds.
-
 Budgets and algorithms are part of a cell's content, so a plan with others is another plan with its
 own digest and name. The selection of the cells to run now is not: `selected` works on any plan.
 """
 
 from __future__ import annotations
 
-import heapq
 import math
 import statistics
-import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 from sme_registry.errors import OptionError, SMEError, UnknownNameError, did_you_mean
 from sme_registry.io import choice
@@ -52,12 +39,8 @@ SECONDS_PER_STEP = {
     "offline:bc": 0.0015,
     "offline:iql": 0.006,
 }
-_FASTEST, _SLOWEST = SECONDS_PER_STEP["PPO"], SECONDS_PER_STEP["SAC"]  # of any other algorithm
-_START = 1.5  # a process and its imports
-_BATCH_STEP = 6e-5  # one step of all episodes of an evaluation, which run as a batch
-_STATE, _LAYER = 1.5e-6, 1e-6  # a state, and a layer of π* in it
-_RUNS_IN_JAX = 10
-_SLOW_CORE = 2.0  # times the seconds of a fast one
+_OTHER = 0.012  # of an algorithm that is not in the table
+_START = 2.0  # a process, its imports and the evaluations
 _LONGEST_NAME = 64
 _KINDS: dict[str, Callable[[PlannedCell], str]] = {
     "class": lambda planned: planned.class_name,
@@ -65,96 +48,32 @@ _KINDS: dict[str, Callable[[PlannedCell], str]] = {
 }
 
 
-class Span(NamedTuple):
-    """Bounds in seconds, of a fast core and a slow one; equal if they come from finished cells."""
-
-    low: float
-    high: float
-
-
 class Estimator:
-    """Estimates the seconds of cells on one core, from those that have finished."""
+    """Estimates the seconds of cells on one core: those of their steps, and of a start.
+
+    Seconds of a step are from a table, of a fast core. Where cells of the algorithm have finished,
+    the estimate is multiplied by the median ratio of their seconds to their estimates.
+    """
 
     def __init__(self, finished: Iterable[CellResult] = ()) -> None:
         ratios = defaultdict(list)
         for result in finished:
-            expected = _work(result.cell, _FASTEST)
-            if expected > 0:
-                ratios[result.cell.uses].append(result.timing.total / expected)
+            ratios[result.cell.uses].append(result.timing.total / _by_table(result.cell))
         self._ratios = {uses: statistics.median(of_cells) for uses, of_cells in ratios.items()}
 
     def knows(self, cell: Cell) -> bool:
         """Whether a cell of the same algorithm has finished."""
         return cell.uses in self._ratios
 
-    def seconds(self, cell: Cell) -> Span:
-        start = _START / _RUNS_IN_JAX if in_jax(cell.uses) else _START
-        low, high = _work(cell, _FASTEST), _SLOW_CORE * _work(cell, _SLOWEST)
-        if cell.uses in self._ratios:
-            low = high = low * self._ratios[cell.uses]
-        return Span(start + low, start + high)
+    def seconds(self, cell: Cell) -> float:
+        return _by_table(cell) * self._ratios.get(cell.uses, 1.0)
 
 
-def _work(cell: Cell, otherwise: float) -> float:
-    """A cell's seconds by the table without its start; `otherwise` is an unknown step's."""
+def _by_table(cell: Cell) -> float:
     kind, name = parse_uses(cell.uses)
-    agents = 1 if cell.spec.team is None else len(cell.spec.team.agents)
-    transitions = 0 if kind == "reference" else cell.steps * agents
-    step = SECONDS_PER_STEP.get(name if kind == "independent" else cell.uses, otherwise)
-    curve = cell.evaluations * cell.spec.horizon * _BATCH_STEP
-    states = cell.protocol.states_per_region * len(cell.protocol.edges)
-    report = sum(_STATE + _LAYER * (spec.complexity - 1) for spec in cell.specs) * states
-    return transitions * step + curve / (_RUNS_IN_JAX if kind == "jax" else 1) + report
-
-
-def makespan(seconds: Sequence[float], workers: int) -> float:
-    """Seconds to the end of jobs that are started in order, each by the first free worker."""
-    free = [0.0] * min(workers, len(seconds))
-    for job in seconds:
-        heapq.heapreplace(free, free[0] + job)
-    return max(free, default=0.0)
-
-
-class _Reported(NamedTuple):
-    """When a job reported first and last, and what shares of its steps it had done."""
-
-    cells: Sequence[Cell]
-    since: float
-    before: float
-    now: float
-    share: float
-
-
-class Pace:
-    """How long all of a study takes, by the seconds that its work so far took."""
-
-    def __init__(
-        self, finished: Iterable[CellResult], one_at_a_time: Callable[[Cell], bool]
-    ) -> None:
-        self._estimator, self._one_at_a_time = Estimator(finished), one_at_a_time
-        self._reported: dict[str, _Reported] = {}  # by a job's first cell
-
-    def report(self, cells: Sequence[Cell], share: float) -> None:
-        key, now = cells[0].digest, time.monotonic()
-        first = self._reported.get(key, _Reported(cells, now, share, now, share))
-        self._reported[key] = first._replace(now=now, share=share)
-
-    def seconds_left(self, jobs: Iterable[Sequence[Cell]], workers: int) -> float:
-        """Seconds to the end of the cells of running jobs and of those that wait."""
-        jobs_so_far = self._reported.values()
-        took = sum(job.now - job.since for job in jobs_so_far)
-        estimated = sum((job.share - job.before) * self._work(job.cells) for job in jobs_so_far)
-        pace = took / estimated if estimated else 1.0
-        seconds: dict[bool, list[float]] = {True: [], False: []}  # one at a time; others
-        for cells in jobs:
-            reported = self._reported.get(cells[0].digest)
-            left = 1.0 if reported is None else 1.0 - reported.share
-            seconds[self._one_at_a_time(cells[0])].append(pace * left * self._work(cells))
-        return max(sum(seconds[True]), makespan(seconds[False], workers))
-
-    def _work(self, cells: Sequence[Cell]) -> float:
-        """Seconds of cells as estimated, between a fast core and a slow one."""
-        return sum(sum(self._estimator.seconds(cell)) / 2 for cell in cells)
+    transitions = 0 if kind == "reference" else cell.steps * len(cell.spec.agents)
+    step = SECONDS_PER_STEP.get(name if kind == "independent" else cell.uses, _OTHER)
+    return _START + transitions * step
 
 
 def scaled(

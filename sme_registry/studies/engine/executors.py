@@ -3,6 +3,7 @@
 Every executor is one `map`: it takes the next job when a worker is free, a cell or the cells of one
 program, and yields the outcomes in the order in which cells end. Its caller writes them: only the
 driver touches the study's folder, except for the states of programs, which may be gigabytes.
+A new executor is a class here, and a row of `EXECUTORS`.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from multiprocessing import connection
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 from sme_registry.errors import OptionError
 from sme_registry.io import require_packages
@@ -40,7 +41,7 @@ from sme_registry.studies.engine.cell import jax_programs, run_cell
 from sme_registry.studies.engine.result import CPU, CellResult, Job, Outcome, Report, failed
 
 RunCell = Callable[[Cell, Callable[[int, int], None] | None, Path | None], CellResult]
-ReportProgress = Callable[..., None]  # called with a job and the arguments of `Report`
+ReportProgress = Callable[[Job, int, int], None]  # called with the steps done, and those in all
 Jobs = Iterator[Job | None]
 
 POLL_SECONDS = 0.2
@@ -61,12 +62,41 @@ _SETTINGS = {
 _ADDRESSES = "Give 'local', or the host:port of a running cluster of this Ray version."
 
 
-class Executor(Protocol):
-    """Runs cells."""
+class Executor(ABC):
+    """Runs cells with `run`, as many jobs at once as there are workers.
+
+    `jobs` is the most at once, None for one per core; `address` is that of a cluster.
+    """
+
+    local: ClassVar[bool] = True  # whether jobs have the files and devices of this machine
+
+    def __init__(
+        self,
+        jobs: int | None = None,
+        run: RunCell = run_cell,
+        keep_models: bool = False,
+        address: str = "local",
+    ) -> None:
+        self._jobs, self._run, self._keep_models = jobs, run, keep_models
+        self._address = address
+        self._running: dict[Any, Any] = {}
 
     @property
     def workers(self) -> int:
         """Jobs that can run at once."""
+        return available_cores() if self._jobs is None else self._jobs
+
+    def _session(self) -> AbstractContextManager[None]:
+        """Open what jobs run in; leaving it ends those that are still running."""
+        return contextlib.nullcontext()
+
+    @abstractmethod
+    def _start(self, job: Job) -> None:
+        """Start a job and add it to those running."""
+
+    @abstractmethod
+    def _ended(self, progress: ReportProgress) -> Iterator[Outcome]:
+        """Wait up to `POLL_SECONDS`, report progress, and remove the jobs that have ended."""
 
     def map(self, jobs: Jobs, progress: ReportProgress) -> Generator[Outcome, None, None]:
         """Run jobs; when the iterator is closed or raises, no cell is left running.
@@ -74,6 +104,22 @@ class Executor(Protocol):
         The next job is asked for whenever a worker is free; None means that none is available now.
         Outcomes come in the order in which cells end.
         """
+        exhausted = False
+        with self._session():
+            while not exhausted or self._running:
+                while not exhausted and len(self._running) < self.workers:
+                    job = next(jobs, _END)
+                    exhausted = job is _END
+                    if not isinstance(job, Job):
+                        break
+                    self._start(job)
+                if self._running:
+                    yield from self._ended(progress)
+                elif not exhausted:
+                    time.sleep(POLL_SECONDS)
+
+
+_END = object()
 
 
 def run_job(run: RunCell, job: Job, keep_models: bool, progress: Report) -> Iterator[Outcome]:
@@ -104,90 +150,40 @@ def _outcomes(run: RunCell, job: Job, keep_models: bool, progress: Report) -> It
 
 
 def _throttled(report: Report) -> Report:
-    """Pass on a report if the last one is some time ago, at the end, and with a note."""
+    """Pass on a report if the last one is some time ago, and at the end."""
     last = 0.0
 
-    def throttled(done: int, total: int, note: str = "") -> None:
+    def throttled(done: int, total: int) -> None:
         nonlocal last
         now = time.monotonic()
-        if now - last >= _SECONDS_BETWEEN_REPORTS or done >= total or note:
+        if now - last >= _SECONDS_BETWEEN_REPORTS or done >= total:
             last = now
-            report(done, total, note)
+            report(done, total)
 
     return throttled
 
 
-@dataclass(frozen=True)
-class InProcess:
+class InProcess(Executor):
     """One job after the other in this process: for debugging, or where processes are forbidden."""
 
-    run: RunCell = run_cell
-    keep_models: bool = False
-    workers: int = 1
+    workers = 1
 
-    def map(self, jobs: Jobs, progress: ReportProgress) -> Generator[Outcome, None, None]:
-        for job in jobs:
-            if job is None:
-                time.sleep(POLL_SECONDS)
-                continue
-            yield from run_job(self.run, job, self.keep_models, functools.partial(progress, job))
-
-
-class ConcurrentExecutor(ABC):
-    """Keeps as many jobs running as there are workers."""
-
-    def __init__(
-        self, jobs: int | None = None, run: RunCell = run_cell, keep_models: bool = False
-    ) -> None:
-        self._jobs, self._run, self._keep_models = jobs, run, keep_models
-        self._running: dict[Any, Any] = {}
-
-    @property
-    @abstractmethod
-    def workers(self) -> int: ...
-
-    @abstractmethod
-    def _session(self) -> AbstractContextManager[None]:
-        """Open what jobs run in; leaving it ends those that are still running."""
-
-    @abstractmethod
     def _start(self, job: Job) -> None:
-        """Start a job and add it to those running."""
+        self._running[id(job)] = job
 
-    @abstractmethod
     def _ended(self, progress: ReportProgress) -> Iterator[Outcome]:
-        """Wait up to `POLL_SECONDS`, report progress, and remove the jobs that have ended."""
-
-    def map(self, jobs: Jobs, progress: ReportProgress) -> Generator[Outcome, None, None]:
-        exhausted = False
-        with self._session():
-            while not exhausted or self._running:
-                while not exhausted and len(self._running) < self.workers:
-                    job = next(jobs, _END)
-                    exhausted = job is _END
-                    if not isinstance(job, Job):
-                        break
-                    self._start(job)
-                if self._running:
-                    yield from self._ended(progress)
-                elif not exhausted:
-                    time.sleep(POLL_SECONDS)
+        _, job = self._running.popitem()
+        report = functools.partial(progress, job)
+        yield from run_job(self._run, job, self._keep_models, report)
 
 
-_END = object()
-
-
-class Processes(ConcurrentExecutor):
+class Processes(Executor):
     """A new process (`spawn`) with one thread for each job.
 
     Not a pool of `concurrent.futures`, in which one dead worker fails every cell that is running:
     each process has its own pipe, so its death fails only its cells. It ends with this one,
     however that ends, and ignores Ctrl-C, which this process handles.
     """
-
-    @property
-    def workers(self) -> int:
-        return available_cores() if self._jobs is None else self._jobs
 
     @contextlib.contextmanager
     def _session(self) -> Iterator[None]:
@@ -280,20 +276,16 @@ def _child(pipe: Any, run: RunCell, job: Job, keep_models: bool, log: Path) -> N
         pipe.send(outcome)
 
 
-class OnRay(ConcurrentExecutor):
+class OnRay(Executor):
     """A task on one core of a Ray cluster for each job; one whose node is lost runs again."""
 
-    def __init__(
-        self,
-        address: str = "local",
-        jobs: int | None = None,
-        run: RunCell = run_cell,
-        keep_models: bool = False,
-    ) -> None:
-        super().__init__(jobs, run, keep_models)
-        self._address, self._ray = address, _import_ray()
+    local = False
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._ray = _import_ray()
         self._connected_here = False  # then `map` disconnects
-        if address != "local":  # now, so that a wrong one is refused before anything is written
+        if self._address != "local":  # now, so that a wrong one is refused before anything runs
             self._connect()
 
     @property
@@ -380,3 +372,11 @@ def _import_ray() -> Any:
         warnings.simplefilter("ignore")
         import ray
     return ray
+
+
+EXECUTORS: dict[str, type[Executor]] = {
+    "processes": Processes,
+    "in-process": InProcess,
+    "ray": OnRay,
+}
+"""The executors by name, as `run_study` and `sme study run` take it."""

@@ -26,7 +26,7 @@ from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
-from sme_registry.errors import OptionError, SMEError, UnknownNameError
+from sme_registry.errors import OptionError, SMEError
 from sme_registry.io import (
     Arrays,
     Lock,
@@ -40,15 +40,14 @@ from sme_registry.io import (
 )
 from sme_registry.spec import StudyFile
 from sme_registry.spec.study import PlannedCell
-from sme_registry.studies.engine.budget import Estimator, Span, selected
+from sme_registry.studies.engine.budget import Estimator, selected
 from sme_registry.studies.engine.result import CellFailure, CellResult
 from sme_registry.training.record import MODELS_OF_STUDY, folder_of_cell, model_of_cell
 
 PLAN = "plan.json"
 CELLS, FAILED, LOCKS, REPORT = "cells", "failed", "locks", "report"
-REQUESTS = "requests"  # selections of cells that were asked for, a file each
 STATE_FILES = "states"  # of programs that run, or were killed
-_STUDY_FILES = {PLAN, CELLS, FAILED, LOCKS, MODELS_OF_STUDY, REPORT, REQUESTS, STATE_FILES}
+_STUDY_FILES = {PLAN, CELLS, FAILED, LOCKS, MODELS_OF_STUDY, REPORT, STATE_FILES}
 
 
 class SavedState(NamedTuple):
@@ -106,23 +105,6 @@ class Ledger:
 
     def write_plan(self, file: StudyFile) -> None:
         file.write(self.folder / PLAN)
-
-    def write_request(self, file: StudyFile, only: Sequence[str]) -> None:
-        """Remember that these cells of a plan were asked for; no pattern means every cell."""
-        text = to_json({"plan": file.digest, "only": sorted(set(only))})
-        path = self.folder / REQUESTS / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.json"
-        if not path.exists():
-            write_atomically(path, text)
-
-    def requests(self, file: StudyFile) -> list[list[str]]:
-        """The patterns of each request for cells of a plan; an invalid file counts as absent."""
-        requests = []
-        for path in sorted((self.folder / REQUESTS).glob("*.json")):
-            with contextlib.suppress(SMEError, KeyError, TypeError):
-                document = read_json(path)
-                if document["plan"] == file.digest:
-                    requests.append([str(pattern) for pattern in document["only"]])
-        return requests
 
     def result(self, key: str) -> CellResult | None:
         return self.results([key]).get(key)
@@ -308,15 +290,14 @@ class StudyStatus:
 
     `places` are the selected cells of the plan, in its order. Streams may share fresh agents, which
     run once and count once, except in `counts`. `seconds_left` are of one core; running cells count
-    in full. `other_results` belong to no cell of the plan; no run asked for `never_requested` ones.
+    in full. `other_results` belong to no cell of the plan.
     """
 
     folder: Path
     file: StudyFile
     places: tuple[CellStatus, ...]
-    seconds_left: Span
+    seconds_left: float
     other_results: int
-    never_requested: int = 0
 
     @property
     def cells(self) -> tuple[CellStatus, ...]:
@@ -352,9 +333,8 @@ class StudyStatus:
             "digest": self.file.digest,
             "cells": len(self.cells),
             **{state: self.count(state) for state in STATES},
-            "core_seconds_left": self.seconds_left._asdict(),
+            "core_seconds_left": self.seconds_left,
             "other_results": self.other_results,
-            "never_requested": self.never_requested,
             "groups": [
                 {"class": name, "algorithm": algorithm, **{s: counts[s] for s in STATES}}
                 for (name, algorithm), counts in self.counts.items()
@@ -374,25 +354,25 @@ class StudyStatus:
         }
 
 
-def requested(ledger: Ledger, file: StudyFile) -> set[str] | None:
-    """Digests of a plan's cells that any run asked for; None if that is unknown."""
-    digests: set[str] | None = None
-    for only in ledger.requests(file):
-        with contextlib.suppress(OptionError, UnknownNameError):
-            cells = selected(file.plan.cells, only)
-            digests = (digests or set()) | {planned.cell.digest for planned in cells}
-    return digests
+def requested(ledger: Ledger, file: StudyFile) -> set[str]:
+    """Digests of the cells of each class and algorithm of which a run has finished or failed."""
+    ended = ledger.results().keys() | ledger.failures().keys()
+    groups: dict[tuple[str, str], set[str]] = {}
+    for planned in file.plan.cells:
+        group = planned.class_name, planned.algorithm
+        groups.setdefault(group, set()).add(planned.cell.digest)
+    return {key for keys in groups.values() if keys & ended for key in keys}
 
 
 def study_status(
     folder: str | os.PathLike[str],
-    only: Sequence[str] | None = None,
+    only: Sequence[str] = (),
     scale: Callable[[StudyFile], StudyFile] = lambda file: file,
 ) -> StudyStatus:
     """The state of the study in a folder. Changes nothing, and may be called while it runs.
 
-    `only` has patterns `class=GLOB`, `algorithm=GLOB`; it is empty for every cell of the plan, and
-    None for those that any run asked for. `scale` is applied to the folder's plan first.
+    `only` has patterns `class=GLOB`, `algorithm=GLOB`; it is empty for every cell of the plan.
+    `scale` is applied to the folder's plan first.
 
     Examples:
       >>> from sme_registry.studies import study_status
@@ -403,30 +383,22 @@ def study_status(
     return plan_status(ledger, scale(ledger.study_file()), only)
 
 
-def plan_status(ledger: Ledger, file: StudyFile, only: Sequence[str] | None) -> StudyStatus:
-    every = file.plan.cells
-    keys = {id(planned): planned.cell.digest for planned in every}
+def plan_status(ledger: Ledger, file: StudyFile, only: Sequence[str]) -> StudyStatus:
     results, failures = ledger.results(), ledger.failures()
-    estimator = Estimator(results.values())
     places = []
-    for planned in selected(every, only or ()):
-        key = keys[id(planned)]
+    for planned in selected(file.plan.cells, only):
+        key = planned.cell.digest
         state: State = "done" if key in results else "failed" if key in failures else "waiting"
         if state != "done" and ledger.is_running(key):
             state = "running"
         failure = failures.get(key) if state == "failed" else None
         places.append(CellStatus(planned, key, state, failure))
-    asked = requested(ledger, file) if only is None else None
-    shown = [
-        cell for cell in places if asked is None or cell.state != "waiting" or cell.key in asked
-    ]
-    unfinished = {c.key: c.planned.cell for c in shown if c.state in ("running", "waiting")}
-    spans = [estimator.seconds(cell) for cell in unfinished.values()]
+    unfinished = {c.key: c.planned.cell for c in places if c.state in ("running", "waiting")}
+    estimator = Estimator(results.values())
     return StudyStatus(
         folder=ledger.folder,
         file=file,
-        places=tuple(shown),
-        seconds_left=Span(sum(span.low for span in spans), sum(span.high for span in spans)),
-        other_results=len(results.keys() - set(keys.values())),
-        never_requested=len({cell.key for cell in places} - {cell.key for cell in shown}),
+        places=tuple(places),
+        seconds_left=sum(map(estimator.seconds, unfinished.values())),
+        other_results=len(results.keys() - {planned.cell.digest for planned in file.plan.cells}),
     )

@@ -13,7 +13,6 @@ bits.
 from __future__ import annotations
 
 import contextlib
-import functools
 import importlib.metadata
 import json
 import math
@@ -21,15 +20,15 @@ import multiprocessing
 import signal
 import time
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sme_registry.errors import OptionError, PolicyError, ResourceLimitError
+from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation import EvaluationReport, Policy, StreamReport, as_policy, evaluate_many
 from sme_registry.evaluation.dynamic_regret import DynamicRegret
 from sme_registry.evaluation.models import saved_sb3
@@ -37,7 +36,7 @@ from sme_registry.evaluation.rollouts import start_states
 from sme_registry.io import Arrays, to_json
 from sme_registry.io.system import available_cores, child_environment, end_with_parent
 from sme_registry.jax import find_device
-from sme_registry.jax.program import Evaluation, Program, StepLog, check_room
+from sme_registry.jax.program import Evaluation, Program, StepLog
 from sme_registry.jax.run import hidden_of, new_program, policy_of
 from sme_registry.jax.run import run as run_to_end
 from sme_registry.jax.task import Form
@@ -58,7 +57,6 @@ from sme_registry.studies.engine.result import (
 )
 from sme_registry.training.record import Snapshots, versions_for
 
-_Returned = TypeVar("_Returned")
 _Shape = tuple[int, int, int, int]
 SECONDS_BETWEEN_STATES = 180.0
 _MOST_RUNS = 10  # on a CPU: more save little time, and the last of a study would run alone longer
@@ -106,17 +104,6 @@ class Programs:
         device = self._device if self.one_at_a_time else CPU
         return SharedProgram(runs, device, build_key=build_key)
 
-    def without_room(self, cells: Iterable[Cell], workers: int) -> dict[str, str]:
-        """How many runs fit in memory, by a cell of each program that would not."""
-        groups: dict[Hashable, list[Cell]] = defaultdict(list)
-        for cell in cells:
-            if in_jax(cell.uses):
-                groups[self.group(cell)].append(cell)
-        programs = [(group[0], self.program(group[0])) for group in groups.values()]
-        number = sum(math.ceil(len(group) / self.runs(group[0])) for group in groups.values())
-        at_once = 1 if self.one_at_a_time else min(workers, number)
-        return _beside_the_gpu(_without_room, programs, at_once) if programs else {}
-
     def cells(self, keys: Iterable[str]) -> tuple[Cell, ...] | None:
         """The cells of the plan with these keys; None if one of them is not in it any longer."""
         known = [self._cells.get(key) for key in keys]
@@ -149,8 +136,8 @@ def shape_of(cell: Cell) -> _Shape:
     return S, A, L, H
 
 
-def _new_program(cells: Sequence[Cell], shared: SharedProgram, at_once: int = 1) -> Program:
-    """The program of cells of one group, of which `at_once` are to share the memory."""
+def _new_program(cells: Sequence[Cell], shared: SharedProgram) -> Program:
+    """The program of cells of one group."""
     cell = cells[0]
     return new_program(
         cell.uses,
@@ -161,35 +148,20 @@ def _new_program(cells: Sequence[Cell], shared: SharedProgram, at_once: int = 1)
         steps=cell.steps,
         runs=shared.runs,
         device=shared.device,
-        at_once=at_once,
     )
 
 
 def platform_of(device: str | None) -> str:
     """The platform of a device, or of JAX's default: "cpu", "gpu" or "tpu"."""
-    return _beside_the_gpu(_platform, device)
-
-
-def _beside_the_gpu(function: Callable[..., _Returned], *arguments: Any) -> _Returned:
-    """Call a function of JAX, in a process of its own where a GPU's memory might be taken."""
     if not importlib.metadata.entry_points(group="jax_plugins"):
-        return function(*arguments)
+        return _platform(device)
+    # In a process of its own, or this one would take a GPU's memory.
     with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(function, arguments)
+        return pool.apply(_platform, (device,))
 
 
 def _platform(device: str | None) -> str:
     return str(find_device(device).platform)
-
-
-def _without_room(programs: Sequence[tuple[Cell, SharedProgram]], at_once: int) -> dict[str, str]:
-    reasons = {}
-    for cell, shared in programs:
-        try:
-            check_room(functools.partial(_new_program, [cell], shared, at_once))
-        except ResourceLimitError as error:
-            reasons[cell.digest] = str(error)
-    return reasons
 
 
 def run_program(
@@ -374,8 +346,7 @@ class _ProgramRun:
         try:
             check_forms(records, present)
             self._program.restore(_named(arrays, _PROGRAM))
-        except OptionError as error:
-            self._progress(0, self._cell.steps, f"starts again, without {state}: {error}")
+        except OptionError:
             return
         self._snapshots = {name: records.pop(name) for name in self._snapshots}
         self._record.restore(records)

@@ -1,7 +1,6 @@
 """`CellResult`: the result of one finished run of a study, one file each; and its `Record`.
 
 STUDY/plan.json               the plan, as a `StudyFile`
-STUDY/requests/*.json         the selections of cells (`only`) that runs asked for
 STUDY/cells/<64 hex>.json     results, by the cell's digest; renamed into place when complete
 STUDY/failed/<64 hex>.json    cells that failed, with the error; a successful retry removes it
 STUDY/locks/<64 hex>          locked by the operating system while a cell runs
@@ -39,7 +38,7 @@ from sme_registry.spec.study import Cell, parse_uses
 from sme_registry.training.record import versions_for
 
 CPU = "cpu"
-Report = Callable[..., None]  # called with the steps done, those in all, and perhaps a note
+Report = Callable[[int, int], None]  # called with the steps done, and those in all
 _Numbers = Annotated[tuple[Real, ...], Field(strict=False)]
 
 

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, NamedTuple
 from rich.console import Console
 from rich.markup import escape
 
-from sme_registry.errors import OptionError, ResourceLimitError, UnknownNameError
-from sme_registry.io import Lock, integer_in
-from sme_registry.io.terminal import Progress, duration
+from sme_registry.errors import OptionError, UnknownNameError
+from sme_registry.io import Lock, choice, integer_in
+from sme_registry.io.terminal import Progress
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.spec.study import Cell, PlannedCell, in_jax
-from sme_registry.studies.engine.budget import Pace, first_places, selected, with_sources
+from sme_registry.studies.engine.budget import selected, with_sources
 from sme_registry.studies.engine.cell import jax_programs, run_cell
-from sme_registry.studies.engine.executors import Executor, InProcess, OnRay, Processes, RunCell
+from sme_registry.studies.engine.executors import EXECUTORS, Executor, RunCell
 from sme_registry.studies.engine.ledger import Ledger, SavedState, StudyStatus, label, plan_status
 from sme_registry.studies.engine.result import CPU, CellFailure, CellResult, Job, Outcome
 from sme_registry.training.algorithms import check_algorithm, code_notice, find
@@ -27,8 +27,6 @@ from sme_registry.training.record import versions_for
 
 if TYPE_CHECKING:
     from sme_registry.studies.engine.programs import Programs
-
-EXECUTORS = ("processes", "in-process", "ray")
 
 
 def run_study(
@@ -74,24 +72,23 @@ def run_study(
     if lanes is not None:
         lanes = integer_in("lanes", lanes, 1, 100_000)
     plan_file = with_sources(plan_file)
-    planned = first_places(selected(plan_file.plan.cells, only))
+    planned: dict[str, PlannedCell] = {}
+    for place in selected(plan_file.plan.cells, only):
+        planned.setdefault(place.cell.digest, place)
     console = console or Console(stderr=True)
     checked = planned.values() if run is run_cell else ()
     _check(plan_file.plan, checked, console if progress else None)
-    on_ray = executor == "ray" or isinstance(executor, OnRay)
-    programs = _programs(plan_file.plan, checked, device, lanes, on_ray=on_ray)
-    runs_on = _executor(executor, jobs, ray, run, keep_models)
+    if isinstance(executor, str):
+        kind = EXECUTORS[choice("executor", executor, EXECUTORS, error=UnknownNameError)]
+        executor = kind(jobs, run, keep_models, ray)
+    programs = _programs(plan_file.plan, checked, device, lanes, local=executor.local)
     ledger = Ledger(folder)
     earlier_plan = ledger.plan_file()
     queue = Queue(ledger, planned, programs, retry_failed=retry_failed)
-    if programs is not None and not on_ray:  # whose nodes have a memory of their own
-        _check_room(programs, queue, runs_on.workers)
     if earlier_plan is None or earlier_plan != plan_file:
         ledger.write_plan(plan_file)
-    if queue.finished < len(planned):
-        ledger.write_request(plan_file, only)
     title = f"study {plan_file.versioned_name}"
-    study = _StudyRun(title, planned, queue, runs_on, console, progress)
+    study = _StudyRun(title, queue, executor, console, progress)
     ledger.warn = study.say
     study.announce()
     for notice in _notices(ledger, earlier_plan, plan_file, queue, keep_models):
@@ -125,9 +122,9 @@ def _programs(
     device: str | None,
     lanes: int | None,
     *,
-    on_ray: bool,
+    local: bool,
 ) -> Programs | None:
-    """The programs of a plan, if any of these cells runs in one; on Ray each has one core."""
+    """The programs of a plan, if any of these cells runs in one; on a cluster each has one core."""
     if not any(in_jax(cell.cell.uses) for cell in planned):
         for name, value in (("device", device), ("lanes", lanes)):
             if value is not None:
@@ -136,41 +133,15 @@ def _programs(
                     'out, or use --agents jax (in a plan, "uses": "jax:PPO").'
                 )
         return None
-    if on_ray and device not in (None, CPU):
+    if not local and device not in (None, CPU):
         raise OptionError(
-            f"device={device!r}: must be cpu on Ray, where a program has one core. Leave out "
+            f"device={device!r}: must be cpu on a cluster, where a program has one core. Leave out "
             "--device, or leave out --ray on a machine that has such a device."
         )
-    device = CPU if on_ray else device
+    device = device if local else CPU
     jax, cells = jax_programs(), (cell.cell for cell in plan.cells)
     programs: Programs = jax.Programs(cells, jax.platform_of(device), device, lanes)
     return programs
-
-
-def _executor(
-    executor: str | Executor, jobs: int | None, ray: str, run: RunCell, keep_models: bool
-) -> Executor:
-    if not isinstance(executor, str):
-        return executor
-    if executor == "processes":
-        return Processes(jobs, run, keep_models)
-    if executor == "in-process":
-        return InProcess(run, keep_models)
-    if executor == "ray":
-        return OnRay(ray, jobs, run, keep_models)
-    raise UnknownNameError(f"executor={executor!r}: must be one of {', '.join(EXECUTORS)}.")
-
-
-def _check_room(programs: Programs, queue: Queue, workers: int) -> None:
-    """Raise ResourceLimitError if programs that run at once would not fit in memory."""
-    cells = [planned.cell for planned in queue.waiting.values()]
-    reasons = programs.without_room(cells, workers)
-    if reasons:
-        named = ((queue.waiting[key], reason) for key, reason in reasons.items())
-        raise ResourceLimitError(
-            "\n".join(f"{cell.algorithm} on {cell.class_name}: {why}" for cell, why in named)
-            + "\nSee --lanes and --jobs."
-        )
 
 
 class _RunningCell(NamedTuple):
@@ -179,7 +150,7 @@ class _RunningCell(NamedTuple):
 
 
 class Queue:
-    """The cells of one `run_study`: what waits, what runs, and what could not be written.
+    """The cells of one `run_study`: what waits and what runs.
 
     Any number of processes may share a folder: the lock of a cell decides who runs it. Cells are
     claimed when a worker is free, so that the others are left to other processes.
@@ -193,51 +164,24 @@ class Queue:
         *,
         retry_failed: bool,
     ) -> None:
-        self._ledger, self._planned, self._programs = ledger, planned, programs
+        self._ledger, self.planned, self._programs = ledger, planned, programs
         self.results = ledger.results(planned)
         self._failures = ledger.failures(planned.keys() - self.results.keys())
         self.finished, self.failed = len(self.results), 0
         self.waiting = {
-            key: planned_cell
-            for key, planned_cell in planned.items()
+            key: place
+            for key, place in planned.items()
             if key not in self.results and (retry_failed or key not in self._failures)
         }
         self._running: dict[str, _RunningCell] = {}
-        self._unwritten: list[Outcome] = []
-
-    def one_at_a_time(self, cell: Cell) -> bool:
-        """Whether a cell's program has the device to itself."""
-        programs = self._programs
-        return programs is not None and programs.one_at_a_time and in_jax(cell.uses)
-
-    @property
-    def running(self) -> list[Job]:
-        """The jobs with cells that have not ended."""
-        return list({id(running.job): running.job for running in self._running.values()}.values())
 
     def jobs(self) -> Iterator[Job | None]:
-        """Jobs of locked cells; None while no cell is available.
+        """Jobs of locked cells; None while no cell is available."""
+        while self.waiting:
+            yield self._next_job()
 
-        The folder may not be writable: running cells are then left to finish, since there may be
-        space again, and their outcomes are kept in memory until they are written, before new jobs.
-        """
-        while self.waiting or self._unwritten:
-            job = None
-            try:
-                for outcome in list(self._unwritten):
-                    self.write(outcome)
-                    self._unwritten.remove(outcome)
-                job = self._next_job()
-            except OptionError:
-                if len(self._running) == len(self._unwritten):
-                    raise
-            yield job
-
-    def keep(self, outcome: Outcome) -> None:
-        self._unwritten.append(outcome)
-
-    def write(self, outcome: Outcome) -> None:
-        """Write how a cell ended, and release its lock; OptionError if it cannot be written."""
+    def write(self, outcome: Outcome) -> Job | None:
+        """Write how a cell ended, and release its lock; returns its job if all of that ended."""
         entry, key = outcome.entry, outcome.entry.key
         if isinstance(entry, CellFailure) and key in self._failures:
             attempts = self._failures[key].attempts + 1
@@ -246,9 +190,11 @@ class Queue:
         lock, job = self._running.pop(key)
         lock.release()
         self._count(entry)
-        ended = not any(cell.digest in self._running for cell in job.cells)
-        if ended and job.program is not None and job.program.state is not None:
+        if any(cell.digest in self._running for cell in job.cells):
+            return None
+        if job.program is not None and job.program.state is not None:
             self._ledger.remove_states(job.program.state)
+        return job
 
     def release(self) -> None:
         for running in self._running.values():
@@ -260,19 +206,24 @@ class Queue:
 
     def _next_job(self) -> Job | None:
         """Claim the next cells that still have to run; None if there are none to claim now."""
-        occupied = any(self.one_at_a_time(cell) for job in self.running for cell in job.cells)
-        for key, planned in list(self.waiting.items()):
-            if occupied and self.one_at_a_time(planned.cell):
+        jobs = (running.job for running in self._running.values())
+        occupied = any(self._has_the_device(job.cells[0]) for job in jobs)
+        for key, place in list(self.waiting.items()):
+            if occupied and self._has_the_device(place.cell):
                 continue
-            if self._programs is not None and in_jax(planned.cell.uses):
+            if self._programs is not None and in_jax(place.cell.uses):
                 job = self._claim_program(self._programs, key)
-            elif (lock := self._claim(key)) is not None:
-                job = self._started(Job((planned.cell,)), [lock])
             else:
-                job = None
+                lock = self._claim(key)
+                job = None if lock is None else self._started(Job((place.cell,)), [lock])
             if job is not None:
                 return job
         return None
+
+    def _has_the_device(self, cell: Cell) -> bool:
+        """Whether a cell's program has the device to itself."""
+        programs = self._programs
+        return programs is not None and programs.one_at_a_time and in_jax(cell.uses)
 
     def _claim_program(self, programs: Programs, first: str) -> Job | None:
         """Claim a cell and the others of its program: those of a saved state, or the next ones."""
@@ -283,7 +234,7 @@ class Queue:
             return None
         with claiming, contextlib.ExitStack() as stack:  # releases all of them if one raises
             cells, locks = list[Cell](), list[Lock]()
-            program = programs.program(self._planned[first].cell)
+            program = programs.program(self.planned[first].cell)
             saved = self._ledger.state_of(first, program.build_key)
             in_state = programs.cells(saved.keys) if saved else None
             if in_state is None:
@@ -293,7 +244,7 @@ class Queue:
                     lock = self._claim(key)
                     if lock is not None:
                         locks.append(stack.enter_context(lock))
-                        cells.append(self._planned[key].cell)
+                        cells.append(self.planned[key].cell)
                 if not cells:
                     return None
             new = self._ledger.state_path([cell.digest for cell in cells], program.build_key)
@@ -303,14 +254,14 @@ class Queue:
 
     def _candidates(self, programs: Programs, first: str, saved: SavedState | None) -> list[str]:
         """The waiting cells that may be runs of the program of the first one, which leads."""
-        group = programs.group(self._planned[first].cell)
+        group = programs.group(self.planned[first].cell)
         others = self.waiting if saved is None else saved.keys
         return [first] + [
             key
             for key in others
             if key != first
             and key in self.waiting
-            and programs.group(self._planned[key].cell) == group
+            and programs.group(self.planned[key].cell) == group
         ]
 
     def _claim(self, key: str) -> Lock | None:
@@ -321,15 +272,11 @@ class Queue:
         with contextlib.ExitStack() as stack:
             stack.enter_context(lock)
             self._ledger.set_aside(key)
-            result, failure = self._ledger.result(key), self._ledger.failure(key)
-            earlier = self._failures.get(key)
-            attempts = earlier.attempts if earlier else 0
-            if result is None and (failure is None or failure.attempts <= attempts):
+            entry = self._ledger.result(key) or self._ledger.failure(key)
+            if entry is None or entry == self._failures.get(key):
                 stack.pop_all()
                 return lock
         del self.waiting[key]
-        entry = result or failure
-        assert entry is not None
         self._count(entry)
         return None
 
@@ -344,27 +291,27 @@ class _StudyRun:
     """One `run_study`: it hands jobs to the executor, writes outcomes, and shows progress."""
 
     def __init__(
-        self,
-        title: str,
-        planned: Mapping[str, PlannedCell],
-        queue: Queue,
-        executor: Executor,
-        console: Console,
-        progress: bool,
+        self, title: str, queue: Queue, executor: Executor, console: Console, progress: bool
     ) -> None:
-        self._title, self._planned, self._queue, self._executor = title, planned, queue, executor
-        self._pace = Pace(queue.results.values(), queue.one_at_a_time)
+        self._title, self._queue, self._executor = title, queue, executor
+        total, done = len(queue.planned), queue.finished
         self._progress = Progress(
-            title,
-            len(planned),
-            done=queue.finished,
-            console=console,
-            unit="cells",
-            seconds_left=self.seconds_left,
-            enabled=progress,
+            title, total, done=done, console=console, unit="cells", enabled=progress
         )
         self.say = self._progress.message
-        self._shown: dict[str, Job] = {}  # running jobs, by name
+
+    def announce(self) -> None:
+        queue, cells = self._queue, len(self._queue.planned)
+        parts = [f"{cells:,} cells"]
+        if queue.finished:
+            parts.append(f"{queue.finished:,} finished before and reused")
+        skipped = cells - queue.finished - len(queue.waiting)
+        if skipped:
+            parts.append(f"{skipped:,} failed before (--retry runs them again)")
+        parts.append(f"{len(queue.waiting):,} to run")
+        if queue.waiting:
+            parts.append(f"{self._executor.workers} at once")
+        self.say(f"{self._title}: {' · '.join(parts)}")
 
     def run(self) -> None:
         if not self._queue.waiting:
@@ -375,75 +322,36 @@ class _StudyRun:
                 with contextlib.closing(outcomes):  # ends running cells before their locks go
                     for outcome in outcomes:
                         self._write(outcome)
-                        self._show()
             finally:
                 self._queue.release()
 
-    def seconds_left(self) -> float:
-        waiting = ((planned.cell,) for planned in self._queue.waiting.values())
-        running = (job.cells for job in self._queue.running)
-        return self._pace.seconds_left([*running, *waiting], self._executor.workers)
-
     def _jobs(self) -> Iterator[Job | None]:
         for job in self._queue.jobs():
-            self._show()
+            if job is not None:
+                self._progress.start_part(self._name(job), "compiling" if job.program else "")
+            self._show_counts()
             yield job
+
+    def _report(self, job: Job, done: int, total: int) -> None:
+        state = f"{done:,} of {total:,} steps" if done < total else "evaluating"
+        self._progress.update_part(self._name(job), done / total if total else 1.0, state)
 
     def _write(self, outcome: Outcome) -> None:
         entry = outcome.entry
         if isinstance(entry, CellFailure):
-            self.say(f"failed: {label(self._planned[entry.key])}: {entry.error}")
-        elif entry.program is None:
-            self._pace.report((entry.cell,), 1.0)
-        try:
-            self._queue.write(outcome)
-        except OptionError as error:
-            self._queue.keep(outcome)
-            self.say(
-                f"{error} No new cell starts until there is space. Finished cells are kept in "
-                "memory, and are lost only if this process ends before it can write them."
-            )
+            self.say(f"failed: {label(self._queue.planned[entry.key])}: {entry.error}")
+        ended = self._queue.write(outcome)
+        if ended is not None:
+            self._progress.end_part(self._name(ended))
+        self._show_counts()
 
-    def _report(self, job: Job, done: int, total: int, note: str = "") -> None:
-        if note:
-            self.say(f"{self._name(job)}: {note}")
-            return
-        share = done / total if total else 1.0
-        self._pace.report(job.cells, share)
-        state = f"{done:,} of {total:,} steps" if done < total else "evaluating"
-        self._progress.update_part(self._name(job), share, state)
-
-    def _show(self) -> None:
-        """Show which jobs run, also those that another process has finished."""
-        running = {self._name(job): job for job in self._queue.running}
-        for name in self._shown.keys() - running.keys():
-            self._progress.end_part(name)
-        for name, job in running.items():
-            if name not in self._shown:
-                self._progress.start_part(name, "compiling" if job.program else "")
-                if job.program is None:
-                    self._pace.report(job.cells, 0.0)
-        self._shown = running
+    def _show_counts(self) -> None:
         failed = self._queue.failed
         self._progress.update(self._queue.finished, f"{failed} failed" if failed else "")
 
-    def announce(self) -> None:
-        queue, cells = self._queue, len(self._planned)
-        parts = [f"{cells:,} cells"]
-        if queue.finished:
-            parts.append(f"{queue.finished:,} finished before and reused")
-        skipped = cells - queue.finished - len(queue.waiting)
-        if skipped:
-            parts.append(f"{skipped:,} failed before (--retry runs them again)")
-        parts.append(f"{len(queue.waiting):,} to run")
-        if queue.waiting:
-            parts.append(f"{self._executor.workers} at once")
-            parts.append(f"about {duration(self.seconds_left())}")
-        self.say(f"{self._title}: {' · '.join(parts)}")
-
     def _name(self, job: Job) -> str:
         """What people call a job: `PPO on k-25, run 3`, or `…, and 9 more`."""
-        first, *others = (label(self._planned[cell.digest]) for cell in job.cells)
+        first, *others = (label(self._queue.planned[cell.digest]) for cell in job.cells)
         return f"{first}, and {len(others)} more" if others else first
 
 
@@ -458,24 +366,23 @@ def _notices(
             "reused; the others stay in the folder."
         )
     installed = functools.cache(versions_for)
-    others, differences, without_model = 0, set[str](), 0
-    for result in queue.results.values():
+    differences: dict[str, set[str]] = {}  # of reused results, by their key
+    for key, result in queue.results.items():
         now = installed(result.cell.uses)
-        different = {
+        differences[key] = {
             f"{package} {version} (installed: {now[package]})"
             for package, version in result.versions.items()
             if now.get(package, version) != version
         }
-        others, differences = others + bool(different), differences | different
-        # Only a cell that learnt by acting leaves a model.
-        learnt = result.online_regret is not None
-        without_model += learnt and not ledger.model_path(result.key).exists()
-    if others:
+    if others := sum(map(bool, differences.values())):
         yield (
             f"{others:,} of the reused results come from other package versions: "
-            f"{', '.join(sorted(differences))}. For results of one set of versions, run the plan "
-            "in a new folder."
+            f"{', '.join(sorted(set().union(*differences.values())))}. For results of one set of "
+            "versions, run the plan in a new folder."
         )
+    # Only a cell that learnt by acting leaves a model.
+    learnt = [key for key, result in queue.results.items() if result.online_regret is not None]
+    without_model = sum(not ledger.model_path(key).exists() for key in learnt)
     if keep_models and without_model:
         yield (
             f"{without_model:,} of the finished cells have no model and are not run again. To get "

@@ -2,23 +2,19 @@
 
 import contextlib
 import io
-from dataclasses import dataclass, field
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from rich.console import Console
 
-from sme_registry.errors import OptionError, ResourceLimitError
+from sme_registry.errors import OptionError
 from sme_registry.spec import StudyFile, StudyPlan
-from sme_registry.studies.engine import budget
+from sme_registry.studies.engine.executors import InProcess
 from sme_registry.studies.engine.ledger import Ledger, write_state
-from sme_registry.studies.engine.result import Job, failed
+from sme_registry.studies.engine.result import failed
 from sme_registry.studies.engine.runner import run_study
 
 pytest.importorskip("jax")
 
-from sme_registry.jax import program
 from sme_registry.studies.engine.programs import Programs
 
 
@@ -53,14 +49,14 @@ def cells(file, *classes):
     ]
 
 
-@dataclass
-class Refusing:
+class Refusing(InProcess):
     """An executor that records jobs, and fails their cells."""
 
-    workers: int = 1
-    jobs: list[Job] = field(default_factory=list)
-    meanwhile: Any = None  # called with the number of jobs so far
-    while_waiting: Any = None  # called where no job is available
+    def __init__(self, meanwhile=None, while_waiting=None):
+        """Functions: one is called with the number of jobs so far, one where none is available."""
+        super().__init__()
+        self.jobs = []
+        self.meanwhile, self.while_waiting = meanwhile, while_waiting
 
     def map(self, jobs, progress):
         for job in jobs:
@@ -174,57 +170,10 @@ def test_while_another_run_claims_a_program_this_one_waits(tmp_path):
     assert waited == [True]
 
 
-@pytest.mark.parametrize(
-    ("workers", "MiB", "fit"), [(1, 20, None), (2, 20, "at most 1 fit"), (8, 10, "not one fits")]
-)
-def test_programs_that_do_not_fit_in_memory_at_once_are_refused_before_the_first_runs(
-    workers, MiB, fit, tmp_path, monkeypatch
-):
-    file = plan_file(steps=1000, algorithms=[{"name": "TD3", "uses": "jax:TD3"}])
-    executor = Refusing(workers)
-
-    def run():
-        run_study(file, tmp_path, executor=executor, lanes=3, device="cpu", progress=False)
-
-    # The state of three runs takes 13.6 MiB; there are three programs.
-    monkeypatch.setattr(program, "memory_of", lambda device: MiB * 2**20)
-    if fit is None:
-        run()
-        assert len(executor.jobs) == 3
-        return
-    with pytest.raises(ResourceLimitError) as caught:
-        run()
-    shared, delayed, last = str(caught.value).splitlines()
-    assert shared.startswith("TD3 on small: runs=3: their state takes 0.0 GiB")
-    assert f"{min(workers, 3)} programs at once: {fit}. Choose" in delayed
-    assert "--jobs" in last
-    assert not executor.jobs
-    assert not list(tmp_path.iterdir())
-
-
-def test_the_time_left_does_not_count_compiling_as_the_speed_of_training(tmp_path, monkeypatch):
-    file = plan_file(seeds=1)
-    seconds_left = []
-    now = [0.0]
-    monkeypatch.setattr(budget, "time", SimpleNamespace(monotonic=lambda: now[0]))
-
-    @dataclass
-    class Reporting(Refusing):
-        def map(self, jobs, progress):
-            first = next(jobs)
-            for now[0], done in ((60.0, 100), (61.0, 200), (62.0, 300)):
-                progress(first, done, 1000)
-                seconds_left.append(progress.__self__.seconds_left())
-            yield from (failed(cell, "refused", "") for cell in first.cells)
-
-    only = ["algorithm=PPO", "class=delayed"]
-    run_study(file, tmp_path, executor=Reporting(), device="cpu", only=only, progress=False)
-    assert seconds_left[0] < 100.0  # from a table, not 540 s
-    assert seconds_left[1:] == pytest.approx([8.0, 7.0])
-
-
 def test_programs_on_ray_run_on_cpus_alone(tmp_path):
-    with pytest.raises(OptionError, match=r"device='gpu': must be cpu on Ray.*leave out --ray"):
+    with pytest.raises(
+        OptionError, match=r"device='gpu': must be cpu on a cluster.*leave out --ray"
+    ):
         run_study(plan_file(), tmp_path, executor="ray", device="gpu")
 
 

@@ -286,20 +286,7 @@ def test_only_the_selected_cells_are_run_and_the_others_are_apart(study):
     assert {cell.planned.algorithm for cell in status.cells} == {"optimal"}
     assert Ledger(study).plan_file() == file
     assert study_status(study, ["algorithm=constant"]).count("waiting") == 2
-    status = study_status(study)
-    assert (len(status.cells), status.count("done"), status.never_requested) == (2, 2, 2)
-    assert status.seconds_left.high == 0
-    for only in ("abc", ["abc"], ["class=nothing*"], [""]):  # does not fit the plan
-        request = json.dumps({"plan": file.digest, "only": only})
-        (study / "requests" / "0.json").write_text(request)
-        assert study_status(study).never_requested == 2
-        assert study_status(study, only=()).count("waiting") == 2
-    quick(file, study)
-    status = study_status(study)
-    assert (len(status.cells), status.never_requested) == (4, 0)
-    Ledger(study).write_plan(small_file(seeds=3, algorithms=("optimal", "constant")))
-    status = study_status(study)
-    assert (status.count("waiting"), status.never_requested) == (2, 0)
+    assert study_status(study).count("waiting") == 2
 
 
 def test_on_a_full_disk_it_stops_with_a_typed_error_and_loses_nothing(study, tmp_path):
@@ -318,39 +305,6 @@ def test_on_a_full_disk_it_stops_with_a_typed_error_and_loses_nothing(study, tmp
     assert {path: path.read_bytes() for path in (study / "cells").iterdir()} == before
     status, _ = quick(small, study)
     assert status.count("done") == 2
-
-
-class _WatchedOutput(io.StringIO):
-    """Output that calls a function when certain words are written."""
-
-    def __init__(self, words, then):
-        super().__init__()
-        self._words, self._then = words, then
-
-    def write(self, text):
-        if self._words in text:
-            self._then()
-        return super().write(text)
-
-
-def test_what_cannot_be_written_now_is_kept_until_there_is_room(study, notes):
-    file = small_file(seeds=3)
-    Ledger(study).write_plan(file)
-    in_the_way = study / "cells"
-    in_the_way.touch()
-
-    def make_room():
-        in_the_way.unlink()
-        (notes / cells.GATE).touch()
-
-    # Run 0 ends and cannot be written; run 1 runs until there is room again.
-    console = Console(
-        file=_WatchedOutput("No new cell starts until there is space", make_room), width=400
-    )
-    work = partial(cells.gated, notes, open_for=1)
-    status, _ = quick(file, study, executor="processes", jobs=2, run=work, console=console)
-    assert status.count("done") == 3
-    assert set(cells.starts(notes).values()) == {1}
 
 
 HELD = small_file(seeds=3).plan.cells[2].cell.digest
@@ -446,7 +400,7 @@ def test_a_result_of_another_cell_is_a_failure(study):
 @pytest.mark.parametrize(
     ("options", "error", "words"),
     [
-        ({"executor": "threads"}, UnknownNameError, "must be one of processes"),
+        ({"executor": "threads"}, UnknownNameError, "must be 'processes', 'in-process' or 'ray'"),
         ({"only": ["class"]}, OptionError, "class=GLOB"),
         ({"only": ["algorithm=constnat"]}, UnknownNameError, "Did you mean 'constant'"),
         ({"device": "cpu"}, OptionError, "^device=.*no cell to run has one. Leave it out, or"),
@@ -462,7 +416,8 @@ def test_bad_arguments_are_refused_and_nothing_is_written(options, error, words,
 def test_a_terminal_has_bars_and_anything_else_lines(study, monkeypatch):
     monkeypatch.setattr("sme_registry.io.terminal.Progress._line_is_due", lambda *_: True)
     _, output = quick(small_file(seeds=2), study)
-    assert "study small-v1: 1 of 2 cells · about" in output
+    assert "study small-v1: 1 of 2 cells · " in output
+    assert " · about " in output
     screen = io.StringIO()
     console = Console(file=screen, force_terminal=True, width=120)
     status, _ = quick(small_file(seeds=4), study, console=console, run=cells.modelled)
