@@ -17,6 +17,7 @@ from sme_registry.spec.catalogue import (
     STREAM,
     SYMMETRIC,
     as_document,
+    content_id,
     registered,
     released,
     resolve,
@@ -122,7 +123,6 @@ def env_spec(spec: SpecLike | StreamLike, **kwargs: Any) -> EnvSpec:
       10
     """
     from sme_registry.envs import SMEEnv, arguments
-    from sme_registry.envs.schedule import content_id
     from sme_registry.task import load
 
     document = load(spec)

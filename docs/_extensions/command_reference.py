@@ -24,7 +24,10 @@ _SPECIAL = re.compile(r"([\\*_\[\]<>|#$])")
 
 def page(program: str, module: str) -> str:
     """The commands of `module.app` as Markdown, with headings from the second level on."""
-    return "\n".join(_command(get_command(importlib.import_module(module).app), program, None, 1))
+    command: Any = get_command(importlib.import_module(module).app)
+    for name in command.modules:  # of which a group knows only a summary
+        command.load(name)
+    return "\n".join(_command(command, program, None, 1))
 
 
 def _command(command: Any, path: str, parent: Any, level: int) -> Iterator[str]:

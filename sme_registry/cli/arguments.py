@@ -1,4 +1,4 @@
-"""Arguments and output that several commands share."""
+"""Options and output that several commands share."""
 
 from __future__ import annotations
 
@@ -7,17 +7,14 @@ import functools
 import inspect
 import os
 import typing
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import typer
 from rich.markup import escape
 
-from sme_registry import explorer
-from sme_registry.diagnosis import load_run
-from sme_registry.envs.arguments import another_stream
+import sme_registry
 from sme_registry.errors import (
     MalformedDocumentError,
     OptionError,
@@ -25,39 +22,27 @@ from sme_registry.errors import (
     UnknownNameError,
     did_you_mean,
 )
-from sme_registry.io import (
-    check_new,
-    install_command,
-    integer_in,
-    is_installed,
-    parse_json,
-    read_json,
-)
+from sme_registry.io import check_new, install_command, is_installed, parse_json, read_json
 from sme_registry.io.markup import Table
 from sme_registry.io.terminal import out, print_json, print_line, print_note
 from sme_registry.spec import (
     EnvFile,
     ProtocolFile,
     SMESpec,
-    StreamClass,
     StreamFile,
     StreamSpec,
     StudyFile,
-    SuiteClass,
     SuiteFile,
     catalogue,
 )
 from sme_registry.spec.catalogue import Envelope, is_path, resolve
-from sme_registry.spec.document import Document
-from sme_registry.spec.study import sweep
-from sme_registry.task import load
 
 TaskName = Annotated[
     str,
     typer.Argument(
         metavar="TASK",
-        help="The task: a name, a path or a digest.",
-        autocompletion=catalogue.completion(EnvFile),
+        help="The task or stream: a name, a path or a digest.",
+        autocompletion=catalogue.completion(EnvFile, StreamFile),
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print plain JSON.")]
@@ -71,13 +56,6 @@ Protocol = Annotated[
     typer.Option(
         help="Evaluation protocol: a name from `sme list`, or a path.",
         autocompletion=catalogue.completion(ProtocolFile),
-    ),
-]
-DatasetsFolder = Annotated[
-    Path | None,
-    typer.Option(
-        "--datasets",
-        help="Folder of data sets; default MINARI_DATASETS_PATH, or ~/.minari/datasets.",
     ),
 ]
 NewFile = Annotated[Path, typer.Argument(help="The file to write.", dir_okay=False)]
@@ -99,6 +77,7 @@ KINDS: dict[str, type[Envelope]] = {
 }
 
 _File = TypeVar("_File", bound=Envelope)
+_Value = TypeVar("_Value")
 
 
 def kind_of(file: Envelope) -> str:
@@ -142,18 +121,23 @@ def find_any(name: str) -> Envelope | SMESpec | StreamSpec:
     return same[0] if len(same) == 1 else document
 
 
-def changes(pairs: list[str] | None) -> dict[str, Any]:
-    """The `field=value` pairs of `--set`; see `json_or_text` for values."""
-    fields: dict[str, Any] = {}
-    for pair in pairs or ():
-        name, equals, text = pair.partition("=")
-        name = name.strip().replace("-", "_")
-        if not equals or not name:
-            raise OptionError(f"--set {pair!r}: must be field=value, such as --set complexity=10.")
-        if name in fields:
-            raise OptionError(f"--set {pair!r}: {name} is set twice. Remove one.")
-        fields[name] = json_or_text(text.strip())
-    return fields
+def assignments(option: str, texts: Iterable[str] | None, example: str) -> dict[str, str]:
+    """What a repeatable option `NAME=VALUE` gives each name."""
+    values: dict[str, str] = {}
+    for text in texts or ():
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if not (name and equals and value):
+            raise OptionError(f"{option} {text!r}: must be NAME=VALUE, such as {example}.")
+        if name in values:
+            raise OptionError(f"{option} {text!r}: {name} is given twice. Remove one.")
+        values[name] = value
+    return values
+
+
+def changes(texts: list[str] | None) -> dict[str, Any]:
+    """The fields or hyperparameters of `--set`."""
+    values = assignments("--set", texts, "complexity=10")
+    return {name: json_or_text(value) for name, value in values.items()}
 
 
 def changed(
@@ -162,7 +146,7 @@ def changed(
     if isinstance(document, SMESpec):
         return document.derive(**fields)
     for field in fields:
-        advice = another_stream(field.partition(".")[0])
+        advice = sme_registry.envs.arguments.another_stream(field.partition(".")[0])
         raise OptionError(f"--set {field}: {name} is a stream. {advice}")
     return document
 
@@ -216,93 +200,6 @@ def with_options(options: type) -> Callable[[Callable[..., None]], Callable[...,
     return decorate
 
 
-@dataclass(frozen=True, kw_only=True)
-class ClassOptions:
-    suite: Annotated[
-        str | None,
-        typer.Option(
-            help="A suite of classes: name or path.", autocompletion=catalogue.completion(SuiteFile)
-        ),
-    ] = None
-    task: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--task",
-            "-t",
-            help="A task, or a stream, as a class of its own. Repeatable.",
-            autocompletion=catalogue.completion(EnvFile, StreamFile),
-        ),
-    ] = None
-    sweep: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="FIELD=VALUE,…",
-            help="Vary a field of the --task, such as k=1,2,5 or D=0,0.25: a "
-            "class for each value. Repeatable: each sweep is an axis of its own around the task, "
-            "not a cross product.",
-        ),
-    ] = None
-    instances: Annotated[
-        int,
-        typer.Option(
-            help="Draws of each --task: its seed and those that follow; of a stream, other tasks "
-            "for all of its phases."
-        ),
-    ] = 1
-
-    def members(self) -> dict[str, list[dict[str, Any]]]:
-        """The classes of a suite, one for each task or stream, or those of the sweeps."""
-        tasks = self.task or ()
-        if self.sweep and (self.suite is not None or len(tasks) != 1):
-            raise OptionError("--sweep: needs exactly one --task, and no --suite.")
-        if self.suite is None and not tasks:
-            raise OptionError("Give --suite or --task, such as --suite smoke or --task Default.")
-        instances = integer_in("instances", self.instances, 1, 10_000)
-        axes = sweep_axes(self.sweep or ())
-        classes: list[SuiteClass] = []
-        streams: list[StreamClass] = []
-        if self.suite is not None:
-            suite = find_file(SuiteFile, self.suite).suite
-            classes, streams = [*suite.classes], [*suite.streams]
-        for task in tasks:
-            document = load(task)
-            if isinstance(document, SMESpec):
-                classes += sweep(document, axes, name=_title(document), instances=instances)
-                continue
-            if axes:
-                raise OptionError(
-                    f"--sweep: varies a field of a task, and {task!r} is a stream. Make a stream "
-                    "for each value."
-                )
-            draws = tuple(range(instances))
-            streams.append(StreamClass(name=_title(document), stream=document, draws=draws))
-        kinds: dict[str, Sequence[Document]] = {"classes": classes, "streams": streams}
-        return {name: [each.to_dict() for each in some] for name, some in kinds.items() if some}
-
-
-def sweep_axes(texts: Iterable[str]) -> dict[str, list[Any]]:
-    """The axes of `FIELD=VALUE,…`: values are JSON, or else text, separated by commas."""
-    axes: dict[str, list[Any]] = {}
-    for text in texts:
-        field, equals, values = text.partition("=")
-        field = field.strip()
-        if not equals or not field or not values.strip():
-            raise OptionError(f"--sweep {text!r}: must be FIELD=VALUE,…, such as k=1,2,5,10.")
-        if field in axes:
-            raise OptionError(f"--sweep {text!r}: {field} is swept twice. Join their values.")
-        try:
-            axes[field] = parse_json(f"[{values}]")
-        except SMEError:
-            axes[field] = [json_or_text(value.strip()) for value in values.split(",")]
-    return axes
-
-
-def _title(document: SMESpec | StreamSpec) -> str:
-    """The name of a task's or a stream's class: its title, as a document's name."""
-    title = catalogue.title(document).rsplit("/", 1)[-1].removesuffix("-v1")
-    return title.replace(" (", "-").removesuffix(")")
-
-
 def only_with(context: typer.Context, names: Iterable[str], reason: str) -> None:
     """Check that none of these parameters is given, since they belong to something else."""
     parameters = {parameter.name: parameter for parameter in context.command.params}
@@ -322,16 +219,6 @@ def can_draw() -> bool:
     return False
 
 
-def write_run_explorer(folder: Path) -> list[Path]:
-    """Write the explorer of a run; where that cannot be, say so: the run is complete without."""
-    try:
-        path, report = folder / explorer.FILE, explorer.run_report(folder)
-        return [explorer.write_explorer(path, load_run(folder), report=report)]
-    except SMEError as error:
-        print_note(f"no explorer: {escape(str(error))}")
-        return []
-
-
 def print_training(
     result: Any, folder: Path, tables: Iterable[Table] = (), *, json: bool = False
 ) -> None:
@@ -342,6 +229,21 @@ def print_training(
         return
     print_tables([*tables, *result.report.tables()])
     print_line(f"All files are in {escape(str(folder))}{os.sep}")
+
+
+def print_checks(results: list[dict[str, Any]], what: str, *, json: bool) -> None:
+    """Print which of several things are valid, and why the others are not: exit code 2."""
+    if json:
+        print_json(results)
+    for result in results if not json else ():
+        about = " ".join(str(result[key]) for key in result if key not in ("valid", "error"))
+        verdict = "[green]valid[/]  " if result["valid"] else "[red]invalid[/]"
+        print_line(f"{verdict}  {escape(about if result['valid'] else result['error'])}")
+    invalid = sum(not result["valid"] for result in results)
+    if invalid:
+        raise OptionError(
+            f"{invalid} of {len(results)} {what} {'is' if invalid == 1 else 'are'} invalid."
+        )
 
 
 def print_tables(tables: Iterable[Table]) -> None:
@@ -356,5 +258,5 @@ def print_written(paths: Iterable[Path]) -> None:
         print_note(f"wrote {escape(str(path))}")
 
 
-def unique(values: Iterable[str]) -> list[str]:
+def unique(values: Iterable[_Value]) -> list[_Value]:
     return list(dict.fromkeys(values))

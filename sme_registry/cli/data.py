@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,7 +12,6 @@ from rich.markup import escape
 from sme_registry import SMESpec, load
 from sme_registry.cli.arguments import (
     ActionRange,
-    DatasetsFolder,
     Force,
     Json,
     Out,
@@ -21,6 +19,7 @@ from sme_registry.cli.arguments import (
     SpecChanges,
     TaskName,
     changes,
+    print_checks,
     print_training,
 )
 from sme_registry.datasets import (
@@ -40,7 +39,6 @@ from sme_registry.io.markup import Table
 from sme_registry.io.terminal import (
     Progress,
     err,
-    failure,
     out,
     print_json,
     print_line,
@@ -50,8 +48,7 @@ from sme_registry.io.terminal import (
 from sme_registry.spec import catalogue
 from sme_registry.task import materialize
 
-_DEFAULT = "MINARI_DATASETS_PATH, or ~/.minari/datasets"
-
+app = typer.Typer()
 dataset = typer.Typer(
     no_args_is_help=True,
     help="""Data sets for offline RL, of a chosen quality, with the exact regret of every step.
@@ -62,10 +59,13 @@ dataset = typer.Typer(
       sme dataset list
     """,
 )
+app.add_typer(dataset, name="dataset")
 
 Name = Annotated[
     str, typer.Argument(metavar="DATASET", help="The id of a data set, or its folder.")
 ]
+_FOLDER = "Folder of data sets; default MINARI_DATASETS_PATH, or ~/.minari/datasets."
+Folder = Annotated[Path | None, typer.Option("--datasets", help=_FOLDER)]
 
 
 @dataset.command("make")
@@ -96,10 +96,7 @@ def make(
     name: Annotated[
         str | None, typer.Option(help="Minari id, such as sme/mine-v0; default from the settings.")
     ] = None,
-    out_folder: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help=f"Folder of data sets to add to; default {_DEFAULT}."),
-    ] = None,
+    out_folder: Annotated[Path | None, typer.Option("--out", "-o", help=_FOLDER)] = None,
     set_: SpecChanges = None,
     force: Force = False,
     json: Json = False,
@@ -157,7 +154,7 @@ def _weighted(text: str) -> tuple[Any, float]:
 
 
 @dataset.command("list")
-def list_(folder: DatasetsFolder = None, json: Json = False) -> None:
+def list_(folder: Folder = None, json: Json = False) -> None:
     """List the data sets in a folder.
 
     Examples:
@@ -169,7 +166,22 @@ def list_(folder: DatasetsFolder = None, json: Json = False) -> None:
     if json:
         print_json([_summary(dataset) for dataset in datasets])
     elif datasets:
-        out().print(_datasets_table(datasets))
+        rows = [
+            {
+                "id": dataset.id,
+                "transitions": dataset.recipe.transitions,
+                "trajectories": dataset.record.trajectories,
+                "r̃": f"{dataset.record.scores.behaviour.similarity:.3f}",
+                "r̃ of ½": f"{dataset.record.scores.constant.similarity:.3f}",
+                "MB": f"{dataset.size_bytes / 1e6:.1f}",
+            }
+            for dataset in datasets
+        ]
+        caption = (
+            "r̃: similarity of the behaviour, and of the constant action ½, in the states of the "
+            "data set"
+        )
+        out().print(Table.of("Data sets", rows, caption=caption))
     else:
         print_note(
             f"There are no data sets in {escape(str(datasets_folder(folder)))}. "
@@ -180,7 +192,7 @@ def list_(folder: DatasetsFolder = None, json: Json = False) -> None:
 
 
 @dataset.command("show")
-def show(name: Name, folder: DatasetsFolder = None, json: Json = False) -> None:
+def show(name: Name, folder: Folder = None, json: Json = False) -> None:
     """Show a data set: its recipe, scores and digests.
 
     Examples:
@@ -194,7 +206,7 @@ def show(name: Name, folder: DatasetsFolder = None, json: Json = False) -> None:
 @dataset.command("validate")
 def validate(
     sets: Annotated[list[str], typer.Argument(metavar="DATASET…", help="Data sets to check.")],
-    folder: DatasetsFolder = None,
+    folder: Folder = None,
     json: Json = False,
 ) -> None:
     """Check data sets bit for bit: location, digests, and every transition recomputed by the task.
@@ -204,47 +216,18 @@ def validate(
       sme dataset validate sme/Default-v1-nu50-seed7-v0
       sme dataset validate data/sme/inner-v0
     """
-    results: list[dict[str, Any]] = []
-    for name in sets:
-        result: dict[str, Any] = {"set": name, "valid": True, "error": None}
-        try:
-            dataset = open_dataset(name, folder)
-            check_location(dataset, folder)
-            replay(dataset.transitions(), dataset.recipe, materialize(dataset.recipe.spec))
-            result["arrays_digest"] = dataset.record.arrays_digest
-        except SMEError as error:
-            result |= {"valid": False, "error": str(error)}
-            failure(str(error))
-        else:
-            if not json:
-                print_line(f"[green]valid[/] {escape(name)}")
-        results.append(result)
-    if json:
-        print_json(results)
-    if not all(result["valid"] for result in results):
-        raise typer.Exit(2)
+    print_checks([_check(name, folder) for name in sets], "data sets", json=json)
 
 
-def _datasets_table(datasets: Sequence[Dataset]) -> Table:
-    numbers = ("transitions", "trajectories", "r̃", "r̃ of ½", "MB")
-    rows = [
-        (
-            dataset.id,
-            f"{dataset.recipe.transitions:,}",
-            f"{dataset.record.trajectories:,}",
-            f"{dataset.record.scores.behaviour.similarity:.3f}",
-            f"{dataset.record.scores.constant.similarity:.3f}",
-            f"{dataset.size_bytes / 1e6:.1f}",
-        )
-        for dataset in datasets
-    ]
-    return Table(
-        "Data sets",
-        {"id": "text", **dict.fromkeys(numbers, "number")},
-        rows,
-        caption="r̃: similarity of the behaviour, and of the constant action ½, in the states of "
-        "the data set",
-    )
+def _check(name: str, folder: Path | None) -> dict[str, Any]:
+    result: dict[str, Any] = {"set": name, "valid": False, "error": None}
+    try:
+        dataset = open_dataset(name, folder)
+        check_location(dataset, folder)
+        replay(dataset.transitions(), dataset.recipe, materialize(dataset.recipe.spec))
+    except SMEError as error:
+        return result | {"error": str(error)}
+    return result | {"valid": True, "arrays_digest": dataset.record.arrays_digest}
 
 
 def _summary(dataset: Dataset) -> dict[str, Any]:
@@ -278,23 +261,21 @@ def _print(dataset: Dataset, json: bool) -> None:
             _score_row(f"  {behaviour.label}", score, f"{behaviour.weight:g}")
             for behaviour, score in zip(recipe.behaviours, scores.behaviours, strict=True)
         ]
-    scores_table = Table(
-        "Scores",
-        {"policy": "text", **dict.fromkeys(("weight", "r̃", "r", "return"), "number")},
-        [*rows, _score_row("optimum", scores.optimum)],
-        caption="similarity r̃ and step reward r in the states of the data set · return of whole "
-        "episodes, ± standard error",
+    rows.append(_score_row("optimum", scores.optimum))
+    caption = (
+        "similarity r̃ and step reward r in the states of the data set · return of whole episodes, "
+        "± standard error"
     )
-    out().print(scores_table)
+    out().print(Table.of("Scores", rows, caption=caption))
 
 
-def _score_row(policy: str, score: PolicyScore, weight: str = "") -> tuple[str, ...]:
+def _score_row(policy: str, score: PolicyScore, weight: str = "") -> dict[str, object]:
     rollouts = score.rollouts
     returns = "" if rollouts is None else f"{rollouts.mean_return:.2f}"
     if rollouts is not None and rollouts.episodes:
         returns += f" ± {rollouts.standard_error:.2f}"
-    numbers = f"{score.similarity:.4f}", f"{score.step_reward:.4f}"
-    return escape(policy), weight, *numbers, returns
+    similarity, reward = f"{score.similarity:.4f}", f"{score.step_reward:.4f}"
+    return {"policy": policy, "weight": weight, "r̃": similarity, "r": reward, "return": returns}
 
 
 Algorithm = Annotated[str, typer.Option("--algorithm", "-a", help="bc or iql.")]
@@ -305,6 +286,7 @@ Hyperparameters = Annotated[
     typer.Option("--set", metavar="NAME=VALUE", help="Change a hyperparameter. Repeatable."),
 ]
 offline = typer.Typer(no_args_is_help=True)
+app.add_typer(offline, name="offline")
 
 
 @offline.callback()
@@ -326,7 +308,7 @@ def train(
         str | None, typer.Option(help="Protocol of the last evaluation; default the data set's.")
     ] = None,
     set_: Hyperparameters = None,
-    folder: DatasetsFolder = None,
+    folder: Folder = None,
     out_folder: Out = None,
     force: Force = False,
     json: Json = False,
@@ -407,17 +389,14 @@ def sealed(
 
 
 def _scores(record: Any) -> Table:
-    behaviour, last = record.behaviour, record.evaluations[-1]
     algorithm = record.algorithm.upper()
+    means = {
+        f"behaviour, {record.transitions:,} transitions": record.behaviour,
+        f"{algorithm}, {record.episodes} episodes": record.evaluations[-1],
+    }
     rows = [
-        (name, f"{each.similarity:.3f}", f"{each.similarity_sd:.3f}")
-        for name, each in (
-            (f"behaviour, {record.transitions:,} transitions", behaviour),
-            (f"{algorithm}, {record.episodes} episodes", last),
-        )
+        {"": name, "r̃": f"{mean.similarity:.3f}", "SD over steps": f"{mean.similarity_sd:.3f}"}
+        for name, mean in means.items()
     ]
-    return Table(
-        f"{algorithm} on {escape(record.dataset)}",
-        {"": "text", "r̃": "number", "SD over steps": "number"},
-        [*rows, ("improvement", f"{record.improvement:+.3f}", "")],
-    )
+    rows.append({"": "improvement", "r̃": f"{record.improvement:+.3f}", "SD over steps": ""})
+    return Table.of(f"{algorithm} on {escape(record.dataset)}", rows)

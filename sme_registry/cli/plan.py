@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import typing
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,19 +11,19 @@ import typer
 from rich.markup import escape
 
 from sme_registry.cli.arguments import (
-    ClassOptions,
     Force,
     Json,
     NewFile,
     Protocol,
+    assignments,
+    changes,
     check_document_path,
     find_file,
-    json_or_text,
     only_with,
     unique,
     with_options,
 )
-from sme_registry.cli.show import number_of_cells, study_table, summary
+from sme_registry.cli.task import ClassOptions
 from sme_registry.errors import MissingDependencyError, OptionError, SMEError
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.io import read_json
@@ -59,9 +58,60 @@ from sme_registry.training.algorithms import (
     nested_hyperparameters,
 )
 
+_EVERY = "*"  # algorithm
+
 
 @dataclass(frozen=True, kw_only=True)
-class PlanOptions(ClassOptions):
+class Budgets:
+    """Options that make another plan of a plan: other budgets, other implementations."""
+
+    steps: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--steps",
+            "-n",
+            metavar="N|ALGORITHM=N",
+            help="Steps of each training, or of one algorithm's. Repeatable.",
+        ),
+    ] = None
+    seeds: Annotated[
+        int | None,
+        typer.Option(
+            help="Runs of each algorithm on each class. Default the plan's, of a new plan 10."
+        ),
+    ] = None
+    evaluations: Annotated[
+        int | None,
+        typer.Option(
+            help="Evaluations during each training. Default the plan's, of a new plan 100."
+        ),
+    ] = None
+    agents: Annotated[
+        str | None,
+        typer.Option(
+            metavar="sb3|jax",
+            help="Implementation of PPO, TD3 and SAC: of Stable-Baselines3, or in JAX, with the "
+            "environment in one program. Default as in the plan.",
+        ),
+    ] = None
+
+    def scaled(self, file: StudyFile) -> StudyFile:
+        texts = [text if "=" in text else f"{_EVERY}={text}" for text in self.steps or ()]
+        steps: dict[str, int] = {}
+        for name, number in assignments("--steps", texts, "PPO=100000").items():
+            if not number.replace("_", "").isdecimal():
+                raise OptionError(
+                    f"--steps {number!r}: must be N or ALGORITHM=N, such as --steps PPO=100000."
+                )
+            steps[name] = int(number)
+        every = steps.pop(_EVERY, None)
+        counts = {"seeds": self.seeds, "evaluations": self.evaluations}
+        file = scaled(file, steps=every, steps_of=steps, **counts)
+        return file if self.agents is None else with_agents(file, self.agents)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanOptions(Budgets, ClassOptions):
     algorithm: Annotated[
         list[str] | None,
         typer.Option(
@@ -72,12 +122,6 @@ class PlanOptions(ClassOptions):
             "train:mine:train, reference:linear, offline:bc, … Repeatable.",
         ),
     ] = None
-    steps: Annotated[
-        list[str] | None,
-        typer.Option("--steps", "-n", metavar="N|ALGORITHM=N", help="Of each run. Repeatable."),
-    ] = None
-    seeds: Annotated[int, typer.Option(help="Runs of each algorithm on each class.")] = 10
-    evaluations: Annotated[int, typer.Option(help="Evaluations during each training.")] = 100
     evaluation_episodes: Annotated[int, typer.Option(help="Episodes of each evaluation.")] = 5
     action_range: Annotated[
         list[str] | None,
@@ -91,7 +135,6 @@ class PlanOptions(ClassOptions):
             help="A hyperparameter of an algorithm, such as slow.n_steps=64. Repeatable.",
         ),
     ] = None
-    agents: Agents = None
     protocol: Protocol = "paper-v1"
 
     def plan(self, source: str) -> StudyPlan:
@@ -99,14 +142,12 @@ class PlanOptions(ClassOptions):
         fields = {
             **self.members(),
             "algorithms": self._algorithms(),
-            "seeds": self.seeds,
-            "evaluations": self.evaluations,
+            "evaluations": 100,
             "evaluation_episodes": self.evaluation_episodes,
             "protocol": resolve_protocol(self.protocol).to_dict(),
         }
         plan = StudyPlan.from_dict(fields, source)
-        draft = StudyFile(name="draft", digest=plan.digest, plan=plan)
-        return Budgets(steps=self.steps).scaled(draft, self.agents).plan
+        return self.scaled(StudyFile(name="draft", digest=plan.digest, plan=plan)).plan
 
     def _algorithms(self) -> list[dict[str, Any]]:
         """Each `[NAME=]USES` with each action range."""
@@ -117,7 +158,7 @@ class PlanOptions(ClassOptions):
         for text in self.algorithm:
             name, equals, uses = text.partition("=")
             uses_of.append((name, uses) if equals else (_short_name(text), text))
-        settings = _hyperparameters(self.set_ or (), [name for name, _ in uses_of])
+        settings = _hyperparameters(self.set_, [name for name, _ in uses_of])
         return [
             {
                 "name": f"{name} ({action_range})" if len(ranges) > 1 else name,
@@ -140,68 +181,28 @@ def _short_name(uses: str) -> str:
 
 
 def _hyperparameters(
-    pairs: typing.Iterable[str], algorithms: Sequence[str]
+    texts: list[str] | None, algorithms: Sequence[str]
 ) -> dict[str, dict[str, Any]]:
     """The hyperparameters of each algorithm, from `ALGORITHM.NAME=VALUE`; flat, by dotted names."""
     values: dict[str, dict[str, Any]] = {}
-    for pair in pairs:
-        path, equals, text = pair.partition("=")
+    for path, value in changes(texts).items():
         owners = [name for name in algorithms if path.startswith(f"{name}.")]
-        if not equals or not owners:
+        if not owners:
             raise OptionError(
-                f"--set {pair!r}: must be ALGORITHM.NAME=VALUE with an algorithm of the plan "
+                f"--set {path!r}: must be ALGORITHM.NAME=VALUE with an algorithm of the plan "
                 f"({', '.join(algorithms)}), such as {algorithms[0]}.learning_rate=0.001."
             )
         owner = max(owners, key=len)
-        name = path.removeprefix(f"{owner}.").strip()
-        if name in values.setdefault(owner, {}):
-            raise OptionError(f"--set {pair!r}: {path} is set twice. Remove one.")
-        values[owner][name] = json_or_text(text.strip())
+        values.setdefault(owner, {})[path.removeprefix(f"{owner}.")] = value
     return values
 
 
-@dataclass(frozen=True, kw_only=True)
-class Budgets:
-    """Options of a command that change a plan's budgets; other budgets are another plan."""
-
-    steps: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--steps",
-            "-n",
-            metavar="N|ALGORITHM=N",
-            help="Steps of each training, or of one algorithm's. Repeatable.",
-        ),
-    ] = None
-    seeds: Annotated[int | None, typer.Option(help="Runs of each algorithm on each class.")] = None
-    evaluations: Annotated[int | None, typer.Option(help="Evaluations during each training.")] = (
-        None
-    )
-
-    def scaled(self, file: StudyFile, agents: str | None = None) -> StudyFile:
-        """The plan with these budgets, and with other implementations of its algorithms."""
-        budgets: dict[str, int] = {}
-        for text in self.steps or ():
-            name, _, number = text.rpartition("=")
-            if not number.replace("_", "").isdigit():
-                raise OptionError(
-                    f"--steps {text!r}: must be N or ALGORITHM=N, such as --steps PPO=100000."
-                )
-            if name in budgets:
-                raise OptionError(f"--steps {text!r}: {name or 'N'} is given twice. Remove one.")
-            budgets[name] = int(number)
-        every = budgets.pop("", None)
-        counts = {"seeds": self.seeds, "evaluations": self.evaluations}
-        file = scaled(file, steps=every, steps_of=budgets, **counts)
-        return file if agents is None else with_agents(file, agents)
-
-
-Agents = Annotated[
-    str | None,
-    typer.Option(
-        metavar="sb3|jax",
-        help="Implementation of PPO, TD3 and SAC: of Stable-Baselines3, or in JAX, with the "
-        "environment in one program. Default as in the plan.",
+PlanName = Annotated[
+    str,
+    typer.Argument(
+        metavar="PLAN",
+        help="A name from `sme list --kind study`, or a path.",
+        autocompletion=catalogue.completion(StudyFile),
     ),
 ]
 Only = Annotated[
@@ -220,14 +221,7 @@ Jobs = Annotated[
 @with_options(Budgets)
 def plan(
     options: Budgets,
-    plan: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="PLAN",
-            help="A name or a path; without it, list the catalogue.",
-            autocompletion=catalogue.completion(StudyFile),
-        ),
-    ] = None,
+    plan: PlanName,
     folder: Annotated[
         Path | None,
         typer.Option("--folder", "-f", help="Use and count the results in this study's folder."),
@@ -236,7 +230,6 @@ def plan(
         int | None, typer.Option(min=1, help="Also estimate for a cluster with this many cores.")
     ] = None,
     jobs: Jobs = None,
-    agents: Agents = None,
     only: Only = None,
     json: Json = False,
 ) -> None:
@@ -247,15 +240,11 @@ def plan(
 
     Examples:
 
-      sme study plan
       sme study plan paper-ablations --cores 64
       sme study plan paper-ablations --steps 20000 --seeds 3 --only algorithm=PPO --only "class=k-*"
       sme study plan smoke --folder runs/smoke --json
     """
-    if plan is None:
-        _list_plans(json)
-        return
-    file = with_sources(options.scaled(find_file(StudyFile, plan), agents))
+    file = with_sources(options.scaled(find_file(StudyFile, plan)))
     planned = selected(file.plan.cells, only or ())
     cells = {cell.cell.digest: cell.cell for cell in planned}
     results = {} if folder is None else Ledger(folder).results()
@@ -306,41 +295,27 @@ def plan(
         )
 
 
-def _list_plans(json: bool) -> None:
-    files = catalogue.entries(StudyFile)
-    if json:
-        print_json([{**summary(file), "cells": number_of_cells(file.plan)} for file in files])
-    else:
-        out().print(study_table(files))
-
-
 def _plan_table(file: StudyFile, planned: Sequence[PlannedCell], seconds: Any) -> Table:
-    classes = unique(cell.class_name for cell in planned)
-    numbers = ("classes", "runs each", "steps", "evaluations", "cells", "time per run")
     rows = []
     for name in unique(cell.algorithm for cell in planned):
         places = [place for place in planned if place.algorithm == name]
-        cells = {place.cell.digest: place for place in places}.values()
-        first = places[0].cell
-        steps = [each.cell.steps for each in cells]
-        times = [seconds(each.cell) for each in cells]
-        rows.append(
-            (
-                escape(name),
-                str(len({each.class_name for each in places})),
-                str(len({each.run for each in places})),
-                " to ".join(f"{bound:,}" for bound in sorted({min(steps), max(steps)})),
-                f"{first.evaluations:,} × {first.evaluation_episodes}",
-                f"{len(cells):,}",
-                duration_range(min(times), max(times)),
-            )
-        )
-    return Table(
-        f"[bold]{file.versioned_name}[/]  {escape(file.description)}",
-        {"algorithm": "name", **dict.fromkeys(numbers, "number")},
-        rows,
-        caption=f"{file.digest}\n{len(classes)} classes: {escape(', '.join(classes))}",
-    )
+        cells = [*{place.cell.digest: place.cell for place in places}.values()]
+        steps = sorted({cell.steps for cell in cells})
+        times = [seconds(cell) for cell in cells]
+        row = {
+            "algorithm": name,
+            "classes": len({place.class_name for place in places}),
+            "runs each": len({place.run for place in places}),
+            "steps": " to ".join(f"{bound:,}" for bound in unique([steps[0], steps[-1]])),
+            "evaluations": f"{cells[0].evaluations:,} × {cells[0].evaluation_episodes}",
+            "cells": len(cells),
+            "time per run": duration_range(min(times), max(times)),
+        }
+        rows.append(row)
+    classes = unique(cell.class_name for cell in planned)
+    caption = f"{file.digest}\n{len(classes)} classes: {escape(', '.join(classes))}"
+    title = f"[bold]{file.versioned_name}[/]  {escape(file.description)}"
+    return Table.of(title, rows, caption=caption)
 
 
 def check_algorithms(algorithms: Iterable[StudyAlgorithm], errors: type[SMEError]) -> None:

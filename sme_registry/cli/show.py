@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
 from pydantic import BaseModel
 from rich.markup import escape
 
+import sme_registry
 from sme_registry.cli.arguments import KINDS, Json, find_any, kind_of, print_tables
-from sme_registry.envs.schedule import content_id
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.io.markup import Table
 from sme_registry.io.terminal import out, print_json, print_line, print_pairs
@@ -20,22 +20,25 @@ from sme_registry.spec import (
     EnvFile,
     ProtocolFile,
     SMESpec,
+    StreamClass,
     StreamFile,
     StreamSpec,
     StudyFile,
     StudyPlan,
     Suite,
+    SuiteClass,
     SuiteFile,
     cards,
     catalogue,
 )
 from sme_registry.spec.catalogue import Envelope, known
 from sme_registry.spec.suite import EvaluationProtocol
-from sme_registry.task.loading import parameter_bytes
 
+app = typer.Typer()
 Kind = enum.StrEnum("Kind", ["env", "stream", "suite", "protocol", "study"])
 
 
+@app.command("list")
 def list_(
     kind: Annotated[Kind | None, typer.Option("--kind", "-k", help="Only this kind.")] = None,
     tag: Annotated[
@@ -53,25 +56,20 @@ def list_(
       sme list --json | jq '.[].id'
     """
     tags = set(tag or ())
-    files = {
-        name: [file for file in catalogue.entries(model) if tags <= set(file.tags)]
-        for name, model in KINDS.items()
-        if kind in (None, name)
+    catalogued = {
+        name: catalogue.entries(model) for name, model in KINDS.items() if kind in (None, name)
     }
+    groups = [[file for file in files if tags <= set(file.tags)] for files in catalogued.values()]
     if json:
-        print_json([summary(file) for group in files.values() for file in group])
-        return
-    if not any(files.values()):
-        known = sorted(
-            {tag for model in KINDS.values() for f in catalogue.entries(model) for tag in f.tags}
-        )
+        print_json([summary(file) for group in groups for file in group])
+    elif any(groups):
+        print_tables(catalogue_table(group) for group in groups if group)
+    else:
+        used = sorted({tag for files in catalogued.values() for file in files for tag in file.tags})
         raise UnknownNameError(
             f"--tag {' --tag '.join(sorted(tags))}: nothing in the catalogue has "
-            f"{'this tag' if len(tags) == 1 else 'all of these tags'}. Tags: {', '.join(known)}."
+            f"{'this tag' if len(tags) == 1 else 'all of these tags'}. Tags: {', '.join(used)}."
         )
-    for name, group in files.items():
-        if group:
-            out().print(_TABLES[name](group))
 
 
 def summary(file: Envelope) -> dict[str, Any]:
@@ -90,62 +88,52 @@ def summary(file: Envelope) -> dict[str, Any]:
     return entry
 
 
-def _env_table(files: list[EnvFile]) -> Table:
-    numbers = ("n", "S", "A", "L", "k", "r_min", "D", "T")
-    rows = []
-    for file in files:
-        spec = file.spec
-        values = (
-            len(spec.agents), spec.state_dim, spec.action_dim,
-            spec.complexity, spec.k, spec.r_min, spec.D, spec.horizon,
-        )  # fmt: skip
-        name = f"{catalogue.NAMESPACE}/{file.versioned_name}"
-        rows.append((name, *(f"{value:g}" for value in values), " ".join(file.tags)))
-    return Table(
+_TITLES: dict[type[Envelope], tuple[str, str]] = {
+    EnvFile: (
         "Environments",
-        {"id": "name", **dict.fromkeys(numbers, "number"), "tags": "text"},
-        rows,
-        caption="n agents · S state channels, A action channels · L layers of π* · k reward "
-        "interval · T horizon · actions are in [0, 1]; in [−1, 1] by SME/DefaultSymmetric-v1, …",
-    )
+        "n agents · S state channels, A action channels · L layers of π* · k reward interval · "
+        "T horizon · actions are in [0, 1]; in [−1, 1] by SME/DefaultSymmetric-v1, …",
+    ),
+    StreamFile: ("Streams", ""),
+    SuiteFile: ("Suites", ""),
+    ProtocolFile: ("Protocols", ""),
+    StudyFile: ("Studies", ""),
+}
 
 
-def _stream_table(files: list[StreamFile]) -> Table:
-    columns = {"name": "name", "phases": "number", "cycles": "number", "steps": "number"}
-    columns |= {"description": "text"}
-    streams = [file.stream for file in files]
-    counts = ((len(stream.phases), stream.cycles, stream.steps) for stream in streams)
-    return Table("Streams", columns, _rows(files, counts))
+def catalogue_table(files: Sequence[Envelope]) -> Table:
+    """Files of one kind."""
+    title, caption = _TITLES[type(files[0])]
+    return Table.of(title, [_row(file) for file in files], caption=caption)
 
 
-def _suite_table(files: list[SuiteFile]) -> Table:
-    columns = {"name": "name", "classes": "number", "tasks": "number", "streams": "number"}
-    columns |= {"description": "text"}
-    suites = [file.suite for file in files]
-    counts = ((len(each.runs), len(each.instances), len(each.stream_instances)) for each in suites)
-    return Table("Suites", columns, _rows(files, counts))
-
-
-def _protocol_table(files: list[ProtocolFile]) -> Table:
-    columns = {"name": "name", "regions": "number", "states each": "number", "description": "text"}
-    counts = ((len(file.protocol.edges), file.protocol.states_per_region) for file in files)
-    return Table("Protocols", columns, _rows(files, counts))
-
-
-def study_table(files: list[StudyFile]) -> Table:
-    """The plans of studies: how many classes, algorithms, seeds and cells."""
-    columns = {"name": "name", "classes": "number", "algorithms": "text"}
-    columns |= {"seeds": "number", "cells": "number", "description": "text"}
-    counts = (
-        (
-            len(file.plan.classes) + len(file.plan.streams),
-            escape(", ".join(algorithm.name for algorithm in file.plan.algorithms)),
-            file.plan.seeds,
-            number_of_cells(file.plan),
-        )
-        for file in files
-    )
-    return Table("Studies", columns, _rows(files, counts))
+def _row(file: Envelope) -> dict[str, object]:
+    if isinstance(file, EnvFile):
+        spec = file.spec
+        sizes = {"n": len(spec.agents), "S": spec.state_dim, "A": spec.action_dim}
+        fields = {"L": spec.complexity, "k": spec.k, "r_min": spec.r_min, "D": spec.D}
+        about = {"T": spec.horizon, "tags": " ".join(file.tags)}
+        return {"id": f"{catalogue.NAMESPACE}/{file.versioned_name}", **sizes, **fields, **about}
+    counts: dict[str, object] = {}
+    if isinstance(file, StreamFile):
+        stream = file.stream
+        counts = {"phases": len(stream.phases), "cycles": stream.cycles, "steps": stream.steps}
+    elif isinstance(file, SuiteFile):
+        suite = file.suite
+        counts = {"classes": len(suite.runs), "tasks": len(suite.instances)}
+        counts["streams"] = len(suite.stream_instances)
+    elif isinstance(file, ProtocolFile):
+        protocol = file.protocol
+        counts = {"regions": len(protocol.edges), "states each": protocol.states_per_region}
+    elif isinstance(file, StudyFile):
+        plan = file.plan
+        counts = {
+            "classes": len(plan.classes) + len(plan.streams),
+            "algorithms": ", ".join(algorithm.name for algorithm in plan.algorithms),
+            "seeds": plan.seeds,
+            "cells": number_of_cells(plan),
+        }
+    return {"name": file.versioned_name, **counts, "description": file.description}
 
 
 def number_of_cells(plan: StudyPlan) -> int:
@@ -155,41 +143,21 @@ def number_of_cells(plan: StudyPlan) -> int:
     return len(plan.classes) * len(plan.algorithms) * plan.seeds
 
 
-def _rows(
-    files: Sequence[Envelope], values: Iterable[tuple[int | str, ...]]
-) -> Iterator[tuple[str, ...]]:
-    for file, row in zip(files, values, strict=True):
-        texts = (f"{value:,}" if isinstance(value, int) else value for value in row)
-        yield file.versioned_name, *texts, escape(file.description)
-
-
-_TABLES: dict[str, Any] = {
-    "env": _env_table,
-    "stream": _stream_table,
-    "suite": _suite_table,
-    "protocol": _protocol_table,
-    "study": study_table,
-}
-
-
 Schema = enum.StrEnum(
     "Schema",
     "spec env-file stream stream-file suite suite-file protocol protocol-file study study-file",
 )
 _SCHEMAS: dict[str, type[BaseModel]] = {
     "spec": SMESpec,
-    "env-file": EnvFile,
     "stream": StreamSpec,
-    "stream-file": StreamFile,
     "suite": Suite,
-    "suite-file": SuiteFile,
     "protocol": EvaluationProtocol,
-    "protocol-file": ProtocolFile,
     "study": StudyPlan,
-    "study-file": StudyFile,
+    **{f"{kind}-file": model for kind, model in KINDS.items()},
 }
 
 
+@app.command()
 def show(
     name: Annotated[
         str | None,
@@ -235,21 +203,19 @@ def show(
             raise OptionError("--digests: applies to suites, and not with --json. Leave one out.")
         tasks = document.suite.documents
         print_line("\n".join(each.digest for each in tasks))
-    else:
-        _show_document(name, document, json)
-
-
-def _show_document(name: str, document: Envelope | SMESpec | StreamSpec, json: bool) -> None:
-    if isinstance(document, SMESpec | EnvFile):
-        _show_task(document, json)
-    elif isinstance(document, SuiteFile):
-        _show_suite(document, json)
-    elif isinstance(document, StreamSpec) and json:
-        print_json({"stream": document.to_dict(), "digest": document.digest})
     elif json:
-        print_json(document.to_dict())
+        print_json(_data(document))
+    else:
+        _show_document(name, document)
+
+
+def _show_document(name: str, document: Envelope | SMESpec | StreamSpec) -> None:
+    if isinstance(document, SMESpec | EnvFile):
+        _show_task(document)
+    elif isinstance(document, SuiteFile):
+        _show_suite(document)
     elif isinstance(document, StudyFile):
-        out().print(study_table([document]))
+        out().print(catalogue_table([document]))
         out().print(f"{document.digest}\nTo see its runs and times: sme study plan {escape(name)}")
     elif isinstance(document, StreamSpec | StreamFile):
         _show_stream(document)
@@ -258,34 +224,47 @@ def _show_document(name: str, document: Envelope | SMESpec | StreamSpec, json: b
         print_pairs(_title(document), fields)
 
 
-def _show_task(document: SMESpec | EnvFile, json: bool) -> None:
+def _data(document: Envelope | SMESpec | StreamSpec) -> dict[str, Any]:
+    """A document as JSON, with what follows from it."""
+    if isinstance(document, StreamSpec):
+        return {"stream": document.to_dict(), "digest": document.digest}
+    if isinstance(document, SuiteFile):
+        places = zip(document.suite.places, document.suite.documents, strict=True)
+        instances = [
+            {"class": name, kind: number, "digest": instance.digest}
+            for (name, kind, number), instance in places
+        ]
+        return {**document.to_dict(), "derived": {"instances": instances}}
+    if not isinstance(document, SMESpec | EnvFile):
+        return document.to_dict()
     spec = document if isinstance(document, SMESpec) else document.spec
-    facts = _facts(spec)
+    head = {} if isinstance(document, SMESpec) else summary(document)
     agents = cards.agents(spec)
-    if json:
-        head = {} if isinstance(document, SMESpec) else summary(document)
-        derived = facts | ({"agents": agents} if agents else {})
-        print_json({**head, "spec": spec.to_dict(), "digest": spec.digest, "derived": derived})
-        return
+    derived = _facts(spec) | ({"agents": agents} if agents else {})
+    return {**head, "spec": spec.to_dict(), "digest": spec.digest, "derived": derived}
+
+
+def _show_task(document: SMESpec | EnvFile) -> None:
+    spec = document if isinstance(document, SMESpec) else document.spec
     title = spec.content_name if isinstance(document, SMESpec) else _title(document)
     print_pairs(title, cards.field_values(spec))
-    if agents:
+    if agents := cards.agents(spec):
         out().print()
         out().print(cards.agents_table(agents))
     out().print()
-    print_pairs("Derived", {"digest": spec.digest, **facts})
+    print_pairs("Derived", {"digest": spec.digest, **_facts(spec)})
 
 
 def _facts(spec: SMESpec) -> dict[str, Any]:
     """What follows from a spec without drawing its task."""
-    env_id = _env_id(spec)
+    env_id, size = _env_id(spec), sme_registry.task.loading.parameter_bytes(spec)
     symmetric = spec.team is None and "/sha256-" not in env_id
     facts: dict[str, Any] = {
         "id": env_id,
         **({"symmetric_id": catalogue.symmetric_name(env_id)} if symmetric else {}),
         **_spaces(spec),
-        "parameters": parameter_bytes(spec) // 8,
-        "parameter_memory_bytes": parameter_bytes(spec),
+        "parameters": size // 8,
+        "parameter_memory_bytes": size,
         "largest_return": spec.horizon,  # of each agent in a team
         "payouts_in_a_full_episode": math.ceil(spec.horizon / spec.k),
         "largest_payout": min(spec.k, spec.horizon),
@@ -299,7 +278,9 @@ def _facts(spec: SMESpec) -> dict[str, Any]:
 
 def _env_id(spec: SMESpec) -> str:
     name = catalogue.unique_name(spec)
-    return content_id(spec) if name == spec.content_name else f"{catalogue.NAMESPACE}/{name}"
+    return (
+        catalogue.content_id(spec) if name == spec.content_name else f"{catalogue.NAMESPACE}/{name}"
+    )
 
 
 def _spaces(spec: SMESpec) -> dict[str, str]:
@@ -327,20 +308,31 @@ def _show_stream(document: StreamSpec | StreamFile) -> None:
     print_pairs("Stream", cards.stream_facts(stream))
 
 
-def _show_suite(file: SuiteFile, json: bool) -> None:
-    if json:
-        places = zip(file.suite.places, file.suite.documents, strict=True)
-        instances = [
-            {"class": name, kind: number, "digest": document.digest}
-            for (name, kind, number), document in places
-        ]
-        print_json({**file.to_dict(), "derived": {"instances": instances}})
-        return
+def _show_suite(file: SuiteFile) -> None:
     suite = file.suite
-    tables = [make(suite) for make in (_tasks_table, _streams_table)]
-    shown = [table for table in tables if table.rows]
-    shown[0].title, shown[-1].caption = _title(file), file.digest
-    print_tables(shown)
+    tasks = [
+        {
+            "class": member.name,
+            "differs from the default in": cards.in_words(cards.changed_fields(member.setting)),
+            "seed": "\n".join(map(str, member.seeds)),
+            "task": _short_digests(member),
+        }
+        for member in suite.classes
+    ]
+    streams = [
+        {
+            "class": member.name,
+            "phases": len(member.stream.phases),
+            "cycles": member.stream.cycles,
+            "steps": member.stream.steps,
+            "draw": "\n".join(map(str, member.draws)),
+            "stream": _short_digests(member),
+        }
+        for member in suite.streams
+    ]
+    tables = [Table.of("", records) for records in (tasks, streams) if records]
+    tables[0].title, tables[-1].caption = _title(file), file.digest
+    print_tables(tables)
     digests = [each.digest for each in suite.documents]
     kind = "task" if suite.classes else "stream"
     if known(SMESpec).keys() | known(StreamSpec).keys() >= set(digests):
@@ -349,34 +341,8 @@ def _show_suite(file: SuiteFile, json: bool) -> None:
         out().print(f"To train on these {kind}s: sme study new plan.json -a PPO --suite FILE")
 
 
-def _tasks_table(suite: Suite) -> Table:
-    columns = {"class": "name", "differs from the default in": "text", "seed": "number"}
-    rows = [
-        (
-            member.name,
-            escape(cards.in_words(cards.changed_fields(member.setting))),
-            "\n".join(str(seed) for seed in member.seeds),
-            "\n".join(spec.digest[: cards.SHORT] for spec in member.instances),
-        )
-        for member in suite.classes
-    ]
-    return Table("", {**columns, "task": "name"}, rows)
-
-
-def _streams_table(suite: Suite) -> Table:
-    numbers = dict.fromkeys(("phases", "cycles", "steps", "draw"), "number")
-    rows = [
-        (
-            member.name,
-            str(len(member.stream.phases)),
-            str(member.stream.cycles),
-            f"{member.stream.steps:,}",
-            "\n".join(str(number) for number in member.draws),
-            "\n".join(stream.digest[: cards.SHORT] for stream in member.instances),
-        )
-        for member in suite.streams
-    ]
-    return Table("", {"class": "name", **numbers, "stream": "name"}, rows)
+def _short_digests(member: SuiteClass | StreamClass) -> str:
+    return "\n".join(instance.digest[: cards.SHORT] for instance in member.instances)
 
 
 def _title(file: Envelope) -> str:

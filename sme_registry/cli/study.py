@@ -5,22 +5,16 @@ from __future__ import annotations
 import enum
 import re
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.markup import escape
 
+from sme_registry import studies
 from sme_registry.cli.arguments import Json, Out, find_file, unique, with_options
-from sme_registry.cli.plan import (
-    Agents,
-    Budgets,
-    Jobs,
-    Only,
-    PlanOptions,
-    new,
-    plan,
-)
+from sme_registry.cli.plan import Budgets, Jobs, Only, PlanName, PlanOptions, new, plan
 from sme_registry.errors import OptionError
 from sme_registry.io.markup import Table
 from sme_registry.io.system import available_cores
@@ -32,9 +26,10 @@ from sme_registry.io.terminal import (
     print_line,
     print_note,
 )
-from sme_registry.spec import StudyFile, catalogue
+from sme_registry.spec import StudyFile
 from sme_registry.studies.engine.executors import EXECUTORS
 from sme_registry.studies.engine.ledger import (
+    PLAN,
     STATES,
     CellStatus,
     Ledger,
@@ -53,7 +48,7 @@ NewFolder = Annotated[
     Path, typer.Option("--folder", "-f", help="The study's folder; created if necessary.")
 ]
 
-app = typer.Typer(
+study = typer.Typer(
     no_args_is_help=True,
     help="""Studies: algorithms × classes of tasks × seeds, resumable, on a laptop or a cluster.
 
@@ -71,14 +66,7 @@ app = typer.Typer(
 
 @with_options(Budgets)
 def run(
-    plan: Annotated[
-        str,
-        typer.Argument(
-            metavar="PLAN",
-            help="A name from `sme study plan`, or a path.",
-            autocompletion=catalogue.completion(StudyFile),
-        ),
-    ],
+    plan: PlanName,
     folder: NewFolder,
     options: Budgets,
     executor: Annotated[
@@ -95,7 +83,6 @@ def run(
     keep_models: Annotated[
         bool, typer.Option("--keep-models", help="Keep the models trained now, in FOLDER/models.")
     ] = False,
-    agents: Agents = None,
     device: Annotated[
         str | None,
         typer.Option(
@@ -134,7 +121,7 @@ def run(
     if ray is not None and executor not in (None, "ray"):
         raise OptionError(f"--ray {ray}: contradicts --executor {executor}. Leave one out.")
     status = run_study(
-        options.scaled(find_file(StudyFile, plan), agents),
+        options.scaled(find_file(StudyFile, plan)),
         folder,
         executor=executor or ("processes" if ray is None else "ray"),
         jobs=jobs,
@@ -147,10 +134,16 @@ def run(
         console=err(),
     )
     print_status(status, json)
+    check_complete(status)
+
+
+def check_complete(status: StudyStatus) -> None:
+    """End with exit code 1 if cells failed."""
     if status.failed:
+        again = f"sme study run {status.folder / PLAN} --folder {status.folder} --retry"
         print_note(
-            f"[bold red]{len(status.failed)} of {len(status.cells)} cells failed.[/] Add --retry "
-            "to run them again."
+            f"[bold red]{len(status.failed)} of {len(status.cells)} cells failed.[/] "
+            f"To run them again: {escape(again)}"
         )
         raise typer.Exit(1)
 
@@ -172,7 +165,6 @@ def status(
       sme study status runs/smoke
       sme study status runs/all --only "class=k-*" --json
     """
-
     print_status(study_status(folder, only or (), options.scaled), json)
 
 
@@ -206,10 +198,15 @@ def report(
       sme study report runs/all --out paper/study --format pdf,latex
       sme study report runs/smoke --explorers
     """
-    from sme_registry.studies import write_report
-
     chosen = [name.strip() for name in formats.split(",") if name.strip()]
-    files = write_report(folder, out_folder, tuple(dict.fromkeys(chosen)), explorers=explorers)
+    files = studies.write_report(
+        folder, out_folder, tuple(dict.fromkeys(chosen)), explorers=explorers
+    )
+    _print_report(files)
+
+
+def _print_report(files: Sequence[Path]) -> None:
+    """The page, and how many files are in each folder beside it."""
     for path in files:
         if path.name == "index.html":
             print_line(escape(str(path)))
@@ -222,16 +219,14 @@ def print_status(status: StudyStatus, json: bool) -> None:
     if json:
         print_json(status.to_dict())
         return
-    algorithms = unique(cell.planned.algorithm for cell in status.places)
-    title = f"[bold]{status.file.versioned_name}[/] in {escape(str(status.folder))}"
-    columns = {"class": "name", **{escape(name): "number" for name in algorithms}}
     counts = status.counts
-    rows = (
-        (class_name, *(_counts(counts.get((class_name, name))) for name in algorithms))
-        for class_name in unique(cell.planned.class_name for cell in status.places)
-    )
-    out().print(Table(title, columns, rows))
-    out().print("done · [cyan]+ running[/] · [red]! failed[/] · [dim]/ all[/]")
+    algorithms = unique(algorithm for _, algorithm in counts)
+    rows = [
+        {"class": name, **{each: _counts(counts.get((name, each))) for each in algorithms}}
+        for name in unique(class_name for class_name, _ in counts)
+    ]
+    title = f"[bold]{status.file.versioned_name}[/] in {escape(str(status.folder))}"
+    out().print(Table.of(title, rows, caption="done · + running · ! failed · / all"))
     parts = [f"{status.count(state):,} {state}" for state in STATES if status.count(state)]
     out().print(f"{len(status.cells):,} cells: {', '.join(parts)}")
     if status.seconds_left > 0:
@@ -262,12 +257,8 @@ def _counts(counts: Counter[State] | None) -> str:
     """`7 +2 !1 / 10`: done, running, failed, all; empty without cells."""
     if counts is None:
         return ""
-    text = f"{counts['done']}"
-    if counts["running"]:
-        text += f" [cyan]+{counts['running']}[/]"
-    if counts["failed"]:
-        text += f" [red]!{counts['failed']}[/]"
-    return f"{text} [dim]/ {counts.total()}[/]"
+    others = {"+": counts["running"], "!": counts["failed"], "/ ": counts.total()}
+    return " ".join([str(counts["done"]), *(f"{sign}{n}" for sign, n in others.items() if n)])
 
 
 def compare(
@@ -318,9 +309,7 @@ def compare(
         print_json(records(differences))
         return
     for each in write.comparison_tables(differences):
-        columns = {escape(name): "number" for name in each.frame.columns} | {"class": "name"}
-        rows = (tuple(map(escape, row)) for row in each.frame.itertuples(index=False))
-        out().print(Table(f"[bold]{escape(each.title)}[/]", columns, rows))
+        out().print(Table.of(f"[bold]{escape(each.title)}[/]", each.frame.to_dict("records")))
     caveats = write.implementation_caveats(folder, first, second)
     for sentence in (*difference_caveats(differences), *caveats):
         print_line(escape(sentence))
@@ -346,24 +335,17 @@ def sweep(
       sme study sweep -t Team4 --sweep team.reward=individual,team -a PPO --seeds 3 -f runs/reward
       sme study sweep -t Default --sweep k=1,5 --sweep D=0,0.25 -a PPO -a reference:linear -f runs/2
     """
-    from sme_registry.studies import write_report
-
     if not options.sweep:
         raise OptionError("--sweep: is required, such as --sweep k=1,2,5,10.")
     plan = options.plan("the options")
     name = re.sub(r"[^A-Za-z0-9_-]+", "-", folder.resolve().name)[:64] or "sweep"
     file = StudyFile(name=name, digest=plan.digest, plan=plan)
     status = run_study(file, folder, jobs=jobs, console=err())
-    for path in write_report(folder):
-        if path.name == "index.html" or path.stem.startswith(
-            ("regret-", "wd-regret", "ood-regret")
-        ):
-            print_line(escape(str(path)))
-    if status.failed:
-        failed = f"{len(status.failed)} of {len(status.cells)} cells failed"
-        err().print(f"[bold red]{failed}.[/] See `sme study status {escape(str(folder))}`.")
-        raise typer.Exit(1)
+    _print_report(studies.write_report(folder))
+    check_complete(status)
 
 
+app = typer.Typer()
+app.add_typer(study, name="study")
 for _command in (new, plan, sweep, compare, run, status, report):
-    app.command()(_command)
+    study.command()(_command)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,25 +14,28 @@ from rich.markup import escape
 
 from sme_registry import save
 from sme_registry.cli.arguments import (
-    ClassOptions,
     Force,
     Json,
     NewFile,
+    assignments,
     check_document_path,
     find_any,
+    find_file,
     json_or_text,
     kind_of,
+    print_checks,
     read_any,
     with_options,
 )
 from sme_registry.errors import OptionError, SMEError, UnknownNameError
-from sme_registry.io import integer_in, read_json
+from sme_registry.io import integer_in, parse_json
 from sme_registry.io.markup import plural
-from sme_registry.io.terminal import CommandGroup, err, out, print_json, print_line, print_note
+from sme_registry.io.terminal import CommandGroup, out, print_json, print_line, print_note
 from sme_registry.spec import (
     EnvFile,
     ProtocolFile,
     SMESpec,
+    StreamClass,
     StreamFile,
     StreamSpec,
     StudyFile,
@@ -38,13 +43,15 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
+from sme_registry.spec.document import Document
+from sme_registry.spec.study import sweep
 from sme_registry.task import load
 from sme_registry.task.certificate import MARKS, Certificate, short
 from sme_registry.task.certificate import certify as certify_task
 from sme_registry.task.loading import materialize_segments
 
-_MOST_AGENTS = 2**12  # the spec allows far fewer; a list of billions would fill the memory
-_NO_OPTION = ("schema_version", "team")
+app = typer.Typer()
+
 _METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", type(None): "JSON"}
 _FORMS = {  # what a value looks like, where the field's description does not say it
     "policy_init": "'semi_orthogonal' or 'unit_variance'; ",
@@ -52,6 +59,8 @@ _FORMS = {  # what a value looks like, where the field's description does not sa
     "observation": '\'{"distractors": 32, "dynamics": "driven", "mixing": "nonlinear", '
     '"mixing_depth": 1}\', where dynamics is noise, autonomous or driven, and mixing none, '
     "orthogonal or nonlinear; ",
+    "team": '\'{"agents": [{"action_dim": 2, "observes": [0, 1]}, {"action_dim": 2}], "reward": '
+    '"team"}\', where reward is individual or team; ',
     "seed": "an integer, or hexadecimal 0x… for a sealed task; ",
 }
 
@@ -73,38 +82,21 @@ FieldOptions = dataclasses.make_dataclass(
     [
         _field_option(name, field)
         for name, field in SMESpec.model_fields.items()
-        if name not in _NO_OPTION
+        if name != "schema_version"
     ],
     frozen=True,
     kw_only=True,
 )
-"""An option for each field of a spec that has a single value."""
+"""An option for each field of a spec."""
 
 
+@app.command()
 @with_options(FieldOptions)
 def new(
     path: NewFile,
     options: Any,
-    team: Annotated[
-        str | None,
-        typer.Option(
-            metavar="JSON|FILE",
-            help='Agents of a team, as a .json file or as JSON: \'{"agents": [{"action_dim": 2, '
-            '"observes": [0, 1]}, {"action_dim": 2}]}\'.',
-        ),
-    ] = None,
     agents: Annotated[
-        int | None, typer.Option(help="A team of this many equal agents that observe all.")
-    ] = None,
-    channels_each: Annotated[
-        int | None,
-        typer.Option(help="Action channels of each of --agents; by default an equal share."),
-    ] = None,
-    team_reward: Annotated[
-        str | None,
-        typer.Option(
-            help="individual, or team: each agent is rewarded for its own or for all channels."
-        ),
+        int | None, typer.Option(help="A team of this many equal agents, which observe all.")
     ] = None,
     base: Annotated[
         str | None,
@@ -131,57 +123,113 @@ def new(
       sme new sparse.json --from HardDeep --k 25 --description "Paid every 25 steps."
       sme new safe.json --safety '{"tightness": 0.2}' --policy-init unit_variance
       sme new sealed.json --seed 0x9f86d081884c7d659a2feaa0c55ad015
-      sme new team.json --agents 4 --channels-each 2 --team-reward team
+      sme new team.json --agents 4 --action-dim 8
     """
     check_document_path(path, force=force)
     texts = dataclasses.asdict(options)
     fields = {name: json_or_text(text) for name, text in texts.items() if text is not None}
     start = SMESpec() if base is None else load(base, SMESpec)
-    if team is not None and agents is not None:
-        raise OptionError("--agents: --team already lists the agents. Give one or the other.")
-    if channels_each is not None and agents is None:
-        raise OptionError(f"--channels-each {channels_each}: needs --agents. Add it.")
-    if team is not None:
-        fields["team"] = read_json(team) if team.endswith(".json") else json_or_text(team)
-    elif agents is not None:
-        fields |= _equal_team(start, fields.get("action_dim"), agents, channels_each)
-    if team_reward is not None:
-        fields["team"] = _with_reward(start, fields.get("team"), team_reward)
+    if agents is not None:
+        if "team" in fields:
+            raise OptionError("--agents: --team already lists the agents. Give one or the other.")
+        alone = start.derive(**{**fields, "team": None})
+        fields["team"] = _equal_team(alone.action_dim, agents)
     spec = start.derive(**fields)
     save(spec, path, name, description=description, tags=tuple(tag or ()))
     print_line(f"{escape(str(path))}  {spec.digest}")
     print_note(f"[dim]To check the draw: sme certify {escape(str(path))}[/]")
 
 
-def _equal_team(
-    start: SMESpec, action_dim: Any, agents: int, channels_each: int | None
-) -> dict[str, Any]:
-    integer_in("--agents", agents, 1)
-    if channels_each is None:
-        A = start.action_dim if action_dim is None else action_dim
-        channels_each, remainder = divmod(A, agents) if isinstance(A, int) else (0, 0)
-        if remainder or not channels_each:
-            raise OptionError(
-                f"--agents {agents}: action_dim={A} cannot be shared equally. Give "
-                "--channels-each, or --team for unequal agents."
-            )
-    total = agents * channels_each
-    if action_dim not in (None, total):
+def _equal_team(action_dim: int, agents: int) -> dict[str, Any]:
+    integer_in("--agents", agents, 1, 1024)
+    channels, remainder = divmod(action_dim, agents)
+    if remainder or not channels:
         raise OptionError(
-            f"--agents {agents} --channels-each {channels_each}: give {total} action channels, "
-            f"but --action-dim is {action_dim}. Leave it out."
+            f"--agents {agents}: action_dim={action_dim} cannot be shared equally. Change "
+            "--action-dim, or use --team for unequal agents."
         )
-    members = [{"action_dim": channels_each}] * min(agents, _MOST_AGENTS)
-    return {"team": {"agents": members}, "action_dim": total}
+    return {"agents": [{"action_dim": channels}] * agents}
 
 
-def _with_reward(start: SMESpec, team: Any, reward: str) -> dict[str, Any]:
-    """The team, by default of the task to start from, with another reward."""
-    if team is None and start.team is not None:
-        team = start.team.to_dict()
-    if not isinstance(team, dict):
-        raise OptionError(f"--team-reward {reward}: needs a team. Add --agents or --team.")
-    return {**team, "reward": reward}
+@dataclass(frozen=True, kw_only=True)
+class ClassOptions:
+    suite: Annotated[
+        str | None,
+        typer.Option(
+            help="A suite of classes: name or path.", autocompletion=catalogue.completion(SuiteFile)
+        ),
+    ] = None
+    task: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--task",
+            "-t",
+            help="A task, or a stream, as a class of its own. Repeatable.",
+            autocompletion=catalogue.completion(EnvFile, StreamFile),
+        ),
+    ] = None
+    sweep: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FIELD=VALUE,…",
+            help="Vary a field of the --task, such as k=1,2,5 or D=0,0.25: a "
+            "class for each value. Repeatable: each sweep is an axis of its own around the task, "
+            "not a cross product.",
+        ),
+    ] = None
+    instances: Annotated[
+        int,
+        typer.Option(
+            help="Draws of each --task: its seed and those that follow; of a stream, other tasks "
+            "for all of its phases.",
+        ),
+    ] = 1
+
+    def members(self) -> dict[str, list[dict[str, Any]]]:
+        """The classes of a suite, one for each task or stream, or those of the sweeps."""
+        instances = integer_in("instances", self.instances, 1, 10_000)
+        documents = [load(task) for task in self.task or ()]
+        axes = sweep_axes(self.sweep)
+        if axes and (self.suite is not None or len(documents) != 1):
+            raise OptionError("--sweep: needs exactly one --task, and no --suite.")
+        if self.suite is None and not documents:
+            raise OptionError("Give --suite or --task, such as --suite smoke or --task Default.")
+        classes: list[Document] = []
+        streams: list[Document] = []
+        if self.suite is not None:
+            suite = find_file(SuiteFile, self.suite).suite
+            classes, streams = [*suite.classes], [*suite.streams]
+        for document in documents:
+            name = _class_name(document)
+            if isinstance(document, SMESpec):
+                classes += sweep(document, axes, name=name, instances=instances)
+            elif axes:
+                raise OptionError(
+                    f"--sweep: varies a field of a task, and {name!r} is a stream. Make a stream "
+                    "for each value."
+                )
+            else:
+                draws = tuple(range(instances))
+                streams.append(StreamClass(name=name, stream=document, draws=draws))
+        kinds = {"classes": classes, "streams": streams}
+        return {name: [each.to_dict() for each in some] for name, some in kinds.items() if some}
+
+
+def sweep_axes(texts: Iterable[str] | None) -> dict[str, list[Any]]:
+    """The axes of `FIELD=VALUE,…`: values are JSON, or else text, separated by commas."""
+    axes: dict[str, list[Any]] = {}
+    for field, values in assignments("--sweep", texts, "k=1,2,5,10").items():
+        try:
+            axes[field] = parse_json(f"[{values}]")
+        except SMEError:
+            axes[field] = [json_or_text(value.strip()) for value in values.split(",")]
+    return axes
+
+
+def _class_name(document: SMESpec | StreamSpec) -> str:
+    """The title of a task or a stream as a document's name."""
+    title = catalogue.title(document).rsplit("/", 1)[-1].removesuffix("-v1")
+    return title.replace(" (", "-").removesuffix(")")
 
 
 class _NewByDefault(CommandGroup):
@@ -204,6 +252,7 @@ suite = typer.Typer(
       sme suite new more.json --suite smoke -t Complexity50
     """,
 )
+app.add_typer(suite, name="suite")
 
 
 @suite.command("new")
@@ -241,6 +290,7 @@ def new_suite(
     print_note(f"[dim]{escape(hint)}[/]")
 
 
+@app.command()
 def validate(
     paths: Annotated[list[Path], typer.Argument(help="Files, or folders of .json files.")],
     json: Json = False,
@@ -256,21 +306,7 @@ def validate(
       sme validate specs/envs specs/suites
     """
     results = [_check(file) for path in paths for file in _files(path)]
-    if json:
-        print_json(results)
-    else:
-        for result in results:
-            if result["valid"]:
-                name = f"{result['kind']:8}  {escape(result['path'])}"
-                line = f"[green]valid[/]    {name}  {result['digest']}"
-            else:
-                line = f"[red]invalid[/]  {escape(result['error'])}"
-            print_line(line)
-    invalid = sum(not result["valid"] for result in results)
-    if invalid:
-        raise OptionError(
-            f"{invalid} of {len(results)} files {'is' if invalid == 1 else 'are'} invalid."
-        )
+    print_checks(results, "files", json=json)
 
 
 def _files(path: Path) -> list[Path]:
@@ -293,13 +329,13 @@ def _check(path: Path) -> dict[str, Any]:
             _ = file.suite.documents
         elif isinstance(file, StudyFile):
             _ = file.plan.cells
-        result["valid"] = True
     except SMEError as error:
         text = str(error)
-        result["error"] = text if str(path) in text else f"{path}: {text}"
-    return result
+        return result | {"error": text if str(path) in text else f"{path}: {text}"}
+    return result | {"valid": True}
 
 
+@app.command()
 def certify(
     tasks: Annotated[
         list[str],
@@ -326,16 +362,19 @@ def certify(
     specs = [entry for name in tasks for entry in _tasks(name)]
     certificates: list[tuple[str, Certificate]] = []
     for label, spec in specs:
-        certificates.append((label, certify_task(spec, seed=seed)))
-        if not json and len(specs) > 1:
-            _print_outcome(*certificates[-1])
+        certificate = certify_task(spec, seed=seed)
+        certificates.append((label, certificate))
+        if json:
+            continue
+        if len(specs) == 1:
+            out().print(certificate.table(f"Certificate of {escape(label)}"))
+        notable = [*certificate.of("refused"), *certificate.of("warning")]
+        reasons = ", ".join(f"{check.name} {short(check.value)}".rstrip() for check in notable)
+        print_line(f"{MARKS[certificate.outcome]}  {escape(label)}  [dim]{reasons}[/]")
     if json:
-        print_json(
-            [{"task": label, **certificate.to_dict()} for label, certificate in certificates]
-        )
-    elif len(specs) == 1:
-        _print_certificate(*certificates[0])
+        print_json([{"task": label, **each.to_dict()} for label, each in certificates])
     if not all(certificate.passed for _, certificate in certificates):
+        print_note("Of a refused task, use another seed, or change a field.")
         raise typer.Exit(1)
 
 
@@ -362,25 +401,3 @@ def _phases(label: str, document: SMESpec | StreamSpec) -> list[tuple[str, SMESp
     if isinstance(document, SMESpec):
         return [(label, document)]
     return [(f"{label} phase {index}", spec) for index, spec in enumerate(document.specs)]
-
-
-def _print_outcome(label: str, certificate: Certificate) -> None:
-    notable = [*certificate.of("refused"), *certificate.of("warning")]
-    reasons = ", ".join(f"{check.name} {short(check.value)}".rstrip() for check in notable)
-    print_line(f"{MARKS[certificate.outcome]}  {escape(label)}  [dim]{reasons}[/]")
-
-
-def _print_certificate(label: str, certificate: Certificate) -> None:
-    out().print(certificate.table(f"Certificate of {escape(label)}"))
-    out().print()
-    for check in certificate.checks:
-        out().print(f"[bold]{check.name}[/]: {escape(check.meaning)}")
-    out().print()
-    refused = certificate.of("refused")
-    if refused:
-        reasons = ", ".join(check.name for check in refused)
-        err().print(f"[red]refused[/] for {reasons}. Use another seed, or change a field.")
-    elif certificate.outcome == "warning":
-        err().print("[yellow]valid, with warnings[/]: see above.")
-    else:
-        err().print("[green]passed[/]")

@@ -10,7 +10,7 @@ import numpy as np
 import typer
 from rich.markup import escape
 
-from sme_registry import training
+from sme_registry import explorer, training
 from sme_registry.cli.arguments import (
     Force,
     Json,
@@ -21,16 +21,16 @@ from sme_registry.cli.arguments import (
     find_file,
     only_with,
     print_training,
+    print_written,
     with_options,
-    write_run_explorer,
 )
 from sme_registry.cli.plan import Jobs, warn_of_uneven_rollouts
-from sme_registry.cli.study import print_status
-from sme_registry.errors import OptionError
-from sme_registry.evaluation import EvaluationReport, resolve_protocol
-from sme_registry.io import integer_in, write_atomically
-from sme_registry.io.markup import Table, environment
-from sme_registry.io.terminal import err, out, print_line, print_note
+from sme_registry.cli.study import check_complete, print_status
+from sme_registry.diagnosis import load_run
+from sme_registry.errors import OptionError, SMEError
+from sme_registry.evaluation import resolve_protocol
+from sme_registry.io.markup import Table
+from sme_registry.io.terminal import err, print_note
 from sme_registry.spec import (
     EnvFile,
     SMESpec,
@@ -47,10 +47,12 @@ from sme_registry.studies.engine.runner import run_study
 from sme_registry.task import load
 from sme_registry.training import algorithms
 from sme_registry.training.record import CHECKPOINT
-from sme_registry.training.run import DEFAULT_STEPS, REPORT
+from sme_registry.training.run import DEFAULT_STEPS
 
 RUNS = 10
 """Runs on each class by default: those that a leaderboard requires for a rank."""
+
+app = typer.Typer()
 
 _EVALUATIONS = 10  # of a run, for the learning curves of `sme study report`
 _OF_A_TASK = ("task", "seed", "num_envs", "checkpoint_every", "resume", "force")
@@ -133,6 +135,7 @@ class Settings:
         return self.out_folder or Path("runs") / f"{label}-{name}{suffix}"
 
 
+@app.command()
 @with_options(Settings)
 def train(
     context: typer.Context,
@@ -157,7 +160,7 @@ def train(
         int | None,
         typer.Option(
             help="With --suite: runs on each class, in turn on its instances. Default 10, or more "
-            "for equally many on each instance."
+            "for equally many on each instance.",
         ),
     ] = None,
     jobs: Jobs = None,
@@ -223,30 +226,56 @@ def train(
     uses = options.uses(document)
     algorithms.check_hyperparameters(uses, settings, others=SMESpec.model_fields)
     folder = options.folder(_label(task, document, changed=bool(overrides)), uses, f"-seed{seed}")
-    try:
-        result = training.train(
-            document,
-            algorithm=uses,
-            steps=options.steps,
-            seed=seed,
-            folder=folder,
-            hyperparameters=settings,
-            independent=options.independent,
-            action_range=options.action_range,  # type: ignore[arg-type]  # checked there
-            num_envs=num_envs,
-            checkpoint_every=checkpoint_every,
-            protocol=options.protocol,
-            console=err(),
-            resume=resume,
-            force=force,
-            agents=options.agents,  # type: ignore[arg-type]
-            device=options.device,
-        )
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(_how_to_continue(folder)) from None
+    result = _train(
+        document,
+        folder,
+        "the same command with --resume",
+        algorithm=uses,
+        steps=options.steps,
+        seed=seed,
+        hyperparameters=settings,
+        independent=options.independent,
+        action_range=options.action_range,
+        num_envs=num_envs,
+        checkpoint_every=checkpoint_every,
+        protocol=options.protocol,
+        resume=resume,
+        force=force,
+        agents=options.agents,
+        device=options.device,
+    )
     if result.record.stream is None:
-        write_run_explorer(folder)
+        _write_explorer(folder)
     print_training(result, folder, json=json)
+
+
+def _train(
+    document: SMESpec | StreamSpec, folder: Path, continued_by: str, **settings: Any
+) -> training.TrainingResult:
+    """Train; an interrupt says that `continued_by` continues the run, if anything was written."""
+    try:
+        return training.train(document, folder=folder, console=err(), **settings)
+    except KeyboardInterrupt:
+        if training.RunRecord.read(folder) is None:
+            message = "interrupted before the training began: nothing was written."
+        else:
+            has_checkpoint = (folder / CHECKPOINT).exists()
+            saved = "up to its last checkpoint" if has_checkpoint else "without a checkpoint"
+            message = (
+                f"interrupted: the run is in {folder}, {saved}. Run {continued_by} to continue, or "
+                "with --force to start again."
+            )
+        raise KeyboardInterrupt(message) from None
+
+
+def _write_explorer(folder: Path) -> list[Path]:
+    """Write the explorer of a run; where that cannot be, say so: the run is complete without."""
+    try:
+        path, report = folder / explorer.FILE, explorer.run_report(folder)
+        return [explorer.write_explorer(path, load_run(folder), report=report)]
+    except SMEError as error:
+        print_note(f"no explorer: {escape(str(error))}")
+        return []
 
 
 def _label(task: str, document: SMESpec | StreamSpec, *, changed: bool) -> str:
@@ -254,18 +283,6 @@ def _label(task: str, document: SMESpec | StreamSpec, *, changed: bool) -> str:
     if changed or task.startswith("sha256"):
         return document.content_name
     return Path(task).name.removesuffix(".json").removesuffix("-v1")
-
-
-def _how_to_continue(folder: Path, command: str = "the same command with --resume") -> str:
-    """The message after an interrupted training in a folder, which `command` continues."""
-    if training.RunRecord.read(folder) is None:
-        return "interrupted before the training began: nothing was written."
-    has_checkpoint = (folder / CHECKPOINT).exists()
-    saved = "up to its last checkpoint" if has_checkpoint else "without a checkpoint"
-    return (
-        f"interrupted: the run is in {folder}, {saved}. Run {command} to continue, or with --force "
-        "to start again."
-    )
 
 
 def _train_suite(
@@ -297,29 +314,23 @@ def _train_suite(
         "hyperparameters": settings,
         "action_range": options.action_range,
     }
-    plan = StudyPlan.from_dict(
-        {
-            **{
-                kind: some
-                for kind, some in suite.to_dict().items()
-                if kind in ("classes", "streams") and some
-            },
-            "algorithms": [algorithm],
-            "seeds": equal_runs(suite) if seeds is None else integer_in("seeds", seeds, 1),
-            "steps": DEFAULT_STEPS if options.steps is None else options.steps,
-            "evaluations": _EVALUATIONS,
-            "protocol": resolve_protocol(options.protocol).to_dict(),
-        },
-        "options",
-    )
+    members = {name: some for name, some in suite.to_dict().items() if some}
+    fields = {name: members[name] for name in ("classes", "streams") if name in members}
+    fields |= {
+        "algorithms": [algorithm],
+        "seeds": equal_runs(suite) if seeds is None else seeds,
+        "steps": DEFAULT_STEPS if options.steps is None else options.steps,
+        "evaluations": _EVALUATIONS,
+        "protocol": resolve_protocol(options.protocol).to_dict(),
+    }
+    plan = StudyPlan.from_dict(fields, "options")
     warn_of_uneven_rollouts(plan)
     study = StudyFile(name=file.name, digest=plan.digest, plan=plan)
     status = run_study(
         study, folder, jobs=jobs, keep_models=True, device=options.device, console=err()
     )
     print_status(status, json)
-    if status.failed:
-        raise typer.Exit(1)
+    check_complete(status)
     if not json:
         print_note(f"[dim]{escape(_next_step(name, suite, plan, folder))}[/]")
 
@@ -338,14 +349,13 @@ def equal_runs(suite: Suite) -> int:
     return max(-(-RUNS // instances) * instances for instances in suite.runs.values())
 
 
-DEMO_TASK = "Default-v1"
 DEMO_FOLDER = Path("runs/demo")
-_STAGES = 10
 # Networks of 64² units and batches of 128 learn this task in a third of the time of TD3's defaults.
 _STEPS, _SETTINGS = 6_000, {"batch_size": 128, "policy_kwargs": {"net_arch": [64, 64]}}
 _FULL_STEPS = 15_000
 
 
+@app.command()
 def demo(
     out_folder: Annotated[Path, typer.Option("--out", "-o", help="Output folder.")] = DEMO_FOLDER,
     steps: Annotated[
@@ -364,7 +374,7 @@ def demo(
     """Train TD3 on SME/Default-v1, show its regret falling, evaluate it in and out of distribution.
 
     Takes less than a minute on one core, with networks of two layers of 64 units. --full takes a
-    few minutes. Writes figures, report.md and explorer.html, and lists them.
+    few minutes. Writes figures and explorer.html, and lists them.
 
     Examples:
 
@@ -373,67 +383,29 @@ def demo(
     """
     if steps is None:
         steps = _FULL_STEPS if full else _STEPS
-    settings = {} if full else _SETTINGS
-    err().print(
-        f"Training TD3 on SME/{DEMO_TASK} for {steps:,} steps. The optimal action of every state "
+    print_note(
+        f"Training TD3 on SME/Default-v1 for {steps:,} steps. The optimal action of every state "
         "is known, so the regret below is exact."
     )
-    try:
-        result = training.train(
-            DEMO_TASK,
-            steps=steps,
-            folder=out_folder,
-            hyperparameters=settings,
-            console=err(),
-            force=force or out_folder == DEMO_FOLDER,
-        )
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(
-            _how_to_continue(
-                out_folder, f"`sme train {DEMO_TASK} --steps {steps} --out {out_folder} --resume`"
-            )
-        ) from None
-    stages = regret_by_stage(result)
-    out().print(_stages_table(stages))
-    out().print(result.report.table())
-    explorer = write_run_explorer(out_folder)
-    report = write_atomically(out_folder / REPORT, _report(result, stages, explorer))
-    assert isinstance(result.report, EvaluationReport)  # of a task, not of a stream
-    within = result.report.regions[0]
-    out().print(
-        f"\nWithin distribution: r̃ = {within.similarity:.3f}, normalised regret "
-        f"{within.normalised_regret:.3f} (0 is optimal, 1 the constant policy)."
+    result = _train(
+        load("Default-v1"),
+        out_folder,
+        f"`sme train Default-v1 --steps {steps} --out {out_folder} --resume`",
+        steps=steps,
+        hyperparameters={} if full else _SETTINGS,
+        force=force or out_folder == DEMO_FOLDER,
     )
-    log = out_folder / "episodes.csv"
-    for path in (report, *explorer, *result.figures, result.model_path, log):
-        print_line(f"  {escape(str(path))}")
+    files = [*result.figures, *_write_explorer(out_folder)]
+    print_training(result, out_folder, [_regret_of_tenths(result)])
+    print_written(files)
 
 
-def regret_by_stage(result: training.TrainingResult) -> list[tuple[int, int, float]]:
-    """`(first step, last step, mean regret)` of each tenth of training in which episodes ended."""
-    edges = np.linspace(0, result.record.steps_done, _STAGES + 1).astype(int)
-    stages = []
-    for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        regrets = [e.regret for e in result.episodes if first < e.step <= last]
-        if regrets:
-            stages.append((first, last, float(np.mean(regrets))))
-    return stages
-
-
-def _stages_table(stages: list[tuple[int, int, float]]) -> Table:
-    columns = {"steps": "number", "regret": "number", "": "name"}
+def _regret_of_tenths(result: training.TrainingResult) -> Table:
+    """The mean regret of each tenth of the episodes."""
+    episodes = np.array([(episode.step, episode.regret) for episode in result.episodes])
     rows = [
-        (f"{first:,}–{last:,}", f"{regret:.3f}", "█" * round(30 * regret))
-        for first, last, regret in stages
+        {"up to step": int(steps[-1]), "regret": f"{regrets.mean():.3f}"}
+        | {"": "█" * round(30 * regrets.mean())}
+        for steps, regrets in (tenth.T for tenth in np.array_split(episodes, 10) if len(tenth))
     ]
-    return Table("Mean regret during training (0 is optimal)", columns, rows)
-
-
-def _report(
-    result: training.TrainingResult, stages: list[tuple[int, int, float]], explorer: list[Path]
-) -> str:
-    templates = environment(Path(__file__).parent / "templates", autoescape=False)
-    text = templates.get_template("demo.md.jinja").render(
-        task=DEMO_TASK, result=result, stages=stages, explorer=[path.name for path in explorer]
-    )
-    return f"{text}\n"
+    return Table.of("Mean regret during training (0 is optimal)", rows)

@@ -31,7 +31,7 @@ from sme_registry.compiled.arrays import (
 )
 from sme_registry.envs import arguments
 from sme_registry.spec import SMESpec, StreamSpec
-from sme_registry.spec.catalogue import DYNAMICS_VERSION, NAMESPACE, Resolved, resolve
+from sme_registry.spec.catalogue import DYNAMICS_VERSION, NAMESPACE, Resolved, content_id, resolve
 from sme_registry.spec.sme_spec import SpecLike
 from sme_registry.spec.stream import StreamLike
 from sme_registry.task import Task
@@ -184,11 +184,6 @@ class GymnasiumMixin(ScheduleMixin):
         if not isinstance(self.document, StreamSpec):
             raise AttributeError(f"stream: {self!r} runs a task. Its spec is sme_spec.")
         return self.document
-
-
-def content_id(document: SMESpec | StreamSpec) -> str:
-    """`SME/sha256-<first 12 hex of the digest>-v1`."""
-    return f"{NAMESPACE}/{document.content_name}-v{DYNAMICS_VERSION}"
 
 
 def renamed_by_content(env_spec: EnvSpec | None, document: SMESpec | StreamSpec) -> EnvSpec | None:

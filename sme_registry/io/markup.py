@@ -14,7 +14,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rich import box
+from rich import box, markup
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.padding import Padding
@@ -63,7 +63,7 @@ class Table:
         self,
         title: str,
         columns: Mapping[str, str],
-        rows: Iterable[Sequence[str]] = (),
+        rows: Iterable[Iterable[str]] = (),
         *,
         caption: str = "",
     ) -> None:
@@ -73,6 +73,16 @@ class Table:
         """None separates sections."""
         for row in rows:
             self.add_row(*row)
+
+    @classmethod
+    def of(cls, title: str, records: Sequence[Mapping[str, object]], *, caption: str = "") -> Table:
+        """A table with a row for each record; their keys are the headings, the first is a name."""
+        rows = [tuple(map(_cell, record.values())) for record in records]
+        columns: dict[str, str] = {}
+        for heading, cells in zip(next(iter(records), {}), zip(*rows, strict=True), strict=True):
+            text = "text" if columns else "name"
+            columns[heading] = "number" if all(map(_starts_as_number, cells)) else text
+        return cls(title, columns, [map(markup.escape, row) for row in rows], caption=caption)
 
     def add_row(self, *cells: str, style: str | None = None) -> None:
         """Add a row; missing cells are empty."""
@@ -159,6 +169,16 @@ class Table:
                 cells = zip(line, widths, self.columns, strict=True)
                 padded = (_padded(text, width, column.kind) for text, width, column in cells)
                 yield "  ".join(padded).rstrip()
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, int) and not isinstance(value, bool):
+        return f"{value:,}"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _starts_as_number(cell: str) -> bool:
+    return not cell or cell.lstrip("+-−")[:1].isdecimal()
 
 
 def _width(text: str) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import inspect
 import io
 import json
@@ -10,9 +11,10 @@ import os
 import re
 import sys
 import time
+from collections.abc import Mapping
 from importlib import metadata
 from types import TracebackType
-from typing import Annotated, Any, Self, TextIO
+from typing import Annotated, Any, ClassVar, Self, TextIO
 
 import typer
 from rich.cells import cell_len
@@ -22,7 +24,8 @@ from rich.progress import BarColumn, TaskID, TextColumn
 from rich.progress import Progress as Bars
 from rich.table import Table
 from rich.text import Text
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_group
 
 from sme_registry.errors import SMEError
 from sme_registry.io.files import to_json
@@ -290,14 +293,33 @@ def _rate(rate: float, unit: str) -> str:
 
 
 class CommandGroup(TyperGroup):
-    """Commands that report invalid input as one line on standard error and an exit code."""
+    """Commands that report invalid input as one line on standard error and an exit code.
+
+    A command of `modules` is in the `app` of its module, which is imported when it is called; the
+    help shows its summary.
+    """
 
     exit_codes: tuple[tuple[type[SMEError], int], ...] = ()  # the first match; else 2
     extra: str = ""  # of our package, which these commands need
+    modules: ClassVar[Mapping[str, tuple[str, str]]] = {}  # command → module, summary
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
+        for name, (_, summary) in self.modules.items():
+            self.commands[name] = TyperCommand(name, help=summary)
         _show_literally(self)
+
+    def load(self, name: str) -> Any:
+        """The command of a name; its module is imported."""
+        if name in self.modules:
+            module, _ = self.modules[name]
+            self.commands[name] = get_group(importlib.import_module(module).app).commands[name]
+            _show_literally(self.commands[name])
+        return self.commands[name]
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, None if command is None else self.load(args[0]), rest
 
     def main(self, *args: Any, **options: Any) -> Any:
         options |= {"standalone_mode": False, "prog_name": self.name}

@@ -315,6 +315,11 @@ def unique_name(document: SMESpec | StreamSpec) -> str:
     return document.content_name
 
 
+def content_id(document: SMESpec | StreamSpec) -> str:
+    """`SME/sha256-<first 12 hex of the digest>-v1`."""
+    return f"{NAMESPACE}/{document.content_name}-v{DYNAMICS_VERSION}"
+
+
 def title(document: SMESpec | StreamSpec) -> str:
     """What tables and figures call a task or a stream.
 

@@ -165,18 +165,18 @@ class Certificate:
         """The checks with this outcome."""
         return tuple(check for check in self.checks if check.outcome == outcome)
 
-    def table(self, title: str, *, meanings: bool = False) -> Table:
-        """The checks as a table: outcome, name, value and range."""
+    def table(self, title: str) -> Table:
+        """The checks as a table: outcome, name, value, range and meaning."""
         columns = {"": "name", "check": "name", "value": "number", "passes in": "name"}
-        table = Table(title, columns | ({"meaning": "text"} if meanings else {}))
+        table = Table(title, {**columns, "meaning": "text"})
         for check in self.checks:
             bounds = filter(None, (short(check.low, "≥ "), short(check.high, "≤ ")))
             cells = MARKS[check.outcome], f"[bold]{check.name}[/]", short(check.value)
-            table.add_row(*cells, ", ".join(bounds), *([escape(check.meaning)] if meanings else []))
+            table.add_row(*cells, ", ".join(bounds), escape(check.meaning))
         return table
 
     def _repr_html_(self) -> str:
-        return card(table_html(self.table(f"{self.digest}\n{self.outcome}", meanings=True)))
+        return card(table_html(self.table(f"{self.digest}\n{self.outcome}")))
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain JSON data."""

@@ -16,6 +16,8 @@ APPS = {"sme": sme, "sme-leaderboard": leaderboard}
 
 
 def commands(command, path=()):
+    for name in getattr(command, "modules", ()):
+        command.load(name)
     yield path, command
     for name, child in getattr(command, "commands", {}).items():
         yield from commands(child, (*path, name))

@@ -13,7 +13,7 @@ from pydantic import Field
 
 import sme_registry
 from sme_registry import load
-from sme_registry.cli.arguments import sweep_axes
+from sme_registry.cli.task import sweep_axes
 from sme_registry.errors import MalformedDocumentError, SMEError, SpecError, UnknownNameError
 from sme_registry.spec import EnvFile, SMESpec, StreamFile, SuiteFile, catalogue
 from sme_registry.spec.catalogue import resolve

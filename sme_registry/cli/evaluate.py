@@ -18,6 +18,7 @@ from sme_registry.cli.arguments import (
     Out,
     Protocol,
     SpecChanges,
+    TaskName,
     can_draw,
     changed,
     changes,
@@ -39,7 +40,6 @@ from sme_registry.spec import (
     EnvFile,
     EvaluationProtocol,
     SMESpec,
-    StreamFile,
     StreamSpec,
     catalogue,
 )
@@ -49,11 +49,14 @@ _EVALUATION = "evaluation.json"
 _JSON, _PAGE = "diagnosis.json", "diagnosis.md"
 _POLICY_FILES = (".zip", ".onnx", ".npz")
 
+app = typer.Typer()
+
 
 def _complete_policy(incomplete: str) -> list[str]:
     return [name for name in POLICIES if name.startswith(incomplete)]
 
 
+@app.command()
 def evaluate(
     context: typer.Context,
     policies: Annotated[
@@ -65,14 +68,7 @@ def evaluate(
             "On a stream: one, or one for each visit.",
         ),
     ],
-    task: Annotated[
-        str,
-        typer.Argument(
-            metavar="TASK",
-            help="The task or stream: a name, a path or a digest.",
-            autocompletion=catalogue.completion(EnvFile, StreamFile),
-        ),
-    ],
+    task: TaskName,
     protocol: Protocol = "paper-v1",
     out_folder: Out = None,
     action_range: ActionRange = None,
@@ -273,6 +269,7 @@ class SubjectOptions:
         return replace(self, cell=None, log=None).subject(against)
 
 
+@app.command()
 @with_options(SubjectOptions)
 def diagnose(
     run: Annotated[
@@ -360,6 +357,7 @@ def diagnose(
     print_written([*figures, written, data])
 
 
+@app.command()
 @with_options(SubjectOptions)
 def explore(
     what: Annotated[
