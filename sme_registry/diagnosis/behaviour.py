@@ -19,6 +19,7 @@ of tanh is saturated if its mean |h| is at least 0.95.
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import time
 from collections.abc import Callable, Iterator
@@ -34,6 +35,7 @@ from sme_registry.envs import arguments
 from sme_registry.envs.batch import Batch
 from sme_registry.evaluation import Policy, references
 from sme_registry.evaluation.networks import Perceptron
+from sme_registry.evaluation.regions import Uniform
 from sme_registry.evaluation.rollouts import play
 from sme_registry.io import require_packages
 from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf
@@ -261,15 +263,15 @@ def on_policy(task: Task, runs: dict[str, Trajectories]) -> OnPolicy:
 def _reference_actions(
     task: Task, fitted: references.References, n: int, seed: int
 ) -> dict[str, Callable[[Observation], Array]]:
-    """The references as functions of states `[n, S]`."""
-    A = task.spec.action_dim
-    bits = draw.bit_generator(seed, "diagnosis/random_action")
-    return {
-        LINEAR: fitted.linear,
-        "best_constant": lambda s: np.tile(fitted.constant, (n, 1)),
-        "constant_half": lambda s: np.full((n, A), 0.5),
-        "uniform_random": lambda s: draw.to_uniform(bits.random_raw(n * A)).reshape(n, A),
-    }
+    """References as functions of states `[n, S]`."""
+    random, shape = Uniform(seed, "diagnosis/random_action"), (n, task.spec.action_dim)
+
+    def act(name: str, s: Any) -> Array:
+        known = references.Knowledge(task, s, lambda: fitted, random)
+        return np.broadcast_to(references.REFERENCES[name].act(known), shape)
+
+    names = (LINEAR, *CONSTANTS, "uniform_random")
+    return {name: functools.partial(act, name) for name in names}
 
 
 def _reward_signal(task: Task, run: Trajectories) -> RewardSignal:

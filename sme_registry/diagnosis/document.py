@@ -49,8 +49,7 @@ from sme_registry.diagnosis.questions import (
 from sme_registry.diagnosis.subject import AnySubject
 from sme_registry.errors import UnknownNameError
 from sme_registry.evaluation import ObservationReport
-from sme_registry.evaluation.references import LABELS
-from sme_registry.evaluation.report import SAFETY_REFERENCES
+from sme_registry.evaluation.references import LABELS, beside_safety
 from sme_registry.io import choice, read_json, versions
 from sme_registry.io.markup import Table, fixed, percent, plural
 from sme_registry.spec import SMESpec, StreamSpec, catalogue
@@ -74,7 +73,6 @@ _HEADINGS = {
 }
 _STYLES = {"yes": "bold red", "no": "green", "cannot tell": "yellow"}
 _COLUMNS, _INDENT = 80, 4  # of lines of text
-_NAMES = {POLICY: "this policy", **LABELS}
 
 
 class Part(NamedTuple):
@@ -120,6 +118,10 @@ def cell(value: float | str | None) -> str:
     if value is None:
         return "–"
     return fixed(value, 3) if isinstance(value, float) else label(str(value))
+
+
+def _name(policy: str) -> str:
+    return "this policy" if policy == POLICY else LABELS.get(policy, policy)
 
 
 class Diagnosis(StrictModel):
@@ -406,7 +408,7 @@ class TaskDiagnosis(Diagnosis):
             ("References, uniform states", measured.uniform),
             ("References, own episodes", measured.on_policy.scores),
         ):
-            rows: dict[str, Any] = {_NAMES[name]: score for name, score in scores.items()}
+            rows: dict[str, Any] = {_name(name): score for name, score in scores.items()}
             yield table(heading, "policy", rows, "regret mae normalised_regret", detail=True)
         rows = {str(channel.channel): channel for channel in measured.channels}
         fields = "mae normalised_regret linear_normalised_regret regret offset slope at_zero at_one"
@@ -443,7 +445,7 @@ def _limits(limits: Violations) -> Iterator[Part]:
     scores = {
         "this policy": report.regions[0],
         "its actions cut off at the limits": limits.cut_off,
-        **{_NAMES[name]: report.references[name][0] for name in SAFETY_REFERENCES},
+        **{_name(name): report.references[name][0] for name in beside_safety(report.references)},
         "this policy, states that it visits": limits.visited,
         **{f"this policy, {region.name}": region for region in report.regions[1:]},
     }

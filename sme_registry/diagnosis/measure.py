@@ -207,8 +207,9 @@ def sample(
     drawn = states_of(task.spec, count, seed, region)
     observation, optimal = observed(task, drawn)
     s = drawn.s.astype(np.float64)
-    random = uniform(seed, f"diagnosis/{region}/random", optimal.size)
-    actions = fitted.actions(s, optimal, random.reshape(optimal.shape))
+    random = Uniform(seed, f"diagnosis/{region}/random")
+    known = references.Knowledge(task, s, lambda: fitted, random, optimal)
+    actions = references.actions(known, references.NAMES)
     return Sample(drawn, observation, s, clipped_actions(policy, observation), optimal, actions)
 
 

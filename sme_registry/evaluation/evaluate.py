@@ -222,17 +222,19 @@ class Measurement:
 
     def run(self) -> Iterator[int]:
         """Measure region after region, or until all policies have failed: the states so far."""
-        fitted, known = self._fit_references()
+        fitted, first = self._fit_references()
         count = 0
         for region in range(len(self._protocol.edges)):
             measured = self._begin(region)
             random = Uniform(self._protocol.seed, f"evaluation/{region}/random_action")
-            for batch in self._batches(region, known):
+            for batch in self._batches(region, first):
                 actions = self._add_policies(measured, batch)
                 if len(self._failed) == len(self._subjects):
                     return
-                others = fitted.actions(batch.s, batch.optimal, random(*batch.optimal.shape))
-                others |= references.safe_actions(self._task.spec, batch.optimal, batch.limit)
+                known = references.Knowledge(
+                    self._task, batch.s, lambda: fitted, random, batch.optimal, batch.limit
+                )
+                others = references.actions(known, self._references)
                 for name, a in others.items():
                     measured.errors[name].add(a, batch.optimal)
                 self._add_safety(measured, batch, {**actions, **others})
@@ -311,11 +313,11 @@ class Measurement:
                 except PolicyError as error:
                     self._failed[index] = error
 
-    def _batches(self, region: int, known: Iterator[Array]) -> Iterator[_Batch]:
-        """The states of a region. `known` are the π* of the first ones, where these are known."""
+    def _batches(self, region: int, first: Iterator[Array]) -> Iterator[_Batch]:
+        """The states of a region, with π* of its first batches where these are known."""
         for drawn in states(self._protocol, region, self._task.spec):
             s = drawn.s.astype(np.float64)
-            optimal = next(known, None)
+            optimal = next(first, None)
             if optimal is None:
                 optimal = self._oracle.optimal_action(s)
             yield _Batch(drawn, s, optimal, self._limit_of(s))

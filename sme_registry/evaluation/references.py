@@ -11,14 +11,16 @@ shrunk_optimal         min(π*(s), 1 − 2τ): the optimum cut off at the lowest
 
 The fitted ones are fitted on the states of WD, at most `FIT_STATES` of them, and used unchanged in
 every other region. All act on the state, also where the agent sees another observation; an agent's
-only on the channels that it observes.
+only on the channels that it observes. `REFERENCES` is the only list of them: reports, tables and
+figures show what a report has.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,35 +33,14 @@ from sme_registry.task.draw import Array
 
 Act = Callable[[Observation], Any]
 
-NAMES = ("optimal", "linear_least_squares", "best_constant", "constant_half", "uniform_random")
-SAFE_NAMES = ("safe_optimal", "shrunk_optimal")
 FIT_STATES = 2**16
 _FIT_NUMBERS = 2**24  # of the states and actions kept for the fit, 128 MiB as float64
 
 
-LABELS = {
-    "optimal": "optimal",
-    "linear_least_squares": "linear (LSQ)",
-    "best_constant": "best constant",
-    "constant_half": "constant ½",
-    "uniform_random": "random",
-    "safe_optimal": "safe optimum",
-    "shrunk_optimal": "optimum ≤ 1 − 2τ",
-}
-"""The labels of references, for people."""
-
-
-def names(spec: SMESpec) -> tuple[str, ...]:
-    return NAMES if spec.safety is None else (*NAMES, *SAFE_NAMES)
-
-
-def fit_states(spec: SMESpec) -> int:
-    """How many states of WD the fit uses; fewer if a state is large."""
-    return max(1, min(FIT_STATES, _FIT_NUMBERS // (spec.state_dim + spec.action_dim)))
-
-
 @dataclass(frozen=True, eq=False)
 class References:
+    """What is fitted."""
+
     constant: Array  # `[A]` the best constant action
     slope: Array  # `[S, A]` about the centre; 0 of channels that an agent does not observe
     intercept: Array  # `[A]` the linear policy's action at the centre
@@ -68,26 +49,74 @@ class References:
         """The linear policy's actions `[B, A]` in states `[B, S]`, not clipped."""
         return (s - 0.5) @ self.slope + self.intercept
 
-    def actions(self, s: Array, optimal: Array, random: Array) -> dict[str, Array]:
-        """The actions of every reference policy in states `[B, S]`, by name."""
-        return {
-            "optimal": optimal,
-            "linear_least_squares": np.clip(self.linear(s), 0.0, 1.0),
-            "best_constant": self.constant,
-            "constant_half": np.full_like(self.constant, 0.5),
-            "uniform_random": random,
-        }
+
+@dataclass(frozen=True, eq=False)
+class Knowledge:
+    """States and what references can know of them, computed when it is asked for."""
+
+    task: Task
+    s: Array  # `[B, S]`
+    fitted: Callable[[], References]
+    random: Callable[..., Array]  # uniform numbers of a shape
+    known_optimal: Array | None = None  # `[B, A]` each, where they are known already
+    known_limit: Array | None = None
+
+    @property
+    def optimal(self) -> Array:
+        """π*(s)."""
+        known = self.known_optimal
+        return engine(self.task).optimal_action(self.s) if known is None else known
+
+    @property
+    def limit(self) -> Array:
+        """ℓ(s)."""
+        return self.task.limit(self.s) if self.known_limit is None else self.known_limit
 
 
-def safe_actions(spec: SMESpec, optimal: Array, limit: Array) -> dict[str, Array]:
-    """The actions `[B, A]` of `SAFE_NAMES`, from π*(s) and the limits; none without safety."""
-    if spec.safety is None:
-        return {}
-    lowest = 1.0 - 2.0 * spec.safety.tightness
-    return {
-        "safe_optimal": np.minimum(optimal, limit),
-        "shrunk_optimal": np.minimum(optimal, lowest),
-    }
+class Reference(NamedTuple):
+    label: str  # for people
+    act: Callable[[Knowledge], Array]  # actions `[B, A]` or `[A]`, not clipped
+    needs_limits: bool = False
+
+
+REFERENCES = {
+    "optimal": Reference("optimal", lambda at: at.optimal),
+    "linear_least_squares": Reference("linear (LSQ)", lambda at: at.fitted().linear(at.s)),
+    "best_constant": Reference("best constant", lambda at: at.fitted().constant),
+    "constant_half": Reference("constant ½", lambda at: np.full(at.task.spec.action_dim, 0.5)),
+    "uniform_random": Reference("random", lambda at: at.random(len(at.s), at.task.spec.action_dim)),
+    "safe_optimal": Reference(
+        "safe optimum", lambda at: np.minimum(at.optimal, at.limit), needs_limits=True
+    ),
+    "shrunk_optimal": Reference(
+        "optimum ≤ 1 − 2τ",
+        lambda at: np.minimum(at.optimal, 1.0 - 2.0 * at.task.spec.tightness),
+        needs_limits=True,
+    ),
+}
+NAMES = tuple(name for name, reference in REFERENCES.items() if not reference.needs_limits)
+SAFE_NAMES = tuple(name for name, reference in REFERENCES.items() if reference.needs_limits)
+LABELS = {name: reference.label for name, reference in REFERENCES.items()}
+_UNSAFE = ("linear_least_squares", "best_constant", "uniform_random")
+
+
+def names(spec: SMESpec) -> tuple[str, ...]:
+    return NAMES if spec.safety is None else (*NAMES, *SAFE_NAMES)
+
+
+def beside_safety(names: Iterable[str]) -> list[str]:
+    """Those of a report's references whose safety tables and figures show."""
+    return [name for name in names if name not in _UNSAFE]
+
+
+def actions(at: Knowledge, names: Iterable[str]) -> dict[str, Array]:
+    """The actions of references by name, `[B, A]` or `[A]` in [0, 1]."""
+    return {name: np.clip(REFERENCES[name].act(at), 0.0, 1.0) for name in names}
+
+
+def fit_states(spec: SMESpec) -> int:
+    """How many states of WD the fit uses; fewer if a state is large."""
+    return max(1, min(FIT_STATES, _FIT_NUMBERS // (spec.state_dim + spec.action_dim)))
 
 
 def fit(task: Task, s: Array, optimal: Array) -> References:
@@ -126,13 +155,12 @@ def reference_policy(name: str, spec: SMESpec) -> Act | dict[str, Act]:
       >>> optimal(np.full((3, 10), 0.5, np.float32)).shape
       (3, 4)
     """
-    joint, S = _joint_policy(SHORT_NAMES.get(name, name), spec), spec.state_dim
-    task = materialize(spec)
+    joint, task = _joint_policy(SHORT_NAMES.get(name, name), spec), materialize(spec)
 
     def of_agent(observed: Sequence[int], owned: slice) -> Act:
         def act(observations: Observation) -> Array:
             # The agent's channels of the joint action do not depend on what it does not observe.
-            s = np.zeros((len(observations), S))
+            s = np.zeros((len(observations), spec.state_dim))
             x = task.unmixed(observations[:, :-2]) if task.mixing else observations
             s[:, observed] = x[:, : len(observed)]
             return joint(s)[:, owned]
@@ -152,19 +180,18 @@ def _joint_policy(name: str, spec: SMESpec) -> Callable[[Array], Array]:
             f"policy={name!r}: needs a task with safety, and this one has no limits. Give "
             "'optimal', or add safety to the task."
         )
-    if name == "optimal":
-        return engine(materialize(spec)).optimal_action
-    if name == "constant_half":
-        return lambda s: np.full((len(s), spec.action_dim), 0.5)
-    if name == "uniform_random":
-        generator = np.random.default_rng(0)
-        return lambda s: generator.random((len(s), spec.action_dim))
-    task = materialize(spec)
-    if name in SAFE_NAMES:
-        optimal_action = engine(task).optimal_action
-        return lambda s: safe_actions(spec, optimal_action(s), task.limit(s))[name]
-    s = np.random.default_rng(0).random((fit_states(spec), spec.state_dim))
-    fitted = fit(task, s, engine(task).optimal_action(s))
-    if name == "best_constant":
-        return lambda s: np.tile(fitted.constant, (len(s), 1))
-    return fitted.linear
+    task, generator = materialize(spec), np.random.default_rng(0)
+
+    @functools.cache
+    def fitted() -> References:
+        s = np.random.default_rng(0).random((fit_states(spec), spec.state_dim))
+        return fit(task, s, engine(task).optimal_action(s))
+
+    def random(*shape: int) -> Array:
+        return generator.random(shape)
+
+    def act(s: Array) -> Array:
+        a = REFERENCES[name].act(Knowledge(task, s, fitted, random))
+        return np.array(np.broadcast_to(a, (len(s), spec.action_dim)))
+
+    return act

@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 from rich.markup import escape
 
-from sme_registry.evaluation import references
-from sme_registry.evaluation.references import LABELS
+from sme_registry.evaluation.references import LABELS, NAMES, beside_safety
 from sme_registry.evaluation.regions import (
     Invariance,
     ObservationReport,
@@ -47,9 +46,6 @@ NOT_COMPARABLE = (
     "Levels ε are not comparable between different state_dim: with more channels, the states of "
     "a shell lie nearer to its outer face."
 )
-
-SAFETY_REFERENCES = ("optimal", "safe_optimal", "shrunk_optimal", "constant_half")
-"""The references whose safety is shown; the report has it of all."""
 
 
 class AgentReport(StrictModel):
@@ -177,13 +173,14 @@ class EvaluationReport(ReportFile):
         yield "observation.distractor_regions", _names_of(self.observed.distractor_regions), outside
         if self.safety is None:
             return
-        expected = sorted(references.names(self.spec))
         yield "agents", list(self.agents), []
         yield "safety.regions", _names_of(self.safety.regions), regions
+        # Reports of other versions have other references beside these.
+        known = sorted({*NAMES, *self.references})
         scores: dict[str, Mapping[str, Sequence[RegionReport] | Sequence[SafetyScore]]]
         scores = {"references": self.references, "safety.references": self.safety.references}
         for field, by_name in scores.items():
-            yield field, sorted(by_name), expected
+            yield field, sorted(by_name), known
             for name, of_regions in by_name.items():
                 yield f"{field}.{name}", _names_of(of_regions), regions
 
@@ -280,7 +277,7 @@ class EvaluationReport(ReportFile):
         )
         table = _RegionTable(self, heading, NOT_COMPARABLE)
         policies = [(escape(self.policy), self.regions)]
-        policies += [(LABELS.get(name, escape(name)), of) for name, of in self.references.items()]
+        policies += [(_label(name), regions) for name, regions in self.references.items()]
         for field, label in _ERRORS.items():
             table.add_group(label, policies, field)
         for label, field, pattern in _SPREAD:
@@ -366,6 +363,10 @@ class _RegionTable(Table):
         self.add_section()
 
 
+def _label(reference: str) -> str:
+    return LABELS.get(reference, escape(reference))
+
+
 def region_heading(region: Any) -> str:
     return f"{region.name}\nε ≤ {region.epsilon_high:g}"
 
@@ -383,7 +384,9 @@ def _safety_table(report: EvaluationReport, safety: SafetyReport) -> Table:
         "Negative safe regret is earned by violating: read it beside the cost.",
     )
     policies = [(escape(report.policy), safety.regions)]
-    policies += [(LABELS[name], safety.references[name]) for name in SAFETY_REFERENCES]
+    policies += [
+        (_label(name), safety.references[name]) for name in beside_safety(safety.references)
+    ]
     for field, label in _SAFETY.items():
         table.add_group(label, policies, field, ".1%" if field == "violating_share" else ".3f")
     table.add("price of safety", safety.regions, "price_of_safety")

@@ -11,9 +11,8 @@ import numpy as np
 
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, SafetyReport, StreamReport
-from sme_registry.evaluation.references import LABELS
+from sme_registry.evaluation.references import LABELS, beside_safety
 from sme_registry.evaluation.regions import SafetyScore
-from sme_registry.evaluation.report import SAFETY_REFERENCES
 from sme_registry.evaluation.streams import Visit
 from sme_registry.plots.curves import (
     Run,
@@ -229,16 +228,17 @@ def draw_cost(
     part: slice,
 ) -> None:
     """Reward against cost of methods, each the scores of its runs, over a part of the regions."""
-    ends = []
-    for name in SAFETY_REFERENCES:
+    ends = {}
+    for name in beside_safety(tasks[0].references):
         x, y = _cost_and_reward([safety.references[name] for safety in tasks], part)
-        ends.append((x.mean(), y.mean()))
+        ends[name] = x.mean(), y.mean()
         axes.plot(
-            *ends[-1], _SAFETY_MARKERS[name], color=GREY, markersize=9, label=LABELS[name],
-            linestyle="none", zorder=2,
+            *ends[name], _SAFETY_MARKERS.get(name, "^"), color=GREY, markersize=9,
+            label=LABELS.get(name, name), linestyle="none", zorder=2,
         )  # fmt: skip
+    mixed = [ends[name] for name in ("optimal", "safe_optimal") if name in ends]
     label = "mixtures of optimal and safe optimum"
-    axes.plot(*zip(*ends[:2], strict=True), color=GREY, linewidth=1.0, zorder=1.5, label=label)
+    axes.plot(*zip(*mixed, strict=True), color=GREY, linewidth=1.0, zorder=1.5, label=label)
     for index, (name, runs) in enumerate(scores):
         x, y = _cost_and_reward(runs, part)
         style: Any = {**look(index), "linestyle": "none"}

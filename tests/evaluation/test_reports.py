@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from sme_registry import EvaluationReport, SMESpec, evaluate
+from sme_registry import EvaluationReport, SMESpec, evaluate, plots
 from sme_registry.errors import DigestMismatchError, MissingDependencyError, SpecError
 from sme_registry.evaluation import references, regions
 from sme_registry.spec import EvaluationProtocol
@@ -159,6 +159,16 @@ def test_a_stored_report_that_lacks_something_is_refused(kind, missing, message)
     functools.reduce(operator.getitem, path, document).pop(last)
     with pytest.raises(SpecError, match=message):
         EvaluationReport.from_dict(document)
+
+
+def test_a_stored_report_may_have_references_of_another_version():
+    document = report_of("safe").to_dict()
+    for scores in (document["references"], document["safety"]["references"]):
+        scores["earlier_name"] = scores.pop("shrunk_optimal")
+    report = EvaluationReport.from_dict(document)
+    shown = str(report)
+    assert shown.count("earlier_name") == 6  # two of errors, four of safety
+    assert plots.reward_against_cost(report)
 
 
 def test_a_stored_report_with_more_than_its_task_has_is_refused(report):
