@@ -287,7 +287,7 @@ _network = partial(_why, unclear="network_unknown one_visit")
 
 
 def _compared(
-    life: StreamDiagnosis, quantity: str, reason_of: Callable[[float, float], str]
+    life: StreamDiagnosis, quantity: str, reason_of: Callable[[float, float], str | bool]
 ) -> Decision:
     """The last network's quantity, compared with fresh agents' or with the first visit's."""
     first, last = life.visits[0].network, life.visits[-1].network
@@ -329,21 +329,15 @@ def _dormant_units(life: StreamDiagnosis) -> Decision:
 @_network(yes="rank_collapsed", no="rank_kept", thresholds="rank_ratio")
 def _rank_collapse(life: StreamDiagnosis) -> Decision:
     """Whether the last hidden layer represents fewer directions."""
-
-    def reason_of(value: float, other: float) -> str:
-        return "rank_collapsed" if value <= THRESHOLDS["rank_ratio"] * other else "rank_kept"
-
-    return _compared(life, "effective_rank", reason_of)
+    most = THRESHOLDS["rank_ratio"]
+    return _compared(life, "effective_rank", lambda value, other: value <= most * other)
 
 
 @_network(yes="weights_grew", no="weights_steady", thresholds="weight_ratio")
 def _weight_growth(life: StreamDiagnosis) -> Decision:
     """Whether weights became so large that steps of the optimiser change little."""
-
-    def reason_of(value: float, other: float) -> str:
-        return "weights_grew" if value >= THRESHOLDS["weight_ratio"] * other else "weights_steady"
-
-    return _compared(life, "weight_norm", reason_of)
+    least = THRESHOLDS["weight_ratio"]
+    return _compared(life, "weight_norm", lambda value, other: value >= least * other)
 
 
 _MOST_STATES = 2048  # in which networks are measured; more would not change the numbers

@@ -30,7 +30,6 @@ from sme_registry.evaluation.references import reference_policy
 from sme_registry.io import read_json
 from sme_registry.plots.maps import STREAM
 from sme_registry.spec import SMESpec, StreamSpec
-from sme_registry.spec.document import check_digest
 from sme_registry.spec.study import Cell, in_jax, parse_uses
 from sme_registry.training import RunRecord
 from sme_registry.training import record as run_files
@@ -143,10 +142,8 @@ def load_run(folder: str | Path) -> AnySubject:
     updates = _updates(record.algorithm, record.hyperparameters, record.steps_done, record.num_envs)
     if record.stream is not None:
         kept = run_files.Snapshots(folder / run_files.SNAPSHOTS, record.stream)
-        report = _report_of_life(folder, record, kept)
-        return StreamSubject(
-            name, report, plan, *_networks(kept, record.stream, record.action_range), None, updates
-        )
+        networks = _networks(kept, record.stream, record.action_range)
+        return StreamSubject(name, _report_of_life(folder), plan, *networks, None, updates)
     path, checkpoint_step = _model_of_run(folder, record)
     log = folder / run_files.EPISODES
     return _subject(
@@ -285,24 +282,13 @@ def _model_of_cell(study: Path, stem: str, cell: Cell) -> Any:
     return load_sb3(path)
 
 
-def _report_of_life(folder: Path, record: RunRecord, kept: run_files.Snapshots) -> StreamReport:
-    """The report of a finished life, with all of whose models it is diagnosed."""
-    path = folder / STREAM
-    if not path.exists():
+def _report_of_life(folder: Path) -> StreamReport:
+    if not (folder / STREAM).exists():
         raise OptionError(
             f"run={str(folder)!r}: contains no {STREAM} yet. A life in a stream is diagnosed when "
             "it has ended. Continue it with `sme train … --resume`."
         )
-    missing = [file.name for file in (kept.initial, *kept.visits) if not file.exists()]
-    if missing:
-        raise OptionError(
-            f"run={str(folder)!r}: {run_files.SNAPSHOTS}/ lacks {missing[0]}. Copy the whole "
-            "folder of the run, or train it again with --force."
-        )
-    report = StreamReport.read(path)
-    advice = "Train the run again with --force."
-    check_digest(str(record.stream_digest), report.stream, f"{path}: stream of run.json", advice)
-    return report
+    return StreamReport.read(folder / STREAM)
 
 
 def _with_fresh(result: FinishedCell, path: Path) -> StreamReport:
