@@ -40,7 +40,7 @@ from sme_registry.io.terminal import (
 )
 from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan, catalogue
 from sme_registry.spec.catalogue import is_path
-from sme_registry.spec.study import PlannedCell, parse_uses
+from sme_registry.spec.study import PlannedCell
 from sme_registry.studies.engine.budget import (
     Estimator,
     scaled,
@@ -56,6 +56,7 @@ from sme_registry.training.algorithms import (
     find,
     folder_name,
     nested_hyperparameters,
+    parse_uses,
 )
 
 _EVERY = "*"  # algorithm

@@ -42,7 +42,6 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
-from sme_registry.spec.study import INDEPENDENT
 from sme_registry.studies.engine.runner import run_study
 from sme_registry.task import load
 from sme_registry.training import algorithms
@@ -310,7 +309,7 @@ def _train_suite(
     folder = options.folder(file.name, uses)
     algorithm = {
         "name": algorithms.short_name(uses),
-        "uses": f"{INDEPENDENT}{uses}" if options.independent else uses,
+        "uses": f"independent:{uses}" if options.independent else uses,
         "hyperparameters": settings,
         "action_range": options.action_range,
     }

@@ -30,10 +30,10 @@ from sme_registry.evaluation.references import reference_policy
 from sme_registry.io import read_json
 from sme_registry.plots.maps import STREAM
 from sme_registry.spec import SMESpec, StreamSpec
-from sme_registry.spec.study import Cell, in_jax, parse_uses
+from sme_registry.spec.study import Cell
 from sme_registry.training import RunRecord
 from sme_registry.training import record as run_files
-from sme_registry.training.algorithms import find, parameters_of
+from sme_registry.training.algorithms import find, in_jax, parse_uses
 from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.record import CHECKPOINT
 
@@ -353,11 +353,10 @@ def _updates(
     if ":" in name:  # a reference, a learner of offline data or somebody's module
         return None
     try:
-        parameters = parameters_of(find(name).load())
+        fields = find(name).settings().model_fields
     except SMEError:  # it is not installed here
         return None
-    settings = {name: parameter.default for name, parameter in parameters.items()}
-    settings |= hyperparameters
+    settings = {name: field.default for name, field in fields.items()} | dict(hyperparameters)
     every, starts = settings.get("train_freq"), settings.get("learning_starts")
     if isinstance(every, int) and isinstance(starts, int):
         return max(0, steps - starts) // (every * num_envs)

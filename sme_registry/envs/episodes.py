@@ -195,8 +195,8 @@ class Episodes:
 
 
 def info_of_envs(infos: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """What `Episodes.add` reads of infos of single environments, as the info of all of them."""
-    keys = [key for key in (*_PLAIN, *_SAFETY) if key in infos[0]]
+    """The regret, costs and phase in infos of single environments, as the info of all of them."""
+    keys = [key for key in (*_PLAIN, *_SAFETY, "phase") if key in infos[0]]
     return {key: [info[key] for info in infos] for key in keys}
 
 

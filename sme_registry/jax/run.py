@@ -17,12 +17,11 @@ import numpy as np
 
 from sme_registry.errors import OptionError, SpecError, UnknownNameError
 from sme_registry.io import choice, integer_in
-from sme_registry.jax.networks import Weights, hidden_layers
+from sme_registry.jax.networks import AgentSettings, Weights, hidden_layers
 from sme_registry.jax.ppo import PPO, PPOProgram
 from sme_registry.jax.program import PIECE, Array, Document, Evaluation, Program, StepLog
 from sme_registry.jax.td3_sac import SAC, TD3, SACProgram, TD3Program
 from sme_registry.spec.sme_spec import ACTION_RANGES
-from sme_registry.spec.study import JAX
 
 ALGORITHMS: dict[str, tuple[Any, type[Program]]] = {
     "PPO": (PPO, PPOProgram),
@@ -35,17 +34,17 @@ _OnEvaluation = Callable[[int, int, Evaluation], Any]
 _OnVisit = Callable[[int, list[dict[str, Array]]], Any]
 
 
-def settings_of(
-    uses: str, hyperparameters: Mapping[str, Any], field: str = "hyperparameters"
-) -> Any:
-    """An algorithm's hyperparameters, JSON values by SB3's names; errors call them `field`."""
-    kind, _ = _algorithm(uses)
+def hyperparameters_of(uses: str, field: str = "uses") -> type[AgentSettings]:
+    """The model of an algorithm's hyperparameters."""
+    return _algorithm(uses)[0]
+
+
+def settings_of(uses: str, hyperparameters: Mapping[str, Any]) -> Any:
+    """An algorithm's hyperparameters, JSON values by SB3's names."""
     try:
-        return kind.from_dict(dict(hyperparameters), field)
+        return hyperparameters_of(uses).from_dict(dict(hyperparameters), "hyperparameters")
     except SpecError as error:
-        raise OptionError(
-            f"{error} For other hyperparameters, use the algorithm of Stable-Baselines3."
-        ) from None
+        raise OptionError(str(error)) from None
 
 
 def new_program(
@@ -234,5 +233,5 @@ def _stacked(program: Program, groups: Sequence[Sequence[Array]]) -> Array:
 
 
 def _algorithm(uses: str) -> tuple[Any, type[Program]]:
-    name = uses.removeprefix(JAX).upper()
+    name = uses.removeprefix("jax:").upper()
     return ALGORITHMS[choice("uses", name, ALGORITHMS, error=UnknownNameError)]

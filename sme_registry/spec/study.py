@@ -40,55 +40,8 @@ FRESH_EVALUATIONS = 10  # at most, of a fresh agent
 Steps = Annotated[Integer, Field(ge=0, le=10**10)]
 
 
-JAX, INDEPENDENT = "jax:", "independent:"
-KINDS = ("offline", "reference", "independent", "jax", "train")
-
-
-def parse_uses(uses: str) -> tuple[str, str]:
-    """Kind and name of a learner: `("jax", "PPO")` for "jax:PPO"; without a prefix "sb3"."""
-    kind, colon, name = uses.partition(":")
-    # `train:make` is a function of a module `train` that returns a model.
-    if colon and kind in KINDS and (kind != "train" or ":" in name):
-        return kind, name
-    return "sb3", uses
-
-
-def in_jax(uses: str) -> bool:
-    return parse_uses(uses)[0] == "jax"
-
-
-def _check_task(uses: str, setting: Setting, field: str) -> None:
-    kind, name = parse_uses(uses)
-    if setting.team is None:
-        if kind == "independent":
-            raise ValueError(
-                f"{field}={uses!r}: needs a team, and this task has a single agent. Use {name!r}."
-            )
-        return
-    reasons = {
-        "offline": ", because data sets are collected for a single agent. Use an algorithm that "
-        "learns online, such as PPO.",
-        "jax": f". Use an algorithm of Stable-Baselines3, such as {name!r}.",
-        "train": ", because its environment has a single agent. Use an algorithm of "
-        "Stable-Baselines3, such as PPO.",
-    }
-    if kind in reasons:
-        agents = len(setting.team.agents)
-        raise ValueError(
-            f"{field}={uses!r}: cannot learn a task for {agents} agents{reasons[kind]}"
-        )
-
-
-def _check_stream(uses: str, field: str) -> None:
-    if parse_uses(uses)[0] not in ("sb3", "jax"):
-        raise ValueError(
-            f"{field}={uses!r}: cannot live in a stream. Use an algorithm that learns online and "
-            "is evaluated on the way, such as PPO. Every stream's report has reference agents."
-        )
-
-
 def _check_source(uses: str, source: str | None) -> None:
-    if source is not None and parse_uses(uses)[0] != "train":
+    if source is not None and not uses.startswith("train:"):
         raise ValueError(f"source={source!r}: is for uses='train:module:function'. Leave it out.")
 
 
@@ -160,12 +113,10 @@ class Cell(Document):
     protocol: EvaluationProtocol
 
     @model_validator(mode="after")
-    def _task_suits_the_algorithm(self) -> Self:
-        _check_task(self.uses, self.spec, "uses")
+    def _lives_in_its_stream(self) -> Self:
         _check_source(self.uses, self.source)
         if self.stream is None:
             return self
-        _check_stream(self.uses, "uses")
         if self.spec != self.stream.phases[0].spec or self.steps != self.stream.steps:
             raise ValueError(
                 "stream: its first phase and its steps must be the cell's spec and steps."
@@ -269,10 +220,6 @@ class StudyPlan(Document):
         check_classes(self.classes, self.streams)
         check_names("algorithms", self.algorithms)
         for i, algorithm in enumerate(self.algorithms):
-            for kind in self.classes:
-                _check_task(algorithm.uses, kind.setting, f"algorithms.{i}.uses")
-            if self.streams:
-                _check_stream(algorithm.uses, f"algorithms.{i}.uses")
             if not self.classes and algorithm.steps is not None:
                 raise ValueError(
                     f"algorithms.{i}.steps={algorithm.steps:,}: must be null, since lives have the "

@@ -1,4 +1,4 @@
-"""`LEARNERS`: what the names in `uses` stand for, in `sme train` and in the cells of a study.
+"""`BACKENDS`: what the names in `uses` stand for, in `sme train` and in the cells of a study.
 
     PPO, TD3, …            an algorithm of Stable-Baselines3, in any case, or one of ours for tasks
                            with `safety`; the agents of a team share one model
@@ -11,7 +11,7 @@
     module:name            imported, from this folder or installed
 
 An entry point or `module:name` is either a class like those of Stable-Baselines3
-(`sb3_contrib:TQC`), or a function that returns a model; see `models`. Of `train:…` see `learn`.
+(`sb3_contrib:TQC`), or a function that returns a model; see `models`. Of `train:…` see `functions`.
 
 Hyperparameters are JSON values. Importing this module does not import PyTorch.
 """
@@ -19,147 +19,204 @@ Hyperparameters are JSON values. Importing this module does not import PyTorch.
 from __future__ import annotations
 
 import contextlib
-import hashlib
+import importlib
 import importlib.metadata
-import importlib.util
 import inspect
 import io
-import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
-from typing import Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import ConfigDict, Field, create_model
 
 from sme_registry.datasets import documents
 from sme_registry.envs.arguments import check_has_limits
 from sme_registry.errors import OptionError, SpecError, UnknownNameError, did_you_mean
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.io import choice, import_object, read_json, require_packages
-from sme_registry.io.system import module_file, working_directory_importable
+from sme_registry.io.system import missing_dependency, module_file
 from sme_registry.spec import SMESpec, StreamSpec, StudyAlgorithm
-from sme_registry.spec.study import JAX, in_jax, parse_uses
+from sme_registry.spec.document import Integer, Real, StrictModel
+
+if TYPE_CHECKING:
+    from sme_registry.training.learn import Learner, Run
 
 ENTRY_POINTS = "sme_registry.algorithms"
 AGENTS = "sb3", "jax"  # whose implementation of an algorithm is trained
+_PLACES = {  # the modules of algorithms with names of their own
+    **dict.fromkeys(("TD3", "SAC", "DDPG", "PPO", "A2C"), "stable_baselines3"),
+    **dict.fromkeys(("PPOLagrangian", "PPOProjection"), "sme_registry.sb3"),  # need limits
+}
 # Arguments of an algorithm's constructor that are not hyperparameters.
 _RESERVED = ("self", "policy", "env", "seed", "device", "verbose", "tensorboard_log")
 # Arguments of a policy's constructor that the algorithm passes.
 _PASSED = ("self", "observation_space", "action_space", "lr_schedule")
-_OF_DATA_SET = ("nu", "transitions", "batch_size")  # of `offline:…`, and not the learner's
+
+Document = SMESpec | StreamSpec
+Kind = Literal["task", "team", "stream"]
+_KINDS: dict[Kind, str] = {
+    "task": "a task of a single agent",
+    "team": "the task of a team",
+    "stream": "a stream",
+}
+
+
+@dataclass(frozen=True)
+class Backend:
+    """The learners of one prefix of `uses`: a new back-end is a module, and a row of `BACKENDS`.
+
+    Functions and classes are `module:name`, and imported when they are needed.
+
+    Attributes:
+      settings: a function of a learner's name, and what errors call that, to the model of its
+        hyperparameters.
+      learns: what it can be trained on.
+      learner: its `Learner`; empty for what a study runs in another way.
+      names: its learners; empty where each name is one.
+      check: a function that raises for a task or stream that it cannot learn for another reason.
+      several: whether it learns in several environments at once.
+      one_thread: whether PyTorch has one thread meanwhile.
+    """
+
+    settings: str
+    learns: tuple[Kind, ...]
+    learner: str = ""
+    names: tuple[str, ...] = ()
+    check: str = ""
+    several: bool = False
+    one_thread: bool = True
+
+
+_HERE = "sme_registry.training"
+BACKENDS: dict[str, Backend] = {
+    "sb3": Backend(  # also what others wrote for its environments; has no prefix
+        settings=f"{_HERE}.algorithms:sb3_settings",
+        learns=("task", "team", "stream"),
+        learner=f"{_HERE}.models:SB3Learner",
+        several=True,
+    ),
+    "independent": Backend(
+        settings=f"{_HERE}.algorithms:independent_settings",
+        learns=("team",),
+        learner=f"{_HERE}.independent:IndependentLearner",
+        several=True,
+    ),
+    "jax": Backend(
+        settings="sme_registry.jax.run:hyperparameters_of",
+        learns=("task", "stream"),
+        learner=f"{_HERE}.jax_agents:JAXLearner",
+        names=("PPO", "TD3", "SAC"),
+        check="sme_registry.jax.task:check_supported",
+    ),
+    "train": Backend(
+        settings=f"{_HERE}.functions:settings",
+        learns=("task",),
+        learner=f"{_HERE}.functions:FunctionLearner",
+        one_thread=False,
+    ),
+    "offline": Backend(
+        settings=f"{_HERE}.algorithms:offline_settings",
+        learns=("task",),
+        names=tuple(documents.ALGORITHMS),
+    ),
+    "reference": Backend(
+        settings=f"{_HERE}.algorithms:no_settings",
+        learns=("task", "team"),
+        names=tuple(POLICIES),
+    ),
+}
 
 
 @dataclass(frozen=True)
 class Entry:
-    """What a name in `uses` stands for; `place` is the module of a class that is ours or SB3's."""
+    """What a name in `uses` stands for: a learner of a back-end, `name` without the prefix."""
 
-    kind: str  # "sb3", also what others wrote for its environments; or a prefix without its colon
-    name: str  # without the prefix
-    place: str = ""
-    needs_limits: bool = False
+    kind: str
+    name: str
+
+    @property
+    def backend(self) -> Backend:
+        return BACKENDS[self.kind]
 
     @property
     def uses(self) -> str:
         return self.name if self.kind == "sb3" else f"{self.kind}:{self.name}"
 
-    def load(self, field: str = "uses") -> Any:
-        if self.kind == "train":
-            return load_function(self.name, field)[0]
-        if self.kind not in ("sb3", "independent"):
-            raise OptionError(
-                f"{field}={self.uses!r}: is no algorithm of Stable-Baselines3's kind. Use it in a "
-                "study."
-            )
-        require_sb3()  # every model gets its `VecEnv`
-        if self.place:
-            # It imports the deprecated `gym` if that is installed, which prints a long notice.
-            with contextlib.redirect_stderr(io.StringIO()), quiet():
-                return import_object(f"{self.place}:{self.name}", field, OptionError)
-        with quiet():
-            if ":" not in self.name:
-                return _entry_point(self.name, field)
-            algorithm = import_object(self.name, field, OptionError)
-        if not callable(algorithm):
-            raise OptionError(
-                f"{field}={self.name!r}: is of type {type(algorithm).__name__}: must be a class "
-                "like those of Stable-Baselines3, or a function from an environment to a learner."
-            )
-        return algorithm
+    def settings(self, field: str = "uses") -> type[StrictModel]:
+        """The model of its hyperparameters; raises if it is not installed here."""
+        model: type[StrictModel] = _imported(self.backend.settings)(self.name, field)
+        return model
 
-    def check_installed(self) -> None:
-        """Check that what learns is installed here, where that can be told in little time."""
-        if self.kind == "jax":
-            jax_package()
-        elif self.kind == "sb3" and self.place:
-            require_sb3()
-        elif self.kind in ("sb3", "train"):
-            self.load()
-        elif self.kind == "independent" and not is_on_policy(self.load()):
+    def learner(self, run: Run) -> Learner:
+        """What learns in this run."""
+        if not self.backend.learner:
             raise OptionError(
-                f"uses={self.uses!r}: must be an on-policy algorithm, such as independent:PPO, "
-                "because the models of a team learn from the same rollouts. Use one model for all "
-                f"agents instead: {self.name}."
+                f"{run.field}={self.uses!r}: learns in no environment. Use it in a study."
             )
+        learner: Learner = _imported(self.backend.learner)(self.name, run)
+        return learner
 
-    def check_task(self, document: SMESpec | StreamSpec) -> None:
-        """Check that it can learn a task or live in a stream, beyond what a plan itself says."""
-        if self.needs_limits:
-            check_has_limits(self.name, document.specs[0])
-        if self.kind == "jax":
-            jax_package().task.check_supported(document)
-        if self.kind == "train" and (isinstance(document, StreamSpec) or document.team):
+    def check_task(self, document: Document) -> None:
+        """Raise if it cannot learn a task or live in a stream."""
+        backend, spec = self.backend, document.specs[0]
+        kind: Kind = "task" if spec.team is None else "team"
+        kind = "stream" if isinstance(document, StreamSpec) else kind
+        if kind not in backend.learns:
+            known = " or ".join(_KINDS[each] for each in backend.learns)
             raise SpecError(
-                f"{self.uses}: is for a task of a single agent, and this is a "
-                f"{'team' if document.specs[0].team else 'stream'}. Train an algorithm "
-                "of Stable-Baselines3, such as PPO."
+                f"uses={self.uses!r}: learns {known}, and this is {_KINDS[kind]}. Choose another "
+                "algorithm, such as PPO."
             )
+        if _PLACES.get(self.name) == "sme_registry.sb3":
+            check_has_limits(self.name, spec)
+        if backend.check:
+            _imported(backend.check)(document)
+
+    @contextlib.contextmanager
+    def surroundings(self) -> Iterator[None]:
+        """Where it learns: without warnings of libraries, and with one thread of PyTorch."""
+        with quiet(), one_thread() if self.backend.one_thread else contextlib.nullcontext():
+            yield
 
 
-_OF_SB3 = {
-    "TD3": "off-policy, deterministic; the fastest learner on the default task",
-    "SAC": "off-policy, entropy-regularised",
-    "DDPG": "off-policy, deterministic; the predecessor of TD3",
-    "PPO": "on-policy; steps ten times faster, but learns from many more",
-    "A2C": "on-policy",
-}
-_OF_OURS = {
-    "PPOLagrangian": "PPO with a limit on the mean cost of a step, for tasks with safety",
-    "PPOProjection": "PPO whose actions are cut at the limits, which it knows, for the same tasks",
-}
-ALGORITHMS = _OF_SB3 | _OF_OURS
-"""Names and descriptions of the algorithms that `sme train` knows by name."""
+def _imported(name: str) -> Any:
+    """What `module:name` is; the error for a missing package names its extra."""
+    module, _, attribute = name.partition(":")
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except ModuleNotFoundError as error:
+        raise missing_dependency(error) or error from None
 
-LEARNERS: dict[str, Entry] = {
-    entry.uses: entry
-    for entry in (
-        *(Entry("sb3", name, "stable_baselines3") for name in _OF_SB3),
-        *(Entry("sb3", name, "sme_registry.sb3", needs_limits=True) for name in _OF_OURS),
-        *(Entry("jax", name) for name in ("PPO", "TD3", "SAC")),
-        *(Entry("offline", name) for name in documents.ALGORITHMS),
-        *(Entry("reference", name) for name in POLICIES),
-    )
-}
+
+def parse_uses(uses: str) -> tuple[str, str]:
+    """Kind and name of a learner: `("jax", "PPO")` for "jax:PPO"; without a prefix "sb3"."""
+    kind, colon, name = uses.partition(":")
+    # `train:make` is a function of a module `train` that returns a model.
+    if colon and kind in BACKENDS and (kind != "train" or ":" in name):
+        return kind, name
+    return "sb3", uses
+
+
+def in_jax(uses: str) -> bool:
+    return parse_uses(uses)[0] == "jax"
 
 
 def find(uses: str, field: str = "uses") -> Entry:
-    """The entry of a name, in any case. A name of no table may be an entry point: see `load`."""
+    """The entry of a name, in any case."""
     kind, name = parse_uses(uses)
-    if kind == "train":
-        return Entry(kind, name)
-    if kind == "independent":
-        return replace(find(name, field), kind=kind)
-    same_kind = {known: entry for known, entry in LEARNERS.items() if entry.kind == kind}
-    for known, entry in same_kind.items():
-        if known.casefold() == uses.casefold():
-            return entry
-    if kind != "sb3":
+    known = {"sb3": _PLACES, "independent": _PLACES}.get(kind, BACKENDS[kind].names)
+    for exact in known:
+        if exact.casefold() == name.casefold():
+            return Entry(kind, exact)
+    if BACKENDS[kind].names:
         hint = " Other algorithms run without JAX." if kind == "jax" else ""
         raise UnknownNameError(
-            f"{field}={uses!r}: must be one of {', '.join(same_kind)}.{hint}"
-            f"{did_you_mean(name, [entry.name for entry in same_kind.values()])}"
+            f"{field}={uses!r}: must be one of {', '.join(f'{kind}:{each}' for each in known)}."
+            f"{hint}{did_you_mean(name, known)}"
         )
-    return Entry("sb3", name)
+    return Entry(kind, name)
 
 
 def default_algorithm(document: SMESpec | StreamSpec) -> str:
@@ -174,7 +231,7 @@ def full_name(uses: str, agents: str | None = None) -> str:
             f"agents='sb3': must be left out for {uses!r}, which is in JAX. Leave it out, or train "
             f"{parse_uses(uses)[1]!r}."
         )
-    return find(f"{JAX}{parse_uses(uses)[1]}" if agents == "jax" else uses, "algorithm").uses
+    return find(f"jax:{parse_uses(uses)[1]}" if agents == "jax" else uses, "algorithm").uses
 
 
 def short_name(uses: str) -> str:
@@ -189,17 +246,70 @@ def folder_name(uses: str) -> str:
 
 def code_notice(uses: Iterable[str]) -> str:
     """Whose code runs to find these algorithms; empty where they name no modules that are here."""
-    names = (parse_uses(name.removeprefix("independent:")) for name in uses)
-    named = [name for kind, name in names if kind in ("sb3", "train") and ":" in name]
-    modules = dict.fromkeys(name.partition(":")[0] for name in named)
+    names = (parse_uses(each)[1] for each in uses)
+    modules = dict.fromkeys(name.partition(":")[0] for name in names if ":" in name)
     here = [module for module in modules if module_file(module)]
     return f"This plan runs the code of {', '.join(here)}." if here else ""
+
+
+def check_hyperparameters(
+    uses: str,
+    hyperparameters: Mapping[str, Any],
+    field: str = "hyperparameters",
+    others: Iterable[str] = (),
+) -> None:
+    """Check that an algorithm is here and has hyperparameters of these names and values.
+
+    Of Stable-Baselines3 and of modules, values are checked when a model is made. Errors call them
+    `field`, and may suggest one of `others`, which the caller has.
+    """
+    entry = find(uses)
+    if entry.kind == "sb3" and entry.name in _PLACES and not hyperparameters:
+        require_sb3()  # which takes less time than its import
+        return
+    model = entry.settings()
+    if others and model.model_config["extra"] == "forbid":
+        for name in hyperparameters.keys() - model.model_fields.keys():
+            raise OptionError(
+                f"{field}.{name}: {uses} has no such hyperparameter."
+                f"{did_you_mean(name, [*model.model_fields, *others])} Known: "
+                f"{', '.join(model.model_fields) or 'none'}."
+            )
+    try:
+        model.from_dict(dict(hyperparameters), field)
+    except SpecError as error:
+        raise OptionError(str(error)) from None
+
+
+def check_algorithm(algorithm: StudyAlgorithm) -> None:
+    field = f"algorithm {algorithm.name!r}: hyperparameters"
+    check_hyperparameters(algorithm.uses, algorithm.hyperparameters, field)
+
+
+def load_algorithm(name: str, field: str = "uses") -> Any:
+    """A class of Stable-Baselines3's kind, or a function that returns a model."""
+    require_sb3()  # every model gets its `VecEnv`
+    with quiet():
+        if name in _PLACES:
+            # It imports the deprecated `gym` if that is installed, which prints a long notice.
+            with contextlib.redirect_stderr(io.StringIO()):
+                return import_object(f"{_PLACES[name]}:{name}", field, OptionError)
+        if ":" not in name:
+            return _entry_point(name, field)
+        algorithm = import_object(name, field, OptionError)
+    if not callable(algorithm):
+        raise OptionError(
+            f"{field}={name!r}: is of type {type(algorithm).__name__}: must be a class like those "
+            "of Stable-Baselines3, or a function from an environment to a learner."
+        )
+    return algorithm
 
 
 def _entry_point(name: str, field: str) -> Any:
     installed = {point.name: point for point in importlib.metadata.entry_points(group=ENTRY_POINTS)}
     if name not in installed:
-        known = [*LEARNERS, *sorted(installed)]
+        prefixed = [f"{kind}:{one}" for kind, row in BACKENDS.items() for one in row.names]
+        known = [*_PLACES, *prefixed, *sorted(installed)]
         raise UnknownNameError(
             f"{field}={name!r}: must be one of {', '.join(known)}; or module:Class or "
             f"module:function, such as sb3_contrib:TQC.{did_you_mean(name, known)}"
@@ -207,60 +317,82 @@ def _entry_point(name: str, field: str) -> Any:
     return import_object(installed[name].value, f"{field}={name!r}: entry point", OptionError)
 
 
-_loaded: dict[str, str] = {}  # the digest of the source that a module has run
+def sb3_settings(name: str, field: str) -> type[StrictModel]:
+    """The arguments of an algorithm's constructor, or of a function that returns a model."""
+    algorithm = load_algorithm(name, field)
+    if not (isinstance(algorithm, type) and is_sb3(algorithm)):
+        return arguments_of(algorithm, "seed", passed=1)
+    policy = algorithm.policy_aliases[policy_alias(algorithm)]
+    model = arguments_of(algorithm, *_RESERVED)
+    in_policy: Any = arguments_of(policy, *_PASSED) | None
+    return create_model(name, __base__=model, policy_kwargs=(in_policy, None))
 
 
-def source_of(uses: str, field: str = "uses") -> str | None:
-    """The digest of the source of `train:module:name`, which is not imported; None of any other."""
-    kind, name = parse_uses(uses)
-    return _source(name, field)[1] if kind == "train" else None
+def independent_settings(name: str, field: str) -> type[StrictModel]:
+    if not is_on_policy(load_algorithm(name, field)):
+        raise OptionError(
+            f"{field}='independent:{name}': must be an on-policy algorithm, such as "
+            "independent:PPO, because the models of a team learn from the same rollouts. Use one "
+            f"model for all agents instead: {name}."
+        )
+    return sb3_settings(name, field)
 
 
-def load_function(name: str, field: str = "uses") -> tuple[Callable[..., Any], str]:
-    """The function `module:function` of the present source, and the source's digest.
+def offline_settings(name: str, field: str) -> type[StrictModel]:
+    """The hyperparameters of an offline learner, and its data set's."""
+    return create_model(
+        name,
+        __base__=documents.ALGORITHMS[name],
+        nu=(Annotated[Real, Field(ge=0, le=1)], ...),
+        transitions=(Annotated[Integer, Field(ge=1)], 50_000),
+        batch_size=(Annotated[Integer, Field(ge=1)], 256),
+    )
 
-    The source is run again where it has changed, so what runs is what the digest says.
+
+def no_settings(name: str, field: str) -> type[StrictModel]:
+    return StrictModel
+
+
+class _Open(StrictModel):
+    model_config = ConfigDict(extra="allow")
+
+
+def arguments_of(function: Any, *reserved: str, passed: int = 0) -> type[StrictModel]:
+    """The arguments of a function, or a class's constructor and those that it passes on to.
+
+    Without those of reserved names, and the first ones, which are `passed`.
     """
-    module_name, _, attribute = name.partition(":")
-    with working_directory_importable():
-        path, digest, source = _source(name, field)
-        module = sys.modules.get(module_name)
-        try:
-            if module is None or _loaded.get(module_name) != digest:
-                if module is None:
-                    spec: Any = importlib.util.find_spec(module_name)
-                    module = importlib.util.module_from_spec(spec)
-                sys.modules[module_name] = module
-                exec(compile(source, path, "exec"), vars(module))
-                _loaded[module_name] = digest
-        except Exception as error:
-            sys.modules.pop(module_name, None)
-            raise OptionError(
-                f"{field}='train:{name}': {module_name} cannot be imported: "
-                f"{type(error).__name__}: {error}. Correct it."
-            ) from error
-    function = getattr(module, attribute, None)
-    if not callable(function):
-        functions = [known for known, value in vars(module).items() if callable(value)]
-        raise OptionError(
-            f"{field}='train:{name}': {path} has no function {attribute!r}."
-            f"{did_you_mean(attribute, functions)} Define {attribute}(env, steps, seed), which "
-            "returns a policy."
-        )
-    return function, digest
+    parameters = list(_parameters_of(function).values())
+    more = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
+    fields: dict[str, Any] = {
+        each.name: (Any, ... if each.default is each.empty else each.default)
+        for each in parameters[passed:]
+        if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)
+        and each.name not in reserved
+        and not each.name.startswith("_")
+    }
+    return create_model("Hyperparameters", __base__=_Open if more else StrictModel, **fields)
 
 
-def _source(name: str, field: str) -> tuple[str, str, bytes]:
-    """The path, the digest and the bytes of a module's source, which is not imported."""
-    module = name.partition(":")[0]
-    path = module_file(module)
-    if not path or not path.endswith(".py"):
-        raise OptionError(
-            f"{field}='train:{name}': there is no Python module {module!r}. It must be "
-            "train:module:function, with the module in the working directory or installed."
-        )
-    source = Path(path).read_bytes()
-    return path, f"sha256:{hashlib.sha256(source).hexdigest()}", source
+def _parameters_of(function: Any) -> Mapping[str, inspect.Parameter]:
+    if not isinstance(function, type):
+        return inspect.signature(function).parameters
+    parameters: dict[str, inspect.Parameter] = {}
+    for owner in function.__mro__:
+        if "__init__" not in vars(owner):
+            continue
+        own = inspect.signature(owner).parameters
+        parameters = {**own, **parameters}
+        if not any(each.kind is each.VAR_KEYWORD for each in own.values()):
+            passed_on = inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL
+            return {name: p for name, p in parameters.items() if p.kind not in passed_on}
+    return parameters
+
+
+def policy_alias(algorithm: Any) -> str:
+    """SB3's name of an algorithm's perceptron policy: "MlpPolicy", or "MlpLstmPolicy"."""
+    aliases: list[str] = ["MlpPolicy", *algorithm.policy_aliases]
+    return next(a for a in aliases if a in algorithm.policy_aliases and a.startswith("Mlp"))
 
 
 def require_sb3() -> None:
@@ -268,13 +400,6 @@ def require_sb3() -> None:
     require_packages(
         "training", {"stable_baselines3": "Stable-Baselines3", "torch": "PyTorch"}, "train"
     )
-
-
-def jax_package() -> ModuleType:
-    """Our package of agents in JAX, with its modules; raises where JAX is missing."""
-    import sme_registry.jax.run
-
-    return sme_registry.jax
 
 
 def is_on_policy(algorithm: Any) -> bool:
@@ -338,99 +463,3 @@ def read_hyperparameters(path: Path) -> dict[str, Any]:
             '{"learning_rate": 0.0001, "policy_kwargs": {"net_arch": [64, 64]}}.'
         )
     return nested_hyperparameters(values)
-
-
-def check_hyperparameters(
-    uses: str,
-    hyperparameters: Mapping[str, Any],
-    field: str = "hyperparameters",
-    others: Iterable[str] = (),
-) -> None:
-    """Check that an algorithm has hyperparameters of these names; values only in JAX and offline.
-
-    Names are those of the constructor or function, and in `policy_kwargs` those of the policy's
-    constructor. Messages call them `field`, and may suggest one of `others`, which the caller has.
-    """
-    if not hyperparameters:
-        return
-    entry = find(uses)
-    if entry.kind == "reference":
-        raise OptionError(
-            f"hyperparameters={sorted(hyperparameters)}: {uses} has no hyperparameters. Leave them "
-            "out."
-        )
-    if entry.kind == "offline":
-        of_learner = {n: v for n, v in hyperparameters.items() if n not in _OF_DATA_SET}
-        documents.check_algorithm(entry.name, of_learner)
-    elif entry.kind == "jax":
-        if others:  # where Stable-Baselines3 is needed anyway
-            check_names(find(entry.name).load(), entry.name, hyperparameters, field, others)
-        jax_package().run.settings_of(uses, hyperparameters, field)
-    else:
-        check_names(entry.load(field), uses, hyperparameters, field, others)
-
-
-def check_algorithm(algorithm: StudyAlgorithm) -> None:
-    field = f"algorithm {algorithm.name!r}: hyperparameters"
-    check_hyperparameters(algorithm.uses, algorithm.hyperparameters, field)
-
-
-def check_names(
-    algorithm: Any,
-    uses: str,
-    hyperparameters: Mapping[str, Any],
-    field: str = "hyperparameters",
-    others: Iterable[str] = (),
-) -> None:
-    """Raise OptionError if an algorithm's class or function has no hyperparameter of a name."""
-    of_train = parse_uses(uses)[0] == "train"
-    of_sb3 = not of_train and isinstance(algorithm, type) and is_sb3(algorithm)
-    first = next(iter(inspect.signature(algorithm).parameters), "env")
-    passed = (first, "seed", "steps") if of_train else (first, "seed")
-    _check_names(field, uses, hyperparameters, algorithm, _RESERVED if of_sb3 else passed, others)
-    in_policy = hyperparameters.get("policy_kwargs")
-    if of_sb3 and isinstance(in_policy, Mapping):
-        policy: Any = cast(Any, algorithm).policy_aliases[policy_alias(algorithm)]
-        _check_names(f"{field}.policy_kwargs", f"{uses}'s policy", in_policy, policy, _PASSED)
-
-
-def _check_names(
-    field: str,
-    owner: str,
-    names: Iterable[str],
-    function: Any,
-    reserved: Iterable[str],
-    others: Iterable[str] = (),
-) -> None:
-    parameters = parameters_of(function)
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
-        return
-    known = [name for name in parameters if name not in reserved and not name.startswith("_")]
-    for name in names:
-        if name not in known:
-            raise OptionError(
-                f"{field}.{name}: {owner} has no such hyperparameter."
-                f"{did_you_mean(name, [*known, *others])} Known: {', '.join(known) or 'none'}."
-            )
-
-
-def policy_alias(algorithm: Any) -> str:
-    """SB3's name of an algorithm's perceptron policy: "MlpPolicy", or "MlpLstmPolicy"."""
-    aliases: list[str] = ["MlpPolicy", *algorithm.policy_aliases]
-    return next(a for a in aliases if a in algorithm.policy_aliases and a.startswith("Mlp"))
-
-
-def parameters_of(function: Any) -> dict[str, inspect.Parameter]:
-    """The parameters of a function, or of a class's constructor and those that it passes on to."""
-    if not isinstance(function, type):
-        return dict(inspect.signature(function).parameters)
-    parameters: dict[str, inspect.Parameter] = {}
-    for owner in function.__mro__:
-        if "__init__" not in vars(owner):
-            continue
-        own = inspect.signature(owner).parameters
-        parameters = {**own, **parameters}
-        if not any(each.kind is each.VAR_KEYWORD for each in own.values()):
-            passed_on = inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL
-            return {name: p for name, p in parameters.items() if p.kind not in passed_on}
-    return parameters

@@ -1,42 +1,28 @@
-"""`Learner`, of which a function of yours is one; `learn`, which trains a run by any `Learner`.
-
-    def train(env, steps, seed):            # `train:module:train` in `sme train -a` and in plans
-        ...                                 # takes at most `steps` steps of `env`
-        return policy                       # from observations [B, O] to actions [B, A]
-
-`env` is a Gymnasium environment of one task, with the exact regret of each step in its info.
-Hyperparameters are keyword arguments. The policy acts in the environment's action space; a model
-with `predict`, as those of Stable-Baselines3, and a PyTorch module are policies, too. It is
-evaluated once, at the end of its training.
+"""`Learner`, what learns in a run; `learn`, which trains a run by any `Learner`.
 
 A run goes on from its last checkpoint. Each finished episode is logged with its exact regret.
 """
 
 from __future__ import annotations
 
-import inspect
-import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import gymnasium
 import numpy as np
 from rich.console import Console
 
 from sme_registry.compiled.arrays import Array
-from sme_registry.envs import SMEEnv
-from sme_registry.envs.episodes import Episode, Episodes, info_of_envs
-from sme_registry.errors import OptionError, PolicyError
+from sme_registry.envs.episodes import Episode, Episodes
+from sme_registry.errors import PolicyError
 from sme_registry.evaluation import Policy, TeamPolicy, as_policy
-from sme_registry.evaluation.models import saved_sb3
-from sme_registry.io import write_atomically
-from sme_registry.io.system import defer_interrupts, working_directory_importable
+from sme_registry.io.system import defer_interrupts
 from sme_registry.io.terminal import Progress
-from sme_registry.spec import SMESpec
+from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.sme_spec import ActionRange
-from sme_registry.training.algorithms import load_function, short_name
+from sme_registry.training.algorithms import short_name
 from sme_registry.training.record import (
     CHECKPOINT,
     EPISODES,
@@ -50,10 +36,38 @@ from sme_registry.training.record import (
 _RECENT = 20  # episodes in the running mean that the progress shows
 
 
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """What a learner learns, and how; errors call its name `field`.
+
+    `num_envs` is 1 where that is None, and more for a team and an on-policy algorithm. `piece` is
+    the most steps between two pauses of what has them at any step.
+    """
+
+    document: SMESpec | StreamSpec
+    seed: int
+    steps: int
+    hyperparameters: Mapping[str, Any]
+    action_range: ActionRange = "symmetric"
+    num_envs: int | None = None
+    device: str | None = None
+    piece: int = 100
+    field: str = "uses"
+
+
+class Steps(NamedTuple):
+    """What happened in one or more steps of all environments: the arguments of `Episodes.add`."""
+
+    rewards: Any
+    info: Mapping[str, Any]
+    terminated: Any
+    ended: Any
+
+
 class Watch:
     """What is called while a learner learns; `RunLog` of a run, and another of a study's cell."""
 
-    def on_steps(self) -> None:
+    def on_steps(self, steps: Steps) -> None:
         """The learner's environments have taken one or more steps."""
 
     def on_visit(self, visit: int) -> None:
@@ -72,21 +86,37 @@ class Learner:
     Attributes:
       steps: environment steps so far.
       total: environment steps at the end; on-policy algorithms collect whole rollouts.
-      model: the trained policy, as `evaluate` takes it.
       hyperparameters: those that differ from the defaults.
+      source: the digest of the source of the code that learns, if that is part of a cell.
+      seconds: CPU seconds in its environments, if they are known.
+      only_at_the_end: whether it has no policy before.
+      model: the trained policy, as `evaluate` takes it.
     """
 
+    source: str | None = None
+    seconds: Any = 0.0
+    only_at_the_end = False
     steps: Any
     total: Any
     model: Any
-    hyperparameters: dict[str, Any]
+
+    def __init__(self, name: str, run: Run) -> None:
+        self.name, self.run = name, run
+        self.hyperparameters: dict[str, Any] = dict(run.hyperparameters)
 
     def learn(self, watch: Watch) -> None:
         """Take the steps of the run that are left; ValueError where weights are not finite."""
+        raise NotImplementedError
 
-    def add_to(self, sums: Episodes) -> list[Episode]:
-        """Add the steps since the last call to sums; returns the episodes that ended in them."""
-        return []
+    def policy(self) -> Policy | TeamPolicy:
+        """The present policy."""
+        return as_policy(self.model, self.run.document.specs[0], action_range=self.run.action_range)
+
+    def lasting_policy(self) -> Policy:
+        """The present policy of a single agent, which further training must not change."""
+        policy = self.policy()
+        assert isinstance(policy, Policy)
+        return policy
 
     def save(self, path: Path) -> None:
         """Write the model; nothing of one that cannot be saved."""
@@ -191,8 +221,8 @@ class RunLog(Watch):
     def prepare(self, note: str) -> None:
         self._progress.prepare(note)
 
-    def on_steps(self) -> None:
-        finished = self._learner.add_to(self._sums)
+    def on_steps(self, steps: Steps) -> None:
+        finished = self._sums.add(*steps)
         for episode in finished:
             by_agent = (episode.agents_regret or (episode.regret,)) if self._agents else ()
             number = len(self.episodes) + 1
@@ -260,100 +290,3 @@ class RunLog(Watch):
             cost = f", cost {np.mean(costs):.3f}" if costs else ""
             notes.append(f"{whose} {regret:.3f}{cost} (last {len(recent)} episodes)")
         return ", ".join(notes)
-
-
-class FunctionLearner(Learner):
-    """A function `train(env, steps, seed) -> policy` in its environment."""
-
-    def __init__(
-        self,
-        name: str,
-        spec: SMESpec,
-        *,
-        seed: int,
-        steps: int,
-        hyperparameters: Mapping[str, Any],
-        action_range: ActionRange,
-        field: str = "uses",
-    ) -> None:
-        self._named, self._spec, self._action_range = f"{field}='train:{name}'", spec, action_range
-        self._seed, self.total, self.hyperparameters = seed, steps, dict(hyperparameters)
-        self._function, self.source = load_function(name, field)
-        self.env = CountedEnv(SMEEnv(spec, action_range=action_range), steps, self._named)
-        self.model: Any = None
-        try:
-            inspect.signature(self._function).bind(self.env, steps, seed, **self.hyperparameters)
-        except TypeError as error:
-            raise OptionError(
-                f"{self._named}: cannot be called with an environment, steps, a seed and the "
-                f"hyperparameters {sorted(hyperparameters)}: {error}. Define "
-                f"{name.partition(':')[2]}(env, steps, seed), and hyperparameters by name."
-            ) from None
-
-    @property
-    def steps(self) -> int:
-        return self.env.steps
-
-    def learn(self, watch: Watch) -> None:
-        self.env.after_step = watch.on_steps
-        self.env.reset(seed=self._seed)  # so that episodes without a seed are reproducible
-        with working_directory_importable():
-            self.model = self._function(self.env, self.total, self._seed, **self.hyperparameters)
-        is_policy = callable(self.model) or hasattr(self.model, "predict")
-        if not is_policy or isinstance(self.model, type):
-            raise PolicyError(
-                f"{self._named}: returned {self.model!r:.80}: must be a policy. Return a function "
-                f"from observations [B, {self._spec.observation_dim}] to actions "
-                f"[B, {self._spec.action_dim}], or a model with predict, as those of "
-                "Stable-Baselines3."
-            )
-
-    def policy(self) -> Policy | TeamPolicy:
-        return as_policy(self.model, self._spec, action_range=self._action_range)
-
-    def add_to(self, sums: Episodes) -> list[Episode]:
-        reward, terminated, truncated, info = self.env.last
-        ended = [terminated or truncated]
-        return sums.add([reward], info_of_envs([info]), [terminated], ended)
-
-    def save(self, path: Path) -> None:
-        kinds = sys.modules.get("stable_baselines3.common.base_class")
-        if kinds is not None and isinstance(self.model, kinds.BaseAlgorithm):
-            write_atomically(path, saved_sb3(self.model))
-
-    def close(self) -> None:
-        self.env.close()
-
-
-class CountedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An environment that takes no more than its steps, and counts their regret and CPU seconds.
-
-    `cost` is None without `safety`; `last` is the last step without its observation.
-    """
-
-    def __init__(self, env: SMEEnv, budget: int, named: str) -> None:
-        super().__init__(env)
-        self._budget, self._named = budget, named
-        self.steps, self.seconds, self.regret = 0, 0.0, np.zeros(1)
-        self.cost: float | None = None if env.sme_spec.safety is None else 0.0
-        self.last: tuple[Any, bool, bool, dict[str, Any]] = (0.0, False, False, {})
-        self.after_step: Callable[[], None] = lambda: None
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        if self.steps >= self._budget:
-            raise PolicyError(
-                f"{self._named}: takes more than {self._budget:,} steps: must stop at the steps "
-                "that it is given. Choose rollouts and evaluations of your own that fit, or give "
-                "more steps."
-            )
-        begun = time.thread_time()
-        result = self.env.step(action)
-        self.seconds += time.thread_time() - begun
-        info = result[4]
-        self.steps += 1
-        self.regret += info["regret"]
-        if self.cost is not None:
-            self.cost += info["cost"]
-        self.last = (float(result[1]), *result[2:])
-        self.after_step()
-        return result

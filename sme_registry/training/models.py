@@ -33,28 +33,27 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
+from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from sme_registry.envs.episodes import Episode, Episodes
+from sme_registry.envs.episodes import Episode, info_of_envs
 from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation import Perceptron, Policy, TeamPolicy
 from sme_registry.evaluation.models import saved_sb3, torch_policy
 from sme_registry.io import import_object, is_installed, write_atomically
 from sme_registry.sb3 import SMETeamVecEnv, SMEVecEnv
-from sme_registry.sb3.vec_env import SingleVecEnv, finished_in, log_episode
+from sme_registry.sb3.vec_env import log_episode
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.sme_spec import ActionRange
-from sme_registry.spec.study import parse_uses
 from sme_registry.training.algorithms import (
-    check_names,
+    arguments_of,
     default_num_envs,
-    find,
     is_on_policy,
     is_sb3,
-    parameters_of,
+    load_algorithm,
+    parse_uses,
     policy_alias,
 )
-from sme_registry.training.learn import Learner, Watch
+from sme_registry.training.learn import Learner, Run, Steps, Watch
 from sme_registry.training.numpy_policy import numpy_policy, numpy_team_policy
 from sme_registry.training.record import VisitEnds
 
@@ -65,7 +64,7 @@ _ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "
 
 
 def new_model(
-    uses: str,
+    name: str,
     env: Any,
     *,
     seed: int,
@@ -74,8 +73,7 @@ def new_model(
     field: str = "uses",
 ) -> Any:
     """Create a model that learns in a `VecEnv`, from so many steps of all its lanes."""
-    algorithm = find(uses, field).load(field)
-    check_names(algorithm, uses, hyperparameters)
+    algorithm = load_algorithm(name, field)
     settings = resolved(hyperparameters)
     if isinstance(algorithm, type) and is_sb3(algorithm):
         if is_off_policy(algorithm):
@@ -85,7 +83,7 @@ def new_model(
             model = algorithm(policy, env, seed=seed, device="cpu", **settings)
         except (AssertionError, MemoryError, TypeError, ValueError) as error:
             raise OptionError(
-                f"{field}={uses!r}: rejects the task or the hyperparameters "
+                f"{field}={name!r}: rejects the task or the hyperparameters "
                 f"{sorted(hyperparameters)}: {error}. Change them, or create the learner in a "
                 "function and give module:function."
             ) from error
@@ -94,14 +92,14 @@ def new_model(
             inspect.signature(algorithm).bind(env, seed=seed, **settings)
         except TypeError as error:
             raise OptionError(
-                f"{field}={uses!r}: cannot be called with an environment, seed= and the "
+                f"{field}={name!r}: cannot be called with an environment, seed= and the "
                 f"hyperparameters {sorted(settings)}: {error}. Give only those that it accepts."
             ) from None
         model = algorithm(env, seed=seed, **settings)
-    missing = [name for name in ("learn", "predict") if not hasattr(model, name)]
+    missing = [method for method in ("learn", "predict") if not hasattr(model, method)]
     if missing:
         raise OptionError(
-            f"{field}={uses!r}: returned a {type(model).__name__}, which has no "
+            f"{field}={name!r}: returned a {type(model).__name__}, which has no "
             f"{' and no '.join(missing)}. Return a learner like those of Stable-Baselines3."
         )
     if is_sb3(model):
@@ -220,7 +218,7 @@ def for_lanes(algorithm: Any, lanes: int, chosen: Iterable[str] = ()) -> dict[st
     if lanes == 1:
         return {}
     if is_on_policy(algorithm) and "n_steps" not in chosen:
-        default = parameters_of(algorithm)["n_steps"].default
+        default: int = arguments_of(algorithm).model_fields["n_steps"].default
         n_steps = min(default, max(_MIN_ROLLOUT, _ROLLOUT // lanes))
         return {} if n_steps == default else {"n_steps": n_steps}
     of_updates = {"gradient_steps", "train_freq"} & set(chosen)
@@ -237,21 +235,21 @@ def random_seed(*numbers: int) -> int:
     return int(np.random.SeedSequence(numbers).generate_state(1)[0] >> 1)
 
 
-class CountedVecEnv(VecEnvWrapper):  # type: ignore[misc, unused-ignore]  # untyped without SB3
-    """Environments that count their steps, regret, cost and CPU seconds of this thread.
+def log_of_run(logger: Any, episode: Episode, agents: Sequence[str] = ()) -> None:
+    """Log an episode as Stable-Baselines3 does, and its exact regret."""
+    logger.record_mean("rollout/ep_rew_mean", episode.episode_return)
+    logger.record_mean("rollout/ep_len_mean", episode.length)
+    log_episode(logger, episode, agents)
 
-    Every model steps its environment, so counting here needs no hook in it. `after_step` is called
-    with `steps` after each step; its time is not counted.
-    """
+
+class WatchedVecEnv(VecEnvWrapper):  # type: ignore[misc, unused-ignore]  # untyped without SB3
+    """Environments that count their steps and CPU seconds, and say what happened in each step."""
 
     def __init__(self, venv: Any) -> None:
         super().__init__(venv)
-        self.names: tuple[str, ...] = tuple(getattr(venv, "agents", ("",)))
+        self.names: tuple[str, ...] = venv.agents
         self.steps, self.seconds = 0, 0.0
-        self.regret = np.zeros(len(self.names))  # sums over steps, by agent
-        self.cost: float | None = None if venv.sme_spec.safety is None else 0.0
-        self.last: tuple[Any, Any, list[dict[str, Any]]] = (0, 0, [])  # rewards, dones, infos
-        self.after_step: Callable[[int], None] = lambda steps: None
+        self.on_steps: Callable[[Steps], None] = lambda steps: None
 
     def reset(self) -> Any:
         observations = self.venv.reset()
@@ -261,15 +259,11 @@ class CountedVecEnv(VecEnvWrapper):  # type: ignore[misc, unused-ignore]  # unty
     def step_wait(self) -> Any:
         begun = time.thread_time()
         result = self.venv.step_wait()
-        self.last = result[1:]
-        infos = result[3]
-        regret = np.array([info["regret"] for info in infos])
-        self.regret += regret.reshape(-1, len(self.names)).sum(axis=0)
-        if self.cost is not None:
-            self.cost += sum(info["cost"] for info in infos)
-        self.steps += self.num_envs // len(self.names)
         self.seconds += time.thread_time() - begun
-        self.after_step(self.steps)
+        self.steps += self.num_envs // len(self.names)
+        _, rewards, dones, infos = result
+        terminated = [not info["TimeLimit.truncated"] for info in infos]
+        self.on_steps(Steps(rewards, info_of_envs(infos), terminated, dones))
         return result
 
 
@@ -282,35 +276,16 @@ class SB3Learner(Learner):
     `models` are by agent; one that is shared has no name.
     """
 
-    def __init__(
-        self,
-        uses: str,
-        document: SMESpec | StreamSpec,
-        *,
-        seed: int,
-        steps: int,
-        hyperparameters: Mapping[str, Any],
-        action_range: ActionRange,
-        num_envs: int | None = None,
-        field: str = "uses",
-    ) -> None:
-        """With `num_envs` the environments log the returns of episodes, as in `sme train`."""
-        self._uses, self._document, self._action_range = uses, document, action_range
-        self._seed, self._steps, self._field = seed, steps, field
-        spec = document.specs[0]
-        algorithm = find(uses, field).load(field)
-        env: Any
-        if spec.team is not None:
-            teams = num_envs or default_num_envs(spec, algorithm)
-            env = SMETeamVecEnv(spec, teams, action_range=action_range)
-        elif num_envs in (None, 1):
-            env = SingleVecEnv(document, action_range=action_range)
-        else:
-            env = SMEVecEnv(document, num_envs, action_range=action_range)
-        lanes = self._lanes(env)
-        changes = for_lanes(algorithm, lanes, hyperparameters)
-        self.hyperparameters = {**changes, **hyperparameters}
-        self.env: Any = CountedVecEnv(env if num_envs is None else VecMonitor(env))
+    def __init__(self, name: str, run: Run) -> None:
+        super().__init__(name, run)
+        self._seed, spec = run.seed, run.document.specs[0]
+        algorithm = load_algorithm(name, run.field)
+        num_envs = run.num_envs or default_num_envs(spec, algorithm)
+        kind: Any = SMEVecEnv if spec.team is None else SMETeamVecEnv
+        env = kind(run.document, num_envs, action_range=run.action_range)
+        changes = for_lanes(algorithm, self._lanes(env), run.hyperparameters)
+        self.hyperparameters = {**changes, **run.hyperparameters}
+        self.env: Any = WatchedVecEnv(env)
         self.models = self._new_models()
 
     def _lanes(self, env: Any) -> int:
@@ -319,12 +294,12 @@ class SB3Learner(Learner):
 
     def _new_models(self) -> dict[str, Any]:
         model = new_model(
-            self._uses,
+            self.name,
             self.env,
-            seed=self._seed,
-            steps=self._steps * len(self.env.names),
+            seed=self.run.seed,
+            steps=self.run.steps * len(self.env.names),
             hyperparameters=self.hyperparameters,
-            field=self._field,
+            field=self.run.field,
         )
         return {"": model}
 
@@ -341,44 +316,49 @@ class SB3Learner(Learner):
         first = next(iter(self.models.values()))
         rollout: int = first.n_steps if hasattr(first, "rollout_buffer") else 1
         chunk: int = rollout * self.env.num_envs // len(self.env.names)
-        return self.steps + -(-max(0, self._steps - self.steps) // chunk) * chunk
+        return self.steps + -(-max(0, self.run.steps - self.steps) // chunk) * chunk
+
+    @property
+    def seconds(self) -> float:
+        return float(self.env.seconds)
 
     def learn(self, watch: Watch) -> None:
-        stream, first_step = self._document, self.steps
+        stream, first_step = self.run.document, self.steps
         visits = None
         if isinstance(stream, StreamSpec):
             visits = VisitEnds(stream, watch.on_visit, first_step)
 
-        def after_step(steps: int) -> None:
-            watch.on_steps()
+        def on_steps(steps: Steps) -> None:
+            watch.on_steps(steps)
             if visits is not None:
-                visits.after_step(steps)
+                visits.after_step(self.steps)
 
-        self.env.after_step = after_step
-        if first_step < self._steps:
+        self.env.on_steps = on_steps
+        if first_step < self.run.steps:
             self._learn(watch, first_step)
         watch.on_pause()
         if visits is not None:  # the last one ends with the training
             visits.finish(self.steps)
 
     def _learn(self, watch: Watch, first_step: int) -> None:
-        left = (self._steps - first_step) * len(self.env.names)
+        left = (self.run.steps - first_step) * len(self.env.names)
         if is_sb3(self.model):
             self.model.learn(left, callback=_Pauses(watch), reset_num_timesteps=first_step == 0)
-        else:
-            self.model.learn(left)
-
-    def add_to(self, sums: Episodes) -> list[Episode]:
-        return finished_in(sums, *self.env.last)
+            return
+        self.model.learn(left)
+        if self.steps < self.run.steps:
+            raise PolicyError(
+                f"uses={self.name!r}: learn({left}) returned after {self.steps} steps of its "
+                "environment. It must take all of them, in that environment."
+            )
 
     def policy(self) -> Policy | TeamPolicy:
-        range_ = self._action_range
-        if self.env.sme_spec.team is None:
-            return numpy_policy(self.model, self._document, action_range=range_)
-        return numpy_team_policy(self.model, self.env.sme_spec, action_range=range_)
+        document, range_ = self.run.document, self.run.action_range
+        if document.specs[0].team is None:
+            return numpy_policy(self.model, document, action_range=range_)
+        return numpy_team_policy(self.model, document.specs[0], action_range=range_)
 
     def lasting_policy(self) -> Policy:
-        """The present policy of a single agent, which further training does not change."""
         policy = self.policy()
         assert isinstance(policy, Policy)  # streams have no teams
         if isinstance(policy.act, Perceptron):
@@ -388,13 +368,19 @@ class SB3Learner(Learner):
             copied = copy.deepcopy(network or self.model, {id(self.env): self.env})
         except Exception as error:
             raise PolicyError(
-                f"uses={self._uses!r}: cannot live in a stream, since its learner cannot be copied "
+                f"uses={self.name!r}: cannot live in a stream, since its learner cannot be copied "
                 f"at the end of a visit: {type(error).__name__}: {error}. Give it a __deepcopy__."
             ) from error
-        return numpy_policy(copied, self._document, action_range=self._action_range)
+        return numpy_policy(copied, self.run.document, action_range=self.run.action_range)
+
+    @property
+    def _of_sb3(self) -> dict[str, Any]:
+        """The models that can be logged and resumed, by agent."""
+        return {agent: model for agent, model in self.models.items() if is_sb3(model)}
 
     def is_finite(self) -> bool:
-        weights = (weight for model in self.models.values() for weight in model.policy.parameters())
+        models = self._of_sb3.values()
+        weights = (weight for model in models for weight in model.policy.parameters())
         # Squared: products of weights that are finite and huge are not, and nor are the actions.
         return all(bool(torch.isfinite(weight.square()).all()) for weight in weights)
 
@@ -407,12 +393,13 @@ class SB3Learner(Learner):
         # Another stream than the first session's, the same whenever this session is repeated.
         model.set_random_seed(random_seed(self._seed, model.num_timesteps))
         self.env.steps = int(model.num_timesteps) // len(self.env.names)
-        if isinstance(self._document, StreamSpec):  # a seed begins a new life, here where it was
+        if isinstance(self.run.document, StreamSpec):  # a seed begins a new life, here where it was
             self.env.set_options({"lifetime": self.env.steps})
 
     def save_checkpoint(self, path: Path, sums: Any = None) -> None:
         """Write a checkpoint; the present episodes restart, so their sums are not in it."""
-        save_checkpoint(self.model, path)
+        for model in self._of_sb3.values():
+            save_checkpoint(model, path)
 
     def save(self, path: Path) -> None:
         if is_sb3(self.model):
@@ -423,18 +410,19 @@ class SB3Learner(Learner):
             write_atomically(path, archive.getvalue())
 
     def begin_log(self, folder: Path) -> None:
-        for name, model in self.models.items():
+        for name, model in self._of_sb3.items():
             silence(model)
             if is_installed("tensorboard"):
                 model.set_logger(configure(str(folder / name), ["tensorboard"]))
 
     def log(self, episodes: Sequence[Episode]) -> None:
         names = self.env.names
-        for episode in episodes:
-            log_episode(self.model.logger, episode, names if len(names) > 1 else ())
+        for model in self._of_sb3.values():
+            for episode in episodes:
+                log_of_run(model.logger, episode, names if len(names) > 1 else ())
 
     def close(self) -> None:
-        for model in self.models.values():
+        for model in self._of_sb3.values():
             model.logger.close()
         self.env.close()
 

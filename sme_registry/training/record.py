@@ -39,7 +39,7 @@ from sme_registry.errors import OptionError
 from sme_registry.io import read_json, to_json, versions, write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
 from sme_registry.spec.document import Integer, Real, StrictModel, without_empty
-from sme_registry.spec.study import in_jax, parse_uses
+from sme_registry.training.algorithms import in_jax, parse_uses
 
 RECORD = "run.json"
 MODEL, MODELS = "model.zip", "model"  # a folder of one model for each independent agent

@@ -52,26 +52,25 @@ from sme_registry.plots.maps import STREAM
 from sme_registry.spec import SMESpec, StreamSpec, catalogue
 from sme_registry.spec.sme_spec import ACTION_RANGES, ActionRange, SpecLike
 from sme_registry.spec.stream import StreamLike
-from sme_registry.spec.study import INDEPENDENT, parse_uses
 from sme_registry.spec.suite import ProtocolLike
 from sme_registry.task import load
 from sme_registry.task.loading import materialize_segments
 from sme_registry.training.algorithms import (
     Entry,
+    check_hyperparameters,
     default_algorithm,
     default_num_envs,
     find,
     full_name,
-    is_sb3,
+    in_jax,
     jax_package,
+    load_algorithm,
     nested_hyperparameters,
-    one_thread,
     quiet,
-    require_sb3,
     short_name,
-    source_of,
 )
-from sme_registry.training.learn import FunctionLearner, Learner, learn
+from sme_registry.training.functions import source_of
+from sme_registry.training.learn import Run, learn
 from sme_registry.training.record import (
     CHECKPOINT,
     EPISODES,
@@ -155,9 +154,8 @@ def train(
     end of each visit. A resumed life goes on at the step of its checkpoint.
 
     Args:
-      algorithm: a name of `algorithms.LEARNERS` that trains in an environment, in any case, an
-        entry point, "module:Class", or "train:module:function" (see `learn`); None takes TD3, and
-        PPO for a team.
+      algorithm: a name (see `algorithms`) in any case, an entry point, "module:Class", or
+        "train:module:function"; None takes TD3, and PPO for a team.
       steps: environment steps over all environments; None takes 20,000, and those of a stream. One
         step of a team is a step of all its agents. PPO and A2C finish their last rollout.
       hyperparameters: as JSON values, such as
@@ -193,19 +191,17 @@ def train(
     document = load(spec)
     stream = document if isinstance(document, StreamSpec) else None
     task = document.specs[0]
-    if independent and task.team is None:
-        raise OptionError(
-            "independent=True: must be False for a task of a single agent. Leave it out, or give a "
-            "team, such as Team4."
-        )
     steps = _steps(document, steps)
     if checkpoint_every is None:
         checkpoint_every = max(_MIN_STEPS_BETWEEN_CHECKPOINTS, steps // _CHECKPOINTS)
     choice("action_range", action_range, ACTION_RANGES)
     protocol = resolve_protocol(protocol)
     uses = full_name(default_algorithm(document) if algorithm is None else algorithm, agents)
+    entry = find(f"independent:{uses}" if independent else uses, "algorithm")
+    hyperparameters = nested_hyperparameters(hyperparameters or {})
     with quiet():
-        entry = find(uses, "algorithm")
+        check_hyperparameters(entry.uses, hyperparameters)
+        entry.check_task(document)
         num_envs = _num_envs(document, entry, num_envs)
         plan = RunRecord(
             status="running",
@@ -214,8 +210,8 @@ def train(
             stream=stream,
             stream_digest="" if stream is None else stream.digest,
             task=document.name,
-            algorithm=uses,
-            hyperparameters=nested_hyperparameters(hyperparameters or {}),
+            algorithm=entry.name if independent else entry.uses,
+            hyperparameters=hyperparameters,
             device=_device(entry, device),
             source=source_of(uses, "algorithm") or "",
             seed=integer_in("seed", seed, 0, 2**32 - num_envs),
@@ -232,9 +228,19 @@ def train(
     materialize_segments(document)  # fails before the folder is created
     folder = Path(folder)
     record = _new_or_continued(folder, plan, resume=resume, force=force)
-    with quiet(), contextlib.nullcontext() if entry.kind == "train" else one_thread():
-        # Rejects values of hyperparameters, and tasks, before the folder is created.
-        learner = _learner(record)
+    with entry.surroundings():
+        run = Run(
+            document=document,
+            seed=record.seed,
+            steps=record.steps,
+            hyperparameters=record.hyperparameters,
+            action_range=record.action_range,
+            num_envs=record.num_envs,
+            device=record.device,
+            piece=min(100, record.checkpoint_every),
+            field="algorithm",
+        )
+        learner = entry.learner(run)  # rejects hyperparameters before the folder is created
         record = record.updated(hyperparameters=learner.hyperparameters)
         if record.sessions == 1:
             claim_folder(folder, _FILES if force else (), force=force)
@@ -264,35 +270,20 @@ def _steps(document: SMESpec | StreamSpec, steps: int | None) -> int:
 
 
 def _num_envs(document: SMESpec | StreamSpec, entry: Entry, num_envs: int | None) -> int:
-    if entry.kind == "independent":
-        raise OptionError(
-            f"algorithm={entry.uses!r}: is a name for studies. Train {entry.name!r} with "
-            "independent=True (in the terminal, --independent)."
-        )
-    if entry.kind in ("jax", "train"):
-        if num_envs not in (None, 1):
-            raise OptionError(
-                f"num_envs={num_envs!r}: must be 1 for {entry.uses!r}. Leave it out, or train an "
-                "algorithm of Stable-Baselines3."
-            )
-        if entry.kind == "train":
-            entry.check_task(document)
-        return 1
-    algorithm = entry.load("algorithm")
-    entry.check_task(document)
-    if isinstance(document, SMESpec):
-        default = default_num_envs(document, algorithm)
+    if entry.backend.several and isinstance(document, SMESpec):
+        default = default_num_envs(document, load_algorithm(entry.name, "algorithm"))
         return integer_in("num_envs", default if num_envs is None else num_envs, 1, 4096)
     if num_envs not in (None, 1):
         raise OptionError(
-            f"num_envs={num_envs}: must be 1 on a stream, since each environment would live a life "
-            "of its own. Leave it out."
+            f"num_envs={num_envs!r}: must be 1 on a stream, since each environment would live a "
+            "life of its own, and for algorithms that are not of Stable-Baselines3's kind. Leave "
+            "it out."
         )
     return 1
 
 
 def _device(entry: Entry, device: str | None) -> str:
-    if entry.kind == "jax":
+    if in_jax(entry.uses):
         return str(jax_package().find_device(device).platform)
     if device is not None:
         raise OptionError(
@@ -300,33 +291,6 @@ def _device(entry: Entry, device: str | None) -> str:
             'or use --agents jax (in Python, agents="jax").'
         )
     return ""
-
-
-def _learner(record: RunRecord) -> Learner:
-    kind, name = parse_uses(record.algorithm)
-    options: dict[str, Any] = {
-        "seed": record.seed,
-        "steps": record.steps,
-        "hyperparameters": record.hyperparameters,
-        "action_range": record.action_range,
-        "field": "algorithm",
-    }
-    if kind == "train":
-        return FunctionLearner(name, record.spec, **options)
-    require_sb3()  # also of an agent in JAX, `model.zip` is a model of it
-    from sme_registry.training.learners import JAXLearner, new_learner
-
-    if kind == "jax":
-        return JAXLearner(record)
-    uses = f"{INDEPENDENT * record.independent}{name}"
-    learner = new_learner(uses, record.document, num_envs=record.num_envs, **options)
-    if not all(map(is_sb3, learner.models.values())):
-        raise OptionError(
-            f"algorithm={name!r}: returned a {type(learner.model).__name__}, which is no model of "
-            "Stable-Baselines3, so its training cannot be logged or resumed. Train it in a study: "
-            f"`sme study new plan.json -t TASK -a {name}`, or as train:module:function."
-        )
-    return learner
 
 
 def _new_or_continued(folder: Path, plan: RunRecord, *, resume: bool, force: bool) -> RunRecord:
@@ -346,11 +310,6 @@ def _new_or_continued(folder: Path, plan: RunRecord, *, resume: bool, force: boo
             f"{folder}: contains a {previous.status} run of {previous.algorithm}{reason}. Only "
             "interrupted runs can be resumed, also with more steps. Give another folder, or use "
             "--force to replace it (in Python, force=True)."
-        )
-    if parse_uses(previous.algorithm)[0] == "train":
-        raise OptionError(
-            f"{folder}: contains an unfinished run of {previous.algorithm}, which has no "
-            "checkpoints. Use --force to start again (in Python, force=True)."
         )
     if not resume:
         raise OptionError(

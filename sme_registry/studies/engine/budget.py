@@ -11,20 +11,14 @@ import statistics
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
-from typing import Any, cast
 
 from sme_registry.errors import OptionError, SMEError, UnknownNameError, did_you_mean
 from sme_registry.io import choice
 from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan
-from sme_registry.spec.study import JAX, Cell, PlannedCell, in_jax, parse_uses
+from sme_registry.spec.study import Cell, PlannedCell
 from sme_registry.studies.engine.result import CellResult
-from sme_registry.training.algorithms import (
-    AGENTS,
-    find,
-    is_on_policy,
-    parameters_of,
-    source_of,
-)
+from sme_registry.training.algorithms import AGENTS, find, parse_uses
+from sme_registry.training.functions import source_of
 
 # Seconds of one training step with default hyperparameters on a fast core.
 SECONDS_PER_STEP = {
@@ -121,7 +115,7 @@ def with_agents(file: StudyFile, agents: str) -> StudyFile:
             algorithm["uses"] = name if kind == "jax" else uses
         elif kind not in ("reference", "offline"):
             field = f"algorithm {algorithm['name']!r}: uses"
-            algorithm["uses"] = find(uses if kind == "jax" else f"{JAX}{uses}", field).uses
+            algorithm["uses"] = find(uses if kind == "jax" else f"jax:{uses}", field).uses
     plan = StudyPlan.from_dict(fields, f"the plan with agents={agents}")
     return _renamed(file, plan, f"-{agents}")
 
@@ -215,13 +209,8 @@ def uneven_rollouts(plan: StudyPlan) -> list[str]:
 
 def _rollout_steps(algorithm: StudyAlgorithm) -> int:
     """Steps between two updates of an on-policy algorithm; 1 for any other."""
-    uses, chosen = algorithm.uses, algorithm.hyperparameters
-    if in_jax(uses):
-        from sme_registry.jax.run import settings_of
-
-        return int(getattr(settings_of(uses, chosen), "n_steps", 1))
-    learner = find(uses).load()
-    if not is_on_policy(learner):
+    fields = find(algorithm.uses).settings().model_fields
+    if "gae_lambda" not in fields:
         return 1
-    parameter = parameters_of(learner).get("n_steps")
-    return 1 if parameter is None else int(cast(Any, chosen.get("n_steps", parameter.default)))
+    steps: int = algorithm.hyperparameters.get("n_steps", fields["n_steps"].default)
+    return steps

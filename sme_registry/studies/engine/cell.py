@@ -3,15 +3,13 @@
     reference:…    a policy that learns nothing, evaluated as often as a learner
     offline:…      collects a data set, which it does not keep, and learns from it alone
     jax:…          the only run of a program (`programs`)
-    train:…        a `FunctionLearner`, evaluated at its end alone
-    any other      an `SB3Learner` in its environments
+    any other      its `Learner`, in environments of its own
 
 The same cell gives the same result on the same machine, except for `timing`.
 """
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -42,8 +40,8 @@ from sme_registry.studies.engine.result import (
 )
 from sme_registry.task import materialize
 from sme_registry.task.loading import materialize_segments
-from sme_registry.training.algorithms import Entry, check_hyperparameters, find, one_thread, quiet
-from sme_registry.training.learn import FunctionLearner, Watch
+from sme_registry.training.algorithms import Entry, check_hyperparameters, find
+from sme_registry.training.learn import Learner, Run, Steps, Watch
 from sme_registry.training.record import Snapshots
 
 ReportSteps = Callable[[int, int], None]
@@ -73,47 +71,36 @@ def run_cell(
     """
     progress = progress or (lambda done, total: None)
     entry = find(cell.uses)
+    entry.check_task(cell.document)
+    check_hyperparameters(cell.uses, cell.hyperparameters)
     if entry.kind == "jax":
         return _run_alone(cell, progress, model_path)
-    if entry.kind == "offline":
-        return _run_offline(cell, entry.name, progress)
-    if entry.kind == "reference":
-        check_hyperparameters(cell.uses, cell.hyperparameters)
-        with quiet():
+    with entry.surroundings():
+        if entry.kind == "offline":
+            return _run_offline(cell, entry.name, progress)
+        if entry.kind == "reference":
             return _run_reference(cell, entry.name, progress)
-    with quiet(), contextlib.nullcontext() if entry.kind == "train" else one_thread():
         return _train(cell, entry, progress, model_path)
 
 
 def _train(cell: Cell, entry: Entry, progress: ReportSteps, model_path: Path | None) -> CellResult:
-    options: dict[str, Any] = {
-        "seed": cell.seed,
-        "steps": cell.steps,
-        "hyperparameters": cell.hyperparameters,
-        "action_range": cell.action_range,
-    }
-    learner: Any
-    if entry.kind == "train":
-        learner = FunctionLearner(entry.name, cell.spec, **options)
-        if cell.source not in (None, learner.source):
-            raise OptionError(
-                f"uses={cell.uses!r}: the source of its module is {learner.source} now, and that "
-                f"of the cell is {cell.source}. Run the study again: with another source it is "
-                "another cell."
-            )
-        cell = Cell(**dict(cell) | {"source": learner.source})
-    else:
-        entry.load()  # without Stable-Baselines3, what is missing is named
-        from sme_registry.training.learners import new_learner
-
-        learner = new_learner(cell.uses, cell.document, **options)
+    run = Run(
+        document=cell.document,
+        seed=cell.seed,
+        steps=cell.steps,
+        hyperparameters=cell.hyperparameters,
+        action_range=cell.action_range,
+    )
+    learner = entry.learner(run)
+    if cell.source not in (None, learner.source):
+        raise OptionError(
+            f"uses={cell.uses!r}: the source of its module is {learner.source} now, and that "
+            f"of the cell is {cell.source}. Run the study again: with another source it is "
+            "another cell."
+        )
+    cell = Cell(**dict(cell) | {"source": learner.source})
     training = _Training(cell, progress, learner, model_path and model_path.with_suffix(""))
     training.run()
-    if entry.kind != "train" and learner.steps < cell.steps:
-        raise PolicyError(
-            f"uses={cell.uses!r}: learn({cell.steps}) returned after {learner.steps} steps of "
-            "its environment. It must take all of them, in that environment."
-        )
     if model_path is not None:
         learner.save(model_path)
     return training.result()
@@ -144,7 +131,7 @@ def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> Ce
 
 
 def _run_reference(cell: Cell, name: str, progress: ReportSteps) -> CellResult:
-    evaluations = _Evaluations(cell, progress)
+    evaluations = _Evaluations(cell, progress, cell.evaluations)
     policy = as_policy(reference_policy(name, cell.spec), cell.spec)
     for steps in evaluations.record.due:
         evaluations.evaluate(steps, policy)
@@ -155,12 +142,12 @@ def _run_reference(cell: Cell, name: str, progress: ReportSteps) -> CellResult:
 class _Evaluations(Watch):
     """The evaluations of a cell whose policy runs outside JAX."""
 
-    def __init__(self, cell: Cell, progress: ReportSteps) -> None:
+    def __init__(self, cell: Cell, progress: ReportSteps, evaluations: int) -> None:
         self.cell, self._progress = cell, progress
         tasks = materialize_segments(cell.document)
         self._schedule = Schedule(cell.document, tasks)
         agents = () if cell.spec.team is None else tasks[0].names
-        self.record = Record((cell,), 1, time.thread_time, agents)
+        self.record = Record((cell,), 1, evaluations, time.thread_time, agents)
 
     def report(self, steps: int) -> None:
         """Report the steps done; an algorithm may take more than those of the plan."""
@@ -203,9 +190,10 @@ class _Training(_Evaluations):
     """A learner and its evaluations; in a stream also its policies at the ends of visits."""
 
     def __init__(
-        self, cell: Cell, progress: ReportSteps, learner: Any, snapshots: Path | None
+        self, cell: Cell, progress: ReportSteps, learner: Learner, snapshots: Path | None
     ) -> None:
-        super().__init__(cell, progress)
+        n = min(1, cell.evaluations) if learner.only_at_the_end else cell.evaluations
+        super().__init__(cell, progress, n)
         self._learner = learner
         self._files: Snapshots | None = None
         self._policies: list[Policy] = []  # before training, and at the end of each visit
@@ -216,21 +204,19 @@ class _Training(_Evaluations):
             self.on_visit(-1)
 
     def run(self) -> None:
-        env, record = self._learner.env, self.record
         self._evaluate_due(0)
         self.report(0)
         self._learner.learn(self)
-        record.add(env.regret, env.cost)
-        record.spend(TRAINING)
-        while record.evaluated < len(record.due):
-            self.evaluate(env.steps, self._learner.policy())
+        self.record.spend(TRAINING)
+        while self.record.evaluated < len(self.record.due):
+            self.evaluate(self._learner.steps, self._learner.policy())
 
-    def on_steps(self) -> None:
-        """Count a step, before the learner learns from it, and run what is due."""
-        steps = self._learner.steps
+    def on_steps(self, taken: Steps) -> None:
+        """Count steps, before the learner learns from them, and run what is due."""
+        steps, info = self._learner.steps, taken.info
+        self.record.add(info["regret"], info.get("cost"))
         if self.cell.stream is not None:
-            info = self._learner.env.last[2][0]
-            self._uncounted.append((info["regret"], info["phase"]))
+            self._uncounted += zip(info["regret"], info["phase"], strict=True)
             if len(self._uncounted) >= _COUNTED_AT_ONCE:
                 self._count(steps)
         self._evaluate_due(steps)
@@ -251,7 +237,7 @@ class _Training(_Evaluations):
             self._count(learner.steps)
             initial, *visits = self._policies
             report = life_report(self.cell, visits, initial, blocks.dynamic_regret())
-        return self.result_of(report, learner.steps, learner.env.seconds)
+        return self.result_of(report, learner.steps, learner.seconds)
 
     def _evaluate_due(self, steps: int) -> None:
         """Run the evaluations that are due during training; the last one waits for its end."""
@@ -327,8 +313,6 @@ def _recipe(cell: Cell, settings: dict[str, Any]) -> DatasetRecipe:
     """The recipe of a cell's data set; takes its `nu` and `transitions` out of `settings`."""
     if cell.spec.D > 0:
         raise SpecError(f"D={cell.spec.D:g}: must be 0 for an offline cell. Leave it out.")
-    if "nu" not in settings:
-        raise OptionError("hyperparameters.nu: is required. Give a number in [0, 1], such as 0.5.")
     return DatasetRecipe.from_dict(
         {
             "spec": cell.spec,

@@ -40,7 +40,7 @@ from sme_registry.jax.program import Evaluation, Program, StepLog
 from sme_registry.jax.run import hidden_of, new_program, policy_of
 from sme_registry.jax.run import run as run_to_end
 from sme_registry.jax.task import Form
-from sme_registry.spec.study import Cell, in_jax
+from sme_registry.spec.study import Cell
 from sme_registry.studies.engine.ledger import read_header, read_state, write_state
 from sme_registry.studies.engine.result import (
     CPU,
@@ -55,6 +55,7 @@ from sme_registry.studies.engine.result import (
     failed,
     life_report,
 )
+from sme_registry.training.algorithms import in_jax
 from sme_registry.training.record import Snapshots, versions_for
 
 _Shape = tuple[int, int, int, int]
@@ -193,7 +194,7 @@ class _ProgramRun:
             shape=shape_of(self._cell),
         )
         clock = time.process_time if self._program.device.platform == CPU else time.monotonic
-        self._record = Record(self._cells, shared.runs, clock)
+        self._record = Record(self._cells, shared.runs, self._cell.evaluations, clock)
         self._snapshots = self._initial_snapshots()
         self._restore()
         self._last_state = time.monotonic()
@@ -272,8 +273,8 @@ class _ProgramRun:
         ]
 
     def _on_log(self, log: StepLog) -> None:
-        record, cost = self._record, log.cost
-        record.add(log.regret.sum(axis=0), None if cost is None else cost.sum(axis=0))
+        record = self._record
+        record.add(log.regret, log.cost)
         if record.blocks is not None:
             record.blocks.add(self._program.steps, log.regret)
         record.spend(TRAINING)

@@ -34,7 +34,7 @@ from sme_registry.spec.document import (
     StrictModel,
     without_empty,
 )
-from sme_registry.spec.study import Cell, parse_uses
+from sme_registry.spec.study import Cell
 from sme_registry.training.record import versions_for
 
 CPU = "cpu"
@@ -232,7 +232,7 @@ class Record:
 
     One of Stable-Baselines3 is a program with one run. The k-th evaluation follows
     round(steps · k / evaluations) steps, the last one the end of training: on-policy algorithms
-    finish their last rollout, so it can be later. A function is evaluated at the end alone.
+    finish their last rollout, so it can be later.
     The last axis of `arrays` is runs; of a team's only run, `regret` is by agent.
     """
 
@@ -240,13 +240,11 @@ class Record:
         self,
         cells: Sequence[Cell],
         runs: int,
+        evaluations: int,
         clock: Callable[[], float],
         agents: Sequence[str] = (),
     ) -> None:
-        cell = cells[0]
-        n = cell.evaluations
-        if parse_uses(cell.uses)[0] == "train":
-            n = min(n, 1)
+        cell, n = cells[0], evaluations
         self._cells, self._agents = cells, agents
         self.due = [round(cell.steps * k / n) for k in range(1, n + 1)]
         self.evaluated = 0
@@ -272,10 +270,11 @@ class Record:
             self.blocks.regret = arrays["block_regret"]
 
     def add(self, regret: Any, cost: Any = None) -> None:
-        """Add sums over steps of training, by run; of a team by agent."""
-        self.arrays["regret"] += regret
+        """Add steps of training of all runs; of a team, of the agents of each of its copies."""
+        totals = self.arrays["regret"]
+        totals += np.reshape(regret, (-1, len(totals))).sum(axis=0)
         if cost is not None:
-            self.arrays["cost"] += cost
+            self.arrays["cost"] += np.reshape(cost, (-1, len(self.arrays["cost"]))).sum(axis=0)
 
     def evaluation(self, k: int, rows: Any, agents_regret: Any = None) -> None:
         """Store the k-th evaluation: the fields of a `LearningCurve`, by run."""

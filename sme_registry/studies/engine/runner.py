@@ -16,13 +16,13 @@ from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.io import Lock, choice, integer_in
 from sme_registry.io.terminal import Progress
 from sme_registry.spec import StudyFile, StudyPlan
-from sme_registry.spec.study import Cell, PlannedCell, in_jax
+from sme_registry.spec.study import Cell, PlannedCell
 from sme_registry.studies.engine.budget import selected, with_sources
 from sme_registry.studies.engine.cell import jax_programs, run_cell
 from sme_registry.studies.engine.executors import EXECUTORS, Executor, RunCell
 from sme_registry.studies.engine.ledger import Ledger, SavedState, StudyStatus, label, plan_status
 from sme_registry.studies.engine.result import CPU, CellFailure, CellResult, Job, Outcome
-from sme_registry.training.algorithms import check_algorithm, code_notice, find
+from sme_registry.training.algorithms import check_algorithm, code_notice, find, in_jax
 from sme_registry.training.record import versions_for
 
 if TYPE_CHECKING:
@@ -110,7 +110,6 @@ def _check(plan: StudyPlan, planned: Collection[PlannedCell], console: Console |
     if notice and console is not None:
         console.print(escape(notice), highlight=False, soft_wrap=True)
     for algorithm in algorithms:
-        find(algorithm.uses).check_installed()
         check_algorithm(algorithm)
     for cell in planned:
         find(cell.cell.uses).check_task(cell.cell.document)

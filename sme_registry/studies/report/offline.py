@@ -20,7 +20,7 @@ import pandas as pd
 from sme_registry import statistics
 from sme_registry.io.markup import plural, signed
 from sme_registry.spec import StudyAlgorithm
-from sme_registry.spec.study import parse_uses
+from sme_registry.training.algorithms import parse_uses
 from sme_registry.statistics import Array
 from sme_registry.studies.report.analysis import (
     ENOUGH_RUNS,

@@ -48,7 +48,6 @@ import pandas as pd
 
 from sme_registry import statistics
 from sme_registry.spec import StudyFile
-from sme_registry.spec.study import parse_uses
 from sme_registry.statistics import Array, Statistic
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.report.analysis import (

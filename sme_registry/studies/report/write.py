@@ -31,7 +31,6 @@ from sme_registry.io.markup import environment, plural
 from sme_registry.io.terminal import duration
 from sme_registry.plots.style import WRITTEN
 from sme_registry.spec import StudyFile
-from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.ledger import REPORT, Ledger, label, requested
 from sme_registry.studies.report.analysis import (
     METRICS,
