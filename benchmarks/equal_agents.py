@@ -24,7 +24,8 @@ import numpy as np
 from scipy import stats
 
 from sme_registry.spec import SMESpec
-from sme_registry.training.algorithms import find, one_thread, quiet
+from sme_registry.training.algorithms import find
+from sme_registry.training.learn import Run, Steps, Watch
 
 PARTS = 10  # of a run, each with its own mean regret
 MARGIN = {"PPO": 0.01, "TD3": 0.03, "SAC": 0.03}
@@ -33,15 +34,17 @@ CONFIDENCE = 0.9
 
 def train_sb3(algorithm: str, spec: SMESpec, seed: int, steps: int) -> list[float]:
     """The regret of each part of a run of Stable-Baselines3 with its defaults."""
-    from sme_registry.sb3.vec_env import SingleVecEnv
-    from sme_registry.training.models import CountedVecEnv
+    regret: list[float] = []
 
-    env = CountedVecEnv(SingleVecEnv(spec, action_range="symmetric"))
-    total: list[float] = [0.0]
-    env.after_step = lambda done: total.append(float(env.regret[0]))
-    with quiet(), one_thread():
-        find(algorithm).load()("MlpPolicy", env, seed=seed, device="cpu").learn(steps)
-    return parts(np.diff(total))
+    class Listener(Watch):
+        def on_steps(self, taken: Steps) -> None:
+            regret.extend(taken.info["regret"])
+
+    entry = find(algorithm)
+    with entry.surroundings():
+        run = Run(document=spec, seed=seed, steps=steps, hyperparameters={})
+        entry.learner(run).learn(Listener())
+    return parts(regret)
 
 
 def train_jax(

@@ -72,9 +72,9 @@ def training(algorithm: str, lanes: int = 1, budget: int = BUFFER) -> Callable[[
 
 @pytest.mark.parametrize("algorithm", TARGET)
 def test_training_steps_of_one_agent(compare: Any, algorithm: str) -> None:
-    from sme_registry.sb3.vec_env import SingleVecEnv
+    from sme_registry.sb3 import SMEVecEnv
 
-    model = learner(algorithm, SingleVecEnv(SPEC, action_range="symmetric"))
+    model = learner(algorithm, SMEVecEnv(SPEC))
     model.learn(STEPS)
 
     def sb3(steps: int) -> None:

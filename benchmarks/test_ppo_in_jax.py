@@ -45,9 +45,9 @@ def training(specs: Sequence[SMESpec | StreamSpec]) -> Callable[[int], None]:
 
 @pytest.mark.parametrize("agents", TARGET)
 def test_training_steps_of_agents(compare: Any, agents: int) -> None:
-    from sme_registry.sb3.vec_env import SingleVecEnv
+    from sme_registry.sb3 import SMEVecEnv
 
-    model = learner("PPO", SingleVecEnv(SMESpec(), action_range="symmetric"))
+    model = learner("PPO", SMEVecEnv(SMESpec()))
 
     def sb3(steps: int) -> None:
         model.learn(steps, reset_num_timesteps=False)

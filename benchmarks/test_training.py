@@ -63,14 +63,14 @@ def test_evaluations_of_five_episodes(compare: Any, algorithm: str) -> None:
 
 @pytest.mark.parametrize("algorithm", ROUND)
 def test_training_steps(compare: Any, algorithm: str) -> None:
-    from sme_registry.sb3.vec_env import SingleVecEnv
+    from sme_registry.sb3 import SMEVecEnv
 
     def training(env: Any) -> Any:
         model = learner(algorithm, env)
         model.learn(ROUND[algorithm])
         return lambda steps: model.learn(steps, reset_num_timesteps=False)
 
-    env, steps = SingleVecEnv(SPEC, action_range="symmetric"), ROUND[algorithm]
+    env, steps = SMEVecEnv(SPEC), ROUND[algorithm]
     with one_thread():
         compare(
             f"{algorithm}, a step of training", "step", training(env), steps,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -38,7 +38,7 @@ from sme_registry.io.terminal import (
     print_line,
     print_note,
 )
-from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan, catalogue
+from sme_registry.spec import StudyFile, StudyPlan, catalogue
 from sme_registry.spec.catalogue import is_path
 from sme_registry.spec.study import PlannedCell
 from sme_registry.studies.engine.budget import (
@@ -53,7 +53,6 @@ from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.training.algorithms import (
     check_algorithm,
     code_notice,
-    find,
     folder_name,
     nested_hyperparameters,
     parse_uses,
@@ -249,8 +248,7 @@ def plan(
     planned = selected(file.plan.cells, only or ())
     cells = {cell.cell.digest: cell.cell for cell in planned}
     results = {} if folder is None else Ledger(folder).results()
-    names = {cell.algorithm for cell in planned}
-    check_algorithms((a for a in file.plan.algorithms if a.name in names), SMEError)
+    check_algorithms(file.plan, planned, SMEError)
     warn_of_uneven_rollouts(file.plan)
     estimator = Estimator(results.values())
     waiting = [cell for key, cell in cells.items() if key not in results]
@@ -319,20 +317,20 @@ def _plan_table(file: StudyFile, planned: Sequence[PlannedCell], seconds: Any) -
     return Table.of(title, rows, caption=caption)
 
 
-def check_algorithms(algorithms: Iterable[StudyAlgorithm], errors: type[SMEError]) -> None:
-    """Check a plan's algorithms; warn about those that cannot be found here by such an error."""
-    algorithms = list(algorithms)
+def check_algorithms(
+    plan: StudyPlan, planned: Sequence[PlannedCell], errors: type[SMEError]
+) -> None:
+    """Check the algorithms of planned cells; warn about those that raise such an error."""
+    names = {cell.algorithm for cell in planned}
+    algorithms = [algorithm for algorithm in plan.algorithms if algorithm.name in names]
     if notice := code_notice(algorithm.uses for algorithm in algorithms):
         print_note(escape(notice))
     messages = []
     for algorithm in algorithms:
         try:
-            find(algorithm.uses).check_installed()
+            check_algorithm(algorithm, planned)
         except errors as error:
-            unchecked = " Its hyperparameters are not checked." if algorithm.hyperparameters else ""
-            messages.append(f"{error}{unchecked}")
-        else:
-            check_algorithm(algorithm)
+            messages.append(str(error))
     for message in unique(messages):  # several algorithms may lack the same package
         print_note(f"[yellow]cannot run here:[/] {escape(message)}")
 
@@ -397,7 +395,7 @@ def new(
         named = isinstance(data, dict) and "name" in data
         file = StudyFile.with_digest(data, source, **({} if named else default_name) | about)
     # A package that is not installed here may be installed where the plan runs.
-    check_algorithms(file.plan.algorithms, MissingDependencyError)
+    check_algorithms(file.plan, file.plan.cells, MissingDependencyError)
     warn_of_uneven_rollouts(file.plan)
     file.write(path)
     print_line(f"{escape(str(path))}  {file.digest}")

@@ -36,7 +36,8 @@ _OnVisit = Callable[[int, list[dict[str, Array]]], Any]
 
 def hyperparameters_of(uses: str, field: str = "uses") -> type[AgentSettings]:
     """The model of an algorithm's hyperparameters."""
-    return _algorithm(uses)[0]
+    model: type[AgentSettings] = _algorithm(uses)[0]
+    return model
 
 
 def settings_of(uses: str, hyperparameters: Mapping[str, Any]) -> Any:

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from sme_registry.compiled.arrays import REWARD, Array, Mask, Observation
-from sme_registry.envs import SMEEnv, arguments
+from sme_registry.envs import arguments
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.episodes import Episode, Episodes, info_of_envs
 from sme_registry.envs.rendering import METADATA, Frame, batch_renderer, html_card
@@ -338,29 +338,6 @@ class SMETeamVecEnv(_BatchVecEnv):
             raise arguments.not_finite_error()
         by_agent = unit.reshape(self.num_teams, len(self.agents), -1)
         return np.ascontiguousarray(by_agent[:, self._owner, self._entry])
-
-
-class SingleVecEnv(LanesVecEnv):
-    """One environment, bit for bit `SMEVecEnv` with one, without the overhead of a batch."""
-
-    def __init__(self, document: SMESpec | StreamSpec, *, action_range: ActionRange) -> None:
-        self._env = SMEEnv(document, action_range=action_range)
-        super().__init__([self._env])
-
-    def reset(self) -> Observation:
-        observation, info = self._env.reset(seed=self._seeds[0], options=self._options[0] or None)
-        self.reset_infos = [info]
-        self._clear_reset_arguments()
-        return observation[None]
-
-    def step_wait(self) -> StepResult:
-        observation, reward, terminated, truncated, info = self._env.step(self._take_actions()[0])
-        ended = terminated or truncated
-        info["TimeLimit.truncated"] = truncated and not terminated
-        if ended:
-            info["terminal_observation"] = observation
-            observation, self.reset_infos[0] = self._env.reset()
-        return observation[None], np.array([reward], np.float32), np.array([ended]), [info]
 
 
 def log_episode(logger: Any, episode: Episode, agents: Sequence[str] = ()) -> None:

@@ -39,6 +39,7 @@ from sme_registry.io import choice, import_object, read_json, require_packages
 from sme_registry.io.system import missing_dependency, module_file
 from sme_registry.spec import SMESpec, StreamSpec, StudyAlgorithm
 from sme_registry.spec.document import Integer, Real, StrictModel
+from sme_registry.spec.study import PlannedCell
 
 if TYPE_CHECKING:
     from sme_registry.training.learn import Learner, Run
@@ -146,7 +147,7 @@ class Entry:
 
     def settings(self, field: str = "uses") -> type[StrictModel]:
         """The model of its hyperparameters; raises if it is not installed here."""
-        model: type[StrictModel] = _imported(self.backend.settings)(self.name, field)
+        model: type[StrictModel] = imported(self.backend.settings)(self.name, field)
         return model
 
     def learner(self, run: Run) -> Learner:
@@ -155,7 +156,7 @@ class Entry:
             raise OptionError(
                 f"{run.field}={self.uses!r}: learns in no environment. Use it in a study."
             )
-        learner: Learner = _imported(self.backend.learner)(self.name, run)
+        learner: Learner = imported(self.backend.learner)(self.name, run)
         return learner
 
     def check_task(self, document: Document) -> None:
@@ -172,7 +173,7 @@ class Entry:
         if _PLACES.get(self.name) == "sme_registry.sb3":
             check_has_limits(self.name, spec)
         if backend.check:
-            _imported(backend.check)(document)
+            imported(backend.check)(document)
 
     @contextlib.contextmanager
     def surroundings(self) -> Iterator[None]:
@@ -181,7 +182,7 @@ class Entry:
             yield
 
 
-def _imported(name: str) -> Any:
+def imported(name: str) -> Any:
     """What `module:name` is; the error for a missing package names its extra."""
     module, _, attribute = name.partition(":")
     try:
@@ -268,20 +269,24 @@ def check_hyperparameters(
         require_sb3()  # which takes less time than its import
         return
     model = entry.settings()
-    if others and model.model_config["extra"] == "forbid":
-        for name in hyperparameters.keys() - model.model_fields.keys():
-            raise OptionError(
-                f"{field}.{name}: {uses} has no such hyperparameter."
-                f"{did_you_mean(name, [*model.model_fields, *others])} Known: "
-                f"{', '.join(model.model_fields) or 'none'}."
-            )
+    unknown = [name for name in hyperparameters if name not in model.model_fields]
+    for name in unknown if model.model_config["extra"] == "forbid" else ():
+        raise OptionError(
+            f"{field}.{name}: {entry.uses} has no such hyperparameter."
+            f"{did_you_mean(name, [*model.model_fields, *others])} Known: "
+            f"{', '.join(model.model_fields) or 'none'}."
+        )
     try:
         model.from_dict(dict(hyperparameters), field)
     except SpecError as error:
         raise OptionError(str(error)) from None
 
 
-def check_algorithm(algorithm: StudyAlgorithm) -> None:
+def check_algorithm(algorithm: StudyAlgorithm, planned: Iterable[PlannedCell]) -> None:
+    """Check an algorithm of a plan, and that it can learn the tasks of its cells."""
+    for place in planned:
+        if place.algorithm == algorithm.name:
+            find(algorithm.uses).check_task(place.cell.document)
     field = f"algorithm {algorithm.name!r}: hyperparameters"
     check_hyperparameters(algorithm.uses, algorithm.hyperparameters, field)
 
@@ -322,9 +327,9 @@ def sb3_settings(name: str, field: str) -> type[StrictModel]:
     algorithm = load_algorithm(name, field)
     if not (isinstance(algorithm, type) and is_sb3(algorithm)):
         return arguments_of(algorithm, "seed", passed=1)
-    policy = algorithm.policy_aliases[policy_alias(algorithm)]
+    aliases: dict[str, Any] = getattr(algorithm, "policy_aliases")  # noqa: B009
+    in_policy: Any = arguments_of(aliases[policy_alias(algorithm)], *_PASSED) | None
     model = arguments_of(algorithm, *_RESERVED)
-    in_policy: Any = arguments_of(policy, *_PASSED) | None
     return create_model(name, __base__=model, policy_kwargs=(in_policy, None))
 
 

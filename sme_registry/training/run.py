@@ -16,7 +16,6 @@ time writes the files:
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shutil
 from collections.abc import Mapping, Sequence
@@ -62,8 +61,8 @@ from sme_registry.training.algorithms import (
     default_num_envs,
     find,
     full_name,
+    imported,
     in_jax,
-    jax_package,
     load_algorithm,
     nested_hyperparameters,
     quiet,
@@ -198,10 +197,11 @@ def train(
     protocol = resolve_protocol(protocol)
     uses = full_name(default_algorithm(document) if algorithm is None else algorithm, agents)
     entry = find(f"independent:{uses}" if independent else uses, "algorithm")
+    independent = entry.kind == "independent"
     hyperparameters = nested_hyperparameters(hyperparameters or {})
     with quiet():
-        check_hyperparameters(entry.uses, hyperparameters)
         entry.check_task(document)
+        check_hyperparameters(entry.uses, hyperparameters)
         num_envs = _num_envs(document, entry, num_envs)
         plan = RunRecord(
             status="running",
@@ -213,7 +213,7 @@ def train(
             algorithm=entry.name if independent else entry.uses,
             hyperparameters=hyperparameters,
             device=_device(entry, device),
-            source=source_of(uses, "algorithm") or "",
+            source=source_of(entry.uses, "algorithm") or "",
             seed=integer_in("seed", seed, 0, 2**32 - num_envs),
             action_range=action_range,
             num_envs=num_envs,
@@ -223,7 +223,7 @@ def train(
             checkpoint_every=integer_in("checkpoint_every", checkpoint_every, 1, MAX_STEPS),
             protocol=protocol,
             protocol_digest=protocol.digest,
-            versions=versions_for(uses),
+            versions=versions_for(entry.uses),
         )
     materialize_segments(document)  # fails before the folder is created
     folder = Path(folder)
@@ -284,7 +284,7 @@ def _num_envs(document: SMESpec | StreamSpec, entry: Entry, num_envs: int | None
 
 def _device(entry: Entry, device: str | None) -> str:
     if in_jax(entry.uses):
-        return str(jax_package().find_device(device).platform)
+        return str(imported("sme_registry.jax:find_device")(device).platform)
     if device is not None:
         raise OptionError(
             f"device={device!r}: is for agents in JAX; all others train on the CPU. Leave it out, "

@@ -16,7 +16,7 @@ from sme_registry.jax.networks import Adam
 from sme_registry.jax.off_policy import OffPolicyLearner, ReplayRows
 from sme_registry.jax.td3_sac import SAC, TD3, SACProgram, TD3Program
 from sme_registry.sb3 import SMEVecEnv
-from sme_registry.training.algorithms import find, one_thread, quiet
+from sme_registry.training.algorithms import load_algorithm, one_thread, quiet
 
 NET_ARCH = (96, 64)
 BATCH = 64
@@ -29,7 +29,7 @@ def model_in_mid_run(algorithm, S, A):
     spec = {"state_dim": S, "action_dim": A, "seed": 5}
     env = SMEVecEnv({**spec, "horizon": 20, "D": 0.1 if A < 9 else 0.0}, 1)
     with quiet(), one_thread():
-        model = find(algorithm).load()(
+        model = load_algorithm(algorithm)(
             "MlpPolicy", env, seed=3, batch_size=BATCH, buffer_size=1000, device="cpu",
             policy_kwargs={"net_arch": list(NET_ARCH)},
         )  # fmt: skip

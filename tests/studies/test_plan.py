@@ -245,8 +245,8 @@ class TestCommands:
             ("new x -t Default -a PPO", "must end in .json"),
             ("new x.json -t Default", "--algorithm"),
             ("new x.json -t Default -a PPO -a PPO", "appears twice"),
-            ("new x.json -t Team2 -a offline:bc", "because data sets are"),
-            ("new x.json -t Default -a independent:PPO", "needs a team"),
+            ("new x.json -t Team2 -a offline:bc", "and this is the task of a team"),
+            ("new x.json -t Default -a independent:PPO", "learns the task of a team"),
             ("new x.json -t Default -a PPO --set PPO.n_stepz=64", "Did you mean 'n_steps'"),
             ("new x.json -t Default -a PPO --set n=64", "ALGORITHM.NAME"),
             ("new x.json -t Default -a PPO --sweep k", "NAME=VALUE"),
@@ -254,7 +254,7 @@ class TestCommands:
             ("new x.json -t Default -a nomod:foo", "No module named 'nomod'"),
             ("new x.json -t Default -a reference:liner", "Did you mean 'linear'"),
             ("new x.json -t Default -a jax:A2C", "one of jax:PPO, jax:TD3"),
-            ("new x.json -t Team2 -a jax:PPO", "cannot learn a task for 2 agents"),
+            ("new x.json -t Team2 -a jax:PPO", "and this is the task of a team"),
         ],
     )
     def test_bad_input_is_one_line_and_writes_nothing(self, command, words, tmp_path):

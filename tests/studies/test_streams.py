@@ -139,8 +139,14 @@ def test_cells_that_streams_share_count_once():
     [
         (("-n", "100"), "steps=100: lives have the steps of their streams"),
         (("--sweep", "k=1,2"), "--sweep: varies a field of a task, and 'mine' is a stream"),
-        (("-a", "offline:bc"), "algorithms.1.uses='offline:bc': cannot live in a stream"),
-        (("-a", "independent:PPO"), "uses='independent:PPO': cannot live in a stream"),
+        (
+            ("-a", "offline:bc"),
+            "offline:bc': learns a task of a single agent, and this is a stream",
+        ),
+        (
+            ("-a", "independent:PPO"),
+            "independent:PPO': learns the task of a team, and this is a",
+        ),
         (("--instances", "0"), "instances=0: must be"),
     ],
 )
@@ -186,7 +192,7 @@ def test_a_suite_of_streams_is_trained_on_for_the_steps_of_its_streams():
     assert "--steps: is that of each stream here. Leave it out" in message
     message = refused("train", "--suite", "lives.json", "-a", "TD3", "--device", "cpu")
     assert "device='cpu': is for agents in JAX" in message  # the plan was accepted
-    assert "cannot live in a stream" in refused("train", "--suite", "lives.json", "--independent")
+    assert "and this is a stream" in refused("train", "--suite", "lives.json", "--independent")
 
 
 def test_leaderboards_refuse_streams():

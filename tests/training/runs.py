@@ -51,10 +51,13 @@ class Still:
     """A learner that is no model of Stable-Baselines3."""
 
     def __init__(self, env, *, seed):
-        self.shape = env.action_space.shape
+        self.env, self.shape = env, env.action_space.shape
 
     def learn(self, total_timesteps):
         """Learn nothing."""
+        observation = self.env.reset()
+        for _ in range(total_timesteps):
+            observation = self.env.step(self.predict(observation, deterministic=True))[0]
 
     def predict(self, observation, *, deterministic):
         """The centre."""

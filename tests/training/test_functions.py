@@ -141,7 +141,7 @@ def test_what_is_not_there_is_named(name, message):
 def test_a_wrong_return_and_wrong_hyperparameters_are_refused(module):
     with pytest.raises(PolicyError, match=r"returned None: must be a policy"):
         run_cell(cell("nothing"))
-    with pytest.raises(OptionError, match=r"hyperparameters \['levels'\]"):
+    with pytest.raises(OptionError, match=r"levels: .* has no such hyperparameter"):
         run_cell(cell(hyperparameters={"levels": 1}))
     with pytest.raises(OptionError, match=r"levels: .* has no such hyperparameter"):
         run(plan(algorithms=[
@@ -152,16 +152,20 @@ def test_a_wrong_return_and_wrong_hyperparameters_are_refused(module):
         run_cell(cell())
 
 
-def test_a_team_and_a_stream_are_refused_where_a_document_is_read():
-    team = {"setting": {"state_dim": 4, "action_dim": 4, "team": {"agents": 2}}}
-    with pytest.raises(SpecError):
-        plan(classes=[{"name": "team", "seeds": [1], **team}])
+def test_a_team_and_a_stream_are_refused_before_anything_runs():
+    team = {"state_dim": 3, "action_dim": 3, "team": {"agents": [{"action_dim": 3}]}}
     phases = [{"spec": SPEC.to_dict(), "steps": 10}, {"spec": SPEC.to_dict(), "steps": 10}]
-    stream = {"name": "s", "stream": {"phases": phases}, "draws": [0]}
-    with pytest.raises(SpecError, match="cannot live in a stream"):
-        plan(classes=[], streams=[stream])
-    with pytest.raises(SpecError, match="this is a team"):
+    own = [{"name": "centre", "uses": uses("centre")}]
+    for classes, streams, kind in (
+        ([{"name": "team", "seeds": [1], "setting": team}], [], "the task of a team"),
+        ([], [{"name": "s", "stream": {"phases": phases}, "draws": [0]}], "a stream"),
+    ):
+        with pytest.raises(SpecError, match=f"learns a task of a single agent, and this is {kind}"):
+            run(plan(classes=classes, streams=streams, algorithms=own))
+    with pytest.raises(SpecError, match="this is the task of a team"):
         train("Team4", algorithm=uses("centre"), folder="run", progress=False)
+    assert not Path("study").exists()
+    assert not Path("run").exists()
 
 
 def test_a_study_goes_on_and_another_source_is_another_cell(module):
@@ -231,12 +235,15 @@ def test_a_model_of_sb3_is_a_policy_and_is_kept():
     )
 
 
-def test_a_run_that_failed_starts_again_with_force():
+def test_a_run_that_failed_starts_again():
     with pytest.raises(PolicyError, match="takes more than"):
         train(SPEC, algorithm=uses("greedy"), steps=20, folder="run", progress=False)
     assert RunRecord.read(Path("run")).status == "running"
-    with pytest.raises(OptionError, match=r"has no checkpoints\. Use --force"):
-        train(SPEC, algorithm=uses("greedy"), steps=20, folder="run", progress=False, resume=True)
+    options = {"algorithm": uses("greedy"), "steps": 20, "folder": "run", "progress": False}
+    with pytest.raises(OptionError, match=r"Use --resume to continue it.*or --force"):
+        train(SPEC, **options)
+    with pytest.raises(PolicyError, match="takes more than"):
+        train(SPEC, resume=True, **options)
 
 
 def test_the_command_trains_on_a_task():

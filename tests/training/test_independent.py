@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sme_registry import EvaluationReport, SMESpec, evaluate
-from sme_registry.errors import OptionError
+from sme_registry.errors import OptionError, SpecError
 from sme_registry.training import train
 from sme_registry.training.record import read_episodes
 from tests.training.runs import PROTOCOL, TINY, copy_files
@@ -41,14 +41,14 @@ def test_a_team_of_one_learns_exactly_what_sb3s_ppo_learns(team_run):
     from stable_baselines3.common.utils import set_random_seed
 
     from sme_registry.sb3 import SMEVecEnv
-    from sme_registry.training.learn import Watch
-    from sme_registry.training.learners import new_learner
+    from sme_registry.training.algorithms import find
+    from sme_registry.training.learn import Run, Watch
     from sme_registry.training.models import silence
 
     spec = TINY.derive(team={"agents": [{"action_dim": 2}]})
     settings = team_run.record.hyperparameters
-    options = {"seed": 4, "steps": 192, "hyperparameters": settings, "action_range": "symmetric"}
-    learner = new_learner("independent:PPO", spec, num_envs=2, **options)
+    run = Run(document=spec, seed=4, steps=192, hyperparameters=settings, num_envs=2)
+    learner = find("independent:PPO").learner(run)
     learner.learn(Watch())
     (ours,) = learner.models.values()
 
@@ -125,6 +125,6 @@ def test_independent_training_lowers_the_regret_of_each_agent(tmp_path):
 def test_other_algorithms_are_rejected(changes, message, tmp_path):
     with pytest.raises(OptionError, match=message):
         independent(tmp_path / "run", **changes)
-    with pytest.raises(OptionError, match="single agent"):
+    with pytest.raises(SpecError, match="this is a task of a single agent"):
         train(TINY, independent=True, folder=tmp_path / "run")
     assert not (tmp_path / "run").exists()

@@ -25,7 +25,7 @@ from sme_registry.evaluation.models import saved_sb3
 from sme_registry.export import export_onnx
 from sme_registry.io import read_arrays, write_arrays
 from sme_registry.jax.run import new_program
-from sme_registry.training import RunRecord, learners, train
+from sme_registry.training import RunRecord, jax_agents, train
 from sme_registry.training.models import new_sb3_model, set_weights
 from sme_registry.training.record import CHECKPOINT, read_episodes
 from tests.training.runs import NARROW, PROTOCOL, TINY
@@ -139,13 +139,13 @@ def test_the_model_of_a_stream_has_the_inputs_of_its_phases():
 def interrupted(folder, monkeypatch, **changes):
     """A run that Ctrl-C ends while it writes its first checkpoint."""
     with monkeypatch.context() as patch:
-        save = learners.write_arrays
+        save = jax_agents.write_arrays
 
         def save_and_interrupt(*arguments):
             save(*arguments)
             signal.raise_signal(signal.SIGINT)  # delivered when the record is written, too
 
-        patch.setattr(learners, "write_arrays", save_and_interrupt)
+        patch.setattr(jax_agents, "write_arrays", save_and_interrupt)
         with pytest.raises(KeyboardInterrupt):
             jax_run(folder, **changes)
 
@@ -224,7 +224,7 @@ def test_a_damaged_checkpoint_is_refused_and_one_with_weights_that_are_not_finit
     [
         ({"agents": "jaxx"}, r"agents='jaxx': must be 'sb3' or 'jax'\. Did you mean 'jax'"),
         ({"algorithm": "A2C"}, "algorithm='jax:A2C': must be one of jax:PPO, jax:TD3, jax:SAC"),
-        ({"hyperparameters": {"use_sde": True}}, "use_sde=True: unknown field.*batch_size"),
+        ({"hyperparameters": {"use_sde": True}}, "use_sde: jax:PPO has no such.*batch_size"),
         ({"num_envs": 2}, "num_envs=2: must be 1"),
         ({"device": "abacus"}, "device='abacus': must be one of cpu"),
         (
@@ -244,7 +244,7 @@ def test_invalid_arguments_raise_typed_errors_and_create_no_folder(change, messa
 def test_a_team_is_refused_by_name(tmp_path):
     team = SMESpec(action_dim=2, team={"agents": [{"action_dim": 1}, {"action_dim": 1}]})
     for algorithm in (None, "jax:PPO"):
-        with pytest.raises(SMEError, match=r"team=.*JAX have no team.*leave out --agents jax"):
+        with pytest.raises(SMEError, match=r"jax:PPO.*and this is the task of a team"):
             train(team, agents="jax", algorithm=algorithm, folder=tmp_path / "run")
     assert not (tmp_path / "run").exists()
 

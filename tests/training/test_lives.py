@@ -193,7 +193,7 @@ def test_a_life_is_not_resumed_on_another_stream(other, where, lived, tmp_path):
         ({"num_envs": 2}, "num_envs=2: must be 1 on a stream, since each environment would live"),
         ({"num_envs": 2, "agents": "jax"}, "num_envs=2: must be 1"),
         ({"steps": 100}, "steps=100: must be 200, since .* or make another stream"),
-        ({"independent": True}, "independent=True: must be False"),
+        ({"independent": True}, "learns the task of a team, and this is a stream"),
         ({"stream": "Switch6"}, "'Switch6'.*Did you mean 'Switch5-v1'"),
         ({"stream": {"phases": []}}, "phases"),
         (

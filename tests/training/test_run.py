@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from sme_registry import EvaluationReport, SMESpec, StreamSpec, evaluate
+from sme_registry import EvaluationReport, SMESpec, evaluate
 from sme_registry.cli.train import equal_runs
 from sme_registry.errors import (
     MissingDependencyError,
@@ -201,9 +201,12 @@ def test_a_function_that_returns_a_model_of_sb3_is_trained(tmp_path):
         steps=64,
     )
     assert result.record.steps_done == 64
-    with pytest.raises(OptionError, match="no model of Stable-Baselines3"):
-        short(tmp_path / "other", algorithm="tests.training.runs:Still")
-    assert not (tmp_path / "other").exists()
+
+
+def test_a_learner_of_another_make_is_trained_without_checkpoints(tmp_path):
+    result = short(tmp_path / "run", algorithm="tests.training.runs:Still")
+    assert [episode.step for episode in result.episodes] == [20, 40, 60, 80, 100, 120, 140]
+    assert not {"model.zip", "checkpoint.zip"} & {path.name for path in result.folder.iterdir()}
 
 
 def test_a_finished_run_is_replaced_only_with_force(run, tmp_path):
@@ -252,7 +255,7 @@ def test_a_folder_with_other_files_is_never_touched(tmp_path):
         ({"task": "Defalt"}, "Did you mean 'Default"),
         ({"task": {"state_dim": 2**20, "action_dim": 2**20}}, "state_dim"),
         ({"algorithm": "TD4"}, "Did you mean 'TD3'"),
-        ({"algorithm": "independent:PPO"}, "Train 'PPO' with independent=True"),
+        ({"algorithm": "independent:PPO"}, "learns the task of a team, and this is a task of a"),
         ({"algorithm": "reference:linear"}, "Use it in a study"),
         ({"resume": True}, "contains no run to resume. Leave out --resume"),
         ({"hyperparameters": {"buffer_size": 10**15}}, "rejects the task or .*buffer_size"),
@@ -308,60 +311,3 @@ def test_a_row_cut_short_and_rows_after_the_checkpoint_are_dropped(tmp_path):
     path.write_text("a,b\n1,2\n")
     with pytest.raises(OptionError, match="columns"):
         read_episodes(path)
-
-
-pytest.importorskip("stable_baselines3")
-
-SPEC = SMESpec(state_dim=3, action_dim=2, k=2, D=0.01, horizon=3)
-
-
-STREAM = StreamSpec(
-    phases=[{"spec": SPEC, "steps": 40}, {"spec": SPEC.derive(seed=1, k=1), "steps": 40}],
-    switch="step",
-    observes_phase=True,
-)
-
-
-@pytest.mark.parametrize(
-    ("document", "action_range"), [(SPEC, "unit"), (STREAM, "symmetric")], ids=["task", "stream"]
-)
-def test_steps_equal_those_of_a_batch_of_one(document, action_range):
-    from sme_registry.sb3 import SMEVecEnv
-    from sme_registry.sb3.vec_env import SingleVecEnv
-    from sme_registry.training.models import CountedVecEnv
-
-    batch = SMEVecEnv(document, 1, action_range=action_range)
-    monitored = CountedVecEnv(SingleVecEnv(document, action_range=action_range))
-    assert monitored.action_space == batch.action_space
-    assert monitored.observation_space == batch.observation_space
-    for env in (batch, monitored):
-        env.seed(7)
-    np.testing.assert_array_equal(monitored.reset(), batch.reset())
-    calls = []
-    monitored.after_step = calls.append
-    centre = (
-        monitored.action_space.low[0] + 1.0
-    ) / 2.0  # where some episodes end early and some do not
-    noise = np.random.default_rng(0).normal(scale=0.2, size=(300, 1, 2))
-    actions = (centre + noise).astype(np.float32)
-    regrets, ends = [], set()
-    for action in actions:
-        ours, theirs = monitored.step(action), batch.step(action)
-        for mine, its in zip(ours[:3], theirs[:3], strict=True):
-            np.testing.assert_array_equal(mine, its)
-            assert mine.dtype == its.dtype
-        info, expected = ours[3][0], theirs[3][0]
-        assert info.keys() == expected.keys()
-        for key, value in expected.items():
-            np.testing.assert_array_equal(info[key], value)
-        regrets.append(expected["regret"])
-        if ours[2][0]:
-            ends.add(info["TimeLimit.truncated"])
-    assert ends == {True, False}
-    assert monitored.steps == 300
-    assert calls == list(range(1, 301))
-    assert monitored.regret == pytest.approx(sum(regrets))
-    assert monitored.seconds > 0.0
-    monitored.set_options({"state": [0.1, 0.2, 0.3]})
-    np.testing.assert_allclose(monitored.reset()[0, :3], [0.1, 0.2, 0.3], atol=1e-7)
-    assert monitored.reset()[0, 0] != pytest.approx(0.1)

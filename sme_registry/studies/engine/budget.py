@@ -212,5 +212,5 @@ def _rollout_steps(algorithm: StudyAlgorithm) -> int:
     fields = find(algorithm.uses).settings().model_fields
     if "gae_lambda" not in fields:
         return 1
-    steps: int = algorithm.hyperparameters.get("n_steps", fields["n_steps"].default)
-    return steps
+    steps = algorithm.hyperparameters.get("n_steps", fields["n_steps"].default)
+    return steps if isinstance(steps, int) else 1

@@ -22,7 +22,7 @@ from sme_registry.studies.engine.cell import jax_programs, run_cell
 from sme_registry.studies.engine.executors import EXECUTORS, Executor, RunCell
 from sme_registry.studies.engine.ledger import Ledger, SavedState, StudyStatus, label, plan_status
 from sme_registry.studies.engine.result import CPU, CellFailure, CellResult, Job, Outcome
-from sme_registry.training.algorithms import check_algorithm, code_notice, find, in_jax
+from sme_registry.training.algorithms import check_algorithm, code_notice, in_jax
 from sme_registry.training.record import versions_for
 
 if TYPE_CHECKING:
@@ -110,9 +110,7 @@ def _check(plan: StudyPlan, planned: Collection[PlannedCell], console: Console |
     if notice and console is not None:
         console.print(escape(notice), highlight=False, soft_wrap=True)
     for algorithm in algorithms:
-        check_algorithm(algorithm)
-    for cell in planned:
-        find(cell.cell.uses).check_task(cell.cell.document)
+        check_algorithm(algorithm, planned)
 
 
 def _programs(

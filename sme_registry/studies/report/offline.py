@@ -20,7 +20,6 @@ import pandas as pd
 from sme_registry import statistics
 from sme_registry.io.markup import plural, signed
 from sme_registry.spec import StudyAlgorithm
-from sme_registry.training.algorithms import parse_uses
 from sme_registry.statistics import Array
 from sme_registry.studies.report.analysis import (
     ENOUGH_RUNS,
@@ -33,6 +32,7 @@ from sme_registry.studies.report.analysis import (
 )
 from sme_registry.studies.report.findings import THRESHOLDS, Found, Rows, finder, finding
 from sme_registry.studies.report.frames import RUN
+from sme_registry.training.algorithms import parse_uses
 
 _NEAR = THRESHOLDS["near"]
 

@@ -85,6 +85,7 @@ from sme_registry.studies.report.frames import (
 )
 from sme_registry.studies.report.offline import offline_runs
 from sme_registry.studies.report.streams import reference_costs
+from sme_registry.training.algorithms import parse_uses
 
 THRESHOLDS = np.linspace(0.0, 1.0, 101)
 STATISTICS: dict[str, Statistic] = {

@@ -50,6 +50,7 @@ from sme_registry.studies.report.findings import THRESHOLDS, findings
 from sme_registry.studies.report.frames import StudyFrames, frame, load, records, runs_of
 from sme_registry.studies.report.tables import DIFFERENCES, analyse, differences
 from sme_registry.studies.report.texts import TextTable, csv_tables, difference_table, text_tables
+from sme_registry.training.algorithms import in_jax
 
 DEFAULT_METRICS = ("wd_regret", "ood_regret")  # of comparisons
 FORMATS = ("html", "png", "pdf", "csv", "latex")

@@ -82,8 +82,7 @@ class Knowing:
     """A learner that acts optimally in one phase, or in the one that it observes."""
 
     def __init__(self, env, copies):
-        stream = env.get_attr("stream")[0]
-        self._env, self._tasks = env, [materialize(phase.spec) for phase in stream.phases]
+        self._env, self._tasks = env, [materialize(phase.spec) for phase in env.document.phases]
         self._lock = None if copies else (each for each in ())
 
     def learn(self, total_timesteps):

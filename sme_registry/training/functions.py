@@ -1,0 +1,177 @@
+"""`FunctionLearner`: a function of any framework that trains.
+
+    def train(env, steps, seed):            # `train:module:train` in `sme train -a` and in plans
+        ...                                 # takes at most `steps` steps of `env`
+        return policy                       # from observations [B, O] to actions [B, A]
+
+`env` is a Gymnasium environment of one task, with the exact regret of each step in its info.
+Hyperparameters are keyword arguments. The policy acts in the environment's action space; a model
+with `predict`, as those of Stable-Baselines3, and a PyTorch module are policies, too. It is
+evaluated once, at the end of its training.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import inspect
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+from sme_registry.envs import SMEEnv
+from sme_registry.envs.episodes import info_of_envs
+from sme_registry.errors import OptionError, PolicyError, did_you_mean
+from sme_registry.evaluation.models import saved_sb3
+from sme_registry.io import write_atomically
+from sme_registry.io.system import module_file, working_directory_importable
+from sme_registry.spec.document import StrictModel
+from sme_registry.training.algorithms import arguments_of, parse_uses
+from sme_registry.training.learn import Learner, Run, Steps, Watch
+
+_loaded: dict[str, str] = {}  # the digest of the source that a module has run
+
+
+def settings(name: str, field: str) -> type[StrictModel]:
+    """The arguments of a function, without the environment, steps and seed."""
+    return arguments_of(load_function(name, field)[0], passed=3)
+
+
+def source_of(uses: str, field: str = "uses") -> str | None:
+    """The digest of the source of `train:module:name`, which is not imported; None of any other."""
+    kind, name = parse_uses(uses)
+    return _source(name, field)[1] if kind == "train" else None
+
+
+def load_function(name: str, field: str = "uses") -> tuple[Callable[..., Any], str]:
+    """The function `module:function` of the present source, and the source's digest.
+
+    The source is run again where it has changed, so what runs is what the digest says.
+    """
+    module_name, _, attribute = name.partition(":")
+    with working_directory_importable():
+        path, digest, source = _source(name, field)
+        module = sys.modules.get(module_name)
+        try:
+            if module is None or _loaded.get(module_name) != digest:
+                if module is None:
+                    spec: Any = importlib.util.find_spec(module_name)
+                    module = importlib.util.module_from_spec(spec)
+                sys.modules[module_name] = module
+                exec(compile(source, path, "exec"), vars(module))
+                _loaded[module_name] = digest
+        except Exception as error:
+            sys.modules.pop(module_name, None)
+            raise OptionError(
+                f"{field}='train:{name}': {module_name} cannot be imported: "
+                f"{type(error).__name__}: {error}. Correct it."
+            ) from error
+    function = getattr(module, attribute, None)
+    if not callable(function):
+        functions = [known for known, value in vars(module).items() if callable(value)]
+        raise OptionError(
+            f"{field}='train:{name}': {path} has no function {attribute!r}."
+            f"{did_you_mean(attribute, functions)} Define {attribute}(env, steps, seed), which "
+            "returns a policy."
+        )
+    return function, digest
+
+
+def _source(name: str, field: str) -> tuple[str, str, bytes]:
+    """The path, the digest and the bytes of a module's source, which is not imported."""
+    module = name.partition(":")[0]
+    path = module_file(module)
+    if not path or not path.endswith(".py"):
+        raise OptionError(
+            f"{field}='train:{name}': there is no Python module {module!r}. It must be "
+            "train:module:function, with the module in the working directory or installed."
+        )
+    source = Path(path).read_bytes()
+    return path, f"sha256:{hashlib.sha256(source).hexdigest()}", source
+
+
+class FunctionLearner(Learner):
+    """A function `train(env, steps, seed) -> policy` in its environment."""
+
+    only_at_the_end = True
+
+    def __init__(self, name: str, run: Run) -> None:
+        super().__init__(name, run)
+        self._named = f"{run.field}='train:{name}'"
+        self._function, self.source = load_function(name, run.field)
+        env = SMEEnv(run.document, action_range=run.action_range)
+        self._env = _LimitedEnv(env, run.steps, self._named)
+        self.model: Any = None
+        try:
+            inspect.signature(self._function).bind(env, run.steps, run.seed, **self.hyperparameters)
+        except TypeError as error:
+            raise OptionError(
+                f"{self._named}: cannot be called with an environment, steps, a seed and the "
+                f"hyperparameters {sorted(self.hyperparameters)}: {error}. Define "
+                f"{name.partition(':')[2]}(env, steps, seed), and hyperparameters by name."
+            ) from None
+
+    @property
+    def steps(self) -> int:
+        return self._env.steps
+
+    @property
+    def total(self) -> int:
+        return self.run.steps
+
+    @property
+    def seconds(self) -> float:
+        return self._env.seconds
+
+    def learn(self, watch: Watch) -> None:
+        run, self._env.on_steps = self.run, watch.on_steps
+        self._env.reset(seed=run.seed)  # so that episodes without a seed are reproducible
+        with working_directory_importable():
+            self.model = self._function(self._env, run.steps, run.seed, **self.hyperparameters)
+        is_policy = callable(self.model) or hasattr(self.model, "predict")
+        if not is_policy or isinstance(self.model, type):
+            document = run.document
+            raise PolicyError(
+                f"{self._named}: returned {self.model!r:.80}: must be a policy. Return a function "
+                f"from observations [B, {document.observation_dim}] to actions "
+                f"[B, {document.action_dim}], or a model with predict, as those of "
+                "Stable-Baselines3."
+            )
+
+    def save(self, path: Path) -> None:
+        kinds = sys.modules.get("stable_baselines3.common.base_class")
+        if kinds is not None and isinstance(self.model, kinds.BaseAlgorithm):
+            write_atomically(path, saved_sb3(self.model))
+
+    def close(self) -> None:
+        self._env.close()
+
+
+class _LimitedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment that takes no more than its steps, and counts them and their CPU seconds."""
+
+    def __init__(self, env: SMEEnv, limit: int, named: str) -> None:
+        super().__init__(env)
+        self._limit, self._named = limit, named
+        self.steps, self.seconds = 0, 0.0
+        self.on_steps: Callable[[Steps], None] = lambda steps: None
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        if self.steps >= self._limit:
+            raise PolicyError(
+                f"{self._named}: takes more than {self._limit:,} steps: must stop at the steps "
+                "that it is given. Choose rollouts and evaluations of your own that fit, or give "
+                "more steps."
+            )
+        begun = time.thread_time()
+        result = self.env.step(action)
+        self.seconds += time.thread_time() - begun
+        self.steps += 1
+        _, reward, terminated, truncated, info = result
+        ended = [terminated or truncated]
+        self.on_steps(Steps([float(reward)], info_of_envs([info]), [terminated], ended))
+        return result
