@@ -232,13 +232,13 @@ def serve(
     url: Annotated[
         str, typer.Option(help="The board's public address, which its pages show to submitters.")
     ] = "",
-    trusted_proxy: Annotated[
-        list[str] | None,
+    behind_proxy: Annotated[
+        bool,
         typer.Option(
-            help="Address or network of a reverse proxy, whose X-Forwarded-For names the client. "
-            "Repeat it for several.",
+            "--behind-proxy",
+            help="Listen on any address: only a reverse proxy reaches it.",
         ),
-    ] = None,
+    ] = False,
     season_secret: Annotated[
         list[Path] | None,
         typer.Option(
@@ -250,17 +250,17 @@ def serve(
 ) -> None:
     """Serve the board: its pages, and an API that accepts submissions, and score them.
 
-    By default only this machine can reach it. Put an HTTPS proxy in front of it for others; see
+    Only this machine can reach it. Put an HTTPS proxy in front of it for others, as in
     docs/guides/deployment.md. Scoring needs bubblewrap (apt install bubblewrap).
 
     Examples:
 
       sme-leaderboard serve board --port 8000 --workers 2
 
-      sme-leaderboard serve board --url https://board.example --trusted-proxy 127.0.0.1
+      sme-leaderboard serve board --url https://board.example
     """
     from leaderboard.documents.board import Folder
-    from leaderboard.web.serve import serve as serve_board
+    from leaderboard.web.server import serve as serve_board
 
     Folder(board).read()  # a wrong folder fails before anything listens
     serve_board(
@@ -269,7 +269,7 @@ def serve(
         port=port,
         workers=workers,
         url=url,
-        trusted_proxies=trusted_proxy or (),
+        behind_proxy=behind_proxy,
         unsafe_no_sandbox=unsafe_no_sandbox,
         season_secrets=season_secret or (),
     )

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from leaderboard.documents.master import Master
 from leaderboard.documents.season import MAX_LANES, Season
-from leaderboard.errors import BoardError, Rejection, TamperedError
+from leaderboard.errors import BoardError, TamperedError
 from leaderboard.sealed.instance import SteppedInstance
 from leaderboard.sealed.scores import unplayed_result
 from leaderboard.sealed.ticket import RunningTicket
@@ -158,15 +158,12 @@ class Tickets:
         return answer
 
     def quick_step(self, number: int, token: str, instance: int, body: bytes) -> bytes | None:
-        """`step`, which does not block; None where it would, or is refused."""
+        """`step`, which does not block; None where it would."""
         ticket = self._running.get(number)
         instances = () if ticket is None else ticket.instances
         if instance >= len(instances) or not instances[instance].is_ready:
             return None
-        try:
-            return self.step(number, token, instance, body)
-        except Rejection:
-            return None
+        return self.step(number, token, instance, body)
 
     def finish(self, number: int, token: str, instance: int) -> None:
         """`SteppedInstance.finish`, with the password of the ticket."""

@@ -21,9 +21,8 @@ import contextlib
 import hashlib
 import os
 import re
-import tempfile
 from collections.abc import AsyncIterator, Callable, Iterable
-from typing import IO, Any, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import anyio
 from anyio import CapacityLimiter, to_thread
@@ -35,39 +34,36 @@ from leaderboard import exports, intake
 from leaderboard.artefact.isolation import Isolation, available_isolation
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.result import Metric
-from leaderboard.documents.submission import Envelope, SignedSubmission, SignedWithdrawal
+from leaderboard.documents.submission import (
+    MAX_BYTES,
+    Envelope,
+    SignedSubmission,
+    SignedWithdrawal,
+)
 from leaderboard.errors import BoardError, Rejection, ScoringFault
 from leaderboard.public_view import public_view
 from leaderboard.scoring import ranking
 from leaderboard.scoring.worker import background_scorers
 from leaderboard.store import Head, Store, unknown_submission
-from leaderboard.web import errors, limits
-from leaderboard.web.downloads import Downloads
-from leaderboard.web.errors import HTTP_CODES, RequestError
-from leaderboard.web.guard import Guard
+from leaderboard.web import http
+from leaderboard.web.http import HTTP_CODES, RequestError
 from leaderboard.web.seasons import SeasonRoutes
 from leaderboard.web.site import Pages, content_type
 from sme_registry.errors import SMEError
 
 METRICS: tuple[Metric, ...] = get_args(Metric)
-PAGES_KEPT = 256
 _Render = Callable[[Pages, str], bytes]
-_CHUNK = 2**18  # bytes
-_BYTES_KEPT = 2**26
+_PAGES_KEPT, _BYTES_KEPT = 256, 2**26
 _HEALTH_SECONDS = 5.0
 _LOG_ENTRIES = 100
-_DOCUMENTS = 64  # signed documents to verify at the same time
-_ADMISSIONS = 16  # keys with a submission to check at the same time
+_OBJECTS = 8  # uploads and downloads in memory at the same time
 
 
 def create_app(
     path: str | os.PathLike[str],
     *,
     score_workers: int = 0,
-    upload_seconds: float = limits.UPLOAD_SECONDS,
-    pages_kept: int = PAGES_KEPT,
     url: str = "",
-    requests_of_address: int = limits.REQUESTS_OF_ADDRESS,
     isolation: Isolation = "bwrap",
     season_secrets: Iterable[str | os.PathLike[str]] = (),
 ) -> FastAPI:
@@ -76,12 +72,8 @@ def create_app(
     Args:
       path: the board's folder.
       score_workers: number of scorer processes that run as long as the application does.
-      upload_seconds: the longest that an upload may take.
-      pages_kept: number of rendered pages to keep until the log grows; 0 renders every request.
       url: the board's public address, shown on its pages; empty if it is not known. It is never
         taken from a request, whose Host header anyone can choose.
-      requests_of_address: the most requests in progress from one IPv4 address or IPv6 /64 network;
-        those of this machine are not counted.
       isolation: of the scorers' sandboxes. "process", resource limits alone, is for a board to
         which nobody else can submit.
       season_secrets: the masters of the sealed-online seasons that this server steps.
@@ -93,7 +85,7 @@ def create_app(
     if score_workers:
         _refuse_missing(isolation)
     store = Store.open(os.fspath(path))
-    routes = _Routes(store, upload_seconds, _PageCache(store, pages_kept, url))
+    routes = _Routes(store, _PageCache(store, url))
     seasons = SeasonRoutes(store, season_secrets)
 
     @contextlib.asynccontextmanager
@@ -108,17 +100,14 @@ def create_app(
         redoc_url=None,
         openapi_url=None,
         exception_handlers={
-            Rejection: errors.on_rejection,
-            RequestError: errors.on_rejection,
-            HTTPException: errors.on_http_error,
-            SMEError: errors.on_board_error,
+            Rejection: http.on_rejection,
+            RequestError: http.on_rejection,
+            HTTPException: http.on_http_error,
+            SMEError: http.on_board_error,
         },
     )
-    app.state.scores = score_workers > 0  # see `errors.on_board_error`
-    app.state.take_steps = seasons.take_steps  # see `serve.server_config`
-    app.add_middleware(limits.RequestsByAddress, limit=requests_of_address)
-    app.add_middleware(Guard)
-    app.add_middleware(limits.RefusedBodies)  # the last one is the outermost
+    app.state.scores = score_workers > 0  # see `http.on_board_error`
+    app.add_middleware(http.SecurityHeaders)
     app.router.routes.extend(seasons.routes)
     app.add_api_route("/healthz", routes.health)
     app.add_api_route("/api/objects/{digits}", routes.put_object, methods=["PUT"])
@@ -146,24 +135,22 @@ def _refuse_missing(isolation: Isolation) -> None:
 
 
 class _Routes:
-    """The handlers of the routes. Calls that may block run in threads and never wait for a client.
+    """The handlers of the routes. Calls that may block run in threads.
 
-    An upload in progress is an unnamed file, which disappears however the upload ends, and counts
-    towards the quotas from its start. One thread checks submissions, because checking is bound by
-    Python, and so no two submissions can share the last free place of a quota.
+    One thread checks submissions, because checking is bound by Python, and so no two submissions
+    can share the last free place of a quota; neither can two uploads.
     """
 
-    def __init__(self, store: Store, upload_seconds: float, pages: _PageCache) -> None:
+    def __init__(self, store: Store, pages: _PageCache) -> None:
         self._store = store
-        self._upload_seconds = upload_seconds
-        self._documents = limits.Turns(_DOCUMENTS)
-        self._admissions = limits.Turns(_ADMISSIONS)
+        self._documents = CapacityLimiter(1)
+        self._admissions = CapacityLimiter(1)
+        self._objects = CapacityLimiter(_OBJECTS)
+        self._uploads = CapacityLimiter(1)
         self._refusals = intake.Refusals()
-        self._reservations = limits.UploadReservations(store)
         self._rendering = CapacityLimiter(1)
         self._health = CapacityLimiter(1)
         self._pages = pages
-        self._downloads = Downloads(store)
 
     async def health(self) -> Response:
         scoring = "fault"  # also if the board cannot be read in time
@@ -183,38 +170,48 @@ class _Routes:
 
     async def put_object(self, request: Request, digits: str) -> Response:
         digest = _digest(digits)
-        limit = self._store.document.limits.artefact_bytes
-        # The HTTP parser accepts digits only, and holds the body to them.
-        size = int(request.headers.get("Content-Length", limit))
-        key = intake.uploader(
-            request.headers.get("Authorization"), digest, board=self._store.document.key
-        )
-        async with self._reservations.reserve(key, size):
-            # Without a name, and in the board's file system.
-            with await to_thread.run_sync(
-                lambda: tempfile.TemporaryFile(dir=self._store.folder.path)
-            ) as spool:
-                async for chunk in limits.body_chunks(request, size, self._upload_seconds):
-                    await to_thread.run_sync(spool.write, chunk)
-                new = await to_thread.run_sync(self._store_object, spool, digest, key)
+        header, board = request.headers.get("Authorization"), self._store.document.key
+        key = intake.uploader(header, digest, board=board)
+
+        def put(data: bytes) -> bool:
+            intake.check_upload(self._store, key, len(data))
+            return self._store.put_object(digest, [data], by=key)
+
+        async with self._objects:
+            limit = self._store.document.limits.artefact_bytes
+            data = await http.read_body(request, limit, "object")
+            new = await to_thread.run_sync(put, data, limiter=self._uploads)
         return JSONResponse({"digest": digest}, 201 if new else 200)
 
-    def _store_object(self, spool: IO[bytes], digest: str, key: str) -> bool:
-        spool.seek(0)  # the store verifies the digest of what it reads
-        return self._store.put_object(digest, iter(lambda: spool.read(_CHUNK), b""), by=key)
+    async def get_object(self, digits: str) -> Response:
+        digest = _digest(digits)
 
-    async def get_object(self, request: Request, digits: str) -> Response:
-        return await self._downloads.answer(request, _digest(digits))
+        def read() -> bytes:
+            if not self._store.is_public(digest):
+                raise RequestError("not_found", f"object={digest}: {HTTP_CODES['not_found']}.")
+            return self._store.objects.read(digest)
+
+        headers = {
+            "Cache-Control": "public, max-age=31536000, immutable",
+            "Content-Disposition": f'attachment; filename="{digits}.onnx"',
+        }
+        data = await to_thread.run_sync(read, limiter=self._objects)
+        return Response(data, headers=headers, media_type="application/octet-stream")
 
     async def post_submission(self, request: Request) -> Response:
-        text = await limits.read_document(request, "submission")
+        text = await http.read_body(request, MAX_BYTES, "submission")
 
         # Garbage without a valid signature never waits with submissions, whose check is longer.
-        envelope = await self._documents.run(lambda: Envelope.read(text, SignedSubmission))
+        def read() -> Envelope[SignedSubmission]:
+            return Envelope.read(text, SignedSubmission)
+
+        envelope = await to_thread.run_sync(read, limiter=self._documents)
+
+        def receive() -> bool:
+            return intake.receive(self._store, envelope, self._refusals)
+
+        new = await to_thread.run_sync(receive, limiter=self._admissions)
         id = envelope.id
-        new = await self._admissions.run(
-            lambda: intake.receive(self._store, envelope, self._refusals), envelope.key
-        )
         url = f"/api/submissions/{hex_of(id)}"
         return JSONResponse({"id": id, "url": url}, 202 if new else 200, headers={"Location": url})
 
@@ -222,14 +219,14 @@ class _Routes:
         return await self._cached(request, _view, _digest(digits), "application/json")
 
     async def post_withdrawal(self, request: Request) -> Response:
-        text = await limits.read_document(request, "withdrawal")
+        text = await http.read_body(request, MAX_BYTES, "withdrawal")
 
         def withdraw() -> str:
             signed = SignedWithdrawal.read(text)
             self._store.withdraw(signed)
             return signed.withdrawal.submission
 
-        id = await self._documents.run(withdraw)
+        id = await to_thread.run_sync(withdraw, limiter=self._documents)
         return JSONResponse({"id": id, "status": "withdrawn"})
 
     async def get_board(self, request: Request) -> Response:
@@ -277,14 +274,13 @@ class _CachedFile(NamedTuple):
 class _PageCache:
     """Rendered files, discarded when the log grows or a scoring fails.
 
-    At most `kept` files of together 64 MiB are kept, those that were used last. One thread uses it
+    At most 256 files of together 64 MiB are kept, those that were used last. One thread uses it
     at a time: rendering is bound by Python, and clients that ask at once for a page that is not
     cached wait for one rendering of it.
     """
 
-    def __init__(self, store: Store, kept: int, url: str) -> None:
+    def __init__(self, store: Store, url: str) -> None:
         self._store = store
-        self._kept = kept
         # A copy without its key accepts no submissions.
         self._address = url if store.folder.key.is_file() else None
         self._head: tuple[Head, int] | None = None
@@ -298,7 +294,7 @@ class _PageCache:
             self._files.clear()
         file = self._files.pop((render, name), None) or _rendered(self._pages, render, name)
         self._files[render, name] = file
-        while len(self._files) > self._kept or self._bytes > _BYTES_KEPT:
+        while len(self._files) > _PAGES_KEPT or self._bytes > _BYTES_KEPT:
             del self._files[next(iter(self._files))]
         return file
 

@@ -14,8 +14,8 @@
     GET  /api/seasons/{id}/tickets/{n}/instances/{i}/journal    digest of the steps
     PUT  /api/seasons/{id}/tickets/{n}/instances/{i}/answers    201 stored, 200 the same again
 
-Steps are usually answered before they come here (`quick`), in the event loop; what replays a
-journal, waits for the disk or is refused runs in threads.
+Steps of an instance that is ready are taken in the event loop; what replays a journal or waits for
+the disk runs in threads.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from anyio import CapacityLimiter, to_thread
 from fastapi import Request
+from starlette.datastructures import Headers
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import Scope
@@ -34,15 +35,13 @@ from starlette.types import Scope
 from leaderboard import intake
 from leaderboard.documents.entry import SignedEntry, SignedTicketRequest
 from leaderboard.documents.result import RANKED_METRICS
-from leaderboard.documents.submission import Envelope
+from leaderboard.documents.submission import MAX_BYTES, Envelope
 from leaderboard.errors import Rejection
 from leaderboard.scoring.memo import Memo
 from leaderboard.scoring.season import ranking_facts
 from leaderboard.sealed import Tickets, attending
 from leaderboard.store import SeasonRow, Store
-from leaderboard.web import limits
-from leaderboard.web.errors import HTTP_CODES, RequestError
-from leaderboard.web.quick import StepRequest
+from leaderboard.web.http import HTTP_CODES, RequestError, read_body
 from sme_registry import seasons
 from sme_registry.io import to_json
 from sme_registry.seasons import wire
@@ -51,9 +50,7 @@ _SEASON = "/api/seasons/{season}"
 _TICKET = _SEASON + "/tickets/{ticket}"
 _INSTANCE = _TICKET + "/instances/{instance}"
 _WORKERS = 4  # threads that replay journals and write answers
-_REQUESTS = 64  # of a kind, that wait or run at the same time
 _LARGEST = 2**31
-_BODY_SECONDS = 30.0
 _T = TypeVar("_T")
 
 
@@ -74,11 +71,11 @@ class SeasonRoutes:
             each.season.id: each for path in secrets for each in Tickets.of_master(store, path)
         }
         self._threads = CapacityLimiter(_WORKERS)
-        self._challenges = limits.Turns(_REQUESTS)
-        self._requests = limits.Turns(_REQUESTS)
-        self._entries = limits.Turns(_REQUESTS)
+        self._challenges = CapacityLimiter(1)
+        self._requests = CapacityLimiter(1)
+        self._entries = CapacityLimiter(1)
         self._refusals = intake.Refusals()
-        self._rankings = limits.Turns(_REQUESTS)
+        self._rankings = CapacityLimiter(1)
         self._ranked: Memo[bytes] = Memo(16)
 
     @contextlib.contextmanager
@@ -143,7 +140,7 @@ class SeasonRoutes:
         def ranked() -> bytes:
             return self._ranked.get((name, metric, self._store.head.digest), rank)
 
-        return Response(await self._rankings.run(ranked), media_type="application/json")
+        return Response(await _run(ranked, self._rankings), media_type="application/json")
 
     def _view(self, row: SeasonRow) -> dict[str, Any]:
         """What is public of a season in short."""
@@ -161,7 +158,7 @@ class SeasonRoutes:
     async def post_ticket(self, request: Request) -> Response:
         """Start a ticket."""
         tickets = self.tickets_of(request.path_params["season"])
-        text = await limits.read_document(request, "ticket")
+        text = await read_body(request, MAX_BYTES, "ticket")
         header = request.headers.get("Authorization")
 
         def start() -> tuple[seasons.Ticket, bool]:
@@ -170,22 +167,22 @@ class SeasonRoutes:
             number, new = intake.start_ticket(self._store, envelope, tickets.digest)
             return tickets.ticket(number).document, new
 
-        ticket, new = await self._requests.run(start)
+        ticket, new = await _run(start, self._requests)
         return JSONResponse(ticket.to_dict(), 201 if new else 200)
 
     async def post_entry(self, request: Request) -> Response:
         """Store an entry of the offline track, whose answers have been uploaded."""
         name = request.path_params["season"]
-        text = await limits.read_document(request, "entry")
+        text = await read_body(request, MAX_BYTES, "entry")
 
         # Garbage without a valid signature never waits with entries, whose check is longer.
-        envelope = await self._requests.run(lambda: Envelope.read(text, SignedEntry))
+        envelope = await _run(lambda: Envelope.read(text, SignedEntry), self._requests)
 
         def enter() -> bool:
             season = self._store.season_row(name).digest
             return intake.receive_entry(self._store, envelope, season, self._refusals)
 
-        new = await self._entries.run(enter, envelope.key)
+        new = await _run(enter, self._entries)
         return JSONResponse({"id": envelope.id}, 201 if new else 200)
 
     async def get_ticket(self, request: Request) -> Response:
@@ -214,22 +211,19 @@ class SeasonRoutes:
         """The challenge states of an instance."""
         tickets, where = self.place(request.scope)
         await self._in_thread(lambda: tickets.refuse_challenge(*where))
-        owner = f"{tickets.season.id}/{where.ticket}"
-        return _octets(await self._challenges.run(lambda: tickets.challenge(*where), owner))
+        return _octets(await _run(lambda: tickets.challenge(*where), self._challenges))
 
     async def journal(self, request: Request) -> Response:
         """The digest of an instance's steps."""
         tickets, where = self.place(request.scope)
-        owner = f"{tickets.season.id}/{where.ticket}"
-        digest = await self._challenges.run(lambda: tickets.journal_digest(*where), owner)
+        digest = await _run(lambda: tickets.journal_digest(*where), self._challenges)
         return JSONResponse(wire.JournalDigest(journal=digest).to_dict())
 
     async def answer(self, request: Request) -> Response:
         """Store the answers to a challenge."""
         tickets, where = self.place(request.scope)
         limit = await self._in_thread(lambda: tickets.answer_bytes(*where))
-        chunks = limits.body_chunks(request, limit, limits.UPLOAD_SECONDS, "answers")
-        data = b"".join([chunk async for chunk in chunks])
+        data = await read_body(request, limit, "answers")
         signature = request.query_params.get("signature", "")
         new = await self._in_thread(lambda: tickets.answer(*where, data, signature))
         return Response(status_code=201 if new else 200)
@@ -237,17 +231,11 @@ class SeasonRoutes:
     async def step(self, request: Request) -> Response:
         """Take the steps of a request."""
         tickets, where = self.place(request.scope)
-        chunks = limits.body_chunks(request, tickets.step_bytes, _BODY_SECONDS, "steps")
-        body = b"".join([chunk async for chunk in chunks])
-        return _octets(await self._in_thread(lambda: tickets.step(*where, body)))
-
-    def take_steps(self, request: StepRequest) -> bytes | None:
-        """The answer to a request for steps; None where that would block, or refuse them."""
-        tickets = self._tickets.get(request.season)
-        if tickets is None:
-            return None
-        token = _without_scheme(request.authorization)
-        return tickets.quick_step(request.ticket, token, request.instance, request.body)
+        body = await read_body(request, tickets.step_bytes, "steps")
+        steps = tickets.quick_step(*where, body)
+        if steps is None:
+            steps = await self._in_thread(lambda: tickets.step(*where, body))
+        return _octets(steps)
 
     def tickets_of(self, season: str) -> Tickets:
         """The tickets of a season that this server steps.
@@ -276,7 +264,11 @@ class SeasonRoutes:
         return self.tickets_of(parameters["season"]), where
 
     async def _in_thread(self, work: Callable[[], _T]) -> _T:
-        return await to_thread.run_sync(work, limiter=self._threads)
+        return await _run(work, self._threads)
+
+
+async def _run(work: Callable[[], _T], limiter: CapacityLimiter) -> _T:
+    return await to_thread.run_sync(work, limiter=limiter)
 
 
 class _Where(NamedTuple):
@@ -297,14 +289,7 @@ def _small(scope: Scope, name: str) -> int:
 
 def _token(scope: Scope) -> str:
     """The password in the header `Authorization`; empty without one."""
-    for name, value in scope["headers"]:
-        if name == b"authorization":
-            return _without_scheme(value.decode("latin-1"))
-    return ""
-
-
-def _without_scheme(authorization: str) -> str:
-    return authorization.removeprefix(wire.bearer(""))
+    return Headers(scope=scope).get("Authorization", "").removeprefix(wire.bearer(""))
 
 
 def _octets(data: bytes) -> Response:

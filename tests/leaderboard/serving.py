@@ -12,16 +12,13 @@ import uvicorn
 
 from leaderboard.intake import upload_header
 from leaderboard.web.app import create_app
-from leaderboard.web.connections import Connections
-from leaderboard.web.serve import listen, server_config, url_of
+from leaderboard.web.server import listen, server_config, url_of
 
-# The server's five seconds to end become sixty, of which slow clients get 0.2: load logs no error.
+# The server's five seconds to end become sixty: load logs no error.
 _SERVE = """
 import sys
 import uvicorn
-from leaderboard.web import connections
-from leaderboard.web.serve import serve
-connections._ENDING_SECONDS = 0.2
+from leaderboard.web.server import serve
 Config = uvicorn.Config
 uvicorn.Config = lambda *given, **named: Config(*given, **named | {"timeout_graceful_shutdown": 60})
 serve(sys.argv[1], port=0, workers=int(sys.argv[2]), announce=lambda url: print(url, flush=True))
@@ -29,13 +26,13 @@ serve(sys.argv[1], port=0, workers=int(sys.argv[2]), announce=lambda url: print(
 
 
 @contextlib.contextmanager
-def serving(path, connections=None, host="127.0.0.1", **options):
-    """A server in a thread; yields its URL."""
-    with listen(host, 0) as listener:
-        app = create_app(path, **options)
-        if connections is None:
-            connections = Connections()
-        server = uvicorn.Server(server_config(app, connections))
+def serving(path, seen=None, **options):
+    """A server in a thread; yields its URL. A list `seen` gets the application's requests."""
+    app = create_app(path, **options)
+    if seen is not None:
+        app.add_middleware(_Seen, seen=seen)
+    with listen("127.0.0.1", 0) as listener:
+        server = uvicorn.Server(server_config(app))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
         try:
@@ -44,6 +41,23 @@ def serving(path, connections=None, host="127.0.0.1", **options):
             server.should_exit = True
             thread.join(10)
             assert not thread.is_alive()
+
+
+class _Seen:
+    """ASGI middleware that adds the path of each request to a list, and removes it at its end."""
+
+    def __init__(self, app, seen):
+        self._app, self._seen = app, seen
+
+    async def __call__(self, scope, receive, send):
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        self._seen.append(scope["path"])
+        try:
+            await self._app(scope, receive, send)
+        finally:
+            self._seen.remove(scope["path"])
 
 
 def authorization(url, key, digest, time=None):

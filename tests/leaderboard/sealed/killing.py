@@ -21,13 +21,13 @@ from leaderboard.sealed.journal import Journal
 from leaderboard.sealed.stepping import Lanes
 from leaderboard.sealed.ticket import RunningTicket
 from leaderboard.store import Store
-from leaderboard.web.serve import listen, url_of
+from leaderboard.web.server import listen, url_of
 from sme_registry import seasons
 from tests.leaderboard.sealed.playing import LANES
 
 _SERVE = """
 import sys
-from leaderboard.web.serve import serve
+from leaderboard.web.server import serve
 board, secret, port = sys.argv[1:]
 serve(board, port=int(port), workers=0, announce=lambda url: print(url, flush=True),
       season_secrets=[secret])

@@ -1,8 +1,12 @@
-"""`serve`: the application under uvicorn, on one address, until it is interrupted."""
+"""`serve`: the application under uvicorn, on one address, until it is interrupted.
+
+Clients that are silent, slow or too many are the business of the reverse proxy in front of it,
+whose configuration is examples/deploy/nginx.conf: it passes on complete requests only. So this
+server listens on this machine alone, unless it is told that a proxy is in front.
+"""
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import ipaddress
 import os
@@ -10,7 +14,7 @@ import re
 import signal
 import socket
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from leaderboard.errors import BoardError
 from sme_registry.errors import OptionError
@@ -20,11 +24,8 @@ if TYPE_CHECKING:
     import uvicorn
     from fastapi import FastAPI
 
-    from leaderboard.web.connections import Connections
-
-_BACKLOG = 128  # connections accepted at a time, and so above the slots for a moment
-_SOCKET_BYTES = 2**17  # of a connection's buffer in the system, for each direction
-_OTHER_FILES = 256  # open ones that belong to no connection
+_CONNECTIONS = 400  # and so fewer open files than the 1,024 that systems usually allow
+_HEAD_BYTES = 2**14
 # Its characters need no quotes in the commands that the pages show.
 _PUBLIC_URL = re.compile(r"https?://([\w.-]+|\[[\da-fA-F:]+\])(:\d{1,5})?(/[\w.~-]+)*/?", re.ASCII)
 
@@ -36,7 +37,7 @@ def serve(
     workers: int = 1,
     announce: Callable[[str], None] = print,
     url: str = "",
-    trusted_proxies: Iterable[str] = (),
+    behind_proxy: bool = False,
     unsafe_no_sandbox: bool = False,
     season_secrets: Iterable[str | os.PathLike[str]] = (),
 ) -> None:
@@ -46,16 +47,13 @@ def serve(
 
     Args:
       path: the board's folder.
-      host: address to listen on; put an HTTPS proxy in front of any but the loopback, as in
-        docs/guides/deployment.md.
+      host: address to listen on; any but the loopback needs `behind_proxy`.
       port: 0 for any free port.
       workers: number of scorer processes; 0 for none.
       announce: called with the board's URL once it listens.
       url: the board's public address, such as that of its proxy, which its pages show; empty if it
         is not known.
-      trusted_proxies: addresses or networks of reverse proxies. Their `X-Forwarded-For` names the
-        client, which counts for the limit on requests by address, and they may open any number of
-        connections. From anyone else the header is ignored.
+      behind_proxy: only a reverse proxy reaches this address, as in docs/guides/deployment.md.
       unsafe_no_sandbox: score without bubblewrap. Submitted policies could then read the files of
         this account and use the network, so nobody else may be able to submit. Not with the master
         of a season, which is one of these files.
@@ -64,14 +62,20 @@ def serve(
     Raises:
       BoardError: the folder holds no board, the address cannot be used, bubblewrap, which the
         scorers need, does not work, or a master is of no season of the board.
-      OptionError: the public address, or that of a proxy, is invalid, or scoring without bubblewrap
-        would let policies read the master of a season.
+      OptionError: the public address is invalid, the host needs a proxy in front, or scoring
+        without bubblewrap would let policies read the master of a season.
       MissingDependencyError: FastAPI or uvicorn is not installed.
     """
     if url and not _PUBLIC_URL.fullmatch(url):
         raise OptionError(
             f"url={url!r:.80}: must be http(s)://host[:port][/path]. Give the address at which "
             "others reach the board."
+        )
+    if not behind_proxy and not _is_loopback(host):
+        raise OptionError(
+            f"host={host!r:.80}: must be a loopback address, such as 127.0.0.1. Put a reverse "
+            "proxy in front of it, as docs/guides/deployment.md shows; if only the proxy reaches "
+            "this address, add --behind-proxy."
         )
     secrets = list(season_secrets)
     if unsafe_no_sandbox and workers and secrets:
@@ -83,10 +87,7 @@ def serve(
     import uvicorn
 
     from leaderboard.web.app import create_app
-    from leaderboard.web.connections import ConnectionLimits, Connections
 
-    proxies = [_network(each) for each in trusted_proxies]
-    limits = ConnectionLimits(connections=_connections())
     app = create_app(
         path,
         score_workers=workers,
@@ -94,64 +95,40 @@ def serve(
         isolation="process" if unsafe_no_sandbox else "bwrap",
         season_secrets=secrets,
     )
-    config = server_config(app, Connections(limits, proxies))
     with listen(host, port) as listener:
         announce(url_of(listener))
         # Uvicorn shuts down on both signals, then raises the one it received.
         previous = signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             with contextlib.suppress(KeyboardInterrupt):
-                uvicorn.Server(config).run(sockets=[listener])
+                uvicorn.Server(server_config(app)).run(sockets=[listener])
         finally:
             signal.signal(signal.SIGTERM, previous)
 
 
-def server_config(app: FastAPI, connections: Connections) -> uvicorn.Config:
+def server_config(app: FastAPI) -> uvicorn.Config:
     """How uvicorn serves a board."""
     import uvicorn
 
-    proxies = [str(network) for network in connections.proxies]
-    connections.take_steps = app.state.take_steps
     return uvicorn.Config(
         app,
         loop="asyncio",
-        http=cast("type[asyncio.Protocol]", connections.protocol),
+        http="h11",  # always the same parser, whatever else is installed
         ws="none",
-        backlog=_BACKLOG,
+        h11_max_incomplete_event_size=_HEAD_BYTES,
+        limit_concurrency=_CONNECTIONS,
         log_level="error",  # a client's faults are not the server's
         server_header=False,
-        proxy_headers=bool(proxies),
-        forwarded_allow_ips=proxies,
+        proxy_headers=False,
         timeout_graceful_shutdown=5,
     )
 
 
-def _connections() -> int:
-    """The most connections for which this process has files; it raises its limit on them.
-
-    A connection has a socket and an artefact's file.
-    """
-    import resource  # Windows, where boards are not served, has none
-
-    from leaderboard.web.connections import ConnectionLimits
-
-    most = ConnectionLimits().connections
-    wanted = 2 * (most + _BACKLOG) + _OTHER_FILES
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    files = wanted if hard == resource.RLIM_INFINITY else min(hard, wanted)
-    if soft < files:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (files, hard))
-    return max(1, min(most, (files - _OTHER_FILES) // 2 - _BACKLOG))
-
-
-def _network(text: str) -> ipaddress.IPv4Network | ipaddress.IPv6Network:
+def _is_loopback(host: str) -> bool:
     try:
-        return ipaddress.ip_network(text)
+        return ipaddress.ip_address(host).is_loopback
     except ValueError:
-        raise OptionError(
-            f"trusted_proxies={text!r:.80}: must be an IP address or network, as in 127.0.0.1 or "
-            "10.0.0.0/8. Give the address from which the proxy connects."
-        ) from None
+        return host == "localhost"
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -162,14 +139,12 @@ def listen(host: str, port: int) -> socket.socket:
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        listener = socket.create_server((host, port), family=family, backlog=_BACKLOG)
+        listener = socket.create_server((host, port), family=family)
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise BoardError(
             f"host={host!r}, port={port}: cannot listen here: {reason}. Use another --port."
         ) from None
-    for buffer in (socket.SO_RCVBUF, socket.SO_SNDBUF):  # every connection inherits them
-        listener.setsockopt(socket.SOL_SOCKET, buffer, _SOCKET_BYTES)
     # Asyncio does not, where it is given a socket: head and body of an answer were 40 ms apart.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return listener

@@ -1,0 +1,207 @@
+"""What all routes share: bodies within limits, errors as answers, and security headers."""
+
+from __future__ import annotations
+
+import html
+import logging
+import re
+from typing import Any
+
+from fastapi import Request
+from starlette.datastructures import MutableHeaders
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
+from starlette.responses import JSONResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from leaderboard.errors import NotPublishable, Rejection
+
+HTTP_CODES = {
+    "not_found": "nothing exists at this address",
+    "method_not_allowed": "this address does not accept this method",
+    "not_publishable": "a reference row is missing, waiting or off",
+    "bad_request": "the request is invalid",
+    "season_not_served": "this server does not have the season's secret, and cannot step its tasks",
+    "internal": "the server failed; its log has the details",
+}
+
+STATUSES = {
+    "not_json": 400,
+    "unsafe_name": 400,
+    "bad_signature": 403,
+    "wrong_board": 403,
+    "stale_time": 403,
+    "token_wrong": 403,
+    "unknown_submission": 404,
+    "season_unknown": 404,
+    "ticket_unknown": 404,
+    "instance_unknown": 404,
+    "not_found": 404,
+    "method_not_allowed": 405,
+    "start_conflict": 409,
+    "step_conflict": 409,
+    "step_ahead": 409,
+    "budget_spent": 409,
+    "instance_phase": 409,
+    "answer_conflict": 409,
+    "withdrawn": 410,
+    "ticket_ended": 410,
+    "too_large": 413,
+    "quota": 429,
+    "ticket_limit": 429,
+    "internal": 500,
+    "season_not_served": 503,
+    "not_publishable": 503,
+    "storage_full": 507,
+}
+"""Any other code of a `Rejection` is 422, any other code is 400."""
+
+_RETRY_SECONDS = 5
+_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+        "connect-src 'self'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
+}
+_ENCODED = re.compile(rb"%(2f|5c|00)|\\", re.IGNORECASE)
+_log = logging.getLogger(__name__)
+
+
+class RequestError(Exception):
+    """A request that fails for a reason in `HTTP_CODES`."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(f"{code}: {message}")
+        self.code = code
+        self.message = message
+
+
+async def read_body(request: Request, limit: int, name: str) -> bytes:
+    """A whole body of at most `limit` bytes; of a larger one no more is kept.
+
+    Raises:
+      Rejection: `too_large`.
+    """
+    too_large = Rejection(
+        "too_large", f"{name}: must be at most {limit:,} bytes. Send a smaller one."
+    )
+    if int(request.headers.get("Content-Length", 0)) > limit:  # the HTTP parser admits digits only
+        raise too_large
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > limit:
+            raise too_large
+    return bytes(body)
+
+
+class SecurityHeaders:
+    """ASGI middleware: security headers; refuses unsafe paths, logs internal faults, hides them."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        started = False
+
+        async def send_with_headers(message: Message) -> None:
+            nonlocal started
+            if message["type"] == "http.response.start":
+                started = True
+                headers = MutableHeaders(scope=message)
+                headers.update(_HEADERS)
+                headers.setdefault("Cache-Control", "no-store")
+            await send(message)
+
+        request = Request(scope)
+        if not _is_safe(scope):
+            answer = error_answer(
+                request,
+                "unsafe_name",
+                "path: '..', encoded slashes and backslashes are not allowed. Correct the address.",
+            )
+            await answer(scope, receive, send_with_headers)
+            return
+        try:
+            await self._app(scope, receive, send_with_headers)
+        except ClientDisconnect:  # nobody is left to answer
+            return
+        except Exception:
+            _log.exception("%s %s failed", scope["method"], scope["path"])
+            if started:
+                raise
+            answer = error_answer(request, "internal", f"{HTTP_CODES['internal']}.")
+            await answer(scope, receive, send_with_headers)
+
+
+def _is_safe(scope: Scope) -> bool:
+    raw, path = scope.get("raw_path") or b"", scope["path"]
+    return (
+        not _ENCODED.search(raw) and not {".", ".."} & set(path.split("/")) and path.isprintable()
+    )
+
+
+async def on_rejection(request: Request, error: Exception) -> Response:
+    """The answer to a `Rejection` or a `RequestError`."""
+    assert isinstance(error, Rejection | RequestError)
+    return error_answer(request, error.code, error.message)
+
+
+async def on_http_error(request: Request, error: Exception) -> Response:
+    """The answer to an error that Starlette raises."""
+    assert isinstance(error, HTTPException)
+    code = {404: "not_found", 405: "method_not_allowed"}.get(error.status_code, "bad_request")
+    return error_answer(request, code, f"{HTTP_CODES[code]}.", headers=error.headers)
+
+
+async def on_board_error(request: Request, error: Exception) -> Response:
+    """The answer where the board publishes nothing; every other fault is logged and hidden."""
+    if not isinstance(error, NotPublishable):
+        raise error
+    waits = error.waiting and request.app.state.scores
+    headers = {"Retry-After": str(_RETRY_SECONDS)} if waits else None
+    return error_answer(request, "not_publishable", str(error), headers)
+
+
+def error_answer(request: Request, code: str, message: str, headers: Any = None) -> Response:
+    """An error as JSON, or as a page if a browser asks for one."""
+    status = STATUSES.get(code, 400 if code in HTTP_CODES else 422)
+    is_api = request.url.path.startswith("/api/")
+    if is_api or "text/html" not in request.headers.get("Accept", ""):
+        return JSONResponse({"code": code, "message": message}, status, headers=headers)
+    page = _ERROR_PAGE.format(
+        status=status,
+        code=html.escape(code),
+        message=html.escape(message),
+        root="../" * (request.url.path.count("/") - 1) or "./",
+    )
+    return Response(page, status, headers=headers, media_type="text/html")
+
+
+_ERROR_PAGE = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{status}</title>
+<link rel="stylesheet" href="{root}static/board.css">
+</head>
+<body>
+<main id="main" class="frame">
+<h1>{status}</h1>
+<p><code>{code}</code>: {message}</p>
+<p><a href="{root}">Back to the board</a></p>
+</main>
+</body>
+</html>
+"""
