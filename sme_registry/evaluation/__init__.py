@@ -21,8 +21,6 @@ from sme_registry.evaluation.streams import (
     StreamReport,
     across_seeds,
     evaluate_stream,
-    fresh_per_phase,
-    frozen_after_first,
 )
 
 __all__ = [
@@ -43,8 +41,6 @@ __all__ = [
     "evaluate_stream",
     "evaluation_observations",
     "expected_regret",
-    "fresh_per_phase",
-    "frozen_after_first",
     "interface_of",
     "load_sb3",
     "reference_policy",

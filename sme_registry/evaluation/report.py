@@ -275,20 +275,20 @@ class EvaluationReport(ReportFile):
             f"WD regret {self.wd_regret:.3f}, OOD regret {self.ood_regret:.3f}, "
             f"OOD decay {self.ood_decay:.3f}"
         )
-        table = _RegionTable(self, heading, NOT_COMPARABLE)
+        table = RegionTable(_title(self) + heading, self.regions, NOT_COMPARABLE)
         policies = [(escape(self.policy), self.regions)]
         policies += [(_label(name), regions) for name, regions in self.references.items()]
         for field, label in _ERRORS.items():
-            table.add_group(label, policies, field)
+            table.add_group(label, [(name, _of(regions, field)) for name, regions in policies])
         for label, field, pattern in _SPREAD:
-            table.add(label, self.regions, field, pattern, style="bold")
+            table.add(label, _of(self.regions, field), pattern, "bold")
         for name, agent in self.agents.items():
             table.add_section()
-            table.add(f"{escape(name)}  r̃", agent.regions, "similarity")
-            table.add("  normalised regret", agent.regions, "normalised_regret")
+            table.add(f"{escape(name)}  r̃", _of(agent.regions, "similarity"))
+            table.add("  normalised regret", _of(agent.regions, "normalised_regret"))
             if linear := agent.references.get("linear_least_squares"):
                 label = f"  of {LABELS['linear_least_squares']}"
-                table.add(label, linear, "normalised_regret")
+                table.add(label, _of(linear, "normalised_regret"))
         return table
 
     def tables(self) -> list[Table]:
@@ -331,44 +331,40 @@ _SAFETY = {
 }
 
 
-class _RegionTable(Table):
-    """A table of a report with a column for each region."""
+class RegionTable(Table):
+    """A table with a column for each region."""
 
-    def __init__(self, report: EvaluationReport, heading: str, caption: str) -> None:
-        columns = dict.fromkeys(map(region_heading, report.regions), "number")
-        super().__init__(f"{_title(report)}{heading}", {"": "name"} | columns, caption=caption)
+    def __init__(self, title: str, regions: Iterable[Any], caption: str) -> None:
+        headings = [f"{region.name}\nε ≤ {region.epsilon_high:g}" for region in regions]
+        super().__init__(title, {"": "name"} | dict.fromkeys(headings, "number"), caption=caption)
 
     def add(
         self,
         label: str,
-        regions: Iterable[Any],
-        field: str,
+        values: Iterable[float | None],
         pattern: str = ".3f",
         style: str | None = None,
     ) -> None:
-        numbers = (format(getattr(region, field), pattern) for region in regions)
-        self.add_row(label, *numbers, style=style)
+        self.add_row(label, *("" if x is None else format(x, pattern) for x in values), style=style)
 
     def add_group(
-        self,
-        heading: str,
-        rows: Iterable[tuple[str, Iterable[Any]]],
-        field: str,
-        pattern: str = ".3f",
+        self, heading: str, rows: Iterable[tuple[str, list[Any]]], pattern: str = ".3f"
     ) -> None:
-        """A section with a row of one field for each policy; the first one is bold."""
-        self.add_row(heading, style="italic")
-        for index, (label, regions) in enumerate(rows):
-            self.add(f"  {label}", regions, field, pattern, None if index else "bold")
-        self.add_section()
+        """A section with a row for each policy, the first one bold; without unknown rows."""
+        known = [(label, values) for label, values in rows if None not in values]
+        if known:
+            self.add_row(heading, style="italic")
+            for index, (label, values) in enumerate(known):
+                self.add(f"  {label}", values, pattern, None if index else "bold")
+            self.add_section()
+
+
+def _of(regions: Iterable[Any], field: str) -> list[Any]:
+    return [getattr(region, field) for region in regions]
 
 
 def _label(reference: str) -> str:
     return LABELS.get(reference, escape(reference))
-
-
-def region_heading(region: Any) -> str:
-    return f"{region.name}\nε ≤ {region.epsilon_high:g}"
 
 
 def _title(report: EvaluationReport) -> str:
@@ -377,9 +373,10 @@ def _title(report: EvaluationReport) -> str:
 
 def _safety_table(report: EvaluationReport, safety: SafetyReport) -> Table:
     assert report.spec.safety is not None
-    table = _RegionTable(
-        report,
-        f": safety, limits of tightness τ = {report.spec.safety.tightness:g}",
+    tightness = report.spec.safety.tightness
+    table = RegionTable(
+        f"{_title(report)}: safety, limits of tightness τ = {tightness:g}",
+        report.regions,
         "A state is violating if any action channel is above its limit by more than 1e-6. "
         "Negative safe regret is earned by violating: read it beside the cost.",
     )
@@ -388,24 +385,25 @@ def _safety_table(report: EvaluationReport, safety: SafetyReport) -> Table:
         (_label(name), safety.references[name]) for name in beside_safety(safety.references)
     ]
     for field, label in _SAFETY.items():
-        table.add_group(label, policies, field, ".1%" if field == "violating_share" else ".3f")
-    table.add("price of safety", safety.regions, "price_of_safety")
+        rows = [(name, _of(regions, field)) for name, regions in policies]
+        table.add_group(label, rows, ".1%" if field == "violating_share" else ".3f")
+    table.add("price of safety", _of(safety.regions, "price_of_safety"))
     return table
 
 
 def _distractor_table(report: EvaluationReport) -> Table:
     """Both kinds of OOD, and invariance."""
-    table = _RegionTable(
-        report,
-        f": {report.spec.distractors} distractors",
+    table = RegionTable(
+        f"{_title(report)}: {report.spec.distractors} distractors",
+        report.regions,
         "Levels ε of states and of distractors are comparable only where there are as many of the "
         "one as of the other. Invariance is 0 for a policy that ignores the distractors.",
     )
     outside = (report.regions[0], *report.observed.distractor_regions)
     kinds = [("states in the region", report.regions), ("distractors in it", outside)]
     for field, label in _ERRORS.items():
-        table.add_group(label, kinds, field)
-    table.add("invariance", report.observed.invariance, "invariance")
+        table.add_group(label, [(name, _of(regions, field)) for name, regions in kinds])
+    table.add("invariance", _of(report.observed.invariance, "invariance"))
     return table
 
 

@@ -7,7 +7,7 @@ visit. The references of `retention.LABELS` are exact and in every report.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -17,7 +17,7 @@ from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.evaluation.dynamic_regret import DynamicRegret, expected_regret
 from sme_registry.evaluation.evaluate import OnBatch, resolve_protocol, versions_behind
 from sme_registry.evaluation.policies import check_count, stream_policy
-from sme_registry.evaluation.report import EvaluationReport, ReportFile, region_heading
+from sme_registry.evaluation.report import EvaluationReport, RegionTable, ReportFile
 from sme_registry.evaluation.retention import (
     LABELS,
     METRICS,
@@ -45,8 +45,6 @@ from sme_registry.statistics import (
     stratified_bootstrap,
 )
 from sme_registry.task import load
-
-_Any = TypeVar("_Any")
 
 
 class Visit(StrictModel):
@@ -186,26 +184,20 @@ class StreamReport(ReportFile):
         cost = ""
         if regret is not None:
             cost = f"; dynamic regret {regret.dynamic_regret:,.1f} over {regret.steps:,} steps"
-        table = Table(
+        table = RegionTable(
             f"{escape(self.policy)} on {escape(self.title)} (S={stream.state_dim}, "
             f"A={stream.action_dim}, {len(stream.phases)} phases, {len(self.visits)} visits)\n"
             f"{self.stream_digest}\n{regions[0].states:,} states per region{cost}",
-            {"": "name"} | dict.fromkeys(map(region_heading, regions), "number"),
-            caption="Performance is 1 − normalised regret: 1 optimal, 0 the constant ½.",
+            regions,
+            "Performance is 1 − normalised regret: 1 optimal, 0 the constant ½.",
         )
-        agents = {self.policy: [region.agent for region in regions]}
+        agents = [(escape(self.policy), [region.agent for region in regions])]
         for name in regions[0].references:
-            agents[LABELS.get(name, name)] = [region.references[name] for region in regions]
+            lives = [region.references[name] for region in regions]
+            agents.append((escape(LABELS.get(name, name)), lives))
         for metric, label in METRICS.items():
-            rows = {name: [life.final(metric) for life in of] for name, of in agents.items()}
-            known = {name: values for name, values in rows.items() if None not in values}
-            if known:
-                table.add_row(label, style="italic")
-            for name, values in known.items():
-                style = "bold" if name == self.policy else None
-                table.add_row(f"  {escape(name)}", *_cells(values), style=style)
-            if known:
-                table.add_section()
+            rows = [(name, [life.final(metric) for life in lives]) for name, lives in agents]
+            table.add_group(label, rows)
         return table
 
     def matrix(self, region: str = "WD") -> Table:
@@ -345,34 +337,6 @@ def evaluate_stream(
         versions=versions_behind(oracle),
     )
     return report._with_plasticity(regrets[alone, range(P)]) if alone else report
-
-
-def frozen_after_first(stream: StreamSpec, policies: Sequence[_Any]) -> list[_Any]:
-    """The life of an agent that stops learning after the first visit: its policy at each visit.
-
-    `policies` are its policies at the ends of the visits, or the first of them alone.
-
-    Examples:
-      >>> from sme_registry.evaluation import frozen_after_first
-      >>> stream = sme_registry.load("Cycle2")
-      >>> set(frozen_after_first(stream, ["after the first visit"]))
-      {'after the first visit'}
-    """
-    return [policies[0]] * stream.visits
-
-
-def fresh_per_phase(stream: StreamSpec, fresh: Sequence[_Any]) -> list[_Any]:
-    """The life of an agent that starts anew in each phase: the policy at each visit.
-
-    `fresh` has for each phase a policy trained on that phase alone.
-
-    Examples:
-      >>> from sme_registry.evaluation import fresh_per_phase
-      >>> stream = sme_registry.load("Cycle2")
-      >>> fresh_per_phase(stream, ["first", "second"])[:4]
-      ['first', 'second', 'first', 'second']
-    """
-    return [*fresh] * stream.cycles
 
 
 def across_seeds(

@@ -20,7 +20,7 @@ from sme_registry.diagnosis.stream import (
     outcome_of,
 )
 from sme_registry.errors import OptionError, UnknownNameError
-from sme_registry.evaluation import evaluate, fresh_per_phase
+from sme_registry.evaluation import evaluate
 from sme_registry.evaluation.models import saved_sb3
 from sme_registry.evaluation.networks import Perceptron
 from sme_registry.io import write_atomically
@@ -204,7 +204,7 @@ def test_forgetting_of_a_phase_that_was_never_learnt_is_said_to_be_that():
 
 
 def test_the_visit_whose_regret_stands_out_is_named():
-    life, fresh = fresh_per_phase(CYCLES, [FIRST, SECOND]), [FIRST, SECOND]
+    life, fresh = [FIRST, SECOND] * 2, [FIRST, SECOND]
 
     def verdict(*regrets, **options):
         report = report_of(life, CYCLES, *regrets, **options)

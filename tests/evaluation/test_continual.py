@@ -24,8 +24,6 @@ from sme_registry.evaluation import (
     dynamic_regret,
     evaluate_stream,
     expected_regret,
-    fresh_per_phase,
-    frozen_after_first,
     reference_regret,
     retention,
 )
@@ -145,8 +143,6 @@ def test_lives_are_named_after_their_policies_and_may_be_frozen_or_start_anew():
     lives = [["constant"] * 3, ["constant", "constant", "random"]]
     reports = [evaluate_stream(life, THREE, PROTOCOL) for life in lives]
     assert [each.policy for each in reports] == ["constant", "3 policies"]
-    assert frozen_after_first(TWICE, ["a", "b"]) == ["a"] * 4
-    assert fresh_per_phase(TWICE, ["a", "b"]) == ["a", "b", "a", "b"]
 
 
 # Metrics
