@@ -140,24 +140,6 @@ class DatasetRecipe(Document):
         boundaries[-1] = self.transitions
         return tuple(high - low for low, high in itertools.pairwise(boundaries))
 
-    def differences(self, other: DatasetRecipe) -> list[str]:
-        ours, theirs = _leaves(self.to_dict()), _leaves(other.to_dict())
-        return [
-            f"{path} {short_repr(ours.get(path))}, requested {short_repr(theirs.get(path))}"
-            for path in {**ours, **theirs}
-            if ours.get(path) != theirs.get(path)
-        ]
-
-
-def _leaves(plain: Any, path: str = "") -> dict[str, Any]:
-    """The values in plain data by their paths, such as `behaviours.0.nu`."""
-    if not isinstance(plain, dict | list):
-        return {path: plain}
-    leaves: dict[str, Any] = {}
-    for name, value in plain.items() if isinstance(plain, dict) else enumerate(plain):
-        leaves |= _leaves(value, f"{path}.{name}".lstrip("."))
-    return leaves
-
 
 def parse_behaviour(policy: Any, weight: float = 1.0, action_range: str | None = None) -> Behaviour:
     """The behaviour for a policy as `make_dataset` accepts it."""
@@ -268,11 +250,10 @@ class DatasetRecord(StrictModel):
             )
         record = super().from_dict(data, f"{source}: {KEY}")
         recipe, remedy = record.recipe, "Download the data set again, or generate it again."
-        check_digest(record.recipe_digest, recipe, f"{source}: {KEY}.recipe_digest", remedy)
-        check_digest(record.spec_digest, recipe.spec, f"{source}: {KEY}.spec_digest", remedy)
-        check_digest(
-            record.protocol_digest, recipe.protocol, f"{source}: {KEY}.protocol_digest", remedy
-        )
+        documents = {"recipe": recipe, "spec": recipe.spec, "protocol": recipe.protocol}
+        for name, document in documents.items():
+            stated, where = getattr(record, f"{name}_digest"), f"{source}: {KEY}.{name}_digest"
+            check_digest(stated, document, where, remedy)
         return record
 
 

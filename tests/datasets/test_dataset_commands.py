@@ -118,14 +118,10 @@ def test_invalid_input_gives_one_line_and_writes_nothing(arguments, message, tmp
 
 def test_an_existing_data_set_is_kept_without_force():
     good("make", "Default", "-n", "50")
-    assert "already exists and is the same data set. Give" in refused("make", "Default", "-n", "50")
-    for options, difference in [
-        (["-n", "60"], "transitions 50, requested 60."),
-        (["-n", "50", "--coverage", "0"], "coverage None, requested 0.0."),
-        (["-n", "60", "--protocol", "quick-v1"], "transitions 50, requested 60; protocol.states"),
-    ]:
+    assert "already exists, with the same recipe. Give" in refused("make", "Default", "-n", "50")
+    for options in (["-n", "60"], ["-n", "50", "--coverage", "0"]):
         message = refused("make", "Default", *options)
-        assert f"already exists, with another recipe: {difference}" in message
+        assert "already exists, with another recipe. Give" in message
         assert "--force to replace it" in message
     good("make", "Default", "-n", "60", "--force")
     assert open_dataset("sme/Default-v1-nu50-seed0-v0").recipe.transitions == 60

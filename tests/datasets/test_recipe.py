@@ -1,4 +1,4 @@
-"""The recipe of a data set: its digest, its validation and its differences."""
+"""The recipe of a data set: its digest and its validation."""
 
 import numpy as np
 import pytest
@@ -31,35 +31,6 @@ def test_equal_recipes_have_equal_digests_and_each_field_counts():
         recipe(protocol={"seed": 1}),
     ]
     assert len({other.digest for other in others}) == len(others)
-
-
-def test_differences_name_fields_with_both_values():
-    assert recipe().differences(recipe()) == []
-    asked = recipe(transitions=200, spec={"complexity": 10}, coverage=-0.2, protocol={"seed": 1})
-    assert DatasetRecipe.from_dict(asked.to_dict()) == asked
-    assert recipe().differences(asked) == [
-        "spec.complexity 1, requested 10",
-        "transitions 50000, requested 200",
-        "coverage None, requested -0.2",
-        "protocol.seed 0, requested 1",
-    ]
-
-
-def test_differences_of_behaviours_name_their_index():
-    halves = recipe(behaviours=weights(0.5, 0.5))
-    assert halves.differences(recipe(behaviours=weights(0.5, 0.25, 0.25))) == [
-        "behaviours.1.weight 0.5, requested 0.25",
-        "behaviours.2.kind None, requested 'random'",
-        "behaviours.2.weight None, requested 0.25",
-    ]
-    assert halves.differences(recipe(behaviours=weights(0.25, 0.75))) == [
-        "behaviours.0.weight 0.5, requested 0.25",
-        "behaviours.1.weight 0.5, requested 0.75",
-    ]
-    file = {"kind": "policy", "policy": "x", "sha256": "sha256:" + "0" * 64}
-    named = recipe(behaviours=[{"kind": "policy", "policy": "x"}])
-    (line,) = named.differences(recipe(behaviours=[file]))
-    assert line.startswith("behaviours.0.sha256 None, requested 'sha256:000")
 
 
 def test_weights_may_differ_from_one_by_rounding():
