@@ -3,13 +3,11 @@
 from leaderboard.intake.admission import admit, receive, submit_bundle
 from leaderboard.intake.entries import enter, receive_entry
 from leaderboard.intake.references import submit_references
-from leaderboard.intake.refusals import Refusals
 from leaderboard.intake.tickets import refuse_other_sender, start_ticket
 from leaderboard.intake.uploads import UPLOAD_MINUTES, check_upload, upload_header, uploader
 
 __all__ = [
     "UPLOAD_MINUTES",
-    "Refusals",
     "admit",
     "check_upload",
     "enter",

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import datetime
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from leaderboard.artefact.gate import inspect, widths
 from leaderboard.bundle import Bundle
@@ -26,7 +26,6 @@ from leaderboard.documents.submission import (
     utc,
 )
 from leaderboard.errors import Rejection
-from leaderboard.intake.refusals import Refusals
 from leaderboard.intake.uploads import check_room, quota_window
 from leaderboard.store import Store
 
@@ -39,17 +38,13 @@ _verdicts: dict[tuple[str, int, int], tuple[str, str] | None] = {}
 
 
 def receive(
-    store: Store,
-    envelope: Envelope[SignedSubmission],
-    refusals: Refusals,
-    at: datetime.datetime | None = None,
+    store: Store, envelope: Envelope[SignedSubmission], at: datetime.datetime | None = None
 ) -> bool:
-    """Admit a submission that a server received; if it is refused, that counts for its key.
+    """Admit a submission that a server received.
 
     Args:
       store: the board.
       envelope: the submission, its signature verified and its content not validated.
-      refusals: of the server.
       at: time of arrival; now by default.
 
     Returns:
@@ -60,15 +55,9 @@ def receive(
     """
     check_board(store.document, envelope.board)
     moment = at or datetime.datetime.now(datetime.UTC)
-    refused = refusals.times(envelope.key, moment)
     if store.entry(envelope.id) is None:
-        refusals.repeat(envelope.id)
-        _check_quotas(store, envelope.key, moment, refused)
-    try:
-        return admit(store, envelope.open(), moment, refused=refused)
-    except Rejection as rejection:
-        refusals.add(envelope, rejection, moment)
-        raise
+        _check_quotas(store, envelope.key, moment)
+    return admit(store, envelope.open(), moment)
 
 
 def admit(
@@ -76,7 +65,6 @@ def admit(
     signed: SignedSubmission,
     at: datetime.datetime | None = None,
     artefact: ReadArtefact | None = None,
-    refused: Sequence[str] = (),
 ) -> bool:
     """Check a submission and store it.
 
@@ -86,7 +74,6 @@ def admit(
       at: time of arrival; now by default.
       artefact: returns an artefact's bytes by digest, of the size in the submission; they are
         stored with the submission. By default the submitter's key has uploaded them.
-      refused: when other submissions of the key were refused; they count for its quota.
 
     Returns:
       True if it is new, False if the board already has it.
@@ -109,16 +96,16 @@ def admit(
     key = submission.submitter.key
     check_submission(store.document, submission, moment)
     check_name(store, submission.submitter)
-    _check_quotas(store, key, moment, refused)
+    _check_quotas(store, key, moment)
     _check_artefacts(store, submission, artefact)
     if artefact is not None:
         for digest in _artefacts(submission):
             store.put_object(digest, [artefact(digest)], by=key)
     with store.transaction():  # no other submission can use the quota or the name in between
         check_name(store, submission.submitter)
-        _check_quotas(store, key, moment, refused)
+        _check_quotas(store, key, moment)
         if key != store.document.key:
-            check_room(store, key, len(signed.to_bytes()))
+            check_room(store, len(signed.to_bytes()))
         for declared in _artefacts(submission).values():  # nor can `gc` take an artefact
             check_stored(store, key, declared)
         return store.receive(signed)
@@ -158,9 +145,7 @@ def check_name(store: Store, submitter: Submitter) -> None:
         )
 
 
-def _check_quotas(
-    store: Store, key: str, moment: datetime.datetime, refused: Sequence[str]
-) -> None:
+def _check_quotas(store: Store, key: str, moment: datetime.datetime) -> None:
     """Reject one more submission of a key if its quota, or the queue, is full.
 
     The board's own key has no quota, because nothing is shown without the reference rows.
@@ -168,7 +153,7 @@ def _check_quotas(
     limits = store.document.limits
     if key == store.document.key:
         return
-    check_daily_quota(store, key, moment, refused)
+    check_daily_quota(store, key, moment)
     waiting = store.queue.queued()  # those that faults have stopped take nobody's place
     if waiting >= limits.waiting_submissions:
         raise Rejection(
@@ -178,20 +163,17 @@ def _check_quotas(
         )
 
 
-def check_daily_quota(
-    store: Store, key: str, moment: datetime.datetime, refused: Sequence[str] = ()
-) -> None:
+def check_daily_quota(store: Store, key: str, moment: datetime.datetime) -> None:
     """Reject (`quota`) one more submission or entry of a key that has sent a day's number."""
     limits = store.document.limits
-    times = sorted([*store.submission_times(key, *quota_window(moment)), *refused])
+    times = store.submission_times(key, *quota_window(moment))
     if len(times) >= limits.submissions_per_day:
         first = datetime.datetime.fromisoformat(times[-limits.submissions_per_day])
         free = shifted(first, _DAY)
         raise Rejection(
             "quota",
             f"key={key[:16]}…: has sent {len(times)} of {limits.submissions_per_day} submissions "
-            f"within 24 hours, {len(refused)} of them refused. Send the next one after "
-            f"{utc(free)}.",
+            f"within 24 hours. Send the next one after {utc(free)}.",
         )
 
 

@@ -6,7 +6,6 @@ The answers come first, as uploads of the entrant's key. Nothing is scored befor
 from __future__ import annotations
 
 import datetime
-from collections.abc import Sequence
 
 from leaderboard.artefact.answers import read_answers
 from leaderboard.documents.checks import check_board, check_names, check_time, skeleton
@@ -15,21 +14,17 @@ from leaderboard.documents.season import Season
 from leaderboard.documents.submission import Artefact, Envelope
 from leaderboard.errors import Rejection
 from leaderboard.intake.admission import ReadArtefact, check_daily_quota, check_name, check_stored
-from leaderboard.intake.refusals import Refusals
 from leaderboard.intake.uploads import check_room
 from leaderboard.store import Store
 
 
-def receive_entry(
-    store: Store, envelope: Envelope[SignedEntry], season: str, refusals: Refusals
-) -> bool:
-    """Admit an entry that a server received; if it is refused, that counts for its key.
+def receive_entry(store: Store, envelope: Envelope[SignedEntry], season: str) -> bool:
+    """Admit an entry that a server received.
 
     Args:
       store: the board.
       envelope: the entry, its signature verified and its content not validated.
       season: digest of the season that it was sent to.
-      refusals: of the server's entries.
 
     Returns:
       True if it is new, False if the board already has it.
@@ -39,21 +34,16 @@ def receive_entry(
     """
     check_board(store.document, envelope.board)
     moment = datetime.datetime.now(datetime.UTC)
-    refused = refusals.times(envelope.key, moment)
     if store.entrant(envelope.id) is None:
-        check_daily_quota(store, envelope.key, moment, refused)
-    try:
-        signed = envelope.open()
-        if signed.entry.season != season:
-            raise Rejection(
-                "season_unknown",
-                f"season={signed.entry.season}: the entry was sent to the season {season}. Send "
-                "it to its own.",
-            )
-        return enter(store, signed, moment, refused=refused)
-    except Rejection as rejection:
-        refusals.add(envelope, rejection, moment)
-        raise
+        check_daily_quota(store, envelope.key, moment)
+    signed = envelope.open()
+    if signed.entry.season != season:
+        raise Rejection(
+            "season_unknown",
+            f"season={signed.entry.season}: the entry was sent to the season {season}. Send "
+            "it to its own.",
+        )
+    return enter(store, signed, moment)
 
 
 def enter(
@@ -61,7 +51,6 @@ def enter(
     signed: SignedEntry,
     at: datetime.datetime | None = None,
     answers: ReadArtefact | None = None,
-    refused: Sequence[str] = (),
 ) -> bool:
     """Check an entry and store it.
 
@@ -71,7 +60,6 @@ def enter(
       at: time of arrival; now by default.
       answers: returns the bytes of an answer by digest; they are stored with the entry. By default
         the entrant's key has uploaded them.
-      refused: when other entries of the key were refused; they count for its quota.
 
     Returns:
       True if it is new, False if the board already has it.
@@ -89,16 +77,16 @@ def enter(
     store.open_season(entry.season, "sealed-offline")
     season = store.season(entry.season)
     check_name(store, entry.submitter)
-    check_daily_quota(store, key, moment, refused)
+    check_daily_quota(store, key, moment)
     given = _check_answers(store, season, signed, answers)
     if answers is not None:
         for answer in given:
             store.put_object(answer.sha256, [answers(answer.sha256)], by=key)
     with store.transaction():  # no other entrant can take the name, nor `gc` an answer in between
         check_name(store, entry.submitter)
-        check_daily_quota(store, key, moment, refused)
+        check_daily_quota(store, key, moment)
         _check_newest(store, season, entry)
-        check_room(store, key, len(signed.to_bytes()))
+        check_room(store, len(signed.to_bytes()))
         for answer in given:
             check_stored(store, key, answer)
         return store.enter(signed)

@@ -87,5 +87,5 @@ def start_ticket(
     with store.transaction():  # no other entrant can take the name, or the room, in between
         check_name(store, request.submitter)
         check_daily_quota(store, request.submitter.key, moment)
-        check_room(store, request.submitter.key, size)
+        check_room(store, size)
         return store.start_ticket(signed), True

@@ -105,9 +105,6 @@ def check_upload(
     store: Store,
     key: str,
     size: int,
-    *,
-    pending: int = 0,
-    pending_of_key: int = 0,
     at: datetime.datetime | None = None,
 ) -> None:
     """Reject an upload that is too large, or exceeds the key's or the board's quota.
@@ -116,8 +113,6 @@ def check_upload(
       store: the board.
       key: the uploader's public key.
       size: of the object, in bytes.
-      pending: bytes of all uploads in progress.
-      pending_of_key: bytes of this key's uploads in progress.
       at: time of arrival; now by default.
 
     Raises:
@@ -131,25 +126,19 @@ def check_upload(
             "Export a smaller network.",
         )
     moment = at or datetime.datetime.now(datetime.UTC)
-    used = store.uploaded_bytes(key, *quota_window(moment)) + pending_of_key
+    used = store.uploaded_bytes(key, *quota_window(moment))
     if used + size > limits.upload_bytes_per_day:
         raise Rejection(
             "quota",
             f"key={key[:16]}…: has uploaded {used:,} of {limits.upload_bytes_per_day:,} bytes "
             "within 24 hours. Upload the rest 24 hours after the first of them.",
         )
-    check_room(store, key, pending + size)
+    check_room(store, size)
 
 
-def check_room(store: Store, key: str, size: int) -> None:
-    """Reject (`quota`) what does not fit onto a board, even without the uploads of others.
-
-    Args:
-      store: the board; it loses uploads that no submission names if it is full.
-      key: the public key of the sender, which loses nothing.
-      size: of what is to be stored, in bytes.
-    """
-    if not make_room(store, size, keep=key):
+def check_room(store: Store, size: int) -> None:
+    """Reject (`quota`) so many bytes that do not fit onto a board, even without old uploads."""
+    if not make_room(store, size):
         raise Rejection(
             "quota",
             f"board: its {store.document.limits.total_bytes:,} bytes are full. "

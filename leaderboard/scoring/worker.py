@@ -382,7 +382,7 @@ class _Scorers:
                 if scorer.errors.poll():
                     error = scorer.errors.recv()
             code = scorer.process.exitcode
-            fault = f"its scorer ended with status {code}" if code and not self._stopping else None
+            fault = f"its scorer ended with status {code}" if code and not self._stopping else ""
             # Also if it exited normally: Ctrl-C may arrive just after it has claimed a submission.
             had_claim = self._store.queue.abandon(name, fault)
             if error is not None or (code != 0 and not had_claim):

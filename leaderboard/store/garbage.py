@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import datetime
 import time
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -85,21 +84,10 @@ def collect_garbage(
     return Garbage(len(temporary), len(objects), size)
 
 
-def make_room(store: Store, size: int, *, keep: str = "", older_than: float = 600.0) -> bool:
-    """Remove artefacts that no submission names, until `size` more bytes fit onto the board.
+def make_room(store: Store, size: int) -> bool:
+    """Whether `size` more bytes fit onto a board.
 
-    Whoever has neither a submission nor an entry on the board loses its uploads first, and then
-    whoever has uploaded nothing for longest. An upload's age is that of its key's last one, so that
-    a key that uploads many artefacts over a slow connection keeps the first of them.
-
-    Args:
-      store: the board.
-      size: in bytes.
-      keep: the public key of an uploader that loses nothing.
-      older_than: seconds since a key's last upload; a submission may follow within that time.
-
-    Returns:
-      False if they do not fit; then nothing is removed.
+    A full one first removes uploads of more than ten minutes ago that no submission names.
 
     Raises:
       BoardError: a file cannot be removed.
@@ -108,35 +96,19 @@ def make_room(store: Store, size: int, *, keep: str = "", older_than: float = 60
     if store.total_bytes() + size <= limit:
         return True
     with store.transaction() as index:
-        excess = store.total_bytes() + size - limit
-        removed: set[tuple[str, str]] = set()
-        files: list[str] = []
-        uploads = index.connection.execute(_UNNAMED, (keep, *_outside(older_than))).fetchall()
-        holders = Counter(digest for (digest,) in index.connection.execute(_HOLDERS))
-        for digest, bytes_, key in uploads:
-            if excess <= 0:
-                break
-            removed.add((digest, key))
-            holders[digest] -= 1
-            if holders[digest] == 0:
-                files.append(digest)
-                excess -= bytes_
-        if excess > 0:
-            return False
-        for digest in files:
-            _remove(store.folder.object(digest))
-        index.connection.executemany("DELETE FROM upload WHERE digest = ? AND key = ?", removed)
-    return True
+        expired = f"FROM upload WHERE {_OLD}"
+        age = _outside(_UNNAMED_SECONDS)
+        digests = index.connection.execute(f"SELECT DISTINCT digest {expired}", age).fetchall()
+        index.connection.execute(f"DELETE {expired}", age)
+        for (digest,) in digests:
+            if index.one(_IS_HELD, digest) is None:
+                _remove(store.folder.object(digest))
+        return store.total_bytes() + size <= limit
 
 
-_HOLDERS = "SELECT digest FROM upload WHERE digest NOT IN (SELECT digest FROM object)"
-_UNNAMED = """
-SELECT digest, size, upload.key FROM upload
-JOIN (SELECT key, max(time) AS last FROM upload GROUP BY key) AS uploader USING (key)
-WHERE digest NOT IN (SELECT digest FROM object) AND key <> ? AND NOT (last > ? AND last <= ?)
-ORDER BY EXISTS (SELECT 1 FROM entry WHERE entry.key = upload.key)
-  OR EXISTS (SELECT 1 FROM sealed WHERE sealed.key = upload.key), last, time, digest
-"""
+_UNNAMED_SECONDS = 600.0
+_OLD = "NOT (time > ? AND time <= ?)"  # also if its time is in the future, by a wrong clock
+_IS_HELD = "SELECT 1 FROM object WHERE digest = ?1 UNION ALL SELECT 1 FROM upload WHERE digest = ?1"
 
 
 def _outside(seconds: float) -> tuple[str, str]:
@@ -149,8 +121,7 @@ def _outside(seconds: float) -> tuple[str, str]:
 def _forget_uploads_of_named_artefacts(index: Index, older_than: float) -> None:
     """Forget who else has the bytes of a submission's artefact, and has not submitted it."""
     index.connection.execute(
-        "DELETE FROM upload WHERE digest IN (SELECT digest FROM object) "
-        "AND NOT (time > ? AND time <= ?)",
+        f"DELETE FROM upload WHERE digest IN (SELECT digest FROM object) AND {_OLD}",
         _outside(older_than),
     )
 

@@ -1,9 +1,8 @@
 """`index.sqlite`: the tables behind pages, ranking and queue, derived from log and documents.
 
 The tables `head`, `entry`, `run`, `object` and `artefact`, and those of `seasons`, are a function
-of the log alone, so a rebuilt index equals one that grew. `lease`, `turn` and `upload` are
-temporary state: the claims of scorers and the faults that ended them, the scoring time of each
-key, and artefacts that no submission names yet.
+of the log alone, so a rebuilt index equals one that grew. `lease` and `upload` are temporary state:
+the claims of scorers and the faults that ended them, and artefacts that no submission names yet.
 """
 
 from __future__ import annotations
@@ -70,9 +69,8 @@ CREATE TABLE artefact (
 CREATE TABLE lease (
   submission TEXT PRIMARY KEY, worker TEXT NOT NULL, attempt INTEGER NOT NULL,
   held INTEGER NOT NULL, faults INTEGER NOT NULL, fault TEXT NOT NULL,
-  boot TEXT NOT NULL, since REAL NOT NULL, expires REAL NOT NULL
+  boot TEXT NOT NULL, expires REAL NOT NULL
 ) STRICT, WITHOUT ROWID;
-CREATE TABLE turn (key TEXT PRIMARY KEY, time REAL NOT NULL) STRICT, WITHOUT ROWID;
 CREATE TABLE upload (
   digest TEXT NOT NULL, size INTEGER NOT NULL, key TEXT NOT NULL, time TEXT NOT NULL,
   PRIMARY KEY (digest, key)

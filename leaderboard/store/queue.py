@@ -1,19 +1,12 @@
 """`Queue`: the submissions that wait to be scored, and the scorers that have claimed them.
 
+First come, first served, the reference rows before all others. A key has a second submission in
+progress only while nobody else's waits, so that many scorers do not all work for one.
+
 Whatever ends a claim without a result is a fault of the machine (a killed scorer, a full disk, a
 sandbox that does not start) and never a verdict on the submission. It waits and is tried again: at
 once after the first fault, then after 10 s, 20 s, 40 s … up to an hour. Meanwhile, others are
 scored.
-
-The reference rows are first. Then keys take turns by scoring time, so that nobody's submissions
-delay everyone else's (start-time fair queueing, Goyal, Vin and Cheng 1996):
-
-    start(key)  = max(time(key), start of the last claim)     the least is claimed next
-    time(key)   = start(key) + seconds of the claim           once the claim has ended
-
-A new key starts at the present, neither before nor behind the others. Every fourth claim is of the
-submission received first, so that new keys, which never end, delay nobody forever. Who signs with
-many keys gets many turns: only the quotas limit that.
 """
 
 from __future__ import annotations
@@ -42,19 +35,11 @@ _CLAIMABLE = (
     "FROM entry LEFT JOIN lease ON submission = id WHERE status = 'waiting' "
     "AND (submission IS NULL OR boot <> ? OR expires <= ?)"
 )
-_NOW = "coalesce((SELECT time FROM turn WHERE key = ''), 0.0)"  # the start of the last claim
 _NEXT = f"""
-WITH busy AS (
-  SELECT key, count(*) AS claims FROM lease JOIN entry ON id = submission WHERE held GROUP BY key
-)
-SELECT id, key, coalesce(attempt, 0), coalesce(faults, 0), coalesce(fault, ''),
-  max(coalesce(turn.time, 0.0), {_NOW}) AS start
-FROM entry LEFT JOIN lease ON submission = id
-  LEFT JOIN turn USING (key) LEFT JOIN busy USING (key)
-WHERE status = 'waiting' AND (submission IS NULL OR boot <> ? OR expires <= ?)
-ORDER BY reference DESC, {{order}} sequence LIMIT 1
+SELECT id, coalesce(attempt, 0), coalesce(faults, 0), coalesce(fault, '') {_CLAIMABLE}
+ORDER BY reference DESC,
+  key IN (SELECT key FROM lease JOIN entry ON id = submission WHERE held), sequence LIMIT 1
 """
-_CLAIMS = "coalesce((SELECT time FROM turn WHERE key = 'claims'), 0.0)"
 
 
 @dataclass(frozen=True)
@@ -97,26 +82,16 @@ class Queue:
           BoardError: the index cannot be written, or the board's key is missing.
         """
         with self._database.transaction() as index:
+            _end_lost(index)
             boot, at = _uptime()
-            _end_lost(index, (boot, at))
-            claims = index.number(f"SELECT {_CLAIMS}")
-            order = "" if claims % 4 == 3 else "coalesce(claims, 0), start,"
-            row = index.one(_NEXT.format(order=order), boot, at)
+            row = index.one(_NEXT, boot, at)
             if row is None:
                 return None
             self._database.signing_key()  # without it no result could follow
-            id, key, attempts, faults, fault, start = row
+            id, attempts, faults, fault = row
             index.connection.execute(
-                "REPLACE INTO lease VALUES (?, ?, ?, 1, ?, ?, ?, ?, ?)",
-                (id, worker, attempts + 1, faults, fault, boot, at, at + seconds),
-            )
-            # Of a key whose time is past, nothing need be remembered.
-            index.connection.execute(
-                "DELETE FROM turn WHERE time < ? AND key <> 'claims'", (start,)
-            )
-            index.connection.execute(
-                "REPLACE INTO turn VALUES ('', ?), (?, ?), ('claims', ?)",
-                (start, key, start, claims + 1),
+                "REPLACE INTO lease VALUES (?, ?, ?, 1, ?, ?, ?, ?)",
+                (id, worker, attempts + 1, faults, fault, boot, at + seconds),
             )
             return Claim(id, worker, attempts + 1, seconds)
 
@@ -140,7 +115,7 @@ class Queue:
         """Return a claim that ended without a fault of the machine; it can be claimed at once."""
         with self._database.transaction() as index:
             if _is_current(index, claim):
-                _end(index, claim.id, _uptime(), worker="")
+                _end(index, claim.id)
 
     def fault(self, claim: Claim, text: str) -> None:
         """Return a claim that ended in a fault of the machine; the submission is postponed.
@@ -151,14 +126,14 @@ class Queue:
         """
         with self._database.transaction() as index:
             if _is_current(index, claim):
-                _end(index, claim.id, _uptime(), worker="", fault=text)
+                _end(index, claim.id, fault=text)
 
-    def abandon(self, worker: str, fault: str | None = _ENDED) -> bool:
+    def abandon(self, worker: str, fault: str = _ENDED) -> bool:
         """Declare a scorer dead, and end its claim.
 
         Args:
           worker: the scorer's name.
-          fault: that ended it; None if it was none, and its submission is not postponed.
+          fault: that ended it; empty if it was none, and its submission is not postponed.
 
         Returns:
           Whether it had a claim.
@@ -166,13 +141,13 @@ class Queue:
         with self._database.transaction() as index:
             row = index.one("SELECT submission FROM lease WHERE worker = ?", worker)
             if row is not None:
-                _end(index, row[0], _uptime(), worker="", fault=fault)
+                _end(index, row[0], fault=fault)
         return row is not None
 
     def retry(self) -> None:
         """End the postponement of every submission, for example after a fault was repaired."""
         with self._database.transaction() as index:
-            _end_lost(index, _uptime())
+            _end_lost(index)
             index.connection.execute("UPDATE lease SET expires = 0 WHERE NOT held")
 
     def finish(self, claim: Claim, result: Result) -> bool:
@@ -192,7 +167,6 @@ class Queue:
         with self._database.transaction() as index:
             if not _is_current(index, claim):
                 return False
-            _end(index, claim.id, _uptime())
             path = self._database.folder.result(claim.id)
             self._database.record("result", claim.id, result, path)
         return True
@@ -237,58 +211,27 @@ def retry_seconds(faults: int) -> float:
     return min(RETRY_SECONDS * 2.0 ** min(faults - 2, 20), LONGEST_RETRY_SECONDS)
 
 
-def _end_lost(index: Index, now: tuple[str, float]) -> None:
+def _end_lost(index: Index) -> None:
     """End the claims that have expired."""
-    for (id,) in index.connection.execute(
-        f"SELECT submission FROM lease WHERE held AND NOT ({_CLAIMED})", now
-    ).fetchall():
+    lost = f"SELECT submission, worker FROM lease WHERE held AND NOT ({_CLAIMED})"
+    for id, worker in index.connection.execute(lost, _uptime()).fetchall():
         # It keeps its worker, who may be slow, and finish before anyone claims it again.
-        _end(index, id, now, fault=_NO_NEWS)
+        _end(index, id, worker, fault=_NO_NEWS)
 
 
-def _end(
-    index: Index,
-    id: str,
-    now: tuple[str, float],
-    *,
-    worker: str | None = None,
-    fault: str | None = None,
-) -> None:
-    """End a claim, and add its seconds to its key's time.
+def _end(index: Index, id: str, worker: str = "", *, fault: str = "") -> None:
+    """End a claim; after a fault of the machine, its submission is postponed.
 
-    Args:
-      index: of the transaction.
-      id: the submission's.
-      now: as `_uptime` returns it.
-      worker: who may still finish it; None for the one who claimed it.
-      fault: of the machine; None if there was none, and the submission is not postponed.
+    `worker` is who may still finish it.
     """
-    boot, at = now
-    name, faults, since, expires, then = index.connection.execute(
-        "SELECT worker, faults, since, expires, boot FROM lease WHERE submission = ?", (id,)
-    ).fetchone()
-    ended = min(at, expires) if then == boot else expires
+    boot, at = _uptime()
+    faults = index.number("SELECT faults FROM lease WHERE submission = ?", id) + bool(fault)
+    text = " ".join(fault.split())[:MAX_FAULT]
     index.connection.execute(
-        f"INSERT INTO turn SELECT key, {_NOW} + ?1 FROM entry WHERE id = ?2 "
-        "ON CONFLICT DO UPDATE SET time = time + ?1",
-        (max(0.0, ended - since), id),
+        "UPDATE lease SET worker = ?, held = 0, faults = ?, fault = coalesce(nullif(?, ''), fault),"
+        " boot = ?, expires = ? WHERE submission = ?",
+        (worker, faults, text, boot, at + retry_seconds(faults) if fault else 0.0, id),
     )
-    faults += fault is not None
-    index.connection.execute(
-        "UPDATE lease SET worker = ?, held = 0, faults = ?, fault = coalesce(?, fault), boot = ?, "
-        "since = ?, expires = ? WHERE submission = ?",
-        (
-            *(name if worker is None else worker, faults, fault and _line(fault), boot, ended),
-            0.0 if fault is None else at + retry_seconds(faults),
-            id,
-        ),
-    )
-
-
-def _line(text: str) -> str:
-    """A text as one line of printable characters, shortened."""
-    words = " ".join(text.split())
-    return "".join(each if each.isprintable() else "?" for each in words[:MAX_FAULT])
 
 
 def _is_current(index: Index, claim: Claim) -> bool:

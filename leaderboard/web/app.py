@@ -147,7 +147,6 @@ class _Routes:
         self._admissions = CapacityLimiter(1)
         self._objects = CapacityLimiter(_OBJECTS)
         self._uploads = CapacityLimiter(1)
-        self._refusals = intake.Refusals()
         self._rendering = CapacityLimiter(1)
         self._health = CapacityLimiter(1)
         self._pages = pages
@@ -208,7 +207,7 @@ class _Routes:
         envelope = await to_thread.run_sync(read, limiter=self._documents)
 
         def receive() -> bool:
-            return intake.receive(self._store, envelope, self._refusals)
+            return intake.receive(self._store, envelope)
 
         new = await to_thread.run_sync(receive, limiter=self._admissions)
         id = envelope.id

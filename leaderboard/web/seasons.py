@@ -74,7 +74,6 @@ class SeasonRoutes:
         self._challenges = CapacityLimiter(1)
         self._requests = CapacityLimiter(1)
         self._entries = CapacityLimiter(1)
-        self._refusals = intake.Refusals()
         self._rankings = CapacityLimiter(1)
         self._ranked: Memo[bytes] = Memo(16)
 
@@ -180,7 +179,7 @@ class SeasonRoutes:
 
         def enter() -> bool:
             season = self._store.season_row(name).digest
-            return intake.receive_entry(self._store, envelope, season, self._refusals)
+            return intake.receive_entry(self._store, envelope, season)
 
         new = await _run(enter, self._entries)
         return JSONResponse({"id": envelope.id}, 201 if new else 200)

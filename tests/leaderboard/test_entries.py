@@ -1,11 +1,8 @@
 """Entries of a sealed-offline season: what a board accepts, and what it refuses with which code."""
 
-import json
-
 import httpx
 import numpy as np
 import pytest
-import rfc8785
 
 from leaderboard import intake
 from leaderboard.documents.entry import Entry, SignedEntry
@@ -156,33 +153,13 @@ def test_an_entry_that_was_signed_before_one_of_its_method_is_refused(store, key
     assert send(store, entry(store, key, None, None, **older, method=method))
 
 
-def test_refused_entries_of_a_server_count_for_their_key(tmp_path, key):
-    refusals, codes = intake.Refusals(), []
-    with tiny_board(tmp_path / "small", limits={"submissions_per_day": 2}) as store:
-        store.announce(SEASON)
-        plain = manifest(SEASON, key, answers=[])  # signed, and no entry
-        signature = key.sign("entry", sha256_of(rfc8785.dumps(plain)), store.document.key)
-        document = {"entry": plain, "signature": signature, "board": store.document.key}
-        for data in (
-            json.dumps(document).encode(),
-            entry(store, key, GOOD, None).to_bytes(),
-            entry(store, key, None, None).to_bytes(),
-        ):
-            with pytest.raises(Rejection) as error:
-                intake.receive_entry(
-                    store, Envelope.read(data, SignedEntry), SEASON.digest, refusals
-                )
-            codes.append(error.value.code)
-    assert codes == ["schema", "artefact_missing", "quota"]
-
-
 def test_an_entry_that_is_sent_to_another_season_is_refused(store, key):
     other = tiny_season(id="other")
     store.announce(other)
     envelope = Envelope.read(entry(store, key, None, None).to_bytes(), SignedEntry)
     with pytest.raises(Rejection, match="season_unknown"):
-        intake.receive_entry(store, envelope, other.digest, intake.Refusals())
-    assert intake.receive_entry(store, envelope, SEASON.digest, intake.Refusals())
+        intake.receive_entry(store, envelope, other.digest)
+    assert intake.receive_entry(store, envelope, SEASON.digest)
 
 
 def test_entries_over_http_have_the_same_codes(store, key):
