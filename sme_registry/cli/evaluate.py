@@ -32,7 +32,7 @@ from sme_registry.diagnosis.figures import draw
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.evaluation import EvaluationReport, Policy, StreamReport, TeamPolicy
 from sme_registry.evaluation.references import POLICIES
-from sme_registry.io import check_new, integer_in, to_json, write_atomically
+from sme_registry.io import check_new, integer_in, write_atomically
 from sme_registry.io.terminal import Progress, err, out, print_json
 from sme_registry.plots.maps import STREAM
 from sme_registry.plots.reports import write_evaluation, write_stream
@@ -353,7 +353,7 @@ def diagnose(
     text = result.markdown(names, details=all_)
     # The data last, so that the other files exist once it does.
     written = write_atomically(out_folder / _PAGE, text)
-    data = write_atomically(out_folder / _JSON, to_json(result.to_dict()))
+    data = result.write(out_folder / _JSON)
     print_written([*figures, written, data])
 
 

@@ -28,10 +28,11 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from sme_registry.errors import PolicyError, SpecError, UnknownNameError
-from sme_registry.io import choice, read_json, sha256_of
+from sme_registry.io import choice, sha256_of
 from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.spec.document import (
     Digest,
+    DigestedFile,
     Document,
     Integer,
     Real,
@@ -327,7 +328,7 @@ class BehaviourQuality(StrictModel):
     step_reward: Real
 
 
-class OfflineRecord(StrictModel):
+class OfflineRecord(DigestedFile):
     """The arguments, data, evaluations and cost of an offline training.
 
     Attributes:
@@ -349,6 +350,9 @@ class OfflineRecord(StrictModel):
       cpu_ms_per_step: of a gradient step, without evaluations.
       versions: of Python and the packages that the numbers depend on.
     """
+
+    documents = ("spec",)
+    remedy = "Train again."
 
     schema_version: SchemaVersion = 1
     algorithm: Literal["bc", "iql"]
@@ -378,12 +382,3 @@ class OfflineRecord(StrictModel):
     def improvement(self) -> float:
         """The final policy's similarity minus the behaviour's."""
         return self.similarity - self.behaviour.similarity
-
-    @classmethod
-    def read(cls, path: str | os.PathLike[str]) -> OfflineRecord:
-        """Read `offline.json`."""
-        record = cls.from_dict(read_json(path), str(path))
-        check_digest(
-            record.spec_digest, record.spec, f"{os.fspath(path)}: spec_digest", "Train again."
-        )
-        return record

@@ -36,9 +36,7 @@ from sme_registry.io import (
     integer_in,
     is_installed,
     require_packages,
-    to_json,
     versions,
-    write_atomically,
 )
 from sme_registry.plots import reports as plot_files
 from sme_registry.spec import SMESpec
@@ -175,7 +173,7 @@ def train_offline(
         if is_installed("matplotlib"):
             plot_files.write_evaluation(evaluated, target)
         # Last, so that a folder with a record is complete.
-        write_atomically(target / RECORD, to_json(record.to_dict()))
+        record.write(target / RECORD)
     return OfflineResult(policy, record, evaluated, target)
 
 

@@ -9,10 +9,9 @@ Of actions a, clipped to [0, 1], and the optimal actions a*:
 
 from __future__ import annotations
 
-import os
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, JsonValue
 from rich.console import RenderableType
@@ -50,16 +49,16 @@ from sme_registry.diagnosis.subject import AnySubject
 from sme_registry.errors import UnknownNameError
 from sme_registry.evaluation import ObservationReport
 from sme_registry.evaluation.references import LABELS, beside_safety
-from sme_registry.io import choice, read_json, versions
+from sme_registry.io import choice, versions
 from sme_registry.io.markup import Table, fixed, percent, plural
 from sme_registry.spec import SMESpec, StreamSpec, catalogue
 from sme_registry.spec.document import (
     Digest,
+    DigestedFile,
     Integer,
     Real,
     StrictModel,
     TupleOf,
-    check_digest,
 )
 
 Level = Literal["solved", "better_than_linear", "worse_than_linear", "no_better_than_constant"]
@@ -124,7 +123,7 @@ def _name(policy: str) -> str:
     return "this policy" if policy == POLICY else LABELS.get(policy, policy)
 
 
-class Diagnosis(StrictModel):
+class Diagnosis(DigestedFile):
     """What is known about the regret of a run; of a task, a team or a stream, with more fields.
 
     Attributes:
@@ -139,7 +138,8 @@ class Diagnosis(StrictModel):
       versions: of Python and of the packages that the numbers depend on.
     """
 
-    document_field: ClassVar[str] = "spec"
+    documents = ("spec",)
+    remedy = "Diagnose the run again."
 
     schema_version: Annotated[
         Literal[2],
@@ -159,9 +159,10 @@ class Diagnosis(StrictModel):
     @classmethod
     def about(cls, subject: AnySubject, **fields: Any) -> Self:
         """The diagnosis of a subject, with the fields of its kind and without verdicts."""
+        (name,) = cls.documents
         document: dict[str, Any] = {
-            cls.document_field: subject.document,
-            f"{cls.document_field}_digest": subject.document.digest,
+            name: subject.document,
+            f"{name}_digest": subject.document.digest,
         }
         return cls(
             name=subject.name,
@@ -193,15 +194,15 @@ class Diagnosis(StrictModel):
         return self.learnt <= THRESHOLDS["solved"]
 
     @property
-    def subject(self) -> tuple[SMESpec | StreamSpec, str]:
-        """The task or stream, and the digest that the file states."""
-        field = self.document_field
-        return getattr(self, field), getattr(self, f"{field}_digest")
+    def document(self) -> SMESpec | StreamSpec:
+        """The task or stream."""
+        document: SMESpec | StreamSpec = getattr(self, self.documents[0])
+        return document
 
     @property
     def title(self) -> str:
         """The run or policy, and its task or stream with the main fields."""
-        document, _ = self.subject
+        document = self.document
         if isinstance(document, StreamSpec):
             phases = plural(len(document.phases), "phase")
             visits = plural(document.visits, "visit")
@@ -214,8 +215,8 @@ class Diagnosis(StrictModel):
     def origin(self) -> str:
         """What it is about, and the versions that its numbers depend on."""
         versions = ", ".join(f"{name} {version}" for name, version in self.versions.items())
-        kind = "Stream" if self.document_field == "stream" else "Task"
-        return f"{kind} `{self.subject[1]}`. Versions: {versions}."
+        (kind,) = self.documents
+        return f"The {kind} is `{self.document.digest}`. Versions: {versions}."
 
     def verdict(self, question: str) -> Verdict:
         """The verdict on a question, such as "credit assignment" or "credit_assignment"."""
@@ -290,15 +291,6 @@ class Diagnosis(StrictModel):
             kind = max(kinds, key=lambda kind: len(kind.model_fields.keys() & data.keys()))
             return kind.from_dict(data, source)
         return super().from_dict(data, source)
-
-    @classmethod
-    def read(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a diagnosis.json."""
-        diagnosis = cls.from_dict(read_json(path), str(path))
-        document, digest = diagnosis.subject
-        where = f"{path}: {diagnosis.document_field}_digest"
-        check_digest(digest, document, where, "Diagnose the run again.")
-        return diagnosis
 
 
 def _rows(verdicts: Iterable[Verdict]) -> list[tuple[str, ...]]:

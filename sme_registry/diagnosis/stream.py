@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -58,7 +58,7 @@ class PhaseDiagnosis(StrictModel):
 class StreamDiagnosis(Diagnosis):
     """The diagnosis of a life in a stream, by visit and by phase."""
 
-    document_field: ClassVar[str] = "stream"
+    documents = ("stream",)
     stream: StreamSpec
     stream_digest: Digest
     average_performance: Real  # at the end of the life

@@ -18,7 +18,7 @@ import os
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import Field, model_validator
 from rich.markup import escape
@@ -32,10 +32,10 @@ from sme_registry.evaluation.regions import (
     SafetyReport,
     SafetyScore,
 )
-from sme_registry.io import read_json, require_packages, to_json, write_atomically
+from sme_registry.io import require_packages, write_atomically
 from sme_registry.io.markup import Table, card, table_html
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
-from sme_registry.spec.document import StrictModel, check_digest
+from sme_registry.spec.document import DigestedFile, StrictModel
 
 if TYPE_CHECKING:
     import pandas
@@ -60,23 +60,10 @@ class AgentReport(StrictModel):
     references: dict[str, RegionReports]
 
 
-class ReportFile(StrictModel):
+class ReportFile(DigestedFile):
     """A report that a file can hold, and that prints as a table."""
 
-    documents: ClassVar[tuple[str, ...]]  # fields, of each of which `<document>_digest` exists
-
-    @classmethod
-    def read(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a report."""
-        report = cls.from_dict(read_json(path), str(path))
-        for what in cls.documents:
-            stated, where = getattr(report, f"{what}_digest"), f"{path}: {what}_digest"
-            check_digest(stated, getattr(report, what), where, _REMEDY)
-        return report
-
-    def write(self, path: str | os.PathLike[str]) -> Path:
-        """Write the report as JSON, completely or not at all."""
-        return write_atomically(path, to_json(self.to_dict()))
+    remedy = _REMEDY
 
     @abstractmethod
     def table(self) -> Table:

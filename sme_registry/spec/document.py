@@ -11,6 +11,7 @@ import os
 import re
 import textwrap
 from collections.abc import Callable, Iterator, Sequence, Sized
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, cast, get_args
 
 import rfc8785
@@ -30,7 +31,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails
 
 from sme_registry.errors import DigestMismatchError, SpecError, UnknownNameError, did_you_mean
-from sme_registry.io import sha256_of
+from sme_registry.io import read_json, sha256_of, to_json, write_atomically
 
 _words: dict[str, str] = {}  # of patterns
 _ENDS = ("ge", "gt", "le", "lt")
@@ -301,6 +302,26 @@ def check_digest(stated: str, document: Document, where: str, remedy: str) -> No
             f"{where}={stated!r:.90}: its document has the digest {document.digest!r}. One of them "
             f"was changed later. {remedy}"
         )
+
+
+class DigestedFile(StrictModel):
+    """What a file holds whole, with documents and the digests that they had when it was written."""
+
+    documents: ClassVar[tuple[str, ...]]  # fields, of each of which `<document>_digest` exists
+    remedy: ClassVar[str]  # where a digest is of another document
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a file that `write` wrote."""
+        content = cls.from_dict(read_json(path), os.fspath(path))
+        for name in content.documents:
+            stated, where = getattr(content, f"{name}_digest"), f"{path}: {name}_digest"
+            check_digest(stated, getattr(content, name), where, cls.remedy)
+        return content
+
+    def write(self, path: str | os.PathLike[str]) -> Path:
+        """Write it as JSON, completely or not at all."""
+        return write_atomically(path, to_json(self.to_dict()))
 
 
 def without_empty(plain: dict[str, Any], *names: str) -> dict[str, Any]:
