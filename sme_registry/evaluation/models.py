@@ -412,8 +412,11 @@ class OnnxNetwork:
         return self._session.run(None, {self._input: observations})[0]
 
 
-def start_session(model: Path | bytes) -> Any:
-    """A session of onnxruntime for a file or its content."""
+def start_session(model: Path | bytes, optimized: Path | None = None) -> Any:
+    """A session of onnxruntime for a file or its content; `optimized` is where it writes it.
+
+    What it writes has no operations on constants, and is of standard operators.
+    """
     name = "model" if isinstance(model, bytes) else str(model)
     require_packages(f"running {name}", {"onnxruntime": "onnxruntime"}, "onnx")
     # From version 1.31 on its telemetry is on by default; an evaluation must not send any.
@@ -423,6 +426,10 @@ def start_session(model: Path | bytes) -> Any:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4  # errors are raised instead
+    if optimized is not None:
+        options.optimized_model_filepath = os.fspath(optimized)
+        basic = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
+        options.graph_optimization_level = basic
     try:
         return onnxruntime.InferenceSession(
             model if isinstance(model, bytes) else os.fspath(model),

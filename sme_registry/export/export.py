@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -128,12 +127,11 @@ def onnx_bytes(
         choice("action_range", action_range, ACTION_RANGES)
     interface = None if spec is None else interface_of(load(spec, SMESpec))
     network = _network(policy, interface, action_range, vec_normalize)
-    written = network.to_onnx()
     try:  # boards accept no tensors of computed sizes
-        data = _finished(written, network.observation_dim, folded=True)
+        data = _finished(network.to_onnx(fixed_rows=True))
         _check_difference(data, network)
     except PolicyError:
-        data = _finished(written, network.observation_dim, folded=False)
+        data = _finished(network.to_onnx(fixed_rows=False))
         _check_difference(data, network)
     return data
 
@@ -183,24 +181,11 @@ def _loaded(policy: Any) -> Any:
     )
 
 
-def _finished(data: bytes, observation_dim: int, *, folded: bool) -> bytes:
-    """The model with its action range as metadata, and without unused nodes."""
+def _finished(data: bytes) -> bytes:
+    """The model with its action range as metadata."""
     import onnx
 
     model = onnx.load_model_from_string(data)
-    if folded:
-        for node in model.graph.node:
-            if node.op_type == "Expand":
-                node.op_type = "Identity"
-                del node.input[1:]
-        _fold_shapes(model, observation_dim)
-    used, kept = {output.name for output in model.graph.output}, []
-    for node in reversed(model.graph.node):
-        if used.intersection(node.output):
-            used.update(_read_by(node))
-            kept.append(node)
-    del model.graph.node[:]
-    model.graph.node.extend(reversed(kept))
     onnx.helper.set_model_props(model, {ACTION_RANGE: "unit"})
     return bytes(model.SerializeToString())
 
@@ -238,113 +223,3 @@ def _check_difference(data: bytes, network: Network) -> None:
             f"most {TOLERANCE:g}. Check that it is deterministic and depends only on the "
             "observation, or write the ONNX file yourself."
         )
-
-
-def _fold_shapes(model: Any, observation_dim: int) -> None:
-    """Replace what is computed from shapes alone by the numbers that it computes, in place.
-
-    PyTorch computes sizes from `Shape`, although only the batch size varies. What depends on no
-    entry of the observations is computed for two batch sizes; what is equal, or has equal rows,
-    becomes a constant.
-    """
-    import onnx
-
-    nodes = list(model.graph.node)
-    computed = set(_computed_from_shapes(model))
-    folded = {
-        name
-        for node in nodes
-        if not computed.issuperset(node.output)
-        for name in _read_by(node)
-        if name in computed
-    }
-    folded -= {name for node in nodes if node.op_type == "Constant" for name in node.output}
-    if not folded:
-        return
-    reshapes = [node for node in nodes if node.op_type == "Reshape" and node.input[1] in folded]
-    few, many = _values(model, observation_dim, folded | {node.output[0] for node in reshapes})
-    constants = {name: _constant(few[name], many[name]) for name in folded}
-    for node in reshapes:
-        # Sizes of its own: another reader of these may need the batch size itself.
-        output = node.output[0]
-        sizes = _sizes(few[output].shape, many[output].shape)
-        if constants[node.input[1]] is None and sizes is not None:
-            node.input[1] = f"{output}.sizes"
-            constants[node.input[1]] = sizes
-    constants = {name: value for name, value in constants.items() if value is not None}
-    del model.graph.node[:]
-    for name, value in sorted(constants.items()):
-        tensor = onnx.numpy_helper.from_array(np.ascontiguousarray(value), name)
-        model.graph.node.append(onnx.helper.make_node("Constant", [], [name], value=tensor))
-    model.graph.node.extend(node for node in nodes if constants.keys().isdisjoint(node.output))
-
-
-def _read_by(node: Any) -> Iterator[str]:
-    """The values that a node reads, those in its branches and loops included."""
-    yield from node.input
-    for graph in _subgraphs(node):
-        yield from (output.name for output in graph.output)
-        for inner in graph.node:
-            yield from _read_by(inner)
-
-
-def _subgraphs(node: Any) -> list[Any]:
-    attributes = node.attribute
-    return [part.g for part in attributes if part.HasField("g")] + [
-        graph for part in attributes for graph in part.graphs
-    ]
-
-
-def _computed_from_shapes(model: Any) -> Iterator[str]:
-    """The outputs of nodes that depend on no entry of the observations, only on their shape."""
-    dependent = {INPUT}
-    for node in model.graph.node:
-        outputs = [name for name in node.output if name]
-        read = () if node.op_type in ("Shape", "Size") else _read_by(node)
-        # One output each: the constant that replaces it is a node of its own.
-        if len(outputs) != 1 or _subgraphs(node) or dependent.intersection(read):
-            dependent.update(outputs)
-        else:
-            yield outputs[0]
-
-
-def _values(model: Any, observation_dim: int, names: Iterable[str]) -> list[dict[str, Any]]:
-    """The values of these names for two batch sizes."""
-    import onnx
-
-    names = sorted(names)
-    probe = onnx.ModelProto()
-    probe.CopyFrom(model)
-    del probe.graph.output[:]
-    probe.graph.output.extend(onnx.ValueInfoProto(name=name) for name in names)
-    session = start_session(probe.SerializeToString())
-    random = np.random.default_rng(0)
-    batches = [random.random((rows, observation_dim), dtype=np.float32) for rows in (2, 3)]
-    return [dict(zip(names, session.run(names, {INPUT: x}), strict=True)) for x in batches]
-
-
-def _constant(few: Any, many: Any) -> Any:
-    """The value for any batch size, one row where all are equal; None if there is no such value."""
-    if few.shape == many.shape:
-        return few if np.array_equal(few, many) else None
-    axis = _batch_axis(few.shape, many.shape)
-    if axis is None:
-        return None
-    one = few.take([0], axis)
-    return one if (few == one).all() and (many == one).all() else None
-
-
-def _sizes(few: tuple[int, ...], many: tuple[int, ...]) -> Any:
-    """The sizes to reshape to, −1 for that of the batch."""
-    axis = _batch_axis(few, many)
-    if few != many and axis is None:
-        return None
-    return np.array([-1 if i == axis else size for i, size in enumerate(few)], dtype=np.int64)
-
-
-def _batch_axis(few: tuple[int, ...], many: tuple[int, ...]) -> int | None:
-    """The one axis whose length differs."""
-    if len(few) != len(many):
-        return None
-    axes = [axis for axis, sizes in enumerate(zip(few, many, strict=True)) if len({*sizes}) > 1]
-    return axes[0] if len(axes) == 1 else None

@@ -17,6 +17,7 @@ import inspect
 import io
 import os
 import pickle
+import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,7 +28,7 @@ import numpy as np
 from sme_registry.compiled.arrays import Observation
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation import Perceptron
-from sme_registry.evaluation.models import Interface, device_of, evaluating
+from sme_registry.evaluation.models import Interface, device_of, evaluating, start_session
 from sme_registry.io import require_packages
 from sme_registry.spec.sme_spec import ActionRange
 
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 
 INPUT, OUTPUT = "observations", "actions"
 _OPSET, _IR_VERSION = 17, 8
+_ROWS = 4099  # of a traced batch: a prime, which no layer is wide
 _OPERATORS = {"relu": "Relu", "tanh": "Tanh", "sigmoid": "Sigmoid", "elu": "Elu"}
 _OTHER_LIBRARIES = "Give networks of other libraries, and linear maps, as a `Perceptron` of arrays."
 
@@ -45,7 +47,7 @@ class Network(NamedTuple):
 
     observation_dim: int
     act: Callable[[Observation], Any]
-    to_onnx: Callable[[], bytes]
+    to_onnx: Callable[..., bytes]  # with `fixed_rows`, see `traced`
 
 
 def array_network(perceptron: Perceptron, symmetric: bool) -> Network:
@@ -55,7 +57,10 @@ def array_network(perceptron: Perceptron, symmetric: bool) -> Network:
         actions = perceptron(observations)
         return (actions + 1.0) * 0.5 if symmetric else actions
 
-    return Network(perceptron.observation_dim, act, lambda: _to_onnx(perceptron, symmetric))
+    def to_onnx(fixed_rows: bool) -> bytes:
+        return _to_onnx(perceptron, symmetric)
+
+    return Network(perceptron.observation_dim, act, to_onnx)
 
 
 def _to_onnx(perceptron: Perceptron, symmetric: bool) -> bytes:
@@ -128,15 +133,20 @@ def torch_network(policy: Any, interface: Interface, symmetric: bool) -> Network
         return actions.cpu().numpy()
 
     width = interface.observation_dim
-    return Network(width, act, lambda: traced(module, width))
+    return Network(width, act, functools.partial(traced, module, width))
 
 
-def traced(module: Any, width: int) -> bytes:
-    """A module from observations `[B, width]` to actions as ONNX, in evaluation mode."""
+def traced(module: Any, width: int, *, fixed_rows: bool = False) -> bytes:
+    """A module from observations `[B, width]` to actions as ONNX, in evaluation mode.
+
+    PyTorch computes sizes from shapes, where only the batch varies, unless it writes the model for
+    a number of rows (`fixed_rows`). That number then stands for any.
+    """
     import torch
 
     stream: Any = io.BytesIO()
-    rows = torch.zeros((2, width), device=device_of(module))
+    rows = torch.zeros((_ROWS, width), device=device_of(module))
+    batch = {} if fixed_rows else {INPUT: {0: "batch"}, OUTPUT: {0: "batch"}}
     # Warnings of tracing are for PyTorch's developers: the file is compared with the module.
     with evaluating(module), warnings.catch_warnings(action="ignore"), torch.no_grad():
         try:
@@ -148,7 +158,7 @@ def traced(module: Any, width: int) -> bytes:
                 opset_version=_OPSET,
                 input_names=[INPUT],
                 output_names=[OUTPUT],
-                dynamic_axes={INPUT: {0: "batch"}, OUTPUT: {0: "batch"}},
+                dynamic_axes=batch,
             )
         except Exception as error:
             raise PolicyError(
@@ -156,7 +166,35 @@ def traced(module: Any, width: int) -> bytes:
                 f"{str(error).strip().splitlines()[0]:.300} Give a torch.nn.Module of standard "
                 "layers, or write the ONNX file yourself."
             ) from error
-    return bytes(stream.getvalue())
+    data = bytes(stream.getvalue())
+    return _for_any_rows(data) if fixed_rows else data
+
+
+def _for_any_rows(data: bytes) -> bytes:
+    """A model for `_ROWS` rows, for any number; without operations on sizes, which are constant."""
+    import onnx
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.onnx"
+        start_session(data, optimized=path)
+        model = onnx.load(path)
+    graph = model.graph
+    sizes = {node.input[1] for node in graph.node if node.op_type == "Reshape"}
+    for tensor in graph.initializer:
+        array = onnx.numpy_helper.to_array(tensor)
+        if tensor.name in sizes:
+            array = np.where(array == _ROWS, 0, array)  # as many as the input has
+        elif _ROWS in array.shape:
+            one = array.take([0], array.shape.index(_ROWS))
+            array = one if (array == one).all() else array
+        tensor.CopyFrom(onnx.numpy_helper.from_array(np.ascontiguousarray(array), tensor.name))
+    del graph.value_info[:]
+    for end in (*graph.input, *graph.output):
+        end.type.tensor_type.shape.dim[0].dim_param = "batch"
+    standard = [opset for opset in model.opset_import if not opset.domain]
+    del model.opset_import[:]
+    model.opset_import.extend(standard)
+    return bytes(model.SerializeToString())
 
 
 def _unit_policy(function: Callable[..., Any], symmetric: bool) -> Any:
@@ -259,7 +297,7 @@ def sb3_network(
 
     function = _deterministic(network, normaliser)
     module = _unit_policy(function, symmetric or network.squash_output)
-    return Network(width, act, lambda: traced(module, width))
+    return Network(width, act, functools.partial(traced, module, width))
 
 
 def _policy_of(model: Any) -> Any:
