@@ -184,16 +184,13 @@ def selected(cells: Iterable[PlannedCell], only: Sequence[str] = ()) -> tuple[Pl
 
 def uneven_rollouts(plan: StudyPlan) -> list[str]:
     """What to change where the rollouts of an on-policy algorithm do not end where phases do."""
+    phases = {
+        member.name: math.gcd(*(phase.steps for phase in member.stream.phases))
+        for member in plan.streams
+    }
     warnings = []
-    for algorithm in plan.algorithms if plan.streams else ():
-        try:
-            n = _rollout_steps(algorithm)
-        except SMEError:  # it cannot be found here
-            continue
-        phases = {
-            member.name: math.gcd(*(phase.steps for phase in member.stream.phases))
-            for member in plan.streams
-        }
+    for algorithm in plan.algorithms if phases else ():
+        n = _rollout_steps(algorithm)
         uneven = [name for name, steps in phases.items() if steps % n]
         if uneven:
             together = math.gcd(*phases.values())
@@ -208,9 +205,10 @@ def uneven_rollouts(plan: StudyPlan) -> list[str]:
 
 
 def _rollout_steps(algorithm: StudyAlgorithm) -> int:
-    """Steps between two updates of an on-policy algorithm; 1 for any other."""
-    fields = find(algorithm.uses).settings().model_fields
-    if "gae_lambda" not in fields:
+    """Steps between two updates of an on-policy algorithm; 1 for any other, or one not here."""
+    try:
+        fields = find(algorithm.uses).settings().model_fields
+    except SMEError:
         return 1
-    steps = algorithm.hyperparameters.get("n_steps", fields["n_steps"].default)
-    return steps if isinstance(steps, int) else 1
+    steps = algorithm.hyperparameters.get("n_steps", getattr(fields.get("n_steps"), "default", 1))
+    return steps if "gae_lambda" in fields and isinstance(steps, int) else 1

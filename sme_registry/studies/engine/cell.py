@@ -40,7 +40,7 @@ from sme_registry.studies.engine.result import (
 )
 from sme_registry.task import materialize
 from sme_registry.task.loading import materialize_segments
-from sme_registry.training.algorithms import Entry, check_hyperparameters, find
+from sme_registry.training.algorithms import Entry, check_hyperparameters, find, imported
 from sme_registry.training.learn import Learner, Run, Steps, Watch
 from sme_registry.training.record import Snapshots
 
@@ -106,20 +106,10 @@ def _train(cell: Cell, entry: Entry, progress: ReportSteps, model_path: Path | N
     return training.result()
 
 
-def jax_programs() -> Any:
-    """The module of programs, which imports JAX: a study without agents in JAX needs none."""
-    from sme_registry.studies.engine import programs
-
-    return programs
-
-
 def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> CellResult:
-    def report(done: int, total: int, note: str = "") -> None:
-        progress(done, total)
-
-    keep_models = model_path is not None
+    run_program = imported("sme_registry.studies.engine.programs:run_program")
     outcome: Outcome
-    (outcome,) = jax_programs().run_program((cell,), SharedProgram(1), report, keep_models)
+    (outcome,) = run_program((cell,), SharedProgram(1), progress, model_path is not None)
     entry, model, snapshots = outcome
     if isinstance(entry, CellFailure):
         raise PolicyError(entry.error.removeprefix("PolicyError: "))

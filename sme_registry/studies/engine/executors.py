@@ -37,8 +37,9 @@ from sme_registry.io.system import (
     end_with_parent,
 )
 from sme_registry.spec.study import Cell
-from sme_registry.studies.engine.cell import jax_programs, run_cell
+from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.result import CPU, CellResult, Job, Outcome, Report, failed
+from sme_registry.training.algorithms import imported
 
 RunCell = Callable[[Cell, Callable[[int, int], None] | None, Path | None], CellResult]
 ReportProgress = Callable[[Job, int, int], None]  # called with the steps done, and those in all
@@ -136,7 +137,8 @@ def run_job(run: RunCell, job: Job, keep_models: bool, progress: Report) -> Iter
 
 def _outcomes(run: RunCell, job: Job, keep_models: bool, progress: Report) -> Iterator[Outcome]:
     if job.program is not None:
-        yield from jax_programs().run_program(job.cells, job.program, progress, keep_models)
+        run_program = imported("sme_registry.studies.engine.programs:run_program")
+        yield from run_program(job.cells, job.program, progress, keep_models)
         return
     (cell,) = job.cells
     with tempfile.TemporaryDirectory(prefix="sme-cell-") as folder:

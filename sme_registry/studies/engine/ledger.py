@@ -198,13 +198,7 @@ class Ledger:
                 _read_entry(kind, path, key)
             except SMEError as error:
                 aside = path.with_name(f"{path.name}.corrupt")
-                try:
-                    path.replace(aside)
-                except OSError as reason:
-                    raise OptionError(
-                        f"{path}: is invalid and cannot be renamed: {reason.strerror}. Remove it. "
-                        f"{error}"
-                    ) from None
+                path.replace(aside)
                 self.warn(f"{error} Renamed to {aside.name}; the cell runs again.")
 
     def _path(self, folder: str, key: str) -> Path:

@@ -17,24 +17,20 @@ import importlib.metadata
 import json
 import math
 import multiprocessing
-import signal
 import time
 from collections import defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation import EvaluationReport, Policy, StreamReport, as_policy, evaluate_many
-from sme_registry.evaluation.dynamic_regret import DynamicRegret
 from sme_registry.evaluation.models import saved_sb3
 from sme_registry.evaluation.rollouts import start_states
 from sme_registry.io import Arrays, to_json
-from sme_registry.io.system import available_cores, child_environment, end_with_parent
 from sme_registry.jax import find_device
 from sme_registry.jax.program import Evaluation, Program, StepLog
 from sme_registry.jax.run import hidden_of, new_program, policy_of
@@ -51,13 +47,13 @@ from sme_registry.studies.engine.result import (
     Record,
     Report,
     SharedProgram,
-    check_forms,
     failed,
     life_report,
 )
-from sme_registry.training.algorithms import in_jax
+from sme_registry.training.algorithms import imported, in_jax
 from sme_registry.training.record import Snapshots, versions_for
 
+_Report = EvaluationReport | StreamReport
 _Shape = tuple[int, int, int, int]
 SECONDS_BETWEEN_STATES = 180.0
 _MOST_RUNS = 10  # on a CPU: more save little time, and the last of a study would run alone longer
@@ -195,7 +191,7 @@ class _ProgramRun:
         )
         clock = time.process_time if self._program.device.platform == CPU else time.monotonic
         self._record = Record(self._cells, shared.runs, self._cell.evaluations, clock)
-        self._snapshots = self._initial_snapshots()
+        self._record.arrays |= self._initial_snapshots()
         self._restore()
         self._last_state = time.monotonic()
 
@@ -212,20 +208,39 @@ class _ProgramRun:
         self._note_failures()
 
     def results(self) -> Iterator[Outcome]:
-        groups: dict[Hashable, list[int]] = defaultdict(list)  # runs that are evaluated together
+        groups: dict[str, list[int]] = defaultdict(list)  # runs that are evaluated together
         for run, cell in enumerate(self._cells):
             step = int(self._record.arrays["failed_at"][run])
             if cell.digest in self._of_job and step >= 0:
                 yield failed(cell, _not_finite(step))
             elif cell.digest in self._of_job:
-                life = run if cell.stream else None
-                groups[cell.spec.seed, cell.protocol.digest, life].append(run)
-        trained = [[self._trained(run) for run in group] for group in groups.values()]
-        on_cpu = self._program.device.platform == CPU  # where programs share the cores
-        evaluated = _evaluate(trained, 1 if on_cpu else available_cores())
-        for group, (reports, seconds) in zip(groups.values(), evaluated, strict=True):
-            for run, report in zip(group, reports, strict=True):
-                yield self._outcome(run, report, seconds / len(group))
+                groups[cell.digest if cell.stream else cell.protocol.digest].append(run)
+        for runs in groups.values():
+            begun = time.process_time()
+            reports = self._reports(runs)
+            seconds = (time.process_time() - begun) / len(runs)
+            for run, report in zip(runs, reports, strict=True):
+                yield self._outcome(run, report, seconds)
+
+    def _reports(self, runs: Sequence[int]) -> Sequence[_Report | PolicyError]:
+        """The reports of some runs on tasks, or of a life; or why there is none."""
+        if self._record.blocks is None:
+            policies = [(self._policy_of_task(run), self._cells[run].spec) for run in runs]
+            return evaluate_many(policies, self._cells[runs[0]].protocol)
+        (run,) = runs
+        cell, regret = self._cells[run], self._record.blocks.dynamic_regret(run)
+        initial, *visits = (_policy(cell, weights) for weights in self._weights_of_life(run))
+        try:
+            return [life_report(cell, visits, initial, regret)]
+        except PolicyError as error:
+            return [error]
+
+    def _policy_of_task(self, run: int) -> Policy:
+        cell, weights = self._cells[run], self._program.weights(run)
+        act, range_ = _policy(cell, weights), cell.action_range
+        policy = as_policy(act, cell.spec, action_range=range_, name=cell.uses)
+        assert isinstance(policy, Policy)  # cells in JAX have no team
+        return replace(policy, hidden=hidden_of(cell.uses, weights, cell.hyperparameters))
 
     def _outcome(self, run: int, report: _Report | PolicyError, seconds: float) -> Outcome:
         if isinstance(report, PolicyError):
@@ -234,12 +249,6 @@ class _ProgramRun:
         timing = record.timing(steps, seconds, cells=len(self._of_job))
         result = record.result(run, steps, report, timing, program=self._result)
         return Outcome(result, *(self._models(run) if self._keep_models else ()))
-
-    def _trained(self, run: int) -> _Trained:
-        if self._record.blocks is None:
-            return _Trained(self._cells[run], [self._program.weights(run)])
-        regret = self._record.blocks.dynamic_regret(run)
-        return _Trained(self._cells[run], self._weights_of_life(run), regret)
 
     def _initial_snapshots(self) -> Arrays:
         """The weights of lives, `[snapshots, runs, …]`: the actors', or all of models to be kept.
@@ -257,12 +266,12 @@ class _ProgramRun:
         return snapshots
 
     def _on_visit(self, visit: int) -> None:
-        for name, kept in self._snapshots.items():
-            kept[visit + 1] = self._program.state.weights[name.removeprefix(_SNAPSHOT)]
+        for name, kept in _named(self._record.arrays, _SNAPSHOT).items():
+            kept[visit + 1] = self._program.state.weights[name]
 
     def _weights_of_life(self, run: int) -> list[Arrays]:
         """A run's weights before training, and at the end of each visit."""
-        kept = _named(self._snapshots, _SNAPSHOT)
+        kept = _named(self._record.arrays, _SNAPSHOT)
         columns = (snapshots[:, run] for snapshots in kept.values())
         return [dict(zip(kept, weights, strict=True)) for weights in zip(*columns, strict=True)]
 
@@ -305,8 +314,8 @@ class _ProgramRun:
 
     def _models(self, run: int) -> tuple[bytes, dict[str, bytes]]:
         """A run's model as Stable-Baselines3 saves it; of a life also those of its visits."""
-        cell, set_weights = self._cells[run], _sb3_models().set_weights
-        model = _new_model(cell)
+        cell = self._cells[run]
+        model, set_weights = _new_model(cell), imported("sme_registry.training.models:set_weights")
 
         def saved(weights: Arrays, steps: int) -> bytes:
             set_weights(model, weights, steps)
@@ -329,43 +338,36 @@ class _ProgramRun:
     def _save(self) -> None:
         if self._shared.state is None:
             return
-        records = {**self._record.arrays, **self._snapshots}
         arrays = {_PROGRAM + name: array for name, array in self._program.save().items()}
-        arrays |= {_RECORDS + name: array for name, array in records.items()}
+        arrays |= {_RECORDS + name: array for name, array in self._record.arrays.items()}
         with contextlib.suppress(OptionError):  # a full disk costs only what a kill would lose
             write_state(self._shared.state, self._header(), arrays)
 
     def _restore(self) -> None:
         """Go on from the state, if there is one that was made in the same way."""
-        state = self._shared.state
+        state, present = self._shared.state, self._record.arrays
         if state is None or read_header(state) != json.loads(to_json(self._header())):
             return
         arrays = read_state(state)
-        present = {**self._record.arrays, **self._snapshots}
         # A program that kept models has more weights of visits than one that keeps none.
         records = {n: a for n, a in _named(arrays, _RECORDS).items() if n in present}
-        try:
-            check_forms(records, present)
-            self._program.restore(_named(arrays, _PROGRAM))
-        except OptionError:
-            return
-        self._snapshots = {name: records.pop(name) for name in self._snapshots}
-        self._record.restore(records)
+        if _forms_of(records) == _forms_of(present):
+            with contextlib.suppress(OptionError):  # of another program
+                self._program.restore(_named(arrays, _PROGRAM))
+                self._record.restore(records)
+
+
+def _forms_of(arrays: Arrays) -> dict[str, Any]:
+    return {name: (array.dtype, array.shape) for name, array in arrays.items()}
 
 
 def _named(arrays: Arrays, prefix: str) -> Arrays:
     return {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)}
 
 
-def _sb3_models() -> Any:
-    """What makes models of Stable-Baselines3, which is needed only where models are kept."""
-    from sme_registry.training import models
-
-    return models
-
-
 def _new_model(cell: Cell) -> Any:
-    return _sb3_models().new_sb3_model(
+    """A model of Stable-Baselines3, which is needed only where models are kept."""
+    return imported("sme_registry.training.models:new_sb3_model")(
         cell.uses,
         cell.document,
         seed=cell.seed,
@@ -375,61 +377,9 @@ def _new_model(cell: Cell) -> Any:
     )
 
 
-class _Trained(NamedTuple):
-    cell: Cell
-    weights: list[Arrays]
-    regret: DynamicRegret | None = None
-
-
-_Report = EvaluationReport | StreamReport
-_Evaluated = tuple[Sequence[_Report | PolicyError], float]
-"""The reports of some cells, or why there is none, and the CPU seconds of all of them."""
-
-
-def _evaluate(groups: list[list[_Trained]], processes: int) -> Iterator[_Evaluated]:
-    """Evaluate groups of cells with tasks of one draw, in order."""
-    if processes == 1 or len(groups) == 1:
-        yield from map(_evaluate_together, groups)
-        return
-    spawn = multiprocessing.get_context("spawn")
-    # On CPUs: a device that runs programs has one process.
-    with (
-        child_environment({"JAX_PLATFORMS": CPU}),
-        ProcessPoolExecutor(processes, spawn, _begin_worker) as pool,
-    ):
-        yield from pool.map(_evaluate_together, groups)
-
-
-def _evaluate_together(group: list[_Trained]) -> _Evaluated:
-    start = time.process_time()
-    first = group[0]
-    reports: Sequence[_Report | PolicyError]
-    if first.regret is not None:
-        initial, *visits = (_policy(first.cell, weights) for weights in first.weights)
-        try:
-            reports = [life_report(first.cell, visits, initial, first.regret)]
-        except PolicyError as error:
-            reports = [error]
-    else:
-        policies = []
-        for cell, (weights,), _ in group:
-            range_, name, act = cell.action_range, cell.uses, _policy(cell, weights)
-            policy = as_policy(act, cell.spec, action_range=range_, name=name)
-            assert isinstance(policy, Policy)  # cells in JAX have no team
-            hidden = hidden_of(cell.uses, weights, cell.hyperparameters)
-            policies.append((replace(policy, hidden=hidden), cell.spec))
-        reports = evaluate_many(policies, first.cell.protocol)
-    return reports, time.process_time() - start
-
-
 def _policy(cell: Cell, weights: Arrays) -> Any:
-    options: dict[str, Any] = {"action_range": cell.action_range}
-    return policy_of(cell.uses, weights, hyperparameters=cell.hyperparameters, **options)
-
-
-def _begin_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
+    settings, range_ = cell.hyperparameters, cell.action_range
+    return policy_of(cell.uses, weights, hyperparameters=settings, action_range=range_)
 
 
 def _not_finite(step: int) -> PolicyError:

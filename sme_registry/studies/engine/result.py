@@ -21,7 +21,6 @@ from typing import Annotated, Any, NamedTuple, Self
 import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, StreamReport, evaluate_stream
 from sme_registry.evaluation.dynamic_regret import DynamicRegret, RegretBlocks, reference_regret
 from sme_registry.evaluation.policies import stream_policy
@@ -346,15 +345,6 @@ class Record:
             environment=environment,
             evaluation=evaluation + at_the_end,
             steps_per_second=steps / training if steps and training else 0.0,
-        )
-
-
-def check_forms(arrays: Arrays, own: Arrays) -> None:
-    """Raise OptionError if arrays that were saved have other names, types or shapes than those."""
-    one, other = ({n: (a.dtype, a.shape) for n, a in each.items()} for each in (arrays, own))
-    if one != other:
-        raise OptionError(
-            "its records of the runs are missing or others, or of lives without models."
         )
 
 

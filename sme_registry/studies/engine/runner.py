@@ -18,11 +18,11 @@ from sme_registry.io.terminal import Progress
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.spec.study import Cell, PlannedCell
 from sme_registry.studies.engine.budget import selected, with_sources
-from sme_registry.studies.engine.cell import jax_programs, run_cell
+from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.executors import EXECUTORS, Executor, RunCell
 from sme_registry.studies.engine.ledger import Ledger, SavedState, StudyStatus, label, plan_status
 from sme_registry.studies.engine.result import CPU, CellFailure, CellResult, Job, Outcome
-from sme_registry.training.algorithms import check_algorithm, code_notice, in_jax
+from sme_registry.training.algorithms import check_algorithm, code_notice, imported, in_jax
 from sme_registry.training.record import versions_for
 
 if TYPE_CHECKING:
@@ -136,8 +136,10 @@ def _programs(
             "--device, or leave out --ray on a machine that has such a device."
         )
     device = device if local else CPU
-    jax, cells = jax_programs(), (cell.cell for cell in plan.cells)
-    programs: Programs = jax.Programs(cells, jax.platform_of(device), device, lanes)
+    module = "sme_registry.studies.engine.programs"
+    platform = imported(f"{module}:platform_of")(device)
+    cells = (cell.cell for cell in plan.cells)
+    programs: Programs = imported(f"{module}:Programs")(cells, platform, device, lanes)
     return programs
 
 

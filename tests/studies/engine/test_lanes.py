@@ -239,17 +239,14 @@ def test_a_retry_goes_on_from_the_state_if_an_evaluation_at_the_end_failed(
     whole, study, state, monkeypatch
 ):
     monkeypatch.setattr(programs, "SECONDS_BETWEEN_STATES", 0.0)
-    evaluate_together = programs._evaluate_together
 
-    def evaluate_one_draw(group):
-        if group[0].cell.spec.seed == 2:
-            raise OSError("no space left")
-        return evaluate_together(group)
+    def evaluate_nothing(policies, protocol):
+        raise OSError("no space left")
 
     with monkeypatch.context() as patch:
-        patch.setattr(programs, "_evaluate_together", evaluate_one_draw)
+        patch.setattr(programs, "evaluate_many", evaluate_nothing)
         status = ran(study)
-    assert (status.count("done"), status.count("failed")) == (2, 2)
+    assert (status.count("done"), status.count("failed")) == (0, 4)
     steps = []
     assert ran(study, retry_failed=True, on_steps=steps.append).count("done") == 4
     assert steps == []  # its training was complete
