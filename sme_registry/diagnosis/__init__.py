@@ -16,8 +16,7 @@ from sme_registry.diagnosis.subject import (
     load_policy,
     load_run,
 )
-from sme_registry.diagnosis.task import diagnose_task
-from sme_registry.diagnosis.team import diagnose_team
+from sme_registry.diagnosis.task import diagnose_task, diagnose_team
 from sme_registry.errors import OptionError
 from sme_registry.io import integer_in
 

@@ -31,6 +31,7 @@ import numpy.typing as npt
 
 from sme_registry.compiled.arrays import REWARD, STEP_REWARD, Mask, Observation
 from sme_registry.diagnosis.measure import LINEAR, MAX_NUMBERS, POLICY, Score, observed, states_of
+from sme_registry.diagnosis.questions import THRESHOLDS
 from sme_registry.envs import arguments
 from sme_registry.envs.batch import Batch
 from sme_registry.evaluation import Policy, references
@@ -46,7 +47,6 @@ from sme_registry.training.algorithms import one_thread, quiet
 
 CONSTANTS = ("best_constant", "constant_half")
 _TIME_BINS, _COVERAGE_BINS = 10, 20
-_MARGIN = 0.02  # of regret below the constant action's
 GRADIENT_STEPS = 3000
 DEFAULT_STATES = 20_000
 _MIN_STATES, _MAX_STATES = 256, 50_000
@@ -315,7 +315,7 @@ def _coverage(values: Array) -> float:
 def training(log: Log, constant_regret: float) -> TrainingSummary:
     rows = len(log.regret)
     steps, median, window = smoothed(log.step, log.regret)
-    improved = np.flatnonzero(median < constant_regret - _MARGIN)
+    improved = np.flatnonzero(median < constant_regret - THRESHOLDS["constant_margin"])
     recent = median[-max(1, len(median) // 3) :]
     best = int(np.argmin(median))
     return TrainingSummary(

@@ -14,7 +14,7 @@ import numpy as np
 from sme_registry.diagnosis.document import Diagnosis, TaskDiagnosis
 from sme_registry.diagnosis.measure import LINEAR, POLICY
 from sme_registry.diagnosis.stream import StreamDiagnosis
-from sme_registry.diagnosis.team import TeamDiagnosis
+from sme_registry.diagnosis.task import TeamDiagnosis
 from sme_registry.evaluation.references import LABELS
 from sme_registry.plots.curves import tick_visits
 from sme_registry.plots.style import (
