@@ -99,7 +99,7 @@ class WireError(SMEError, ValueError):
 
 
 class SealedError(SMEError):
-    """A sealed season's server refused a request, or gives no answer.
+    """A board's server refused a request, or gives no answer.
 
     Its `code` is the board's, or "unreachable", "http" or "wire" where it sent none.
     """

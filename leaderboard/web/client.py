@@ -11,9 +11,8 @@ import functools
 import json
 import os
 import re
-import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from leaderboard.bundle import Bundle
 from leaderboard.documents.board import BoardDocument, hex_of
@@ -23,20 +22,15 @@ from leaderboard.documents.season import Season
 from leaderboard.documents.submission import SignedWithdrawal
 from leaderboard.errors import CODES, BoardError, Rejection
 from leaderboard.intake import upload_header
-from sme_registry.errors import MalformedDocumentError, OptionError, SpecError
-from sme_registry.io import parse_json, printable, require_packages, server_address
+from sme_registry.errors import MalformedDocumentError, OptionError, SealedError, SpecError
+from sme_registry.io import parse_json
 from sme_registry.seasons import Ticket
-from sme_registry.seasons.wire import tickets_path
-
-if TYPE_CHECKING:
-    import httpx
+from sme_registry.seasons.wire import Connection, tickets_path
 
 Progress = Callable[[int, int], None]
 
-_WAITS = (0.25, 1.0, 4.0)  # seconds before each further attempt
-_TRANSIENT = frozenset({408, 502, 503, 504})
-_MAX_ANSWER = 64 * 2**20  # a board may be hostile, too
-_CHUNK = 64 * 2**10
+_PATIENCE = 30.0  # seconds
+_MOST = 2**24  # bytes of an answer: a result of a thousand runs has less than two million
 
 
 def submit(
@@ -67,14 +61,14 @@ def submit(
     content = Bundle.read(bundle)
     runs = content.signed.submission.runs
     digests = list(dict.fromkeys(run.artefact.sha256 for run in runs if run.artefact))
-    with _Client(url, insecure=insecure) as client:
-        board = client.board_document().key
+    with _Board(url, insecure=insecure) as served:
+        board = served.document().key
         signed = content.signed.for_board(board, key)
         for done, digest in enumerate(digests, start=1):
-            client.upload(digest, content.artefact(digest), key, board)
+            served.upload(digest, content.artefact(digest), key, board)
             if progress is not None:
                 progress(done, len(digests))
-        _, answer = client.request("POST", "/api/submissions", signed.to_bytes())
+        answer = served.request("POST", "/api/submissions", signed.to_bytes())
     return str(_answer_for(signed.id, answer, url)["id"])
 
 
@@ -93,8 +87,8 @@ def status(url: str, id: str, *, insecure: bool = False) -> dict[str, Any]:
       BoardError: the board cannot be reached, or its answer is invalid.
       OptionError: the URL or the id is invalid.
     """
-    with _Client(url, insecure=insecure) as client:
-        _, answer = client.request("GET", f"/api/submissions/{_digits(id)}")
+    with _Board(url, insecure=insecure) as served:
+        answer = served.request("GET", f"/api/submissions/{_digits(id)}")
     return _answer_for(f"sha256:{_digits(id)}", answer, url)
 
 
@@ -105,8 +99,8 @@ def board_document(url: str, *, insecure: bool = False) -> BoardDocument:
       BoardError: the board cannot be reached, or its answer is invalid.
       OptionError: the URL is invalid.
     """
-    with _Client(url, insecure=insecure) as client:
-        return client.board_document()
+    with _Board(url, insecure=insecure) as served:
+        return served.document()
 
 
 def season(url: str, id: str, *, insecure: bool = False) -> tuple[str, str]:
@@ -117,13 +111,13 @@ def season(url: str, id: str, *, insecure: bool = False) -> tuple[str, str]:
       BoardError: the board cannot be reached, or its answer is invalid.
       OptionError: the URL or the id is invalid.
     """
-    with _Client(url, insecure=insecure) as client:
-        _, answer = client.request("GET", f"/api/seasons/{_name(id)}")
+    with _Board(url, insecure=insecure) as served:
+        answer = served.request("GET", f"/api/seasons/{_name(id)}")
         try:
             found = Season.from_dict(answer["document"], "season.json")
         except (SpecError, LookupError, TypeError) as error:
-            raise BoardError(f"{url}: answered with no season: {printable(error)}") from None
-        return found.digest, client.board_document().key
+            raise BoardError(f"{url}: answered with no season: {error}") from None
+        return found.digest, served.document().key
 
 
 def request_ticket(
@@ -151,13 +145,13 @@ def request_ticket(
       OptionError: the URL or the id is invalid.
     """
     sign = functools.partial(upload_header, key, signed.id, board=signed.board)
-    with _Client(url, insecure=insecure) as client:
+    with _Board(url, insecure=insecure) as served:
         path = tickets_path(_name(season))
-        _, answer = client.request("POST", path, signed.to_bytes(), sign)
+        answer = served.request("POST", path, signed.to_bytes(), sign)
     try:
         ticket = Ticket.from_dict(answer, "ticket")
     except SpecError as error:
-        raise BoardError(f"{url}: answered with no ticket: {printable(error)}") from None
+        raise BoardError(f"{url}: answered with no ticket: {error}") from None
     return ticket.model_copy(update={"signer": signed.signer(key)})
 
 
@@ -189,13 +183,13 @@ def enter(
       BoardError: the board cannot be reached, or its answer is invalid.
       OptionError: the URL or the id is invalid.
     """
-    with _Client(url, insecure=insecure) as client:
+    with _Board(url, insecure=insecure) as served:
         for done, (digest, data) in enumerate(answers.items(), start=1):
-            client.upload(digest, data, key, signed.board)
+            served.upload(digest, data, key, signed.board)
             if progress is not None:
                 progress(done, len(answers))
         path = f"/api/seasons/{_name(season)}/entries"
-        _, answer = client.request("POST", path, signed.to_bytes())
+        answer = served.request("POST", path, signed.to_bytes())
     return str(_answer_for(signed.id, answer, url)["id"])
 
 
@@ -216,41 +210,35 @@ def withdraw(
       OptionError: the URL or the id is invalid.
     """
     id = f"sha256:{_digits(id)}"
-    with _Client(url, insecure=insecure) as client:
-        board = client.board_document().key
+    with _Board(url, insecure=insecure) as served:
+        board = served.document().key
         signed = SignedWithdrawal.create(id, key, reason, board=board)
-        client.request("POST", "/api/withdrawals", json.dumps(signed.to_dict()).encode())
+        served.request("POST", "/api/withdrawals", json.dumps(signed.to_dict()).encode())
 
 
-class _Client:
-    """An HTTP client of one board, which repeats requests after network failures."""
+class _Board:
+    """One served board; errors are those of this module's functions.
+
+    Digests identify objects and documents, so that every request is safe to repeat.
+    """
 
     def __init__(self, url: str, *, insecure: bool) -> None:
-        require_packages("reaching a served board", {"httpx": "httpx"}, "leaderboard")
-        import httpx
+        self._url = url
+        self._connection = Connection(url, insecure=insecure, patience=_PATIENCE)
 
-        self._httpx = httpx
-        address = server_address(url, insecure=insecure)
-        self._url = address.url
-        self._client = httpx.Client(
-            timeout=httpx.Timeout(30.0, read=120.0), trust_env=not address.is_local
-        )
-
-    def __enter__(self) -> _Client:
+    def __enter__(self) -> _Board:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._client.close()
+        self._connection.close()
 
-    def board_document(self) -> BoardDocument:
-        """The board's definition; errors as for the function of this name."""
-        _, answer = self.request("GET", "/definition.json")
+    def document(self) -> BoardDocument:
+        """The board's definition."""
+        answer = self.request("GET", "/definition.json")
         try:
             return BoardDocument.from_dict(answer)
         except SpecError as error:
-            raise BoardError(
-                f"{self._url}: its definition is invalid: {printable(error)}"
-            ) from None
+            raise BoardError(f"{self._url}: its definition is invalid: {error}") from None
 
     def upload(self, digest: str, data: bytes, key: SigningKey, board: str | None) -> None:
         """Send an object, also if the board has it: only who has its bytes may submit it."""
@@ -258,50 +246,17 @@ class _Client:
         self.request("PUT", f"/api/objects/{hex_of(digest)}", data, sign)
 
     def request(
-        self,
-        method: str,
-        path: str,
-        content: bytes | None = None,
-        sign: Callable[[], str] | None = None,
-    ) -> tuple[int, Any]:
-        """Status and JSON of the answer to a request, repeated after failures of the network.
-
-        Every request is safe to repeat, because digests identify objects and documents. `sign`
-        returns its `Authorization`, a new one for each attempt, because it is valid for minutes.
-        """
-        for wait in (*_WAITS, None):
-            headers = {"Accept": "application/json"}
-            if sign is not None:
-                headers["Authorization"] = sign()
-            try:
-                with self._client.stream(
-                    method, self._url + path, content=content, headers=headers
-                ) as response:
-                    code, answer = response.status_code, self._read(response)
-            except self._httpx.TransportError as error:
-                reason = str(error) or type(error).__name__
-                code, answer = 503, {"message": f"cannot be reached: {reason}"}
-            if code not in _TRANSIENT or wait is None:
-                break
-            time.sleep(wait)
-        if 200 <= code < 300:
-            return code, answer
-        fields = answer if isinstance(answer, dict) else {}
-        message = printable(fields.get("message") or f"answered with HTTP status {code}")
-        if (rejection := str(fields.get("code"))) in CODES:
-            raise Rejection(rejection, message)
-        raise BoardError(f"{self._url}: {message}")
-
-    def _read(self, answer: httpx.Response) -> Any:
-        text = bytearray()
-        for chunk in answer.iter_bytes(_CHUNK):
-            text += chunk
-            if len(text) > _MAX_ANSWER:
-                raise BoardError(
-                    f"{self._url}: answered with more than {_MAX_ANSWER:,} bytes. Check the URL."
-                )
+        self, method: str, path: str, content: bytes = b"", sign: Callable[[], str] | None = None
+    ) -> Any:
+        """The JSON of an answer; None if it is none."""
+        try:
+            data = self._connection.request(method, path, content, most=_MOST, sign=sign)
+        except SealedError as error:
+            if error.code in CODES:
+                raise Rejection(error.code, error.message) from None
+            raise BoardError(f"{self._url}: {error.message}") from None
         with contextlib.suppress(MalformedDocumentError):
-            return parse_json(bytes(text), self._url)
+            return parse_json(data, self._url)
         return None
 
 

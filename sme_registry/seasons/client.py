@@ -134,7 +134,7 @@ class Instance:
         if self._ticket.signer is not None:
             require_signatures()  # before the stepping ends for good
         self._request("POST", "finish")
-        data = self._request("GET", "challenge", most=2**31)
+        data = self._request("GET", "challenge", most=2**28)
         return unpack_table(data, self.setting.state_dim + 2)
 
     def send_answers(self, actions: npt.NDArray[np.floating]) -> None:

@@ -45,7 +45,7 @@ import random
 import re
 import ssl
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -69,7 +69,6 @@ from sme_registry.io import (
     integer_in,
     number_in,
     parse_json,
-    printable,
     read_json,
     require_packages,
     server_address,
@@ -134,7 +133,7 @@ def require_signatures() -> None:
 class TicketClass(StrictModel):
     name: Name
     setting: Setting  # all of a spec but its seed
-    instances: Annotated[Integer, Field(ge=1)]  # number of hidden tasks
+    instances: Annotated[Integer, Field(ge=1, le=1000)]  # number of hidden tasks
     budget: Annotated[Integer, Field(ge=1)]  # steps on each instance, over all lanes
 
 
@@ -175,7 +174,7 @@ class Ticket(StrictModel):
     token: _Secret
     deadline: Annotated[str, Field(max_length=40)]
     lanes: Annotated[Integer, Field(ge=1)]
-    classes: Annotated[TupleOf[TicketClass], Field(min_length=1)]
+    classes: Annotated[TupleOf[TicketClass], Field(min_length=1, max_length=1000)]
     signer: Signer | None = None
 
     @property
@@ -387,6 +386,7 @@ _TIMEOUT = 300.0  # to accept a connection, or send more: a restarted server rep
 _FIRST_WAIT, _LONGEST_WAIT = 0.1, 15.0
 _TRANSIENT = frozenset({408, 502, 503, 504, 507})
 _JSON_BYTES = 2**20
+_MESSAGE = 2000  # characters
 _TYPE = "application/octet-stream"
 
 _log = logging.getLogger(__name__)
@@ -394,27 +394,40 @@ _now, _sleep = time.monotonic, time.sleep
 
 
 class Connection:
-    """An HTTP connection to a server, kept open between requests. Not for several threads.
+    """An HTTP connection to a board, kept open between requests. Not for several threads.
 
-    From the first answer on, a request is repeated for `patience` seconds.
+    From the first answer on, a request is repeated for `patience` seconds. A server may be hostile:
+    an answer is its raw bytes, up to a limit, and neither a coding nor a redirect is followed.
     """
 
     def __init__(
-        self, url: str, token: str, *, insecure: bool = False, patience: float = PATIENCE
+        self, url: str, token: str = "", *, insecure: bool = False, patience: float = PATIENCE
     ) -> None:
         self._http: http.client.HTTPConnection | None = None
         self._address = server_address(url, insecure=insecure)
         self._patience = number_in("patience", patience, 0.0)
-        self._headers = {"Authorization": bearer(token), "Content-Type": _TYPE}
+        self._authorization = bearer(token)
         self._answered = False
 
-    def request(self, method: str, path: str, body: bytes = b"", *, most: int) -> bytes:
-        """The body of the answer, of at most `most` bytes."""
+    def request(
+        self,
+        method: str,
+        path: str,
+        body: bytes = b"",
+        *,
+        most: int = 0,
+        sign: Callable[[], str] | None = None,
+    ) -> bytes:
+        """The body of the answer, of at most `most` bytes, or a MiB.
+
+        `sign` returns its `Authorization`, anew for each attempt.
+        """
         wait, started = _FIRST_WAIT, _now()
         while True:
             reused = self._http is not None
             try:
-                status, data = self._exchange(method, path, body, most)
+                headers = {"Authorization": sign() if sign else self._authorization}
+                status, data = self._exchange(method, path, body, headers, max(most, _JSON_BYTES))
             except ssl.SSLCertVerificationError as error:
                 raise SealedError("unreachable", f"{self._address.url}: {error}.") from None
             except (OSError, http.client.HTTPException) as error:
@@ -423,9 +436,9 @@ class Connection:
                     continue
             else:
                 self._answered = True
-                if status in (200, 201):
+                if 200 <= status < 300:
                     return data
-                code, message = _reason_in(data, status)
+                code, message = self._reason_in(data, status)
                 if status not in _TRANSIENT:
                     kind = BudgetSpentError if code == "budget_spent" else SealedError
                     raise kind(code, message)
@@ -435,7 +448,7 @@ class Connection:
                 raise SealedError(
                     "unreachable",
                     f"{self._address.url}: gives no answer: {reason:.500} Check the URL and try "
-                    "again: no step is lost, or taken twice.",
+                    "again: nothing is lost, or done twice.",
                 )
             _log.warning("%s: no answer, trying again: %.200s", self._address.url, reason)
             # Clients that lost the same server do not all come back at the same moment.
@@ -450,16 +463,21 @@ class Connection:
     def __del__(self) -> None:  # few users close their environments
         self.close()
 
-    def _exchange(self, method: str, path: str, body: bytes, most: int) -> tuple[int, bytes]:
+    def _exchange(
+        self, method: str, path: str, body: bytes, headers: dict[str, str], most: int
+    ) -> tuple[int, bytes]:
         if self._http is None:
             self._http = self._new()
         try:
-            self._http.request(method, self._address.path + path, body, self._headers)
+            headers |= {"Accept": "application/json", "Content-Type": _TYPE}
+            self._http.request(method, self._address.path + path, body, headers)
             with self._http.getresponse() as answer:
-                data = answer.read(max(most, _JSON_BYTES) + 1)
-                if len(data) > max(most, _JSON_BYTES):
+                data = answer.read(most + 1)
+                if len(data) > most:
                     raise SealedError(
-                        "wire", f"{self._address.url}: answered with more than {most:,} bytes."
+                        "wire",
+                        f"{self._address.url}: answered with more than {most:,} bytes. Check the "
+                        "URL.",
                     )
                 if answer.length:  # `read` does not raise where the connection was lost
                     raise http.client.IncompleteRead(data, answer.length)
@@ -482,13 +500,12 @@ class Connection:
         connection.set_tunnel(address.host, address.port)
         return connection
 
-
-def _reason_in(data: bytes, status: int) -> tuple[str, str]:
-    try:
-        plain: Any = parse_json(data, "answer")
-    except MalformedDocumentError:
-        plain = None
-    match plain:
-        case {"code": str(code), "message": str(message)}:
-            return printable(code), printable(message)
-    return "http", f"answered with HTTP status {status}. Check the URL."
+    def _reason_in(self, data: bytes, status: int) -> tuple[str, str]:
+        """Code and message of a refusal, on one line of limited length."""
+        plain: Any = None
+        with contextlib.suppress(MalformedDocumentError):
+            plain = parse_json(data, "answer")
+        match plain:
+            case {"code": str(code), "message": str(message)}:
+                return code[:40], " ".join(message[:_MESSAGE].split())
+        return "http", f"{self._address.url}: answered with HTTP status {status}. Check the URL."

@@ -207,7 +207,7 @@ def test_steps_need_a_reset_and_resets_have_no_options(server):
 @pytest.mark.parametrize(
     ("error", "message", "least", "most"),
     [
-        (ConnectionRefusedError("refused"), r"unreachable: .* no step is lost", 2, 6),
+        (ConnectionRefusedError("refused"), r"unreachable: .* nothing is lost", 2, 6),
         (ssl.SSLCertVerificationError("self-signed"), r"unreachable: .*self-signed", 0, 0),
     ],
 )
