@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from sme_registry import SMESpec, StreamSpec
-from sme_registry.diagnosis import StreamSubject, diagnose, load_cell, load_policy, load_run
+from sme_registry.diagnosis import (
+    Diagnosis,
+    StreamSubject,
+    diagnose,
+    load_cell,
+    load_policy,
+    load_run,
+)
 from sme_registry.diagnosis.behaviour import NetworkState, network_state
 from sme_registry.diagnosis.questions import DOUBTS
 from sme_registry.diagnosis.stream import (
@@ -388,7 +395,8 @@ def test_the_command_writes_a_page_its_data_and_its_figures(run, tmp_path, laid_
     assert len(laid_out) == 2
     for figure in laid_out:
         assert_readable(figure)
-    read = StreamDiagnosis.from_dict(json.loads((tmp_path / "d" / "diagnosis.json").read_text()))
+    read = Diagnosis.read(tmp_path / "d" / "diagnosis.json")
+    assert isinstance(read, StreamDiagnosis)
     assert read.stream_digest == THREE.digest
     assert all(visit.online_regret is not None for visit in read.visits)
     assert read.visits[2].network != read.visits[0].network != read.initial_network
