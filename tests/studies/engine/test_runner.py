@@ -434,7 +434,7 @@ def test_the_command_ends_with_1_where_a_cell_failed_and_lists_it(study, tmp_pat
     command = ("study", "run", plan, "-f", study, "--executor", "in-process")
     result = sme(*command)
     assert result.exit_code == 1, result.output
-    assert "2 of 4 cells failed. Add --retry" in result.stderr
+    assert "2 of 4 cells failed. To run them again: sme study run" in result.stderr
     assert "bad on small, run 0: OptionError: " in result.stdout
     again = sme(*command, "--retry", "--json")
     assert again.exit_code == 1
