@@ -361,27 +361,16 @@ def _normaliser(model: Any, vec_normalize: Any, width: int) -> Any:
 
 
 def _deterministic(network: Any, normaliser: Any) -> Callable[[torch.Tensor], torch.Tensor]:
-    """The network's `_predict` without distributions, whose broadcasting no board accepts."""
+    """The network's deterministic actions, of observations that are normalised as in training."""
     import torch
-    from stable_baselines3.common.policies import ActorCriticPolicy
-    from stable_baselines3.sac.policies import SACPolicy
-
-    def rescaled(x: torch.Tensor) -> torch.Tensor:
-        if normaliser is None:
-            return x
-        deviation = np.sqrt(normaliser.obs_rms.var + normaliser.epsilon)
-        mean = torch.as_tensor(normaliser.obs_rms.mean, device=network.device)
-        scaled = (x.double() - mean) / torch.as_tensor(deviation, device=network.device)
-        return scaled.clamp(-normaliser.clip_obs, normaliser.clip_obs).float()
 
     def act(observations: torch.Tensor) -> torch.Tensor:
-        x = rescaled(observations)
-        if isinstance(network, ActorCriticPolicy):
-            latent = network.mlp_extractor.forward_actor(network.pi_features_extractor(x))
-            mean: torch.Tensor = network.action_net(latent)
-            return torch.tanh(mean) if network.squash_output else mean
-        if isinstance(network, SACPolicy):
-            return torch.tanh(network.actor.get_action_dist_params(x)[0])
+        x = observations
+        if normaliser is not None:
+            deviation = np.sqrt(normaliser.obs_rms.var + normaliser.epsilon)
+            mean = torch.as_tensor(normaliser.obs_rms.mean, device=network.device)
+            scaled = (x.double() - mean) / torch.as_tensor(deviation, device=network.device)
+            x = scaled.clamp(-normaliser.clip_obs, normaliser.clip_obs).float()
         action: torch.Tensor = network._predict(x, deterministic=True)
         return action
 
