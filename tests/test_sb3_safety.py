@@ -2,7 +2,6 @@
 
 import io
 import math
-import pickle
 
 import numpy as np
 import pytest
@@ -152,11 +151,6 @@ def test_projected_actions_never_cost_anything(action_range):
     # Studies evaluate a copy of the network in NumPy, which must not lose the projection.
     policy = numpy_policy(model, SPEC, action_range=action_range)
     assert np.array_equal(policy.act(seen), actions)
-
-
-def test_a_model_that_an_older_version_saved_finds_its_policy():
-    saved = b"csme_registry.sb3.ppo_projection\nProjectedPolicy\n."  # as in the model's zip
-    assert pickle.loads(saved) is PPOProjection.policy_aliases["MlpPolicy"]
 
 
 def test_projected_actions_need_observations_that_show_the_state():

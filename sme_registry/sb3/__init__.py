@@ -11,19 +11,14 @@ Bit for bit the numbers of SB3's `DummyVecEnv` of as many single environments or
 many `SMETeamEnv`s stepped in a loop.
 """
 
-import sys
-
 from sme_registry.io import require_packages
 
 try:
-    from sme_registry.sb3 import safety
     from sme_registry.sb3.safety import PPOLagrangian, PPOProjection
     from sme_registry.sb3.vec_env import RegretCallback, SMETeamVecEnv, SMEVecEnv
 except ImportError:
     require_packages("sme_registry.sb3", {"stable_baselines3": "Stable-Baselines3"}, "train")
     raise
-
-sys.modules["sme_registry.sb3.ppo_projection"] = safety  # where older models look for their policy
 
 __all__ = [
     "PPOLagrangian",

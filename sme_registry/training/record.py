@@ -20,14 +20,11 @@ from __future__ import annotations
 
 import csv
 import io
-import re
 from collections.abc import Callable, Sequence
-from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
-    BeforeValidator,
     Field,
     JsonValue,
     SerializerFunctionWrapHandler,
@@ -58,13 +55,6 @@ def versions_for(uses: str) -> dict[str, str]:
         (name if kind in ("independent", "train") else uses).partition(":")[0].partition(".")[0]
     )
     return versions([*PACKAGES, package, *(["jaxlib"] if in_jax(uses) else [])])
-
-
-def _from_text(value: Any) -> Any:
-    """The changes in the text of older records, "…, but n_steps=256"."""
-    if not isinstance(value, str):
-        return value
-    return {name: int(number) for name, number in re.findall(r"(\w+)=(\d+)", value)}
 
 
 class RunRecord(StrictModel):
@@ -114,9 +104,7 @@ class RunRecord(StrictModel):
     stream_digest: str = ""
     task: str = ""
     algorithm: str
-    hyperparameters: Annotated[dict[str, JsonValue], BeforeValidator(_from_text)] = Field(
-        default_factory=dict
-    )
+    hyperparameters: dict[str, JsonValue] = Field(default_factory=dict)
     device: str = ""
     source: str = ""
     seed: Integer
@@ -171,10 +159,9 @@ class RunRecord(StrictModel):
             pairs[f"hyperparameters.{name}"] = (before, value)
         for field, (before, now) in pairs.items():
             if before != now:
-                where = _difference(previous, self) if field == "stream_digest" else ""
                 raise OptionError(
-                    f"{field}={now!r}: the run in {folder} has {before!r}{where}. Resume it with "
-                    "the same value, or train into another folder."
+                    f"{field}={now!r}: the run in {folder} has {before!r}. Resume it with the same "
+                    "value, or train into another folder."
                 )
         if self.steps < min(previous.steps, previous.steps_done):
             raise OptionError(
@@ -186,16 +173,6 @@ class RunRecord(StrictModel):
             sessions=previous.sessions + 1,
             steps_done=previous.steps_done,
         )
-
-
-def _difference(one: RunRecord, other: RunRecord) -> str:
-    if one.stream is None or other.stream is None:
-        return ""
-    before, now = one.stream.to_dict(), other.stream.to_dict()
-    phases = zip_longest(before.pop("phases"), now.pop("phases"))
-    different = [f"phases.{index}" for index, (a, b) in enumerate(phases) if a != b]
-    different += [name for name in before if before[name] != now[name]]
-    return f" ({different[0]} differs)"
 
 
 _AGENT_PREFIX = "regret/"

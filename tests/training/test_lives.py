@@ -171,19 +171,10 @@ def test_force_removes_the_snapshots_of_the_run_before(lived, tmp_path):
     assert not (replaced.folder / "snapshots" / "visit-09.zip").exists()
 
 
-@pytest.mark.parametrize(
-    ("other", "where"),
-    [
-        (STREAM.draw(1), r"phases\.0 differs"),
-        (STREAM.model_copy(update={"phases": STREAM.phases[::-1]}), r"phases\.0 differs"),
-        (StreamSpec(phases=STREAM.phases[:1], cycles=4), r"phases\.1 differs"),
-        (StreamSpec(phases=STREAM.phases), "cycles differs"),
-        (TINY, "has 'sha256:[0-9a-f]{64}'. Resume"),
-    ],
-)
-def test_a_life_is_not_resumed_on_another_stream(other, where, lived, tmp_path):
+@pytest.mark.parametrize("other", [STREAM.draw(1), StreamSpec(phases=STREAM.phases), TINY])
+def test_a_life_is_not_resumed_on_another_stream(other, lived, tmp_path):
     lived.record.updated(status="running").write(tmp_path)
-    with pytest.raises(OptionError, match=rf"^stream_digest='.*': the run in .*{where}"):
+    with pytest.raises(OptionError, match=r"^stream_digest='.*': the run in .* has 'sha256:"):
         life(tmp_path, other, resume=True, steps=None if other is not TINY else 300)
 
 

@@ -48,8 +48,6 @@ def test_the_record_and_the_report_describe_the_run(run):
     assert record.spec_digest == TINY.digest
     assert {"torch", "stable_baselines3", "numpy", "python"} <= record.versions.keys()
     assert record.steps_per_second == pytest.approx(150 / record.wall_seconds, rel=0.01)
-    older = {**record.to_dict(), "hyperparameters": "stable-baselines3 defaults, but n_steps=8"}
-    assert RunRecord.from_dict(older, "run.json").hyperparameters == {"n_steps": 8}
     report = EvaluationReport.read(run.folder / "evaluation.json")
     assert report == run.report
     assert evaluate(run.model_path, TINY, PROTOCOL, name="TD3").regions == report.regions

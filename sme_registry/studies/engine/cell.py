@@ -48,7 +48,6 @@ ReportSteps = Callable[[int, int], None]
 
 TRANSITIONS = 50_000
 BATCH_SIZE = 256
-_COUNTED_AT_ONCE = 500  # steps of a life; one by one they would cost a twentieth of PPO's
 
 
 def run_cell(
@@ -187,7 +186,6 @@ class _Training(_Evaluations):
         self._learner = learner
         self._files: Snapshots | None = None
         self._policies: list[Policy] = []  # before training, and at the end of each visit
-        self._uncounted: list[tuple[float, int]] = []  # regret and phase of steps of a life
         if cell.stream is not None:
             if snapshots is not None:
                 self._files = Snapshots(snapshots, cell.stream)
@@ -204,11 +202,7 @@ class _Training(_Evaluations):
     def on_steps(self, taken: Steps) -> None:
         """Count steps, before the learner learns from them, and run what is due."""
         steps, info = self._learner.steps, taken.info
-        self.record.add(info["regret"], info.get("cost"))
-        if self.cell.stream is not None:
-            self._uncounted += zip(info["regret"], info["phase"], strict=True)
-            if len(self._uncounted) >= _COUNTED_AT_ONCE:
-                self._count(steps)
+        self.record.add(steps, info["regret"], info.get("cost"), info.get("phase"))
         self._evaluate_due(steps)
         self.report(steps)
 
@@ -224,7 +218,6 @@ class _Training(_Evaluations):
         if blocks is None:
             report = self.report_on(learner.policy())
         else:
-            self._count(learner.steps)
             initial, *visits = self._policies
             report = life_report(self.cell, visits, initial, blocks.dynamic_regret())
         return self.result_of(report, learner.steps, learner.seconds)
@@ -235,12 +228,6 @@ class _Training(_Evaluations):
         while record.evaluated + 1 < len(record.due) and record.due[record.evaluated] <= steps:
             record.spend(TRAINING)
             self.evaluate(steps, self._learner.policy())
-
-    def _count(self, steps: int) -> None:
-        if self._uncounted and self.record.blocks is not None:
-            regret, phase = zip(*self._uncounted, strict=True)
-            self.record.blocks.add(steps, np.array(regret)[:, None], phase)
-            self._uncounted.clear()
 
 
 def _run_offline(cell: Cell, name: str, progress: ReportSteps) -> CellResult:

@@ -282,11 +282,8 @@ class _ProgramRun:
         ]
 
     def _on_log(self, log: StepLog) -> None:
-        record = self._record
-        record.add(log.regret, log.cost)
-        if record.blocks is not None:
-            record.blocks.add(self._program.steps, log.regret)
-        record.spend(TRAINING)
+        self._record.add(self._program.steps, log.regret, log.cost)
+        self._record.spend(TRAINING)
 
     def _on_evaluation(self, k: int, step: int, evaluation: Evaluation) -> None:
         steps = evaluation.length.sum(axis=1)

@@ -268,12 +268,17 @@ class Record:
             self.blocks.steps = arrays["block_steps"]
             self.blocks.regret = arrays["block_regret"]
 
-    def add(self, regret: Any, cost: Any = None) -> None:
-        """Add steps of training of all runs; of a team, of the agents of each of its copies."""
-        totals = self.arrays["regret"]
-        totals += np.reshape(regret, (-1, len(totals))).sum(axis=0)
-        if cost is not None:
-            self.arrays["cost"] += np.reshape(cost, (-1, len(self.arrays["cost"]))).sum(axis=0)
+    def add(self, end: int, regret: Any, cost: Any = None, phase: Any = None) -> None:
+        """Add the steps of training before step `end` of all runs, or of a team's agents.
+
+        `phase` is that in force in each step of a life; None where it follows from the step.
+        """
+        sums = {"regret": regret} if cost is None else {"regret": regret, "cost": cost}
+        for name, values in sums.items():
+            total = self.arrays[name]
+            total += np.reshape(values, (-1, len(total))).sum(axis=0)
+        if self.blocks is not None:
+            self.blocks.add(end, np.reshape(regret, (-1, len(self.arrays["regret"]))), phase)
 
     def evaluation(self, k: int, rows: Any, agents_regret: Any = None) -> None:
         """Store the k-th evaluation: the fields of a `LearningCurve`, by run."""
