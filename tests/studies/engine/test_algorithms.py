@@ -2,11 +2,25 @@
 
 import sys
 
+import numpy as np
 import pytest
 
 from sme_registry import SMESpec
-from sme_registry.errors import OptionError, UnknownNameError
-from sme_registry.training.algorithms import check_hyperparameters, find, load_algorithm
+from sme_registry.envs import SMEEnv
+from sme_registry.envs.episodes import info_of_envs
+from sme_registry.errors import OptionError, SpecError, UnknownNameError
+from sme_registry.spec.document import StrictModel
+from sme_registry.spec.study import Cell
+from sme_registry.studies import run_cell
+from sme_registry.training import train
+from sme_registry.training.algorithms import (
+    BACKENDS,
+    Backend,
+    check_hyperparameters,
+    find,
+    load_algorithm,
+)
+from sme_registry.training.learn import Learner, Steps
 from sme_registry.training.models import new_model
 
 sb3 = pytest.importorskip("stable_baselines3")
@@ -105,3 +119,64 @@ def test_a_name_that_leads_nowhere_is_explained(name, error, said, own_module):
 def test_what_an_algorithm_does_not_take_or_make_is_refused(uses, settings, said, env, own_module):
     with pytest.raises(OptionError, match=said):
         made(uses, env, **settings)
+
+
+class ConstantSettings(StrictModel):
+    level: float = 0.0
+
+
+def constant_settings(name, field):
+    """What a row of the table names."""
+    return ConstantSettings
+
+
+class Constant(Learner):
+    """A back-end: it acts by a constant, and learns nothing."""
+
+    def __init__(self, name, run):
+        super().__init__(name, run)
+        level = ConstantSettings(**run.hyperparameters).level
+        self.steps, self.total = 0, run.steps
+        self.model = lambda observations: np.full((len(observations), 2), level)
+
+    def learn(self, watch):
+        env = SMEEnv(self.run.document, action_range=self.run.action_range)
+        observation, _ = env.reset(seed=self.run.seed)
+        while self.steps < self.total:
+            action = self.model(observation[None])[0].astype(np.float32)
+            observation, reward, terminated, truncated, info = env.step(action)
+            self.steps += 1
+            ended = terminated or truncated
+            watch.on_steps(Steps([reward], info_of_envs([info]), [terminated], [ended]))
+            if ended:
+                observation, _ = env.reset()
+
+
+def test_a_back_end_is_a_module_and_a_row_for_training_and_for_studies(tmp_path, monkeypatch):
+    row = Backend(
+        settings=f"{__name__}:constant_settings",
+        learns=("task",),
+        learner=f"{__name__}:Constant",
+        names=("centre",),
+    )
+    monkeypatch.setitem(BACKENDS, "constant", row)
+    fields = {
+        "spec": SPEC, "uses": "constant:centre", "hyperparameters": {}, "seed": 3, "steps": 40,
+        "action_range": "symmetric", "evaluations": 2, "evaluation_episodes": 2,
+        "protocol": {"states_per_region": 50},
+    }  # fmt: skip
+    result, reference = (run_cell(Cell(**fields | {"uses": uses})) for uses in (
+        "constant:centre", "reference:constant"
+    ))  # fmt: skip
+    assert result.curve.to_dict() == reference.curve.to_dict()
+    assert 0.0 < result.online_regret < 1.0
+    options = {"steps": 40, "protocol": {"states_per_region": 50}, "progress": False}
+    run = train(SPEC, algorithm="constant:Centre", folder=tmp_path / "run", **options)
+    assert [episode.step for episode in run.episodes] == [20, 40]
+    assert run.report.regions[0].similarity == result.report.regions[0].similarity
+    with pytest.raises(OptionError, match="Did you mean 'level'"):
+        check_hyperparameters("constant:centre", {"levl": 1.0})
+    with pytest.raises(UnknownNameError, match="must be one of constant:centre"):
+        find("constant:center")
+    with pytest.raises(SpecError, match="learns a task of a single agent, and this is the task of"):
+        train("Team4", algorithm="constant:centre", folder=tmp_path / "team")
