@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import gymnasium
 import numpy as np
@@ -91,28 +91,8 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped cl
         return [False for _ in self._get_indices(indices)]
 
 
-class _Start(NamedTuple):
-    seed: int | None
-    state: Array | None
-    distractors: Array | None
-    lifetime: int | None
-
-
-class _SingleLane(EnvView):
-    """A lane of a single agent's task, which can be reset alone."""
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        start = self._owner._start(seed, [options or {}])
-        observations = self._owner._begin({self._index: start})
-        return observations[self._index], self._owner._info_at_reset(self._index)
-
-
 class _BatchVecEnv(LanesVecEnv):
     """Every agent of every team of a `Batch` is a lane; a single agent is a team of one."""
-
-    _lane_type = EnvView
 
     def __init__(
         self,
@@ -127,7 +107,7 @@ class _BatchVecEnv(LanesVecEnv):
         task = batch.task
         self.num_teams, self.agents = batch.num_envs, task.names
         self._task, self._batch, self._action_dim = task, batch, action_dim
-        self._begun, self._owned = np.zeros(self.num_teams, bool), task.owned
+        self._begun, self._owned = False, task.owned
         action_space, self._rescaled = arguments.action_space(action_range, action_dim)
         observation_space = gymnasium.spaces.Box(0.0, 1.0, (observation_dim,), np.float32)
         shared = {
@@ -136,7 +116,7 @@ class _BatchVecEnv(LanesVecEnv):
         }  # fmt: skip
         teams = range(self.num_teams)
         super().__init__(
-            [self._lane_type(self, team, agent=a, **shared) for team in teams for a in self.agents]
+            [EnvView(self, team, agent=a, **shared) for team in teams for a in self.agents]
         )
         self._renderer = batch_renderer(render_mode, render_lanes, batch, self._rescaled)
         self.metadata = {**self.metadata, "render_fps": METADATA["render_fps"]}
@@ -173,46 +153,39 @@ class _BatchVecEnv(LanesVecEnv):
         return self._seeds
 
     def reset(self) -> Observation:
-        n = len(self.agents)
-        options = [self._options[team * n : (team + 1) * n] for team in range(self.num_teams)]
-        starts = [*map(self._start, self._seeds[::n], options)]
-        observations = self._begin(dict(enumerate(starts)))
+        joint = self._batch.observe()
+        for team in range(self.num_teams):
+            self._begin(team, joint)
+        self._begun = True
+        if self._renderer is not None:
+            self._renderer.record(range(self.num_teams))
         self.reset_infos = [self._info_at_reset(lane) for lane in range(self.num_envs)]
         self._clear_reset_arguments()
-        return observations
-
-    def _begin(self, teams: dict[int, _Start]) -> Observation:
-        joint = self._batch.observe()
-        for team, start in teams.items():
-            if start.seed is not None:
-                self._batch.seed(team, start.seed)
-            if start.lifetime is not None:
-                self._batch.live(team, start.lifetime)
-            self._batch.begin(np.array([team]), joint, start.state, start.distractors)
-            self._begun[team] = True
-        if self._renderer is not None:
-            self._renderer.record(teams)
         return self._observations(joint)
 
-    def _start(self, seed: int | None, options: list[dict[str, Any]]) -> _Start:
-        """How a team begins an episode, from its seed and the options of its lanes."""
+    def _begin(self, team: int, joint: Observation) -> None:
+        """Begin a team's episode, with its seed and the options of its lanes."""
+        first, n, spec = team * len(self.agents), len(self.agents), self._task.spec
+        seed, options = arguments.checked_seed(self._seeds[first]), self._options[first : first + n]
         for of_lane in options:
             arguments.check_options(of_lane, self._batch.schedule.reset_options)
-        shape = (self._task.spec.state_dim,)
+        shape = (spec.state_dim,)
         states = [arguments.initial_states(of["state"], shape) for of in options if "state" in of]
-        if states and (len(states) < len(options) or len({*map(tuple, states)}) > 1):
+        if states and (len(states) < n or len({*map(tuple, states)}) > 1):
             raise OptionError("options: a team has one state. Give the same to each of its lanes.")
-        state = states[0][None] if states else None
         # Teams have neither distractors nor a lifetime.
-        distractors = arguments.initial_values(
-            "distractors", options[0], (self._task.spec.distractors,), 1
-        )
+        distractors = arguments.initial_values("distractors", options[0], (spec.distractors,), 1)
         lifetime = arguments.lifetime_in(options[0])
-        return _Start(arguments.checked_seed(seed), state, distractors, lifetime)
+        if seed is not None:
+            self._batch.seed(team, seed)
+        if lifetime is not None:
+            self._batch.live(team, lifetime)
+        state = states[0][None] if states else None
+        self._batch.begin(np.array([team]), joint, state, distractors)
 
     def step_wait(self) -> StepResult:
         actions = self._take_actions()
-        if not self._begun.all():
+        if not self._begun:
             raise EpisodeError("step: the episodes have not begun. Call reset() first.")
         n, shape = len(self.agents), (self.num_envs, self._action_dim)
         unit = arguments.to_unit(actions, shape, self._rescaled)
@@ -270,8 +243,6 @@ class SMEVecEnv(_BatchVecEnv):
       >>> env.reset().shape
       (4, 10)
     """
-
-    _lane_type = _SingleLane
 
     def __init__(
         self,
