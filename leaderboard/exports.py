@@ -15,6 +15,7 @@ from leaderboard.documents.result import METRICS, Estimate, Metric
 from leaderboard.documents.submission import now
 from leaderboard.scoring.ranking import RankedRow
 from sme_registry.io import to_json as plain_to_json
+from sme_registry.io import visible
 from sme_registry.io.markup import escape_latex
 from sme_registry.io.terminal import fixed
 
@@ -27,10 +28,10 @@ _RANKED: tuple[Metric, ...] = get_args(Metric)
 _FORMULA_STARTS = tuple("=+-@＝＋－＠|%")
 
 
-def to_json(
+def to_dict(
     rows: Rows, metric: Metric, board: BoardDocument, head: Head, date: str | None = None
-) -> str:
-    """A ranking as JSON.
+) -> dict[str, Any]:
+    """A ranking as plain data.
 
     Args:
       rows: from `ranking`.
@@ -38,21 +39,23 @@ def to_json(
       board: the board.
       head: number and digest of the log's last entry.
       date: UTC time as documents write it; None for now.
-
-    Returns:
-      The content of the file.
     """
-    return plain_to_json(
-        {
-            "title": board.title,
-            **_provenance(board, head, date),
-            "metric": metric,
-            "rows": [
-                {**_facts(row), "scores": row.entry.scores and row.entry.scores.to_dict()}
-                for row in rows
-            ],
-        }
-    )
+    return {
+        "title": board.title,
+        **_provenance(board, head, date),
+        "metric": metric,
+        "rows": [
+            {**_facts(row), "scores": row.entry.scores and row.entry.scores.to_dict()}
+            for row in rows
+        ],
+    }
+
+
+def to_json(
+    rows: Rows, metric: Metric, board: BoardDocument, head: Head, date: str | None = None
+) -> str:
+    """A ranking as JSON. Arguments: see `to_dict`."""
+    return plain_to_json(to_dict(rows, metric, board, head, date))
 
 
 def to_csv(
@@ -60,7 +63,7 @@ def to_csv(
 ) -> str:
     """A ranking as CSV: a header, then one line per entry; the last cells repeat the provenance.
 
-    Arguments: see `to_json`.
+    Arguments: see `to_dict`.
     """
     regions = range(len(board.protocol.edges))
     columns = [*METRICS, *(f"normalised_regret_{region}" for region in regions)]
@@ -87,7 +90,7 @@ def to_latex(
 ) -> str:
     """A ranking as a LaTeX `tabular` (package booktabs), its provenance in comments above.
 
-    Arguments: see `to_json`.
+    Arguments: see `to_dict`.
     """
     provenance = _provenance(board, head, date)
     lines = [f"% {name}: {_latex(str(value))}" for name, value in provenance.items()]
@@ -147,17 +150,16 @@ def _csv_cell(cell: Any) -> Any:
         return str(cell).lower()
     if not isinstance(cell, str):
         return cell
-    text = one_line(cell)
+    text = _one_line(cell)
     return f"'{text}" if text.startswith(_FORMULA_STARTS) else text
 
 
 def _latex(text: str) -> str:
-    return escape_latex(one_line(text))
+    return escape_latex(_one_line(text))
 
 
-def one_line(text: str) -> str:
-    """Text on one line, without invisible characters such as those that reverse the direction."""
-    return "".join(letter for letter in " ".join(text.split()) if letter.isprintable())
+def _one_line(text: str) -> str:
+    return visible(" ".join(text.split()))
 
 
 def _interval(estimate: Estimate) -> str:

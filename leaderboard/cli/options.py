@@ -13,11 +13,13 @@ import typer
 from leaderboard.documents.board import FILE, BoardDocument, Folder, refuse_unscored
 from leaderboard.documents.submission import now
 from sme_registry.errors import OptionError
+from sme_registry.io import read_regular
 from sme_registry.spec import ProtocolFile, SuiteFile, catalogue
 
 if TYPE_CHECKING:
     from leaderboard.store import Store
 
+_FILE_BYTES = 2**28  # of answers
 _LONG_LOG = 2000  # entries, read in two seconds or so
 _HOST = re.compile(r"[A-Za-z0-9.-]+:\d+(/.*)?|localhost(/.*)?|[A-Za-z0-9-]+(\.[A-Za-z0-9-]+)+/.*")
 
@@ -221,9 +223,9 @@ def answers_in(path: str) -> bytes | None:
 
 
 def read_file(path: Path) -> bytes:
-    """The bytes of a file; raises `OptionError` if it cannot be read."""
+    """The bytes of a file; raises `OptionError` if it cannot be read, as a pipe cannot."""
     try:
-        return path.read_bytes()
+        return read_regular(path, _FILE_BYTES, links=True)
     except OSError as error:
         raise OptionError(f"{path}: cannot be read: {error.strerror}. Correct the path.") from None
 

@@ -71,15 +71,13 @@ def rank(
         ranking.refuse_unpublishable(entries)
         rows = ranking.ranking(entries, metric)
         document, head = store.document, store.head[:2]
-    for wanted, export in (
-        (json, exports.to_json),
-        (csv, exports.to_csv),
-        (latex, exports.to_latex),
-    ):
-        if wanted:
-            sys.stdout.write(export(rows, metric, document, head))
-            return
-    out().print(_ranking_table(rows, metric, document))
+    given = rows, metric, document, head
+    if json:
+        print_json(exports.to_dict(*given))
+    elif csv or latex:
+        sys.stdout.write((exports.to_csv if csv else exports.to_latex)(*given))
+    else:
+        out().print(_ranking_table(*given[:3]))
 
 
 def _ranking_table(rows: list[RankedRow], metric: Metric, board: BoardDocument) -> Table:
@@ -172,13 +170,11 @@ def show(
     _print_submission(view)
     result = view.result
     if view.withheld:
-        withheld = escape(_printable(view.withheld))
-        out().print(f"[yellow]scores withheld[/]: {withheld}", soft_wrap=True)
+        out().print(f"[yellow]scores withheld[/]: {escape(view.withheld)}", soft_wrap=True)
     if result is None:
         return
     if result.status == "rejected":
-        message = escape(_printable(result.message))
-        out().print(f"[red]{escape(result.code)}[/]: {message}", soft_wrap=True)
+        out().print(f"[red]{escape(result.code)}[/]: {escape(result.message)}", soft_wrap=True)
         return
     out().print(_scores_table(result))
     out().print(_class_table(result))
@@ -224,18 +220,8 @@ def _print_submission(view: PublicView) -> None:
     if view.withdrawal is not None:
         pairs["reason for withdrawal"] = view.withdrawal.withdrawal.reason or "not stated"
     title = f"{method.name} {method.version}", submission.submitter.name, view.status
-    name, submitter, status = (escape(_printable(text)) for text in title)
-    print_pairs(
-        f"[bold]{name}[/] by {submitter}: {status}",
-        {label: _printable(str(value)) for label, value in pairs.items()},
-    )
-
-
-def _printable(text: str) -> str:
-    """Text without control characters: a served board may be hostile."""
-    from leaderboard.exports import one_line
-
-    return "\n".join(map(one_line, text.splitlines()))
+    name, submitter, status = map(escape, title)
+    print_pairs(f"[bold]{name}[/] by {submitter}: {status}", pairs)
 
 
 def _scores_table(result: Result) -> Table:
@@ -346,7 +332,7 @@ def _print_verification(report: VerifyReport, pairs: dict[str, object], *, confi
     for note in report.notes:
         line = f"note: {note.submission}: {note.kind}: {note.where}: "
         line += f"recorded {note.recorded or 'nothing'}, here {note.here}"
-        out().print(escape(_printable(line)), soft_wrap=True)
+        out().print(escape(line), soft_wrap=True)
     out().print(f"Digest of the last log entry, {last}:\n{digest}", soft_wrap=True)
 
 

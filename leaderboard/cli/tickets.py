@@ -23,6 +23,7 @@ from leaderboard.cli.options import (
     answers_in,
     manifest_fields,
     policy_of_each,
+    read_file,
 )
 from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import Rejection
@@ -73,7 +74,7 @@ def ticket(
     request_file = out_file.with_name(f"{out_file.name}.request")
     repeated = request_file.exists()
     if repeated:
-        signed = SignedTicketRequest.read(request_file.read_bytes())
+        signed = SignedTicketRequest.read(read_file(request_file))
         err().print(f"Repeating {escape(str(request_file))}.", soft_wrap=True)
     else:
         season_digest, board = client.season(url, season)

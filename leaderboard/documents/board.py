@@ -23,11 +23,10 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer
 
 from leaderboard.documents.keys import PublicKey, SigningKey
-from leaderboard.documents.reading import read_regular
 from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, SuiteReference, Track
 from leaderboard.errors import BoardError
 from sme_registry.errors import SMEError, SpecError
-from sme_registry.io import parse_json
+from sme_registry.io import parse_json, read_regular
 from sme_registry.spec import EvaluationProtocol, SMESpec, Suite, SuiteFile
 from sme_registry.spec.document import Document, Integer, Name, SchemaVersion, StrictModel
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from leaderboard.documents.secret_files import parse_secret, write_secret
 from leaderboard.errors import BoardError
-from sme_registry.io import require_packages
+from sme_registry.io import read_regular, require_packages
 from sme_registry.spec.document import matching
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class SigningKey:
         """
         _require_nacl()
         try:
-            data = Path(path).read_bytes()
+            data = read_regular(path, 4096, links=True)
         except OSError as error:
             raise _no_key(path, str(error.strerror)) from None
         return cls.parse(data, path)

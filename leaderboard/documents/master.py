@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import Literal
 
 from leaderboard.documents.plain import plain_json
-from leaderboard.documents.reading import read_regular
 from leaderboard.documents.secret_files import parse_secret, write_secret
 from leaderboard.errors import BoardError
-from sme_registry.io import sha256_of
+from sme_registry.io import read_regular, sha256_of
 
 SEAL = "sme-seal/1"
 BYTES = 32

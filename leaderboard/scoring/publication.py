@@ -16,14 +16,13 @@ from typing import Any, Literal
 
 from leaderboard.artefact.answers import rows_of
 from leaderboard.documents.master import Master
-from leaderboard.documents.reading import read_regular
 from leaderboard.documents.season import MAX_INSTANCES, Digests, Hidden, Season, Terms
 from leaderboard.errors import BoardError
 from leaderboard.scoring.sealed import Instance, challenge, instances
 from sme_registry.compiled import chosen_backend
 from sme_registry.datasets import DatasetRecipe, SealedDataset
 from sme_registry.evaluation import resolve_protocol
-from sme_registry.io import build_folder, read_json, sha256_of, to_json, versions
+from sme_registry.io import build_folder, read_json, read_regular, sha256_of, to_json, versions
 from sme_registry.seasons.wire import instance_name, pack_table, table_bytes
 
 Progress = Callable[[int, int], None]

@@ -31,6 +31,7 @@ from leaderboard.store import LEASE_SECONDS, Claim, Store
 from sme_registry.errors import MissingDependencyError, SMEError
 from sme_registry.io import integer_in
 from sme_registry.io.system import block_interrupts, defer_interrupts, unblock_interrupts
+from sme_registry.io.terminal import log_to_terminal
 
 _POLL_SECONDS = 0.2
 _STOP_SECONDS = 10.0
@@ -408,6 +409,7 @@ def _scorer_process(
         raise KeyboardInterrupt
 
     signal.signal(signal.SIGINT, interrupt_once)
+    log_to_terminal()
     parent = multiprocessing.parent_process()
     try:
         unblock_interrupts()

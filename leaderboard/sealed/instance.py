@@ -17,7 +17,6 @@ from typing import Literal
 
 from leaderboard.artefact.answers import Float32, read_answers, rows_of
 from leaderboard.documents.entry import SignedAnswers
-from leaderboard.documents.reading import read_regular
 from leaderboard.documents.season import MAX_LANES, SeasonClass
 from leaderboard.errors import Rejection, TamperedError
 from leaderboard.sealed.journal import Journal
@@ -25,6 +24,7 @@ from leaderboard.sealed.signatory import Signatory
 from leaderboard.sealed.stepping import Lanes, Start
 from sme_registry import EvaluationProtocol, io
 from sme_registry.errors import ActionError, SMEError, WireError
+from sme_registry.io import read_regular
 from sme_registry.seasons.wire import InstanceStatus, StepFormat, table_bytes
 
 Phase = Literal["waiting", "stepping", "answering", "answered"]

@@ -23,9 +23,9 @@ from typing import BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from leaderboard.documents.reading import open_regular
 from leaderboard.errors import BoardError, TamperedError
 from sme_registry import io
+from sme_registry.io import open_regular
 
 _MAGIC = b"sme-journal/1\n\0\0"
 _HEADER, _NUMBER = struct.Struct("<16sII"), struct.Struct("<Q")

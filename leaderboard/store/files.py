@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import BinaryIO, TypeVar
 
 from leaderboard.documents.board import Folder, hex_of
-from leaderboard.documents.reading import read_regular
 from leaderboard.errors import BoardError, TamperedError
 from sme_registry import io
 from sme_registry.errors import SMEError
+from sme_registry.io import read_regular
 from sme_registry.spec.document import StrictModel
 
 try:

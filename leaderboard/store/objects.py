@@ -8,10 +8,10 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from leaderboard.documents.board import Folder
-from leaderboard.documents.reading import is_regular, read_regular
 from leaderboard.documents.submission import MAX_ARTEFACT_BYTES
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.store.files import durable_file, unwritable
+from sme_registry.io import is_regular, read_regular
 
 
 class Objects:

@@ -117,6 +117,7 @@ def server_config(app: FastAPI) -> uvicorn.Config:
         ws="none",
         h11_max_incomplete_event_size=_HEAD_BYTES,
         limit_concurrency=_CONNECTIONS,
+        log_config=None,  # as all other logs
         log_level="error",  # a client's faults are not the server's
         server_header=False,
         proxy_headers=False,

@@ -1,6 +1,6 @@
 """Files, checks of arguments, and the machine; terminal, tables and markup are imported by name."""
 
-from sme_registry.io.checks import choice, integer_in, number_in, printable, server_address
+from sme_registry.io.checks import choice, integer_in, number_in, server_address, visible
 from sme_registry.io.files import (
     TEMPORARY,
     Arrays,
@@ -12,9 +12,12 @@ from sme_registry.io.files import (
     claim_folder,
     file_lock,
     is_locked,
+    is_regular,
+    open_regular,
     parse_json,
     read_arrays,
     read_json,
+    read_regular,
     sha256_of,
     sync_folder,
     temporary_beside,
@@ -49,12 +52,14 @@ __all__ = [
     "integer_in",
     "is_installed",
     "is_locked",
+    "is_regular",
     "missing_dependency",
     "number_in",
+    "open_regular",
     "parse_json",
-    "printable",
     "read_arrays",
     "read_json",
+    "read_regular",
     "require_packages",
     "server_address",
     "sha256_of",
@@ -62,6 +67,7 @@ __all__ = [
     "temporary_beside",
     "to_json",
     "versions",
+    "visible",
     "write_arrays",
     "write_atomically",
 ]

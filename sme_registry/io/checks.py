@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 import math
 import operator
+import re
 from collections.abc import Collection
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
@@ -100,6 +101,25 @@ def server_address(url: str, *, insecure: bool = False) -> Address:
     return address
 
 
-def printable(text: object, longest: int | None = 2000) -> str:
-    """A text from elsewhere on one line of limited length, without control characters."""
-    return "".join(each if each.isprintable() else " " for each in str(text)[:longest])
+# Letters that take no ink or no width, and which Python calls printable.
+_INVISIBLE = re.compile(
+    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u2800\u3164\ufe00-\ufe0f\uffa0"
+    "\U0001d173-\U0001d17a\U000e0100-\U000e01ef]"
+)
+
+
+def hidden_in(text: str) -> set[str]:
+    """The characters of a text that a terminal obeys or does not show, but for line breaks.
+
+    They are control characters, marks of direction, and letters without ink or width.
+    """
+    if text.isascii() and text.isprintable():
+        return set()
+    hidden = {letter for letter in text if not letter.isprintable()} - {"\n"}
+    return hidden.union(_INVISIBLE.findall(text))
+
+
+def visible(text: str) -> str:
+    """A text with hidden characters as escapes, such as `\\x1b` and `\\u202e`."""
+    escapes = {ord(each): each.encode("unicode_escape").decode() for each in hidden_in(text)}
+    return text.translate(escapes)

@@ -6,11 +6,14 @@ A killed process leaves the old target and at most temporary paths that `TEMPORA
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
+import io
 import json
 import os
 import secrets
 import shutil
+import stat
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
@@ -232,17 +235,55 @@ def _reason(error: ValueError | RecursionError) -> str:
     return f"cannot be parsed: {error}."  # an integer of thousands of digits
 
 
-def read_json(path: str | os.PathLike[str]) -> Any:
-    path = Path(path)
+# Where a system has them: pipes are not waited for, text is not translated.
+_FLAGS = os.O_RDONLY
+for _name in ("O_NONBLOCK", "O_BINARY", "O_CLOEXEC"):
+    _FLAGS |= getattr(os, _name, 0)
+_IRREGULAR = (errno.ELOOP, errno.ENXIO)  # a link, a socket
+
+
+def open_regular(path: str | os.PathLike[str], *, links: bool = False) -> io.BufferedReader:
+    """Open a file for reading; a pipe, a device or a folder is an OSError, and no wait.
+
+    So is a link, as a stranger may have prepared the folder; a user may name one (`links`).
+    """
     try:
-        if path.is_file() and path.stat().st_size > MAX_DOCUMENT_BYTES:
-            raise MalformedDocumentError(
-                f"{path}: larger than {MAX_DOCUMENT_BYTES // 2**20} MiB, the limit for documents."
-            )
-        text = path.read_bytes()
+        handle = os.open(path, _FLAGS | (0 if links else getattr(os, "O_NOFOLLOW", 0)))
+    except OSError as error:
+        if error.errno in _IRREGULAR:
+            raise OSError(errno.EINVAL, "is not a regular file") from None
+        raise
+    if not stat.S_ISREG(os.fstat(handle).st_mode):
+        os.close(handle)
+        raise OSError(errno.EINVAL, "is not a regular file")
+    return os.fdopen(handle, "rb")
+
+
+def read_regular(path: str | os.PathLike[str], limit: int, *, links: bool = False) -> bytes:
+    """The bytes of a file as `open_regular` opens it; more than `limit` are an OSError."""
+    with open_regular(path, links=links) as stream:
+        large = os.fstat(stream.fileno()).st_size > limit
+        data = b"" if large else stream.read(limit + 1)
+    if large or len(data) > limit:
+        raise OSError(errno.EFBIG, f"has more than {limit:,} bytes")
+    return data
+
+
+def is_regular(path: str | os.PathLike[str]) -> bool:
+    """Whether the path is a regular file, and not a link to one."""
+    with contextlib.suppress(OSError, ValueError):
+        return stat.S_ISREG(os.lstat(path).st_mode)
+    return False
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    try:
+        text = read_regular(path, MAX_DOCUMENT_BYTES, links=True)
     except (OSError, ValueError) as error:
-        raise MalformedDocumentError(f"{path}: cannot be read: {reason_of(error)}.") from None
-    return parse_json(text, str(path))
+        raise MalformedDocumentError(
+            f"{os.fspath(path)}: cannot be read: {reason_of(error)}."
+        ) from None
+    return parse_json(text, os.fspath(path))
 
 
 def to_json(value: Any) -> str:

@@ -22,24 +22,20 @@ from rich.segment import Segment
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from sme_registry.io.checks import printable
+from sme_registry.io.checks import visible
 
 if TYPE_CHECKING:
     from jinja2 import Environment
 
 
 class CleanConsole(Console):
-    """Prints no control characters of a text, such as escape sequences in a name from elsewhere."""
+    """Shows hidden characters of a text as escapes: a name from elsewhere may hold any."""
 
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterator[Segment]:
         for segment in super().render(renderable, options):
-            if segment.control or segment.text.replace("\n", "").isprintable():
-                yield segment
-            else:
-                lines = (printable(line, longest=None) for line in segment.text.split("\n"))
-                yield segment._replace(text="\n".join(lines))
+            yield segment if segment.control else segment._replace(text=visible(segment.text))
 
 
 class TableColumn(NamedTuple):

@@ -7,6 +7,7 @@ import importlib
 import inspect
 import io
 import json
+import logging
 import os
 import re
 import sys
@@ -28,6 +29,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
 from sme_registry.errors import SMEError
+from sme_registry.io.checks import hidden_in
 from sme_registry.io.files import to_json
 from sme_registry.io.markup import CleanConsole
 from sme_registry.io.system import missing_dependency
@@ -102,11 +104,23 @@ def failure(message: str) -> None:
 
 
 def print_json(value: Any) -> None:
-    """Plain JSON, and nothing else, on standard output; unprintable characters are escaped."""
+    """Plain JSON, and nothing else, on standard output; hidden characters are escaped."""
     text = to_json(value)
-    unprintable = {each for each in text if not each.isprintable()} - {"\n"}
-    escapes = {ord(each): json.dumps(each)[1:-1] for each in unprintable}
+    escapes = {ord(each): json.dumps(each)[1:-1] for each in hidden_in(text)}
     sys.stdout.write(text.translate(escapes))
+
+
+class _LogHandler(logging.Handler):
+    """Prints what libraries and servers log as all other text."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print_note(escape(self.format(record)))
+
+
+def log_to_terminal() -> None:
+    """Let logs and warnings of this process pass through the console, which cleans them."""
+    logging.basicConfig(handlers=[_LogHandler()])
+    logging.captureWarnings(True)
 
 
 def print_pairs(title: str, pairs: dict[str, object]) -> None:
@@ -324,6 +338,7 @@ class CommandGroup(TyperGroup):
     def main(self, *args: Any, **options: Any) -> Any:
         options |= {"standalone_mode": False, "prog_name": self.name}
         _use_utf8()
+        log_to_terminal()
         try:
             code = super().main(*args, **options)
             sys.stdout.flush()

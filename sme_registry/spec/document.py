@@ -71,7 +71,7 @@ def _spec_error(error: ValidationError, source: str, model: type[BaseModel]) -> 
 def _explain(model: type[BaseModel], line: ErrorDetails) -> str:
     """One of Pydantic's errors as `field=value: what is allowed. What to do.`"""
     location, kind = line["loc"], line["type"]
-    path = _shortened(".".join(map(str, location)), 120)
+    path = _shortened(".".join(map(str, location)), 120).replace("\n", "\\n")
     value = f"{path}={short_repr(line['input'])}" if path else short_repr(line["input"])
     fields = _fields_at(model, location[:-1])
     if kind == "missing":

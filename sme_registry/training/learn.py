@@ -19,7 +19,7 @@ from sme_registry.envs.episodes import Episode, Episodes
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation import Policy, TeamPolicy, as_policy
 from sme_registry.io.system import defer_interrupts
-from sme_registry.io.terminal import Progress
+from sme_registry.io.terminal import Progress, err
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.sme_spec import ActionRange
 from sme_registry.training.algorithms import short_name
@@ -191,7 +191,7 @@ class RunLog(Watch):
             self._sums.sums[:] = present
         name = short_name(record.algorithm)
         if progress and total > max(first_step, record.steps):
-            (console or Console(stderr=True)).print(
+            (console or err()).print(
                 f"{name} collects whole rollouts: {total:,} steps, not {record.steps:,}.",
                 style="dim",
             )

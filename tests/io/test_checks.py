@@ -1,5 +1,6 @@
 """Checks of arguments and addresses, and the versions that documents record."""
 
+import ast
 import math
 import platform
 import sys
@@ -9,7 +10,7 @@ import pytest
 
 import sme_registry
 from sme_registry.errors import OptionError
-from sme_registry.io import choice, integer_in, number_in, printable, server_address, versions
+from sme_registry.io import choice, integer_in, number_in, server_address, versions, visible
 
 
 def test_an_integer_or_a_number_in_its_range_comes_back_as_pythons():
@@ -96,6 +97,12 @@ def test_plain_http_is_for_this_machine(url, host, port, path, local):
     assert (far.is_https, far.is_local) == (False, False)
 
 
-def test_a_server_s_text_has_no_control_characters():
-    assert printable("a\x1b[2J\nb") == "a [2J b"
-    assert len(printable("a" * 10_000)) == 2000
+def test_hidden_characters_are_shown_as_escapes():
+    assert visible("é r̃ ½ 名\n") == "é r̃ ½ 名\n"
+    controls, marks = "\0\x07\x1b\r\t\x7f\x9b", "\u061c\u200b\u200d\u202e\u2069\ufeff\ufe0f"
+    for hidden in f"{controls}{marks}\u00a0\u00ad\u2800\u3164":
+        shown = visible(f"a{hidden}b")
+        assert shown.isascii()
+        assert shown.isprintable()
+        assert ast.literal_eval(f'"{shown}"') == f"a{hidden}b"
+    assert visible("\ud800\U000e0001") == r"\ud800\U000e0001"

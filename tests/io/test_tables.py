@@ -117,5 +117,8 @@ def test_no_text_reaches_a_terminal_with_control_characters(capsys):
     printed = capsys.readouterr()
     assert all(line.isprintable() for line in (printed.out + printed.err).split("\n"))
     assert "half ½" in printed.out
+    for escape in (r"\x1b[2J", r"\x9b1m", r"\u202e"):
+        assert escape in printed.out
+        assert escape in printed.err
     text = printed.out[printed.out.index("{") :]
     assert json.loads(text) == {"name": evil, "space": "\u00a0", "tag": "\U000e0001"}

@@ -14,7 +14,7 @@ from rich.markup import escape
 
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.io import Lock, choice, integer_in
-from sme_registry.io.terminal import Progress
+from sme_registry.io.terminal import Progress, err
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.spec.study import Cell, PlannedCell
 from sme_registry.studies.engine.budget import selected, with_sources
@@ -75,7 +75,7 @@ def run_study(
     planned: dict[str, PlannedCell] = {}
     for place in selected(plan_file.plan.cells, only):
         planned.setdefault(place.cell.digest, place)
-    console = console or Console(stderr=True)
+    console = console or err()
     checked = planned.values() if run is run_cell else ()
     _check(plan_file.plan, checked, console if progress else None)
     if isinstance(executor, str):

@@ -13,11 +13,11 @@ import pytest
 
 from leaderboard.documents.board import Folder
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.reading import is_regular, open_regular, read_regular
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.verify import verify
 from leaderboard.store import Store
 from sme_registry.errors import SMEError
+from sme_registry.io import is_regular, open_regular, read_regular
 from tests.leaderboard.conftest import put_submission, tiny_board
 from tests.leaderboard.store.synthetic import synthetic_result
 
