@@ -20,7 +20,7 @@ from sme_registry.spec.study import Cell, PlannedCell
 from sme_registry.studies.engine.budget import selected, with_sources
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.executors import EXECUTORS, Executor, RunCell
-from sme_registry.studies.engine.ledger import Ledger, SavedState, StudyStatus, label, plan_status
+from sme_registry.studies.engine.ledger import Ledger, StudyStatus, label, plan_status
 from sme_registry.studies.engine.result import CPU, CellFailure, CellResult, Job, Outcome
 from sme_registry.training.algorithms import check_algorithm, code_notice, imported, in_jax
 from sme_registry.training.record import versions_for
@@ -91,7 +91,7 @@ def run_study(
     study = _StudyRun(title, queue, executor, console, progress)
     ledger.warn = study.say
     study.announce()
-    for notice in _notices(ledger, earlier_plan, plan_file, queue, keep_models):
+    for notice in _notices(earlier_plan, plan_file, queue):
         study.say(notice)
     try:
         study.run()
@@ -238,30 +238,22 @@ class Queue:
             in_state = programs.cells(saved.keys) if saved else None
             if in_state is None:
                 saved, in_state = None, ()
-            for key in self._candidates(programs, first, saved):
-                if len(cells) < program.runs:
-                    lock = self._claim(key)
-                    if lock is not None:
-                        locks.append(stack.enter_context(lock))
-                        cells.append(self.planned[key].cell)
+            group = programs.group(self.planned[first].cell)
+            candidates = [
+                key
+                for key in (self.waiting if saved is None else saved.keys)
+                if key in self.waiting and programs.group(self.planned[key].cell) == group
+            ]
+            for key in sorted(candidates, key=lambda key: key != first):  # which leads
+                if len(cells) < program.runs and (lock := self._claim(key)) is not None:
+                    locks.append(stack.enter_context(lock))
+                    cells.append(self.planned[key].cell)
                 if not cells:
                     return None
             new = self._ledger.state_path([cell.digest for cell in cells], program.build_key)
             program = replace(program, state=saved.path if saved else new, cells=in_state)
             stack.pop_all()
         return self._started(Job(tuple(cells), program), locks)
-
-    def _candidates(self, programs: Programs, first: str, saved: SavedState | None) -> list[str]:
-        """The waiting cells that may be runs of the program of the first one, which leads."""
-        group = programs.group(self.planned[first].cell)
-        others = self.waiting if saved is None else saved.keys
-        return [first] + [
-            key
-            for key in others
-            if key != first
-            and key in self.waiting
-            and programs.group(self.planned[key].cell) == group
-        ]
 
     def _claim(self, key: str) -> Lock | None:
         """Lock a waiting cell; None if another process holds it, or has run it."""
@@ -354,9 +346,7 @@ class _StudyRun:
         return f"{first}, and {len(others)} more" if others else first
 
 
-def _notices(
-    ledger: Ledger, earlier: StudyFile | None, file: StudyFile, queue: Queue, keep_models: bool
-) -> Iterator[str]:
+def _notices(earlier: StudyFile | None, file: StudyFile, queue: Queue) -> Iterator[str]:
     """What a reader of the results should know before the run."""
     if earlier is not None and earlier.digest != file.digest:
         yield (
@@ -365,25 +355,14 @@ def _notices(
             "reused; the others stay in the folder."
         )
     installed = functools.cache(versions_for)
-    differences: dict[str, set[str]] = {}  # of reused results, by their key
-    for key, result in queue.results.items():
-        now = installed(result.cell.uses)
-        differences[key] = {
-            f"{package} {version} (installed: {now[package]})"
-            for package, version in result.versions.items()
-            if now.get(package, version) != version
-        }
-    if others := sum(map(bool, differences.values())):
+    others = {
+        f"{package} {version} (installed: {now})"
+        for result in queue.results.values()
+        for package, version in result.versions.items()
+        if (now := installed(result.cell.uses).get(package, version)) != version
+    }
+    if others:
         yield (
-            f"{others:,} of the reused results come from other package versions: "
-            f"{', '.join(sorted(set().union(*differences.values())))}. For results of one set of "
-            "versions, run the plan in a new folder."
-        )
-    # Only a cell that learnt by acting leaves a model.
-    learnt = [key for key, result in queue.results.items() if result.online_regret is not None]
-    without_model = sum(not ledger.model_path(key).exists() for key in learnt)
-    if keep_models and without_model:
-        yield (
-            f"{without_model:,} of the finished cells have no model and are not run again. To get "
-            "their models, run the plan in a new folder."
+            f"Reused results come from other package versions: {', '.join(sorted(others))}. For "
+            "results of one set of versions, run the plan in a new folder."
         )
