@@ -28,7 +28,6 @@ from sme_registry.jax.networks import HostWeights, Weights
 from sme_registry.jax.task import (
     Form,
     TaskParams,
-    check_supported,
     first_distractors,
     judge,
     random_numbers,
@@ -95,10 +94,8 @@ class Lives:
     """
 
     def __init__(self, documents: Sequence[Document], device: Any) -> None:
-        _check_alike(documents)
         first, drawn = documents[0], {}
         for document in dict.fromkeys(documents):
-            check_supported(document)
             drawn[document] = materialize_segments(document)
         self.stream = first if isinstance(first, StreamSpec) else None
         self._times, self._at_once = first.times, first.switch == "step"
@@ -275,17 +272,6 @@ class Program(ABC):
         if shape == present.shape:
             return saved
         return np.concatenate([saved, np.zeros_like(present[len(saved) :])])
-
-
-def _check_alike(documents: Sequence[Document]) -> None:
-    first, *others = (document.switches for document in documents)
-    for index, other in enumerate(others, 1):
-        if other != first:
-            raise OptionError(
-                f"specs[{index}]: must switch at the same steps as specs[0]: streams of equal "
-                "steps, drift.increments, cycles, switch and observes_phase, or tasks alone. Make "
-                "two programs."
-            )
 
 
 @jax.jit

@@ -16,12 +16,11 @@ import jax
 import numpy as np
 
 from sme_registry.errors import OptionError, SpecError, UnknownNameError
-from sme_registry.io import choice, integer_in
+from sme_registry.io import choice
 from sme_registry.jax.networks import AgentSettings, Weights, hidden_layers
 from sme_registry.jax.ppo import PPO, PPOProgram
 from sme_registry.jax.program import PIECE, Array, Document, Evaluation, Program, StepLog
 from sme_registry.jax.td3_sac import SAC, TD3, SACProgram, TD3Program
-from sme_registry.spec.sme_spec import ACTION_RANGES
 
 ALGORITHMS: dict[str, tuple[Any, type[Program]]] = {
     "PPO": (PPO, PPOProgram),
@@ -59,20 +58,12 @@ def new_program(
     runs: int | None = None,
     device: str | None = None,
 ) -> Program:
-    """A program of new runs, `jax:PPO`, `jax:TD3` or `jax:SAC`.
+    """A program of new runs, `jax:PPO`, `jax:TD3` or `jax:SAC`; its callers check the arguments.
 
     Tasks or streams are of equal shapes, and streams switch at the same steps. `seeds` in
     [0, 2**32) are of weights, starts and noise, and `steps` those of each run. Copies of the first
     run fill up to `runs`.
     """
-    integer_in("len(specs)", len(specs), 1)
-    integer_in("len(seeds)", len(seeds), len(specs), len(specs), advice="Give a seed of each task.")
-    for i, seed in enumerate(seeds):
-        integer_in(f"seeds[{i}]", seed, 0, 2**32 - 1)
-    integer_in("steps", steps, 0)
-    if runs is not None:
-        integer_in("runs", runs, len(specs), advice="Leave it out for one of each task.")
-    choice("action_range", action_range, ACTION_RANGES)
     _, program = _algorithm(uses)
     return program(
         settings_of(uses, hyperparameters or {}),
@@ -93,7 +84,6 @@ def policy_of(
     action_range: str = "symmetric",
 ) -> Callable[[Array], Array]:
     """The deterministic policy of weights, from observations `[B, O]` to actions `[B, A]`."""
-    choice("action_range", action_range, ACTION_RANGES)
     _, program = _algorithm(uses)
     settings, symmetric = settings_of(uses, hyperparameters or {}), action_range == "symmetric"
 

@@ -226,13 +226,13 @@ def default_algorithm(document: SMESpec | StreamSpec) -> str:
 
 
 def full_name(uses: str, agents: str | None = None) -> str:
-    """The exact name of an algorithm in any case, of `agents`: "sb3", "jax", or as it says."""
-    if agents is not None and choice("agents", agents, AGENTS) == "sb3" and in_jax(uses):
-        raise OptionError(
-            f"agents='sb3': must be left out for {uses!r}, which is in JAX. Leave it out, or train "
-            f"{parse_uses(uses)[1]!r}."
-        )
-    return find(f"jax:{parse_uses(uses)[1]}" if agents == "jax" else uses, "algorithm").uses
+    """The exact name of an algorithm in any case, in the implementation of `agents`, if given."""
+    kind, name = parse_uses(uses)
+    if agents is not None and choice("agents", agents, AGENTS) == "jax":
+        uses = f"jax:{name}"
+    elif agents == "sb3" and kind == "jax":
+        uses = name
+    return find(uses, "algorithm").uses
 
 
 def short_name(uses: str) -> str:

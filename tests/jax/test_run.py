@@ -8,9 +8,8 @@ import pytest
 pytest.importorskip("jax")
 
 from sme_registry import SMESpec
-from sme_registry.errors import OptionError
 from sme_registry.jax.program import Evaluation, Program, StepLog
-from sme_registry.jax.run import ALGORITHMS, new_program, run, settings_of
+from sme_registry.jax.run import ALGORITHMS, run, settings_of
 from sme_registry.spec import StreamSpec
 
 SPECS = (SMESpec(state_dim=2), SMESpec(state_dim=2, seed=1))
@@ -151,23 +150,6 @@ def test_a_restored_run_goes_on_after_the_visits_that_have_ended():
     assert ended == [2, 3]
     scripted_run(program, [], on_visit=lambda visit, _: ended.append(visit))
     assert ended == [2, 3, 3]  # saved after its last step: the last visit ends with the training
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"action_range": "foo"}, "action_range='foo': must be 'unit' or 'symmetric'"),
-        ({"specs": (), "seeds": ()}, r"len\(specs\)=0: must be an integer of at least 1"),
-        ({"seeds": (0,)}, r"len\(seeds\)=1: must be .*Give a seed of each task"),
-        ({"seeds": (0, -1)}, r"seeds\[1\]=-1: must be"),
-        ({"runs": 1}, "runs=1: must be an integer of at least 2"),
-        ({"steps": -1}, "steps=-1: must be"),
-    ],
-)
-def test_a_program_of_invalid_runs_is_refused(change, message):
-    arguments = {"specs": SPECS, "seeds": (0, 1), "steps": 10, **change}
-    with pytest.raises(OptionError, match=message):
-        new_program("jax:PPO", **arguments)
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)

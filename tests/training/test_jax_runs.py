@@ -231,7 +231,6 @@ def test_a_damaged_checkpoint_is_refused_and_one_with_weights_that_are_not_finit
             {"agents": "sb3", "algorithm": "PPO", "device": "cpu"},
             r"device='cpu': is for agents in JAX.*--agents jax",
         ),
-        ({"agents": "sb3", "algorithm": "jax:PPO"}, "agents='sb3': must be left out for 'jax:PPO'"),
     ],
 )
 def test_invalid_arguments_raise_typed_errors_and_create_no_folder(change, message, tmp_path):
