@@ -24,14 +24,12 @@ import pandas as pd
 from sme_registry.diagnosis.questions import THRESHOLDS as DIAGNOSIS
 from sme_registry.io.markup import conjunction, fixed, plural, signed
 from sme_registry.studies.report.analysis import (
-    ALL,
     ENOUGH_RUNS,
     OFFLINE_INTERVAL,
-    SEVERAL,
     Analysis,
-    axis_label,
     training_data,
 )
+from sme_registry.studies.report.design import ALL, SEVERAL, axis_label
 from sme_registry.studies.report.frames import frame
 
 COLUMNS = (

@@ -102,42 +102,50 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sme_registry.evaluation import EvaluationReport, StreamReport
-from sme_registry.evaluation.retention import BY_VISIT, METRICS, StreamRegion
+from sme_registry.evaluation import EvaluationReport, StreamReport, retention
+from sme_registry.evaluation.retention import BY_VISIT, StreamRegion
 from sme_registry.spec import StudyPlan
 from sme_registry.spec.study import PlannedCell
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellResult
+from sme_registry.studies.report.design import metrics_of
 
 RUN = ["class_name", "algorithm", "run"]
 RUN_COLUMNS = "class_name:str algorithm:str run:int64 "  # columns of `RUN`, for `frame`
+
+
+def _metric_columns(needs: str) -> str:
+    return " ".join(metric.key for metric in metrics_of("run") if metric.needs == needs)
+
+
 _REGION = """region:str epsilon_low epsilon_high states:int64 similarity similarity_sd mae
     normalised_regret similarity_decay similarity_loss clipped_share linear_normalised_regret
     best_constant_normalised_regret random_normalised_regret constant_similarity """
-_RUN = """wd_regret ood_regret ood_decay final_return online_regret uses:str action_range:str
-    steps:int64 state_dim:int64 action_dim:int64 k:int64 r_min D complexity:int64 horizon:int64
+_RUN = f"""{_metric_columns("")} uses:str action_range:str steps:int64
+    state_dim:int64 action_dim:int64 k:int64 r_min D complexity:int64 horizon:int64
     hidden_width:int64 policy_init:str rotation spec_seed:str spec_digest:str seed:int64 nu
     transitions:Int64 dataset_digest:string behaviour_similarity behaviour_similarity_sd
     offline_similarity offline_similarity_sd improvement seconds steps_per_second key:str"""
 # Columns of a run, and of its regions, only where the plan has tasks with these fields.
 _OF_TASKS = {
     "safety": (
-        "tightness online_cost wd_cost wd_safe_regret",
+        f"tightness {_metric_columns('safety')}",
         "cost violating_share safe_regret price_of_safety",
     ),
     "observation": (
-        "distractors:Int64 dynamics:string mixing:string mixing_depth:Int64 distractor_regret "
-        "wd_invariance",
+        "distractors:Int64 dynamics:string mixing:string mixing_depth:Int64 "
+        f"{_metric_columns('observation')}",
         "invariance",
     ),
 }
 CURVES = RUN_COLUMNS + "step:int64 episode_return regret similarity length"
 # Columns of each agent of a team, as in `wd_regret/agent_0`.
-AGENT_COLUMNS = ("normalised_regret", "wd_regret", "ood_regret", "online_regret")
+AGENT_COLUMNS = ("normalised_regret", *(metric.key for metric in metrics_of("agent")))
 _LIVES = f"""{RUN_COLUMNS} region:str epsilon_low epsilon_high states:int64 visited_regret
-    {" ".join(METRICS)} learning_transfer online_regret dynamic_regret frozen_online_regret
-    uses:str action_range:str steps:int64 state_dim:int64 action_dim:int64 horizon:int64
-    stream_digest:str seed:int64 fresh_agents:int64 seconds steps_per_second key:str"""
+    {" ".join(retention.METRICS)} learning_transfer online_regret dynamic_regret
+    frozen_online_regret uses:str action_range:str steps:int64 state_dim:int64 action_dim:int64
+    horizon:int64 stream_digest:str seed:int64 fresh_agents:int64 seconds steps_per_second
+    key:str"""
 _VISITS = f"""{RUN_COLUMNS} region:str visit:int64 cycle:int64 phase:int64 lifetime:int64
     normalised_regret fresh_normalised_regret {" ".join(BY_VISIT)} online_regret dynamic_regret
     frozen_online_regret fresh_online_regret learning_transfer"""
@@ -283,25 +291,16 @@ def place(cell: PlannedCell) -> dict[str, Any]:
 
 def _run_columns(result: CellResult, report: EvaluationReport) -> dict[str, Any]:
     """The columns of `_RUN`; those of offline runs only where there are any."""
-    cell, safety, observed = result.cell, report.safety, report.observation
+    cell = result.cell
     columns = {
         **cell.spec.every_field(),
-        **{name: getattr(report, name) for name in ("wd_regret", "ood_regret", "ood_decay")},
+        **_metrics(result, report),
         **_of_cell(result),
-        "final_return": _final_return(result),
-        "online_regret": result.online_regret,
-        "online_cost": result.online_cost,
         "spec_seed": str(cell.spec.seed),
         "spec_digest": cell.spec.digest,
     }
     for block in (cell.spec.safety, cell.spec.observation):
         columns |= {} if block is None else block.to_dict()
-    if safety is not None:
-        inside = safety.regions[0]
-        columns |= {"wd_cost": inside.cost, "wd_safe_regret": inside.safe_regret}
-    if observed is not None:
-        columns["distractor_regret"] = report.distractor_regret
-        columns["wd_invariance"] = next((r.invariance for r in observed.invariance), None)
     for name, agent in report.agents.items():
         wd, *shells = (region.normalised_regret for region in agent.regions)
         columns |= {
@@ -316,6 +315,22 @@ def _run_columns(result: CellResult, report: EvaluationReport) -> dict[str, Any]
             "improvement": offline.similarity - offline.behaviour_similarity,
         }
     return columns
+
+
+def _metrics(result: CellResult, report: EvaluationReport) -> dict[str, Any]:
+    """Every metric of a run: a property of its report or result, or of the training cube."""
+    inside = report.task_scores(0)
+    metrics = {
+        "final_return": _final_return(result),
+        "wd_cost": inside.get("cost"),
+        "wd_safe_regret": inside.get("safe_regret"),
+        "wd_invariance": inside.get("invariance"),
+    }
+    for metric in metrics_of("run"):
+        if metric.key not in metrics:
+            source = report if hasattr(report, metric.key) else result
+            metrics[metric.key] = getattr(source, metric.key)
+    return metrics
 
 
 def _of_cell(result: CellResult) -> dict[str, Any]:
@@ -414,7 +429,7 @@ def _life_rows(life: FinishedLife) -> Iterator[dict[str, Any]]:
         yield {
             **of_life,
             **{n: getattr(region, n) for n in ("epsilon_low", "epsilon_high", "states")},
-            **{name: region.agent.final(name) for name in METRICS},
+            **{name: region.agent.final(name) for name in retention.METRICS},
             "region": region.name,
             "visited_regret": M[np.arange(len(M)), np.arange(len(M)) % M.shape[1]].mean(),
         }

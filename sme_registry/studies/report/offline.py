@@ -25,11 +25,11 @@ from sme_registry.studies.report.analysis import (
     ENOUGH_RUNS,
     OFFLINE_INTERVAL,
     Analysis,
-    Metric,
     summary,
     table,
     training_data,
 )
+from sme_registry.studies.report.design import Metric
 from sme_registry.studies.report.findings import THRESHOLDS, Found, Rows, finder, finding
 from sme_registry.studies.report.frames import RUN
 from sme_registry.training.algorithms import parse_uses
@@ -46,7 +46,7 @@ _NEAR = THRESHOLDS["near"]
 def _offline(analysis: Analysis) -> Iterator[dict[str, Any]]:
     runs = analysis.offline_runs
     intervals = summary(
-        runs, ["nu"], [Metric("improvement", "improvement", -1)], analysis.bootstrap,
+        runs, ["nu"], [Metric("improvement", "improvement", -1, "run")], analysis.bootstrap,
         lambda name, learner, _, nu: ("offline", learner, name, f"{nu:g}"),
         place=["class_name", "learner"], statistic=statistics.mean, fewest=OFFLINE_INTERVAL,
     )  # fmt: skip

@@ -38,18 +38,13 @@ from sme_registry.statistics import Array
 from sme_registry.studies.report.analysis import (
     ENOUGH_RUNS,
     INTERVAL,
-    OF_LIVES,
-    OF_VISITS,
     PLACE_COLUMNS,
-    RETENTION,
-    TASKS,
-    WITHIN,
     Analysis,
-    Metric,
     by_place,
     summary,
     table,
 )
+from sme_registry.studies.report.design import TASKS, WITHIN, Metric, metrics_of
 from sme_registry.studies.report.findings import (
     THRESHOLDS,
     Found,
@@ -101,13 +96,13 @@ def _counts(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
 
 @table("stream_metrics", f"{PLACE_COLUMNS} region:str metric:str {INTERVAL}")
 def _metrics(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
-    return _summary(analysis, analysis.tables["stream_lives"], ["region"], OF_LIVES)
+    return _summary(analysis, analysis.tables["stream_lives"], ["region"], metrics_of("life"))
 
 
 @table("stream_visit_metrics", f"{PLACE_COLUMNS} {_AT} {INTERVAL}")
 def _visit_metrics(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
     visits = analysis.tables["stream_visits"]
-    return _summary(analysis, visits, ["region", "visit", "phase"], OF_VISITS)
+    return _summary(analysis, visits, ["region", "visit", "phase"], metrics_of("visit"))
 
 
 @table("stream_matrices", "")
@@ -115,7 +110,7 @@ def _matrices(analysis: Analysis) -> pd.DataFrame:
     """The IQM over lives of the retention matrices."""
     rows = analysis.tables["stream_retention"]
     rows = rows.assign(visit=rows.visit.fillna(_INITIAL).astype("int64"))
-    rows = _summary(analysis, rows, ["region", "visit", "phase"], OF_VISITS[:1])
+    rows = _summary(analysis, rows, ["region", "visit", "phase"], metrics_of("visit")[:1])
     matrices = frame([*rows], f"{PLACE_COLUMNS} {_AT} {INTERVAL}").drop(columns="metric")
     return matrices.assign(visit=matrices.visit.astype("Int64").replace(_INITIAL, pd.NA))
 
@@ -127,7 +122,7 @@ def _references(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
     for life in analysis.lives:
         for region in (*life.report.regions, life.report.ood):
             for name, reference in region.references.items():
-                for metric in RETENTION:
+                for metric in retention.METRICS:
                     value = reference.final(metric)
                     if value is not None:
                         at = life.planned.class_name, name, region.name, metric

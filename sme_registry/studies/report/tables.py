@@ -51,26 +51,28 @@ from sme_registry.spec import StudyFile
 from sme_registry.statistics import Array, Statistic
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.report.analysis import (
-    ALL,
     CURVES,
     ENOUGH_RUNS,
     INTERVAL,
-    METRICS,
     PLACE,
     PLACE_COLUMNS,
     Analysis,
     Bootstrap,
-    Metric,
     RunKind,
     by_place,
     change_verdict,
-    class_infos,
-    groups,
-    stream_infos,
     summary,
     table,
     training_data,
     with_tables,
+)
+from sme_registry.studies.report.design import (
+    ALL,
+    Metric,
+    class_infos,
+    groups,
+    metrics_of,
+    stream_infos,
 )
 from sme_registry.studies.report.frames import (
     RUN,
@@ -97,7 +99,6 @@ DIFFERENCES = (
     "first:str second:str metric:str class_name:str first_level second_level difference low high "
     "pairs:int64 instances:int64 enough_pairs:bool verdict:str"
 )
-AGENT_METRICS = (*METRICS[:2], METRICS[4])
 _GROUP = "group:str metric:str "
 
 
@@ -287,7 +288,7 @@ def _levels(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
     results = analysis.tables["results"]
     linear = {place: _linear_medians(rows) for place, rows in by_place(results).items()}
     rows = summary(
-        analysis.runs, [], analysis.metrics, analysis.bootstrap,
+        analysis.runs, [], analysis.parts[0].metrics, analysis.bootstrap,
         lambda name, algorithm, key: ("level", algorithm, name, key),
     )  # fmt: skip
     for row in rows:
@@ -319,7 +320,8 @@ def layers(probed: pd.DataFrame) -> pd.DataFrame:
 @table("agents", f"{PLACE_COLUMNS} agent:str metric:str {INTERVAL}", optional=True)
 def _agents(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
     """The IQM of regret of each agent of a team."""
-    runs, keys = analysis.runs, [metric.key for metric in AGENT_METRICS]
+    runs, metrics = analysis.runs, metrics_of("agent")
+    keys = [metric.key for metric in metrics]
     names = [c.partition("/")[2] for c in runs.columns if c.startswith(f"{keys[0]}/")]
     if names:
         columns = [
@@ -327,7 +329,7 @@ def _agents(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
             for name in names
         ]
         yield from summary(
-            pd.concat(columns), ["agent"], AGENT_METRICS, analysis.bootstrap,
+            pd.concat(columns), ["agent"], metrics, analysis.bootstrap,
             lambda name, algorithm, key, agent: ("agent", algorithm, name, f"{key}/{agent}"),
         )  # fmt: skip
 
@@ -397,7 +399,7 @@ def _compared(analysis: Analysis) -> Iterator[tuple[str, str, dict[str, dict[str
     """Each group and regret metric with `[n]` values 1 − regret, by algorithm and class."""
     at = by_place(analysis.runs)
     comparable = [group for group in analysis.groups if group.compared]
-    for group, metric in itertools.product(comparable, METRICS[:2]):
+    for group, metric in itertools.product(comparable, metrics_of("score")):
         values = {
             a: {c: 1.0 - at[c, a][metric.key].to_numpy() for c in group.compared}
             for a in analysis.algorithms

@@ -13,27 +13,25 @@ from sme_registry.evaluation.retention import LABELS
 from sme_registry.io.markup import escape_latex, fixed, signed
 from sme_registry.studies.report.analysis import (
     ENOUGH_RUNS,
-    METRICS,
-    OF_LIVES,
-    OF_TRAINING,
-    OF_VISITS,
     OFFLINE_INTERVAL,
+    TABLES,
+    Analysis,
+)
+from sme_registry.studies.report.design import (
+    METRICS,
     OUTSIDE,
     SCHEDULE,
-    SPECIAL_METRICS,
-    TABLES,
     WITHIN,
-    Analysis,
     Metric,
+    metrics_of,
 )
 
 _ABSENT = "–"
 _STATISTICS = {"iqm": "IQM", "median": "median", "optimality_gap": "optimality gap"}
 _REGIONS = {"wd_regret": "WD", "ood_regret": "OOD"}
-_OF_RUNS = {metric.key: metric for metric in (*METRICS, *SPECIAL_METRICS)}
-_OF_LIVES = {metric.key: metric for metric in (*OF_LIVES, *OF_VISITS)}
-_LABELS = {key: metric.label for key, metric in _OF_LIVES.items()}
-_OF_TRAINING = [metric.key for metric in OF_TRAINING]  # the same numbers in all regions
+_METRICS = {metric.key: metric for metric in METRICS}
+_LABELS = {key: metric.label for key, metric in _METRICS.items()}
+_OF_TRAINING = [metric.key for metric in metrics_of("visit") if metric.training]
 _SHOWN_BY_VISIT = ("normalised_regret", "forgetting", "plasticity_ratio", *_OF_TRAINING)
 _BY_CLASS, _BY_STREAM = {"class_name": "class"}, {"class_name": "stream"}
 _INTERVAL = "with its 95 % bootstrap interval"
@@ -281,7 +279,7 @@ def _life_table(analysis: Analysis, name: str) -> TextTable:
     everywhere = rows.metric.isin(_OF_TRAINING)
     rows = rows[~everywhere | (rows.region == WITHIN)]
     rows = rows.assign(region=rows.region.mask(everywhere, ""), label=rows.metric.map(_LABELS))
-    order = list(_OF_LIVES)
+    order = list(_METRICS)
     table = _text(
         f"stream-metrics-{slug(name)}", f"Lives in {name}",
         f"IQM over lives, {_INTERVAL}, at the end of the life; the regret on "
@@ -298,7 +296,7 @@ def _life_table(analysis: Analysis, name: str) -> TextTable:
     cells = {}
     for row in references.itertuples():
         region = "" if row.metric in _OF_TRAINING else row.region
-        value = fixed(row.value, _OF_LIVES[row.metric].digits)
+        value = fixed(row.value, _METRICS[row.metric].digits)
         cells[_LABELS[row.metric], region, row.reference] = value
     places = [*zip(table.frame["metric"], table.frame["region"], strict=True)]
     for reference in dict.fromkeys(references.reference):
@@ -315,15 +313,15 @@ def _retention_table(rows: pd.DataFrame, name: str, phases: int) -> TextTable:
         f"stream-retention-{slug(name)}", f"Retention in {name}",
         "Normalised regret within distribution on the task of each phase, of the policy before "
         f"training and at the end of each visit. IQM over lives, {_INTERVAL}.",
-        rows.assign(after=after, metric=OF_VISITS[0].key, column="phase " + rows.phase.astype(str)),
+        rows.assign(after=after, column="phase " + rows.phase.astype(str)),
         {"algorithm": "algorithm", "after": "policy"}, "column", _level,
     )  # fmt: skip
 
 
 def _by_metric(rows: pd.DataFrame) -> Iterator[tuple[Metric, pd.DataFrame]]:
     """Each metric of runs on single tasks, in the order of reports, and its rows."""
-    for key, metric in _OF_RUNS.items():
-        yield metric, rows[rows.metric == key]
+    for metric in metrics_of("run"):
+        yield metric, rows[rows.metric == metric.key]
 
 
 def _text(
@@ -341,10 +339,9 @@ def _text(
 
     `entry` is called with a row and the number of digits of its metric.
     """
-    metrics = _OF_LIVES if name.startswith("stream") else _OF_RUNS
     lines: dict[tuple[Any, ...], dict[str, str]] = {}
     for row in rows.itertuples():
-        metric = metrics.get(getattr(row, "metric", ""))
+        metric = _METRICS.get(getattr(row, "metric", ""))
         place = tuple(getattr(row, column) for column in index)
         digits = 2 if metric is None else metric.digits
         lines.setdefault(place, {})[getattr(row, across)] = entry(row, digits)

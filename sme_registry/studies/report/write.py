@@ -32,13 +32,8 @@ from sme_registry.io.terminal import duration
 from sme_registry.plots.style import WRITTEN
 from sme_registry.spec import StudyFile
 from sme_registry.studies.engine.ledger import REPORT, Ledger, label, requested
-from sme_registry.studies.report.analysis import (
-    METRICS,
-    SPECIAL_METRICS,
-    Analysis,
-    Metric,
-    metrics_of,
-)
+from sme_registry.studies.report.analysis import Analysis
+from sme_registry.studies.report.design import Metric, metrics_of
 from sme_registry.studies.report.figures import (
     draw,
     draw_differences,
@@ -313,7 +308,7 @@ def compare(
         study = load(study)
     finished = runs_of(study.results)
     _check_names(first, second, list(dict.fromkeys(finished.algorithm)))
-    chosen = [_metric(name, metrics_of(finished)) for name in metrics]
+    chosen = [_metric(name, metrics_of("run", finished.columns)) for name in metrics]
     table = frame([*differences(finished, [(first, second)], chosen)], DIFFERENCES)
     if table.empty:
         raise OptionError(
@@ -388,7 +383,7 @@ def _check_names(first: str, second: str, known: Sequence[str]) -> None:
         raise OptionError(f"{first!r}: is given twice. Give two different algorithms.")
 
 
-def _metric(name: str, metrics: Sequence[Metric] = (*METRICS, *SPECIAL_METRICS)) -> Metric:
+def _metric(name: str, metrics: Sequence[Metric] = metrics_of("run")) -> Metric:
     known = {metric.key: metric for metric in metrics}
     if name not in known:
         raise UnknownNameError(

@@ -10,7 +10,7 @@ from sme_registry import statistics
 from sme_registry.spec import StudyPlan
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.report import tables
-from sme_registry.studies.report.analysis import ALL, SEVERAL, class_infos
+from sme_registry.studies.report.design import ALL, SEVERAL, class_infos
 from sme_registry.studies.report.frames import window
 from sme_registry.studies.report.tables import analyse
 from tests.studies.finished import analysed

@@ -10,7 +10,7 @@ from sme_registry.evaluation.regions import LayerProbe
 from sme_registry.spec import StudyPlan
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.report import frames, texts
-from sme_registry.studies.report.analysis import METRICS
+from sme_registry.studies.report.design import metrics_of
 from sme_registry.studies.report.frames import study_frames
 from sme_registry.studies.report.tables import analyse, layers
 from sme_registry.studies.report.write import compare
@@ -166,7 +166,7 @@ def test_tables_for_people_show_them_and_what_the_layers_keep(study, analysis):
     ]
     assert "layers" in texts.csv_tables(analysis)
     plain = analyse(*only(study, "plain"), draws=200)
-    assert plain.metrics == METRICS
+    assert plain.parts[0].metrics == tuple(m for m in metrics_of("run") if not m.needs)
     assert "layers" not in texts.csv_tables(plain)
     assert "layers" not in {table.name for table in texts.text_tables(plain)}
 

@@ -7,7 +7,7 @@ from sme_registry.io.markup import fixed
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import OfflineCell
-from sme_registry.studies.report.analysis import ALL
+from sme_registry.studies.report.design import ALL
 from sme_registry.studies.report.tables import analyse
 from sme_registry.studies.report.texts import offline_tables
 from tests.studies.finished import study_file

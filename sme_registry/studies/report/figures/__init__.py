@@ -14,7 +14,8 @@ from sme_registry.errors import SMEError
 from sme_registry.evaluation import as_policy
 from sme_registry.plots import maps, style
 from sme_registry.plots.style import GREY, literal, new_figure
-from sme_registry.studies.report.analysis import ALL, METRICS, Analysis, by_place
+from sme_registry.studies.report.analysis import Analysis, by_place
+from sme_registry.studies.report.design import ALL, metrics_of
 from sme_registry.studies.report.figures import curves, panels
 from sme_registry.studies.report.figures.panels import (
     FEW,
@@ -75,7 +76,9 @@ def draw_contrasts(analysis: Analysis) -> Drawn:
         yield (
             "No contrasts: they need finished runs of one number on the first class and on another."
         )
-    for name, metrics in (("regret", METRICS[:3]), ("training", METRICS[3:])):
+    general = [metric for metric in metrics_of("run") if not metric.needs]
+    for name in ("regret", "training"):
+        metrics = [metric for metric in general if metric.training == (name == "training")]
         rows = table[table.metric.isin([metric.key for metric in metrics])]
         if rows.empty:
             continue
@@ -244,7 +247,7 @@ def draw_improvements(analysis: Analysis) -> Drawn:
 
 def draw_differences(analysis: Analysis) -> Drawn:
     """The paired difference of each algorithm from the first one, one row a class."""
-    drawn, first = METRICS[:2], analysis.algorithms[0]
+    drawn, first = metrics_of("score"), analysis.algorithms[0]
     rows = analysis.tables["differences"]
     rows = rows[(rows["first"] == first) & rows.metric.isin([metric.key for metric in drawn])]
     if rows.empty:

@@ -18,14 +18,16 @@ from sme_registry.plots.style import GREY, legend_below, literal, shades
 from sme_registry.studies.report.analysis import (
     CURVES,
     ENOUGH_RUNS,
-    OF_LIVES,
     OFFLINE_INTERVAL,
+    Analysis,
+    training_data,
+)
+from sme_registry.studies.report.design import (
     SEVERAL,
     WITHIN,
-    Analysis,
     Group,
+    metrics_of,
     setting_label,
-    training_data,
 )
 from sme_registry.studies.report.figures import panels
 from sme_registry.studies.report.figures.panels import (
@@ -294,7 +296,7 @@ def draw_lives(analysis: Analysis) -> Iterator[Picture]:
             f"{metric.label}\n({'less' if metric.worse > 0 else 'more'} is better)",
             neutral=1.0 if metric.key == "plasticity_ratio" else 0.0,
         )
-        for metric in OF_LIVES
+        for metric in metrics_of("life")
         if metric.key in _SHOWN and metric.key in set(rows.metric)
     ]
     places = {name: float(i) for i, name in enumerate(_lived(analysis))}

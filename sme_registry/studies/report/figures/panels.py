@@ -28,7 +28,8 @@ from sme_registry.plots.style import (
     wrapped,
 )
 from sme_registry.statistics import Array
-from sme_registry.studies.report.analysis import ENOUGH_RUNS, Analysis, is_numeric
+from sme_registry.studies.report.analysis import ENOUGH_RUNS, Analysis
+from sme_registry.studies.report.design import is_numeric
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
