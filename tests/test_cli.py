@@ -692,7 +692,7 @@ class TestTrain:
         assert "Did you mean 'gamma'" in refused(*in_jax, "--set", "gama=0.9")
         assert "num_envs=2" in refused(*in_jax, "--num-envs", "2")
         assert "device='abacus'" in refused(*in_jax, "--device", "abacus")
-        assert "no team" in refused("train", "Team2", "--agents", "jax")
+        assert "this is the task of a team" in refused("train", "Team2", "--agents", "jax")
 
     @pytest.mark.parametrize(
         ("options", "message"),
