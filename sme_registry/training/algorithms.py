@@ -87,7 +87,7 @@ class Backend:
     names: tuple[str, ...] = ()
     check: str = ""
     several: bool = False
-    one_thread: bool = True
+    one_thread: bool = False
 
 
 _HERE = "sme_registry.training"
@@ -97,12 +97,14 @@ BACKENDS: dict[str, Backend] = {
         learns=("task", "team", "stream"),
         learner=f"{_HERE}.models:SB3Learner",
         several=True,
+        one_thread=True,
     ),
     "independent": Backend(
         settings=f"{_HERE}.algorithms:independent_settings",
         learns=("team",),
         learner=f"{_HERE}.independent:IndependentLearner",
         several=True,
+        one_thread=True,
     ),
     "jax": Backend(
         settings="sme_registry.jax.run:hyperparameters_of",
@@ -110,12 +112,12 @@ BACKENDS: dict[str, Backend] = {
         learner=f"{_HERE}.jax_agents:JAXLearner",
         names=("PPO", "TD3", "SAC"),
         check="sme_registry.jax.task:check_supported",
+        one_thread=True,
     ),
     "train": Backend(
         settings=f"{_HERE}.functions:settings",
         learns=("task",),
         learner=f"{_HERE}.functions:FunctionLearner",
-        one_thread=False,
     ),
     "offline": Backend(
         settings=f"{_HERE}.algorithms:offline_settings",

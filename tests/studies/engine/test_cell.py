@@ -221,7 +221,8 @@ def test_what_cannot_be_run_is_refused():
 
 
 def test_without_sb3_a_reference_runs_and_a_learner_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "stable_baselines3", None)  # as if it were not installed
+    for package in ("stable_baselines3", "torch"):  # as if they were not installed
+        monkeypatch.setitem(sys.modules, package, None)
     assert run_cell(cell("reference:linear")).online_regret is None
     with pytest.raises(MissingDependencyError, match=r"pip install .*\[train\]"):
         run_cell(cell("PPO"))
