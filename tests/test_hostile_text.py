@@ -16,7 +16,7 @@ from leaderboard.documents.keys import SigningKey
 from sme_registry.io.checks import hidden_in
 from sme_registry.io.terminal import log_to_terminal
 from tests.leaderboard.sealing import tiny_season
-from tests.leaderboard.web.site import boards
+from tests.leaderboard.web import boards
 from tests.leaderboard.web.test_client import bundle_of, scripted
 
 HOSTILE = "\x1b[2J\x9b1m\u202ename\u200b\x07\u3164"

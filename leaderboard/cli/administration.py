@@ -212,7 +212,7 @@ def site(
 
       sme-leaderboard site board --explorers
     """
-    from leaderboard.web.site import write_site
+    from leaderboard.web.server import write_site
 
     target = board / "site" if out_folder is None else out_folder
     with open_board(board) as store:

@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 
 from leaderboard.cli.options import BoardFolder, BoardOrUrl, Json, is_url, open_board
-from leaderboard.documents.result import Metric
+from leaderboard.documents.result import LABELS, SYMBOLS, Metric
 from leaderboard.errors import BoardError
 from sme_registry.errors import OptionError
 from sme_registry.io.markup import Table
@@ -19,19 +19,11 @@ from sme_registry.io.terminal import Progress, err, fixed, out, print_json, prin
 if TYPE_CHECKING:
     from leaderboard.documents.board import BoardDocument
     from leaderboard.documents.result import Estimate, Result
-    from leaderboard.public_view import PublicView
     from leaderboard.scoring.ranking import RankedRow
     from leaderboard.scoring.verify import VerifyReport
     from leaderboard.store import EntryRow, Store
+    from leaderboard.web.tables import PublicView
 
-SYMBOLS = {"wd_regret": "N₀", "ood_regret": "N̄", "ood_decay": "N̄ − N₀"}
-LABELS = {
-    "wd_regret": "WD regret N₀",
-    "ood_regret": "OOD regret N̄",
-    "ood_decay": "OOD decay N̄ − N₀",
-    "regret_slope": "regret slope on ε",
-    "similarity_loss": "similarity loss, points",
-}
 _SHORTEST_ID = 4
 
 
@@ -61,8 +53,9 @@ def rank(
 
       sme-leaderboard rank board --csv > ranking.csv
     """
-    from leaderboard import exports
+    from leaderboard.documents.submission import now
     from leaderboard.scoring import ranking
+    from leaderboard.web.tables import RankingFile
 
     if json + csv + latex > 1:
         raise OptionError("--json, --csv, --latex: give at most one of them.")
@@ -71,18 +64,18 @@ def rank(
         ranking.refuse_unpublishable(entries)
         rows = ranking.ranking(entries, metric)
         document, head = store.document, store.head[:2]
-    given = rows, metric, document, head
+    file = RankingFile(rows, metric, document, head, now())
     if json:
-        print_json(exports.to_dict(*given))
+        print_json(file.to_dict())
     elif csv or latex:
-        sys.stdout.write((exports.to_csv if csv else exports.to_latex)(*given))
+        sys.stdout.write(file.to_csv() if csv else file.to_latex())
     else:
-        out().print(_ranking_table(*given[:3]))
+        out().print(_ranking_table(rows, metric, document))
 
 
 def _ranking_table(rows: list[RankedRow], metric: Metric, board: BoardDocument) -> Table:
     from leaderboard.scoring.ranking import REASONS
-    from leaderboard.web.site.rows import steps_text
+    from leaderboard.web.tables import steps_text
 
     reasons: dict[str, None] = dict.fromkeys(row.reason for row in rows if row.reason)
     notes = dict(zip(reasons, "*†‡§¶", strict=False))
@@ -184,8 +177,8 @@ def show(
 
 def _public_view(board: str, id: str) -> PublicView:
     """What a board's folder or a served board publishes about a submission."""
-    from leaderboard.public_view import PublicView, public_view
     from leaderboard.web import client
+    from leaderboard.web.tables import PublicView, public_view
 
     if is_url(board):
         return PublicView.from_dict(client.status(board, id))
@@ -211,6 +204,8 @@ def _print_submission(view: PublicView) -> None:
         "training": submission.training.library or "not stated",
         "statement": submission.statement or "none",
     }
+    if view.place:
+        pairs["place in the queue"] = view.place
     if view.faults:
         pairs["failed attempts"] = f"{view.faults}, no verdict; the last: {view.fault}"
     if view.not_ranked not in ("", "reference"):

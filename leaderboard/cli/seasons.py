@@ -9,9 +9,8 @@ import typer
 from rich.markup import escape
 
 from leaderboard.cli.options import BoardFolder, Json, open_board
-from leaderboard.cli.results import LABELS
 from leaderboard.documents.master import Master
-from leaderboard.documents.result import Metric
+from leaderboard.documents.result import LABELS, Metric
 from leaderboard.documents.season import Reveal
 from leaderboard.errors import Rejection
 from sme_registry.errors import OptionError

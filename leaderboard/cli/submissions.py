@@ -27,8 +27,9 @@ from leaderboard.cli.options import (
     find_suite,
     is_url,
 )
-from leaderboard.cli.results import LABELS, SYMBOLS, find_entry
+from leaderboard.cli.results import find_entry
 from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.result import LABELS, SYMBOLS
 from leaderboard.documents.submission import Knowledge, SignedWithdrawal
 from leaderboard.errors import Rejection
 from sme_registry.errors import OptionError

@@ -37,7 +37,15 @@ Metric = Literal["wd_regret", "ood_regret", "ood_decay"]
 
 RANKED_METRICS: tuple[Metric, ...] = get_args(Metric)
 
-METRICS = ("wd_regret", "ood_regret", "ood_decay", "regret_slope", "similarity_loss")
+SYMBOLS = {"wd_regret": "N₀", "ood_regret": "N̄", "ood_decay": "N̄ − N₀"}
+LABELS = {
+    "wd_regret": "WD regret N₀",
+    "ood_regret": "OOD regret N̄",
+    "ood_decay": "OOD decay N̄ − N₀",
+    "regret_slope": "regret slope on ε",
+    "similarity_loss": "similarity loss, points",
+}
+METRICS = tuple(LABELS)
 Isolation = Literal["", "bwrap", "process"]
 _Regions = Annotated[tuple[Real, ...], Field(strict=False, min_length=2)]
 

@@ -22,18 +22,18 @@ import hashlib
 import os
 import re
 from collections.abc import AsyncIterator, Callable, Iterable
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import anyio
 from anyio import CapacityLimiter, to_thread
-from fastapi import FastAPI, Request
+from fastapi import FastAPI
 from starlette.exceptions import HTTPException
+from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
-from leaderboard import exports, intake
+from leaderboard import intake
 from leaderboard.artefact.isolation import Isolation, available_isolation
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.result import Metric
 from leaderboard.documents.submission import (
     MAX_BYTES,
     Envelope,
@@ -41,17 +41,15 @@ from leaderboard.documents.submission import (
     SignedWithdrawal,
 )
 from leaderboard.errors import BoardError, Rejection, ScoringFault
-from leaderboard.public_view import public_view
-from leaderboard.scoring import ranking
 from leaderboard.scoring.worker import background_scorers
 from leaderboard.store import Head, Store, unknown_submission
 from leaderboard.web import http
 from leaderboard.web.http import HTTP_CODES, RequestError
+from leaderboard.web.pages import Pages, content_type
 from leaderboard.web.seasons import SeasonRoutes
-from leaderboard.web.site import Pages, content_type
+from leaderboard.web.tables import TABS, public_view
 from sme_registry.errors import SMEError
 
-METRICS: tuple[Metric, ...] = get_args(Metric)
 _Render = Callable[[Pages, str], bytes]
 _PAGES_KEPT, _BYTES_KEPT = 256, 2**26
 _HEALTH_SECONDS = 5.0
@@ -229,12 +227,13 @@ class _Routes:
         return JSONResponse({"id": id, "status": "withdrawn"})
 
     async def get_board(self, request: Request) -> Response:
-        metric = request.query_params.get("metric", METRICS[0])
-        if metric not in METRICS:
+        metric = request.query_params.get("metric", TABS[0].key)
+        stems = {tab.key: tab.stem for tab in TABS}
+        if metric not in stems:
             raise RequestError(
-                "bad_request", f"metric={metric!r:.80}: must be one of {', '.join(METRICS)}."
+                "bad_request", f"metric={metric!r:.80}: must be one of {', '.join(stems)}."
             )
-        return await self._cached(request, _ranking, metric, "application/json")
+        return await self._cached(request, _page, f"{stems[metric]}.json", "application/json")
 
     async def get_log(self, request: Request) -> Response:
         text = request.query_params.get("start", "0")
@@ -305,11 +304,6 @@ class _PageCache:
 def _rendered(pages: Pages, render: _Render, name: str) -> _CachedFile:
     content = render(pages, name)
     return _CachedFile(content, f'"{hashlib.sha256(content).hexdigest()[:32]}"')
-
-
-def _ranking(pages: Pages, metric: Any) -> bytes:
-    rows = ranking.ranking(pages.entries, metric)
-    return exports.to_json(rows, metric, pages.document, pages.store.head[:2]).encode()
 
 
 def _view(pages: Pages, id: str) -> bytes:

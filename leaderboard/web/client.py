@@ -1,7 +1,8 @@
 """Client of a served board: sends artefacts and submissions, reads status, withdraws, gets tickets.
 
 Every object is addressed by its hash, so a lost request can be repeated unchanged. A rejection by
-the board is raised here as the same `Rejection`, with the board's code and message.
+the board is raised here as the same `Rejection`, with the board's code and message. A board that
+cannot be reached, or whose answer is invalid, is a `BoardError`, and a false URL an `OptionError`.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def submit(
     *,
     insecure: bool = False,
 ) -> str:
-    """Send a bundle to a board.
+    """Send a bundle to a board, and return the submission's id; the board scores it later.
 
     Args:
       url: of the board, such as `https://board.example`.
@@ -49,18 +50,10 @@ def submit(
       key: the submitter's; signs the uploads, and the submission if it is signed for no board yet.
       progress: called with the number of artefacts on the board and of all artefacts.
       insecure: allow plain http to other machines, in a network that you trust.
-
-    Returns:
-      The submission's id. The board scores it later; see `status`.
-
-    Raises:
-      Rejection: the bundle is invalid, or the board rejects it.
-      BoardError: the board cannot be reached, or its answer is invalid.
-      OptionError: the URL is invalid.
     """
     content = Bundle.read(bundle)
     runs = content.signed.submission.runs
-    digests = list(dict.fromkeys(run.artefact.sha256 for run in runs if run.artefact))
+    digests = dict.fromkeys(run.artefact.sha256 for run in runs if run.artefact)
     with _Board(url, insecure=insecure) as served:
         board = served.document().key
         signed = content.signed.for_board(board, key)
@@ -81,11 +74,6 @@ def status(url: str, id: str, *, insecure: bool = False) -> dict[str, Any]:
     """A submission's `id`, `status` and, once it is scored, `result`, as the board answers.
 
     While the board withholds scores, the result is None and `withheld` has the reason.
-
-    Raises:
-      Rejection: `unknown_submission`.
-      BoardError: the board cannot be reached, or its answer is invalid.
-      OptionError: the URL or the id is invalid.
     """
     with _Board(url, insecure=insecure) as served:
         answer = served.request("GET", f"/api/submissions/{_digits(id)}")
@@ -93,24 +81,13 @@ def status(url: str, id: str, *, insecure: bool = False) -> dict[str, Any]:
 
 
 def board_document(url: str, *, insecure: bool = False) -> BoardDocument:
-    """The definition of a served board: suite, protocol and limits.
-
-    Raises:
-      BoardError: the board cannot be reached, or its answer is invalid.
-      OptionError: the URL is invalid.
-    """
+    """The definition of a served board: suite, protocol and limits."""
     with _Board(url, insecure=insecure) as served:
         return served.document()
 
 
 def season(url: str, id: str, *, insecure: bool = False) -> tuple[str, str]:
-    """The digest of a season of a served board, and the board's public key.
-
-    Raises:
-      Rejection: `season_unknown`.
-      BoardError: the board cannot be reached, or its answer is invalid.
-      OptionError: the URL or the id is invalid.
-    """
+    """The digest of a season of a served board, and the board's public key."""
     with _Board(url, insecure=insecure) as served:
         answer = served.request("GET", f"/api/seasons/{_name(id)}")
         try:
@@ -130,24 +107,12 @@ def request_ticket(
 ) -> Ticket:
     """Start a ticket, or get the one that this request has started before.
 
-    Args:
-      url, insecure: as for `submit`.
-      season: the season's id.
-      signed: the request, signed for this board.
-      key: the entrant's, which signed it.
-
-    Returns:
-      The ticket, with the signer of its answers.
-
-    Raises:
-      Rejection: the board rejects it.
-      BoardError: the board cannot be reached, or its answer is invalid.
-      OptionError: the URL or the id is invalid.
+    `season` is its id, and `key` the entrant's, which signed the request for this board. The
+    ticket has the signer of its answers.
     """
     sign = functools.partial(upload_header, key, signed.id, board=signed.board)
     with _Board(url, insecure=insecure) as served:
-        path = tickets_path(_name(season))
-        answer = served.request("POST", path, signed.to_bytes(), sign)
+        answer = served.request("POST", tickets_path(_name(season)), signed.to_bytes(), sign)
     try:
         ticket = Ticket.from_dict(answer, "ticket")
     except SpecError as error:
@@ -165,23 +130,9 @@ def enter(
     *,
     insecure: bool = False,
 ) -> str:
-    """Send an entry of a sealed-offline season to a board.
+    """Send an entry of a sealed-offline season to a board, and return its id.
 
-    Args:
-      url, insecure: as for `submit`.
-      season: the season's id.
-      signed: the entry, signed for this board.
-      answers: the files that it names, by their digests.
-      key: the submitter's, to sign the uploads.
-      progress: called with the number of answers on the board and of all.
-
-    Returns:
-      The entry's id.
-
-    Raises:
-      Rejection: the board rejects it.
-      BoardError: the board cannot be reached, or its answer is invalid.
-      OptionError: the URL or the id is invalid.
+    `answers` are the files that it names, by their digests; the rest is as for `submit`.
     """
     with _Board(url, insecure=insecure) as served:
         for done, (digest, data) in enumerate(answers.items(), start=1):
@@ -196,23 +147,10 @@ def enter(
 def withdraw(
     url: str, id: str, key: SigningKey, reason: str = "", *, insecure: bool = False
 ) -> None:
-    """Withdraw a submission from a board.
-
-    Args:
-      url, insecure: as for `submit`.
-      id: the submission's.
-      key: the key that signed the submission.
-      reason: shown on the submission's page; up to 300 characters.
-
-    Raises:
-      Rejection: the board rejects it.
-      BoardError: the board cannot be reached, or its answer is invalid.
-      OptionError: the URL or the id is invalid.
-    """
+    """Withdraw a submission that this key has signed; its page shows the reason."""
     id = f"sha256:{_digits(id)}"
     with _Board(url, insecure=insecure) as served:
-        board = served.document().key
-        signed = SignedWithdrawal.create(id, key, reason, board=board)
+        signed = SignedWithdrawal.create(id, key, reason, board=served.document().key)
         served.request("POST", "/api/withdrawals", json.dumps(signed.to_dict()).encode())
 
 

@@ -401,7 +401,7 @@ def test_a_board_without_its_key_accepts_nothing():
 
 def test_the_index_comes_back_from_the_files(scored, monkeypatch):
     # A ranking says when it was written, to the second.
-    monkeypatch.setattr("leaderboard.exports.now", lambda: "2026-01-01T00:00:00Z")
+    monkeypatch.setattr("leaderboard.documents.submission.now", lambda: "2026-01-01T00:00:00Z")
     before = good("rank", "board", "--csv")
     for path in Path("board").glob("index.sqlite*"):
         path.unlink()

@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 import leaderboard
 from leaderboard.cli import app
 from leaderboard.documents.keys import SigningKey
-from leaderboard.public_view import PublicView, public_view
+from leaderboard.web.tables import PublicView, public_view
 from sme_registry.errors import SpecError
-from tests.leaderboard.web.site import boards
+from tests.leaderboard.web import boards
 
 # Private to the two packages: their modules are imported by name.
 SHARED = ("sme_registry.io.", "sme_registry.spec.")
@@ -72,6 +72,12 @@ def test_an_earlier_version_is_shown_with_the_reason_why_it_has_no_rank(tmp_path
     for change in ({"copy_of": [{"id": "x"}]}, {"copy_of": 3}, {"faults": "many"}):
         with pytest.raises(SpecError, match="invalid answer"):
             PublicView.from_dict({**plain, **change})
-    for name in ("not_ranked", "copy_of", "faults", "fault"):  # what earlier servers leave out
+    for name in (
+        "not_ranked",
+        "copy_of",
+        "place",
+        "faults",
+        "fault",
+    ):  # what earlier servers leave out
         del plain[name]
     assert PublicView.from_dict(plain) == views[1]

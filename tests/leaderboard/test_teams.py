@@ -19,7 +19,7 @@ from leaderboard.scoring.rescore import rescore
 from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import run_scorer
 from leaderboard.store import Store
-from leaderboard.web.site import write_site
+from leaderboard.web.server import write_site
 from sme_registry import EvaluationProtocol
 from sme_registry.spec import Suite, SuiteFile
 from tests.leaderboard.conftest import linear_onnx

@@ -47,7 +47,7 @@ def test_the_wheel_holds_the_packages_and_the_catalogue_and_nothing_else(wheel):
         "sme_registry/py.typed",
         "leaderboard/py.typed",
         "sme_registry/specs/envs/Default-v1.json",
-        "leaderboard/web/site/templates/_base.html",
+        "leaderboard/web/templates/_base.html",
     ):
         assert name in names
     assert any(name.startswith("sme_registry/diagnosis/templates/") for name in names)

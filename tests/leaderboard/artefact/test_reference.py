@@ -8,7 +8,7 @@ import pytest
 from leaderboard.artefact.gate import inspect, widths
 from leaderboard.artefact.network import network_of
 from leaderboard.artefact.reference import constant_onnx, optimal_onnx
-from leaderboard.web.site.explorers import can_show, explorer
+from leaderboard.web.charts import can_show, explorer
 from sme_registry import SMESpec, evaluate, materialize
 from sme_registry.export.export import onnx_bytes
 from tests.explorer.networks import offline, perceptron

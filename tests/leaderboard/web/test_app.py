@@ -21,10 +21,10 @@ from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import SignedSubmission, utc
 from leaderboard.errors import BoardError
-from leaderboard.public_view import PublicView
 from leaderboard.web import app
 from leaderboard.web.http import HTTP_CODES, STATUSES
 from leaderboard.web.server import serve
+from leaderboard.web.tables import PublicView
 from sme_registry.errors import OptionError
 from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import (
@@ -35,7 +35,7 @@ from tests.leaderboard.conftest import (
     tiny_submission,
 )
 from tests.leaderboard.serving import authorization, serving, serving_process
-from tests.leaderboard.web.site import boards
+from tests.leaderboard.web import boards
 
 # More patient than httpx, for busy machines; a connection for each request, as `httpx.get` has.
 HTTP = httpx.Client(timeout=60, limits=httpx.Limits(max_keepalive_connections=0))
@@ -213,6 +213,22 @@ def test_a_waiting_entry_shows_the_faults_that_postponed_it(tmp_path):
     assert all("no space left &lt;on&gt; device" in text for text in after)
     assert (view["faults"], view["fault"]) == (1, "no space left <on> device")
     assert PublicView.from_dict(view).to_dict() == view
+
+
+def test_who_waits_sees_a_place_in_the_queue(tmp_path):
+    with boards.create(tmp_path / "board", classes=1) as store:
+        scored = boards.submit(store, SigningKey.generate(), "Done", [0.2] * 6)
+        ids = [boards.submit(store, SigningKey.generate(), name, None) for name in "AB"]
+        with serving(store.folder.path) as url:
+            views = [
+                HTTP.get(f"{url}/api/submissions/{hex_of(id)}").json() for id in (scored, *ids)
+            ]
+            page = HTTP.get(f"{url}/submissions/{hex_of(ids[1])}.html").text
+            board = HTTP.get(url).text
+        assert [view["place"] for view in views] == [0, 1, 2]
+        assert "place 2 of 2 in the queue" in page
+        assert re.findall(r'data-label="Place">(\d+)<', board) == ["1", "2"]
+        assert store.queue.claim("scorer").id == ids[0]
 
 
 def test_what_does_not_last_is_announced_only_by_a_server_that_scores(store, monkeypatch):

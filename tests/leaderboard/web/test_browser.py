@@ -7,10 +7,10 @@ from playwright.sync_api import expect, sync_playwright
 
 from leaderboard import intake
 from leaderboard.documents.board import hex_of
-from leaderboard.web.site import write_site
+from leaderboard.web.server import write_site
 from tests.browser import launched, needs_chromium, serving_files
 from tests.leaderboard.serving import serving
-from tests.leaderboard.web.site import boards
+from tests.leaderboard.web import boards
 
 CSP = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "

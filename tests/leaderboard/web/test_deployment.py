@@ -22,7 +22,7 @@ from sme_registry.io import sha256_of
 from sme_registry.seasons import wire
 from tests.leaderboard.sealed.playing import online_board
 from tests.leaderboard.serving import serving
-from tests.leaderboard.web.site import boards
+from tests.leaderboard.web import boards
 from tests.leaderboard.web.test_client import bundle_of
 
 NGINX = shutil.which("nginx", path=f"{os.environ['PATH']}:/usr/sbin:/usr/local/sbin")

@@ -1,4 +1,6 @@
-"""Drawings of scores as inline SVG without styles, so that the pages can forbid inline styles.
+"""What the pages draw: scores as inline SVG, and explorers of policies, which are pages.
+
+Drawings have no styles, so that the pages can forbid inline styles.
 
 Colours come from `board.css`, for light, dark and print. All text is escaped.
 """
@@ -13,6 +15,8 @@ from dataclasses import dataclass
 from markupsafe import Markup, escape
 
 from leaderboard.documents.result import Estimate
+from sme_registry import SMESpec
+from sme_registry.errors import OptionError, PolicyError, ResourceLimitError
 from sme_registry.io.terminal import fixed
 
 Edges = Sequence[tuple[float, float]]
@@ -237,3 +241,41 @@ def _anchor(part: float) -> str:
 
 def _short(value: float) -> str:
     return f"{value:g}".replace("-", "\u2212")
+
+
+_UNKNOWN = (
+    "This page cannot compute the network of this policy. It shows the task, with a linear and a "
+    "constant policy."
+)
+
+
+def can_show(spec: SMESpec) -> bool:
+    """Whether a task is small enough for the page of an explorer."""
+    from sme_registry.explorer import check_size
+
+    try:
+        check_size(spec)
+    except (OptionError, ResourceLimitError):
+        return False
+    return True
+
+
+def explorer(name: str, data: bytes, spec: SMESpec) -> str:
+    """The page that computes a policy's network, of its ONNX file, in the browser.
+
+    A stranger's network reaches it as numbers only, through `artefact.network`; of one that is not
+    understood in full, or whose actions are not finite, it shows the task alone.
+    """
+    from leaderboard.artefact.gate import widths
+    from leaderboard.artefact.network import network_of
+    from sme_registry.diagnosis import load_policy
+    from sme_registry.explorer import explorer_page, facts
+
+    network = network_of(data, *widths(spec))
+    if network is not None:
+        try:
+            subject = load_policy(network, spec, action_range="unit", name=name)
+            return explorer_page(facts(subject), "../static/")
+        except PolicyError:
+            pass
+    return explorer_page(facts(spec, remark=_UNKNOWN), "../static/")

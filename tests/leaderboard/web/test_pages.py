@@ -19,12 +19,14 @@ from leaderboard.documents.result import Estimate
 from leaderboard.documents.submission import SignedWithdrawal
 from leaderboard.errors import BoardError, NotPublishable
 from leaderboard.store import Likeness, Store
-from leaderboard.web.site import STATIC, Pages, charts, content_type, rows, write_site
-from leaderboard.web.site import pages as site_pages
+from leaderboard.web import charts, tables
+from leaderboard.web import pages as site_pages
+from leaderboard.web.pages import STATIC, Pages, content_type
+from leaderboard.web.server import write_site
 from sme_registry.errors import OptionError
-from tests.leaderboard.web.site import boards
+from tests.leaderboard.web import boards
 
-EXAMPLE = Path(__file__).resolve().parents[4] / "examples" / "board"  # of rules 1
+EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "board"  # of rules 1
 VOID = {"meta", "link", "input", "br", "img"}
 ELEMENTS = """
 html head meta title link script body a header footer main nav div section p span strong em small
@@ -206,10 +208,10 @@ def test_a_board_says_how_to_submit_and_its_limits_unless_it_accepts_nothing(boa
             assert text in words
     for name, page in pages.items():
         assert any(a["href"].endswith("index.html#submit") for a in page.all("a")), name
-    page = Page(Pages(board[0], "https://x/<script>").board())
+    page = Page(html(Pages(board[0], "https://x/<script>"), "index.html"))
     assert "submit ppo https://x/<script>" in page.words
     with Store.open(EXAMPLE, read_only=True) as store:
-        words = Page(Pages(store).board("wd_regret")).words.split("How to submit")[1]
+        words = Page(html(Pages(store), "index.html")).words.split("How to submit")[1]
     assert "accepts no submissions" in words
     assert "sme-leaderboard new" not in words
 
@@ -229,6 +231,10 @@ def test_the_pages_of_method_log_and_suite_explain_what_they_must(pages, board):
         assert member in words
     assert "state_dim=2" in words
     assert f"--seeds {store.document.runs_to_rank} " in words
+
+
+def html(pages, path):
+    return pages.read(path).decode()
 
 
 def rows_of(text):
@@ -275,12 +281,12 @@ def test_the_decay_page_ranks_by_the_floored_value_and_shows_the_entrys_own(smal
     submitted(small, "Better", [0.1] * 6, spread=0.0)
     submitted(small, "Near", [4e-7, *[0.0] * 5], spread=0.0)
     pages = Pages(small)
-    rows = {name: row for _, name, row in rows_of(pages.read("ood_decay.html").decode())}
+    rows = {name: row for _, name, row in rows_of(html(pages, "ood_decay.html"))}
     assert 'data-value="0.0"' in rows["Worse inside"]
     assert "<span>itself \u22120.200</span>" in rows["Worse inside"]
     assert "itself" not in rows["Better"]
     assert any(-1e-6 < entry.scores.ood_decay.value < 0 for entry in pages.entries)
-    assert "-0.000" not in pages.read("board.tex").decode()
+    assert "-0.000" not in html(pages, "board.tex")
 
 
 def test_a_superseded_entry_is_listed_as_history_and_its_versions_link_to_one_another(small):
@@ -289,8 +295,11 @@ def test_a_superseded_entry_is_listed_as_history_and_its_versions_link_to_one_an
     second = boards.submit(small, key, "P-P-0", [0.2] * 6, statement="second")
     submitted(small, "PPO", [0.3] * 6)
     pages = Pages(small)
-    marks = {name: row for _, name, row in rows_of(pages.board("wd_regret"))}
-    old, new = Page(pages.submission(first)), Page(pages.submission(second))
+    marks = {name: row for _, name, row in rows_of(html(pages, "index.html"))}
+    old, new = (
+        Page(html(pages, f"submissions/{hex_of(first)}.html")),
+        Page(html(pages, f"submissions/{hex_of(second)}.html")),
+    )
     assert ">superseded</span>" in marks["PPO"] or ">superseded</span>" in marks["P-P-0"]
     assert "Superseded." in old.words
     assert "Superseded." not in new.words
@@ -308,12 +317,12 @@ def test_a_copy_names_the_entry_that_it_copies_and_the_number_of_runs(small, mon
     ]
     monkeypatch.setattr(small, "entries", lambda: list(entries))
     pages = Pages(small)
-    shown = {name: (rank, row) for rank, name, row in rows_of(pages.board("wd_regret"))}
+    shown = {name: (rank, row) for rank, name, row in rows_of(html(pages, "index.html"))}
     assert shown["First"][0] == "1"
     assert shown["Copy"][0] == "–"
     link = f'href="submissions/{hex_of(first)}.html"'
     assert f"{link}>copy of <bdi>First 1.0" in shown["Copy"][1]
-    words = Page(pages.submission(copy)).words
+    words = Page(html(pages, f"submissions/{hex_of(copy)}.html")).words
     assert "10 of 10 policies act like those of earlier entries" in words
 
 
@@ -497,25 +506,28 @@ def test_a_long_log_has_pages_and_full_ones_never_change(board, monkeypatch):
     shown = [
         int(number)
         for page in range(count)
-        for number in re.findall(r'<th scope="row" class="n">(\d+)</th>', pages.log(page))
+        for number in re.findall(
+            r'<th scope="row" class="n">(\d+)</th>', html(pages, f"log-{page}.html")
+        )
     ]
     assert shown == list(range(last + 1))
-    assert pages.log() == pages.log(count - 1)
-    assert Page(pages.log()).all("nav")[1]["aria-label"] == "Pages of the log"
+    newest = pages.read("log.html")
+    assert newest == pages.read(f"log-{count - 1}.html")
+    assert Page(newest.decode()).all("nav")[1]["aria-label"] == "Pages of the log"
 
 
 def test_an_empty_board_has_a_page(small):
-    page = Page(Pages(small).board("wd_regret"))
+    page = Page(html(Pages(small), "index.html"))
     assert "No entry is ranked yet." in page.words
     assert "0 ranked of 0 submitted" in page.words
 
 
 def test_steps_are_short_and_only_https_becomes_a_link():
     shown = {0: "0", 999: "999", 1000: "1 k", 1_250_000: "1.25 M", 30_000_000_000: "30 G"}
-    assert {steps: rows.steps_text(steps) for steps in shown} == shown
-    assert rows.https_only("https://example.org/") == "https://example.org/"
+    assert {steps: tables.steps_text(steps) for steps in shown} == shown
+    assert tables.https_only("https://example.org/") == "https://example.org/"
     for link in (None, "javascript:alert(1)", "http://example.org", " https://example.org"):
-        assert rows.https_only(link) is None
+        assert tables.https_only(link) is None
 
 
 def test_contrast_is_enough_in_light_and_dark():

@@ -7,10 +7,11 @@ from leaderboard.documents.result import Stepping
 from leaderboard.documents.season import Reveal
 from leaderboard.scoring.metrics import failed_run
 from leaderboard.scoring.sealed import sealed_result
-from leaderboard.web.site import Pages, write_site
+from leaderboard.web.pages import Pages
+from leaderboard.web.server import write_site
 from tests.leaderboard.sealing import MASTER, move_clock, signed_entry, signed_request, tiny_season
-from tests.leaderboard.web.site import boards, test_pages
-from tests.leaderboard.web.site.test_pages import Page
+from tests.leaderboard.web import boards, test_pages
+from tests.leaderboard.web.test_pages import Page
 
 HOSTILE = "Autumn <script>alert(1)</script>"
 OFFLINE, ONLINE = tiny_season(id="autumn", title=HOSTILE), tiny_season("sealed-online", id="winter")

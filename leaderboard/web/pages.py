@@ -10,8 +10,9 @@
     suite.json, definition.json         the suite, to train on it, and the board's definition
     board.json, .csv, .tex              the board by N₀ as data; so are ood_regret.*, ood_decay.*
 
-Jinja2 escapes all text from submitters. Only the drawings are marked as safe; they contain numbers
-and text that they escape themselves.
+The pages are accessible HTML without inline script or style. Jinja2 escapes all text from
+submitters. Only the drawings are marked as safe; they contain numbers and text that they escape
+themselves.
 """
 
 from __future__ import annotations
@@ -24,19 +25,17 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from leaderboard import exports
-from leaderboard.documents.board import BoardDocument, hex_of
+from leaderboard.documents.board import hex_of
 from leaderboard.documents.result import METRICS, Estimate, Metric, Result
 from leaderboard.documents.submission import SignedSubmission
 from leaderboard.errors import CODES, NotPublishable
 from leaderboard.scoring import ranking
 from leaderboard.store import EntryRow, SeasonRow, Store
-from leaderboard.web.site import charts, rows
-from leaderboard.web.site.rows import SHORT, TABS
-from leaderboard.web.site.seasons import season_page
+from leaderboard.web import charts, tables
+from leaderboard.web.seasons import season_page
+from leaderboard.web.tables import SHORT, TABS
 from sme_registry import SMESpec
 from sme_registry.io import to_json
-from sme_registry.spec.document import StrictModel
 
 STATIC = Path(__file__).parent / "static"
 LOG_ROWS = 200  # entries on a page of the log; a full page never changes again
@@ -50,12 +49,7 @@ _TYPES = {
     ".tex": "text/plain; charset=utf-8",
     ".svg": "image/svg+xml",
 }
-_DEFINITIONS: dict[str, Callable[[BoardDocument], StrictModel]] = {
-    "suite.json": lambda board: board.suite_file,
-    "definition.json": lambda board: board,
-}
 _NEED_SCORES = (*(tab.page for tab in TABS), "compare.html")
-_EXPORTS = {"json": exports.to_json, "csv": exports.to_csv, "tex": exports.to_latex}
 
 
 class Pages:
@@ -97,17 +91,89 @@ class Pages:
             return error.waiting and self._address is not None
         return False
 
-    def board(self, metric: Metric = "wd_regret") -> str:
-        """The board by a metric.
+    def read(self, path: str) -> bytes | None:
+        """A file of the site by its path, such as `ood_regret.html`; None if there is none.
 
         Raises:
-          NotPublishable: see `entries`; every other page raises it too.
+          NotPublishable: see `entries`.
         """
-        tab = next(tab for tab in TABS if tab.key == metric)
-        ranked = ranking.ranking(self.entries, metric)
+        folder, _, name = path.rpartition("/")
+        if folder == "static":
+            return self._static.get(name)
+        if path in self._definitions:  # without scores, and needed to train for the board
+            return to_json(self._definitions[path]).encode()
+        if self.preparing and (path.endswith(".html") or folder == "submissions"):
+            return self._prepared(folder, name)
+        self.entries  # noqa: B018  raises if the board may not publish
+        if folder in ("submissions", "results"):
+            return self._document(folder, name)
+        if folder == "explorers":
+            return self._explorer(name)
+        if folder == "seasons":
+            return self._season(name)
+        render = None if folder else self._top.get(name)
+        return render().encode() if render is not None else None
+
+    def paths(self) -> Iterator[str]:
+        """The paths of all files of the site; `index.html` last, so that its links work."""
+        yield from (f"static/{name}" for name in self._static)
+        yield from self._definitions
+        for entry in self.entries:
+            digits = hex_of(entry.id)
+            yield f"submissions/{digits}.json"
+            if entry.scores is not None or entry.code:
+                yield f"results/{digits}.json"
+            yield from (f"explorers/{digits}-{n}.html" for n in self._explored(entry.id))
+            yield f"submissions/{digits}.html"
+        yield from (f"seasons/{id}.html" for id in self._seasons)
+        yield from self._top
+
+    @cached_property
+    def _definitions(self) -> dict[str, Any]:
+        files = {"suite.json": self.document.suite_file, "definition.json": self.document}
+        return {path: document.to_dict() for path, document in files.items()}
+
+    @cached_property
+    def _top(self) -> dict[str, Callable[[], str]]:
+        """The files of the top folder by name: functions that render them."""
+        logs = range(self.store.head[0] // LOG_ROWS + 1)
+        return {
+            **{_log_page(number): partial(self._log, number) for number in logs},
+            "board-data.js": self._data_js,
+            "log.html": partial(self._log, logs[-1]),
+            "method.html": self._method,
+            "suite.html": self._suite,
+            "compare.html": self._compare,
+            **({"seasons.html": self._season_list} if self._seasons else {}),
+            **{
+                f"{tab.stem}.{kind}": partial(self._file, tab.key, kind)
+                for tab in TABS
+                for kind in ("json", "csv", "tex")
+            },
+            **{tab.page: partial(self._board, tab) for tab in reversed(TABS)},
+        }
+
+    def _prepared(self, folder: str, name: str) -> bytes | None:
+        """A file without scores, while the reference rows wait."""
+        if folder == "submissions":
+            return self._document(folder, name)
+        if folder == "seasons":
+            id = name.removesuffix(".html")
+            # The scorer of the reference rows has scored the entries, too.
+            if id in self._seasons and any(self._season_page(id).rankings.values()):
+                return self._preparation("../").encode()
+            return self._season(name)
+        if folder or name not in self._top:
+            return None
+        render = self._preparation if name in _NEED_SCORES else self._top[name]
+        return render().encode()
+
+    def _board(self, tab: tables.MetricTab) -> str:
+        """The board by a metric."""
+        ranked = ranking.ranking(self.entries, tab.key)
         scores = [row.entry.scores for row in ranked if row.entry.scores]
-        estimates = [row.shown(metric) for row in ranked]
         regrets = [[each.value for each in one.normalised_regret] for one in scores]
+        sparks = charts.sparklines(regrets)
         submitted = [row for row in ranked if not row.entry.reference]
         return self._render(
             "board.html",
@@ -123,22 +189,18 @@ class Pages:
             reasons=ranking.REASONS,
             names={id: f"{entry.method} {entry.version}" for id, entry in self._by_id.items()},
             **self._overview,
-            bars=charts.Bars(estimates, tab.references),
-            sparks=dict(
-                zip((row.entry.id for row in ranked), charts.sparklines(regrets), strict=True)
-            ),
+            bars=charts.Bars([row.shown(tab.key) for row in ranked], tab.references),
+            sparks=dict(zip((row.entry.id for row in ranked), sparks, strict=True)),
         )
 
-    def preparation(self, root: str = "") -> str:
+    def _preparation(self, root: str = "") -> str:
         """The page of a board whose reference rows wait, which reloads itself.
 
-        Args:
-          root: the path from the page's folder to the top one.
+        `root` is the path from the page's folder to the top one.
         """
         here = "" if root else "index.html"
-        return self._render(
-            "preparing.html", here=here, root=root, title="Preparing", **self._overview
-        )
+        overview = self._overview
+        return self._render("preparing.html", here=here, root=root, title="Preparing", **overview)
 
     @cached_property
     def _overview(self) -> dict[str, Any]:
@@ -157,12 +219,8 @@ class Pages:
             ),
         }
 
-    def submission(self, id: str) -> str:
-        """The page of a submission: waiting, scored, rejected or withdrawn.
-
-        Raises:
-          KeyError: there is no such submission.
-        """
+    def _submission(self, id: str) -> str:
+        """The page of a submission: waiting, scored, rejected or withdrawn."""
         entry = self._by_id[id]
         signed, result = self._documents(id)
         withheld = self.preparing and result is not None and result.scores is not None
@@ -176,6 +234,7 @@ class Pages:
             chart = charts.regret_chart(result.scores.normalised_regret, edges, name)
             sparks = charts.sparklines([each.normalised_regret for each in result.classes])
             classes = list(zip(result.classes, sparks, strict=True))
+        versions = tables.versions_of(entry, self._listed)
         return self._render(
             "submission.html",
             here="",
@@ -189,22 +248,19 @@ class Pages:
             preparing=self.preparing,
             reason=self._reasons.get(id, ""),
             copies=[(each, self._by_id[each.id]) for each in entry.copy_of],
-            versions=[
-                (other, self._reasons.get(other.id, ""))
-                for other in rows.versions_of(entry, self._listed)
-            ],
+            versions=[(other, self._reasons.get(other.id, "")) for other in versions],
             entry=entry,
             withdrawal=withdrawal and withdrawal.withdrawal,
             codes=CODES,
             chart=chart,
             classes=classes,
-            agents=[] if result is None else rows.agent_rows(self.document, submission, result),
+            agents=[] if result is None else tables.agent_rows(self.document, submission, result),
             regions=charts.region_labels(edges),
-            runs=rows.run_rows(submission, result, self._class_of),
+            runs=tables.run_rows(submission, result, self._class_of),
             explored=self._explored(id),
         )
 
-    def compare(self) -> str:
+    def _compare(self) -> str:
         """The page on which `board.js` compares chosen entries."""
         estimates = [each for entry in self._scored for each in entry.scores.normalised_regret]
         chart = charts.comparison_chart(estimates, self.document.protocol.edges)
@@ -212,20 +268,9 @@ class Pages:
             "compare.html", here="compare.html", title="Compare entries", chart=chart
         )
 
-    def log(self, page: int | None = None) -> str:
-        """A page of the log, with instructions to verify it.
-
-        Args:
-          page: 0 for the oldest entries; None for the newest page.
-
-        Raises:
-          KeyError: there is no such page.
-        """
+    def _log(self, page: int) -> str:
+        """A page of the log, 0 for the oldest entries, with instructions to verify it."""
         last = self.store.head[0]
-        count = last // LOG_ROWS + 1
-        page = count - 1 if page is None else page
-        if not 0 <= page < count:
-            raise KeyError(page)
         return self._render(
             "log.html",
             here="log.html",
@@ -235,47 +280,38 @@ class Pages:
             page=page,
             pages=[
                 (n, _log_page(n), n * LOG_ROWS, min((n + 1) * LOG_ROWS - 1, last))
-                for n in range(count)
+                for n in range(last // LOG_ROWS + 1)
             ],
         )
 
-    def method(self) -> str:
-        """The page of formulas."""
+    def _method(self) -> str:
         regions = charts.region_labels(self.document.protocol.edges)
         return self._render("method.html", here="method.html", title="Method", regions=regions)
 
-    def suite(self) -> str:
-        """The page of the tasks."""
+    def _suite(self) -> str:
+        classes, seeds = tables.task_rows(self.document), self._overview["seeds"]
         return self._render(
-            "suite.html",
-            here="suite.html",
-            title="Suite",
-            classes=rows.task_rows(self.document),
-            seeds=self._overview["seeds"],
+            "suite.html", here="suite.html", title="Suite", classes=classes, seeds=seeds
         )
 
-    def season_list(self) -> str:
-        """The page of all seasons."""
+    def _season_list(self) -> str:
         return self._render("seasons.html", here="seasons.html", title="Sealed seasons")
 
-    def season(self, id: str) -> str:
-        """The page of a season, before, during and after it.
+    def _season_page(self, id: str) -> Any:
+        return season_page(self.store, self._seasons[id])
 
-        Raises:
-          KeyError: there is no such season.
-        """
-        row = self._seasons[id]
-        page = season_page(self.store, row)
+    def _season(self, name: str) -> bytes | None:
+        """The page of a season, before, during and after it."""
+        id, _, kind = name.rpartition(".")
+        if kind != "html" or id not in self._seasons:
+            return None
+        page = self._season_page(id)
+        title, reasons = page.row.title, ranking.REASONS
         return self._render(
-            "season.html",
-            here="",
-            root="../",
-            title=row.title,
-            page=page,
-            reasons=ranking.REASONS,
-        )
+            "season.html", here="", root="../", title=title, page=page, reasons=reasons
+        ).encode()
 
-    def data_js(self) -> str:
+    def _data_js(self) -> str:
         """`board-data.js`: the data of the comparison. A script, since `file:` forbids `fetch`."""
 
         def rounded(estimate: Estimate) -> list[float | None]:
@@ -298,93 +334,25 @@ class Pages:
         }
         return f"window.boardData = {json.dumps(data, separators=(',', ':'))};\n"
 
-    def read(self, path: str) -> bytes | None:
-        """A file of the site by its path, such as `ood_regret.html`; None if there is none.
-
-        Raises:
-          NotPublishable: see `entries`.
-        """
-        folder, _, name = path.rpartition("/")
-        if folder == "static":
-            return self._static.get(name)
-        if path in _DEFINITIONS:  # without scores, and needed to train for the board
-            return to_json(_DEFINITIONS[path](self.document).to_dict()).encode()
-        if self.preparing and (path.endswith(".html") or folder == "submissions"):
-            return self._prepared(folder, name)
-        self.entries  # noqa: B018  raises if the board may not publish
-        if folder in ("submissions", "results"):
-            return self._document(folder, name)
-        if folder == "explorers":
-            return self._explorer(name)
-        if folder == "seasons":
-            id, _, kind = name.rpartition(".")
-            return self.season(id).encode() if kind == "html" and id in self._seasons else None
-        render = None if folder else self._top.get(name)
-        return render().encode() if render is not None else None
-
-    def paths(self) -> Iterator[str]:
-        """The paths of all files of the site; `index.html` last, so that its links work."""
-        yield from (f"static/{name}" for name in self._static)
-        yield from _DEFINITIONS
-        for entry in self.entries:
-            digits = hex_of(entry.id)
-            yield f"submissions/{digits}.json"
-            if entry.scores is not None or entry.code:
-                yield f"results/{digits}.json"
-            yield from (f"explorers/{digits}-{n}.html" for n in self._explored(entry.id))
-            yield f"submissions/{digits}.html"
-        yield from (f"seasons/{id}.html" for id in self._seasons)
-        yield from self._top
-
-    @cached_property
-    def _top(self) -> dict[str, Callable[[], str]]:
-        """The files of the top folder by name: functions that render them."""
-        logs = range(self.store.head[0] // LOG_ROWS + 1)
-        return {
-            **{_log_page(number): partial(self.log, number) for number in logs},
-            "board-data.js": self.data_js,
-            "log.html": self.log,
-            "method.html": self.method,
-            "suite.html": self.suite,
-            "compare.html": self.compare,
-            **({"seasons.html": self.season_list} if self._seasons else {}),
-            **{
-                f"{tab.stem}.{kind}": partial(self._export, tab.key, kind)
-                for tab in TABS
-                for kind in _EXPORTS
-            },
-            **{tab.page: partial(self.board, tab.key) for tab in reversed(TABS)},
-        }
-
-    def _prepared(self, folder: str, name: str) -> bytes | None:
-        """A file without scores, while the reference rows wait."""
-        if folder == "submissions":
-            return self._document(folder, name)
-        if folder == "seasons":
-            id, _, kind = name.rpartition(".")
-            if kind != "html" or id not in self._seasons:
-                return None
-            # The scorer of the reference rows has scored the entries, too.
-            scored = any(season_page(self.store, self._seasons[id]).rankings.values())
-            return (self.preparation("../") if scored else self.season(id)).encode()
-        if folder or name not in self._top:
-            return None
-        render = self.preparation if name in _NEED_SCORES else self._top[name]
-        return render().encode()
-
-    def _export(self, metric: Metric, kind: str) -> str:
-        rows = ranking.ranking(self.entries, metric)
+    def _file(self, metric: Metric, kind: str) -> str:
+        """The ranking by a metric as JSON, CSV or LaTeX."""
         # The date is the log's, not the clock's, so that the same board gives equal bytes.
-        (last,) = self.store.log(self.store.head[0], 1)
-        return _EXPORTS[kind](rows, metric, self.document, self.store.head[:2], last.time)
+        [last] = self.store.log(self.store.head[0], 1)
+        rows = ranking.ranking(self.entries, metric)
+        head = self.store.head[:2]
+        file = tables.RankingFile(rows, metric, self.document, head, last.time)
+        if kind == "json":
+            return to_json(file.to_dict())
+        return file.to_csv() if kind == "csv" else file.to_latex()
 
     def _document(self, folder: str, name: str) -> bytes | None:
+        """The page of a submission, or its document or result."""
         digits, _, kind = name.partition(".")
         id = f"sha256:{digits}"
         if id not in self._by_id:
             return None
         if kind == "html" and folder == "submissions":
-            return self.submission(id).encode()
+            return self._submission(id).encode()
         if kind != "json":
             return None
         _, result = self._documents(id)
@@ -403,8 +371,7 @@ class Pages:
         """The runs of a submission that have an explorer."""
         if not self._explorers or self._by_id[id].status != "scored":
             return []
-        signed, _ = self._documents(id)
-        runs = enumerate(signed.submission.runs)
+        runs = enumerate(self._documents(id)[0].submission.runs)
         return [n for n, run in runs if run.artefact is not None and run.spec in self._shown]
 
     def _explorer(self, name: str) -> bytes | None:
@@ -413,25 +380,20 @@ class Pages:
         id = f"sha256:{digits}"
         if id not in self._by_id or number not in map(str, self._explored(id)):
             return None
-        from leaderboard.web.site import explorers
-
         submission = self._documents(id)[0].submission
         run, method = submission.runs[int(number)], submission.method
         assert run.artefact is not None  # it is explored
         data = self.store.objects.read(run.artefact.sha256)
         title = f"{method.name} {method.version}"
-        return explorers.explorer(title, data, self._shown[run.spec]).encode()
+        return charts.explorer(title, data, self._shown[run.spec]).encode()
 
     @cached_property
     def _shown(self) -> dict[str, SMESpec]:
         """The instances that an explorer can show, by digest."""
-        from leaderboard.web.site import explorers
-
-        instances = self.document.instances.items()
         return {
             digest: spec.named(f"{name}, instance {digest[7:19]}")
-            for digest, (name, spec) in instances
-            if explorers.can_show(spec)
+            for digest, (name, spec) in self.document.instances.items()
+            if charts.can_show(spec)
         }
 
     @cached_property
@@ -439,9 +401,9 @@ class Pages:
         """The files in static/, by name."""
         if not self._explorers:
             return _static()
-        from leaderboard.web.site import explorers
+        from sme_registry.explorer import STATIC as of_explorers
 
-        return {**_static(), **{name: text.encode() for name, text in explorers.STATIC.items()}}
+        return {**_static(), **{name: text.encode() for name, text in of_explorers.items()}}
 
     @cached_property
     def _seasons(self) -> dict[str, SeasonRow]:
@@ -469,6 +431,10 @@ class Pages:
         return [entry for entry in self.entries if entry.scores and entry.status == "scored"]
 
     @cached_property
+    def _class_of(self) -> dict[str, str]:
+        return {digest: name for digest, (name, _) in self.document.instances.items()}
+
+    @cached_property
     def _common(self) -> dict[str, Any]:
         """What every page needs. Documents compute their digests on each access."""
         document = self.document
@@ -482,14 +448,11 @@ class Pages:
             },
             "learned": ranking.LEARNED,
             "seasons": list(self._seasons.values()),
-            "marks": rows.MARKS,
+            "marks": tables.MARKS,
             "address_digits": SHORT,
             "metrics": TABS,
+            "places": tables.places(self._listed),
         }
-
-    @cached_property
-    def _class_of(self) -> dict[str, str]:
-        return {digest: name for digest, (name, _) in self.document.instances.items()}
 
     def _render(self, template: str, **values: Any) -> str:
         return _environment().get_template(template).render({**self._common, **values})
@@ -511,13 +474,13 @@ def _environment() -> Environment:
         auto_reload=False,
     )
     environment.filters |= {
-        "day": rows.day,
+        "day": tables.day,
         "hex": hex_of,
-        "https_only": rows.https_only,
-        "minute": rows.minute,
+        "https_only": tables.https_only,
+        "minute": tables.minute,
         "number": charts.number,
-        "short": lambda digest, digits=12: hex_of(digest)[:digits],
-        "steps": rows.steps_text,
+        "short": tables.short,
+        "steps": tables.steps_text,
     }
     return environment
 
