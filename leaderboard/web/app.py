@@ -1,6 +1,6 @@
-"""`create_app`: a board over HTTP, with the pages of `site` and a small API.
+"""`create_app`: a board over HTTP, with its pages and a small API.
 
-    GET  /…                              the pages, at the paths that `site` writes them to
+    GET  /…                              the pages, at the paths of `pages`
     PUT  /api/objects/<hex>              upload an artefact; signed, see `intake.uploads`
     GET  /api/objects/<hex>              its bytes, once it is scored, so that anyone can rescore it
     POST /api/submissions                202 accepted, 200 already known
@@ -11,7 +11,7 @@
          /api/seasons/…                  sealed seasons, see `seasons`
     GET  /healthz                        200 while the server runs; scoring: ok, waiting or fault
 
-An error is {"code", "message"}: the code of a `Rejection`, or one of `errors.HTTP_CODES`. The
+An error is {"code", "message"}: the code of a `Rejection`, or one of `http.HTTP_CODES`. The
 server keeps no sessions and sets no cookies; every request that changes the board is signed.
 """
 
@@ -72,13 +72,8 @@ def create_app(
       score_workers: number of scorer processes that run as long as the application does.
       url: the board's public address, shown on its pages; empty if it is not known. It is never
         taken from a request, whose Host header anyone can choose.
-      isolation: of the scorers' sandboxes. "process", resource limits alone, is for a board to
-        which nobody else can submit.
+      isolation: of the scorers' sandboxes; "process" if nobody else can submit to the board.
       season_secrets: the masters of the sealed-online seasons that this server steps.
-
-    Raises:
-      BoardError: the folder holds no board, bubblewrap is to isolate scorers and does not work, a
-        master is of no season of the board, or another server steps its season.
     """
     if score_workers:
         _refuse_missing(isolation)
@@ -263,8 +258,6 @@ class _Routes:
 
 
 class _CachedFile(NamedTuple):
-    """A rendered file and its ETag."""
-
     content: bytes
     tag: str
 
@@ -285,7 +278,6 @@ class _PageCache:
         self._files: dict[tuple[_Render, str], _CachedFile] = {}  # in the order of their last use
 
     def get(self, render: _Render, name: str) -> _CachedFile:
-        """The file of this name, rendered if it is not cached."""
         head = self._store.head, self._store.queue.faults()
         if head != self._head:
             self._head, self._pages = head, Pages(self._store, self._address)

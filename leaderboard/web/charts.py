@@ -35,16 +35,11 @@ def number(value: float, digits: int = 3) -> str:
 
 @dataclass(frozen=True)
 class Scale:
-    """An axis.
-
-    Attributes:
-      low, high: its ends; `low < high`.
-      ticks: round numbers from end to end.
-    """
+    """An axis."""
 
     low: float
-    high: float
-    ticks: tuple[float, ...]
+    high: float  # more than `low`
+    ticks: tuple[float, ...]  # round numbers from end to end
 
     @classmethod
     def covering(cls, *values: float) -> Scale:
@@ -66,11 +61,8 @@ class Scale:
 class Bars:
     """The bars of a table on one scale, with lines at the reference rows.
 
-    Hidden from screen readers, because the same numbers are in the next cell.
-
-    Args:
-      estimates: of all rows.
-      references: the value of each reference row, by class name.
+    Hidden from screen readers, because the same numbers are in the next cell. `estimates` are those
+    of all rows, `references` the value of each reference row.
     """
 
     def __init__(self, estimates: Sequence[Estimate], references: Mapping[str, float]) -> None:

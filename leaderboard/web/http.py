@@ -82,11 +82,7 @@ class RequestError(Exception):
 
 
 async def read_body(request: Request, limit: int, name: str) -> bytes:
-    """A whole body of at most `limit` bytes; of a larger one no more is kept.
-
-    Raises:
-      Rejection: `too_large`.
-    """
+    """A whole body; one of more than `limit` bytes is `too_large`, and no more of it is kept."""
     too_large = Rejection(
         "too_large", f"{name}: must be at most {limit:,} bytes. Send a smaller one."
     )
@@ -107,7 +103,6 @@ class SecurityHeaders:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -151,13 +146,11 @@ def _is_safe(scope: Scope) -> bool:
 
 
 async def on_rejection(request: Request, error: Exception) -> Response:
-    """The answer to a `Rejection` or a `RequestError`."""
     assert isinstance(error, Rejection | RequestError)
     return error_answer(request, error.code, error.message)
 
 
 async def on_http_error(request: Request, error: Exception) -> Response:
-    """The answer to an error that Starlette raises."""
     assert isinstance(error, HTTPException)
     code = {404: "not_found", 405: "method_not_allowed"}.get(error.status_code, "bad_request")
     return error_answer(request, code, f"{HTTP_CODES[code]}.", headers=error.headers)

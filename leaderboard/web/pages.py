@@ -55,12 +55,8 @@ _NEED_SCORES = (*(tab.page for tab in TABS), "compare.html")
 class Pages:
     """The pages of a board in its present state. Create another when its log has grown.
 
-    Args:
-      store: an open store; it is only read.
-      address: the URL at which the board accepts submissions; empty if it is served at an unknown
-        URL; None for a copy that accepts none.
-      explorers: whether there is an explorer of each policy. They take a second each, so a server
-        has none.
+    `address` is the URL at which the board accepts submissions; empty if it is served at an unknown
+    URL; None for a copy that accepts none. Explorers take a second each, so a server has none.
     """
 
     def __init__(
@@ -74,11 +70,7 @@ class Pages:
 
     @cached_property
     def entries(self) -> list[EntryRow]:
-        """Every entry of the board.
-
-        Raises:
-          NotPublishable: the reference rows are missing or differ from 0 and 1.
-        """
+        """Every entry; `NotPublishable` if the reference rows are missing or off."""
         ranking.refuse_unpublishable(self._listed)
         return self._listed
 
@@ -92,11 +84,7 @@ class Pages:
         return False
 
     def read(self, path: str) -> bytes | None:
-        """A file of the site by its path, such as `ood_regret.html`; None if there is none.
-
-        Raises:
-          NotPublishable: see `entries`.
-        """
+        """A file of the site by its path, such as `ood_regret.html`; None if there is none."""
         folder, _, name = path.rpartition("/")
         if folder == "static":
             return self._static.get(name)
@@ -169,7 +157,6 @@ class Pages:
         return render().encode()
 
     def _board(self, tab: tables.MetricTab) -> str:
-        """The board by a metric."""
         ranked = ranking.ranking(self.entries, tab.key)
         scores = [row.entry.scores for row in ranked if row.entry.scores]
         regrets = [[each.value for each in one.normalised_regret] for one in scores]
@@ -459,7 +446,6 @@ class Pages:
 
 
 def content_type(path: str) -> str:
-    """The media type of a file of the site."""
     return _TYPES[Path(path).suffix]
 
 

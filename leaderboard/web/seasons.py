@@ -69,15 +69,7 @@ _T = TypeVar("_T")
 
 
 class SeasonRoutes:
-    """The handlers of the online track.
-
-    Args:
-      store: the board.
-      secrets: paths of the masters of the seasons that this server steps.
-
-    Raises:
-      BoardError: a master belongs to no season of the board, or another server steps its season.
-    """
+    """The handlers; `secrets` are paths of the masters of the seasons that this server steps."""
 
     def __init__(self, store: Store, secrets: Iterable[str | os.PathLike[str]]) -> None:
         self._store = store
@@ -120,12 +112,10 @@ class SeasonRoutes:
         ]
 
     async def get_seasons(self, request: Request) -> Response:
-        """The board's seasons, in the order in which they were announced."""
         rows = await self._in_thread(self._store.seasons)
         return JSONResponse({"seasons": [self._view(row) for row in rows]})
 
     async def get_season(self, request: Request) -> Response:
-        """One season, with its document, and its master after the reveal."""
         name = request.path_params["season"]
 
         def view() -> dict[str, Any]:
@@ -137,7 +127,6 @@ class SeasonRoutes:
         return JSONResponse(await self._in_thread(view))
 
     async def get_ranking(self, request: Request) -> Response:
-        """The methods with results, ranked: online as tickets end, offline after the reveal."""
         name = request.path_params["season"]
         text = request.query_params.get("metric", RANKED_METRICS[0])
         metric = next((each for each in RANKED_METRICS if each == text), None)
@@ -156,7 +145,6 @@ class SeasonRoutes:
         return Response(await _run(ranked, self._rankings), media_type="application/json")
 
     def _view(self, row: SeasonRow) -> dict[str, Any]:
-        """What is public of a season in short."""
         return {
             "id": row.id,
             "digest": row.digest,
@@ -169,7 +157,6 @@ class SeasonRoutes:
         }
 
     async def post_ticket(self, request: Request) -> Response:
-        """Start a ticket."""
         tickets = self.tickets_of(request.path_params["season"])
         text = await read_body(request, MAX_BYTES, "ticket")
         header = request.headers.get("Authorization")
@@ -184,7 +171,6 @@ class SeasonRoutes:
         return JSONResponse(ticket.to_dict(), 201 if new else 200)
 
     async def post_entry(self, request: Request) -> Response:
-        """Store an entry of the offline track, whose answers have been uploaded."""
         name = request.path_params["season"]
         text = await read_body(request, MAX_BYTES, "entry")
 
@@ -199,14 +185,12 @@ class SeasonRoutes:
         return JSONResponse({"id": envelope.id}, 201 if new else 200)
 
     async def get_ticket(self, request: Request) -> Response:
-        """A ticket's status."""
         tickets = self.tickets_of(request.path_params["season"])
         number, token = _small(request.scope, "ticket"), _token(request.scope)
         status = await self._in_thread(lambda: tickets.status(number, token))
         return JSONResponse(status.to_dict())
 
     async def start(self, request: Request) -> Response:
-        """Begin an instance, or go on."""
         text = request.query_params.get("lanes", "")
         if not (text.isascii() and text.isdigit() and len(text) < 10):
             raise RequestError("bad_request", f"lanes={text!r:.80}: must be a number. Correct it.")
@@ -215,25 +199,21 @@ class SeasonRoutes:
         return _octets(await self._in_thread(lambda: tickets.start(*where, lanes)))
 
     async def finish(self, request: Request) -> Response:
-        """Take no more steps of an instance."""
         tickets, where = self.place(request.scope)
         await self._in_thread(lambda: tickets.finish(*where))
         return Response()
 
     async def challenge(self, request: Request) -> Response:
-        """The challenge states of an instance."""
         tickets, where = self.place(request.scope)
         await self._in_thread(lambda: tickets.refuse_challenge(*where))
         return _octets(await _run(lambda: tickets.challenge(*where), self._challenges))
 
     async def journal(self, request: Request) -> Response:
-        """The digest of an instance's steps."""
         tickets, where = self.place(request.scope)
         digest = await _run(lambda: tickets.journal_digest(*where), self._challenges)
         return JSONResponse(wire.JournalDigest(journal=digest).to_dict())
 
     async def answer(self, request: Request) -> Response:
-        """Store the answers to a challenge."""
         tickets, where = self.place(request.scope)
         limit = await self._in_thread(lambda: tickets.answer_bytes(*where))
         data = await read_body(request, limit, "answers")
@@ -242,7 +222,6 @@ class SeasonRoutes:
         return Response(status_code=201 if new else 200)
 
     async def step(self, request: Request) -> Response:
-        """Take the steps of a request."""
         tickets, where = self.place(request.scope)
         body = await read_body(request, tickets.step_bytes, "steps")
         steps = tickets.quick_step(*where, body)
@@ -251,12 +230,6 @@ class SeasonRoutes:
         return _octets(steps)
 
     def tickets_of(self, season: str) -> Tickets:
-        """The tickets of a season that this server steps.
-
-        Raises:
-          Rejection: `season_unknown`, or `season_track` if the season is not online.
-          RequestError: `season_not_served`.
-        """
         found = self._tickets.get(season)
         if found is not None:
             return found
@@ -311,39 +284,23 @@ def _octets(data: bytes) -> Response:
 
 @dataclass(frozen=True)
 class EntrantRow:
-    """An entry or ticket in the table of a season.
-
-    Attributes:
-      row: its row of the index.
-      counts: whether it counts; a later entry of its key and method replaces it otherwise.
-      online_regret: mean over the instances; None offline, and before its end.
-      curve: of that over the budget, drawn; empty likewise.
-    """
+    """An entry or ticket in the table of a season."""
 
     row: SealedRow
-    counts: bool
-    online_regret: float | None
-    curve: Markup
+    counts: bool  # a later entry of its key and method replaces it otherwise
+    online_regret: float | None  # mean over the instances; None offline, and before its end
+    curve: Markup  # of that over the budget, drawn; empty likewise
 
 
 @dataclass(frozen=True)
 class SeasonPage:
-    """All that the page of a season shows.
-
-    Attributes:
-      settings: of each class, the fields that differ from a spec's defaults.
-      rankings: by declared knowledge, of methods with results.
-      keys: how often each key takes part.
-      master: 64 hex digits after the reveal; empty before.
-    """
-
     row: SeasonRow
     season: Season
-    settings: list[str]
+    settings: list[str]  # of each class, the fields that differ from a spec's defaults
     entrants: list[EntrantRow]
-    rankings: dict[Knowledge, list[RankedRow]]
-    keys: dict[str, OfKey]
-    master: str
+    rankings: dict[Knowledge, list[RankedRow]]  # by declared knowledge, of methods with results
+    keys: dict[str, OfKey]  # how often each takes part
+    master: str  # 64 hex digits after the reveal; empty before
 
     @property
     def online(self) -> bool:

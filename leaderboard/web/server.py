@@ -59,20 +59,12 @@ def serve(
       port: 0 for any free port.
       workers: number of scorer processes; 0 for none.
       announce: called with the board's URL once it listens.
-      url: the board's public address, such as that of its proxy, which its pages show; empty if it
-        is not known.
+      url: the board's public address, which its pages show; empty if it is not known.
       behind_proxy: only a reverse proxy reaches this address, as in docs/guides/deployment.md.
       unsafe_no_sandbox: score without bubblewrap. Submitted policies could then read the files of
         this account and use the network, so nobody else may be able to submit. Not with the master
         of a season, which is one of these files.
       season_secrets: the files of the masters of the sealed-online seasons that are stepped.
-
-    Raises:
-      BoardError: the folder holds no board, the address cannot be used, bubblewrap, which the
-        scorers need, does not work, or a master is of no season of the board.
-      OptionError: the public address is invalid, the host needs a proxy in front, or scoring
-        without bubblewrap would let policies read the master of a season.
-      MissingDependencyError: FastAPI or uvicorn is not installed.
     """
     if url and not _PUBLIC_URL.fullmatch(url):
         raise OptionError(
@@ -115,7 +107,6 @@ def serve(
 
 
 def server_config(app: FastAPI) -> uvicorn.Config:
-    """How uvicorn serves a board."""
     import uvicorn
 
     return uvicorn.Config(
@@ -141,11 +132,6 @@ def _is_loopback(host: str) -> bool:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A socket that listens on an address.
-
-    Raises:
-      BoardError: the address is invalid or in use.
-    """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         listener = socket.create_server((host, port), family=family)
@@ -160,7 +146,6 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def url_of(listener: socket.socket) -> str:
-    """The URL of a listening socket."""
     host, port = listener.getsockname()[:2]
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
@@ -172,24 +157,11 @@ def write_site(
     *,
     explorers: bool = False,
 ) -> Path:
-    """Write the board's pages into a folder. Each file is written completely or not at all.
+    """Write the board's pages into a folder, and return the path of `index.html`.
 
-    The same board gives the same bytes. Unchanged files and other files are left alone.
-
-    Args:
-      store: an open store; it is only read.
-      out: the folder; created if it is missing.
-      progress: called with the number of files written and of all files.
-      explorers: whether to write an explorer of each run of each scored submission, of 60 kB or
-        more and in a second each.
-
-    Returns:
-      The path of `index.html`.
-
-    Raises:
-      NotPublishable: the reference rows are missing or differ from 0 and 1; nothing is written.
-      OptionError: the folder is a board, or a folder of a board's files.
-      BoardError: a file cannot be written.
+    Each file is written completely or not at all. The same board gives the same bytes. Unchanged
+    files and other files are left alone. Explorers, of each run of each scored submission, have
+    60 kB or more and take a second each.
     """
     out = Path(out)
     _refuse_board(out)

@@ -50,12 +50,10 @@ class MetricTab:
 
     @property
     def symbol(self) -> str:
-        """Such as N₀."""
         return SYMBOLS[self.key]
 
     @property
     def label(self) -> str:
-        """Such as WD regret N₀."""
         return LABELS[self.key]
 
 
@@ -186,7 +184,6 @@ def minute(time: str) -> str:
 
 
 def short(digest: str, digits: int = 12) -> str:
-    """The first digits of a digest."""
     return hex_of(digest)[:digits]
 
 
@@ -360,11 +357,7 @@ class PublicView:
 
     @classmethod
     def from_dict(cls, plain: dict[str, Any]) -> PublicView:
-        """The view that `to_dict` wrote, as a served board answers it, or an earlier version.
-
-        Raises:
-          SpecError: it is not such a view.
-        """
+        """The view that `to_dict` wrote, here or in an earlier version of a served board."""
         try:
             result, withdrawal = plain["result"], plain["withdrawal"]
             signed = {name: plain[name] for name in ("submission", "signature")}
@@ -394,7 +387,6 @@ class PublicView:
         return view
 
     def to_dict(self) -> dict[str, Any]:
-        """The view as plain data."""
         return {
             "id": self.id,
             "status": self.status,

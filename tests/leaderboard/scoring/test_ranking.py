@@ -2,7 +2,6 @@
 
 import csv
 import io
-import json
 import random
 from dataclasses import replace
 
@@ -13,9 +12,9 @@ from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Estimate, Scores
 from leaderboard.errors import NotPublishable
-from leaderboard.exports import to_csv, to_json, to_latex
 from leaderboard.scoring.ranking import ranking, refuse_unpublishable, superseded
 from leaderboard.store import EntryRow, Likeness
+from leaderboard.web.tables import RankingFile
 from sme_registry import EvaluationProtocol
 from sme_registry.spec import Suite
 
@@ -262,8 +261,12 @@ def hostile_rows():
     return ranking([*REFERENCES, evil, tex], "wd_regret")
 
 
+def file(rows, metric="wd_regret"):
+    return RankingFile(rows, metric, BOARD, HEAD, DATE)
+
+
 def csv_of(rows, metric="wd_regret"):
-    return list(csv.DictReader(io.StringIO(to_csv(rows, metric, BOARD, HEAD, DATE))))
+    return list(csv.DictReader(io.StringIO(file(rows, metric).to_csv())))
 
 
 def test_no_cell_of_the_csv_is_a_formula():
@@ -278,13 +281,15 @@ def test_no_cell_of_the_csv_is_a_formula():
     assert lines[1]["method"] == "'" + HOSTILE
     assert lines[1]["version"] == "'-1"  # text that looks like a negative number stays text
     assert float(lines[1]["ood_decay"]) == pytest.approx(-0.1)
-    text = to_csv(hostile_rows(), "wd_regret", BOARD, HEAD, DATE)
+    text = file(hostile_rows()).to_csv()
     assert '"a;=1+1 =2"' in text  # whole in its quotes, where semicolons split cells, too
-    for start in ["=", "+", "-", "@", "\t=", " =", "\r=", "＝", "|", "%", "\x00=", "\u202e="]:
+    for start in ["=", "+", "-", "@", "\t=", " =", "\r=", "＝", "|", "%"]:
         (line,) = csv_of(
             ranking([entry(3, scores(0.1, 0.2), submitter=f"{start}cmd")], "wd_regret")
         )
         assert line["submitter"] == f"'{start[-1]}cmd"
+    (line,) = csv_of(ranking([entry(3, scores(0.1, 0.2), submitter="\x00\u202e=cmd")], "wd_regret"))
+    assert line["submitter"] == r"\x00\u202e=cmd"
 
 
 def test_the_csv_has_every_score_with_its_interval():
@@ -306,11 +311,11 @@ def test_an_export_has_what_an_entry_ranks_by_its_steps_per_run_and_what_it_copi
     assert float(line["ood_decay"]) == pytest.approx(-0.2)
     assert (line["steps_per_run"], line["copied_runs"]) == ("100", "2")
     assert line["copy_of"] == "sha256:" + "a" * 64
-    assert r"& 10 & 100 & " in to_latex(rows, "ood_decay", BOARD, HEAD, DATE)
+    assert r"& 10 & 100 & " in file(rows, "ood_decay").to_latex()
 
 
 def test_names_are_escaped_in_latex_and_stay_on_their_line():
-    text = to_latex(hostile_rows(), "wd_regret", BOARD, HEAD, DATE)
+    text = file(hostile_rows()).to_latex()
     line = next(line for line in text.splitlines() if "passwd" in line)
     assert line == (
         r"2 & \textbackslash{}input\{/etc/passwd\} 50\% \& \$x\_1\textasciicircum{}2\$ "
@@ -318,22 +323,22 @@ def test_names_are_escaped_in_latex_and_stay_on_their_line():
         r"$0.600$ [$0.550$, $0.650$] & $0.700$ [$0.650$, $0.750$] & $0.100$ [$0.050$, $0.150$] \\"
     )
     rows = ranking([entry(3, scores(0.1, 0.2), submitter="a\n\\end{tabular}\u2028b")], "wd_regret")
-    lines = to_latex(rows, "wd_regret", BOARD, HEAD, DATE).splitlines()
+    lines = file(rows).to_latex().splitlines()
     assert sum("tabular" in line for line in lines) == 3
     assert r"a \textbackslash{}end\{tabular\} b" in "\n".join(lines)
 
 
 def test_the_json_has_the_whole_scores():
-    plain = json.loads(to_json(hostile_rows(), "wd_regret", BOARD, HEAD, DATE))
+    plain = file(hostile_rows()).to_dict()
     assert plain["metric"] == "wd_regret"
     assert [row["not_ranked"] for row in plain["rows"]] == ["reference", "", "", "reference"]
     assert Scores.from_dict(plain["rows"][1]["scores"]) == scores(0.3, 0.2)
     assert plain["rows"][1]["method"] == HOSTILE
 
 
-@pytest.mark.parametrize("write", [to_csv, to_latex, to_json])
-def test_every_export_names_its_suite_protocol_and_log(write):
-    text = write(hostile_rows(), "wd_regret", BOARD, HEAD, DATE).replace(r"\_", "_")
+def test_every_export_names_its_suite_protocol_and_log():
+    ranked = file(hostile_rows())
     suite, protocol = BOARD.suite.digest, BOARD.protocol.digest
-    for fact in ("small_suite-v1", suite, "few-v1", protocol, HEAD[1], DATE):
-        assert fact in text
+    for text in (ranked.to_csv(), ranked.to_latex(), str(ranked.to_dict())):
+        for fact in ("small_suite-v1", suite, "few-v1", protocol, HEAD[1], DATE):
+            assert fact in text.replace(r"\_", "_")
