@@ -410,7 +410,7 @@ def probe_layers(
     observation = batch.observation(batch.seen(task), task.spec.horizon)
     targets = np.concatenate([batch.s, batch.d], axis=1).astype(np.float64)
 
-    def probe(layer: int, h: Array) -> LayerProbe:
+    def probe(layer: int, h: npt.NDArray[np.floating]) -> LayerProbe:
         if not np.isfinite(h).all():
             raise PolicyError(f"hidden layer {layer}: has outputs that are NaN or infinite.")
         r2 = held_out_r2(h.astype(np.float64), targets)
@@ -425,7 +425,7 @@ def probe_layers(
     layers = hidden(observation.copy())
     if layers is None:
         return ()
-    outputs = [observation[:, :-2].astype(np.float64), *layers]
+    outputs: list[npt.NDArray[np.floating]] = [observation[:, :-2], *layers]
     if any(_STATES_PER_UNKNOWN * (h.shape[1] + 1) > count // 2 for h in outputs):
         return ()
     return tuple(probe(layer, h) for layer, h in enumerate(outputs))
