@@ -192,7 +192,8 @@ class _Board:
         except SealedError as error:
             if error.code in CODES:
                 raise Rejection(error.code, error.message) from None
-            raise BoardError(f"{self._url}: {error.message}") from None
+            named = error.code in ("unreachable", "http", "wire")  # the client's own, with the URL
+            raise BoardError(error.message if named else f"{self._url}: {error.message}") from None
         with contextlib.suppress(MalformedDocumentError):
             return parse_json(data, self._url)
         return None

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import uvicorn
     from fastapi import FastAPI
 
-_CONNECTIONS = 400  # and so fewer open files than the 1,024 that systems usually allow
+_CONNECTIONS = 800  # and so fewer open files than the 1,024 that systems usually allow
 _HEAD_BYTES = 2**14
 _WRITERS = 8  # threads of `write_site` that wait for the disk
 # Its characters need no quotes in the commands that the pages show.

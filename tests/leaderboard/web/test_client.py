@@ -161,6 +161,7 @@ def test_a_server_that_is_no_board_is_reported(status, body):
     with scripted(lambda *_: (status, body)) as (url, _), pytest.raises(BoardError) as caught:
         client.status(url, "0" * 64)
     assert len(str(caught.value)) < 1000
+    assert str(caught.value).count(url) == 1
 
 
 def test_an_answer_is_raw_bytes_up_to_a_limit(monkeypatch):
