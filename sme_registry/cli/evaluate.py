@@ -29,7 +29,7 @@ from sme_registry.cli.arguments import (
 )
 from sme_registry.diagnosis import AnySubject
 from sme_registry.diagnosis.figures import draw
-from sme_registry.errors import OptionError, UnknownNameError
+from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, Policy, StreamReport, TeamPolicy
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.io import check_new, integer_in, write_atomically
@@ -218,45 +218,30 @@ class SubjectOptions:
     action_range: ActionRange = None
     set_: SpecChanges = None
 
-    def check(self, what: str) -> None:
+    def subject(self, what: str, *, or_task: bool = False) -> Any:
+        """The policy on a task, the cell of a study, the run; or the spec of a task."""
+        fields = changes(self.set_)
         if self.task is not None:
             if self.cell is not None:
                 raise OptionError("--cell: names a cell of a study, --task a policy's task.")
-        elif self.action_range is not None:
-            raise OptionError("--action-range: applies to a policy with --task; a run has its own.")
-        elif self.log is not None:
-            raise OptionError("--log: is the log of a policy with --task; a run has its own.")
-        elif self.set_ and (self.cell is not None or Path(what).is_dir()):
-            raise OptionError("--set: changes the task of a policy. Add --task, or leave it out.")
-
-    def subject(self, what: str) -> AnySubject:
-        """The policy on a task, the cell of a study, or the run."""
-        if self.task is not None:
-            spec = load(self.task, SMESpec).derive(**changes(self.set_))
+            spec = load(self.task, SMESpec).derive(**fields)
             return diagnosis.load_policy(what, spec, action_range=self.action_range, log=self.log)
-        if self.cell is not None:
-            return diagnosis.load_cell(what, self.cell)
-        if not Path(what).is_dir():
+        if self.action_range is not None or self.log is not None:
+            option = "--log" if self.action_range is None else "--action-range"
+            raise OptionError(f"{option}: is of a policy with --task; a run has its own.")
+        if self.cell is not None or Path(what).is_dir():
+            if fields:
+                raise OptionError("--set: changes the task of a policy. Add --task, or remove it.")
+            if self.cell is not None:
+                return diagnosis.load_cell(what, self.cell)
+            return diagnosis.load_run(what)
+        is_policy = what.endswith(_POLICY_FILES) or (":" in what and not what.startswith("sha256:"))
+        if is_policy or not or_task:
             raise OptionError(
                 f"{what!r}: is not a folder. Give a folder of `sme train`; for a policy, add the "
                 "task that it is for, such as --task Default."
             )
-        return diagnosis.load_run(what)
-
-    def subject_or_task(self, what: str) -> AnySubject | SMESpec:
-        """The same, or a task by its name, path or digest."""
-        if self.task is not None or self.cell is not None or Path(what).is_dir():
-            return self.subject(what)
-        if what.endswith(_POLICY_FILES):
-            raise OptionError(
-                f"{what!r}: is a policy. Add the task that it is for: --task Default."
-            )
-        try:
-            return load(what, SMESpec).derive(**changes(self.set_))
-        except UnknownNameError as error:
-            if ":" not in what or what.startswith("sha256:"):
-                raise
-            raise OptionError(f"{error} For a policy, add its task: --task Default.") from None
+        return load(what, SMESpec).derive(**fields)
 
     def other(self, what: str, against: str) -> AnySubject:
         """What --against names: like the argument, or a cell as STUDY:KEY or by its key."""
@@ -331,7 +316,6 @@ def diagnose(
     """
     if out_folder is not None:
         check_new(out_folder / _JSON, force=force)
-    options.check(run)
     result = diagnosis.diagnose(
         options.subject(run),
         against=None if against is None else options.other(run, against),
@@ -412,9 +396,8 @@ def explore(
     """
     integer_in("--episodes", episodes, 1, 10_000)
     pairs = [_channels(text) for text in channels or ()]
-    options.check(what)
     target = _target(what, options, out, force=force)
-    subject = options.subject_or_task(what)
+    subject = options.subject(what, or_task=True)
     is_run = not isinstance(subject, SMESpec) and options.task is None
     written = explorer.write_explorer(
         target,

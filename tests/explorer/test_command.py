@@ -58,11 +58,11 @@ def test_a_task_and_a_policy_become_pages(here):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["actor.npz"], "is a policy. Add the task that it is for"),
-        (["mine:act"], "For a policy, add its task: --task Default."),
+        (["actor.npz"], "for a policy, add the task that it is for, such as --task Default."),
+        (["mine:act"], "for a policy, add the task that it is for"),
         (["small.json", "--out", "page.txt"], "must end in .html"),
-        (["small.json", "--log", "x.csv"], "--log: is the log of a policy with --task"),
-        (["small.json", "--action-range", "unit"], "applies to a policy with --task"),
+        (["small.json", "--log", "x.csv"], "--log: is of a policy with --task"),
+        (["small.json", "--action-range", "unit"], "--action-range: is of a policy with --task"),
         (["small.json", "--episodes", "0"], "must be an integer in [1, 10,000]"),
         (["."], "contains no run.json"),
         (["Switch5"], "is a stream"),
