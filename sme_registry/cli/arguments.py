@@ -41,7 +41,7 @@ TaskName = Annotated[
     str,
     typer.Argument(
         metavar="TASK",
-        help="The task or stream: a name, a path or a digest.",
+        help="The task: a name, a path or a digest.",
         autocompletion=catalogue.completion(EnvFile, StreamFile),
     ),
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,6 +22,7 @@ from sme_registry.cli.arguments import (
     changes,
     print_checks,
     print_training,
+    with_options,
 )
 from sme_registry.datasets import (
     Dataset,
@@ -278,13 +280,28 @@ def _score_row(policy: str, score: PolicyScore, weight: str = "") -> dict[str, o
     return {"policy": policy, "weight": weight, "r̃": similarity, "r": reward, "return": returns}
 
 
-Algorithm = Annotated[str, typer.Option("--algorithm", "-a", help="bc or iql.")]
-GradientSteps = Annotated[int, typer.Option("--steps", "-n", help="Gradient steps.")]
-BatchSize = Annotated[int, typer.Option(help="Transitions in each gradient step.")]
-Hyperparameters = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="NAME=VALUE", help="Change a hyperparameter. Repeatable."),
-]
+@dataclass(frozen=True, kw_only=True)
+class TrainingOptions:
+    """Options of a training on a data set."""
+
+    algorithm: Annotated[str, typer.Option("--algorithm", "-a", help="bc or iql.")] = "iql"
+    steps: Annotated[int, typer.Option("--steps", "-n", help="Gradient steps.")] = 20_000
+    batch_size: Annotated[int, typer.Option(help="Transitions in each gradient step.")] = 256
+    seed: Annotated[int, typer.Option(help="Seed of weights, shuffling and episodes.")] = 0
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Change a hyperparameter. Repeatable."),
+    ] = None
+
+    def arguments(self) -> dict[str, Any]:
+        named = {name: getattr(self, name) for name in ("algorithm", "steps", "batch_size", "seed")}
+        return {**named, "hyperparameters": changes(self.set_)}
+
+    def progress(self) -> Progress:
+        title = f"training {self.algorithm.upper()}"
+        return Progress(title, max(1, self.steps), console=err())
+
+
 offline = typer.Typer(no_args_is_help=True)
 app.add_typer(offline, name="offline")
 
@@ -295,19 +312,16 @@ def _group() -> None:
 
 
 @offline.command()
+@with_options(TrainingOptions)
 def train(
     dataset: Annotated[
         str, typer.Argument(metavar="DATASET", help="An id from `sme dataset list`, or a path.")
     ],
-    algorithm: Algorithm = "iql",
-    steps: GradientSteps = 20_000,
-    batch_size: BatchSize = 256,
-    seed: Annotated[int, typer.Option(help="Seed of weights, shuffling and episodes.")] = 0,
+    options: TrainingOptions,
     evaluations: Annotated[int, typer.Option(help="Evaluations during training.")] = 20,
     protocol: Annotated[
         str | None, typer.Option(help="Protocol of the last evaluation; default the data set's.")
     ] = None,
-    set_: Hyperparameters = None,
     folder: Folder = None,
     out_folder: Out = None,
     force: Force = False,
@@ -330,19 +344,16 @@ def train(
       sme offline train sme/Default-v1-nu50-seed7-v0 -a iql --set expectile=0.9
       sme evaluate runs/Default-v1-nu50-seed7-v0-iql-seed0/policy.npz Default
     """
-    algorithm, _ = check_algorithm(algorithm)
+    algorithm, _ = check_algorithm(options.algorithm)
     opened = open_dataset(dataset, folder)
     if out_folder is None:
-        out_folder = Path("runs") / f"{opened.id.rsplit('/', 1)[-1]}-{algorithm}-seed{seed}"
-    with Progress(f"training {algorithm.upper()}", max(1, steps), console=err()) as progress:
+        name = opened.id.rsplit("/", 1)[-1]
+        out_folder = Path("runs") / f"{name}-{algorithm}-seed{options.seed}"
+    with options.progress() as progress:
         result = train_offline(
             opened,
-            algorithm=algorithm,
-            steps=steps,
-            batch_size=batch_size,
-            seed=seed,
-            evaluations=min(evaluations, max(1, steps)),
-            hyperparameters=changes(set_),
+            **options.arguments(),
+            evaluations=min(evaluations, max(1, options.steps)),
             protocol=protocol,
             folder=out_folder,
             force=force,
@@ -352,16 +363,13 @@ def train(
 
 
 @offline.command()
+@with_options(TrainingOptions)
 def sealed(
     dataset: Annotated[
         Path, typer.Argument(metavar="DATASET", help="The folder of a sealed data set.")
     ],
     out_file: Annotated[Path, typer.Option("--out", "-o", help="The policy's .npz file.")],
-    algorithm: Algorithm = "iql",
-    steps: GradientSteps = 20_000,
-    batch_size: BatchSize = 256,
-    seed: Annotated[int, typer.Option(help="Seed of weights and shuffling.")] = 0,
-    set_: Hyperparameters = None,
+    options: TrainingOptions,
     force: Force = False,
 ) -> None:
     """Train bc or iql on a sealed data set, whose task is hidden. Nothing is evaluated here.
@@ -373,16 +381,9 @@ def sealed(
       sme offline sealed autumn/datasets/sealed/autumn/deep-0-v0 -o deep-0.npz
     """
     check_new(out_file, force=force)
-    title = f"training {algorithm.upper()}"
-    with Progress(title, max(1, steps), console=err()) as progress:
+    with options.progress() as progress:
         policy = train_sealed(
-            dataset,
-            algorithm=algorithm,
-            steps=steps,
-            batch_size=batch_size,
-            seed=seed,
-            hyperparameters=changes(set_),
-            progress=lambda done, _: progress.update(done),
+            dataset, **options.arguments(), progress=lambda done, _: progress.update(done)
         )
     policy.save(out_file)
     print_line(escape(str(out_file)))

@@ -27,7 +27,6 @@ from sme_registry.cli.arguments import (
     print_written,
     with_options,
 )
-from sme_registry.diagnosis import AnySubject
 from sme_registry.diagnosis.figures import draw
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, Policy, StreamReport, TeamPolicy
@@ -243,7 +242,7 @@ class SubjectOptions:
             )
         return load(what, SMESpec).derive(**fields)
 
-    def other(self, what: str, against: str) -> AnySubject:
+    def other(self, what: str, against: str) -> Any:
         """What --against names: like the argument, or a cell as STUDY:KEY or by its key."""
         if self.task is None and not Path(against).exists():
             study, colon, key = against.rpartition(":")

