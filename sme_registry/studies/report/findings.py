@@ -98,13 +98,6 @@ def _tasks(analysis: Analysis) -> Found:
             yield from _no_worst(about, name, contrasts)
             continue
         yield from _worst(about, name, contrasts, worst)
-        at = of_class.get(worst.class_name)
-        yield from _position(about, worst, at)
-        if base is not None and at is not None and at.linear - base.linear > THRESHOLDS["hurt"]:
-            text = f"The linear policy had {fixed(base.linear)} on the first class, so the optimum "
-            text += "itself is harder to fit."
-            place = {"class_name": worst.class_name, "value": at.linear}
-            yield about("linear policy", "harder_to_fit", text, **place)
         yield from _other_axes(about, contrasts, worst)
         yield from _outside(about, _contrasts(analysis, name, _OOD), worst)
 
@@ -120,17 +113,6 @@ def _no_worst(about: Any, name: str, contrasts: Rows) -> Found:
     if better:
         text = f"Its WD regret is lower than on the first class with {_listed(better)}."
         yield about("other axes", "better", text)
-    highest = max((c.high for c in contrasts if not math.isnan(c.high)), default=None)
-    if highest is not None:
-        text = f"The highest end of an interval is {signed(highest)}."
-        yield about("highest", "open", text, value=highest)
-    single = _largest(c for c in contrasts if math.isnan(c.high))
-    if single is not None:
-        text = (
-            "A single pair of runs has no interval; the largest change of such a pair is "
-            f"{signed(single.change)} ({single.class_name})."
-        )
-        yield about("single", "open", text, class_name=single.class_name, value=single.change)
 
 
 def _worst(about: Any, name: str, contrasts: Rows, worst: Any) -> Found:
@@ -143,7 +125,6 @@ def _worst(about: Any, name: str, contrasts: Rows, worst: Any) -> Found:
         f"from {fixed(worst.base)} to {fixed(worst.level)}, by {change_text(worst)}."
     )
     yield about("worst", severity, text, worst)
-    yield from _larger(about, larger)
     rivals = _of_each_axis(c for c in contrasts if c.axis != worst.axis and not c.high < worst.low)
     verdict = "certain"
     text = f"It is the worst of the axes varied here: its interval begins at {signed(worst.low)}, "
@@ -160,34 +141,9 @@ def _worst(about: Any, name: str, contrasts: Rows, worst: Any) -> Found:
     yield about("certainty", verdict, text, worst)
 
 
-def _larger(about: Any, larger: Rows) -> Found:
-    if larger:
-        yield about("larger", "open", f"Larger still, but not certain: {_listed(larger)}.")
-
-
-def _position(about: Any, worst: Any, at: Any) -> Found:
-    """Where the worst level is among the constant's, which is 1, and the linear policy's."""
-    level, linear = worst.level, math.nan if at is None else at.linear
-    constant, than = "the constant action ½, which has 1", "worse" if level > linear else "better"
-    if level > 2.0 - _UNLEARNT:
-        verdict, text = "worse_than_constant", f"worse than {constant}"
-    elif level >= _UNLEARNT:
-        verdict, text = "like_constant", f"about as good as {constant}"
-    elif math.isnan(linear):
-        return
-    else:
-        verdict = f"{than}_than_linear"
-        text = f"better than {constant}, and {than} than the linear policy fitted to the optimum, "
-        text += f"which has {fixed(linear)}"
-    text = f"At {fixed(level)} it is {text}."
-    yield about("position", verdict, text, class_name=worst.class_name, value=level)
-
-
 def _other_axes(about: Any, contrasts: Rows, worst: Any) -> Found:
     worse = _of_each_axis(c for c in contrasts if c.verdict == "worse" and c.axis != worst.axis)
-    still_open = [
-        c for c in _of_each_axis(contrasts) if c.verdict != "worse" and c.change <= worst.change
-    ]
+    still_open = _of_each_axis(c for c in contrasts if c.verdict != "worse")
     certain, few = ([c for c in worse if c.enough_pairs == enough] for enough in (True, False))
     if certain:
         yield about("other axes", "worse", f"Also worse by {_listed(certain)}.")
@@ -207,7 +163,6 @@ def _outside(about: Any, contrasts: Rows, worst: Any) -> Found:
         costs = "costs" if larger else "costs most"
         text = f"Out of distribution, {what} {costs}: {_listed([far])}."
         yield about("out of distribution", "worse", text, far)
-        yield from _larger(about, larger)
 
 
 @finder
