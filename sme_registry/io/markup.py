@@ -16,26 +16,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rich import box, markup
 from rich.cells import cell_len
-from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.console import Console, ConsoleOptions, RenderResult
 from rich.padding import Padding
-from rich.segment import Segment
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from sme_registry.io.checks import visible
-
 if TYPE_CHECKING:
     from jinja2 import Environment
-
-
-class CleanConsole(Console):
-    """Shows hidden characters of a text as escapes: a name from elsewhere may hold any."""
-
-    def render(
-        self, renderable: RenderableType, options: ConsoleOptions | None = None
-    ) -> Iterator[Segment]:
-        for segment in super().render(renderable, options):
-            yield segment if segment.control else segment._replace(text=visible(segment.text))
 
 
 class TableColumn(NamedTuple):

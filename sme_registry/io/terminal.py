@@ -12,26 +12,26 @@ import os
 import re
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib import metadata
 from types import TracebackType
 from typing import Annotated, Any, ClassVar, Self, TextIO
 
 import typer
 from rich.cells import cell_len
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
 from rich.progress import BarColumn, TaskID, TextColumn
 from rich.progress import Progress as Bars
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
 from sme_registry.errors import SMEError
-from sme_registry.io.checks import hidden_in
+from sme_registry.io.checks import hidden_in, visible
 from sme_registry.io.files import to_json
-from sme_registry.io.markup import CleanConsole
 from sme_registry.io.system import missing_dependency
 
 _SECONDS_PER_DAY = 86_400
@@ -63,8 +63,11 @@ def duration_range(low: float, high: float) -> str:
 _UNLIMITED = 100_000  # columns: lines of a file or a pipe are never wrapped
 
 
-class _Console(CleanConsole):
-    """Wraps no lines of output that is no terminal, and leaves broken pipes to `CommandGroup`."""
+class _Console(Console):
+    """Shows hidden characters as escapes: a name from elsewhere may hold any.
+
+    It wraps no lines of output that is no terminal, and leaves broken pipes to `CommandGroup`.
+    """
 
     def __init__(self, file: TextIO) -> None:
         super().__init__(file=file, highlight=False)
@@ -75,6 +78,12 @@ class _Console(CleanConsole):
             )
         if not self.is_terminal:
             self.width = _UNLIMITED
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterator[Segment]:
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else segment._replace(text=visible(segment.text))
 
     def on_broken_pipe(self) -> None:
         raise BrokenPipeError
@@ -282,8 +291,8 @@ class Progress:
         done_before, start = self._rate_from or (self._done, now)
         rate = (self._done - done_before) / max(now - start, 1e-9)
         parts = [f"{self._done:,} of {self._total:,} {self._unit}"]
-        if rate > 0:
-            parts.append(_rate(rate, self._unit))
+        if rate >= 1:
+            parts.append(f"{rate:,.0f} {self._unit}/s")
         if self._done >= self._total:
             parts.append("done")
         elif rate > 0:
@@ -296,14 +305,6 @@ class Progress:
         parts = [f"{name} {state}" for name, state in self._parts.items()]
         more = f", and {len(parts) - _PARTS_NAMED} more" if len(parts) > _PARTS_NAMED else ""
         return [f"running: {', '.join(parts[:_PARTS_NAMED])}{more}"]
-
-
-def _rate(rate: float, unit: str) -> str:
-    """`280 steps/s`; where a step takes longer than a second, `3 s per run`."""
-    if rate < 1 and unit.endswith("s"):
-        one = f"{unit[:-3]}y" if unit.endswith("ies") else unit[:-1]
-        return f"{duration(1 / rate)} per {one}"
-    return f"{rate:,.0f} {unit}/s"
 
 
 class CommandGroup(TyperGroup):

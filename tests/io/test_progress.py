@@ -64,18 +64,8 @@ def test_what_precedes_the_first_steps_is_shown_at_once_and_slows_no_estimate(cl
     assert lines == [
         "training: 20 of 100 steps",
         "training: 90 of 100 steps · 1 steps/s · about 10 s left",
-        "training: 95 of 100 steps · 3 s per step · about 13 s left",
+        "training: 95 of 100 steps · about 13 s left",
     ]
-
-
-def test_a_slow_rate_names_one_of_the_unit(clock):
-    for unit, one in (("steps", "step"), ("entries", "entry")):
-        text = io.StringIO()
-        with Progress("scoring", 10, console=Console(file=text, width=200), unit=unit) as progress:
-            for done in (1, 2):
-                clock.now += 30.0
-                progress.update(done)
-        assert f"30 s per {one} " in text.getvalue()
 
 
 @pytest.mark.parametrize(("hours", "most"), [(0.05, 7), (1, 20), (24 * 30, 30)])

@@ -63,6 +63,8 @@ ARGUMENTS = {
 
 def leaves(command, path=()):
     """The names of a command and of all commands in it."""
+    for name in getattr(command, "modules", ()):
+        command.load(name)
     yield path
     for name, child in getattr(command, "commands", {}).items():
         yield from leaves(child, (*path, name))
