@@ -801,6 +801,17 @@ def test_output_is_utf8_where_the_system_has_another_encoding(arguments):
     assert (process.stdout + process.stderr).decode().isascii() is False
 
 
+@pytest.mark.parametrize("arguments", [["--help"], ["list", "--json"]])
+def test_the_help_and_the_catalogue_load_no_other_command(arguments):
+    code = (
+        "import sys; from sme_registry.cli import app\n"
+        "try: app(sys.argv[1:])\n"
+        "finally: sys.exit('scipy' in sys.modules or 'sme_registry.task' in sys.modules)"
+    )
+    command = [sys.executable, "-c", code, *arguments]
+    assert subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode == 0
+
+
 def test_the_installed_command_prints_pure_json_or_one_line_and_its_exit_code():
     listed, unknown = (
         subprocess.run([*SME, *arguments], capture_output=True, check=False, text=True)
