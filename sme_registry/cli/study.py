@@ -270,8 +270,8 @@ def compare(
         typer.Option(
             "--metric",
             "-m",
-            help="wd_regret, ood_regret, ood_decay, final_return or online_regret. Repeatable; "
-            "default wd_regret and ood_regret.",
+            help="A metric of the report's levels, such as final_return. Repeatable; default "
+            "wd_regret and ood_regret.",
         ),
     ] = None,
     out_folder: Annotated[
@@ -298,7 +298,11 @@ def compare(
     """
     from sme_registry.studies.report import write
     from sme_registry.studies.report.frames import records
-    from sme_registry.studies.report.texts import difference_caveats
+    from sme_registry.studies.report.texts import (
+        comparison_tables,
+        difference_caveats,
+        implementation_caveats,
+    )
 
     metrics = tuple(metric or write.DEFAULT_METRICS)
     differences = write.compare(folder, first, second, metrics)
@@ -308,9 +312,9 @@ def compare(
     if json:
         print_json(records(differences))
         return
-    for each in write.comparison_tables(differences):
+    for each in comparison_tables(differences):
         out().print(Table.of(f"[bold]{escape(each.title)}[/]", each.frame.to_dict("records")))
-    caveats = write.implementation_caveats(folder, first, second)
+    caveats = implementation_caveats(Ledger(folder).study_file().plan, (first, second))
     for sentence in (*difference_caveats(differences), *caveats):
         print_line(escape(sentence))
     if files:

@@ -18,7 +18,7 @@ class Metric(NamedTuple):
     key: str
     label: str
     worse: int  # +1: more of it is worse; −1: less
-    of: str  # "run", "life", "visit", "agent" of a team, "score": 1 − it is compared over classes
+    of: str  # run, life, visit, agent of a team, data of offline runs; score: 1 − it is compared
     digits: int = 2  # of its values in tables for people
     training: bool = False  # of training: the same in all regions
     needs: str = ""  # the field of tasks without which runs have no such column
@@ -31,6 +31,7 @@ METRICS = (
     Metric("ood_regret", "OOD regret", 1, "run agent score"),
     Metric("ood_decay", "OOD decay", 1, "run"),
     Metric("final_return", "final return, % of optimum", -1, "run", 1, training=True),
+    Metric("improvement", "improvement on the behaviour policy", -1, "data", 3),
     Metric("visited_regret", _VISITED, 1, "life"),
     Metric("normalised_regret", _VISITED, 1, "visit"),
     *(

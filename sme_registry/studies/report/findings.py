@@ -1,8 +1,8 @@
 """`findings`: what a study found, as a table with a verdict and a sentence in each row.
 
-A change or a metric counts if its 95 % interval excludes the neutral value, 0 or for a ratio 1; it
-is an indication if it rests on fewer than `ENOUGH_RUNS` pairs of runs or lives. Any other is open,
-which does not mean that there is no effect.
+A change or a metric counts if its 95 % interval excludes the neutral value: 0, or 1 for a ratio, or
+½ for a probability. Any other is open, which does not mean that there is no effect. A verdict that
+rests on fewer than `ENOUGH_RUNS` runs, pairs of runs or lives ends with `_few`: an indication.
 
     section      tasks, comparison, caveats, offline, streams, stream_changes, stream_caveats
     algorithm, class_name    what it is about; "" where it is about several
@@ -13,10 +13,9 @@ which does not mean that there is no effect.
 
 from __future__ import annotations
 
-import functools
+import itertools
 import math
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import pandas as pd
@@ -26,11 +25,21 @@ from sme_registry.io.markup import conjunction, fixed, plural, signed
 from sme_registry.studies.report.analysis import (
     ENOUGH_RUNS,
     OFFLINE_INTERVAL,
+    PLACE,
     Analysis,
+    RunKind,
     training_data,
 )
-from sme_registry.studies.report.design import ALL, SEVERAL, axis_label
+from sme_registry.studies.report.design import (
+    ALL,
+    METRICS,
+    SEVERAL,
+    TASKS,
+    WITHIN,
+    axis_label,
+)
 from sme_registry.studies.report.frames import frame
+from sme_registry.studies.report.texts import implementation_caveats
 
 COLUMNS = (
     "section:str algorithm:str class_name:str question:str verdict:str value low high runs:Int64 "
@@ -40,197 +49,307 @@ THRESHOLDS = {
     "unlearnt": DIAGNOSIS["unlearnt"],  # normalised regret, at least: almost nothing was learnt
     "broken": 0.2,  # change of normalised regret, at least
     "hurt": 0.05,  # at least; a smaller one hurts slightly
-    "probability": 0.5,  # of improvement, for the better of two algorithms
-    "enough_runs": float(ENOUGH_RUNS),  # with fewer runs or pairs a change is an indication
+    "enough_runs": float(ENOUGH_RUNS),  # with fewer runs or pairs a verdict is an indication
     "interval_runs": float(OFFLINE_INTERVAL),  # with fewer an improvement has no interval
     "near": 0.02,  # difference of r̃, at most: as good as
-    "collapse": 0.1,  # of r̃ below the behaviour policy, at least
 }
-_WD, _OOD = "wd_regret", "ood_regret"
 _CHANCE = 0.05  # share of 95 % intervals that exclude 0 without an effect
-_UNLEARNT = THRESHOLDS["unlearnt"]
-
+_LABELS = {metric.key: metric.label for metric in METRICS}
+# The columns of other tables from which those of a finding are taken.
+_TAKEN = {
+    "algorithm": ("algorithm", "first"),
+    "class_name": ("class_name",),
+    "value": ("change", "difference", "probability", "iqm", "value"),
+    "low": ("low",),
+    "high": ("high",),
+    "runs": ("pairs", "fewest_runs", "runs"),
+}
+# Metrics of a life: the neutral value, and what an agent does above it, below it, or if it is open.
+_LIVES = {
+    "forgetting": (
+        0.0, "forgets", "is better on earlier phases than ever before", "was not shown to forget",
+    ),
+    "plasticity_ratio": (
+        1.0, "loses plasticity", "learns more than a fresh agent",
+        "was not shown to lose plasticity",
+    ),
+    "forward_transfer": (
+        0.0, "is better on phases before their first visit than before training",
+        "is worse on phases before their first visit than before training",
+        "was shown neither better nor worse on phases before their first visit",
+    ),
+    "learning_transfer": (
+        0.0, "learns faster in its visits than a fresh agent",
+        "learns more slowly in its visits than a fresh agent",
+        "was shown neither ahead of nor behind a fresh agent in its visits",
+    ),
+}  # fmt: skip
+_OFFLINE = {
+    "near": "is as good as the policy that made its data",
+    "above": "surpasses its data",
+    "above_few": "surpasses its data in every run",
+    "below": "falls behind its data",
+    "below_few": "falls behind its data in every run",
+    "open": "was shown neither above nor below its data",
+    "like_constant": "is no better than the constant ½",
+}
 
 Found = Iterator[dict[str, Any]]
-Finder = Callable[[Analysis], Found]
-Rows = Sequence[Any]  # of a table, as named tuples
-FINDERS: list[Finder] = []
-
-
-def finder(find: Finder) -> Finder:
-    """Register a function that finds something, in the order of the page."""
-    FINDERS.append(find)
-    return find
 
 
 def findings(analysis: Analysis) -> pd.DataFrame:
     """The findings of a study, from its tables."""
-    return frame([row for find in FINDERS for row in find(analysis)], COLUMNS)
-
-
-@finder
-def _tasks(analysis: Analysis) -> Found:
-    """Which property of the task breaks each learner, and how sure that is."""
-    levels = analysis.tables["levels"]
-    for name in analysis.learners:
-        about = functools.partial(finding, "tasks", algorithm=name)
-        contrasts = _contrasts(analysis, name, _WD)
-        if not contrasts:
-            yield about(
-                "contrasts", "none",
-                f"{name} has no contrasts yet: no run on the first class, {analysis.base}, has a "
-                "run of the same number on another class.",
-            )  # fmt: skip
-            continue
-        rows = levels[(levels.algorithm == name) & (levels.metric == _WD)]
-        of_class = {row.class_name: row for row in rows.itertuples()}
-        base = of_class.get(analysis.base)
-        if base is not None and base.iqm >= _UNLEARNT:
-            yield about(
-                "first class", "unlearnt",
-                f"{name} has learnt almost nothing on the first class: its WD regret there is "
-                f"{fixed(base.iqm)}, and the constant action's is 1. What was not learnt cannot "
-                "break, so the contrasts need a longer budget.",
-                value=base.iqm,
-            )  # fmt: skip
-        worst = _largest(c for c in contrasts if c.verdict == "worse")
-        if worst is None:
-            yield from _no_worst(about, name, contrasts)
-            continue
-        yield from _worst(about, name, contrasts, worst)
-        yield from _other_axes(about, contrasts, worst)
-        yield from _outside(about, _contrasts(analysis, name, _OOD), worst)
-
-
-def _no_worst(about: Any, name: str, contrasts: Rows) -> Found:
-    """What is known of a learner that no class was shown to make worse."""
-    yield about(
-        "worst", "none_shown",
-        f"No class was shown to make {name} worse within distribution. That does not show that "
-        "none does.",
-    )  # fmt: skip
-    better = [c for c in contrasts if c.verdict == "better"]
-    if better:
-        text = f"Its WD regret is lower than on the first class with {_listed(better)}."
-        yield about("other axes", "better", text)
-
-
-def _worst(about: Any, name: str, contrasts: Rows, worst: Any) -> Found:
-    larger = _of_each_axis(c for c in contrasts if c.change > worst.change)
-    size = [worst.change >= THRESHOLDS["broken"], worst.change >= THRESHOLDS["hurt"], True]
-    severity = ("broken", "hurt", "slightly_hurt")[size.index(True)]
-    is_hurt = severity.replace("_", " ") + ("" if larger else " most")
-    text = (
-        f"{name} is {is_hurt} by {_property(worst)}: on {worst.class_name} its WD regret rises "
-        f"from {fixed(worst.base)} to {fixed(worst.level)}, by {change_text(worst)}."
+    found = itertools.chain(
+        *(_task(analysis, name) for name in analysis.learners),
+        _comparison(analysis),
+        _offline(analysis),
+        _lives(analysis),
+        _changes(analysis),
+        *(_caveats(analysis, part) for part in analysis.parts),
     )
-    yield about("worst", severity, text, worst)
-    rivals = _of_each_axis(c for c in contrasts if c.axis != worst.axis and not c.high < worst.low)
-    verdict = "certain"
-    text = f"It is the worst of the axes varied here: its interval begins at {signed(worst.low)}, "
-    text += "above the end of every other axis."
-    if not worst.enough_pairs:
-        verdict = "indication"
-        text = f"This is an indication, not a finding: it rests on {plural(worst.pairs, 'pair')} "
-        text += f"of runs, and {ENOUGH_RUNS} would be enough."
-    elif rivals:
-        verdict, text = "rivals", "The interval shows that it hurts, but not that it hurts most: "
-        text += f"the intervals allow a larger change by {_listed(rivals)}."
-    elif len({c.axis for c in contrasts}) == 1:
-        verdict, text = "only_axis", "The interval shows that it hurts; no other axis was varied."
-    yield about("certainty", verdict, text, worst)
+    return frame([*found], COLUMNS)
 
 
-def _other_axes(about: Any, contrasts: Rows, worst: Any) -> Found:
-    worse = _of_each_axis(c for c in contrasts if c.verdict == "worse" and c.axis != worst.axis)
-    still_open = _of_each_axis(c for c in contrasts if c.verdict != "worse")
-    certain, few = ([c for c in worse if c.enough_pairs == enough] for enough in (True, False))
-    if certain:
-        yield about("other axes", "worse", f"Also worse by {_listed(certain)}.")
-    if few:
-        text = f"There are indications that it is made worse by {_listed(few)}."
-        yield about("other axes", "indication", text)
-    if still_open:
-        text = f"Not shown to make it worse: {_listed(still_open)}."
-        yield about("other axes", "open", f"{text} A wide interval means too few runs.")
+def finding(
+    section: str, question: str, verdict: str, sentence: str, row: Any = None, **columns: Any
+) -> dict[str, Any]:
+    """A row of findings; those columns that `row`, of any table, has are taken from it."""
+    result = {"algorithm": "", "class_name": "", "section": section, "question": question}
+    for column, names in _TAKEN.items():
+        known = [getattr(row, name) for name in names if hasattr(row, name)]
+        result |= {column: known[0]} if known else {}
+    if verdict.endswith("_few"):
+        sentence += f" An indication: it rests on fewer than {ENOUGH_RUNS} runs."
+    return result | {"verdict": verdict, "sentence": sentence} | columns
 
 
-def _outside(about: Any, contrasts: Rows, worst: Any) -> Found:
-    far = _largest(c for c in contrasts if c.verdict == "worse")
-    if far is not None:
-        larger = _of_each_axis(c for c in contrasts if c.change > far.change)
-        what = "the same property" if far.axis == worst.axis else _property(far)
-        costs = "costs" if larger else "costs most"
-        text = f"Out of distribution, {what} {costs}: {_listed([far])}."
-        yield about("out of distribution", "worse", text, far)
+def _rows(table: pd.DataFrame, **values: str) -> list[Any]:
+    """The rows of a table that have these values, as named tuples."""
+    for column, value in values.items():
+        table = table[table[column] == value]
+    return list(table.itertuples())
 
 
-@finder
+def _of_few(verdict: str, runs: int) -> str:
+    return verdict if verdict == "open" or runs >= ENOUGH_RUNS else f"{verdict}_few"
+
+
+def _task(analysis: Analysis, name: str) -> Found:
+    """Which property of the task breaks a learner, and how sure that is."""
+    place = {"algorithm": name, "metric": "wd_regret"}
+    yield from _worst(analysis, name, "wd_regret")
+    for row in _rows(analysis.tables["levels"], class_name=analysis.base, **place):
+        if row.iqm >= THRESHOLDS["unlearnt"]:
+            yield finding(
+                "tasks", "first class", "unlearnt",
+                f"{name} has learnt almost nothing on the first class: its WD regret there is "
+                f"{fixed(row.iqm)}, and the constant action's is 1. What was not learnt cannot "
+                "break, so the contrasts need a longer budget.",
+                row,
+            )  # fmt: skip
+    contrasts = _rows(analysis.tables["contrasts"], **place)
+    contrasts.sort(key=lambda row: (row.verdict != "worse", -row.change))
+    largest = {row.axis or row.class_name: row for row in reversed(contrasts)}
+    for row in reversed(largest.values()):
+        verb = {"worse": "is higher", "better": "is lower", "open": "was not shown to be higher"}
+        yield finding(
+            "tasks", "axis", _of_few(row.verdict, row.pairs),
+            f"Its WD regret {verb[row.verdict]} with {_property(analysis, row)}: on "
+            f"{row.class_name} by {_change(row)}.",
+            row,
+        )  # fmt: skip
+    yield from _worst(analysis, name, "ood_regret")
+
+
+def _worst(analysis: Analysis, name: str, metric: str) -> Found:
+    """The largest change of a kind of regret that is shown, and whether others may be larger."""
+    regret = _LABELS[metric]
+    contrasts = _rows(analysis.tables["contrasts"], algorithm=name, metric=metric)
+    worse = [row for row in contrasts if row.verdict == "worse"]
+    if not worse:
+        text = f"No class was shown to raise the {regret} of {name}"
+        text += f" from that on {analysis.base}, which does not show that none does."
+        yield finding("tasks", f"worst {regret}", "none_shown", text, algorithm=name)
+        return
+    worst = max(worse, key=lambda row: row.change)
+    severity = "slightly_hurt"
+    if worst.change >= THRESHOLDS["hurt"]:
+        severity = "broken" if worst.change >= THRESHOLDS["broken"] else "hurt"
+    yield finding(
+        "tasks", f"worst {regret}", _of_few(severity, worst.pairs),
+        f"{name} is {severity.replace('_', ' ')} by {_property(analysis, worst)}: on "
+        f"{worst.class_name} its {regret} rises from {fixed(worst.base)} to {fixed(worst.level)}, "
+        f"by {_change(worst)}.",
+        worst,
+    )  # fmt: skip
+    rivals = [row for row in contrasts if row.axis != worst.axis and not row.high < worst.low]
+    verdict, text = "certain", "No interval allows as large a change by another axis."
+    if rivals:
+        names = dict.fromkeys(_property(analysis, row) for row in rivals)
+        verdict = "rivals"
+        text = f"The intervals also allow as large a change by {conjunction([*names])}."
+    yield finding("tasks", f"certainty of {regret}", _of_few(verdict, worst.pairs), text, worst)
+
+
 def _comparison(analysis: Analysis) -> Found:
-    """The best learner over all classes among those with equal data, and its rivals."""
-    rows = analysis.tables["aggregates"]
-    rows = rows[(rows.group == ALL) & (rows.metric == _WD) & (rows.statistic == "iqm")]
-    compared = list(rows[rows.algorithm.isin(analysis.learners)].itertuples())
-    of_all = dict(zip(analysis.runs.algorithm, analysis.runs.steps.tolist(), strict=True))
-    steps = {row.algorithm: of_all[row.algorithm] for row in compared}
-    if len(set(steps.values())) > 1:
-        listed = ", ".join(f"{name} {count:,}" for name, count in steps.items())
-        yield finding("comparison", "training steps", "differ", f"Training steps differ: {listed}.")
+    """The best learner over all classes among those with equal data, and how sure that is."""
+    over_all = {"group": ALL, "metric": "wd_regret"}
+    rows = _rows(analysis.tables["aggregates"], **over_all, statistic="iqm")
+    learners = [row for row in rows if row.algorithm in analysis.learners]
     data = training_data(analysis.runs)
-    for shared in dict.fromkeys(data[row.algorithm] for row in compared):
-        alike = [row for row in compared if data[row.algorithm] == shared]
-        if len(alike) < 2:
-            continue
-        best = max(alike, key=lambda row: row.value)
-        nu, transitions = shared or (math.nan, 0)
-        of_data = f" of those with {transitions:,} transitions of ν = {nu:g}," if shared else ""
+    best: dict[str, Any] = {}
+    for source in dict.fromkeys(data[row.algorithm] for row in learners):
+        alike = [row for row in learners if data[row.algorithm] == source]
+        row = max(alike, key=lambda row: row.value)
+        if len(alike) > 1:
+            best[row.algorithm] = row
+    for name, row in best.items():
+        source = data[name]
+        of_data = f" of those with data of ν = {source[0]:g}" if source else ""
         yield finding(
             "comparison", "best", "best",
-            f"Over the {plural(best.classes, 'class', 'classes')} on which all have runs,{of_data} "
-            f"{best.algorithm} is best within distribution: {fixed(best.value)}{ends_text(best)}, "
-            "where 1 is the optimum and 0 the constant ½.",
-            best, class_name="",
+            f"Over the {plural(row.classes, 'class', 'classes')} on which all have runs, {name} is "
+            f"best within distribution{of_data}: {fixed(row.value)} {_interval(row)}, where 1 is "
+            "the optimum and 0 the constant ½.",
+            row,
         )  # fmt: skip
-        yield from _rivals(analysis, best.algorithm, {row.algorithm for row in alike})
+    for row in _rows(analysis.tables["improvements"], **over_all):
+        if {row.first, row.second} & {*best} and {row.first, row.second} <= {*analysis.learners}:
+            yield finding(
+                "comparison", "improvement", _side(row, row.fewest_runs, 0.5),
+                f"A run of {row.first} beats one of {row.second} with probability "
+                f"{fixed(row.probability)} {_interval(row)}.",
+                row,
+            )  # fmt: skip
 
 
-def _rivals(analysis: Analysis, best: str, among: set[str]) -> Found:
-    rows = analysis.tables["improvements"]
-    for row in rows[(rows.group == ALL) & (rows.metric == _WD)].itertuples():
-        if best not in (row.first, row.second) or not {row.first, row.second} <= among:
-            continue
-        value, low, high, other = row.probability, row.low, row.high, row.second
-        if row.second == best:
-            value, low, high, other = 1.0 - value, 1.0 - high, 1.0 - low, row.first
-        verdict, end = "open", ", so either may be better."
-        if low > THRESHOLDS["probability"]:
-            enough = row.fewest_runs >= ENOUGH_RUNS
-            verdict = "better" if enough else "indication"
-            end = "." if enough else ", an indication from few runs."
-        numbers = {"value": value, "low": low, "high": high, "runs": row.fewest_runs}
-        text = f"One of its runs beats one of {other} with probability {fixed(value)}"
-        interval = "" if math.isnan(low) else f" ({fixed(low)} to {fixed(high)})"
+def _offline(analysis: Analysis) -> Found:
+    """Where each offline learner is as good as the policy that made its data, or better."""
+    near = THRESHOLDS["near"]
+    for learner, table in analysis.tables["offline"].groupby("learner", sort=False):
+        like_constant = table.similarity <= table.constant_similarity + near
+        cases = {verdict: table.verdict == verdict for verdict in _OFFLINE}
+        cases |= {"near": table.improvement.abs() <= near, "like_constant": like_constant}
+        for verdict, selected in cases.items():
+            rows = table[selected]
+            if not rows.empty:
+                at = ", ".join(
+                    f"{name} (ν = {', '.join(f'{nu:g}' for nu in of_class.nu)})"
+                    for name, of_class in rows.groupby("class_name", sort=False)
+                )
+                low, high = (signed(f(rows.improvement), 3) for f in (min, max))
+                by = low if low == high else f"{low} to {high}"
+                text = f"{learner} {_OFFLINE[verdict]} at {at}: r̃ − r̃ of the data is {by}."
+                yield finding("offline", "data", verdict, text, algorithm=learner)
+
+
+def _lives(analysis: Analysis) -> Found:
+    """What each agent forgets in each stream, whether it loses plasticity, and what transfers."""
+    for name in analysis.streams:
+        metrics = _rows(analysis.tables["stream_metrics"], class_name=name, region=WITHIN)
+        for key, (neutral, *does) in _LIVES.items():
+            of_metric = [row for row in metrics if row.metric == key]
+            for row in sorted(of_metric, key=lambda row: -row.iqm):
+                verdict = _side(row, row.runs, neutral)
+                words = dict(zip(("above", "below", "open"), does, strict=True))
+                text = f"{row.algorithm} {words[verdict.removesuffix('_few')]}: "
+                lives = plural(row.runs, "life", "lives")
+                text += f"{_LABELS[key]} {fixed(row.iqm)} {_interval(row, lives)}."
+                yield finding("streams", _LABELS[key], verdict, text, row)
+            if key == "forgetting":
+                yield from _forgets_more(analysis, name)
+        for row in metrics:
+            if row.metric == "visited_regret" and row.iqm >= THRESHOLDS["unlearnt"]:
+                text = f"{row.algorithm} has learnt almost nothing: its regret at the end of a "
+                text += f"visit is {fixed(row.iqm)}. It has little to forget or to lose."
+                yield finding("streams", _LABELS[row.metric], "unlearnt", text, row)
+
+
+def _forgets_more(analysis: Analysis, name: str) -> Found:
+    rows = analysis.tables["stream_differences"]
+    for row in _rows(rows, class_name=name, metric="forgetting"):
+        verdict = _side(row, row.pairs, 0.0)
+        text = f"Whether {row.first} or {row.second} forgets more is open"
+        if verdict != "open":
+            than = "more" if row.low > 0.0 else "less"
+            text = f"{row.first} forgets {than} than {row.second}"
+        pairs = _interval(row, plural(row.pairs, "pair"))
+        text += f": the difference is {signed(row.difference)} {pairs}."
+        yield finding("streams", "forgets more", verdict, text, row)
+
+
+def _changes(analysis: Analysis) -> Found:
+    """What streams that differ from the first in their tasks alone change for each algorithm."""
+    if not analysis.streams:
+        return
+    rows = analysis.tables["stream_contrasts"]
+    rows = rows[(rows.axis == TASKS) & rows.metric.isin(_LIVES)]
+    base = analysis.streams[analysis.stream_base]
+    for name, of_class in rows.groupby("class_name", sort=False):
+        info = analysis.streams[name]
+        verdict, text = "other", f"{name} differs from {base.name} in its tasks alone."
+        if info.related and not base.related and info.stream.kinds == base.stream.kinds:
+            verdict = "related"
+            text += (
+                f" Its phases are rotations of one task, those of {base.name} are not, so the "
+                "changes are those that relatedness makes."
+            )
+        yield finding("stream_changes", "relatedness", verdict, text, class_name=name)
+        for row in of_class.itertuples():
+            text = f"{row.algorithm}: {_LABELS[row.metric]} is {row.verdict}, {fixed(row.base)} → "
+            text += f"{fixed(row.level)}, by {_change(row)}."
+            verdict = _of_few(row.verdict, row.pairs)
+            yield finding("stream_changes", _LABELS[row.metric], verdict, text, row)
+
+
+def _caveats(analysis: Analysis, part: RunKind) -> Found:
+    """Why the numbers of runs, or of lives, say less than they seem to."""
+    section, counts = f"{part.prefix}caveats", analysis.counts(streams=part.streams)
+    if missing := counts["missing"] + counts["failed"]:
+        text = f"{missing:,} of {plural(counts['finished'] + missing, 'run')} are missing, "
+        text += f"{counts['failed']:,} of them because they failed. No number includes them."
+        yield finding(section, "missing runs", "missing", text, value=missing)
+    if part.runs.empty:
+        return
+    of_place = part.runs.groupby(PLACE)
+    few = of_place.size().min()
+    if few < ENOUGH_RUNS:
         yield finding(
-            "comparison", "rival", verdict, f"{text}{interval}{end}", algorithm=best, **numbers
-        )
-
-
-@finder
-def _caveats(analysis: Analysis) -> Found:
-    rows = analysis.tables["contrasts"]
-    rows = rows[rows.algorithm.isin(analysis.learners)]
-    yield from missing_runs("caveats", analysis.counts(streams=False))
-    if not rows.empty:
-        yield from few_runs("caveats", rows.pairs.min(), "pair of runs", "pairs of runs")
-    intervals = int(((rows.metric == _WD) & rows.low.notna()).sum())
+            section, "few runs", "few",
+            f"Some numbers rest on {plural(few, 'run')}. The 95 % bootstrap interval of 2 runs "
+            "covers the truth in only 32–62 % of cases, of 3 runs in 48–86 %, depending on their "
+            f"distribution, and of 4 or more in 94–98 %. With fewer than {ENOUGH_RUNS}, this "
+            "report calls a result an indication at most.",
+            runs=few,
+        )  # fmt: skip
+    if (of_place[part.instance].nunique() < of_place.size()).any():
+        yield finding(
+            section, "instances", "repeat",
+            "Several runs of an algorithm share a draw of their task or stream. They are not "
+            "independent draws, so the intervals are too narrow for other draws.",
+        )  # fmt: skip
+    intervals = int(analysis.tables[f"{part.prefix}contrasts"].low.notna().sum())
     if intervals > 1:
         value = max(1, round(_CHANCE * intervals))
         yield finding(
-            "caveats", "chance", "expected",
-            f"There are {intervals} contrasts within distribution, each with its own interval. If "
-            f"nothing had an effect, about {value} of them would exclude 0 by chance.",
+            section, "chance", "expected",
+            f"There are {intervals} contrasts, each with its own interval. If nothing had an "
+            f"effect, about {value} of them would exclude 0 by chance.",
             value=value,
         )  # fmt: skip
+    learners = analysis.stream_algorithms if part.streams else analysis.learners
+    for text in implementation_caveats(analysis.plan, learners):
+        yield finding(section, "implementations", "differ", text)
+    yield from _without_fresh(analysis, section) if part.streams else _unlike(analysis, section)
+
+
+def _unlike(analysis: Analysis, section: str) -> Found:
+    """In what else algorithms and classes differ."""
+    steps = dict(zip(analysis.runs.algorithm, analysis.runs.steps.tolist(), strict=True))
+    steps = {name: steps[name] for name in analysis.learners}
+    if len(set(steps.values())) > 1:
+        listed = ", ".join(f"{name} {count:,}" for name, count in steps.items())
+        yield finding(section, "training steps", "differ", f"Training steps differ: {listed}.")
     init = {name: info.setting["policy_init"] for name, info in analysis.classes.items()}
     other = [
         name
@@ -239,104 +358,36 @@ def _caveats(analysis: Analysis) -> Found:
     ]
     if other:
         yield finding(
-            "caveats", "policy_init", "differs",
+            section, "policy_init", "differs",
             f"The policy_init of {conjunction(other)} also differs from the first class’s, as deep "
             "tasks require. The contrasts include its effect.",
         )  # fmt: skip
 
 
-def _contrasts(analysis: Analysis, algorithm: str, metric: str) -> Rows:
-    rows = analysis.tables["contrasts"]
-    rows = rows[(rows.algorithm == algorithm) & (rows.metric == metric)]
-    setting = rows.class_name.map({name: c.label for name, c in analysis.classes.items()})
-    return list(rows.assign(setting=setting).itertuples())
+def _without_fresh(analysis: Analysis, section: str) -> Found:
+    count = sum(life.fresh_agents < len(life.planned.cell.fresh) for life in analysis.lives)
+    if count:
+        text = f"{plural(count, 'life has', 'lives have')} not all of their fresh agents yet: no "
+        text += "number on plasticity or learning transfer includes them."
+        yield finding(section, "fresh agents", "missing", text, value=count)
 
 
-def _largest(contrasts: Iterable[Any]) -> Any | None:
-    return max(contrasts, key=lambda c: c.change, default=None)
-
-
-def _of_each_axis(contrasts: Iterable[Any]) -> Rows:
-    """For each axis the contrast with the largest change, in falling order."""
-    largest: dict[str, Any] = {}
-    for contrast in sorted(contrasts, key=lambda c: c.change, reverse=True):
-        largest.setdefault(contrast.axis or contrast.class_name, contrast)
-    return list(largest.values())
-
-
-def _property(contrast: Any) -> str:
+def _property(analysis: Analysis, contrast: Any) -> str:
     """What differs between the classes of a contrast: `reward interval k`."""
     if contrast.axis == SEVERAL:
-        return f"several axes at once ({contrast.setting})"
+        return f"several axes at once ({analysis.classes[contrast.class_name].label})"
     return axis_label(contrast.axis) or f"the class {contrast.class_name}"
 
 
-def _listed(contrasts: Rows) -> str:
-    """`complexity L (complexity-10: +0.13, 95 % interval +0.12 to +0.15, 5 pairs)`, …"""
-    return ", ".join(f"{_property(c)} ({c.class_name}: {change_text(c)})" for c in contrasts)
+def _side(row: Any, runs: int, neutral: float) -> str:
+    side = "above" if row.low > neutral else "below" if row.high < neutral else "open"
+    return _of_few(side, runs)
 
 
-def finding(
-    section: str, question: str, verdict: str, sentence: str, row: Any = None, **columns: Any
-) -> dict[str, Any]:
-    """A row of findings; those columns that `row`, of any table, has are taken from it."""
-    result = {
-        "section": section, "question": question, "verdict": verdict, "sentence": sentence,
-        "algorithm": "", "class_name": "", "value": math.nan, "low": math.nan, "high": math.nan,
-        "runs": None,
-    }  # fmt: skip
-    taken: dict[str, tuple[str, ...]] = {
-        name: (name,) for name in ("class_name", "algorithm", "low", "high")
-    }
-    taken |= {"runs": ("pairs", "fewest_runs", "runs"), "value": ("change", "iqm", "value")}
-    for column, names in taken.items():
-        known = [getattr(row, name) for name in names if hasattr(row, name)]
-        result[column] = known[0] if known else result[column]
-    return result | columns
+def _change(row: Any) -> str:
+    return f"{signed(row.change)} {_interval(row, plural(row.pairs, 'pair'))}"
 
 
-def missing_runs(section: str, counts: Counter[str]) -> Found:
-    missing = counts["missing"] + counts["failed"]
-    if missing:
-        because = f", {counts['failed']:,} of them because they failed" if counts["failed"] else ""
-        text = f"{missing:,} of {plural(counts['finished'] + missing, 'run')} are missing{because}."
-        text += " No number includes them; the table of runs lists them."
-        yield finding(section, "missing runs", "missing", text, value=missing)
-
-
-def few_runs(section: str, fewest: int, one: str, many: str) -> Found:
-    if fewest < ENOUGH_RUNS:
-        yield finding(
-            section, "few runs", "few",
-            f"Some numbers rest on {plural(fewest, one, many)}. The 95 % bootstrap interval of 2 "
-            "runs covers the truth in only 32–62 % of cases, of 3 runs in 48–86 %, depending on "
-            "their distribution, and of 4 or more in 94–98 %. With fewer than "
-            f"{plural(ENOUGH_RUNS, one, many)}, this report calls a change an indication at most.",
-            runs=fewest,
-        )  # fmt: skip
-
-
-def change_text(row: Any) -> str:
-    if math.isnan(row.low):
-        return f"{signed(row.change)}, a single pair, no interval"
-    ends = f"95 % interval {signed(row.low)} to {signed(row.high)}"
-    return f"{signed(row.change)}, {ends}, {plural(row.pairs, 'pair')}"
-
-
-def lives_text(row: Any) -> str:
-    if math.isnan(row.low):
-        return " (a single life, no interval)"
-    ends = f"95 % interval {fixed(row.low)} to {fixed(row.high)}"
-    return f" ({ends}, {plural(row.runs, 'life', 'lives')})"
-
-
-def ends_text(row: Any) -> str:
-    return "" if math.isnan(row.low) else f" ({fixed(row.low)} to {fixed(row.high)})"
-
-
-def side(row: Any, neutral: float) -> str:
-    return "above" if row.low > neutral else "below" if row.high < neutral else "open"
-
-
-def indication(row: Any) -> str:
-    return "" if row.runs >= ENOUGH_RUNS else " (an indication)"
+def _interval(row: Any, *counts: str) -> str:
+    known = f"95 % interval {fixed(row.low)} to {fixed(row.high)}"
+    return f"({', '.join(('no interval' if math.isnan(row.low) else known, *counts))})"

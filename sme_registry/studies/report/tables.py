@@ -1,4 +1,4 @@
-"""`analyse`: the tables of a study's runs on single tasks; `offline` and `streams` have others.
+"""`analyse`: the tables of a study's runs on single tasks; `streams` has those of streams alone.
 
 An unknown interval end is NaN.
 
@@ -32,6 +32,12 @@ Columns of each table, those that name the row first; class_name and algorithm a
     improvements      group, metric, first, second: classes, fewest_runs; probability; low, high
     learning_curves   measure, step: median, q25, q75 over runs, smoothed; runs; window: evaluations
                       averaged
+    offline           nu, learner (the same for every ν): runs; similarity and similarity_sd, means
+                      over runs of `offline_similarity` and `offline_similarity_sd`; improvement,
+                      the mean of r̃ minus that of the policy that made the data (0 for imitation),
+                      low, high from `OFFLINE_INTERVAL` runs; verdict: above, above_few, below,
+                      below_few, open; behaviour_similarity and behaviour_similarity_sd, means over
+                      the data_sets; constant_similarity: of the constant ½ in WD, over runs
 """
 
 from __future__ import annotations
@@ -47,13 +53,14 @@ import numpy as np
 import pandas as pd
 
 from sme_registry import statistics
-from sme_registry.spec import StudyFile
+from sme_registry.spec import StudyAlgorithm, StudyFile
 from sme_registry.statistics import Array, Statistic
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.report.analysis import (
     CURVES,
     ENOUGH_RUNS,
     INTERVAL,
+    OFFLINE_INTERVAL,
     PLACE,
     PLACE_COLUMNS,
     Analysis,
@@ -85,7 +92,6 @@ from sme_registry.studies.report.frames import (
     study_frames,
     window,
 )
-from sme_registry.studies.report.offline import offline_runs
 from sme_registry.studies.report.streams import reference_costs
 from sme_registry.training.algorithms import parse_uses
 
@@ -409,3 +415,80 @@ def _compared(analysis: Analysis) -> Iterator[tuple[str, str, dict[str, dict[str
 
 def _iqm(values: Any) -> float:
     return float(statistics.iqm(values))
+
+
+@table(
+    "offline",
+    "class_name:str nu learner:str runs:int64 similarity similarity_sd improvement low high "
+    "verdict:str behaviour_similarity behaviour_similarity_sd data_sets:int64 constant_similarity",
+    optional=True,
+)
+def _offline(analysis: Analysis) -> Iterator[dict[str, Any]]:
+    runs = analysis.offline_runs
+    intervals = summary(
+        runs, ["nu"], metrics_of("data"), analysis.bootstrap,
+        lambda name, learner, _, nu: ("offline", learner, name, f"{nu:g}"),
+        place=["class_name", "learner"], statistic=statistics.mean, fewest=OFFLINE_INTERVAL,
+    )  # fmt: skip
+    known = {row[:3]: row[4:] for row in intervals}
+    for (name, nu), same_data in runs.groupby(["class_name", "nu"], sort=False):
+        data_sets = same_data.drop_duplicates("dataset_digest")  # however many runs learnt from one
+        data = {
+            "behaviour_similarity": data_sets.behaviour_similarity.to_numpy().mean(),
+            "behaviour_similarity_sd": data_sets.behaviour_similarity_sd.to_numpy().mean(),
+            "data_sets": len(data_sets),
+            "constant_similarity": same_data.constant_similarity.to_numpy().mean(),
+        }
+        for learner, group in same_data.groupby("learner", sort=False):
+            count, improvement, low, high = known[name, learner, nu]
+            yield {
+                "class_name": name, "nu": nu, "learner": learner, "runs": count,
+                "similarity": group.offline_similarity.to_numpy().mean(),
+                "similarity_sd": group.offline_similarity_sd.to_numpy().mean(),
+                "improvement": improvement, "low": low, "high": high,
+                "verdict": offline_verdict(group.improvement.to_numpy(), low, high), **data,
+            }  # fmt: skip
+
+
+def offline_runs(results: pd.DataFrame, algorithms: Sequence[StudyAlgorithm]) -> pd.DataFrame:
+    """One row per run of an offline learner, ordered by class, ν, learner and run."""
+    names = learner_names(algorithms)
+    rows = results[results.nu.notna()].drop_duplicates(RUN)
+    rows = rows.assign(learner=rows.algorithm.map(names))
+    order = {"class_name": list(dict.fromkeys(rows.class_name)),
+             "learner": list(dict.fromkeys(names.values()))}  # fmt: skip
+
+    def key(column: pd.Series) -> pd.Series:
+        return column.map(order[column.name].index) if column.name in order else column
+
+    return rows.sort_values(["class_name", "nu", "learner", "run"], key=key, ignore_index=True)
+
+
+def offline_verdict(improvements: Array, low: float, high: float) -> str:
+    """Whether a learner surpasses its data, from the improvements of its runs."""
+    if len(improvements) >= ENOUGH_RUNS:
+        return "above" if low > 0.0 else "below" if high < 0.0 else "open"
+    if len(improvements) > 1 and improvements.min() > 0.0:
+        return "above_few"
+    return "below_few" if len(improvements) > 1 and improvements.max() < 0.0 else "open"
+
+
+def learner_names(algorithms: Sequence[StudyAlgorithm]) -> dict[str, str]:
+    """What each algorithm of a plan is apart from its ν: `IQL`, or `IQL (expectile = 0.9)`."""
+    settings = {
+        algorithm.name: {k: v for k, v in algorithm.hyperparameters.items() if k != "nu"}
+        | ({} if algorithm.steps is None else {"steps": algorithm.steps})
+        for algorithm in algorithms
+    }
+    names = {}
+    for algorithm in algorithms:
+        alike = [settings[other.name] for other in algorithms if other.uses == algorithm.uses]
+        options = settings[algorithm.name]
+        differing = [
+            f"{key} = {options[key]}" if key in options else f"default {key}"
+            for key in sorted({key for setting in alike for key in setting})
+            if any(setting.get(key) != alike[0].get(key) for setting in alike)
+        ]
+        name = parse_uses(algorithm.uses)[1].upper()
+        names[algorithm.name] = f"{name} ({', '.join(differing)})" if differing else name
+    return names

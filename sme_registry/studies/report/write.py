@@ -44,8 +44,7 @@ from sme_registry.studies.report.figures.panels import Picture
 from sme_registry.studies.report.findings import THRESHOLDS, findings
 from sme_registry.studies.report.frames import StudyFrames, frame, load, records, runs_of
 from sme_registry.studies.report.tables import DIFFERENCES, analyse, differences
-from sme_registry.studies.report.texts import TextTable, csv_tables, difference_table, text_tables
-from sme_registry.training.algorithms import in_jax
+from sme_registry.studies.report.texts import TextTable, comparison_tables, csv_tables, text_tables
 
 DEFAULT_METRICS = ("wd_regret", "ood_regret")  # of comparisons
 FORMATS = ("html", "png", "pdf", "csv", "latex")
@@ -184,7 +183,6 @@ def page(
             if present.get(key) or by_section[key]
         },
         findings=_by_subject(rows),
-        in_jax=_in_jax(analysis),
         figures=by_section,
         tables={"offline": offline, "tables": [t for t in tables if t not in offline]},
         absent=absent,
@@ -214,14 +212,6 @@ def _kinds(analysis: Analysis) -> list[str]:
 def _missing(analysis: Analysis) -> list[tuple[str, str]]:
     missing = [*analysis.missing(streams=False), *analysis.missing(streams=True)]
     return [(label(planned), analysis.errors.get(planned.cell.digest, "")) for planned in missing]
-
-
-def _in_jax(analysis: Analysis) -> list[str]:
-    """The algorithms that run in JAX, if others beside them learn without it."""
-    of_plan = {algorithm.name: algorithm.uses for algorithm in analysis.plan.algorithms}
-    learners = {*analysis.learners, *analysis.stream_algorithms}
-    ours = [name for name in of_plan if name in learners and in_jax(of_plan[name])]
-    return ours if len(ours) < len(learners) else []
 
 
 def _origin(analysis: Analysis) -> Iterable[tuple[str, str, str]]:
@@ -283,9 +273,7 @@ def compare(
 
     Args:
       study: the frames of `load`, or the study's folder.
-      metrics: of "wd_regret", "ood_regret", "ood_decay", "final_return", "online_regret"; where
-        tasks have safety "wd_cost", "wd_safe_regret", "online_cost"; where they have distractors
-        "distractor_regret", "wd_invariance".
+      metrics: of the report's levels, such as "final_return", or "wd_cost" where tasks have safety.
 
     Returns:
       One row for each metric and class, and one for "all classes": the IQM over the paired runs of
@@ -316,26 +304,6 @@ def compare(
             "same seed. Run more of the study's cells."
         )
     return table
-
-
-def comparison_tables(table: pd.DataFrame) -> list[TextTable]:
-    """The result of `compare` for people, a table for each metric."""
-    return [
-        difference_table(table[table.metric == key], _metric(key), levels=True)
-        for key in dict.fromkeys(table.metric)
-    ]
-
-
-def implementation_caveats(folder: str | os.PathLike[str], first: str, second: str) -> list[str]:
-    """A sentence if one of two algorithms runs in JAX and the other does not."""
-    uses = {a.name: a.uses for a in Ledger(folder).study_file().plan.algorithms}
-    ours, *others = sorted((first, second), key=lambda name: not in_jax(uses[name]))
-    if in_jax(uses[ours]) == in_jax(uses[others[0]]):
-        return []
-    return [
-        f"{ours} runs in JAX and {others[0]} does not: their difference is also one between "
-        "implementations."
-    ]
 
 
 def write_comparison(

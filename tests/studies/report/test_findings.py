@@ -43,30 +43,40 @@ def of_alpha(analysis):
 
 def test_findings_name_the_property_that_each_learner_was_built_to_fail_at(analysis):
     alpha, beta = of_alpha(analysis), found(analysis, section="tasks", algorithm="Beta")
-    assert (alpha["worst"].verdict, alpha["worst"].class_name) == ("broken", "r_min-0_5")
-    assert alpha["worst"].sentence.startswith("Alpha is broken most by minimum reward r_min: on")
-    assert alpha["worst"].runs == 5
-    assert alpha["certainty"].verdict == "certain"
-    assert (beta["worst"].verdict, beta["worst"].class_name) == ("broken", "k-25")
+    worst = alpha["worst WD regret"]
+    assert (worst.verdict, worst.class_name, worst.runs) == ("broken", "r_min-0_5", 5)
+    assert worst.sentence.startswith("Alpha is broken by minimum reward r_min: on r_min-0_5 its WD")
+    assert alpha["certainty of WD regret"].verdict == "certain"
+    assert alpha["worst OOD regret"].verdict == "broken"
+    worst = beta["worst WD regret"]
+    assert (worst.verdict, worst.class_name) == ("broken_few", "k-25")
 
 
-def test_larger_changes_that_are_open_are_listed_next_to_the_worst(analysis):
+def test_every_axis_has_a_verdict_those_that_hurt_first(analysis):
+    rows = findings(analysis)
+    rows = rows[(rows.algorithm == "Alpha") & (rows.question == "axis")]
+    assert list(zip(rows.class_name, rows.verdict, strict=True)) == [
+        ("r_min-0_5", "worse"), ("k-25", "worse"), ("complexity-10", "open"), ("plane", "open"),
+    ]  # fmt: skip
+    lower = contrasted(analysis, "plane", {"change": -0.3, "low": -0.4, "high": -0.2})
+    assert of_alpha(lower)["axis"].verdict == "better"  # the last one
+
+
+def test_larger_changes_that_are_open_are_rivals_of_the_worst(analysis):
     alpha = of_alpha(contrasted(analysis, "complexity-10", {"change": 1.06, **SINGLE}))
-    assert (alpha["worst"].verdict, alpha["worst"].class_name) == ("broken", "r_min-0_5")
-    assert "most" not in alpha["worst"].sentence
-    assert alpha["certainty"].verdict == "rivals"
-    change = "(complexity-10: +1.06, a single pair, no interval)"
-    assert change in alpha["certainty"].sentence
-    assert change in alpha["other axes"].sentence
+    worst = alpha["worst WD regret"]
+    assert (worst.verdict, worst.class_name) == ("broken", "r_min-0_5")
     # Nothing is certainly the worst next to a change without an interval, however small.
-    alpha = of_alpha(contrasted(analysis, "complexity-10", {"change": 0.01, **SINGLE}))
-    assert alpha["certainty"].verdict == "rivals"
-    assert "complexity-10" in alpha["certainty"].sentence
+    for change in (0.01, 1.06):
+        alpha = of_alpha(contrasted(analysis, "complexity-10", {"change": change, **SINGLE}))
+        assert alpha["certainty of WD regret"].verdict == "rivals"
+        assert "complexity L" in alpha["certainty of WD regret"].sentence
 
 
 def test_few_pairs_make_an_indication_and_a_caveat(analysis):
     beta = found(analysis, section="tasks", algorithm="Beta")
-    assert beta["certainty"].verdict == "indication"
+    assert beta["worst WD regret"].verdict == "broken_few"
+    assert "An indication: it rests on fewer than 5" in beta["worst WD regret"].sentence
     caveats = found(analysis, section="caveats")
     assert caveats["few runs"].runs == 3
     assert caveats["missing runs"].sentence.startswith("2 of 75 runs are missing, 1 of them")
@@ -77,9 +87,9 @@ def test_single_runs_show_nothing(finished):
     cut = analysed(finished, lambda p: p.run > 0)
     for name in cut.learners:
         own = found(cut, section="tasks", algorithm=name)
-        assert own["worst"].verdict == "none_shown"
+        assert own["worst WD regret"].verdict == "none_shown"
     ends = {"change": 0.01, "low": -0.02, "high": 0.04, "pairs": 2}
-    assert of_alpha(contrasted(cut, "k-25", ends))["worst"].verdict == "none_shown"
+    assert of_alpha(contrasted(cut, "k-25", ends))["worst WD regret"].verdict == "none_shown"
 
 
 def test_a_first_class_that_was_not_learnt_is_marked(analysis):
@@ -96,21 +106,20 @@ def test_a_first_class_that_was_not_learnt_is_marked(analysis):
 def test_severity_is_the_size_of_the_largest_change(analysis, change, verdict):
     rows = analysis.tables["contrasts"]
     rows = rows.assign(change=change, low=change / 2, high=2 * change, verdict="worse")
-    assert of_alpha(with_tables(analysis, contrasts=rows))["worst"].verdict == verdict
+    assert of_alpha(with_tables(analysis, contrasts=rows))["worst WD regret"].verdict == verdict
 
 
-def test_an_improvement_whose_interval_includes_a_half_is_open(analysis):
-    best = found(analysis, section="comparison")["best"].algorithm
-    assert best in analysis.learners
+@pytest.mark.parametrize(
+    ("ends", "verdict"),
+    [((0.1, 0.9, 5), "open"), ((0.98, 1.0, 5), "above"), ((0.98, 1.0, 4), "above_few"),
+     ((0.1, 0.2, 5), "below")],
+)  # fmt: skip
+def test_an_improvement_is_judged_by_its_interval_against_a_half(analysis, ends, verdict):
+    assert found(analysis, section="comparison")["best"].algorithm in analysis.learners
     rows = analysis.tables["improvements"]
-    blurred = with_tables(analysis, improvements=rows.assign(low=0.1, high=0.9))
-    assert found(blurred, section="comparison")["rival"].verdict == "open"
-    certain = rows.assign(probability=0.99, low=0.98, high=1.0, fewest_runs=5)
-    certain[["first", "second"]] = [
-        (best, row.second if row.first == best else row.first) for row in certain.itertuples()
-    ]
-    rival = found(with_tables(analysis, improvements=certain), section="comparison")["rival"]
-    assert (rival.verdict, rival.value) == ("better", 0.99)
+    rows = rows.assign(**dict(zip(("low", "high", "fewest_runs"), ends, strict=True)))
+    row = found(with_tables(analysis, improvements=rows), section="comparison")["improvement"]
+    assert (row.verdict, row.runs) == (verdict, ends[2])
 
 
 def test_different_training_steps_are_reported(analysis):

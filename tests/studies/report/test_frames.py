@@ -15,7 +15,7 @@ from sme_registry.statistics import iqm
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.report import frames
 from sme_registry.studies.report.design import ALL
-from sme_registry.studies.report.write import comparison_tables
+from sme_registry.studies.report.texts import comparison_tables
 from tests.commands import good
 
 
