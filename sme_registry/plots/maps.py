@@ -34,6 +34,7 @@ LifeReports = _LifeReport | Sequence[_LifeReport]
 STREAM = "stream.json"  # of a report, in the folder of a run
 MATRIX_SCALE = "normalised regret\n(0 = optimal, 1 = constant ½)"
 _STEP = 0.05  # of the ends of a colour scale
+_LUMINANCE = (0.299, 0.587, 0.114)  # of red, green and blue
 _MOST_NUMBERS = 12  # of columns of a matrix whose cells show their values
 
 
@@ -184,7 +185,9 @@ def retention_map(
     V, P = M.shape
     size = (max(3.6, 1.9 + 0.52 * min(P, 20)), max(2.8, 1.5 + 0.32 * min(V, 30)))
     with canvas(ax, size, path, title=lives_title(reports, title, f", {region}")) as (axes,):
-        image = draw_matrix(axes, M, visited, labels, max(1.0, float(M.max())))
+        scale = 0.0, max(1.0, float(M.max()))
+        phases = [str(phase) for phase in range(P)]
+        image = draw_matrix(axes, M, labels, phases, scale, visited, "viridis_r")
         axes.set_xlabel("evaluated on the task of phase")
         axes.set_ylabel("policy at the end of")
         bar = figure_of(axes).colorbar(image, ax=axes, label=MATRIX_SCALE)
@@ -193,25 +196,33 @@ def retention_map(
 
 
 def draw_matrix(
-    axes: Axes, M: Array, visited: Sequence[tuple[int, int]], labels: Sequence[str], top: float
+    axes: Axes,
+    M: Array,
+    rows: Sequence[str],
+    columns: Sequence[str],
+    scale: tuple[float, float],
+    visited: Sequence[tuple[int, int]] = (),
+    colours: str = "viridis",
 ) -> AxesImage:
-    """A retention matrix `[V, P]` with `visited` cells outlined; the darkest colour is `top`."""
+    """A matrix as colours, with its values where they are legible; `visited` cells are outlined."""
+    low, high = scale
     image = axes.imshow(
-        M, vmin=0.0, vmax=top, cmap="viridis_r", aspect="auto", interpolation="nearest"
+        M, vmin=low, vmax=high, cmap=colours, aspect="auto", interpolation="nearest"
     )
     axes.grid(visible=False)
-    V, P = M.shape
-    if P <= _MOST_NUMBERS:
-        for row, column in np.ndindex(V, P):
-            colour = "white" if M[row, column] > 0.5 * top else "black"
+    digits = 2 if high - low > 0.11 else 3
+    if len(columns) <= _MOST_NUMBERS:
+        for (row, column), value in np.ndenumerate(M):
+            known = not math.isnan(value)
+            dark = known and np.dot(image.to_rgba(np.asarray(value))[:3], _LUMINANCE) < 0.5
             axes.text(
-                column, row, f"{M[row, column]:.2f}", ha="center", va="center", fontsize=8,
-                color=colour,
+                column, row, f"{value:.{digits}f}" if known else "–", ha="center", va="center",
+                fontsize=7.5, color="white" if dark else "black",
             )  # fmt: skip
     for row, column in visited:
         _outline(axes, column - 0.47, row - 0.47, 0.94, (2.4, 1.0))
-    _tick(axes.yaxis, labels)
-    _tick(axes.xaxis, [str(j) for j in range(P)])
+    _tick(axes.yaxis, rows)
+    _tick(axes.xaxis, columns)
     return image
 
 

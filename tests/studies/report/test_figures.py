@@ -73,7 +73,7 @@ def test_a_heat_map_has_one_scale_that_covers_its_values_and_prints_them(analysi
     assert len(maps) == len(analysis.algorithms)
     assert {axes.images[0].get_clim() for axes in maps} == {(0.9, 1.0)}
     first = maps[0].images[0].get_array()[0, 0]
-    assert maps[0].texts[0].get_text() == f"{first:.3f}".removeprefix("0")
+    assert maps[0].texts[0].get_text() == f"{first:.3f}"
     assert any("colours from 0.90 to 1.00" in axes.get_xlabel() for axes in figure.axes)
 
 

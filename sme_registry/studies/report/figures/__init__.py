@@ -7,30 +7,30 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pandas as pd
 
 from sme_registry.errors import SMEError
 from sme_registry.evaluation import as_policy
+from sme_registry.io.markup import conjunction
 from sme_registry.plots import maps, style
-from sme_registry.plots.style import GREY, literal, new_figure
+from sme_registry.plots.style import GREY, literal, new_figure, wrapped
 from sme_registry.studies.report.analysis import Analysis, by_place
-from sme_registry.studies.report.design import ALL, metrics_of
+from sme_registry.studies.report.design import ALL, WITHIN, Metric, metrics_of
 from sme_registry.studies.report.figures import curves, panels
 from sme_registry.studies.report.figures.panels import (
     FEW,
-    HEADINGS,
     INDICATION,
     WIDTH,
     Drawn,
-    MarkColumn,
+    Look,
     Picture,
     dims,
     epsilon_remark,
     looks_of,
-    mark_rows,
+    marks,
     new_look,
     panel_grid,
+    side_by_side,
 )
 from sme_registry.studies.report.frames import RUN
 
@@ -39,7 +39,8 @@ if TYPE_CHECKING:
 
 _EPSILON, _RESOLUTION, _TIME = 1.0, 120, 0.5  # of maps of the plane
 _BOX = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
-_LUMINANCE = (0.299, 0.587, 0.114)  # of red, green and blue
+_LABELS = 2.4  # inches of the names of rows
+_OF_LIVES = ("average_performance", "forgetting", "plasticity_ratio", "learning_transfer")
 
 
 def draw(
@@ -47,78 +48,178 @@ def draw(
 ) -> tuple[list[Picture], list[str]]:
     """Pictures with their files, and why others are absent."""
     pictures, reasons = [], []
-    levels = analysis.tables["levels"]
-    single = not levels.empty and levels.runs.min() == 1
     with style.styled():
         for drawn in itertools.chain.from_iterable(drawing(analysis) for drawing in drawings):
             if isinstance(drawn, str):
                 reasons.append(drawn)
-                continue
-            caption = drawn.caption
-            if single and any(words in caption for words in ("95 %", "interquartile")):
-                caption += " A single run has no interval."
-            files = style.encoded(drawn.figure, formats)
-            pictures.append(replace(drawn, caption=caption, files=files))
+            else:
+                files = style.encoded(drawn.figure, formats)
+                pictures.append(replace(drawn, files=files))
     return pictures, reasons
 
 
 def draw_figures(analysis: Analysis, formats: Sequence[str]) -> tuple[list[Picture], list[str]]:
     from_tasks = TASK_FIGURES if analysis.algorithms else ()
-    from_streams = curves.STREAM_FIGURES if analysis.lives else ()
+    from_streams = STREAM_FIGURES if analysis.lives else ()
     return draw((*from_tasks, *from_streams), analysis, formats)
 
 
 def draw_contrasts(analysis: Analysis) -> Drawn:
     """The change that each class makes: of regret, and of metrics of training."""
-    sides = {1: "right", -1: "left"}
-    table = analysis.tables["contrasts"]
-    if table.empty:
-        yield (
-            "No contrasts: they need finished runs of one number on the first class and on another."
-        )
     general = [metric for metric in metrics_of("run") if not metric.needs]
     for name in ("regret", "training"):
         metrics = [metric for metric in general if metric.training == (name == "training")]
-        rows = table[table.metric.isin([metric.key for metric in metrics])]
-        if rows.empty:
-            continue
-        columns = [
-            MarkColumn(m.key, f"change of\n{m.label}\n(worse to the {sides[m.worse]})", neutral=0.0)
-            for m in metrics
-        ]
-        labels = [metric.label.partition(",")[0] for metric in metrics]
-        figure = mark_rows(
-            rows, "change", columns, "class_name", _class_places(analysis, rows),
-            looks_of(analysis, rows.algorithm),
-            share_x=name == "regret",
+        labels = conjunction([metric.label.partition(",")[0] for metric in metrics])
+        yield from _forest(
+            analysis, analysis.tables["contrasts"], "change", metrics,
+            "change of\n{label}\n({worse} is worse)", neutral=0.0, share_x=name == "regret",
+            name=f"contrasts-{name}",
+            title=f"What each class changes: {labels}",
+            caption="IQM over runs of the change from the first class, "
+            f"{analysis.base}, to each other class, each run compared with the run of the same "
+            f"number, with its 95 % bootstrap interval. {FEW} pairs, {INDICATION}",
         )  # fmt: skip
-        yield Picture(
-            f"contrasts-{name}",
-            f"What each class changes: {', '.join(labels[:-1])} and {labels[-1]}",
-            f"IQM over runs of the change from the first class, {analysis.base}, to each other "
-            "class, each run compared with the run of the same number, with its 95 % bootstrap "
-            f"interval. {FEW} pairs, {INDICATION}",
-            figure,
-        )
 
 
 def draw_agents(analysis: Analysis) -> Drawn:
     """Normalised regret of each agent of a team, WD and OOD side by side, one row an agent."""
     rows = analysis.tables["agents"]
+    yield from _forest(
+        analysis, rows.assign(place=rows.class_name + ", " + rows.agent), "iqm",
+        metrics_of("score"), "{label}", "place",
+        name="agents",
+        title="Normalised regret of each agent",
+        caption="IQM over runs with its 95 % bootstrap interval, over the action channels that the "
+        f"agent owns: 0 is the optimum, 1 the constant ½. {FEW} runs.",
+    )  # fmt: skip
+
+
+def draw_aggregates(analysis: Analysis) -> Drawn:
+    """The IQM of 1 − normalised regret, WD and OOD side by side, one row a group of classes."""
+    rows = analysis.tables["aggregates"]
+    yield from _forest(
+        analysis, rows[rows.statistic == "iqm"], "value", metrics_of("score"),
+        "IQM of 1 − {label}", "group",
+        name="aggregates",
+        title="Aggregates over kinds of tasks",
+        caption="Mean over classes of the IQM over runs, with its 95 % stratified bootstrap "
+        "interval: 1 is the optimum, 0 the constant ½. The classes of an axis include the first "
+        "class.",
+    )  # fmt: skip
+
+
+def draw_improvements(analysis: Analysis) -> Drawn:
+    """How probably one algorithm beats another, WD and OOD side by side, one row a pair."""
+    rows = analysis.tables["improvements"]
+    rows = rows[rows.group == ALL]
+    yield from _forest(
+        analysis, rows.assign(place=rows["first"] + " over " + rows["second"], algorithm=""),
+        "probability", metrics_of("score"), "P(less {label})", "place", neutral=0.5,
+        name="improvements",
+        title="Probability of improvement",
+        caption="How probably a run of the first algorithm beats a run of the second on a class "
+        "drawn at random, with its 95 % interval: ½ where neither is better. Algorithms that "
+        "learnt from different data are not compared.",
+    )  # fmt: skip
+
+
+def draw_differences(analysis: Analysis) -> Drawn:
+    """The paired difference of each algorithm from the first one, one row a class."""
+    first, rows = analysis.algorithms[0], analysis.tables["differences"]
+    rows = rows[rows["first"] == first]
+    yield from _forest(
+        analysis, rows.assign(algorithm=rows.second), "difference", metrics_of("score"),
+        f"{literal(first)} − the other:\n{{label}}\n(left: {literal(first)} is better)",
+        neutral=0.0,
+        name="differences",
+        title=f"Paired differences from {first}",
+        caption=f"IQM over pairs of runs of the difference {first} minus the other algorithm, with "
+        "its 95 % bootstrap interval. The runs of a pair have the same instance and seed. "
+        f"{FEW} pairs, {INDICATION}",
+    )  # fmt: skip
+
+
+def draw_lives(analysis: Analysis) -> Drawn:
+    """The metrics of whole lives, one panel a metric and one row a stream."""
+    rows = analysis.tables["stream_metrics"]
+    shown = [metric for metric in metrics_of("life") if metric.key in _OF_LIVES]
+    yield from _forest(
+        analysis, rows[rows.region == WITHIN], "iqm", shown, "{label}\n({worse} is worse)",
+        neutral=0.0, looks=curves.stream_looks(analysis), share_x=False,
+        name="stream-metrics",
+        title="Performance, forgetting and plasticity of whole lives",
+        caption=f"{curves.OVER_LIVES} Black lines: the constant ½, no forgetting, and as good as a "
+        "fresh agent.",
+    )  # fmt: skip
+
+
+def _forest(
+    analysis: Analysis,
+    rows: pd.DataFrame,
+    value: str,
+    metrics: Sequence[Metric],
+    label: str,
+    place: str = "class_name",
+    *,
+    looks: Mapping[str, Look] | None = None,
+    neutral: float | None = None,
+    share_x: bool = True,
+    name: str,
+    title: str,
+    caption: str,
+) -> Drawn:
+    """Marks with intervals: a panel for each metric, and a named row at each place."""
+    metrics = [metric for metric in metrics if metric.key in set(rows.metric)]
+    rows = rows[rows.metric.isin([metric.key for metric in metrics])]
     if rows.empty:
         return
-    rows = rows.assign(place=rows.class_name + ", " + rows.agent)
-    blocks = dict(zip(rows.place, rows.class_name, strict=True))
-    yield Picture(
-        "agents",
-        "Normalised regret of each agent",
-        "IQM over runs with its 95 % bootstrap interval, over the action channels that the agent "
-        f"owns: 0 is the optimum, 1 the constant ½. {FEW} runs.",
-        mark_rows(
-            rows, "iqm", _both("normalised regret"), "place", _spaced(blocks),
-            looks_of(analysis), share_x=True,
-        ),
+    places = _places(analysis, rows, place)
+    looks = looks or looks_of(analysis, rows.algorithm) or {"": new_look("black", "o")}
+
+    def draw_metric(axes: Axes, metric: Metric) -> None:
+        of_metric = rows[rows.metric == metric.key]
+        at = of_metric[place].map(places)
+        for algorithm, look, shift in side_by_side(looks, 0.7):
+            selected = of_metric.algorithm == algorithm
+            marks(axes, of_metric[selected], value, at[selected] + shift, look)
+        if neutral is not None:
+            x = 1.0 if metric.key == "plasticity_ratio" else neutral
+            axes.axvline(x, color="black", linewidth=0.9, zorder=1.5)
+        for y in places.values():
+            axes.axhspan(y - 0.42, y + 0.42, color="#f4f4f4", zorder=0.5, linewidth=0)
+        axes.grid(visible=False, axis="y")
+        axes.tick_params(axis="y", length=0)
+        axes.locator_params(axis="x", nbins=5)
+        text = label.format(label=metric.label, worse="right" if metric.worse > 0 else "left")
+        lines = (wrapped(line, 0.9 * WIDTH / len(metrics)) for line in text.splitlines())
+        axes.set_xlabel("\n".join(lines))
+
+    highest = max(places.values())
+    labels = [wrapped(literal(text), _LABELS) for text in places]
+    more = max(text.count("\n") for text in labels)
+    height = 1.6 + (0.09 * len(looks) + 0.12) * max(4.0, highest + 1) + 0.13 * more * len(labels)
+    figure = panel_grid(
+        [("", metric) for metric in metrics], draw_metric, (0.0, height),
+        looks={algorithm: look for algorithm, look in looks.items() if algorithm},
+        across=len(metrics), share_x=share_x,
     )  # fmt: skip
+    first = figure.axes[0]
+    first.set_yticks([*places.values()], labels, fontsize=8)
+    first.set_ylim(highest + 0.6, -0.6)
+    yield Picture(name, title, caption, figure)
+
+
+def _places(analysis: Analysis, rows: pd.DataFrame, place: str) -> dict[str, float]:
+    """The height of each row of a forest, with a gap between axes, or between teams."""
+    axes = {name: info.axis for name, info in analysis.classes.items()} | {ALL: ALL}
+    places: dict[str, float] = {}
+    y, last = -1.0, None
+    for row in rows.drop_duplicates(place).itertuples():
+        block = getattr(row, "class_name", "")
+        block = axes.get(block, "") if place == "class_name" else block
+        y += 1.0 if last in (None, block) else 1.4
+        places[getattr(row, place)], last = y, block
+    return places
 
 
 def draw_regions(analysis: Analysis) -> Drawn:
@@ -131,8 +232,9 @@ def draw_regions(analysis: Analysis) -> Drawn:
     def draw_map(axes: Axes, name: str) -> None:
         of_name = rows[rows.algorithm == name]
         values = of_name.pivot(index="class_name", columns="region", values="similarity")
-        _heat_map(axes, values.reindex(index=classes, columns=regions).to_numpy(), scale)
-        axes.set_xticks(range(len(regions)), [region.replace("OOD ", "") for region in regions])
+        values = values.reindex(index=classes, columns=regions).to_numpy()
+        columns = [region.replace("OOD ", "") for region in regions]
+        maps.draw_matrix(axes, values, classes, columns, scale)
         axes.set_yticks(range(len(classes)), classes, fontsize=8)
 
     items = [(name, name) for name in analysis.algorithms]
@@ -151,21 +253,6 @@ def draw_regions(analysis: Analysis) -> Drawn:
         figure,
         is_map=True,
     )
-
-
-def _heat_map(axes: Axes, values: Any, scale: tuple[float, float]) -> None:
-    """`[class, region]` similarities as an image with their numbers."""
-    image = axes.imshow(values, vmin=scale[0], vmax=scale[1], cmap="viridis", aspect="auto")
-    axes.grid(visible=False)
-    axes.spines[:].set_visible(False)
-    axes.tick_params(length=0)
-    digits = 2 if scale[1] - scale[0] > 0.11 else 3
-    for (y, x), value in np.ndenumerate(values):
-        known = not np.isnan(value)
-        dark = known and np.dot(image.to_rgba(value)[:3], _LUMINANCE) < 0.5
-        text = f"{value:.{digits}f}".removeprefix("0") if known else "–"
-        colour = "white" if dark else "black"
-        axes.text(x, y, text, ha="center", va="center", fontsize=7.5, color=colour)
 
 
 def draw_decay(analysis: Analysis) -> Drawn:
@@ -195,82 +282,6 @@ def draw_decay(analysis: Analysis) -> Drawn:
         caption += f" It includes runs with S = {', '.join(map(str, state_dims))}."
         caption += epsilon_remark(analysis)
     yield Picture("decay", "Similarity lost outside against similarity inside", caption, figure)
-
-
-def draw_aggregates(analysis: Analysis) -> Drawn:
-    """The IQM of 1 − normalised regret, WD and OOD side by side, one row a group of classes."""
-    rows = analysis.tables["aggregates"]
-    if rows.empty:
-        yield (
-            "No aggregates over classes and no performance profiles: no class has runs of every "
-            "algorithm."
-        )
-        return
-    rows = rows[rows.statistic == "iqm"]
-    yield Picture(
-        "aggregates",
-        "Aggregates over kinds of tasks",
-        "Mean over classes of the IQM over runs, with its 95 % stratified bootstrap interval: "
-        "1 is the optimum, 0 the constant ½. The classes of an axis include the first class.",
-        mark_rows(
-            rows, "value", _both("IQM of 1 − normalised regret"), "group", _spaced(rows.group),
-            looks_of(analysis), share_x=True,
-        ),
-    )  # fmt: skip
-
-
-def draw_improvements(analysis: Analysis) -> Drawn:
-    """How probably one algorithm beats another, WD and OOD side by side, one row a pair."""
-    rows = analysis.tables["improvements"]
-    if rows.empty:
-        yield (
-            "No comparison of algorithms: no two of them have runs on the same classes and, if "
-            "they learn from data, the same data."
-        )
-        return
-    rows = rows[rows.group == ALL]
-    rows = rows.assign(place=rows["first"] + " over " + rows["second"], algorithm="")
-    caption = (
-        "How probably a run of the first algorithm beats a run of the second on a class drawn at "
-        "random, with its 95 % interval: ½ where neither is better."
-    )
-    if not analysis.tables["offline"].empty:
-        caption += " Algorithms that learnt from different data are not compared."
-    columns, looks = (
-        _both("P(a run of X beats a run of Y)", neutral=0.5),
-        {"": new_look("black", "o")},
-    )
-    places = _spaced(rows.place)
-    figure = mark_rows(rows, "probability", columns, "place", places, looks, share_x=True)
-    yield Picture("improvements", "Probability of improvement", caption, figure)
-
-
-def draw_differences(analysis: Analysis) -> Drawn:
-    """The paired difference of each algorithm from the first one, one row a class."""
-    drawn, first = metrics_of("score"), analysis.algorithms[0]
-    rows = analysis.tables["differences"]
-    rows = rows[(rows["first"] == first) & rows.metric.isin([metric.key for metric in drawn])]
-    if rows.empty:
-        return
-    looks, places = looks_of(analysis, rows.second), _class_places(analysis, rows)
-    if ALL in set(rows.class_name):
-        places[ALL] = max(places.values()) + 1.4
-    alone = next(iter(looks)) if len(looks) == 1 else ""
-    label = (
-        f"{literal(first)} − {literal(alone) or 'the other'}\n(left: {literal(first)} is better)"
-    )
-    yield Picture(
-        "differences",
-        f"Paired differences from {first}",
-        f"IQM over pairs of runs of the difference {first} minus {alone or 'the other algorithm'}, "
-        "with its 95 % bootstrap interval. The runs of a pair have the same instance and seed. "
-        f"{FEW} pairs, {INDICATION}",
-        mark_rows(
-            rows.assign(algorithm=rows.second), "difference",
-            [MarkColumn(metric.key, label, metric.label, 0.0) for metric in drawn],
-            "class_name", places, looks, share_x=True,
-        ),
-    )  # fmt: skip
 
 
 def draw_maps(analysis: Analysis) -> Drawn:
@@ -331,30 +342,12 @@ def _kept_maps(
     return kept, problem
 
 
-def _both(label: str, **options: Any) -> list[MarkColumn]:
-    """Columns of WD and OOD regret side by side."""
-    return [MarkColumn(metric, label, heading, **options) for metric, heading in HEADINGS.items()]
-
-
-def _spaced(names: Iterable[str] | Mapping[str, str]) -> dict[str, float]:
-    """The height of each name's row, with a gap where the block changes that a mapping names."""
-    blocks = names if isinstance(names, Mapping) else dict.fromkeys(names, "")
-    places: dict[str, float] = {}
-    y, last = -1.0, None
-    for name, block in blocks.items():
-        y += 1.0 if last in (None, block) else 1.4
-        places[name], last = y, block
-    return places
-
-
-def _class_places(analysis: Analysis, rows: pd.DataFrame) -> dict[str, float]:
-    """The height of each class's row, with a gap between axes."""
-    present = set(rows.class_name)
-    return _spaced({n: info.axis for n, info in analysis.classes.items() if n in present})
-
-
 TASK_FIGURES = (
     draw_contrasts, curves.draw_regret, draw_agents, draw_regions, draw_decay, draw_aggregates,
     curves.draw_profiles, draw_improvements, draw_differences, curves.draw_class_curves,
     curves.draw_learning_curves, draw_maps, curves.draw_offline,
+)  # fmt: skip
+STREAM_FIGURES = (
+    draw_lives, curves.draw_dynamic_regret, curves.draw_plasticity, curves.draw_retention,
+    curves.draw_performance, curves.draw_lifetime_curves,
 )  # fmt: skip

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
@@ -17,7 +17,6 @@ from sme_registry.plots.maps import MATRIX_SCALE, draw_matrix
 from sme_registry.plots.style import GREY, legend_below, literal, shades
 from sme_registry.studies.report.analysis import (
     CURVES,
-    ENOUGH_RUNS,
     OFFLINE_INTERVAL,
     Analysis,
     training_data,
@@ -33,7 +32,7 @@ from sme_registry.studies.report.figures import panels
 from sme_registry.studies.report.figures.panels import (
     CONSTANT,
     FEW,
-    HEADINGS,
+    INDICATION,
     LINEAR,
     WIDTH,
     Drawn,
@@ -54,10 +53,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _BEHAVIOUR, _OPTIMUM = new_look("black"), new_look(GREY, dash=(0, (1, 1.2)))
-_SHOWN = ("average_performance", "forgetting", "plasticity_ratio", "learning_transfer")
 _HEIGHTS = 0.9, 2.3  # inches: of the rest, and of a row of panels
 _PAD = 14.0  # points between panels and titles, for the phases
-_OVER_LIVES = (
+OVER_LIVES = (
     "IQM over lives with its 95 % bootstrap interval, within distribution. "
     f"{panels.FEW} lives, {panels.INDICATION}"
 )
@@ -83,10 +81,11 @@ def draw_regret(analysis: Analysis) -> Drawn:
         f"½, the dashed line the linear least-squares policy fitted to the optimum. {FEW} runs."
     )
     remark, groups = epsilon_remark(analysis), _axis_groups(analysis)
+    metrics = metrics_of("score")
     if len(groups) == 1 and groups[0].axis not in ("", SEVERAL):
         (group,) = groups
         log = ", log scale" if panels.spacing(group.values) == "log" else ""
-        items = [(heading, group, metric) for metric, heading in HEADINGS.items()]
+        items = [(metric.label, group, metric.key) for metric in metrics]
         yield Picture(
             f"regret-{group.axis.replace('.', '-')}",
             f"Normalised regret along the {group.name}",
@@ -94,12 +93,12 @@ def draw_regret(analysis: Analysis) -> Drawn:
             _regret_panels(analysis, items, x=literal(group.name) + log),
         )
         return
-    for metric, heading in HEADINGS.items():
+    for metric in metrics:
         yield Picture(
-            metric.replace("_", "-"),
-            f"Normalised regret {heading}, along each axis",
-            caption + remark * (metric == "ood_regret"),
-            _regret_panels(analysis, [(group.name, group, metric) for group in groups]),
+            slug(metric.key),
+            f"{metric.label} along each axis",
+            caption + remark,
+            _regret_panels(analysis, [(group.name, group, metric.key) for group in groups]),
         )
 
 
@@ -155,16 +154,20 @@ def draw_profiles(analysis: Analysis) -> Drawn:
         axes.set_xlim(0.0, 1.0)
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
 
-    for metric, rows in analysis.tables["profiles"].groupby("metric", sort=False):
+    for metric in metrics_of("score"):
+        rows = analysis.tables["profiles"]
+        rows = rows[rows.metric == metric.key]
+        if rows.empty:
+            continue
         figure = panel_grid(
-            panels.by(rows, "group"), draw_group, (0.7, 2.1), x="τ (1 − normalised regret)",
+            panels.by(rows, "group"), draw_group, (0.7, 2.1), x=f"τ (1 − {metric.label})",
             y="share of runs above τ", looks=looks, share_x=True,
         )  # fmt: skip
         yield Picture(
-            f"profiles-{metric.removesuffix('_regret')}",
-            f"Performance profiles {HEADINGS[metric]}",
-            "The share of runs whose 1 − normalised regret is above τ, classes counting alike, "
-            "with pointwise 95 % bands. A line above another is better at every τ.",
+            f"profiles-{metric.key.removesuffix('_regret')}",
+            f"Performance profiles of {metric.label}",
+            f"The share of runs whose 1 − {metric.label} is above τ, classes counting alike, with "
+            "pointwise 95 % bands. A line above another is better at every τ.",
             figure,
         )
 
@@ -174,27 +177,59 @@ def draw_class_curves(analysis: Analysis) -> Drawn:
     rows = analysis.tables["learning_curves"]
     rows = rows[(rows.measure == "regret") & rows.algorithm.isin(analysis.learners)]
     looks = looks_of(analysis, rows.algorithm)
-    if len(looks) < 2:
-        return
+    if len(looks) > 1:
+        yield Picture(
+            "learning-curves-by-class",
+            "Learning curves of all algorithms by class",
+            f"{curves_caption(rows)} Mean exact regret per step, 0 for the optimum.",
+            _lines_by_class(
+                rows, looks, lambda axes, _: panels.tick_steps(axes),
+                {name: f" ({c.label})" for name, c in analysis.classes.items() if c.label},
+                (0.8, 1.9), x="steps",
+            ),
+        )  # fmt: skip
+
+
+def draw_lifetime_curves(analysis: Analysis) -> Drawn:
+    """Regret per step over the lifetime, evaluated on the task in force, one panel a stream."""
+    rows = analysis.tables["stream_learning_curves"]
+    rows = rows[rows.measure == "regret"]
+    if not rows.empty:
+        yield Picture(
+            "stream-learning-curves",
+            "Learning curves of lives",
+            f"{curves_caption(rows)} Mean exact regret per step in evaluations during training, on "
+            "the task in force. Shades and numbers above are visits and their phases.",
+            _lines_by_class(
+                rows, stream_looks(analysis),
+                lambda axes, name: _finish_lifetime(axes, analysis, name), {}, _HEIGHTS,
+                x="lifetime (steps)", title_pad=_PAD,
+            ),
+        )  # fmt: skip
+
+
+def _lines_by_class(
+    rows: pd.DataFrame,
+    looks: Mapping[str, Look],
+    finish: Callable[[Axes, str], None],
+    labels: Mapping[str, str],
+    heights: tuple[float, float],
+    **options: Any,
+) -> Figure:
+    """A panel for each class, or stream, with a line for each algorithm."""
 
     def draw_class(axes: Axes, of_class: pd.DataFrame) -> None:
         panels.draw_lines(axes, of_class, "algorithm", looks)
-        panels.tick_steps(axes)
+        finish(axes, of_class.class_name.iloc[0])
 
-    labels = {name: f" ({c.label})" if c.label else "" for name, c in analysis.classes.items()}
-    items = [(f"{name}{labels[name]}", group) for name, group in panels.by(rows, "class_name")]
-    yield Picture(
-        "learning-curves-by-class",
-        "Learning curves of all algorithms by class",
-        f"{curves_caption(rows)} Mean exact regret per step, 0 for the optimum.",
-        panel_grid(items, draw_class, (0.8, 1.9), x="steps", y=CURVES["regret"], looks=looks),
-    )
+    items = [
+        (name + labels.get(name, ""), of_class) for name, of_class in panels.by(rows, "class_name")
+    ]
+    return panel_grid(items, draw_class, heights, y=CURVES["regret"], looks=looks, **options)
 
 
 def draw_learning_curves(analysis: Analysis) -> Drawn:
     """One figure an axis: a row of panels an algorithm, the values of the axis as lines."""
-    if analysis.tables["learning_curves"].empty:
-        yield "No learning curves: the plan has no evaluations during training."
     for group in _axis_groups(analysis):
         rows = analysis.tables["learning_curves"]
         rows = rows[rows.class_name.isin(group.classes) & rows.algorithm.isin(analysis.learners)]
@@ -244,23 +279,19 @@ def draw_offline(analysis: Analysis) -> Drawn:
         looks={**looks, **references}, width=max(3.6, min(WIDTH, 1.0 + 2.4 * across)),
         share_x=True,
     )  # fmt: skip
-    caption = (
-        "A small mark is a run, a large one the mean over runs: similarity of the learner minus "
-        "that of the policy that made its data."
+    yield Picture(
+        "offline-improvement",
+        "Improvement over the behaviour policy",
+        "Mean over runs of the similarity of the learner minus that of the policy that made its "
+        f"data, with its 95 % bootstrap interval from {OFFLINE_INTERVAL} runs on. {FEW} runs, "
+        f"{INDICATION}",
+        figure,
     )
-    if rows.low.notna().any():
-        caption += " Bars are 95 % bootstrap intervals of the mean."
-    if rows.runs.min() < OFFLINE_INTERVAL:
-        caption += f" With fewer than {OFFLINE_INTERVAL} runs there is no interval."
-    if rows.runs.min() < ENOUGH_RUNS:
-        caption += f" {FEW} runs, an indication only."
-    yield Picture("offline-improvement", "Improvement over the behaviour policy", caption, figure)
 
 
 def _draw_improvements(
     axes: Axes, analysis: Analysis, rows: pd.DataFrame, looks: Mapping[str, Look]
 ) -> None:
-    runs = analysis.offline_runs[analysis.offline_runs.class_name == rows.class_name.iloc[0]]
     data = rows.drop_duplicates("nu")
     axes.axhline(0.0, color="black", linewidth=0.9, zorder=1.5)
     for look, similarity in ((_OPTIMUM, 1.0), (CONSTANT, data.constant_similarity)):
@@ -269,10 +300,8 @@ def _draw_improvements(
     nus = sorted(set(analysis.tables["offline"].nu))
     apart = min((b - a for a, b in itertools.pairwise(nus)), default=1.0)
     for name, look, shift in side_by_side(looks, 0.25 * apart):
-        means, singles = rows[rows.learner == name], runs[runs.learner == name]
+        means = rows[rows.learner == name]
         marks(axes, means, "improvement", means.nu + shift, look, upright=True, joined=True)
-        mark = {**look, "linestyle": "none", "markersize": 2.5, "markeredgewidth": 0.0}
-        axes.plot(singles.nu + shift, singles.improvement, **mark, alpha=0.5, zorder=3.5)
 
 
 def _axis_groups(analysis: Analysis) -> Sequence[Group]:
@@ -287,30 +316,9 @@ def _class_labels(group: Group, *, with_symbol: bool = False) -> list[str]:
     return labels or list(group.classes)
 
 
-def draw_lives(analysis: Analysis) -> Iterator[Picture]:
-    """The metrics of whole lives, one panel a metric and one row a stream."""
-    rows = _within(analysis.tables["stream_metrics"])
-    columns = [
-        panels.MarkColumn(
-            metric.key,
-            f"{metric.label}\n({'less' if metric.worse > 0 else 'more'} is better)",
-            neutral=1.0 if metric.key == "plasticity_ratio" else 0.0,
-        )
-        for metric in metrics_of("life")
-        if metric.key in _SHOWN and metric.key in set(rows.metric)
-    ]
-    places = {name: float(i) for i, name in enumerate(_lived(analysis))}
-    yield Picture(
-        "stream-metrics",
-        "Performance, forgetting and plasticity of whole lives",
-        f"{_OVER_LIVES} Black lines: the constant ½, no forgetting, and as good as a fresh agent.",
-        panels.mark_rows(rows, "iqm", columns, "class_name", places, _looks(analysis)),
-    )
-
-
 def draw_dynamic_regret(analysis: Analysis) -> Iterator[Picture]:
     """The dynamic regret over the lifetime, one panel a stream."""
-    looks = {name: {**look, "linestyle": "-"} for name, look in _looks(analysis).items()}
+    looks = {name: {**look, "linestyle": "-"} for name, look in stream_looks(analysis).items()}
     regret, references = (analysis.tables[f"stream_{n}"] for n in ("regret", "reference_regret"))
 
     def draw_stream(axes: Axes, name: str) -> None:
@@ -348,7 +356,7 @@ def draw_plasticity(analysis: Analysis) -> Iterator[Picture]:
     rows = rows[rows.metric == "plasticity_ratio"]
     if rows.empty:
         return
-    looks = _looks(analysis)
+    looks = stream_looks(analysis)
 
     def draw_stream(axes: Axes, name: str) -> None:
         for algorithm, look, shift in panels.side_by_side(looks, 0.4):
@@ -365,7 +373,7 @@ def draw_plasticity(analysis: Analysis) -> Iterator[Picture]:
         "stream-plasticity",
         "Plasticity by visit",
         "Normalised regret on the phase just visited, divided by that of a fresh agent after as "
-        f"many steps on that phase alone: above 1, plasticity was lost. {_OVER_LIVES} In its first "
+        f"many steps on that phase alone: above 1, plasticity was lost. {OVER_LIVES} In its first "
         "visit a life is a fresh agent itself: other values than 1 say nothing about plasticity.",
         figure,
     )
@@ -395,7 +403,8 @@ def _retention(rows: pd.DataFrame, visits: Sequence[Visit]) -> Figure:
     def draw_agent(axes: Axes, of_agent: pd.DataFrame) -> None:
         of_agent = of_agent.assign(visit=of_agent.visit.fillna(-1))
         M = of_agent.pivot(index="visit", columns="phase", values="iqm").to_numpy()
-        draw_matrix(axes, M, visited, labels, top)
+        phases = [str(phase) for phase in range(M.shape[1])]
+        draw_matrix(axes, M, labels, phases, (0.0, top), visited, "viridis_r")
 
     height = 0.55 + 0.24 * max(4, min(len(labels), 30))
     figure = panel_grid(
@@ -428,38 +437,6 @@ def draw_performance(analysis: Analysis) -> Iterator[Picture]:
         )
 
 
-def draw_lifetime_curves(analysis: Analysis) -> Iterator[Picture]:
-    """Regret per step over the lifetime, evaluated on the task in force, one panel a stream."""
-    rows = analysis.tables["stream_learning_curves"]
-    rows = rows[rows.measure == "regret"]
-    if rows.empty:
-        return
-    looks = _looks(analysis)
-
-    def draw_stream(axes: Axes, name: str) -> None:
-        panels.draw_lines(axes, rows[rows.class_name == name], "algorithm", looks)
-        _finish_lifetime(axes, analysis, name)
-
-    names = [name for name in _lived(analysis) if name in set(rows.class_name)]
-    figure = panel_grid(
-        _named(names), draw_stream, _HEIGHTS, x="lifetime (steps)", y=CURVES["regret"],
-        looks=looks, title_pad=_PAD,
-    )  # fmt: skip
-    yield Picture(
-        "stream-learning-curves",
-        "Learning curves of lives",
-        f"{panels.curves_caption(rows)} Mean exact regret per step in evaluations during training, "
-        "on the task in force. Shades and numbers above are visits and their phases.",
-        figure,
-    )
-
-
-STREAM_FIGURES = (
-    draw_lives, draw_dynamic_regret, draw_plasticity, draw_retention, draw_performance,
-    draw_lifetime_curves,
-)  # fmt: skip
-
-
 def _finish_lifetime(axes: Axes, analysis: Analysis, name: str) -> None:
     """Visits as bands, with their phases above, and ticks of steps."""
     visits = _visits(analysis, name)
@@ -468,7 +445,7 @@ def _finish_lifetime(axes: Axes, analysis: Analysis, name: str) -> None:
     shade_visits(axes, visits)
 
 
-def _looks(analysis: Analysis) -> dict[str, Look]:
+def stream_looks(analysis: Analysis) -> dict[str, Look]:
     """The looks of the algorithms that have lives; as in the figures of single tasks."""
     names = dict.fromkeys((*analysis.learners, *analysis.stream_algorithms))
     looks = panels.numbered_looks(names)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -43,8 +43,6 @@ FEW = f"Hollow: fewer than {ENOUGH_RUNS}"
 INDICATION = "so that the interval is an indication only."
 WIDTH = 7.2  # inches: of a page, so that 9 points stay 9 points
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (8, 2)))
-HEADINGS = {"wd_regret": "within distribution (WD)", "ood_regret": "out of distribution (OOD)"}
-_LABELS = 2.4  # inches of the names of rows
 _LINE = 0.17  # inches: the height of a line of text
 
 
@@ -240,58 +238,6 @@ def tick_steps(axes: Axes) -> None:
     axes.set_xlim(left=0)
     axes.locator_params(axis="x", nbins=4)
     axes.xaxis.set_major_formatter(step_text)
-
-
-class MarkColumn(NamedTuple):
-    """A panel of rows of marks: the rows' metric, labels, and a line at the neutral value."""
-
-    metric: str
-    label: str
-    title: str = ""
-    neutral: float | None = None
-
-
-def mark_rows(
-    rows: pd.DataFrame,
-    value: str,
-    columns: Sequence[MarkColumn],
-    place: str,
-    places: Mapping[str, float],
-    looks: Mapping[str, Look],
-    *,
-    share_x: bool = False,
-) -> Figure:
-    """A figure with a named row of marks at each place, and a panel for each column."""
-
-    def draw(axes: Axes, column: MarkColumn) -> None:
-        of_metric = rows[rows.metric == column.metric]
-        at = of_metric[place].map(places)
-        for name, look, shift in side_by_side(looks, 0.7):
-            selected = of_metric.algorithm == name
-            marks(axes, of_metric[selected], value, at[selected] + shift, look)
-        if column.neutral is not None:
-            axes.axvline(column.neutral, color="black", linewidth=0.9, zorder=1.5)
-        for y in places.values():
-            axes.axhspan(y - 0.42, y + 0.42, color="#f4f4f4", zorder=0.5, linewidth=0)
-        axes.grid(visible=False, axis="y")
-        axes.tick_params(axis="y", length=0)
-        axes.locator_params(axis="x", nbins=5)
-        lines = column.label.splitlines()
-        axes.set_xlabel("\n".join(wrapped(line, 0.9 * WIDTH / len(columns)) for line in lines))
-
-    highest = max(places.values())
-    labels = [wrapped(literal(name), _LABELS) for name in places]
-    more = max(label.count("\n") for label in labels)
-    height = 1.6 + (0.09 * len(looks) + 0.12) * max(4.0, highest + 1) + 0.13 * more * len(labels)
-    items = [(column.title, column) for column in columns]
-    named = looks if [*looks] != [""] else None
-    figure = panel_grid(
-        items, draw, (0.0, height), looks=named, across=len(columns), share_x=share_x
-    )
-    first = figure.axes[0]
-    first.set_yticks([*places.values()], labels, fontsize=8)
-    first.set_ylim(highest + 0.6, -0.6)
-    return figure
 
 
 Spacing = Literal["linear", "log", "nominal"]
