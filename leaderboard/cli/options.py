@@ -6,18 +6,19 @@ import os
 import re
 from collections.abc import Collection
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from leaderboard.documents.board import FILE, BoardDocument, Folder, refuse_unscored
 from leaderboard.documents.submission import now
+from leaderboard.store import Store
+from leaderboard.web import client
 from sme_registry.errors import OptionError
 from sme_registry.io import read_regular
+from sme_registry.io.terminal import Progress, err
+from sme_registry.seasons import WITHOUT_TASK
 from sme_registry.spec import ProtocolFile, SuiteFile, catalogue
-
-if TYPE_CHECKING:
-    from leaderboard.store import Store
 
 _FILE_BYTES = 2**28  # of answers
 _LONG_LOG = 2000  # entries, read in two seconds or so
@@ -66,8 +67,6 @@ def open_board(board: Path) -> Store:
     Raises:
       BoardError, TamperedError: as `Store.open`.
     """
-    from leaderboard.store import Store
-    from sme_registry.io.terminal import Progress, err
 
     log = Folder(board).log
     entries = sum(1 for _ in os.scandir(log)) if log.is_dir() else 0
@@ -203,7 +202,6 @@ def policy_of_each(policy: str, names: Collection[str]) -> dict[str, str]:
       OptionError: there are several instances, and all would have the same policy, which is none
         of the references that need no task.
     """
-    from sme_registry.seasons import WITHOUT_TASK
 
     if len(names) > 1 and "{name}" not in policy and policy not in WITHOUT_TASK:
         raise OptionError(
@@ -281,6 +279,5 @@ def board_document(board: str) -> BoardDocument:
     Raises:
       BoardError: there is no board, or it cannot be reached.
     """
-    from leaderboard.web import client
 
     return client.board_document(board) if is_url(board) else Folder(board).read()

@@ -4,29 +4,33 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 from rich.markup import escape
 
 from leaderboard.cli.options import BoardFolder, BoardOrUrl, Json, is_url, open_board
-from leaderboard.documents.result import LABELS, SYMBOLS, Metric
+from leaderboard.documents.board import BoardDocument
+from leaderboard.documents.result import LABELS, SYMBOLS, Estimate, Metric, Result
+from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError
+from leaderboard.scoring import ranking
+from leaderboard.scoring.ranking import REASONS, RankedRow
+from leaderboard.scoring.verify import VerifyReport
+from leaderboard.scoring.verify import verify as verify_board
+from leaderboard.store import EntryRow, Store
+from leaderboard.web import client
+from leaderboard.web.tables import PublicView, RankingFile, public_view, steps_text
 from sme_registry.errors import OptionError
 from sme_registry.io.markup import Table
 from sme_registry.io.terminal import Progress, err, fixed, out, print_json, print_pairs
 
-if TYPE_CHECKING:
-    from leaderboard.documents.board import BoardDocument
-    from leaderboard.documents.result import Estimate, Result
-    from leaderboard.scoring.ranking import RankedRow
-    from leaderboard.scoring.verify import VerifyReport
-    from leaderboard.store import EntryRow, Store
-    from leaderboard.web.tables import PublicView
+app = typer.Typer()
 
 _SHORTEST_ID = 4
 
 
+@app.command()
 def rank(
     board: BoardFolder = Path("board"),
     metric: Annotated[
@@ -53,9 +57,6 @@ def rank(
 
       sme-leaderboard rank board --csv > ranking.csv
     """
-    from leaderboard.documents.submission import now
-    from leaderboard.scoring import ranking
-    from leaderboard.web.tables import RankingFile
 
     if json + csv + latex > 1:
         raise OptionError("--json, --csv, --latex: give at most one of them.")
@@ -74,8 +75,6 @@ def rank(
 
 
 def _ranking_table(rows: list[RankedRow], metric: Metric, board: BoardDocument) -> Table:
-    from leaderboard.scoring.ranking import REASONS
-    from leaderboard.web.tables import steps_text
 
     reasons: dict[str, None] = dict.fromkeys(row.reason for row in rows if row.reason)
     notes = dict(zip(reasons, "*†‡§¶", strict=False))
@@ -134,6 +133,7 @@ def _interval(value: Estimate) -> str:
     return f"{fixed(value.value)} ({fixed(value.interval[0])} to {fixed(value.interval[1])})"
 
 
+@app.command()
 def show(
     board: BoardOrUrl,
     id: Annotated[
@@ -177,8 +177,6 @@ def show(
 
 def _public_view(board: str, id: str) -> PublicView:
     """What a board's folder or a served board publishes about a submission."""
-    from leaderboard.web import client
-    from leaderboard.web.tables import PublicView, public_view
 
     if is_url(board):
         return PublicView.from_dict(client.status(board, id))
@@ -187,7 +185,6 @@ def _public_view(board: str, id: str) -> PublicView:
 
 
 def _print_submission(view: PublicView) -> None:
-    from leaderboard.scoring.ranking import REASONS
 
     submission = view.signed.submission
     method, runs = submission.method, submission.runs
@@ -261,6 +258,7 @@ def find_entry(store: Store, id: str) -> EntryRow:
     return matches[0]
 
 
+@app.command()
 def verify(
     board: BoardFolder = Path("board"),
     rescore: Annotated[
@@ -296,8 +294,6 @@ def verify(
       sme-leaderboard verify board --contains sha256:3f2a…
     """
     from dataclasses import asdict
-
-    from leaderboard.scoring.verify import verify as verify_board
 
     with Progress("verifying", 1, console=err(), unit="rows", enabled=not json) as progress:
         report = verify_board(

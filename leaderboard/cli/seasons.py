@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -11,16 +11,25 @@ from rich.markup import escape
 from leaderboard.cli.options import BoardFolder, Json, open_board
 from leaderboard.documents.master import Master
 from leaderboard.documents.result import LABELS, Metric
-from leaderboard.documents.season import Reveal
+from leaderboard.documents.season import Reveal, Terms
 from leaderboard.errors import Rejection
+from leaderboard.scoring.publication import (
+    check_published,
+    create_season,
+    read_plan,
+    read_season,
+    refuse_large_answers,
+    refuse_unrankable,
+)
+from leaderboard.scoring.ranking import REASONS
+from leaderboard.scoring.season import counting, ranking_facts, score_entries
+from leaderboard.scoring.tables import EASY, table_regret
+from leaderboard.sealed import verify_season
+from leaderboard.store import SeasonRow, Store
 from sme_registry.errors import OptionError
 from sme_registry.io import check_new, read_json
 from sme_registry.io.markup import Table, plural
 from sme_registry.io.terminal import Progress, err, fixed, out, print_json, print_pairs
-
-if TYPE_CHECKING:
-    from leaderboard.documents.season import Terms
-    from leaderboard.store import SeasonRow, Store
 
 SeasonId = Annotated[str, typer.Argument(metavar="SEASON", help="The season's id.")]
 SecretFile = Annotated[
@@ -31,7 +40,7 @@ SecretFile = Annotated[
     ),
 ]
 
-app = typer.Typer(
+season = typer.Typer(
     no_args_is_help=True,
     help="""Sealed seasons: tasks that nobody but the organiser knows until they are revealed.
 
@@ -46,7 +55,7 @@ app = typer.Typer(
 )
 
 
-@app.command()
+@season.command()
 def new(
     board: BoardFolder,
     plan: Annotated[
@@ -72,13 +81,6 @@ def new(
 
       sme-leaderboard season new board plan.json --out autumn
     """
-    from leaderboard.scoring.publication import (
-        create_season,
-        read_plan,
-        refuse_large_answers,
-        refuse_unrankable,
-    )
-    from leaderboard.store import Store
 
     fields = read_plan(read_json(plan), str(plan))
     with Store.open(board, read_only=True) as store:
@@ -105,7 +107,7 @@ def new(
     )
 
 
-@app.command()
+@season.command()
 def publish(
     board: BoardFolder,
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="As `season new` wrote it.")],
@@ -118,8 +120,6 @@ def publish(
 
       sme-leaderboard season publish board autumn
     """
-    from leaderboard.scoring.publication import check_published, read_season
-    from leaderboard.store import Store
 
     season = read_season(folder)
     with Progress("checking", len(season.published), console=err(), unit="instances") as progress:
@@ -130,7 +130,7 @@ def publish(
     out().print(f"Open from {season.opens} to {season.closes}.")
 
 
-@app.command()
+@season.command()
 def close(board: BoardFolder, season: SeasonId) -> None:
     """List what counts after the close, and the log's digest to keep elsewhere.
 
@@ -140,7 +140,6 @@ def close(board: BoardFolder, season: SeasonId) -> None:
 
       sme-leaderboard season close board autumn
     """
-    from leaderboard.scoring.season import counting
 
     with open_board(board) as store:
         row = store.season_row(season)
@@ -162,7 +161,7 @@ def close(board: BoardFolder, season: SeasonId) -> None:
     out().print(f"log entry {head.sequence} {head.digest}", soft_wrap=True)
 
 
-@app.command()
+@season.command()
 def reveal(board: BoardFolder, season: SeasonId, secret: SecretFile = None) -> None:
     """Publish the master of a season that is over, and score its offline entries.
 
@@ -172,8 +171,6 @@ def reveal(board: BoardFolder, season: SeasonId, secret: SecretFile = None) -> N
 
       sme-leaderboard season reveal board autumn
     """
-    from leaderboard.scoring.season import score_entries
-    from leaderboard.store import Store
 
     with Store.open(board) as store:
         row = store.season_row(season)
@@ -186,7 +183,7 @@ def reveal(board: BoardFolder, season: SeasonId, secret: SecretFile = None) -> N
     out().print(f"{row.id}: revealed, {entries} scored.")
 
 
-@app.command()
+@season.command()
 def verify(
     board: BoardFolder,
     season: SeasonId,
@@ -208,8 +205,6 @@ def verify(
 
       sme-leaderboard season verify board autumn --published autumn
     """
-    from leaderboard.scoring.publication import check_published
-    from leaderboard.sealed import verify_season
 
     checked: dict[str, Any] = {}
     with open_board(board) as store:
@@ -235,7 +230,7 @@ def verify(
         print_pairs(f"{row.id}: everything follows", checked)
 
 
-@app.command()
+@season.command()
 def show(
     board: BoardFolder,
     season: Annotated[
@@ -256,8 +251,6 @@ def show(
 
       sme-leaderboard season show board autumn --metric ood_regret
     """
-    from leaderboard.scoring.ranking import REASONS
-    from leaderboard.scoring.season import ranking_facts
 
     with open_board(board) as store:
         if season is None:
@@ -298,7 +291,6 @@ def show(
 
 
 def _warn_of_easy_classes(terms: Terms) -> None:
-    from leaderboard.scoring.tables import EASY, table_regret
 
     for member in terms.classes:
         rows = member.data.transitions if member.data else member.budget or 0
@@ -339,3 +331,7 @@ def _secret(board: Path, season: str, given: Path | None) -> Path:
     if path.is_dir():
         raise OptionError(f"secret={path}: is a folder. Give the path of a file.")
     return path
+
+
+app = typer.Typer()
+app.add_typer(season, name="season")

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.markup import escape
 
+from leaderboard import intake
+from leaderboard.artefact.isolation import isolation_for_own
+from leaderboard.bundle import Bundle, make_bundle
 from leaderboard.cli.options import (
     DEFAULT_KEY,
     BoardOrUrl,
@@ -28,20 +31,25 @@ from leaderboard.cli.options import (
     is_url,
 )
 from leaderboard.cli.results import find_entry
+from leaderboard.documents.board import RULES, BoardDocument
+from leaderboard.documents.checks import check_submission
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.result import LABELS, SYMBOLS
+from leaderboard.documents.result import LABELS, SYMBOLS, Result
 from leaderboard.documents.submission import Knowledge, SignedWithdrawal
 from leaderboard.errors import Rejection
+from leaderboard.scoring.score import score_submission
+from leaderboard.store import Store
+from leaderboard.web import client
 from sme_registry.errors import OptionError
+from sme_registry.evaluation import resolve_protocol
 from sme_registry.io import check_new
 from sme_registry.io.terminal import Progress, err, out, print_json
 from sme_registry.spec import SuiteFile, catalogue
 
-if TYPE_CHECKING:
-    from leaderboard.documents.board import BoardDocument
-    from leaderboard.documents.result import Result
+app = typer.Typer()
 
 
+@app.command()
 def keygen(key: KeyFile = DEFAULT_KEY) -> None:
     """Create your signing key. It proves who you are: keep it, and keep it secret.
 
@@ -56,6 +64,8 @@ def keygen(key: KeyFile = DEFAULT_KEY) -> None:
     out().print(f"{escape(str(path))}\npublic key {signing_key.public}", soft_wrap=True)
 
 
+@app.command("export", hidden=True)
+@app.command()
 def export_sb3(
     model: Annotated[Path, typer.Argument(metavar="MODEL.zip", help="A model saved by SB3.")],
     out_file: Annotated[
@@ -82,6 +92,7 @@ def export_sb3(
     out().print(f"{escape(str(path))}, {path.stat().st_size:,} bytes", soft_wrap=True)
 
 
+@app.command()
 def new(
     bundle: BundleFolder,
     runs: Annotated[
@@ -158,7 +169,6 @@ def new(
 
       sme-leaderboard new ppo --board board --runs runs/smoke --method PPO --submitter "A Lab"
     """
-    from leaderboard.bundle import make_bundle
 
     if board is not None and suite is not None:
         raise OptionError("--board, --suite: the board has a suite. Leave out --suite.")
@@ -215,6 +225,7 @@ def _runs_started(pairs: list[str]) -> dict[str, int]:
     return counts
 
 
+@app.command()
 def check(
     bundle: BundleFolder,
     board: Annotated[
@@ -247,10 +258,6 @@ def check(
 
       sme-leaderboard check td3 --protocol quick-v1
     """
-    from leaderboard.artefact.isolation import isolation_for_own
-    from leaderboard.bundle import Bundle
-    from leaderboard.documents.checks import check_submission
-    from leaderboard.scoring.score import score_submission
 
     content = Bundle.read(bundle)
     submission = content.signed.submission
@@ -279,8 +286,6 @@ def check(
 
 def _board_of(file: SuiteFile, protocol: str) -> BoardDocument:
     """A board of a suite that does not exist, to score by."""
-    from leaderboard.documents.board import RULES, BoardDocument
-    from sme_registry.evaluation import resolve_protocol
 
     return BoardDocument(
         title="check",
@@ -308,6 +313,7 @@ def _print_scores(result: Result) -> None:
         out().print("The board will mark it oracle-like, which requires the method's code.")
 
 
+@app.command()
 def submit(
     bundle: BundleFolder,
     board: BoardOrUrl,
@@ -324,10 +330,6 @@ def submit(
 
       sme-leaderboard submit td3 http://127.0.0.1:8000
     """
-    from leaderboard import intake
-    from leaderboard.bundle import Bundle
-    from leaderboard.store import Store
-    from leaderboard.web import client
 
     signed = Bundle.read(bundle).signed
     if is_url(board):
@@ -343,6 +345,7 @@ def submit(
             out().print(intake.submit_bundle(store, bundle, signing_key), soft_wrap=True)
 
 
+@app.command()
 def withdraw(
     board: BoardOrUrl,
     id: Annotated[
@@ -365,8 +368,6 @@ def withdraw(
 
       sme-leaderboard withdraw https://board.example sha256:… --reason "a bug in the wrapper"
     """
-    from leaderboard.store import Store
-    from leaderboard.web import client
 
     signing_key = SigningKey.read(key)
     if is_url(board):

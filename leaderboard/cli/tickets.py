@@ -1,17 +1,19 @@
-"""`sme-leaderboard ticket · answer`: take part in a sealed-online season."""
+"""`sme-leaderboard ticket · answer · enter`: take part in a sealed season."""
 
 from __future__ import annotations
 
 import secrets
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
 
+from leaderboard import intake
 from leaderboard.cli.options import (
     DEFAULT_KEY,
     ActionRange,
+    BoardOrUrl,
     CodeLink,
     Family,
     KeyFile,
@@ -21,26 +23,33 @@ from leaderboard.cli.options import (
     Statement,
     SubmitterName,
     answers_in,
+    board_document,
+    is_url,
     manifest_fields,
     policy_of_each,
     read_file,
 )
+from leaderboard.documents.entry import Entry, SignedTicketRequest, TicketRequest
 from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import Rejection
+from leaderboard.scoring.publication import name_of, read_season
+from leaderboard.store import Store
+from leaderboard.web import client
 from sme_registry.errors import OptionError
-from sme_registry.io import check_new, check_writable, choice, write_atomically
+from sme_registry.io import check_new, check_writable, choice, sha256_of, write_atomically
 from sme_registry.io.markup import Table
 from sme_registry.io.terminal import Progress, err, out
+from sme_registry.seasons import Instance, Ticket, actions_in, prepare_policy
+from sme_registry.seasons.wire import TicketPlace, pack_table, unpack_table
 
-if TYPE_CHECKING:
-    from sme_registry.seasons import Ticket
-    from sme_registry.seasons.wire import TicketPlace
+app = typer.Typer()
 
 ServedBoard = Annotated[
     str, typer.Argument(metavar="URL", help="The URL of the board that serves the season.")
 ]
 
 
+@app.command()
 def ticket(
     url: ServedBoard,
     season: Annotated[str, typer.Argument(metavar="SEASON", help="The season's id.")],
@@ -65,8 +74,6 @@ def ticket(
 
       sme-leaderboard ticket https://board.example winter --method PPO --submitter "A Lab"
     """
-    from leaderboard.documents.entry import SignedTicketRequest, TicketRequest
-    from leaderboard.web import client
 
     check_new(out_file)
     signing_key = SigningKey.read(key)
@@ -121,6 +128,7 @@ def ticket(
     )
 
 
+@app.command()
 def answer(
     url: ServedBoard,
     ticket_file: Annotated[Path, typer.Argument(metavar="TICKET", help="The ticket's file.")],
@@ -176,8 +184,6 @@ def answer(
     """
     import numpy as np
 
-    from sme_registry.seasons import Instance, Ticket, actions_in
-
     if (policy is None) == (challenges is None):
         raise OptionError("POLICY, --challenges: one of the two must be given.")
     held = Ticket.read(ticket_file)
@@ -224,8 +230,6 @@ def _prepared(
     policy: str, place: TicketPlace, action_range: str | None, algorithm: str | None
 ) -> Any:
     """A policy, or the array of actions in a file."""
-    from sme_registry.seasons import prepare_policy
-    from sme_registry.seasons.wire import unpack_table
 
     setting, given = place.member.setting, answers_in(policy)
     if given is not None:
@@ -234,8 +238,6 @@ def _prepared(
 
 
 def _write_challenges(url: str, ticket: Ticket, places: dict[str, int], folder: Path) -> None:
-    from sme_registry.seasons import Instance
-    from sme_registry.seasons.wire import pack_table
 
     check_writable(folder / "challenge.npy")
     with Progress("writing", len(places), console=err(), unit="challenges") as progress:
@@ -244,3 +246,100 @@ def _write_challenges(url: str, ticket: Ticket, places: dict[str, int], folder: 
                 write_atomically(folder / f"{name}.npy", pack_table(hidden.challenge()))
             progress.update(done)
     out().print(f"{escape(str(folder))}: {len(places)} challenges", soft_wrap=True)
+
+
+@app.command()
+def enter(
+    board: BoardOrUrl,
+    published: Annotated[
+        Path,
+        typer.Argument(metavar="SEASON", help="The folder with what the organiser published."),
+    ],
+    policy: Annotated[
+        str,
+        typer.Argument(
+            metavar="POLICY",
+            help="A policy as `sme evaluate` takes it, or an .npy file of actions in the challenge "
+            "states. {name} stands for the instance, such as deep-0.",
+        ),
+    ],
+    method: MethodName,
+    submitter: SubmitterName,
+    method_version: MethodVersion = "1",
+    family: Family = None,
+    knowledge: SealedKnowledge = "generic",
+    failed: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="An instance without a policy; scores 1. Repeatable."),
+    ] = None,
+    action_range: ActionRange = None,
+    code: CodeLink = None,
+    statement: Statement = "",
+    key: KeyFile = DEFAULT_KEY,
+) -> None:
+    """Answer the challenges of a sealed-offline season, and send the answers.
+
+    Only arrays of actions are sent, and no policy. The last entry of your key and method before
+    the close counts; nothing is scored before the reveal.
+
+    Examples:
+
+      sme-leaderboard enter board autumn '{name}.npz' --method IQL --submitter "A Lab"
+
+      sme-leaderboard enter board autumn '{name}.npy' --method X --submitter Y --failed deep-3
+    """
+
+    season, signing_key = read_season(published), SigningKey.read(key)
+    hidden = {name_of(each): each.member.setting for each in season.hidden}
+    without = failed or []
+    for name in without:
+        if name not in hidden:
+            raise OptionError(f"failed={name!r}: must be one of {', '.join(hidden)}.")
+    policies = policy_of_each(policy, hidden)
+    files: list[bytes | None] = []
+    with Progress("answering", len(hidden), console=err(), unit="instances") as progress:
+        for done, (name, setting) in enumerate(hidden.items(), start=1):
+            states = published / "challenges" / f"{name}.npy"
+            files.append(
+                None if name in without else _answers(policies[name], states, setting, action_range)
+            )
+            progress.update(done)
+    digests = [None if data is None else sha256_of(data) for data in files]
+    data = {name: each for name, each in zip(digests, files, strict=True) if name and each}
+    entry = Entry.from_dict(
+        {
+            **manifest_fields(
+                signing_key.public,
+                method=(method, method_version, family, knowledge),
+                submitter=submitter,
+                code=code,
+                statement=statement,
+            ),
+            "season": season.digest,
+            "answers": [name and {"sha256": name, "size": len(data[name])} for name in digests],
+        }
+    )
+    signed = entry.signed(signing_key, board_document(board).key)
+    if is_url(board):
+        with Progress("uploading", len(data), console=err(), unit="answers") as progress:
+            client.enter(board, season.id, signed, data, signing_key, progress=progress.update_of)
+    else:
+        with Store.open(Path(board)) as store:
+            intake.enter(store, signed, answers=data.__getitem__)
+    out().print(signed.id, soft_wrap=True)
+    err().print(
+        f"The season closes at {season.closes}; until then a later entry of "
+        f"{escape(method)} replaces this one.",
+        soft_wrap=True,
+    )
+
+
+def _answers(policy: str, states: Path, setting: Any, action_range: str | None) -> bytes:
+    """The file of answers: the given one, or a policy's actions in the challenge states."""
+
+    given = answers_in(policy)
+    if given is not None:
+        return given
+    prepared = prepare_policy(policy, setting, action_range=action_range)
+    shown = unpack_table(read_file(states), setting.state_dim + 2)
+    return pack_table(actions_in(shown, prepared, setting))

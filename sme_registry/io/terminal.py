@@ -311,24 +311,26 @@ class CommandGroup(TyperGroup):
     """Commands that report invalid input as one line on standard error and an exit code.
 
     A command of `modules` is in the `app` of its module, which is imported when it is called; the
-    help shows its summary.
+    help shows its summary, in a panel if it has one. Without a summary it is hidden.
     """
 
     exit_codes: tuple[tuple[type[SMEError], int], ...] = ()  # the first match; else 2
     extra: str = ""  # of our package, which these commands need
-    modules: ClassVar[Mapping[str, tuple[str, str]]] = {}  # command → module, summary
+    modules: ClassVar[Mapping[str, tuple[str, ...]]] = {}  # command → module, summary[, panel]
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
-        for name, (_, summary) in self.modules.items():
-            self.commands[name] = TyperCommand(name, help=summary)
+        for name, (_, summary, *panel) in self.modules.items():
+            self.commands[name] = TyperCommand(
+                name, help=summary, hidden=not summary, rich_help_panel=panel[0] if panel else None
+            )
         _show_literally(self)
 
     def load(self, name: str) -> Any:
         """The command of a name; its module is imported."""
         if name in self.modules:
-            module, _ = self.modules[name]
-            self.commands[name] = get_group(importlib.import_module(module).app).commands[name]
+            module = importlib.import_module(self.modules[name][0])
+            self.commands[name] = get_group(module.app).commands[name]
             _show_literally(self.commands[name])
         return self.commands[name]
 

@@ -3,7 +3,7 @@
 import pytest
 from typer.testing import CliRunner
 
-from leaderboard.cli.app import app
+from leaderboard.cli import app
 from leaderboard.documents.board import Folder
 from leaderboard.documents.result import Result
 from leaderboard.errors import TamperedError

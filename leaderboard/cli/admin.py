@@ -1,15 +1,21 @@
-"""`sme-leaderboard init · score · site · serve · reindex · gc`: run a board."""
+"""`sme-leaderboard init · score · site · serve · reindex · gc · demo`: run a board."""
 
 from __future__ import annotations
 
 import math
+import os
+import shutil
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.markup import escape
 
+from leaderboard import intake
+from leaderboard.artefact.isolation import Isolation, available_isolation, isolation_for_own
+from leaderboard.bundle import make_bundle
+from leaderboard.cli import results
 from leaderboard.cli.options import (
     BoardFolder,
     Json,
@@ -19,13 +25,19 @@ from leaderboard.cli.options import (
     find_suite,
     open_board,
 )
+from leaderboard.documents.board import RUNS_TO_RANK, Folder
+from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import BoardError
+from leaderboard.scoring.worker import run_scorers
+from leaderboard.store import Store, collect_garbage
+from sme_registry.errors import OptionError
+from sme_registry.evaluation import resolve_protocol
 from sme_registry.io.markup import plural
 from sme_registry.io.terminal import Progress, err, out, print_json
+from sme_registry.spec import EvaluationProtocol, ProtocolFile, Suite, SuiteFile, catalogue
+from sme_registry.training import RunRecord
 
-if TYPE_CHECKING:
-    from leaderboard.artefact.isolation import Isolation
-
+app = typer.Typer()
 
 UnsafeNoSandbox = Annotated[
     bool,
@@ -36,6 +48,7 @@ UnsafeNoSandbox = Annotated[
 ]
 
 
+@app.command()
 def init(
     board: NewBoardFolder = Path("board"),
     suite: SuiteName = "smoke-v1",
@@ -75,10 +88,6 @@ def init(
 
       sme-leaderboard init board --practice
     """
-    from leaderboard import intake
-    from leaderboard.documents.board import RUNS_TO_RANK
-    from leaderboard.store import Store
-    from sme_registry.evaluation import resolve_protocol
 
     file = find_suite(suite)
     protocol = protocol or ("quick-v1" if practice else "paper-v1")
@@ -118,6 +127,7 @@ def init(
     )
 
 
+@app.command()
 def score(
     board: BoardFolder = Path("board"),
     workers: Annotated[
@@ -137,7 +147,6 @@ def score(
 
       sme-leaderboard score board --workers 2
     """
-    from leaderboard.artefact.isolation import available_isolation
 
     isolation: Isolation = "process" if unsafe_no_sandbox else available_isolation()
     if isolation == "process" and not unsafe_no_sandbox:
@@ -155,8 +164,6 @@ def score_waiting(board: Path, workers: int, isolation: Isolation) -> None:
     Raises:
       typer.Exit: with code 1, if some could not be scored because of a fault of the machine.
     """
-    from leaderboard.scoring.worker import run_scorers
-    from leaderboard.store import Store
 
     with Store.open(board) as store:
         entries = store.entries()
@@ -188,6 +195,7 @@ def score_waiting(board: Path, workers: int, isolation: Isolation) -> None:
         raise typer.Exit(1)
 
 
+@app.command()
 def site(
     board: BoardFolder = Path("board"),
     out_folder: Annotated[
@@ -222,6 +230,7 @@ def site(
     out().print(str(index.resolve()), soft_wrap=True, markup=False)
 
 
+@app.command()
 def serve(
     board: BoardFolder = Path("board"),
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
@@ -259,7 +268,6 @@ def serve(
 
       sme-leaderboard serve board --url https://board.example
     """
-    from leaderboard.documents.board import Folder
     from leaderboard.web.server import serve as serve_board
 
     Folder(board).read()  # a wrong folder fails before anything listens
@@ -275,6 +283,7 @@ def serve(
     )
 
 
+@app.command()
 def reindex(board: BoardFolder = Path("board")) -> None:
     """Rebuild the index from the board's log and documents.
 
@@ -282,12 +291,12 @@ def reindex(board: BoardFolder = Path("board")) -> None:
 
       sme-leaderboard reindex board
     """
-    from leaderboard.store import Store
 
     with Store.open(board, reindex=True) as store:
         out().print(f"Indexed {len(store.entries()):,} entries.")
 
 
+@app.command()
 def gc(
     board: BoardFolder = Path("board"),
     older_than_hours: Annotated[
@@ -302,7 +311,6 @@ def gc(
 
       sme-leaderboard gc board --dry-run
     """
-    from leaderboard.store import Store, collect_garbage
 
     if math.isnan(older_than_hours):
         raise BoardError("older_than_hours=nan: must be a number of hours, at least 0.")
@@ -315,3 +323,105 @@ def gc(
         return
     verb = "Would remove" if dry_run else "Removed"
     out().print(f"{verb} {garbage.files:,} files, {garbage.bytes / 2**20:,.1f} MiB.")
+
+
+_FOLDERS = ("bundle", "site", "board")  # removed in this order: the board identifies the others
+_TITLE, _SUITE = "Demonstration", "demo"
+
+
+@app.command()
+def demo(
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="A run folder of `sme train` or `sme demo`.")
+    ] = Path("runs/demo"),
+    out_folder: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Output folder; RUN/leaderboard by default.")
+    ] = None,
+) -> None:
+    """Submit a trained run to a board for its task, score it and write the board's pages.
+
+    An earlier demonstration in the same folder is replaced; other files there are never touched.
+
+    Examples:
+
+      sme demo
+
+      sme-leaderboard demo runs/demo
+    """
+
+    record = RunRecord.read(run)
+    if record is None or record.status != "finished":
+        raise OptionError(f"run={str(run)!r}: holds no finished run. Create one with `sme demo`.")
+    folder = run / "leaderboard" if out_folder is None else out_folder
+    _refuse_other_files(folder)
+    for name in _FOLDERS:
+        shutil.rmtree(folder / name, ignore_errors=True)  # the next write reports what remains
+
+    err().print("Creating a board with this task and two reference rows, and submitting the agent.")
+    _create_board(folder, run, record)
+    score_waiting(folder / "board", 1, isolation_for_own())
+    results.rank(folder / "board")
+    out().print(
+        "The run is listed without a rank, which needs ten runs in each class.\n"
+        f"Open the board in a browser ({escape(str(folder))}):"
+    )
+    site(folder / "board", folder / "site")
+
+
+def _create_board(folder: Path, run: Path, record: RunRecord) -> None:
+    """Create a board for a run's task, and submit the run."""
+
+    setting = record.spec.to_dict()
+    seed = setting.pop("seed")
+    suite = Suite.from_dict({"classes": [{"name": _SUITE, "setting": setting, "seeds": [seed]}]})
+    file = SuiteFile(name=_SUITE, version=1, digest=suite.digest, suite=suite)
+    with Store.create(
+        folder / "board",
+        title=_TITLE,
+        suite_name=file.versioned_name,
+        suite=suite,
+        protocol_name=_name_of(record.protocol),
+        protocol=record.protocol,
+    ) as store:
+        intake.submit_references(store)
+        make_bundle(
+            folder / "bundle",
+            suite=file,
+            board=store.document.key,
+            key=SigningKey.generate(),
+            runs=[run],
+            method=record.algorithm,
+            version="demo",
+            family=record.algorithm,
+            knowledge="generic",
+            submitter="Demonstration",
+        )
+        intake.submit_bundle(store, folder / "bundle")
+
+
+def _refuse_other_files(folder: Path) -> None:
+    """Refuse a folder with files that no demonstration created."""
+    existing = [folder / name for name in sorted(_FOLDERS) if os.path.lexists(folder / name)]
+    if existing and not _is_demonstration(folder / "board"):
+        raise OptionError(
+            f"out={str(folder)!r}: {', '.join(map(str, existing))}: already exists and is not "
+            "from a demonstration. Nothing was removed: use another --out, or move the files."
+        )
+
+
+def _is_demonstration(path: Path) -> bool:
+    """Whether a demonstration created this board; a link may lead to a board worth keeping."""
+    try:
+        document = Folder(path).read()
+    except BoardError:
+        return False
+    expected = (_TITLE, f"{_SUITE}-v1", [_SUITE])
+    classes = [member.name for member in document.suite.classes]
+    return not path.is_symlink() and (document.title, document.suite_name, classes) == expected
+
+
+def _name_of(protocol: EvaluationProtocol) -> str:
+    """The protocol's name in the catalogue, or "custom"."""
+
+    known = {file.digest: file.versioned_name for file in catalogue.entries(ProtocolFile)}
+    return known.get(protocol.digest, "custom")
