@@ -14,7 +14,7 @@ import numpy as np
 
 from leaderboard.artefact.sandbox import Sandbox
 from leaderboard.documents.submission import Submission
-from leaderboard.scoring.metrics import run_metrics
+from leaderboard.scoring.aggregation import run_metrics
 from leaderboard.store import Store
 from sme_registry import evaluate
 

@@ -22,8 +22,7 @@ from leaderboard.scoring.publication import (
     refuse_unrankable,
 )
 from leaderboard.scoring.ranking import REASONS
-from leaderboard.scoring.season import counting, ranking_facts, score_entries
-from leaderboard.scoring.tables import EASY, table_regret
+from leaderboard.scoring.season import EASY, counting, ranking_facts, score_entries, table_regret
 from leaderboard.sealed import verify_season
 from leaderboard.store import SeasonRow, Store
 from sme_registry.errors import OptionError

@@ -8,6 +8,8 @@ for any other purpose or board.
 
 `board "/"` is left out in a board's own log, where a submission is signed for no board yet, and on
 boards of rules 1.
+
+Readers of a board compute the digests of thousands of entries: `PlainDocument` takes little time.
 """
 
 from __future__ import annotations
@@ -19,13 +21,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from leaderboard.documents.secret_files import parse_secret, write_secret
 from leaderboard.errors import BoardError
 from sme_registry.io import read_regular, require_packages
 from sme_registry.spec.document import matching
 
 if TYPE_CHECKING:
     from nacl import signing
+
+
+import json
+from typing import Any
+
+from sme_registry.spec.document import Document
 
 Purpose = Literal["submission", "entry", "ticket", "answers", "withdrawal", "log", "upload"]
 PublicKey = Annotated[str, matching(r"^[0-9a-f]{64}$", "an ed25519 public key, 64 hex digits")]
@@ -156,3 +163,50 @@ def _require_nacl() -> None:
 def _message(purpose: Purpose, digest: str, board: str | None) -> bytes:
     parts = ["sme-leaderboard", purpose, *([] if board is None else [board]), digest]
     return "/".join(parts).encode()
+
+
+def write_secret(path: str | os.PathLike[str], secret: bytes) -> Path:
+    """Write a secret into a new file that only its owner can read.
+
+    Raises:
+      BoardError: the file exists (an overwritten secret is lost) or cannot be written.
+    """
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError:
+        raise BoardError(f"{path} already exists and is not replaced. Give another path.") from None
+    except OSError as error:
+        raise BoardError(f"{path}: cannot be written: {error.strerror}.") from None
+    with os.fdopen(handle, "w") as stream:
+        stream.write(secret.hex() + "\n")
+        stream.flush()
+        os.fsync(stream.fileno())
+    return path
+
+
+def parse_secret(data: bytes) -> bytes:
+    """The bytes in the contents of such a file.
+
+    Raises:
+      ValueError: they are not hex digits.
+    """
+    return bytes.fromhex(data.decode("ascii").strip())
+
+
+def plain_json(value: Any) -> bytes:
+    """RFC 8785's canonical JSON of texts and integers below 2⁵³, in lists and under ASCII names.
+
+    For such data the standard library writes the same as `rfc8785`, which also writes fractions,
+    and is about thirty times as fast.
+    """
+    return json.dumps(value, ensure_ascii=False, sort_keys=True, separators=(",", ":")).encode()
+
+
+class PlainDocument(Document):
+    """A document of texts and integers below 2⁵³, in lists and under ASCII names."""
+
+    def canonical_json(self) -> bytes:
+        """The RFC 8785 canonical JSON of every field."""
+        return plain_json(self.to_dict())

@@ -16,8 +16,7 @@ from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
 import rfc8785
 from pydantic import BeforeValidator, Field, SerializerFunctionWrapHandler, model_serializer
 
-from leaderboard.documents.keys import PublicKey, Signature, SigningKey, verifies
-from leaderboard.documents.plain import PlainDocument
+from leaderboard.documents.keys import PlainDocument, PublicKey, Signature, SigningKey, verifies
 from leaderboard.errors import Rejection
 from sme_registry.errors import MalformedDocumentError, SpecError
 from sme_registry.io import parse_json, sha256_of, to_json

@@ -1,9 +1,8 @@
 """What a board accepts: uploads, submissions, sealed entries, and its own reference rows."""
 
 from leaderboard.intake.admission import admit, receive, submit_bundle
-from leaderboard.intake.entries import enter, receive_entry
+from leaderboard.intake.entries import enter, receive_entry, refuse_other_sender, start_ticket
 from leaderboard.intake.references import submit_references
-from leaderboard.intake.tickets import refuse_other_sender, start_ticket
 from leaderboard.intake.uploads import UPLOAD_MINUTES, check_upload, upload_header, uploader
 
 __all__ = [

@@ -30,9 +30,14 @@ from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.result import AgentScore, Result, RunScore
 from leaderboard.documents.submission import Submission
 from leaderboard.errors import Rejection
-from leaderboard.scoring.aggregation import never_listed, result_of
+from leaderboard.scoring.aggregation import (
+    failed_run,
+    levels_of,
+    never_listed,
+    result_of,
+    run_metrics,
+)
 from leaderboard.scoring.behaviour import PROBES, Behaviours
-from leaderboard.scoring.metrics import failed_run, levels_of, run_metrics
 from sme_registry import SMESpec, evaluate
 from sme_registry.errors import PolicyError, SMEError
 from sme_registry.evaluation import EvaluationReport

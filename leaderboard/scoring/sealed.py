@@ -18,8 +18,15 @@ from leaderboard.documents.board import RULES
 from leaderboard.documents.master import Master, Place
 from leaderboard.documents.result import RunScore, SealedResult, Stepping
 from leaderboard.documents.season import Hidden, Season, Terms
-from leaderboard.scoring.aggregation import Groups, class_score, is_oracle_like, method_scores
-from leaderboard.scoring.metrics import failed_run, levels_of, run_metrics
+from leaderboard.scoring.aggregation import (
+    Groups,
+    class_score,
+    failed_run,
+    is_oracle_like,
+    levels_of,
+    method_scores,
+    run_metrics,
+)
 from sme_registry import EvaluationProtocol, SMESpec
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation import (

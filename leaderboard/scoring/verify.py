@@ -23,8 +23,13 @@ from leaderboard.documents.board import BoardDocument, Folder, hex_of
 from leaderboard.documents.result import Result, RunScore
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal
 from leaderboard.errors import BoardError, Rejection, TamperedError
-from leaderboard.scoring.aggregation import never_listed, result_of
-from leaderboard.scoring.metrics import failed_run, levels_of, run_metrics
+from leaderboard.scoring.aggregation import (
+    failed_run,
+    levels_of,
+    never_listed,
+    result_of,
+    run_metrics,
+)
 from leaderboard.scoring.rescore import RESCORED, RescoreNote, draw, rescore
 from leaderboard.scoring.score import Progress, agent_names, evaluation_seed
 from leaderboard.scoring.verify_seasons import check_sealed_signatures, count_unlogged_of_seasons

@@ -7,7 +7,7 @@ from leaderboard.documents.master import Master
 from leaderboard.documents.result import Stepping
 from leaderboard.documents.season import Terms
 from leaderboard.documents.submission import now, shifted, utc
-from leaderboard.scoring.metrics import failed_run
+from leaderboard.scoring.aggregation import failed_run
 from leaderboard.scoring.sealed import sealed_result
 from sme_registry import EvaluationProtocol
 

@@ -9,7 +9,7 @@ import pytest
 from leaderboard.cli.options import KEY_VARIABLE
 from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import BoardError
-from leaderboard.sealed.attendant import Attendant
+from leaderboard.sealed.tickets import Attendant
 from leaderboard.store import Store
 from leaderboard.web import client
 from sme_registry.seasons import Instance, Ticket

@@ -14,7 +14,7 @@ import pytest
 
 from leaderboard.documents.keys import SigningKey
 from leaderboard.scoring.sealed import instances
-from leaderboard.sealed.attendant import Attendant
+from leaderboard.sealed.tickets import Attendant
 from leaderboard.store import Store
 from sme_registry.envs import SMEVectorEnv
 from sme_registry.seasons import Ticket

@@ -9,8 +9,7 @@ import rfc8785
 from hypothesis import given
 from hypothesis import strategies as st
 
-from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.plain import PlainDocument, plain_json
+from leaderboard.documents.keys import PlainDocument, SigningKey, plain_json
 from leaderboard.documents.submission import (
     MAX_BYTES,
     MAX_ENTRIES,

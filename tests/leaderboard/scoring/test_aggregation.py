@@ -8,8 +8,13 @@ from hypothesis import strategies as st
 from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.result import METRICS, Estimate, Result, RunScore, Scores
 from leaderboard.documents.submission import Submission
-from leaderboard.scoring.aggregation import is_oracle_like, never_listed, result_of
-from leaderboard.scoring.metrics import failed_run, run_metrics
+from leaderboard.scoring.aggregation import (
+    failed_run,
+    is_oracle_like,
+    never_listed,
+    result_of,
+    run_metrics,
+)
 from sme_registry import EvaluationProtocol
 from sme_registry.spec import Suite
 from sme_registry.statistics import iqm

@@ -9,7 +9,7 @@ from benchmarks.interval_coverage import DISTRIBUTIONS, simulate
 from leaderboard.artefact.answers import read_answers
 from leaderboard.documents.master import Place
 from leaderboard.errors import Rejection
-from leaderboard.scoring.metrics import failed_run, run_metrics
+from leaderboard.scoring.aggregation import failed_run, run_metrics
 from leaderboard.scoring.ranking import rank_ranges
 from leaderboard.scoring.sealed import (
     challenge,
@@ -17,7 +17,7 @@ from leaderboard.scoring.sealed import (
     score_run,
     sealed_result,
 )
-from leaderboard.scoring.tables import EASY, table_regret
+from leaderboard.scoring.season import EASY, table_regret
 from sme_registry import evaluate
 from sme_registry.seasons.wire import pack_table
 from sme_registry.spec import Setting

@@ -7,7 +7,7 @@ from leaderboard.cli import app
 from leaderboard.documents.board import Folder
 from leaderboard.documents.result import Result
 from leaderboard.errors import TamperedError
-from leaderboard.scoring.metrics import levels_of, run_metrics
+from leaderboard.scoring.aggregation import levels_of, run_metrics
 from leaderboard.scoring.rescore import RescoreNote, draw, rescore
 from leaderboard.scoring.score import evaluation_seed
 from leaderboard.scoring.verify import verify

@@ -16,8 +16,7 @@ import pytest
 from leaderboard import intake
 from leaderboard.errors import BoardError, ScoringFault, TamperedError
 from leaderboard.scoring import worker as scorer
-from leaderboard.scoring.aggregation import result_of
-from leaderboard.scoring.metrics import failed_run
+from leaderboard.scoring.aggregation import failed_run, result_of
 from leaderboard.scoring.ranking import refuse_unpublishable
 from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import background_scorers, run_scorer, run_scorers

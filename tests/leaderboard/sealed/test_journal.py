@@ -8,7 +8,7 @@ import pytest
 
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.sealed.journal import Journal
-from leaderboard.sealed.regret import measured_steps
+from leaderboard.sealed.scores import measured_steps
 from leaderboard.sealed.stepping import Start
 from sme_registry import SMESpec
 from sme_registry.envs import SMEEnv

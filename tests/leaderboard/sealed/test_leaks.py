@@ -10,9 +10,9 @@ import pytest
 
 from leaderboard.documents.keys import SigningKey
 from leaderboard.scoring.sealed import instances
-from leaderboard.sealed.attendant import Attendant
 from leaderboard.sealed.scores import score_ticket
 from leaderboard.sealed.ticket import RunningTicket
+from leaderboard.sealed.tickets import Attendant
 from leaderboard.store import Store
 from sme_registry import SMEError, materialize, seasons
 from sme_registry.io import sha256_of

@@ -19,12 +19,11 @@ from leaderboard.errors import BoardError, Rejection
 from leaderboard.intake import start_ticket
 from leaderboard.sealed import Tickets
 from leaderboard.sealed import tickets as tickets_module
-from leaderboard.sealed.attendant import Attendant, _score
 from leaderboard.sealed.instance import SteppedInstance
 from leaderboard.sealed.scores import score_ticket
 from leaderboard.sealed.stepping import Lanes
 from leaderboard.sealed.ticket import RunningTicket
-from leaderboard.sealed.tickets import Clock
+from leaderboard.sealed.tickets import Attendant, Clock, _score
 from leaderboard.store import played_bytes
 from leaderboard.store.files import to_bytes
 from sme_registry import materialize
@@ -394,7 +393,7 @@ def test_tickets_that_could_not_be_scored_are_tried_again_one_by_one(played, mon
         attendant.attend()
         return started
 
-    monkeypatch.setattr("leaderboard.sealed.attendant.signal.signal", lambda *_: None)
+    monkeypatch.setattr("leaderboard.sealed.tickets.signal.signal", lambda *_: None)
     monkeypatch.setattr(Attendant, "_start", start)
     whole = broken.read_bytes()
     broken.write_bytes(b"no journal")

@@ -1,8 +1,7 @@
 """Synthetic results, for tests of storage that need no scoring."""
 
 from leaderboard.documents.result import Result, RunScore
-from leaderboard.scoring.aggregation import result_of
-from leaderboard.scoring.metrics import run_metrics
+from leaderboard.scoring.aggregation import result_of, run_metrics
 from leaderboard.scoring.score import evaluation_seed
 
 

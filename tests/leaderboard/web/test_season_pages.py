@@ -5,7 +5,7 @@ import pytest
 from leaderboard import intake
 from leaderboard.documents.result import Stepping
 from leaderboard.documents.season import Reveal
-from leaderboard.scoring.metrics import failed_run
+from leaderboard.scoring.aggregation import failed_run
 from leaderboard.scoring.sealed import sealed_result
 from leaderboard.web.pages import Pages
 from leaderboard.web.server import write_site
