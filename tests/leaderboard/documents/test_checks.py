@@ -5,7 +5,7 @@ import datetime
 import pytest
 from typer.testing import CliRunner
 
-from leaderboard.cli.app import app
+from leaderboard.cli import app
 from leaderboard.cli.options import find_suite
 from leaderboard.documents.board import BoardDocument, Limits
 from leaderboard.documents.checks import (
