@@ -7,9 +7,10 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from sme_registry.evaluation import retention
-from sme_registry.spec import ObservationSpec, StreamSpec, StudyPlan, SuiteClass
+from sme_registry.evaluation.retention import LABELS
+from sme_registry.spec import ObservationSpec, StreamSpec, StudyAlgorithm, StudyPlan, SuiteClass
 from sme_registry.spec.cards import symbol
+from sme_registry.training.algorithms import parse_uses
 
 
 class Metric(NamedTuple):
@@ -20,13 +21,13 @@ class Metric(NamedTuple):
     worse: int  # +1: more of it is worse; −1: less
     of: str  # run, life, visit, agent of a team, data of offline runs; score: 1 − it is compared
     digits: int = 2  # of its values in tables for people
+    neutral: float = 0.0  # neither good nor bad
     training: bool = False  # of training: the same in all regions
     needs: str = ""  # the field of tasks without which runs have no such column
 
 
-_LESS_IS_BETTER = ("forgetting", "plasticity_ratio", "plasticity_difference")
 _VISITED = "regret on the visited phase"
-METRICS = (
+_METRICS = (
     Metric("wd_regret", "WD regret", 1, "run agent score"),
     Metric("ood_regret", "OOD regret", 1, "run agent score"),
     Metric("ood_decay", "OOD decay", 1, "run"),
@@ -34,16 +35,18 @@ METRICS = (
     Metric("improvement", "improvement on the behaviour policy", -1, "data", 3),
     Metric("visited_regret", _VISITED, 1, "life"),
     Metric("normalised_regret", _VISITED, 1, "visit"),
-    *(
-        Metric(key, label, 1 if key in _LESS_IS_BETTER else -1, f"life {visit}")
-        for key, label in retention.METRICS.items()
-        for visit in ["visit" if key in retention.BY_VISIT else ""]
-    ),
+    Metric("average_performance", "average performance", -1, "life visit"),
+    Metric("backward_transfer", "backward transfer", -1, "life visit"),
+    Metric("forgetting", "forgetting", 1, "life visit"),
+    Metric("forward_transfer", "forward transfer", -1, "life"),
+    Metric("relearning", "relearning", -1, "life"),
+    Metric("plasticity_ratio", "plasticity ratio", 1, "life visit", neutral=1.0),
+    Metric("plasticity_difference", "plasticity difference", 1, "life visit"),
     Metric("learning_transfer", "learning transfer", -1, "life visit", training=True),
     Metric("online_regret", "online regret", 1, "run agent life visit", 3, training=True),
     Metric(
-        "frozen_online_regret", f"online regret, {retention.LABELS['frozen_agent']}", 1,
-        "life visit", 3, training=True,
+        "frozen_online_regret", f"online regret, {LABELS['frozen_agent']}", 1, "life visit", 3,
+        training=True,
     ),
     Metric("wd_cost", "WD cost", 1, "run", 3, needs="safety"),
     Metric("wd_safe_regret", "WD safe regret", 1, "run", needs="safety"),
@@ -54,12 +57,13 @@ METRICS = (
     ),
     Metric("wd_invariance", "WD invariance", 1, "run", needs="observation"),
 )  # fmt: skip
+METRICS = {metric.key: metric for metric in _METRICS}
 """Every metric of reports. A new one of runs is a property of their report, and a row here."""
 
 
 def metrics_of(kind: str, columns: Collection[str] | None = None) -> tuple[Metric, ...]:
     """The metrics of runs, lives, …, or those of them that are among some columns."""
-    known = (metric for metric in METRICS if kind in metric.of.split())
+    known = (metric for metric in _METRICS if kind in metric.of.split())
     return tuple(metric for metric in known if columns is None or metric.key in columns)
 
 
@@ -232,3 +236,24 @@ def _flat(fields: Any, prefix: str = "") -> dict[str, Any]:
         )
         flat |= _flat(value, f"{name}.") if nested else {name: value}
     return flat
+
+
+def learner_names(algorithms: Sequence[StudyAlgorithm]) -> dict[str, str]:
+    """What each algorithm of a plan is apart from its ν: `IQL`, or `IQL (expectile = 0.9)`."""
+    settings = {
+        algorithm.name: {k: v for k, v in algorithm.hyperparameters.items() if k != "nu"}
+        | ({} if algorithm.steps is None else {"steps": algorithm.steps})
+        for algorithm in algorithms
+    }
+    names = {}
+    for algorithm in algorithms:
+        alike = [settings[other.name] for other in algorithms if other.uses == algorithm.uses]
+        options = settings[algorithm.name]
+        differing = [
+            f"{key} = {options[key]}" if key in options else f"default {key}"
+            for key in sorted({key for setting in alike for key in setting})
+            if any(setting.get(key) != alike[0].get(key) for setting in alike)
+        ]
+        name = parse_uses(algorithm.uses)[1].upper()
+        names[algorithm.name] = f"{name} ({', '.join(differing)})" if differing else name
+    return names

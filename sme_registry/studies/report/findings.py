@@ -54,7 +54,6 @@ THRESHOLDS = {
     "near": 0.02,  # difference of r̃, at most: as good as
 }
 _CHANCE = 0.05  # share of 95 % intervals that exclude 0 without an effect
-_LABELS = {metric.key: metric.label for metric in METRICS}
 # The columns of other tables from which those of a finding are taken.
 _TAKEN = {
     "algorithm": ("algorithm", "first"),
@@ -64,22 +63,22 @@ _TAKEN = {
     "high": ("high",),
     "runs": ("pairs", "fewest_runs", "runs"),
 }
-# Metrics of a life: the neutral value, and what an agent does above it, below it, or if it is open.
+# What an agent does if a metric of its life is above the neutral value, below it, or open.
 _LIVES = {
     "forgetting": (
-        0.0, "forgets", "is better on earlier phases than ever before", "was not shown to forget",
+        "forgets", "is better on earlier phases than ever before", "was not shown to forget",
     ),
     "plasticity_ratio": (
-        1.0, "loses plasticity", "learns more than a fresh agent",
+        "loses plasticity", "learns more than a fresh agent",
         "was not shown to lose plasticity",
     ),
     "forward_transfer": (
-        0.0, "is better on phases before their first visit than before training",
+        "is better on phases before their first visit than before training",
         "is worse on phases before their first visit than before training",
         "was shown neither better nor worse on phases before their first visit",
     ),
     "learning_transfer": (
-        0.0, "learns faster in its visits than a fresh agent",
+        "learns faster in its visits than a fresh agent",
         "learns more slowly in its visits than a fresh agent",
         "was shown neither ahead of nor behind a fresh agent in its visits",
     ),
@@ -163,7 +162,7 @@ def _task(analysis: Analysis, name: str) -> Found:
 
 def _worst(analysis: Analysis, name: str, metric: str) -> Found:
     """The largest change of a kind of regret that is shown, and whether others may be larger."""
-    regret = _LABELS[metric]
+    regret = METRICS[metric].label
     contrasts = _rows(analysis.tables["contrasts"], algorithm=name, metric=metric)
     worse = [row for row in contrasts if row.verdict == "worse"]
     if not worse:
@@ -247,22 +246,22 @@ def _lives(analysis: Analysis) -> Found:
     """What each agent forgets in each stream, whether it loses plasticity, and what transfers."""
     for name in analysis.streams:
         metrics = _rows(analysis.tables["stream_metrics"], class_name=name, region=WITHIN)
-        for key, (neutral, *does) in _LIVES.items():
+        for key, does in _LIVES.items():
             of_metric = [row for row in metrics if row.metric == key]
             for row in sorted(of_metric, key=lambda row: -row.iqm):
-                verdict = _side(row, row.runs, neutral)
+                verdict = _side(row, row.runs, METRICS[key].neutral)
                 words = dict(zip(("above", "below", "open"), does, strict=True))
                 text = f"{row.algorithm} {words[verdict.removesuffix('_few')]}: "
                 lives = plural(row.runs, "life", "lives")
-                text += f"{_LABELS[key]} {fixed(row.iqm)} {_interval(row, lives)}."
-                yield finding("streams", _LABELS[key], verdict, text, row)
+                text += f"{METRICS[key].label} {fixed(row.iqm)} {_interval(row, lives)}."
+                yield finding("streams", METRICS[key].label, verdict, text, row)
             if key == "forgetting":
                 yield from _forgets_more(analysis, name)
         for row in metrics:
             if row.metric == "visited_regret" and row.iqm >= THRESHOLDS["unlearnt"]:
                 text = f"{row.algorithm} has learnt almost nothing: its regret at the end of a "
                 text += f"visit is {fixed(row.iqm)}. It has little to forget or to lose."
-                yield finding("streams", _LABELS[row.metric], "unlearnt", text, row)
+                yield finding("streams", METRICS[row.metric].label, "unlearnt", text, row)
 
 
 def _forgets_more(analysis: Analysis, name: str) -> Found:
@@ -296,10 +295,11 @@ def _changes(analysis: Analysis) -> Found:
             )
         yield finding("stream_changes", "relatedness", verdict, text, class_name=name)
         for row in of_class.itertuples():
-            text = f"{row.algorithm}: {_LABELS[row.metric]} is {row.verdict}, {fixed(row.base)} → "
+            metric = METRICS[row.metric].label
+            text = f"{row.algorithm}: {metric} is {row.verdict}, {fixed(row.base)} → "
             text += f"{fixed(row.level)}, by {_change(row)}."
             verdict = _of_few(row.verdict, row.pairs)
-            yield finding("stream_changes", _LABELS[row.metric], verdict, text, row)
+            yield finding("stream_changes", metric, verdict, text, row)
 
 
 def _caveats(analysis: Analysis, part: RunKind) -> Found:

@@ -78,6 +78,7 @@ from sme_registry.studies.report.design import (
     Metric,
     class_infos,
     groups,
+    learner_names,
     metrics_of,
     stream_infos,
 )
@@ -180,16 +181,26 @@ def _contrasts(analysis: Analysis, part: RunKind) -> Iterator[tuple[Any, ...]]:
         for metric in part.metrics:
             both = group[[metric.key, f"{metric.key}_0"]].dropna().to_numpy()
             if len(both):
-                change = both[:, :1] - both[:, 1:]
                 seed = "contrast", algorithm, name, metric.key
-                ends = analysis.bootstrap.interval({"": change}, *seed)
-                level, before = statistics.iqm(both)
-                middle = float(statistics.iqm(change)[0])
-                yield (
-                    name, algorithm, metric.key, part.axes[name], before, level, middle, *ends,
-                    len(both), len(both) >= ENOUGH_RUNS,
-                    change_verdict(middle * metric.worse, *ends),
-                )  # fmt: skip
+                level, before, *others = paired({"": both}, metric, analysis.bootstrap, *seed)
+                yield (name, algorithm, metric.key, part.axes[name], before, level, *others)
+
+
+def paired(
+    classes: Mapping[Any, Array], metric: Metric, bootstrap: Bootstrap, *seed: str
+) -> tuple[Any, ...]:
+    """Pairs of runs `[n, 2]` by class: both levels, and the change from the second to the first.
+
+    Its interval, the number of pairs, whether they are enough in each class, and the verdict.
+    """
+    change = {name: both[:, :1] - both[:, 1:] for name, both in classes.items()}
+    middle = float(statistics.aggregate(change)[0])
+    ends = bootstrap.interval(change, *seed)
+    sizes = [len(both) for both in classes.values()]
+    return (
+        *statistics.aggregate(classes), middle, *ends, sum(sizes), min(sizes) >= ENOUGH_RUNS,
+        change_verdict(middle * metric.worse, *ends),
+    )  # fmt: skip
 
 
 @table("differences", DIFFERENCES, both=True)
@@ -226,17 +237,10 @@ def differences(
         for name, part, seed in parts:
             columns = [f"{metric.key}_1", f"{metric.key}_2"]
             both = {key: group[columns].to_numpy() for key, group in part.items()}
-            change = {key: x[:, :1] - x[:, 1:] for key, x in both.items()}
-            ends = bootstrap.interval(change, *seed, metric.key)
-            middle = float(statistics.aggregate(change)[0])
-            enough = min(map(len, both.values())) >= ENOUGH_RUNS
-            verdict = change_verdict(middle * metric.worse, *ends)
-            yield (
-                first, second, metric.key, name, *statistics.aggregate(both), middle, *ends,
-                sum(map(len, both.values())),
-                sum(group[instance].nunique() for group in part.values()), enough,
-                verdict if enough or verdict == "open" else "indication",
-            )  # fmt: skip
+            *numbers, enough, verdict = paired(both, metric, bootstrap, *seed, metric.key)
+            instances = sum(group[instance].nunique() for group in part.values())
+            verdict = verdict if enough or verdict == "open" else "indication"
+            yield (first, second, metric.key, name, *numbers, instances, enough, verdict)
 
 
 @table("learning_curves", "", both=True)
@@ -294,7 +298,7 @@ def _levels(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
     results = analysis.tables["results"]
     linear = {place: _linear_medians(rows) for place, rows in by_place(results).items()}
     rows = summary(
-        analysis.runs, [], analysis.parts[0].metrics, analysis.bootstrap,
+        analysis.runs, [], metrics_of("run", analysis.runs), analysis.bootstrap,
         lambda name, algorithm, key: ("level", algorithm, name, key),
     )  # fmt: skip
     for row in rows:
@@ -471,24 +475,3 @@ def offline_verdict(improvements: Array, low: float, high: float) -> str:
     if len(improvements) > 1 and improvements.min() > 0.0:
         return "above_few"
     return "below_few" if len(improvements) > 1 and improvements.max() < 0.0 else "open"
-
-
-def learner_names(algorithms: Sequence[StudyAlgorithm]) -> dict[str, str]:
-    """What each algorithm of a plan is apart from its ν: `IQL`, or `IQL (expectile = 0.9)`."""
-    settings = {
-        algorithm.name: {k: v for k, v in algorithm.hyperparameters.items() if k != "nu"}
-        | ({} if algorithm.steps is None else {"steps": algorithm.steps})
-        for algorithm in algorithms
-    }
-    names = {}
-    for algorithm in algorithms:
-        alike = [settings[other.name] for other in algorithms if other.uses == algorithm.uses]
-        options = settings[algorithm.name]
-        differing = [
-            f"{key} = {options[key]}" if key in options else f"default {key}"
-            for key in sorted({key for setting in alike for key in setting})
-            if any(setting.get(key) != alike[0].get(key) for setting in alike)
-        ]
-        name = parse_uses(algorithm.uses)[1].upper()
-        names[algorithm.name] = f"{name} ({', '.join(differing)})" if differing else name
-    return names

@@ -21,9 +21,8 @@ from sme_registry.studies.report.analysis import (
 from sme_registry.studies.report.design import METRICS, OUTSIDE, WITHIN
 from sme_registry.training.algorithms import in_jax
 
-_METRICS = {metric.key: metric for metric in METRICS}
-_LABELS = {key: metric.label for key, metric in _METRICS.items()}
-_OF_TRAINING = [metric.key for metric in METRICS if metric.training]
+_LABELS = {key: metric.label for key, metric in METRICS.items()}
+_OF_TRAINING = [key for key, metric in METRICS.items() if metric.training]
 _ABSENT = "–"
 _BY_VISIT = ["normalised_regret", "forgetting", "plasticity_ratio", *_OF_TRAINING]
 _HEADINGS = {
@@ -270,7 +269,7 @@ def comparison_tables(differences: pd.DataFrame) -> list[TextTable]:
     for key, rows in differences.groupby("metric", sort=False):
         (text,) = laid_out(_DIFFERENCES, _named(rows))
         for place, side in enumerate(("first", "second"), 1):
-            levels = [fixed(value, _METRICS[key].digits + 1) for value in rows[f"{side}_level"]]
+            levels = [fixed(value, METRICS[key].digits + 1) for value in rows[f"{side}_level"]]
             text.frame.insert(place, rows[side].iloc[0], levels)
         pair = slug(text.frame.columns[-1])
         texts.append(replace(text, label=f"{text.name}-{pair}"))
@@ -312,7 +311,7 @@ def laid_out(layout: Layout, rows: pd.DataFrame, order: Sequence[str] = ()) -> I
             continue
         lines: dict[tuple[str, ...], dict[str, str]] = {}
         for row in part.itertuples():
-            digits = _METRICS[row.metric].digits if hasattr(row, "metric") else 2
+            digits = METRICS[row.metric].digits if hasattr(row, "metric") else 2
             place = tuple(str(getattr(row, column)) for column in layout.down)
             lines.setdefault(place, {})[getattr(row, layout.across)] = layout.entry(row, digits)
         known = {name: index for index, name in enumerate(order)}

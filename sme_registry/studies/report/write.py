@@ -46,7 +46,7 @@ from sme_registry.studies.report.frames import StudyFrames, frame, load, records
 from sme_registry.studies.report.tables import DIFFERENCES, analyse, differences
 from sme_registry.studies.report.texts import TextTable, comparison_tables, csv_tables, text_tables
 
-DEFAULT_METRICS = ("wd_regret", "ood_regret")  # of comparisons
+DEFAULT_METRICS = tuple(metric.key for metric in metrics_of("score"))  # of comparisons
 FORMATS = ("html", "png", "pdf", "csv", "latex")
 _FIGURE_FORMATS = {"html": "svg", "png": "png", "pdf": "pdf"}
 # Headings, and the beginnings of the figures' names. A section without contents is left out.

@@ -14,7 +14,7 @@ from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.statistics import iqm
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.report import frames
-from sme_registry.studies.report.design import ALL
+from sme_registry.studies.report.design import ALL, metrics_of
 from sme_registry.studies.report.texts import comparison_tables
 from tests.commands import good
 
@@ -77,6 +77,13 @@ def test_every_column_is_documented_and_is_there_without_results(finished, loade
         assert not set(full) - documented
         assert len(empty) == 0
         pd.testing.assert_series_equal(empty.dtypes, full.dtypes)
+
+
+def test_every_metric_is_a_column_of_its_frame(loaded):
+    lives = frames.stream_frames([])
+    for kind, table in (("life", lives.lives), ("visit", lives.visits), ("data", loaded.results)):
+        assert {metric.key for metric in metrics_of(kind)} <= set(table)
+    assert {m.key for m in metrics_of("run") if not m.needs} <= set(frames.runs_of(loaded.results))
 
 
 def test_the_public_names_load_on_first_use():

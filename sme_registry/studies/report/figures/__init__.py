@@ -72,7 +72,8 @@ def draw_contrasts(analysis: Analysis) -> Drawn:
         labels = conjunction([metric.label.partition(",")[0] for metric in metrics])
         yield from _forest(
             analysis, analysis.tables["contrasts"], "change", metrics,
-            "change of\n{label}\n({worse} is worse)", neutral=0.0, share_x=name == "regret",
+            "change of\n{label}\n({worse} is worse)",
+            neutral=lambda _: 0.0, share_x=name == "regret",
             name=f"contrasts-{name}",
             title=f"What each class changes: {labels}",
             caption="IQM over runs of the change from the first class, "
@@ -114,7 +115,7 @@ def draw_improvements(analysis: Analysis) -> Drawn:
     rows = rows[rows.group == ALL]
     yield from _forest(
         analysis, rows.assign(place=rows["first"] + " over " + rows["second"], algorithm=""),
-        "probability", metrics_of("score"), "P(less {label})", "place", neutral=0.5,
+        "probability", metrics_of("score"), "P(less {label})", "place", neutral=lambda _: 0.5,
         name="improvements",
         title="Probability of improvement",
         caption="How probably a run of the first algorithm beats a run of the second on a class "
@@ -130,7 +131,7 @@ def draw_differences(analysis: Analysis) -> Drawn:
     yield from _forest(
         analysis, rows.assign(algorithm=rows.second), "difference", metrics_of("score"),
         f"{literal(first)} − the other:\n{{label}}\n(left: {literal(first)} is better)",
-        neutral=0.0,
+        neutral=lambda _: 0.0,
         name="differences",
         title=f"Paired differences from {first}",
         caption=f"IQM over pairs of runs of the difference {first} minus the other algorithm, with "
@@ -145,7 +146,8 @@ def draw_lives(analysis: Analysis) -> Drawn:
     shown = [metric for metric in metrics_of("life") if metric.key in _OF_LIVES]
     yield from _forest(
         analysis, rows[rows.region == WITHIN], "iqm", shown, "{label}\n({worse} is worse)",
-        neutral=0.0, looks=curves.stream_looks(analysis), share_x=False,
+        neutral=lambda metric: metric.neutral, looks=curves.stream_looks(analysis),
+        share_x=False,
         name="stream-metrics",
         title="Performance, forgetting and plasticity of whole lives",
         caption=f"{curves.OVER_LIVES} Black lines: the constant ½, no forgetting, and as good as a "
@@ -162,7 +164,7 @@ def _forest(
     place: str = "class_name",
     *,
     looks: Mapping[str, Look] | None = None,
-    neutral: float | None = None,
+    neutral: Callable[[Metric], float] | None = None,
     share_x: bool = True,
     name: str,
     title: str,
@@ -183,8 +185,7 @@ def _forest(
             selected = of_metric.algorithm == algorithm
             marks(axes, of_metric[selected], value, at[selected] + shift, look)
         if neutral is not None:
-            x = 1.0 if metric.key == "plasticity_ratio" else neutral
-            axes.axvline(x, color="black", linewidth=0.9, zorder=1.5)
+            axes.axvline(neutral(metric), color="black", linewidth=0.9, zorder=1.5)
         for y in places.values():
             axes.axhspan(y - 0.42, y + 0.42, color="#f4f4f4", zorder=0.5, linewidth=0)
         axes.grid(visible=False, axis="y")
