@@ -73,7 +73,7 @@ def timed(actions: np.ndarray) -> np.ndarray:
     plain = {name: value for name, value in SPEC.to_dict().items() if name != "seed"}
     member = SeasonClass(name="deep", setting=plain, instances=1, budget=10**8)
     wire = StepFormat(1, SPEC.state_dim, SPEC.action_dim)
-    bodies = [wire.pack_request(i + 1, each[None]) for i, each in enumerate(actions)]
+    bodies = [wire.pack(i + 1, each[None]) for i, each in enumerate(actions)]
     seconds = np.empty(len(actions))
     with tempfile.TemporaryDirectory() as folder:
         instance = SteppedInstance(Path(folder), 0, member, EvaluationProtocol(), lambda: START)

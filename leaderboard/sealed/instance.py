@@ -210,7 +210,7 @@ class SteppedInstance:
             self._refuse_answered()
             observation = self._present(journal).observation
             assert self._format is not None  # with the lanes
-            return self._format.pack_start(journal.requests, observation)
+            return self._format.pack(journal.requests, observation)
 
     def step(self, body: bytes) -> bytes:
         """Take the steps of a request, or answer the last one again.

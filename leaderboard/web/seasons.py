@@ -275,7 +275,7 @@ def _small(scope: Scope, name: str) -> int:
 
 def _token(scope: Scope) -> str:
     """The password in the header `Authorization`; empty without one."""
-    return Headers(scope=scope).get("Authorization", "").removeprefix(wire.bearer(""))
+    return Headers(scope=scope).get("Authorization", "").removeprefix("Bearer ")
 
 
 def _octets(data: bytes) -> Response:

@@ -113,7 +113,7 @@ class Instance:
 
     def step(self, actions: npt.NDArray[np.floating]) -> StepsAnswer:
         """One step of every lane by finite actions `[L, A]` in [0, 1]; call `begin` first."""
-        body = self._format.pack_request(self.number + 1, actions)
+        body = self._format.pack(self.number + 1, actions)
         try:
             data = self._request("POST", "steps", body, most=self._format.answer_bytes)
         except SealedError as error:

@@ -245,10 +245,6 @@ def instance_path(season: str, ticket: int, instance: int, action: str) -> str:
     return f"{ticket_path(season, ticket)}/instances/{instance}/{action}"
 
 
-def bearer(token: str) -> str:
-    return f"Bearer {token}"
-
-
 class StepsAnswer(NamedTuple):
     observation: Observation  # `[L, S + 2]`, of the next episode in lanes whose episode ended
     reward: Float32  # `[L]`
@@ -277,15 +273,13 @@ class StepFormat:
     def _width(self) -> int:
         return self.state_dim + 2
 
-    def pack_start(self, number: int, observation: Observation) -> bytes:
-        return _pack_numbered(number, observation)
+    def pack(self, number: int, array: npt.NDArray[np.floating]) -> bytes:
+        """The present observations, or a request with actions; with the number of the steps."""
+        return number.to_bytes(_NUMBER_BYTES, "little") + _pack(array)
 
     def unpack_start(self, data: bytes) -> tuple[int, Observation]:
         """The number of the last steps, and the present observations `[L, S + 2]`."""
         return _unpack_numbered("start", data, self.lanes, self._width)
-
-    def pack_request(self, number: int, actions: npt.NDArray[np.floating]) -> bytes:
-        return _pack_numbered(number, actions)
 
     def unpack_request(self, data: bytes) -> tuple[int, Float32]:
         """The number and the actions `[L, A]` in the body of `steps`; finite, not clipped."""
@@ -360,10 +354,6 @@ def _pack(array: npt.NDArray[np.floating]) -> bytes:
     return array.astype(_FLOAT, copy=False).tobytes()
 
 
-def _pack_numbered(number: int, array: npt.NDArray[np.floating]) -> bytes:
-    return number.to_bytes(_NUMBER_BYTES, "little") + _pack(array)
-
-
 def _unpack_numbered(what: str, data: bytes, rows: int, columns: int) -> tuple[int, Float32]:
     _check_size(what, data, _NUMBER_BYTES + _FLOAT.itemsize * rows * columns)
     array = np.frombuffer(data, _FLOAT, offset=_NUMBER_BYTES).reshape(rows, columns)
@@ -386,8 +376,6 @@ _TIMEOUT = 300.0  # to accept a connection, or send more: a restarted server rep
 _FIRST_WAIT, _LONGEST_WAIT = 0.1, 15.0
 _TRANSIENT = frozenset({408, 502, 503, 504, 507})
 _JSON_BYTES = 2**20
-_MESSAGE = 2000  # characters
-_TYPE = "application/octet-stream"
 
 _log = logging.getLogger(__name__)
 _now, _sleep = time.monotonic, time.sleep
@@ -406,7 +394,7 @@ class Connection:
         self._http: http.client.HTTPConnection | None = None
         self._address = server_address(url, insecure=insecure)
         self._patience = number_in("patience", patience, 0.0)
-        self._authorization = bearer(token)
+        self._authorization = f"Bearer {token}"
         self._answered = False
 
     def request(
@@ -469,7 +457,7 @@ class Connection:
         if self._http is None:
             self._http = self._new()
         try:
-            headers |= {"Accept": "application/json", "Content-Type": _TYPE}
+            headers |= {"Accept": "application/json", "Content-Type": "application/octet-stream"}
             self._http.request(method, self._address.path + path, body, headers)
             with self._http.getresponse() as answer:
                 data = answer.read(most + 1)
@@ -507,5 +495,5 @@ class Connection:
             plain = parse_json(data, "answer")
         match plain:
             case {"code": str(code), "message": str(message)}:
-                return code[:40], " ".join(message[:_MESSAGE].split())
+                return code[:40], " ".join(message[:2000].split())
         return "http", f"{self._address.url}: answered with HTTP status {status}. Check the URL."

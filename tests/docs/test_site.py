@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from tests.browser import launched, needs_chromium, serving_files
+from tests.browser import needs_chromium, serving_files
 from tests.docs.conftest import PAGES, ROOT
 
 WIDTHS = {"phone": 400, "desktop": 1280}
@@ -68,15 +68,6 @@ def test_names_and_commands_in_code_lead_to_their_reference(site):
     assert re.search(r'href="\.\./reference/sme\.html#sme-train"', page)
     page = (site / "guides" / "studies.html").read_text()
     assert re.search(r'href="\.\./reference/python/sme_registry\.studies\.html#sme_reg', page)
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    sync_api = pytest.importorskip("playwright.sync_api")
-    with sync_api.sync_playwright() as playwright:
-        browser = launched(playwright)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from playwright.sync_api import expect, sync_playwright
+from playwright.sync_api import expect
 
 from sme_registry import SMESpec, load, materialize
 from sme_registry.diagnosis import load_policy
 from sme_registry.evaluation import evaluate
 from sme_registry.explorer import write_explorer
-from tests.browser import launched, needs_chromium
+from tests.browser import needs_chromium
 from tests.explorer.networks import fitted, observations, offline, perceptron
 
 pytestmark = needs_chromium
@@ -18,14 +18,6 @@ TOLERANCE = 1e-5
 HOSTILE = "</script><img src=x onerror=alert(1)><b>bold"
 SPEC = SMESpec(state_dim=4, action_dim=2, complexity=2)
 TASK = materialize(SPEC)
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    with sync_playwright() as playwright:
-        browser = launched(playwright)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

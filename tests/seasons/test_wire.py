@@ -49,7 +49,7 @@ def test_an_address_has_the_season_the_ticket_and_the_instance():
 
 
 def test_the_answer_to_start_arrives_and_has_one_size():
-    data = FORMAT.pack_start(2**40, random(LANES, S + 2))
+    data = FORMAT.pack(2**40, random(LANES, S + 2))
     number, observation = FORMAT.unpack_start(data)
     assert number == 2**40
     assert np.array_equal(observation, random(LANES, S + 2))
@@ -59,7 +59,7 @@ def test_the_answer_to_start_arrives_and_has_one_size():
 
 
 def test_numbers_and_actions_arrive_from_double_precision_too():
-    body = FORMAT.pack_request(9, random(LANES, A).astype(np.float64))
+    body = FORMAT.pack(9, random(LANES, A).astype(np.float64))
     number, actions = FORMAT.unpack_request(body)
     assert (number, len(body)) == (9, FORMAT.request_bytes)
     assert actions.dtype == np.float32
@@ -70,7 +70,7 @@ def test_numbers_and_actions_arrive_from_double_precision_too():
 
 
 def test_the_bytes_of_a_request_are_little_endian():
-    body = StepFormat(1, S, 1).pack_request(1, np.array([[0.5]]))
+    body = StepFormat(1, S, 1).pack(1, np.array([[0.5]]))
     assert body == b"\1\0\0\0\0\0\0\0\0\0\0\x3f"
 
 
@@ -161,7 +161,7 @@ def test_actions_that_are_not_finite_are_refused():
         with pytest.raises(ActionError, match="NaN or infinite"):
             unpack_table(pack_table(table), A, 4)
         with pytest.raises(ActionError, match="NaN or infinite"):
-            FORMAT.unpack_request(FORMAT.pack_request(1, table[1:]))
+            FORMAT.unpack_request(FORMAT.pack(1, table[1:]))
 
 
 def test_a_ticket_counts_its_instances_class_by_class_and_hides_its_token():

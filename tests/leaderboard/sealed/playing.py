@@ -144,4 +144,4 @@ class Played:
 def request(number, value=0.3, lanes=LANES):
     """The body of a request for steps whose actions are all the same."""
     form = wire.StepFormat(lanes, 2, 1)
-    return form.pack_request(number, np.full((lanes, 1), value, np.float32))
+    return form.pack(number, np.full((lanes, 1), value, np.float32))

@@ -51,7 +51,7 @@ def everything(url, board, client):
     ticket = seasons.Ticket.from_dict(started.json())
     signer = signed.signer(KEY)
     assert signer is not None
-    token = {"Authorization": wire.bearer(ticket.token)}
+    token = {"Authorization": f"Bearer {ticket.token}"}
 
     def at(action):
         return url + wire.instance_path(board.season.id, 1, 0, action)
@@ -124,7 +124,7 @@ def test_answers_to_steps_have_one_form(tmp_path):
     with serving(board.path, season_secrets=[board.secret]) as url, httpx.Client() as client:
         for nonce in range(2):
             ticket = board.ticket(url, KEY, nonce)
-            token = {"Authorization": wire.bearer(ticket.token)}
+            token = {"Authorization": f"Bearer {ticket.token}"}
             at = url + wire.instance_path(board.season.id, ticket.ticket, 0, "")
             client.post(at + "start?lanes=4", headers=token)
             for number in range(1, 17):

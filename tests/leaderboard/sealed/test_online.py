@@ -218,7 +218,7 @@ def test_large_bodies_numbers_and_other_methods_are_refused(url, board, key):
     ticket = board.ticket(url, key)
     number = ticket.ticket
     at = url + wire.instance_path(board.season.id, number, 0, "")
-    token = {"Authorization": wire.bearer(ticket.token)}
+    token = {"Authorization": f"Bearer {ticket.token}"}
     with httpx.Client(trust_env=False, headers=token) as client:
         client.post(at + "start?lanes=4")
         answers = [

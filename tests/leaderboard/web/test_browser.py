@@ -3,12 +3,12 @@
 import re
 
 import pytest
-from playwright.sync_api import expect, sync_playwright
+from playwright.sync_api import expect
 
 from leaderboard import intake
 from leaderboard.documents.board import hex_of
 from leaderboard.web.server import write_site
-from tests.browser import launched, needs_chromium, serving_files
+from tests.browser import needs_chromium, serving_files
 from tests.leaderboard.serving import serving
 from tests.leaderboard.web import boards
 
@@ -36,14 +36,6 @@ def served(written):
     headers = {"Content-Security-Policy": CSP, "X-Content-Type-Options": "nosniff"}
     with serving_files(written[0], headers) as address:
         yield address
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    with sync_playwright() as playwright:
-        browser = launched(playwright)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture
