@@ -152,6 +152,17 @@ def test_only_classes_with_runs_of_every_algorithm_are_compared(finished):
     assert set(cut.tables["aggregates"][cut.tables["aggregates"].group == ALL].classes) == {4}
 
 
+def test_a_profile_is_the_share_of_runs_above_each_threshold_as_a_mean_over_classes(study):
+    analysis = study[2]
+    rows = analysis.tables["profiles"]
+    rows = rows[(rows.group == ALL) & (rows.metric == "wd_regret") & (rows.algorithm == "Alpha")]
+    assert list(rows.threshold) == pytest.approx(np.arange(101) / 100)
+    classes = [[*regrets(study, name, "Alpha").values()] for name in analysis.groups[0].compared]
+    for row in rows.itertuples():
+        shares = [np.mean(1.0 - np.array(values) > row.threshold) for values in classes]
+        assert row.share == pytest.approx(np.mean(shares))
+
+
 def test_curves_are_the_median_over_runs_then_smoothed(study):
     file, results, analysis = study
     curves = analysis.tables["learning_curves"]
