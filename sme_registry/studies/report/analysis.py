@@ -116,10 +116,6 @@ class Analysis:
         return next(iter(self.classes), "")
 
     @property
-    def stream_base(self) -> str:
-        return next(iter(self.streams), "")
-
-    @property
     def stream_algorithms(self) -> tuple[str, ...]:
         present = {life.planned.algorithm for life in self.lives}
         return tuple(a.name for a in self.plan.algorithms if a.name in present)

@@ -283,7 +283,7 @@ def _changes(analysis: Analysis) -> Found:
         return
     rows = analysis.tables["stream_contrasts"]
     rows = rows[(rows.axis == TASKS) & rows.metric.isin(_LIVES)]
-    base = analysis.streams[analysis.stream_base]
+    base = next(iter(analysis.streams.values()))
     for name, of_class in rows.groupby("class_name", sort=False):
         info = analysis.streams[name]
         verdict, text = "other", f"{name} differs from {base.name} in its tasks alone."

@@ -291,7 +291,6 @@ def draw_maps(analysis: Analysis) -> Drawn:
     single = [name for name, info in analysis.classes.items() if info.setting["team"] == "none"]
     plane = inside[(inside.state_dim == 2) & inside.class_name.isin(single)]
     if plane.empty:
-        yield "No maps of the plane: no finished run has a task with two state channels."
         return
     kept, problem = _kept_maps(analysis, plane[plane.key.isin(analysis.models)])
     if not kept:
