@@ -11,12 +11,7 @@ from leaderboard.documents.master import Place
 from leaderboard.errors import Rejection
 from leaderboard.scoring.aggregation import failed_run, run_metrics
 from leaderboard.scoring.ranking import rank_ranges
-from leaderboard.scoring.sealed import (
-    challenge,
-    instances,
-    score_run,
-    sealed_result,
-)
+from leaderboard.scoring.sealed import challenge, instances, score_run, sealed_result
 from leaderboard.scoring.season import EASY, table_regret
 from sme_registry import evaluate
 from sme_registry.seasons.wire import pack_table
@@ -49,13 +44,8 @@ def test_slope_is_that_of_the_least_squares_line():
 def test_a_constant_policy_has_no_decay_and_a_run_without_a_policy_loses_all_points():
     for levels in (LEVELS, (0.0, 0.1, 0.3, 0.7)):
         constant = run_metrics((1.0,) * len(levels), (0.75,) * len(levels), levels)
-        assert constant == {
-            "wd_regret": 1.0,
-            "ood_regret": 1.0,
-            "ood_decay": 0.0,
-            "regret_slope": 0.0,
-            "similarity_loss": 0.0,
-        }
+        nothing = dict.fromkeys(("ood_decay", "regret_slope", "similarity_loss"), 0.0)
+        assert constant == {"wd_regret": 1.0, "ood_regret": 1.0, **nothing}
     assert run_metrics((1.0,) * 6, None, LEVELS) == {
         "wd_regret": 1.0,
         "ood_regret": 1.0,
