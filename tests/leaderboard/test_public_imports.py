@@ -50,10 +50,7 @@ def test_the_leaderboard_imports_only_public_names_of_the_registry():
 
 def test_a_private_import_would_be_found():
     source = "from sme_registry.task.loading import x\nfrom sme_registry.io import _x, choice"
-    assert private_imports(source) == [
-        "sme_registry.task.loading.x",
-        "sme_registry.io._x",
-    ]
+    assert private_imports(source) == ["sme_registry.task.loading.x", "sme_registry.io._x"]
 
 
 def test_an_earlier_version_is_shown_with_the_reason_why_it_has_no_rank(tmp_path):
@@ -72,12 +69,6 @@ def test_an_earlier_version_is_shown_with_the_reason_why_it_has_no_rank(tmp_path
     for change in ({"copy_of": [{"id": "x"}]}, {"copy_of": 3}, {"faults": "many"}):
         with pytest.raises(SpecError, match="invalid answer"):
             PublicView.from_dict({**plain, **change})
-    for name in (
-        "not_ranked",
-        "copy_of",
-        "place",
-        "faults",
-        "fault",
-    ):  # what earlier servers leave out
-        del plain[name]
+    for name in ("not_ranked", "copy_of", "place", "faults", "fault"):
+        del plain[name]  # which earlier servers leave out
     assert PublicView.from_dict(plain) == views[1]

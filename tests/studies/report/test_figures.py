@@ -39,9 +39,8 @@ def with_algorithms(analysis, names):
 
 
 def test_figures_of_eight_algorithms_with_long_names_are_readable_and_whole(analysis):
-    levels = analysis.tables[
-        "levels"
-    ].copy()  # the worst is in the last panel, and far above the others
+    levels = analysis.tables["levels"].copy()
+    # The worst is in the last panel, and far above the others.
     worst = (levels.class_name == "plane") & (levels.algorithm == "Alpha")
     levels.loc[worst, ["iqm", "low", "high"]] = 1.7, 1.5, 1.9
     names = [f"PPO (learning_rate = 0.000{i}, n_steps = 256)" for i in range(1, 9)]
@@ -65,9 +64,8 @@ def test_a_heat_map_has_one_scale_that_covers_its_values_and_prints_them(analysi
     regions = analysis.tables["regions"].assign(
         similarity=np.linspace(0.91, 0.96, len(analysis.tables["regions"]))
     )
-    ((picture,), _) = figures.draw(
-        [figures.draw_regions], with_tables(analysis, regions=regions), ()
-    )
+    coloured = with_tables(analysis, regions=regions)
+    ((picture,), _) = figures.draw([figures.draw_regions], coloured, ())
     figure = picture.figure
     maps = [axes for axes in figure.axes if axes.images]
     assert len(maps) == len(analysis.algorithms)
@@ -95,6 +93,16 @@ def test_curves_and_levels_near_1_have_headroom(analysis):
     for low, high in {axes.get_ylim() for axes in shown}:
         assert low == 0.0
         assert high - 1.0 > 0.03
+
+
+def test_a_figure_of_levels_shows_those_of_its_own_metric(analysis):
+    levels = analysis.tables["levels"]
+    pictures, _ = figures.draw([curves.draw_regret], analysis, ())
+    for picture, metric in zip(pictures, ("wd_regret", "ood_regret"), strict=True):
+        lines = [line for axes in picture.figure.axes for line in axes.lines]
+        drawn = {float(y) for line in lines for y in line.get_ydata()}
+        rows = levels[levels.metric == metric]
+        assert {*rows.iqm} <= drawn <= {*rows.iqm, *rows.linear}
 
 
 def test_levels_of_one_state_dimension_are_comparable(analysis):
