@@ -20,7 +20,6 @@ from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from leaderboard.documents.sketch import TEXT
 from leaderboard.errors import CODES
 from sme_registry.spec.document import (
     Digest,
@@ -71,10 +70,10 @@ class RunScore(StrictModel):
         module.
       agents: of a team, in the order of the channels that they own; empty for a single agent and
         where there is no policy.
-      rounding: mean |Δa| on random states if the arithmetic is rounded at random; null where there
-        is no policy, and in results of rules 1.
-      sketch: of what the policy does, to find copies, in base64; see `documents.sketch`. Empty
-        where there is no policy or it hardly varies, and in results of rules 1.
+      actions: digest of the policy's actions in the board's states, by which exact copies are
+        found; null where there is no policy or it hardly varies.
+      rounding: of results of earlier versions, mean |Δa| if the arithmetic is rounded at random.
+      sketch: of results of earlier versions, 68 numbers by which copies are found, in base64.
     """
 
     spec: Digest | None
@@ -90,15 +89,15 @@ class RunScore(StrictModel):
     similarity_loss: Real
     agents: Annotated[tuple[AgentScore, ...], Field(strict=False)] = ()
     rounding: Real | None = None
-    sketch: Annotated[str, Field(pattern=TEXT)] = ""
+    sketch: Annotated[str, Field(pattern=r"^([A-Za-z0-9+/]{363}=)?$")] = ""
+    actions: Digest | None = None
 
     @model_serializer(mode="wrap")
     def _omit_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         plain: dict[str, Any] = handler(self)
-        if self.rounding is None:
-            del plain["rounding"]
-        if not self.sketch:
-            del plain["sketch"]
+        for field in ("rounding", "sketch", "actions"):
+            if plain[field] in (None, ""):
+                del plain[field]
         return plain
 
 

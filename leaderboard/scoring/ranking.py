@@ -45,7 +45,7 @@ is better in some region by chance, by less than this on boards of 2,000 states 
 REASONS: dict[str, str] = {
     "reference": "reference row",
     "too_few_runs": "too few runs on an instance or in a class",
-    "copy": "at least half of its policies behave like those of earlier entries of other keys",
+    "copy": "at least half of its policies are copies of earlier entries of other keys",
     "superseded": "a later entry of its key has its method and version, or its policies",
     "not_learned": f"WD regret not certainly below {LEARNED:g}",
 }

@@ -23,7 +23,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, NoReturn
 
-from leaderboard.documents import sketch
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.result import Result, RunScore
 from leaderboard.errors import TamperedError
@@ -33,10 +32,6 @@ from leaderboard.store import Store
 RESCORED = 1e-5
 """Tolerance for new scores of the same policy: another machine or version of onnxruntime changes
 its float32 actions by about 1e-7, and similar actions are divided by a regret as small as 0.1."""
-
-SKETCHED = 1e-3
-"""Tolerance for the numbers of a sketch: means over states in which rounding changes actions by at
-most `TOLERANCE` of `artefact.sandbox` on average."""
 
 _MARGIN = 2.0  # of other rounding errors than those drawn
 _UNCERTAIN = (
@@ -110,12 +105,6 @@ def _other_verdict(stored: Result, again: Result, other_versions: bool) -> Resco
 
 def _other_numbers(store: Store, stored: Result, again: Result) -> Iterator[RescoreNote]:
     for number, (new, old) in enumerate(zip(again.runs, stored.runs, strict=True)):
-        if sketch.differ(new.sketch, old.sketch, SKETCHED):
-            _refuse(
-                stored,
-                f"runs.{number}.sketch: scored again, it differs by more than {SKETCHED:g}, by "
-                "which the board hides copies or invents them",
-            )
         differences = _differences(new, old)
         if max(differences) <= RESCORED:
             continue

@@ -37,7 +37,7 @@ from leaderboard.scoring.aggregation import (
     result_of,
     run_metrics,
 )
-from leaderboard.scoring.behaviour import PROBES, Behaviours
+from leaderboard.scoring.behaviour import COMPARED, Behaviours
 from sme_registry import SMESpec, evaluate
 from sme_registry.errors import PolicyError, SMEError
 from sme_registry.evaluation import EvaluationReport
@@ -87,7 +87,8 @@ def score_submission(
 
     Returns:
       The result, a function of board, submission and artefacts up to floating-point rounding,
-      except for the measured effect of rounding, `RunScore.rounding`. It is a rejection if an
+      except for the measured effect of rounding, `RunScore.rounding`, and the last bits in
+      `RunScore.actions`. It is a rejection if an
       artefact, or its behaviour, is rejected.
 
     Raises:
@@ -174,22 +175,22 @@ def _evaluate(
     digest: str,
     progress: Progress,
     machine: _Machine,
-    observe: Callable[[Sandbox], str],
-) -> tuple[EvaluationReport, float, str]:
-    """Evaluate a policy in the sandbox on the states of its own seed; its rounding and sketch."""
+    observe: Callable[[Sandbox], str | None],
+) -> tuple[EvaluationReport, float, str | None]:
+    """Evaluate a policy in the sandbox on the states of its own seed; its rounding and actions."""
     agents = max(1, len(agent_names(spec)))
     states = board.protocol.states_per_region
-    rows = states * len(board.protocol.edges) + PROBES
+    rows = states * len(board.protocol.edges) + COMPARED
     limits = SandboxLimits.for_policy(len(data), rows, agents)
     with Sandbox(data, *widths(spec), limits, isolation=machine.isolation) as sandbox:
         machine.versions["onnxruntime"] = sandbox.runtime
         policy = _CheckedPolicy(sandbox, states, agents)
         report = _report(board, spec, policy, digest, progress)
         with _sandbox_errors():
-            sketch = observe(sandbox) if board.rules > 1 else ""
+            actions = observe(sandbox) if board.rules > 1 else None
     used = {name: version for name, version in report.versions.items() if name not in _UNUSED}
     machine.versions = {**used, "onnxruntime": sandbox.runtime}
-    return report, float(np.mean(policy.rounding)), sketch
+    return report, float(np.mean(policy.rounding)), actions
 
 
 def rounding_by_region(
@@ -300,7 +301,7 @@ def _run_score(
     digest: str,
     report: EvaluationReport,
     rounding: float,
-    sketch: str,
+    actions: str | None,
 ) -> RunScore:
     regrets = tuple(region.normalised_regret for region in report.regions)
     similarity = tuple(region.similarity for region in report.regions)
@@ -319,6 +320,6 @@ def _run_score(
             for name, each in report.agents.items()
         ),
         rounding=rounding,
-        sketch=sketch,
+        actions=actions,
         **metrics,
     )

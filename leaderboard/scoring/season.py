@@ -9,10 +9,10 @@ A rank needs the board's `runs_to_rank` runs in each class, over all tickets.
 
 from __future__ import annotations
 
+import functools
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +24,6 @@ from leaderboard.documents.result import Metric, RunScore, Scores, SealedResult
 from leaderboard.documents.season import Season
 from leaderboard.documents.submission import Artefact, Knowledge
 from leaderboard.scoring.aggregation import is_oracle_like, method_scores
-from leaderboard.scoring.memo import Memo
 from leaderboard.scoring.ranking import RankedRow, ranking
 from leaderboard.scoring.sealed import (
     Instance,
@@ -43,9 +42,6 @@ KNOWLEDGE: tuple[Knowledge, ...] = ("generic", "family")
 """Ranked apart, in this order."""
 
 _AT_A_TIME = 32  # entries; what an interrupted reveal repeats, and holds in memory
-
-# A bootstrap each, which every page of the season shows. Results never change.
-_TOGETHER: Memo[tuple[Scores, bool]] = Memo(1024)
 
 
 def counting(store: Store, season: Season) -> list[SealedRow]:
@@ -197,10 +193,7 @@ def _methods(
         entrants = [row.entrant for row in members]
         entry = entrants[-1]
         if len(members) > 1:
-            scores, oracle_like = _TOGETHER.get(
-                (store.document.draws, *(row.result for row in members)),
-                partial(_score_together, store, season, members),
-            )
+            scores, oracle_like = _score_together(store, season.digest, tuple(members))
             entry = replace(
                 entry,
                 scores=scores,
@@ -214,8 +207,10 @@ def _methods(
     return entries
 
 
-def _score_together(store: Store, season: Season, rows: Sequence[SealedRow]) -> tuple[Scores, bool]:
-    """The scores of all runs of some tickets, and whether they are oracle-like."""
+@functools.lru_cache(1024)  # a bootstrap, which every page of the season shows
+def _score_together(store: Store, digest: str, rows: tuple[SealedRow, ...]) -> tuple[Scores, bool]:
+    """The scores of all runs of some tickets of a season, and whether they are oracle-like."""
+    season = store.season(digest)
     runs = [result.runs for result in _results(store, rows)]
     groups = groups_of_season(season, runs)
     scores = method_scores(groups, store.document.draws, season.digest)

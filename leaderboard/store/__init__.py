@@ -5,10 +5,10 @@ The signed log is authoritative, the other files hold the documents that it name
 next one continues from the state it leaves.
 """
 
+from leaderboard.store.copies import Copies
 from leaderboard.store.files import digest_of, read_document
 from leaderboard.store.garbage import Garbage, collect_garbage, make_room
 from leaderboard.store.index import Index, IndexUnusable
-from leaderboard.store.likeness import Likeness
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.objects import Objects
 from leaderboard.store.queue import LEASE_SECONDS, Claim, Queue
@@ -20,12 +20,12 @@ __all__ = [
     "EMPTY",
     "LEASE_SECONDS",
     "Claim",
+    "Copies",
     "EntryRow",
     "Garbage",
     "Head",
     "Index",
     "IndexUnusable",
-    "Likeness",
     "Log",
     "LogEntry",
     "Objects",

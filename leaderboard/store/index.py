@@ -25,9 +25,9 @@ from leaderboard.documents.board import BoardDocument, Folder
 from leaderboard.documents.result import Result
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal
 from leaderboard.errors import TamperedError
-from leaderboard.store import likeness, seasons
+from leaderboard.store import copies, seasons
+from leaderboard.store.copies import Copies
 from leaderboard.store.files import BUSY_SECONDS, digest_of, read_document
-from leaderboard.store.likeness import Likeness
 from leaderboard.store.log import EMPTY, Head, LogEntry
 from leaderboard.store.rows import EntryRow, Status, name_object, scores_of, scores_text
 
@@ -58,7 +58,7 @@ CREATE TABLE entry (
 CREATE INDEX entry_waiting ON entry (sequence) WHERE status = 'waiting';
 CREATE INDEX entry_of_key ON entry (key, received);
 CREATE INDEX entry_bytes ON entry (bytes);
-CREATE UNIQUE INDEX entry_sequence ON entry (sequence);{likeness.SCHEMA}{seasons.SCHEMA}
+CREATE UNIQUE INDEX entry_sequence ON entry (sequence);{copies.SCHEMA}{seasons.SCHEMA}
 CREATE TABLE object (
   digest TEXT PRIMARY KEY, size INTEGER NOT NULL, key TEXT NOT NULL, received TEXT NOT NULL
 ) STRICT, WITHOUT ROWID;
@@ -104,7 +104,6 @@ class Index:
         self.folder = folder
         self.document = document
         self._board = document.digest
-        self._runs = likeness.Runs(connection)
         self.seasons = seasons.Seasons(connection, folder)
 
     @classmethod
@@ -168,7 +167,6 @@ class Index:
             yield
         except BaseException:
             self.connection.execute("ROLLBACK")
-            self._runs.forget()
             raise
         self.connection.execute("COMMIT")
 
@@ -261,7 +259,7 @@ class Index:
             "SELECT sequence, reference FROM entry WHERE id = ?", entry.subject
         ) or (0, True)
         if not reference:
-            self._runs.add(entry.subject, sequence, result.runs)
+            copies.add_runs(self.connection, entry.subject, sequence, result.runs)
         self.connection.execute("DELETE FROM lease WHERE submission = ?", (entry.subject,))
 
     def _withdrawn(self, entry: LogEntry) -> None:
@@ -292,7 +290,7 @@ class Index:
 
     def entries(self) -> list[EntryRow]:
         """All submissions, in the order in which they were received."""
-        alike = self._runs.likenesses()
+        alike = copies.copies_of(self.connection)
         return [
             _entry_row(row, alike) for row in self.connection.execute(f"{_ROWS} ORDER BY sequence")
         ]
@@ -300,7 +298,7 @@ class Index:
     def entry(self, id: str) -> EntryRow | None:
         """One submission; None if there is no such submission."""
         row = self.one(f"{_ROWS} WHERE id = ?", id)
-        return None if row is None else _entry_row(row, self._runs.likenesses(id))
+        return None if row is None else _entry_row(row, copies.copies_of(self.connection, id))
 
     def derived_rows(self) -> Iterator[tuple[str, str, tuple[Any, ...]]]:
         """Table, key and values of each row that the log determines, in a fixed order."""
@@ -394,7 +392,7 @@ def _schema() -> list[tuple[Any, ...]]:
         return _schema_of(connection)
 
 
-def _entry_row(row: tuple[Any, ...], alike: dict[str, tuple[Likeness, ...]]) -> EntryRow:
+def _entry_row(row: tuple[Any, ...], alike: dict[str, tuple[Copies, ...]]) -> EntryRow:
     values = dict(zip(_COLUMNS, row, strict=True))
     values["alike"] = alike.get(values["id"], ())
     for name in ("enough_runs", "oracle_like", "reference"):

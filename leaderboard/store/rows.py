@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from leaderboard.documents.result import METRICS, Estimate, Scores
-from leaderboard.store.likeness import Likeness
+from leaderboard.store.copies import Copies
 
 Status = Literal["waiting", "scored", "rejected", "withdrawn"]
 
@@ -55,12 +55,12 @@ class EntryRow:
     reference: bool
     scores: Scores | None
     policies: int = 0
-    alike: tuple[Likeness, ...] = ()
+    alike: tuple[Copies, ...] = ()
     faults: int = 0
     fault: str = ""
 
     @property
-    def copy_of(self) -> tuple[Likeness, ...]:
+    def copy_of(self) -> tuple[Copies, ...]:
         """Earlier submissions of other keys, the one with the most runs first."""
         others = (each for each in self.alike if each.key != self.key)
         return tuple(sorted(others, key=lambda each: -each.runs))

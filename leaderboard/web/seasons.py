@@ -21,6 +21,7 @@ the disk runs in threads. `season_page` is what the page of a season shows.
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -41,7 +42,6 @@ from leaderboard.documents.result import RANKED_METRICS, SealedResult
 from leaderboard.documents.season import Season
 from leaderboard.documents.submission import MAX_BYTES, Envelope, Knowledge
 from leaderboard.errors import Rejection
-from leaderboard.scoring.memo import Memo
 from leaderboard.scoring.ranking import RankedRow
 from leaderboard.scoring.season import (
     OfKey,
@@ -65,6 +65,7 @@ _INSTANCE = _TICKET + "/instances/{instance}"
 _WORKERS = 4  # threads that replay journals and write answers
 _LARGEST = 2**31
 _CURVE_POINTS = 40
+_RANKINGS_KEPT = 16
 _T = TypeVar("_T")
 
 
@@ -81,7 +82,7 @@ class SeasonRoutes:
         self._requests = CapacityLimiter(1)
         self._entries = CapacityLimiter(1)
         self._rankings = CapacityLimiter(1)
-        self._ranked: Memo[bytes] = Memo(16)
+        self._ranked: dict[tuple[str, str, str], bytes] = {}
 
     @contextlib.contextmanager
     def open(self) -> Iterator[None]:
@@ -140,7 +141,12 @@ class SeasonRoutes:
             return to_json({**self._view(row), "metric": metric, "ranking": facts}).encode()
 
         def ranked() -> bytes:
-            return self._ranked.get((name, metric, self._store.head.digest), rank)
+            key = name, metric, self._store.head.digest
+            if key not in self._ranked:
+                if len(self._ranked) >= _RANKINGS_KEPT:
+                    self._ranked.clear()
+                self._ranked[key] = rank()
+            return self._ranked[key]
 
         return Response(await _run(ranked, self._rankings), media_type="application/json")
 
@@ -343,18 +349,10 @@ class _Stepped(NamedTuple):
     curve: list[float]
 
 
-_STEPPED: Memo[_Stepped] = Memo(4096)  # results may have megabytes, and never change
-
-
+@functools.lru_cache(4096)  # results may have megabytes, and never change
 def _stepped(store: Store, row: SealedRow) -> _Stepped:
-    if row.result is None:
-        return _Stepped(None, [])
-
-    def read() -> _Stepped:
-        result = store.sealed_result(row)
-        return _Stepped(_online_regret(result), _mean_curve(result))
-
-    return _STEPPED.get(row.result, read)
+    result = store.sealed_result(row)
+    return _Stepped(_online_regret(result), _mean_curve(result))
 
 
 def _online_regret(result: SealedResult | None) -> float | None:

@@ -13,7 +13,7 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Estimate, Scores
 from leaderboard.errors import NotPublishable
 from leaderboard.scoring.ranking import ranking, refuse_unpublishable, superseded
-from leaderboard.store import EntryRow, Likeness
+from leaderboard.store import Copies, EntryRow
 from leaderboard.web.tables import RankingFile
 from sme_registry import EvaluationProtocol
 from sme_registry.spec import Suite
@@ -198,7 +198,7 @@ def test_a_copy_of_another_key_has_no_rank_and_pushes_nobody_down():
     own = entry(5, scores(0.4, 0.5), key="2" * 64, policies=10)
 
     def thief(copied):
-        alike = (Likeness(copied[0].id, copied[0].key, copied[1]),)
+        alike = (Copies(copied[0].id, copied[0].key, copied[1]),)
         return entry(6, scores(0.1, 0.2), key="1" * 64, policies=10, alike=alike)
 
     assert reasons(original, thief((original, 5)), own) == {3: "", 6: "copy", 5: ""}
@@ -303,7 +303,7 @@ def test_the_csv_has_every_score_with_its_interval():
 
 
 def test_an_export_has_what_an_entry_ranks_by_its_steps_per_run_and_what_it_copies():
-    alike = (Likeness("sha256:" + "a" * 64, "f" * 64, 2),)
+    alike = (Copies("sha256:" + "a" * 64, "f" * 64, 2),)
     copied = entry(3, scores(0.3, 0.1), runs=10, steps=1000, policies=10, alike=alike)
     rows = ranking([copied], "ood_decay")
     (line,) = csv_of(rows, "ood_decay")

@@ -148,7 +148,7 @@ def test_a_run_has_the_numbers_that_anyone_can_recompute(scored):
         assert run.similarity_loss == pytest.approx(
             100 * (similarity[0] - np.mean(similarity[1:])), abs=1e-4
         )
-        assert run.sketch  # by which copies are found
+        assert run.actions  # by which copies are found
 
 
 def test_a_result_is_the_same_each_time_whatever_else_is_loaded(monkeypatch):
@@ -186,7 +186,7 @@ def test_failed_and_unlisted_runs_score_one(scored):
     failed = result.runs[1]
     assert failed.normalised_regret == (1.0,) * 6
     assert failed.similarity is failed.evaluation_seed is None
-    assert failed.sketch == ""
+    assert failed.actions is None
     assert [getattr(failed, name) for name in METRICS] == [1.0, 1.0, 1.0, 1.0, 100.0]
     # The unlisted runs are one on each instance: [N, 1] and [1, 1].
     assert shallow.wd_regret == pytest.approx((result.runs[0].wd_regret + 3.0) / 4.0)

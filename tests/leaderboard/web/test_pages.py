@@ -18,7 +18,7 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Estimate
 from leaderboard.documents.submission import SignedWithdrawal
 from leaderboard.errors import BoardError, NotPublishable
-from leaderboard.store import Likeness, Store
+from leaderboard.store import Copies, Store
 from leaderboard.web import charts, tables
 from leaderboard.web import pages as site_pages
 from leaderboard.web.pages import STATIC, Pages, content_type
@@ -310,7 +310,7 @@ def test_a_superseded_entry_is_listed_as_history_and_its_versions_link_to_one_an
 
 def test_a_copy_names_the_entry_that_it_copies_and_the_number_of_runs(small, monkeypatch):
     first, copy = (submitted(small, name, [0.2] * 6) for name in ("First", "Copy"))
-    alike = (Likeness(first, small.entry(first).key, 10),)
+    alike = (Copies(first, small.entry(first).key, 10),)
     entries = [
         dataclasses.replace(entry, alike=alike) if entry.id == copy else entry
         for entry in small.entries()
