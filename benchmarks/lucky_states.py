@@ -12,8 +12,8 @@ import sys
 
 import numpy as np
 
-from leaderboard.artefact.sandbox import Sandbox
 from leaderboard.documents.submission import Submission
+from leaderboard.gate.sandbox import Sandbox
 from leaderboard.scoring.aggregation import run_metrics
 from leaderboard.store import Store
 from sme_registry import evaluate

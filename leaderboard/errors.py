@@ -76,7 +76,7 @@ CODES = {
     "run_output": "the model's actions have a wrong shape or type",
     "run_not_finite": "an action is NaN or infinite",
     "run_batch_dependent": "an action depends on the other rows of its batch",
-    "run_rounding": "the actions depend on the rounding of the runtime's arithmetic",
+    "run_rounding": "the actions change if observations change by one unit in the last place",
     "run_repeated": "two runs on one instance have the same policy, up to small differences",
     "run_time": "the model exceeds the limit on processor or wall time",
     "run_memory": "the model exceeds the limit on memory",

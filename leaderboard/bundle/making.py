@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from leaderboard.artefact.gate import inspect, widths
 from leaderboard.bundle.reading import Bundle
 from leaderboard.bundle.runs import SubmittedRun, listed_by_class, refuse_other_specs, runs_of
 from leaderboard.documents.board import hex_of
@@ -26,8 +25,18 @@ from leaderboard.documents.submission import (
     now,
 )
 from leaderboard.errors import Rejection
-from sme_registry.errors import OptionError
-from sme_registry.io import build_folder, check_new, sha256_of, write_atomically
+from leaderboard.gate.sandbox import inspect_own, widths
+from sme_registry import SMESpec
+from sme_registry.errors import OptionError, PolicyError
+from sme_registry.evaluation import load_sb3
+from sme_registry.export import onnx_bytes
+from sme_registry.io import (
+    build_folder,
+    check_new,
+    require_packages,
+    sha256_of,
+    write_atomically,
+)
 from sme_registry.spec import SuiteFile
 
 Progress = Callable[[int, int], None]
@@ -175,7 +184,7 @@ def _put_artefact(run: SubmittedRun, bundle: Path) -> Artefact | None:
         return None
     try:
         data = _policy_bytes(run, run.policy, bundle)
-        inspect(data, *widths(run.spec))
+        inspect_own(data, *widths(run.spec))
     except Rejection as error:
         raise Rejection(error.code, f"{run.source}: {error.message}") from error
     artefact = Artefact(sha256=sha256_of(data), size=len(data))
@@ -185,15 +194,13 @@ def _put_artefact(run: SubmittedRun, bundle: Path) -> Artefact | None:
 
 def _policy_bytes(run: SubmittedRun, policy: Path, bundle: Path) -> bytes:
     if policy.suffix == ".zip":
-        from leaderboard.artefact.export_sb3 import export_sb3
-
         exported = export_sb3(policy, bundle / "exported.onnx", spec=run.spec)
         data = exported.read_bytes()
         exported.unlink()
         return data
     try:
         with policy.open("rb") as stream:
-            return stream.read(MAX_ARTEFACT_BYTES + 1)  # one more than `inspect` allows
+            return stream.read(MAX_ARTEFACT_BYTES + 1)  # one more than is allowed
     except OSError as error:
         raise OptionError(
             f"{run.source}: policy={str(policy)!r}: cannot be read: {error.strerror}. "
@@ -213,3 +220,41 @@ def _refuse_existing(folder: Path, force: bool) -> None:
             f"{folder}: is not a bundle, or contains other files, such as {min(others)!r}, and is "
             "not replaced. Give another folder."
         )
+
+
+def export_sb3(
+    model: Any,
+    path: str | os.PathLike[str],
+    *,
+    vec_normalize: Any = None,
+    spec: SMESpec | None = None,
+) -> Path:
+    """Write a model's deterministic policy as an ONNX file that boards accept.
+
+    Args:
+      model: a model of Stable-Baselines3 or sb3-contrib, or the path of its .zip (loading a .zip
+        can run its author's code). Its action space is [0, 1] or [−1, 1] in every channel.
+      path: the file to write, completely or not at all; an existing file is replaced.
+      vec_normalize: see `sme_registry.export_onnx`.
+      spec: the task, to check the widths; None skips the check.
+
+    Returns:
+      The path written.
+
+    Raises:
+      PolicyError: see `sme_registry.export_onnx`.
+      Rejection: its network needs operators that no board accepts, or is too large.
+      OptionError: the file cannot be written.
+      MissingDependencyError: Stable-Baselines3, PyTorch, onnx or ONNX Runtime is not installed.
+    """
+    libraries = {"stable_baselines3": "Stable-Baselines3", "torch": "PyTorch"}
+    require_packages("exporting a model", libraries, "train")
+    if isinstance(model, str | os.PathLike):
+        model = load_sb3(model)
+    if not hasattr(model, "predict"):
+        raise PolicyError(
+            f"model={model!r:.80}: must be a Stable-Baselines3 model or the path of its .zip."
+        )
+    data = onnx_bytes(model, spec, vec_normalize=vec_normalize)
+    inspect_own(data, *(space.shape[0] for space in (model.observation_space, model.action_space)))
+    return write_atomically(path, data)

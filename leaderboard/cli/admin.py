@@ -13,7 +13,6 @@ import typer
 from rich.markup import escape
 
 from leaderboard import intake
-from leaderboard.artefact.isolation import Isolation, available_isolation, isolation_for_own
 from leaderboard.bundle import make_bundle
 from leaderboard.cli import results
 from leaderboard.cli.options import (
@@ -28,6 +27,7 @@ from leaderboard.cli.options import (
 from leaderboard.documents.board import RUNS_TO_RANK, Folder
 from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import BoardError
+from leaderboard.gate.isolation import Isolation, available_isolation, isolation_for_own
 from leaderboard.scoring.worker import run_scorers
 from leaderboard.store import Store, collect_garbage
 from sme_registry.errors import OptionError

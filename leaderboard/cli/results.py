@@ -280,9 +280,8 @@ def verify(
     """Check every signature, hash, log entry and score, and name the first altered row.
 
     The exit code is 3 if a row was altered. --rescore draws from all results and prints its seed.
-    Differences that prove nothing, such as other versions, are listed as notes. The exit code is 1
-    if what the board scored is rejected here, or the reverse, for a reason that may lie in the
-    machine: repeat it on another one.
+    The exit code is 1 if an entry is not confirmed here: its numbers or its verdict differ. Other
+    processors and versions round otherwise, so repeat it on another machine.
 
     Entries cut off the end of the log leave no trace in it: keep the printed digest and pass it to
     --contains next time.
@@ -304,7 +303,7 @@ def verify(
             progress=progress.update_of,
         )
     pairs = asdict(report)
-    confirmed = all(note.kind != "verdict" for note in report.notes)
+    confirmed = all(note.kind == "versions" for note in report.notes)
     if json:
         print_json(pairs)
     else:
@@ -318,10 +317,11 @@ def _print_verification(report: VerifyReport, pairs: dict[str, object], *, confi
     del pairs["notes"]
     if not report.rescored:
         del pairs["rescore_seed"], pairs["tolerance"]
-    outcome = "[green]Verified[/]" if confirmed else "[yellow]Not confirmed, see the notes[/]"
+    outcome = "[green]Verified[/]" if confirmed else "[yellow]Not confirmed here, see below[/]"
     print_pairs(f"{outcome}: no row was altered.", pairs)
     for note in report.notes:
-        line = f"note: {note.submission}: {note.kind}: {note.where}: "
+        what = "note" if note.kind == "versions" else "not confirmed here"
+        line = f"{what}: entry {note.submission}: {note.kind}: {note.where}: "
         line += f"recorded {note.recorded or 'nothing'}, here {note.here}"
         out().print(escape(line), soft_wrap=True)
     out().print(f"Digest of the last log entry, {last}:\n{digest}", soft_wrap=True)

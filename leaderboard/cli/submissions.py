@@ -10,7 +10,6 @@ import typer
 from rich.markup import escape
 
 from leaderboard import intake
-from leaderboard.artefact.isolation import isolation_for_own
 from leaderboard.bundle import Bundle, make_bundle
 from leaderboard.cli.options import (
     DEFAULT_KEY,
@@ -37,6 +36,7 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import LABELS, SYMBOLS, Result
 from leaderboard.documents.submission import Knowledge, SignedWithdrawal
 from leaderboard.errors import Rejection
+from leaderboard.gate.isolation import isolation_for_own
 from leaderboard.scoring.score import score_submission
 from leaderboard.store import Store
 from leaderboard.web import client
@@ -84,7 +84,7 @@ def export_sb3(
 
       sme-leaderboard export-sb3 runs/demo/model.zip
     """
-    from leaderboard.artefact.export_sb3 import export_sb3 as export
+    from leaderboard.bundle.making import export_sb3 as export
 
     target = model.with_suffix(".onnx") if out_file is None else out_file
     check_new(target, force=force)

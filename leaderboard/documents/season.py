@@ -16,10 +16,15 @@ import hmac
 from collections.abc import Iterator
 from typing import Annotated, Literal, NamedTuple, Self
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field, field_validator, model_validator
 
 from leaderboard.documents.master import Master
 from leaderboard.documents.submission import UtcTime
+from leaderboard.errors import Rejection
+from sme_registry.errors import ActionError, WireError
+from sme_registry.seasons.wire import unpack_table
 from sme_registry.spec import EvaluationProtocol, Setting
 from sme_registry.spec.document import (
     Digest,
@@ -43,6 +48,8 @@ MAX_LANES = 256
 """Of an instance that the server steps: the most copies that one request advances."""
 
 SealedTrack = Literal["sealed-offline", "sealed-online"]
+
+Float32 = npt.NDArray[np.float32]
 
 
 class SealedData(StrictModel):
@@ -255,3 +262,30 @@ class Reveal(Document):
     schema_version: SchemaVersion = 1
     season: Digest
     master: Annotated[str, matching(r"^[0-9a-f]{64}$", "a master secret, 64 hex digits")]
+
+
+def rows_of(protocol: EvaluationProtocol) -> int:
+    """The number of challenge states of an instance: of each region as many."""
+    return protocol.states_per_region * len(protocol.edges)
+
+
+def read_answers(data: bytes, setting: Setting, protocol: EvaluationProtocol) -> Float32:
+    """The answers in the bytes of a file.
+
+    Args:
+      data: the file.
+      setting: of the hidden task.
+      protocol: of its season.
+
+    Returns:
+      `[regions · n, A]` finite actions, which are not clipped yet.
+
+    Raises:
+      Rejection: `answer_shape` or `answer_not_finite`.
+    """
+    try:
+        return unpack_table(data, setting.action_dim, rows_of(protocol))
+    except WireError as error:
+        raise Rejection("answer_shape", str(error)) from None
+    except ActionError as error:
+        raise Rejection("answer_not_finite", str(error)) from None

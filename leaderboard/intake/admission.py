@@ -12,7 +12,6 @@ import datetime
 import os
 from collections.abc import Callable
 
-from leaderboard.artefact.gate import inspect, widths
 from leaderboard.bundle import Bundle
 from leaderboard.documents.checks import check_board, check_submission
 from leaderboard.documents.keys import SigningKey
@@ -26,6 +25,8 @@ from leaderboard.documents.submission import (
     utc,
 )
 from leaderboard.errors import Rejection
+from leaderboard.gate.isolation import Isolation, isolation_for_own
+from leaderboard.gate.sandbox import Confined, widths
 from leaderboard.intake.uploads import check_room, quota_window
 from leaderboard.store import Store
 
@@ -33,12 +34,18 @@ _DAY = datetime.timedelta(days=1)
 _VERDICTS_KEPT = 10_000
 ReadArtefact = Callable[[str], bytes]
 
-_verdicts: dict[tuple[str, int, int], tuple[str, str] | None] = {}
-"""The gate's code and message, or None, by digest and widths."""
+_Case = tuple[str, int, int]
+"""The digest of a policy file, and the widths of a task."""
+
+_verdicts: dict[_Case, Rejection | None] = {}
+"""Of the gate."""
 
 
 def receive(
-    store: Store, envelope: Envelope[SignedSubmission], at: datetime.datetime | None = None
+    store: Store,
+    envelope: Envelope[SignedSubmission],
+    at: datetime.datetime | None = None,
+    isolation: Isolation | None = None,
 ) -> bool:
     """Admit a submission that a server received.
 
@@ -46,18 +53,20 @@ def receive(
       store: the board.
       envelope: the submission, its signature verified and its content not validated.
       at: time of arrival; now by default.
+      isolation: of the process that reads its policies; None for the one that this machine has.
 
     Returns:
       True if it is new, False if the board already has it.
 
     Raises:
       Rejection: with the code of the first fault.
+      ScoringFault: that process does not start; nothing is judged.
     """
     check_board(store.document, envelope.board)
     moment = at or datetime.datetime.now(datetime.UTC)
     if store.entry(envelope.id) is None:
         _check_quotas(store, envelope.key, moment)
-    return admit(store, envelope.open(), moment)
+    return admit(store, envelope.open(), moment, isolation=isolation)
 
 
 def admit(
@@ -65,6 +74,7 @@ def admit(
     signed: SignedSubmission,
     at: datetime.datetime | None = None,
     artefact: ReadArtefact | None = None,
+    isolation: Isolation | None = None,
 ) -> bool:
     """Check a submission and store it.
 
@@ -74,12 +84,13 @@ def admit(
       at: time of arrival; now by default.
       artefact: returns an artefact's bytes by digest, of the size in the submission; they are
         stored with the submission. By default the submitter's key has uploaded them.
+      isolation: as in `receive`.
 
     Returns:
       True if it is new, False if the board already has it.
 
     Raises:
-      Rejection: with the code of the first fault.
+      Rejection, ScoringFault: as in `receive`.
     """
     check_board(store.document, signed.board)
     moment = at or datetime.datetime.now(datetime.UTC)
@@ -97,7 +108,7 @@ def admit(
     check_submission(store.document, submission, moment)
     check_name(store, submission.submitter)
     _check_quotas(store, key, moment)
-    _check_artefacts(store, submission, artefact)
+    _check_artefacts(store, submission, artefact, isolation)
     if artefact is not None:
         for digest in _artefacts(submission):
             store.put_object(digest, [artefact(digest)], by=key)
@@ -129,7 +140,7 @@ def submit_bundle(
     """
     bundle = Bundle.read(folder)
     signed = bundle.signed if key is None else bundle.signed.for_board(store.document.key, key)
-    admit(store, signed, artefact=bundle.artefact)
+    admit(store, signed, artefact=bundle.artefact, isolation=isolation_for_own())
     return signed.id
 
 
@@ -182,35 +193,42 @@ def _artefacts(submission: Submission) -> dict[str, Artefact]:
     return {run.artefact.sha256: run.artefact for run in submission.runs if run.artefact}
 
 
-def _check_artefacts(store: Store, submission: Submission, artefact: ReadArtefact | None) -> None:
+def _check_artefacts(
+    store: Store,
+    submission: Submission,
+    artefact: ReadArtefact | None,
+    isolation: Isolation | None,
+) -> None:
     """Check that all are present with the declared sizes; then inspect one after the other."""
     if artefact is None:
         for declared in _artefacts(submission).values():
             check_stored(store, submission.submitter.key, declared)
     instances = store.document.instances
-    dimensions: dict[str, set[tuple[int, int]]] = {}
-    for run in submission.runs:
-        if run.artefact:
-            dimensions.setdefault(run.artefact.sha256, set()).add(widths(instances[run.spec][1]))
-    for digest, pairs in dimensions.items():
-        for observation_dim, action_dim in sorted(pairs):
-            _inspect(artefact or store.objects.read, digest, observation_dim, action_dim)
+    cases = dict.fromkeys(
+        (run.artefact.sha256, *widths(instances[run.spec][1]))
+        for run in submission.runs
+        if run.artefact
+    )
+    _inspect(artefact or store.objects.read, list(cases), isolation)
 
 
-def _inspect(read: ReadArtefact, digest: str, observation_dim: int, action_dim: int) -> None:
-    """The gate's verdict, which depends on the bytes and the widths only, and is kept."""
-    case = (digest, observation_dim, action_dim)
-    if case not in _verdicts:
-        verdict = None
-        try:
-            inspect(read(digest), observation_dim, action_dim)
-        except Rejection as rejection:
-            verdict = (rejection.code, rejection.message)
-        if len(_verdicts) >= _VERDICTS_KEPT:
-            _verdicts.clear()
-        _verdicts[case] = verdict
-    if (verdict := _verdicts[case]) is not None:
-        raise Rejection(*verdict)
+def _inspect(read: ReadArtefact, cases: list[_Case], isolation: Isolation | None) -> None:
+    """Raise the gate's first verdict, which depends on bytes and widths only, and is kept."""
+    if len(_verdicts) >= _VERDICTS_KEPT:
+        _verdicts.clear()
+    unknown = [case for case in cases if case not in _verdicts]
+    if unknown:
+        with Confined(isolation=isolation) as confined:
+            for digest, observation_dim, action_dim in unknown:
+                try:
+                    confined.inspect(read(digest), observation_dim, action_dim)
+                except Rejection as rejection:
+                    _verdicts[digest, observation_dim, action_dim] = rejection
+                    break
+                _verdicts[digest, observation_dim, action_dim] = None
+    for case in cases:
+        if (verdict := _verdicts.get(case)) is not None:
+            raise Rejection(verdict.code, verdict.message)
 
 
 def check_stored(store: Store, key: str, declared: Artefact) -> None:

@@ -11,10 +11,9 @@ from __future__ import annotations
 
 import datetime
 
-from leaderboard.artefact.answers import read_answers
 from leaderboard.documents.checks import check_board, check_names, check_time, skeleton
 from leaderboard.documents.entry import Entry, SignedEntry, SignedTicketRequest
-from leaderboard.documents.season import Season
+from leaderboard.documents.season import Season, read_answers
 from leaderboard.documents.submission import Artefact, Envelope
 from leaderboard.errors import Rejection
 from leaderboard.intake.admission import ReadArtefact, check_daily_quota, check_name, check_stored

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
-from leaderboard.artefact.reference import constant_onnx, optimal_onnx
 from leaderboard.documents.checks import REFERENCE_FAMILY, THE_BOARD
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import (
@@ -19,6 +18,8 @@ from leaderboard.documents.submission import (
     Submission,
     Submitter,
 )
+from leaderboard.gate.isolation import isolation_for_own
+from leaderboard.gate.reference import constant_onnx, optimal_onnx
 from leaderboard.intake.admission import admit
 from leaderboard.store import Store
 from sme_registry.io import sha256_of
@@ -71,7 +72,13 @@ def submit_references(store: Store) -> list[str]:
             ids.append(existing[reference.name])
             continue
         signed, artefacts = _submission(store, key, opened, reference)
-        admit(store, signed, datetime.datetime.fromisoformat(opened), artefacts.__getitem__)
+        admit(
+            store,
+            signed,
+            datetime.datetime.fromisoformat(opened),
+            artefacts.__getitem__,
+            isolation_for_own(),
+        )
         ids.append(signed.id)
     return ids
 

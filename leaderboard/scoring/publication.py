@@ -14,9 +14,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-from leaderboard.artefact.answers import rows_of
 from leaderboard.documents.master import Master
-from leaderboard.documents.season import MAX_INSTANCES, Digests, Hidden, Season, Terms
+from leaderboard.documents.season import MAX_INSTANCES, Digests, Hidden, Season, Terms, rows_of
 from leaderboard.errors import BoardError
 from leaderboard.scoring.sealed import Instance, challenge, instances
 from sme_registry.compiled import chosen_backend

@@ -23,13 +23,12 @@ from typing import Any
 
 import numpy as np
 
-from leaderboard.artefact.gate import widths
-from leaderboard.artefact.isolation import Isolation, available_isolation
-from leaderboard.artefact.sandbox import Actions, Observations, Sandbox, SandboxLimits
 from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.result import AgentScore, Result, RunScore
 from leaderboard.documents.submission import Submission
 from leaderboard.errors import Rejection
+from leaderboard.gate.isolation import Isolation, available_isolation
+from leaderboard.gate.sandbox import Actions, Observations, Sandbox, SandboxLimits, widths
 from leaderboard.scoring.aggregation import (
     failed_run,
     levels_of,
@@ -45,10 +44,6 @@ from sme_registry.io import versions
 
 Progress = Callable[[int, int], None]
 
-ROUNDING_STATES = 512
-"""States of each region in which the effect of rounding is measured."""
-
-_ROUNDING_DRAWS = 4
 _SINGLE_ROWS = 8  # of a checked batch, evaluated one at a time
 # May be loaded in the same process, but no number of a result depends on them.
 _UNUSED = ("stable_baselines3", "torch")
@@ -87,7 +82,7 @@ def score_submission(
 
     Returns:
       The result, a function of board, submission and artefacts up to floating-point rounding,
-      except for the measured effect of rounding, `RunScore.rounding`, and the last bits in
+      except for the last bits in
       `RunScore.actions`. It is a rejection if an
       artefact, or its behaviour, is rejected.
 
@@ -176,8 +171,8 @@ def _evaluate(
     progress: Progress,
     machine: _Machine,
     observe: Callable[[Sandbox], str | None],
-) -> tuple[EvaluationReport, float, str | None]:
-    """Evaluate a policy in the sandbox on the states of its own seed; its rounding and actions."""
+) -> tuple[EvaluationReport, str | None]:
+    """Evaluate a policy in the sandbox on the states of its own seed; digest its actions."""
     agents = max(1, len(agent_names(spec)))
     states = board.protocol.states_per_region
     rows = states * len(board.protocol.edges) + COMPARED
@@ -190,45 +185,7 @@ def _evaluate(
             actions = observe(sandbox) if board.rules > 1 else None
     used = {name: version for name, version in report.versions.items() if name not in _UNUSED}
     machine.versions = {**used, "onnxruntime": sandbox.runtime}
-    return report, float(np.mean(policy.rounding)), actions
-
-
-def rounding_by_region(
-    board: BoardDocument, spec: SMESpec, data: bytes, digest: str
-) -> tuple[float, ...]:
-    """How much rounding may change a policy's normalised regret: mean |Δa| / mean |½ − a*|.
-
-    |Δa| is the largest of several draws of the rounding errors, in each state.
-
-    Args:
-      board: the protocol.
-      spec: the instance.
-      data: the policy's file.
-      digest: of the file, which determines the states.
-
-    Returns:
-      For each region, over all states that are scored, and all channels; dimensionless.
-
-    Raises:
-      Rejection, BoardError: see `Sandbox`.
-    """
-    agents = max(1, len(agent_names(spec)))
-    states = board.protocol.states_per_region
-    limits = SandboxLimits.for_policy(len(data), 20 * states * len(board.protocol.edges), agents)
-    sums = np.zeros(len(board.protocol.edges))
-    rows = 0
-    with Sandbox(data, *widths(spec), limits) as sandbox:
-
-        def policy(observations: Observations) -> Actions:
-            nonlocal rows
-            drawn = [sandbox.rounding(observations) for _ in range(_ROUNDING_DRAWS)]
-            sums[rows // (states * agents)] += np.max(drawn, axis=0).sum()
-            rows += len(observations)
-            return sandbox(observations)
-
-        report = _report(board, spec, policy, digest)
-    constant = [region.mae for region in report.references["constant_half"]]
-    return tuple((sums / (states * agents) / constant).tolist())
+    return report, actions
 
 
 def _report(
@@ -260,14 +217,10 @@ class _CheckedPolicy:
     """A sandboxed policy as `evaluate` calls it: region by region, batch by batch, for each agent.
 
     In each region, a random batch and the last one, which is often smaller, are checked for
-    dependence on other rows, and random states for dependence on rounding.
-
-    Attributes:
-      rounding: mean |Δa| of each region that is complete.
+    dependence on other rows, and the random one for dependence on the observations' last place.
     """
 
     def __init__(self, sandbox: Sandbox, states: int, agents: int) -> None:
-        self.rounding: list[float] = []
         self._sandbox, self._states, self._agents = sandbox, states, agents
         self._random = np.random.default_rng(secrets.randbits(128))
         self._begin_region()
@@ -275,22 +228,19 @@ class _CheckedPolicy:
     def _begin_region(self) -> None:
         self._first = self._calls = 0
         self._batch_with = int(self._random.integers(self._states))
-        count = min(ROUNDING_STATES, self._states)
-        self._chosen = np.sort(self._random.choice(self._states, count, replace=False))
-        self._rows: list[Observations] = []
 
     def __call__(self, observations: Observations) -> Actions:
         end = self._first + len(observations)
-        if self._first <= self._batch_with < end or end == self._states:
+        is_chosen = self._first <= self._batch_with < end
+        if is_chosen or end == self._states:
             self._sandbox.check_rows(observations, _SINGLE_ROWS)
-        low, high = np.searchsorted(self._chosen, (self._first, end))
-        self._rows.append(observations[self._chosen[low:high] - self._first])
+        if is_chosen:
+            self._sandbox.check_last_place(observations)
         a = self._sandbox(observations)
         self._calls += 1
         if self._calls % self._agents == 0:
             self._first = end
             if end == self._states:
-                self.rounding.append(self._sandbox.check_rounding(np.concatenate(self._rows)))
                 self._begin_region()
         return a
 
@@ -300,7 +250,6 @@ def _run_score(
     class_name: str,
     digest: str,
     report: EvaluationReport,
-    rounding: float,
     actions: str | None,
 ) -> RunScore:
     regrets = tuple(region.normalised_regret for region in report.regions)
@@ -319,7 +268,6 @@ def _run_score(
             )
             for name, each in report.agents.items()
         ),
-        rounding=rounding,
         actions=actions,
         **metrics,
     )

@@ -13,11 +13,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from leaderboard.artefact.answers import Float32, rows_of
 from leaderboard.documents.board import RULES
 from leaderboard.documents.master import Master, Place
 from leaderboard.documents.result import RunScore, SealedResult, Stepping
-from leaderboard.documents.season import Hidden, Season, Terms
+from leaderboard.documents.season import Float32, Hidden, Season, Terms, rows_of
 from leaderboard.scoring.aggregation import (
     Groups,
     class_score,

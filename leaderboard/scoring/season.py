@@ -17,11 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from leaderboard.artefact.answers import Float32, read_answers
 from leaderboard.documents.board import RULES
 from leaderboard.documents.master import Master
 from leaderboard.documents.result import Metric, RunScore, Scores, SealedResult
-from leaderboard.documents.season import Season
+from leaderboard.documents.season import Float32, Season, read_answers
 from leaderboard.documents.submission import Artefact, Knowledge
 from leaderboard.scoring.aggregation import is_oracle_like, method_scores
 from leaderboard.scoring.ranking import RankedRow, ranking

@@ -23,9 +23,9 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import FrameType
 
-from leaderboard.artefact.isolation import Isolation
 from leaderboard.documents.result import Result
 from leaderboard.errors import BoardError
+from leaderboard.gate.isolation import Isolation
 from leaderboard.scoring.score import Progress, score_submission
 from leaderboard.store import LEASE_SECONDS, Claim, Store
 from sme_registry.errors import MissingDependencyError, SMEError

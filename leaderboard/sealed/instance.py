@@ -15,9 +15,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Literal
 
-from leaderboard.artefact.answers import Float32, read_answers, rows_of
 from leaderboard.documents.entry import SignedAnswers
-from leaderboard.documents.season import MAX_LANES, SeasonClass
+from leaderboard.documents.season import MAX_LANES, Float32, SeasonClass, read_answers, rows_of
 from leaderboard.errors import Rejection, TamperedError
 from leaderboard.sealed.journal import Journal
 from leaderboard.sealed.signatory import Signatory

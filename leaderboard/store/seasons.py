@@ -11,13 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from leaderboard.artefact.answers import rows_of
 from leaderboard.documents.board import Folder, SeasonFolder
 from leaderboard.documents.checks import skeleton
 from leaderboard.documents.entry import SignedEntry, SignedSealed, SignedTicketRequest
 from leaderboard.documents.master import Master
 from leaderboard.documents.result import SealedResult
-from leaderboard.documents.season import MAX_LANES, Reveal, SealedTrack, Season
+from leaderboard.documents.season import MAX_LANES, Reveal, SealedTrack, Season, rows_of
 from leaderboard.errors import TamperedError
 from leaderboard.store.files import read_document
 from leaderboard.store.log import LogEntry

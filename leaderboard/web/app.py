@@ -32,7 +32,6 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
 from leaderboard import intake
-from leaderboard.artefact.isolation import Isolation, available_isolation
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.submission import (
     MAX_BYTES,
@@ -41,6 +40,7 @@ from leaderboard.documents.submission import (
     SignedWithdrawal,
 )
 from leaderboard.errors import BoardError, Rejection, ScoringFault
+from leaderboard.gate.isolation import Isolation, available_isolation
 from leaderboard.scoring.worker import background_scorers
 from leaderboard.store import Head, Store, unknown_submission
 from leaderboard.web import http
@@ -72,13 +72,12 @@ def create_app(
       score_workers: number of scorer processes that run as long as the application does.
       url: the board's public address, shown on its pages; empty if it is not known. It is never
         taken from a request, whose Host header anyone can choose.
-      isolation: of the scorers' sandboxes; "process" if nobody else can submit to the board.
+      isolation: of the processes that read and run policies; "process" if nobody else can submit.
       season_secrets: the masters of the sealed-online seasons that this server steps.
     """
-    if score_workers:
-        _refuse_missing(isolation)
+    _refuse_missing(isolation)
     store = Store.open(os.fspath(path))
-    routes = _Routes(store, _PageCache(store, url))
+    routes = _Routes(store, _PageCache(store, url), isolation)
     seasons = SeasonRoutes(store, season_secrets)
 
     @contextlib.asynccontextmanager
@@ -134,8 +133,8 @@ class _Routes:
     can share the last free place of a quota; neither can two uploads.
     """
 
-    def __init__(self, store: Store, pages: _PageCache) -> None:
-        self._store = store
+    def __init__(self, store: Store, pages: _PageCache, isolation: Isolation) -> None:
+        self._store, self._isolation = store, isolation
         self._documents = CapacityLimiter(1)
         self._admissions = CapacityLimiter(1)
         self._objects = CapacityLimiter(_OBJECTS)
@@ -200,7 +199,7 @@ class _Routes:
         envelope = await to_thread.run_sync(read, limiter=self._documents)
 
         def receive() -> bool:
-            return intake.receive(self._store, envelope)
+            return intake.receive(self._store, envelope, isolation=self._isolation)
 
         new = await to_thread.run_sync(receive, limiter=self._admissions)
         id = envelope.id

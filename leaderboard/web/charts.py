@@ -255,11 +255,11 @@ def can_show(spec: SMESpec) -> bool:
 def explorer(name: str, data: bytes, spec: SMESpec) -> str:
     """The page that computes a policy's network, of its ONNX file, in the browser.
 
-    A stranger's network reaches it as numbers only, through `artefact.network`; of one that is not
+    A stranger's network reaches it as numbers only, through `gate.network`; of one that is not
     understood in full, or whose actions are not finite, it shows the task alone.
     """
-    from leaderboard.artefact.gate import widths
-    from leaderboard.artefact.network import network_of
+    from leaderboard.gate.network import network_of
+    from leaderboard.gate.sandbox import widths
     from sme_registry.diagnosis import load_policy
     from sme_registry.explorer import explorer_page, facts
 

@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from leaderboard.artefact.gate import inspect
+from leaderboard.gate.sandbox import inspect_own
 from sme_registry import SMESpec, evaluate, export_onnx
 from sme_registry.errors import MissingDependencyError, OptionError, PolicyError
 from sme_registry.evaluation import OfflinePolicy, Perceptron
@@ -29,7 +29,7 @@ def same(policy, path, action_range="unit", act=None):
     for found, expected in zip(exported.regions, own.regions, strict=True):
         assert found.normalised_regret == pytest.approx(expected.normalised_regret, abs=1e-5)
     assert own.regions[0].similarity_sd > 0.02  # no constant
-    inspect(path.read_bytes(), SPEC.state_dim + 2, SPEC.action_dim)
+    inspect_own(path.read_bytes(), SPEC.state_dim + 2, SPEC.action_dim)
 
 
 LAYERS = [(arrays(5, 16), arrays(16), "tanh"), (arrays(16, 2), arrays(2), "identity")]

@@ -7,12 +7,12 @@ import shutil
 
 import pytest
 
-from leaderboard.artefact.reference import constant_onnx, optimal_onnx
 from leaderboard.bundle import Bundle, make_bundle
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, MAX_BYTES, Submission, Training
 from leaderboard.errors import Rejection
+from leaderboard.gate.reference import constant_onnx, optimal_onnx
 from sme_registry import SMESpec, save
 from sme_registry.errors import OptionError, SMEError, SpecError
 from sme_registry.spec import StudyFile, StudyPlan, Suite, SuiteFile

@@ -12,11 +12,11 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from leaderboard.artefact import isolation
 from leaderboard.cli import app
 from leaderboard.cli.options import KEY_VARIABLE
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
+from leaderboard.gate import isolation
 from leaderboard.store import Store
 from sme_registry import EvaluationProtocol
 from sme_registry.io import sha256_of

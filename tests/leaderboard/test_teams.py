@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from leaderboard import intake
-from leaderboard.artefact import sandbox
-from leaderboard.artefact.isolation import available_isolation
-from leaderboard.artefact.reference import optimal_onnx
 from leaderboard.bundle import make_bundle
 from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import Rejection, TamperedError
+from leaderboard.gate import sandbox
+from leaderboard.gate.isolation import available_isolation
+from leaderboard.gate.reference import optimal_onnx
 from leaderboard.scoring import ranking, score
 from leaderboard.scoring.rescore import rescore
 from leaderboard.scoring.verify import verify
@@ -123,6 +123,7 @@ def test_agents_receive_what_they_observe_and_their_rows_are_checked_in_every_re
         return call(self, observations)
 
     monkeypatch.setattr(sandbox.Sandbox, "__call__", recorded)
+    monkeypatch.setattr(sandbox.Sandbox, "check_last_place", lambda self, seen: None)
     monkeypatch.setattr(
         sandbox.Sandbox, "check_rows", lambda self, seen, rows: checked.append(tuple(seen[0, -2:]))
     )

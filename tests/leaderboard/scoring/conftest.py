@@ -15,7 +15,6 @@ from leaderboard.scoring.aggregation import never_listed, result_of
 from leaderboard.scoring.worker import run_scorer
 from leaderboard.store import LogEntry, Store, digest_of
 from sme_registry.io import to_json
-from tests.leaderboard.artefact import models
 from tests.leaderboard.conftest import (
     linear_onnx,
     put_policy,
@@ -24,6 +23,7 @@ from tests.leaderboard.conftest import (
     tiny_board,
     tiny_submission,
 )
+from tests.leaderboard.gate import models
 
 STEADY, FAILED, SENSITIVE, REFUSED, WAITING = range(5)
 """The entries of `board`: its log opens, receives four, has four results, loses `FAILED`, which is

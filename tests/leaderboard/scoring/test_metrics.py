@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks.interval_coverage import DISTRIBUTIONS, simulate
-from leaderboard.artefact.answers import read_answers
 from leaderboard.documents.master import Place
+from leaderboard.documents.season import read_answers
 from leaderboard.errors import Rejection
 from leaderboard.scoring.aggregation import failed_run, run_metrics
 from leaderboard.scoring.ranking import rank_ranges

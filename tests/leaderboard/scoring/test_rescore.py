@@ -6,7 +6,6 @@ from typer.testing import CliRunner
 from leaderboard.cli import app
 from leaderboard.documents.board import Folder
 from leaderboard.documents.result import Result
-from leaderboard.errors import TamperedError
 from leaderboard.scoring.aggregation import levels_of, run_metrics
 from leaderboard.scoring.rescore import RescoreNote, draw, rescore
 from leaderboard.scoring.score import evaluation_seed
@@ -54,23 +53,20 @@ def test_the_draw_is_unpredictable_and_its_seed_repeats_it(board, monkeypatch):
     assert draw(names, "all", 1) == draw(names, 1000, 1) == names
 
 
-def test_a_small_forgery_of_an_ordinary_policy_is_found(board):
-    with pytest.raises(TamperedError, match=r"differs by [\d.]+e-05: must be at most 1.\de-05"):
-        again(board, moved(board, STEADY, 1e-4))
+def kinds(notes):
+    return [(note.kind, note.where) for note in notes if note.kind != "versions"]
+
+
+def test_other_numbers_are_not_confirmed_and_name_the_entry(board):
+    assert again(board, moved(board, STEADY, 1e-6)) == []
+    for number in (STEADY, SENSITIVE):
+        (note,) = again(board, moved(board, number, 1e-4))
+        assert (note.submission, note.kind, note.where) == (ids(board)[number], "numbers", "runs.0")
+        assert "e-0" in note.recorded
     assert verify(board).rescored == 0
-    with pytest.raises(TamperedError) as tampered:
-        verify(board, rescore="all")
-    path = Folder(board).result(ids(board)[STEADY])
-    assert tampered.value.where == f"results/{path.name}"
-
-
-def test_what_rounding_explains_is_a_note_and_more_is_tampering(board):
-    (note,) = again(board, moved(board, SENSITIVE, 1e-4))
-    assert (note.submission, note.kind, note.where) == (
-        *(ids(board)[SENSITIVE], "rounding", "runs.0"),
-    )
-    with pytest.raises(TamperedError, match="scored again, it differs by"):
-        again(board, moved(board, SENSITIVE, 1e-2))
+    answer = CliRunner().invoke(app, ["verify", str(board), "--rescore", "all"])
+    assert (answer.exit_code, "Not confirmed here" in answer.stdout) == (1, True)
+    assert ids(board)[STEADY] in answer.stdout.replace("\n", "")
 
 
 def rejected(result, code, versions=None):
@@ -85,28 +81,22 @@ def rejected(result, code, versions=None):
     )
 
 
-def test_what_depends_on_versions_or_chance_is_noted_and_not_confirmed(board):
+def test_other_versions_are_noted_and_prove_nothing(board):
     honest = result_on(board, STEADY)
     other = honest.model_copy(update={"versions": {**honest.versions, "onnxruntime": "1.0.0"}})
     (note,) = again(board, other)
     assert note == RescoreNote(
         honest.submission, "versions", "onnxruntime", "1.0.0", honest.versions["onnxruntime"]
     )
-    for forged in (
-        rejected(honest, "run_rounding"),
-        rejected(honest, "onnx_op", {"sme_registry": "0.0.9"}),
-    ):
-        notes = again(board, forged)
-        assert [note.here for note in notes if note.kind == "verdict"] == ["scored"]
-        assert {note.submission for note in notes} == {honest.submission}
     answer = CliRunner().invoke(app, ["verify", str(board), "--rescore", "all"])
-    assert (answer.exit_code, "Not confirmed" in answer.stdout) == (1, True)
+    assert answer.exit_code == 0
 
 
-def test_a_board_that_rejects_a_policy_without_a_fault_is_found(board):
-    with pytest.raises(TamperedError, match="it is scored, not onnx_op"):
-        again(board, rejected(result_on(board, STEADY), "onnx_op"))
-    assert verify(board).results == 4
+@pytest.mark.parametrize("code", ["run_rounding", "onnx_op"])
+def test_a_rejected_policy_that_is_scored_here_is_not_confirmed(board, code):
+    notes = again(board, rejected(result_on(board, STEADY), code, {"sme_registry": "0.0.9"}))
+    assert kinds(notes) == [("verdict", "code")]
+    assert (notes[-1].recorded, notes[-1].here) == (code, "scored")
 
 
 def test_scores_of_a_policy_that_is_rejected_are_found(board):
@@ -117,5 +107,5 @@ def test_scores_of_a_policy_that_is_rejected_are_found(board):
     seed = evaluation_seed(Folder(board).read().protocol.digest, run.spec, artefact)
     copy = scored.runs[0].model_copy(update={"artefact": artefact, "evaluation_seed": seed})
     forged = scored.model_copy(update={"submission": refused.submission})
-    with pytest.raises(TamperedError, match="it is onnx_interface, not scored"):
-        again(board, with_runs(board, forged, [copy]))
+    notes = again(board, with_runs(board, forged, [copy]))
+    assert [(note.recorded, note.here) for note in notes] == [("scored", "onnx_interface")]

@@ -16,11 +16,11 @@ import httpx
 import pytest
 
 from leaderboard import intake
-from leaderboard.artefact import isolation
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import SignedSubmission, utc
 from leaderboard.errors import BoardError
+from leaderboard.gate import isolation
 from leaderboard.web import app
 from leaderboard.web.http import HTTP_CODES, STATUSES
 from leaderboard.web.server import serve
@@ -317,7 +317,9 @@ def test_a_board_is_not_served_without_bubblewrap_unless_told(store, tmp_path, m
     isolation._bwrap.cache_clear()
     with pytest.raises(BoardError, match=r"bubblewrap is .*--unsafe-no-sandbox"):
         serve(store.folder.path, port=0)
-    app.create_app(store.folder.path, score_workers=0)
+    with pytest.raises(BoardError, match="bubblewrap is not installed"):
+        app.create_app(store.folder.path, score_workers=0)
+    app.create_app(store.folder.path, isolation="process")
     app.create_app(store.folder.path, score_workers=1, isolation="process")
 
 

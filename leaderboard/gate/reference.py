@@ -33,7 +33,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from leaderboard.artefact.gate import widths
+from leaderboard.gate.sandbox import widths
 from sme_registry import SMESpec, materialize
 from sme_registry.io import require_packages
 from sme_registry.task import Layer

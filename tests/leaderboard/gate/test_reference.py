@@ -5,15 +5,15 @@ import onnx
 import onnxruntime
 import pytest
 
-from leaderboard.artefact.gate import inspect, widths
-from leaderboard.artefact.network import network_of
-from leaderboard.artefact.reference import constant_onnx, optimal_onnx
+from leaderboard.gate.network import network_of
+from leaderboard.gate.reference import constant_onnx, optimal_onnx
+from leaderboard.gate.sandbox import inspect_own, widths
 from leaderboard.web.charts import can_show, explorer
 from sme_registry import SMESpec, evaluate, materialize
 from sme_registry.export.export import onnx_bytes
 from tests.explorer.networks import offline, perceptron
 from tests.explorer.test_programs import module
-from tests.leaderboard.artefact.models import doubling, looping, memory_bomb
+from tests.leaderboard.gate.models import doubling, looping, memory_bomb
 
 SPECS = {
     "default": SMESpec(),
@@ -76,7 +76,7 @@ def test_any_board_takes_the_files_and_the_same_spec_gives_the_same_bytes(spec):
     for made in (optimal_onnx, constant_onnx):
         data = made(spec)
         assert made(spec) == data
-        inspect(data, spec.state_dim + 2, spec.action_dim)
+        inspect_own(data, spec.state_dim + 2, spec.action_dim)
         assert len(onnx.load_from_string(data).graph.node) <= 13 * spec.complexity + 2
 
 
@@ -98,7 +98,7 @@ TEAM = SMESpec(
 @pytest.mark.parametrize(("made", "regret"), [(optimal_onnx, 0.0), (constant_onnx, 1.0)])
 def test_a_teams_reference_is_one_file_for_all_agents(made, regret, tmp_path):
     data = made(TEAM)
-    inspect(data, *widths(TEAM))
+    inspect_own(data, *widths(TEAM))
     (tmp_path / "policy.onnx").write_bytes(data)
     report = evaluate(str(tmp_path / "policy.onnx"), TEAM, {"states_per_region": 500})
     for each in (report, *report.agents.values()):

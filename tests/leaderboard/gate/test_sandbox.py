@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from leaderboard.artefact import isolation as isolations
-from leaderboard.artefact import sandbox
-from leaderboard.artefact.gate import inspect
-from leaderboard.artefact.sandbox import ROWS, Sandbox, SandboxLimits
+from leaderboard.documents.submission import MAX_ARTEFACT_BYTES
 from leaderboard.errors import BoardError, Rejection, ScoringFault
+from leaderboard.gate import child, sandbox
+from leaderboard.gate import isolation as isolations
+from leaderboard.gate.sandbox import ROWS, Sandbox, SandboxLimits, inspect_own
 from sme_registry.errors import MissingDependencyError, StateError
-from tests.leaderboard.artefact import models
-from tests.leaderboard.artefact.models import (
+from tests.leaderboard.gate import models
+from tests.leaderboard.gate.models import (
     ACTION,
     OBSERVATION,
     linear,
@@ -52,9 +52,15 @@ def unconfined(monkeypatch):
 
 
 @pytest.fixture
-def ungated(monkeypatch):
-    """No gate, as if it had a hole: the sandbox stands alone."""
-    monkeypatch.setattr(sandbox, "inspect", lambda *arguments: None)
+def ungated(monkeypatch, tmp_path):
+    """A gate with a hole as wide as itself: the sandbox stands alone."""
+    shutil.copy(child.__file__, tmp_path / "child.py")
+    hole = "class Refused(Exception): pass\nread = lambda *arguments: None"
+    (tmp_path / "gate.py").write_text(hole)
+    monkeypatch.setattr(child, "__file__", str(tmp_path / "child.py"))
+    isolations._bwrap.cache_clear()
+    yield
+    isolations._bwrap.cache_clear()
 
 
 def opened(found, limits=LIMITS, dims=(OBSERVATION, ACTION)):
@@ -111,10 +117,7 @@ def test_batches_of_every_size_are_answered_in_order_and_others_refused():
 
 
 def test_what_onnxruntime_cannot_load_is_refused():
-    undefined = model([node("MatMul", "o Q", "a")], [weights()])
-    unfitting = model([node("MatMul", "o W", "a")], [weights(rows=5)])
-    for found in (undefined, unfitting):
-        assert code_of(found) == "onnx_refused"
+    assert code_of(model([node("MatMul", "o W", "a")], [weights(rows=5)])) == "onnx_refused"
 
 
 FAILING = {
@@ -142,7 +145,7 @@ FAILING = {
 @pytest.mark.parametrize("kind", FAILING)
 def test_a_failing_run_has_its_code(kind, unconfined):
     found, expected = FAILING[kind]
-    inspect(found.SerializeToString(), OBSERVATION, ACTION)  # the gate cannot see it
+    inspect_own(found.SerializeToString(), OBSERVATION, ACTION)  # the gate cannot see it
     limits = SandboxLimits(memory_bytes=2**28)
     assert code_of(found, limits) == expected
 
@@ -187,6 +190,49 @@ def test_an_action_that_depends_on_both_neighbours_is_rejected():
         pytest.raises(Rejection, match="run_batch_dependent"),
     ):
         policy.check_rows(observations(100), rows=[])
+
+
+def amplified(*nodes, **tensors):
+    """½ + factor · `d`, where the nodes compute `d` from `y` = o W."""
+    nodes = [*nodes, node("Mul", "d factor", "amplified"), node("Add", "amplified half", "a")]
+    named = [tensor(name, np.asarray(each, np.float32)) for name, each in tensors.items()]
+    return squashed(nodes, [*named, tensor("half", np.float32(0.5))], opsets=[("", 20)])
+
+
+SENSITIVE = {
+    "the tail of a sigmoid": amplified(
+        node("Abs", "y", "x"), node("Sub", "at x", "z"), node("Sigmoid", "z", "d"),
+        at=-17.0, factor=1e7,
+    ),
+    "the fraction of a large multiple": amplified(
+        node("Mul", "y large", "m"), node("Floor", "m", "f"), node("Sub", "m f", "d"),
+        large=1e6, factor=0.5,
+    ),
+    "a wave of a large multiple": amplified(
+        node("Mul", "y large", "m"), node("Sin", "m", "d"), large=1e6, factor=0.5,
+    ),
+    "the difference of nearly equal numbers": amplified(
+        node("Tanh", "y", "u"), node("Mul", "y near", "n"), node("Tanh", "n", "v"),
+        node("Sub", "u v", "d"), near=1.000001, factor=1e6,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", SENSITIVE)
+def test_actions_that_depend_on_the_last_place_of_observations_are_rejected(kind):
+    with opened(SENSITIVE[kind]) as policy, pytest.raises(Rejection, match="run_rounding"):
+        policy.check_last_place(observations(500))
+
+
+def test_honest_policies_and_trees_keep_their_actions_in_the_last_place():
+    step = squashed(
+        [node("Greater", "y at", "c"), node("Cast", "c", "a", to=1)],
+        [tensor("at", np.float32(0.25))],
+    )
+    for found in (linear(), models.network(hidden=64), models.network(hidden=2000), step):
+        with opened(found) as policy:
+            for rows in (1, 500):
+                policy.check_last_place(observations(rows))
 
 
 def test_the_rows_to_check_may_be_given_and_are_drawn_at_random_otherwise(monkeypatch):
@@ -305,10 +351,10 @@ def test_denormal_numbers_are_zero():
         assert (policy(observations(8)) == 0.0).all()
 
 
-def test_the_gate_runs_before_any_process_starts(monkeypatch):
+def test_a_file_that_is_too_large_starts_no_process(monkeypatch):
     monkeypatch.setattr(sandbox, "start", lambda *arguments: pytest.fail("a process was started"))
-    with pytest.raises(Rejection, match="onnx_malformed"):
-        opened(b"no model")
+    with pytest.raises(Rejection, match="too_large"):
+        opened(bytes(MAX_ARTEFACT_BYTES + 1))
 
 
 def children():
@@ -383,6 +429,7 @@ LIES = {
     ),
     "answers half and ends": ("say(0, 64); os.write(1, b'xx')", "run_failed"),
     "answers without end": ("\nwhile True: os.write(1, bytes(2**16))", "run_failed"),
+    "makes up a verdict": ("os.write(1, struct.pack('<BI', 1, 9) + b'quota now')", "run_failed"),
     "closes its pipes and hangs": ("os.close(0); os.close(1); time.sleep(60)", "run_failed"),
     "crashes": ("os.kill(os.getpid(), signal.SIGSEGV)", "run_failed"),
     "answers NaN": ("say(0, 64); os.write(1, b'\\xff' * 64); time.sleep(60)", "run_not_finite"),

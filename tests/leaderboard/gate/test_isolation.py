@@ -6,12 +6,16 @@ import sys
 
 import pytest
 
-from leaderboard.artefact import isolation, machine
-from leaderboard.artefact.isolation import available_isolation
-from leaderboard.artefact.machine import RESERVED_BYTES, processor_seconds, spare_memory
-from leaderboard.artefact.sandbox import Sandbox
 from leaderboard.errors import ScoringFault
-from tests.leaderboard.artefact.models import ACTION, OBSERVATION, linear
+from leaderboard.gate import isolation
+from leaderboard.gate.isolation import (
+    RESERVED_BYTES,
+    available_isolation,
+    processor_seconds,
+    spare_memory,
+)
+from leaderboard.gate.sandbox import Sandbox
+from tests.leaderboard.gate.models import ACTION, OBSERVATION, linear
 
 MODEL = linear().SerializeToString()
 
@@ -86,7 +90,7 @@ def test_only_a_machine_without_bubblewrap_runs_without_it(monkeypatch, tmp_path
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize(("available", "spare"), [(RESERVED_BYTES + 7, 7), (7, 0), (None, 0)])
 def test_a_child_may_use_the_available_memory_without_a_reserve(monkeypatch, available, spare):
-    monkeypatch.setattr(machine, "available_memory", lambda: available)
+    monkeypatch.setattr(isolation, "available_memory", lambda: available)
     assert spare_memory() == spare
 
 

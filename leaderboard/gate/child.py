@@ -1,51 +1,58 @@
-"""The child process of the sandbox: a script that runs one model under limits that it sets itself.
+"""The confined child: a script that reads and runs policy files under limits of its own.
 
-The parent starts it by its path; it imports nothing of this package. It sets the limits after it
-has loaded the libraries and before it reads a byte of the model. From then on it cannot open or
-grow a file or start a process, and its memory is limited. Messages and answers have a head of
-uint8 and uint32, little-endian:
+The parent starts it by its path; it imports nothing of this package but `gate.py`, by its path. It
+sets the limits after it has loaded the libraries and before it reads a byte of a file. From then on
+it cannot open or grow a file or start a process, and its memory is limited. Messages and answers
+have heads, little-endian:
 
-    in     command, number, content     a model's bytes (number: their length), or
-                                        a batch, float32 [number, S + 2]
-    out    status, length, payload      one answer to the start and to each message
+    in     command, number, S + 2, A, content    a file's bytes (number: their length) for a task of
+                                                 these widths, or a batch, float32 [number, S + 2]
+    out    status, length, payload               one answer to the start and to each message
 
-The policy and its twin for rounding (`twin.py`) may both be loaded. The payload of an `OK` answer
-is a `Start`, nothing for a model, float32 [number, A] for a batch. Every other status has a short
-text. Arguments: memory in bytes and processor time in seconds, both in addition to what the
-libraries use; S + 2; A; then the folders of the libraries.
+The payload of an `OK` answer is a `Start`; nothing for a file that the gate accepts, or that is
+loaded; its network in JSON; float32 [number, A] for a batch. Every other status has a short text,
+`REJECTED` with the gate's code before it. Arguments: memory in bytes and processor time in seconds,
+both in addition to what the libraries use; the allowed operators; the folders of the libraries.
 """
 
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import os
 import struct
 import sys
+from pathlib import Path
 from typing import Any, BinaryIO
 
-HEAD = struct.Struct("<BI")
+HEAD = struct.Struct("<BIHH")
+ANSWER = struct.Struct("<BI")
 START = struct.Struct("<Q32s")  # the memory limit in bytes, in addition to the libraries; version
-LOAD, LOAD_TWIN, RUN, RUN_TWIN = range(4)
-OK, REFUSED, FAILED, OUTPUT, MEMORY = range(5)
-MAX_TEXT = 500
+INSPECT, LOAD, NETWORK, RUN = range(4)
+OK, REJECTED, REFUSED, FAILED, OUTPUT, MEMORY = range(6)
+MAX_TEXT = 700
 
 _PR_SET_PDEATHSIG, _PR_SET_NO_NEW_PRIVS = 1, 38
 _SIGKILL = 9
 
 
 def main() -> None:
-    """Serve one model until the input ends."""
-    memory, seconds, observation_dim, action_dim = map(int, sys.argv[1:5])
-    sys.path += sys.argv[5:]
+    """Serve until the input ends."""
+    memory, seconds = map(int, sys.argv[1:3])
+    operators = frozenset(sys.argv[3].split(","))
+    sys.path += sys.argv[4:]
     messages, answers = os.fdopen(0, "rb"), os.fdopen(os.dup(1), "wb")
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)  # output of a library must not be read as an answer
     os.dup2(nowhere, 2)
 
     import numpy as np
+    import onnx.checker  # noqa: F401  # of the gate, which can open no file later
     import onnxruntime
 
-    def run(session: Any, rows: int) -> tuple[int, bytes]:
+    gate = _gate()
+
+    def run(session: Any, rows: int, observation_dim: int, action_dim: int) -> tuple[int, bytes]:
         batch = np.frombuffer(messages.read(rows * observation_dim * 4), np.float32)
         name = session.get_inputs()[0].name
         a = session.run(None, {name: batch.reshape(rows, observation_dim)})[0]
@@ -57,20 +64,37 @@ def main() -> None:
     granted = _set_limits(memory, seconds)
     _answer(answers, OK, START.pack(granted, onnxruntime.__version__.encode()))
     options = _options(onnxruntime)
-    sessions: dict[int, Any] = {}
+    session = None
     while (head := messages.read(HEAD.size)) and len(head) == HEAD.size:
-        command, number = HEAD.unpack(head)
+        command, number, *widths = HEAD.unpack(head)
         try:
-            if command in (RUN, RUN_TWIN):
-                answer = run(sessions[command], number)
+            if command == RUN:
+                answer = run(session, number, *widths)
             else:
-                sessions[command + RUN] = onnxruntime.InferenceSession(
-                    messages.read(number), options, providers=["CPUExecutionProvider"]
+                data = messages.read(number)
+                model = gate.read(data, *widths, operators)
+                answer = OK, gate.numbers(model) if command == NETWORK else b""
+                del model
+            if command == LOAD:
+                session = onnxruntime.InferenceSession(
+                    data, options, providers=["CPUExecutionProvider"]
                 )
-                answer = OK, b""
+        except gate.Refused as refused:
+            answer = REJECTED, f"{refused.code} {refused.message}".encode("utf-8", "replace")
         except Exception as error:
-            answer = _error_answer(error, FAILED if command in (RUN, RUN_TWIN) else REFUSED)
-        _answer(answers, *answer)
+            answer = _error_answer(error, FAILED if command == RUN else REFUSED)
+        _answer(answers, answer[0], answer[1] if answer[0] == OK else answer[1][:MAX_TEXT])
+
+
+def _gate() -> Any:
+    """The module `gate.py` beside this file."""
+    path = Path(__file__).with_name("gate.py")
+    spec = importlib.util.spec_from_file_location("gate", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def _options(onnxruntime: Any) -> Any:
@@ -118,11 +142,11 @@ def _error_answer(error: Exception, status: int) -> tuple[int, bytes]:
         mark in text for mark in ("bad_alloc", "bad allocation", "allocate memory")
     ):
         status = MEMORY
-    return status, text.encode("utf-8", "replace")[:MAX_TEXT]
+    return status, text.encode("utf-8", "replace")
 
 
 def _answer(stream: BinaryIO, status: int, payload: bytes = b"") -> None:
-    stream.write(HEAD.pack(status, len(payload)) + payload)
+    stream.write(ANSWER.pack(status, len(payload)) + payload)
     stream.flush()
 
 

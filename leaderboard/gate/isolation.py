@@ -1,4 +1,4 @@
-"""How the process of a policy is isolated: by bubblewrap, or by resource limits alone.
+"""How a confined process is isolated, and what the machine has for it. Linux only.
 
     bwrap      no network, no files but the system's and Python's, its own processes and devices
     process    resource limits, an empty environment, no open file
@@ -20,13 +20,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from leaderboard.artefact import child
 from leaderboard.errors import ScoringFault
-from sme_registry.io import require_packages
+from leaderboard.gate import child
+from sme_registry.export import FEED_FORWARD
+from sme_registry.io import available_memory, require_packages
 
 Isolation = Literal["bwrap", "process"]
 
 START_SECONDS = 60.0
+RESERVED_BYTES = 256 * 2**20
+"""Memory for the scorer itself and the child's libraries."""
 
 _SYSTEM_FOLDERS = ("/usr", "/lib", "/lib64", "/etc/ld.so.cache")
 
@@ -69,7 +72,13 @@ def start(isolation: Isolation, arguments: Sequence[int]) -> subprocess.Popen[by
 def _start(prefix: Sequence[str], arguments: Sequence[int]) -> subprocess.Popen[bytes]:
     try:
         return subprocess.Popen(
-            [*prefix, *_script(), *map(str, arguments), *_library_folders()],
+            [
+                *prefix,
+                *_script(),
+                *map(str, arguments),
+                ",".join(sorted(FEED_FORWARD)),
+                *_library_folders(),
+            ],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -105,8 +114,8 @@ def _environment() -> dict[str, str]:
 
 @functools.cache
 def _library_folders() -> tuple[str, ...]:
-    """The folders of NumPy and onnxruntime."""
-    libraries = {"numpy": "NumPy", "onnxruntime": "ONNX Runtime"}
+    """The folders of the child's libraries."""
+    libraries = {"numpy": "NumPy", "onnx": "onnx", "onnxruntime": "ONNX Runtime"}
     require_packages("running a policy's ONNX file", libraries, "leaderboard")
     packages = map(importlib.util.find_spec, libraries)
     files = [package.origin for package in packages if package and package.origin]
@@ -127,23 +136,44 @@ def _bwrap() -> tuple[str, ...]:
         *(folder for folder in _SYSTEM_FOLDERS if os.path.exists(folder)),
         *(sys.base_prefix, sys.prefix, str(interpreter.parent), str(interpreter.resolve().parent)),
         *_library_folders(),
-        str(Path(child.__file__).resolve()),
+        str(Path(child.__file__).resolve().parent),
     ]
     command = (
         *(program, "--unshare-all", "--die-with-parent", "--cap-drop", "ALL"),
         *(word for path in dict.fromkeys(readable) for word in ("--ro-bind", path, path)),
         *("--proc", "/proc", "--dev", "/dev", "--chdir", "/", "--"),
     )
-    with _start(command, (2**31, 60, 1, 1)) as process:
+    with _start(command, (2**31, 60)) as process:
         try:
             answer, _ = process.communicate(timeout=START_SECONDS)
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
             answer = b""
-    if not answer.startswith(child.HEAD.pack(child.OK, child.START.size)):
+    if not answer.startswith(child.ANSWER.pack(child.OK, child.START.size)):
         raise ScoringFault(
             f"bubblewrap is installed ({program}) but does not start a process, with status "
             f"{process.returncode}. Containers often forbid user namespaces: allow them, or use "
             "--unsafe-no-sandbox if nobody else can submit to this board."
         )
     return command
+
+
+def processor_seconds(pid: int) -> float:
+    """Processor time of a process and its descendants, in seconds; 0 for a process that is gone."""
+    ticks = 0
+    pending = [pid]
+    while pending:
+        process = Path("/proc", str(pending.pop()))
+        try:
+            numbers = (process / "stat").read_text().rpartition(")")[2].split()
+            children = [path.read_text() for path in process.glob("task/*/children")]
+        except OSError:  # it ended meanwhile
+            continue
+        ticks += sum(map(int, numbers[11:15]))  # utime, stime, and those of waited-for children
+        pending += map(int, " ".join(children).split())
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def spare_memory() -> int:
+    """Memory in bytes that a new process can use before the system ends one for lack of it."""
+    return max((available_memory() or 0) - RESERVED_BYTES, 0)

@@ -12,9 +12,9 @@ import torch
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import VecNormalize
 
-from leaderboard.artefact.export_sb3 import export_sb3
-from leaderboard.artefact.gate import inspect, widths
+from leaderboard.bundle.making import export_sb3
 from leaderboard.errors import Rejection
+from leaderboard.gate.sandbox import inspect_own, widths
 from sme_registry import SMESpec, evaluate
 from sme_registry.errors import PolicyError
 from sme_registry.sb3 import SMETeamVecEnv, SMEVecEnv
@@ -68,7 +68,7 @@ def test_a_file_acts_as_its_model_does(tmp_path, algorithm, action_range):
     assert expected.min() < 0.01  # clipping and squashing are at work
     assert expected.max() > 0.99
     assert np.abs(acted(path, observations()) - expected).max() <= 1e-6
-    inspect(path.read_bytes(), SPEC.state_dim + 2, SPEC.action_dim)
+    inspect_own(path.read_bytes(), SPEC.state_dim + 2, SPEC.action_dim)
     assert onnx.load(path).opset_import[0].version == 17
 
 
@@ -179,7 +179,7 @@ def test_a_file_that_was_there_is_left_where_the_new_one_is_refused(tmp_path):
 def test_a_teams_model_acts_for_each_agent_from_its_shared_observation(tmp_path):
     model = made(A2C, env=SMETeamVecEnv(TEAM, 1))
     path = export_sb3(model, tmp_path / "team.onnx", spec=TEAM)
-    inspect(path.read_bytes(), *widths(TEAM))
+    inspect_own(path.read_bytes(), *widths(TEAM))
     ours, exported = (
         evaluate(policy, TEAM, {"states_per_region": 50}) for policy in (model, str(path))
     )

@@ -1,1 +1,0 @@
-"""Artefacts: policies as ONNX files, from their bytes to their actions."""
