@@ -339,7 +339,7 @@ def _refuse(code: str, field: str, allowed: str, remedy: str) -> NoReturn:
 def _refuse_bytes(what: str) -> NoReturn:
     _refuse(
         "onnx_malformed",
-        f"artefact: {what}",
+        f"policy: {what}",
         "must be one complete ONNX model, as `onnx.save` writes it",
         "Export it again, or load and save it with the package onnx",
     )

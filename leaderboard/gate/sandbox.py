@@ -21,7 +21,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NoReturn, Self
 
@@ -218,7 +218,7 @@ class Confined:
             self._raise_if_memory_was_short(text)
         code, allowed, remedy = _CODES[status]
         allowed = allowed.format(memory=self._limits.memory_bytes // 2**20)
-        raise Rejection(code, f"artefact: {text}: {allowed}. {remedy}.")
+        raise Rejection(code, f"policy: {text}: {allowed}. {remedy}.")
 
     def _reject(self, code: str, message: str) -> NoReturn:
         """Raise the gate's verdict, of which a child that was taken over can make up any."""
@@ -269,7 +269,7 @@ class Confined:
             )
         raise Rejection(
             "run_time",
-            f"artefact: no answer within {limit:g} s, the limit for loading and for each batch. "
+            f"policy: no answer within {limit:g} s, the limit for loading and for each batch. "
             "Submit a smaller network.",
         )
 
@@ -283,7 +283,7 @@ class Confined:
         if number == signal.SIGXCPU:
             raise Rejection(
                 "run_time",
-                f"artefact: more than {self._limits.cpu_seconds} s of processor time, the limit "
+                f"policy: more than {self._limits.cpu_seconds} s of processor time, the limit "
                 "for all batches. Submit a smaller network.",
             )
         ended = f"The sandbox's process ended with status {status}"
@@ -295,7 +295,7 @@ class Confined:
         self._raise_if_memory_was_short(ended)  # libraries crash where they cannot allocate
         raise Rejection(
             "run_failed",
-            f"artefact: the model crashed its process, which ended with status {status}. Run it on "
+            f"policy: the model crashed its process, which ended with status {status}. Run it on "
             "your machine with `sme-leaderboard check`.",
         )
 
@@ -376,7 +376,7 @@ class Sandbox(Confined):
             )
         return a
 
-    def check_rows(self, observations: Observations, rows: int | Sequence[int] = 16) -> None:
+    def check_rows(self, observations: Observations, rows: int = 16) -> None:
         """Reject a model whose action in a state depends on the other rows of the batch.
 
         The batch in random order and in two parts, and some rows one at a time, must give the same
@@ -384,24 +384,22 @@ class Sandbox(Confined):
 
         Args:
           observations: `[B, S + 2]` float32, B ≥ 1, preferably a batch that is scored.
-          rows: the rows evaluated one at a time, or their number, then drawn at random. Nobody can
-            predict the system's randomness.
+          rows: number of rows evaluated one at a time; the system's randomness draws them.
 
         Raises:
           Rejection: `run_batch_dependent`, or the codes of a call.
-          BoardError, StateError: see a call.
         """
         rng = np.random.default_rng(secrets.randbits(128))
         batched = self(observations)
         order = rng.permutation(len(observations))
-        parts = np.array_split(order, 2)
         other = np.empty_like(batched)
-        for part in parts:
+        for part in np.array_split(order, 2):
             other[part] = self(observations[part])
         self._refuse_difference("in another batch", observations, batched, other)
-        chosen = order[:rows] if isinstance(rows, int) else np.asarray(rows)
-        single = np.concatenate([self(observations[row : row + 1]) for row in chosen])
-        self._refuse_difference("alone", observations[chosen], batched[chosen], single)
+        for row in order[:rows]:
+            alone = slice(row, row + 1)
+            single = self(observations[alone])
+            self._refuse_difference("alone", observations[alone], batched[alone], single)
 
     def check_last_place(self, observations: Observations) -> None:
         """Reject a model whose actions depend on the last place of the observations.
@@ -414,12 +412,8 @@ class Sandbox(Confined):
         Measured: at most 4e-8 for the policies of examples/board; 3e-6 for the optimal policy in
         float32 at complexity 50, the most sensitive honest policy found.
 
-        Args:
-          observations: `[B, S + 2]` float32, B ≥ 1, preferably a batch that is scored.
-
         Raises:
           Rejection: `run_rounding`, or the codes of a call.
-          BoardError, StateError: see a call.
         """
         rng = np.random.default_rng(secrets.randbits(128))
         ends = rng.choice(np.array([-np.inf, np.inf], np.float32), observations.shape)
@@ -495,7 +489,7 @@ def check_size(data: bytes) -> None:
     if len(data) > MAX_ARTEFACT_BYTES:
         raise Rejection(
             "too_large",
-            f"artefact={len(data):,} bytes: must be at most {MAX_ARTEFACT_BYTES:,}. "
+            f"policy={len(data):,} bytes: must be at most {MAX_ARTEFACT_BYTES:,}. "
             "Submit a smaller network.",
         )
 

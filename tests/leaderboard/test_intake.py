@@ -14,7 +14,8 @@ from leaderboard.documents.submission import (
     Submission,
     utc,
 )
-from leaderboard.errors import Rejection
+from leaderboard.errors import Rejection, ScoringFault
+from leaderboard.gate import gate, sandbox
 from leaderboard.intake import admission, references
 from leaderboard.scoring.worker import run_scorer
 from sme_registry.io import sha256_of
@@ -204,6 +205,24 @@ def test_an_artefact_of_another_size_or_width_is_refused_and_a_failed_run_needs_
     runs = [run, {**run, "seed": 9, "artefact": None}]
     failed = resigned(store, key, {**plain, "runs": runs, "runs_started": {"Tiny": 2}})
     assert receive(store, failed) == failed.id
+
+
+def test_only_the_confined_process_reads_policies_and_its_faults_refuse_nobody(
+    store, key, monkeypatch
+):
+    def no_process(*arguments):
+        raise ScoringFault("no process")
+
+    monkeypatch.setattr(gate, "read", lambda *arguments: pytest.fail("read in this process"))
+    monkeypatch.setattr(admission, "_verdicts", {})
+    signed = uploaded(store, key)
+    with monkeypatch.context() as patch:
+        patch.setattr(sandbox, "start", no_process)
+        for _ in range(2):
+            with pytest.raises(ScoringFault):
+                receive(store, signed)
+    assert store.entries() == []
+    assert receive(store, signed) == signed.id
 
 
 def test_the_daily_quota_frees_up_at_the_stated_time(tmp_path, key):

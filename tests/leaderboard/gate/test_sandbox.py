@@ -17,6 +17,7 @@ from leaderboard.documents.submission import MAX_ARTEFACT_BYTES
 from leaderboard.errors import BoardError, Rejection, ScoringFault
 from leaderboard.gate import child, sandbox
 from leaderboard.gate import isolation as isolations
+from leaderboard.gate.network import network_of
 from leaderboard.gate.sandbox import ROWS, Sandbox, SandboxLimits, inspect_own
 from sme_registry.errors import MissingDependencyError, StateError
 from tests.leaderboard.gate import models
@@ -150,28 +151,10 @@ def test_a_failing_run_has_its_code(kind, unconfined):
     assert code_of(found, limits) == expected
 
 
-def test_another_order_of_summation_passes_the_check_of_rows():
-    wide = models.network(hidden=2000)
-    with opened(wide) as policy:
-        policy.check_rows(observations(1000))
-
-
 POSITIONS = [tensor("end", np.int64([2**31]))]
 POSITIONS += [
     tensor(name, np.int64([at])) for at, name in enumerate(["last", "zero", "one", "two"], -1)
 ]
-
-
-def test_a_row_that_reads_another_is_detected_in_reverse_order():
-    # Row 1 has the action of row 0, in any batch that has one; it is not among those asked alone.
-    nodes = [
-        node("Slice", "y zero one", "first"),
-        node("Slice", "y zero last", "but_last"),
-        node("Slice", "but_last zero one", "copied"),
-        node("Slice", "y two end", "rest"),
-        node("Concat", "first copied rest", "a", axis=0),
-    ]
-    assert code_of(squashed(nodes, POSITIONS), rows=100) == "run_batch_dependent"
 
 
 def test_an_action_that_depends_on_both_neighbours_is_rejected():
@@ -189,7 +172,7 @@ def test_an_action_that_depends_on_both_neighbours_is_rejected():
         opened(squashed(nodes, POSITIONS)) as policy,
         pytest.raises(Rejection, match="run_batch_dependent"),
     ):
-        policy.check_rows(observations(100), rows=[])
+        policy.check_rows(observations(100), rows=0)
 
 
 def amplified(*nodes, **tensors):
@@ -231,30 +214,9 @@ def test_honest_policies_and_trees_keep_their_actions_in_the_last_place():
     )
     for found in (linear(), models.network(hidden=64), models.network(hidden=2000), step):
         with opened(found) as policy:
-            for rows in (1, 500):
+            for rows in (1, 2, 500):
                 policy.check_last_place(observations(rows))
-
-
-def test_the_rows_to_check_may_be_given_and_are_drawn_at_random_otherwise(monkeypatch):
-    asked, call, seen = [], Sandbox.__call__, observations(1000)
-    monkeypatch.setattr(Sandbox, "__call__", lambda self, o: asked.append(o) or call(self, o))
-    with opened(linear()) as policy:
-        policy.check_rows(seen, rows=[50, 3, 99])
-        np.testing.assert_array_equal(np.concatenate(asked[-3:]), seen[[50, 3, 99]])
-        asked.clear()
-        policy.check_rows(seen, rows=5)
-        policy.check_rows(seen, rows=5)
-        assert len({rows.tobytes() for rows in asked if len(rows) == 1}) >= 8  # of 5 and 5
-        assert not np.array_equal(asked[1], asked[9])
-        for rows in (1, 2, 3):
-            policy.check_rows(observations(rows))
-
-
-def test_the_process_reports_its_runtime_before_it_reads_the_model(unconfined, monkeypatch):
-    acting_as(STARTED + "os.read(0, 1); say(1, 0)", monkeypatch)
-    monkeypatch.setattr(sandbox.Sandbox, "_load", lambda self, *rest: None)
-    with opened(linear()) as policy:
-        assert policy.runtime == "1.0"
+                policy.check_rows(observations(rows))
 
 
 def test_random_actions_and_a_small_file_of_gigabytes_are_rejected_without_the_gate(
@@ -442,6 +404,28 @@ def test_a_compromised_child_cannot_harm_its_parent(kind, monkeypatch, unconfine
     acting_as(LOADED + script, monkeypatch)
     monkeypatch.setattr(sandbox, "_ENDING_SECONDS", 0.2 if "hangs" in kind else 60.0)
     assert code_of(linear()) == expected
+
+
+TENSOR = '{"type": "|O", "shape": [1], "data": "AAAAAAAAAAA="}'
+MADE_UP = {
+    "no JSON": "[" * 1000,
+    "too many lists": "[" + "[]," * 2**20 + "[]]",
+    "another document": "[1, 2]",
+    "no nodes": '{"constants": {}}',
+    "objects": f'{{"constants": {{"o": {TENSOR}}}, "nodes": [], "input": "o", "output": "o"}}',
+    "nothing computed": '{"constants": {}, "nodes": [7], "input": [], "output": {}}',
+    "another output": '{"constants": {}, "nodes": [], "input": "o", "output": "a"}',
+}
+
+
+@pytest.mark.parametrize("kind", MADE_UP)
+def test_a_network_that_a_compromised_child_makes_up_is_none(kind, monkeypatch, unconfined):
+    size = len(MADE_UP[kind])
+    text = MADE_UP[kind] if kind != "too many lists" else None
+    made = repr(text) if text else "'[' + '[],' * 2**20 + '[]]'"
+    script = f"say(0, {size}); os.write(1, ({made}).encode()); time.sleep(60)"
+    acting_as(STARTED + script, monkeypatch)
+    assert network_of(b"", OBSERVATION, ACTION) is None
 
 
 HANGING = {
