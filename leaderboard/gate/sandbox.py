@@ -77,6 +77,8 @@ _CODES = {
     child.OUTPUT: ("run_output", "must be one float32 action a row", "Export it for this task"),
     child.MEMORY: ("run_memory", "must run within {memory:,} MiB", "Submit a smaller network"),
 }
+# The gate reads files of 8 MiB in 64 MiB; a parser that has less calls them malformed.
+LEAST_MEMORY = 2**28
 _MAX_NETWORK = 2**25  # bytes of a network in JSON
 # Sent by an operator or by a system that is short of memory, not caused by the model.
 _EXTERNAL_SIGNALS = ("SIGKILL", "SIGTERM", "SIGINT", "SIGHUP")
@@ -157,6 +159,8 @@ class Confined:
             self._starting = False
             self._memory, version = child.START.unpack(started)
             self.runtime = printable(version.rstrip(b"\0"))
+            if self._memory < min(self._limits.memory_bytes, LEAST_MEMORY):
+                self._raise_if_memory_was_short("The sandbox reads no file")
 
     def inspect(self, data: bytes, observation_dim: int, action_dim: int) -> None:
         """Reject a file that is no feed-forward network of these widths; see `gate.py`.
@@ -224,8 +228,6 @@ class Confined:
         """Raise the gate's verdict, of which a child that was taken over can make up any."""
         if code not in CODES or not code.startswith("onnx_"):
             raise Rejection("run_failed", "answer: invalid verdict. Submit another model.")
-        if code == "onnx_malformed":  # a parser without memory says so, too
-            self._raise_if_memory_was_short(message)
         raise Rejection(code, message)
 
     def _send(self, left: memoryview, deadline: float) -> None:
@@ -326,8 +328,7 @@ class Sandbox(Confined):
       limits, isolation: as in `Confined`.
 
     Raises:
-      Rejection: a code of `inspect`, or `onnx_refused`, `run_failed`, `run_time` or `run_memory`
-        while the model loads.
+      Rejection: a code of `inspect`, or `onnx_refused`, `run_failed`, `run_time` or `run_memory`.
       Other errors of `Confined`.
     """
 
@@ -358,10 +359,8 @@ class Sandbox(Confined):
           `[B, A]` float32.
 
         Raises:
-          Rejection: `run_failed`, `run_output`, `run_not_finite`, `run_time` or `run_memory`; this
-            closes the sandbox.
-          ScoringFault: its process was ended from outside, or the machine lacks memory or processor
-            time; this closes the sandbox, too.
+          Rejection: `run_failed`, `run_output`, `run_not_finite`, `run_time` or `run_memory`.
+          ScoringFault: see the class; this closes the sandbox, as a rejection does.
           BoardError: the sandbox is closed.
           StateError: the observations have another shape.
         """

@@ -60,7 +60,7 @@ class _Machine:
     """What scores: recorded in the result, whatever becomes of the submission."""
 
     isolation: Isolation
-    versions: dict[str, str] = field(default_factory=lambda: versions(["numpy"]))
+    versions: dict[str, str] = field(default_factory=lambda: versions(["numpy", "onnx"]))
 
 
 def score_submission(
@@ -184,7 +184,7 @@ def _evaluate(
         with _sandbox_errors():
             actions = observe(sandbox) if board.rules > 1 else None
     used = {name: version for name, version in report.versions.items() if name not in _UNUSED}
-    machine.versions = {**used, "onnxruntime": sandbox.runtime}
+    machine.versions |= {**used, "onnxruntime": sandbox.runtime}
     return report, actions
 
 

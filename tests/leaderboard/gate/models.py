@@ -1,7 +1,6 @@
 """Small ONNX models, good and bad, made with the `onnx` package."""
 
 import itertools
-import random
 
 import numpy as np
 from onnx import TensorProto, helper, numpy_helper
@@ -133,25 +132,3 @@ def doubling(times, axis=1):
             node("Add", "y mean", "a"),
         ]
     )
-
-
-def mutant(seed):
-    """A network's file with a few of its bytes changed, lost, added, or copied from elsewhere."""
-    chance = random.Random(seed)
-    data = bytearray(network(hidden=4).SerializeToString())
-    for _ in range(chance.choice((1, 1, 2, 4))):
-        at, source = chance.randrange(len(data)), chance.randrange(len(data))
-        match chance.randrange(6):
-            case 0:
-                data[at] ^= 1 << chance.randrange(8)
-            case 1:
-                data[at] = chance.choice((0x00, 0x01, 0x7F, 0x80, 0xFF))
-            case 2:
-                del data[at : at + chance.randrange(1, 9)]
-            case 3:
-                data[at:at] = chance.randbytes(chance.randrange(1, 9))
-            case 4:
-                data[at:at] = data[source : source + chance.randrange(1, 33)]
-            case _:
-                data[at : at + 8] = data[source : source + 8]
-    return bytes(data)

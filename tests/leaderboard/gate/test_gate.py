@@ -167,7 +167,7 @@ def nested(depth):
     inner = b""
     for _ in range(depth):
         inner = length_prefixed(0x32, length_prefixed(0x0A, length_prefixed(0x2A, inner)))
-    return HEAD + length_prefixed(0x3A, inner)
+    return file_of(inner)
 
 
 def length_prefixed(tag, content):
@@ -178,7 +178,11 @@ def length_prefixed(tag, content):
     return bytes([tag]) + digits + bytes([size]) + content
 
 
-HEAD = b"\x08\x08\x42\x04\x0a\x00\x10\x11"  # IR version 8, opset 17
+def file_of(graph):
+    """The canonical bytes of a model of IR version 8 and opset 17, of the bytes of its graph."""
+    return b"\x08\x08" + length_prefixed(0x3A, graph) + b"\x42\x04\x0a\x00\x10\x11"
+
+
 GRAPH = helper.make_graph([], "empty", [], [])
 ONES = np.ones(1, np.float32)
 
@@ -191,13 +195,11 @@ BAD = {
         "an attribute of two values": attributed(f=1.0),
         "an attribute of another type": attributed(type=3),
         "an empty input of a sum": squashed([node_with("Sum", ["y", "", "y"])]),
-        "a first input that is empty": squashed([node_with("Clip", ["", "y"])]),
         "no output": squashed([node("Tanh", "y", "a"), node_with("Tanh", ["y"], [])]),
         "fewer outputs announced than there are": split(3, num_outputs=2),
         "outputs that nothing announces": split(3),
         "a value computed twice": squashed([node("Tanh", "y", "a"), node("Tanh", "y", "a")]),
         "a value computed and stored": squashed([node("Tanh", "y", "a")], [tensor("y", ONES)]),
-        "a value stored twice": linear_with(weights()),
         "observations that are stored": linear_with(weights("o")),
         "a value that nothing computes": model([node("MatMul", "o Q", "a")], [weights()]),
         "values used before they are computed": reordered(network()),
@@ -284,8 +286,8 @@ def test_every_truncation_and_mutation_of_a_good_file_is_refused_or_read():
     for length in range(len(data)):
         rejection(data[:length])
     codes = set()
-    for seed in range(500):
-        mutant = models.mutant(seed)
+    for at, change in itertools.product(range(len(data)), (0x01, 0x80)):
+        mutant = data[:at] + bytes([data[at] ^ change]) + data[at + 1 :]
         try:
             inspect_own(mutant, OBSERVATION, ACTION)
             codes.add("accepted")
@@ -294,33 +296,27 @@ def test_every_truncation_and_mutation_of_a_good_file_is_refused_or_read():
     assert {"accepted", "onnx_malformed", "onnx_tensor"} <= codes <= {"accepted", *CODES}
 
 
-def in_graph(field, content):
-    return HEAD + length_prefixed(0x3A, length_prefixed(field, content))
+SIZE = MAX_ARTEFACT_BYTES - 100
+FLOODS = {
+    "values": lambda: file_of(b"\x6a\x00" * (SIZE // 2)),
+    "names": lambda: file_of(length_prefixed(0x0A, b"\x0a\x00" * (SIZE // 2))),
+    "metadata": lambda: file_of(b"") + b"\x72\x00" * (SIZE // 2),
+    "tensors": lambda: file_of(b"\x2a\x00" * (SIZE // 2)),
+    "dimensions": lambda: file_of(length_prefixed(0x2A, b"\x08\x01" * (SIZE // 2) + b"\x10\x01")),
+    "packed integers": lambda: file_of(
+        length_prefixed(0x2A, b"\x08\x01\x10\x07" + length_prefixed(0x3A, b"\x01" * SIZE))
+    ),
+    "messages in messages": lambda: file_of(
+        length_prefixed(0x5A, length_prefixed(0x12, b"\x0a\x00" * (SIZE // 2)))
+    ),
+    "one long number": lambda: b"\xff" * SIZE,
+}
 
 
-def flood(kind, size=MAX_ARTEFACT_BYTES - 100):
-    """A file of about so many bytes that is almost all fields, numbers, or one of them."""
-    half = size // 2
-    return {
-        "fields": b"\x32\x00" * half,
-        "metadata": HEAD + b"\x72\x00" * half,
-        "tensors": HEAD + length_prefixed(0x3A, b"\x2a\x00" * half),
-        "dimensions": in_graph(0x2A, b"\x08\x01" * half + b"\x10\x01"),
-        "packed integers": in_graph(
-            0x2A, b"\x08\x01\x10\x07" + length_prefixed(0x3A, b"\x01" * size)
-        ),
-        "one long number": b"\xff" * size,
-        "messages in messages": in_graph(0x5A, length_prefixed(0x12, b"\x0a\x00" * half)),
-    }[kind]
-
-
-FLOODS = ["fields", "metadata", "tensors", "dimensions", "packed integers", "one long number"]
-
-
-@pytest.mark.parametrize("kind", [*FLOODS, "messages in messages"])
+@pytest.mark.parametrize("kind", FLOODS)
 def test_a_flood_is_refused_by_the_child_in_seconds(kind):
     with Confined(SandboxLimits(cpu_seconds=15)) as child, pytest.raises(Rejection) as caught:
-        child.inspect(flood(kind), OBSERVATION, ACTION)
+        child.inspect(FLOODS[kind](), OBSERVATION, ACTION)
     assert caught.value.code in ("onnx_too_many_nodes", "onnx_malformed", "onnx_tensor")
 
 
