@@ -1,6 +1,6 @@
 """Submissions: read, checked against the board and its quotas, then stored.
 
-    read → for this board? → known? → document → name → quotas → artefacts present → gate → store
+    read → for this board? → known? → document → name → quotas → policies present → gate → store
 
 The order is fixed with cheap steps first, so that one fault always has one code, and megabytes
 are read only after everything declared about them has passed.
@@ -32,7 +32,7 @@ from leaderboard.store import Store
 
 _DAY = datetime.timedelta(days=1)
 _VERDICTS_KEPT = 10_000
-ReadArtefact = Callable[[str], bytes]
+ReadFile = Callable[[str], bytes]
 
 _Case = tuple[str, int, int]
 """The digest of a policy file, and the widths of a task."""
@@ -73,7 +73,7 @@ def admit(
     store: Store,
     signed: SignedSubmission,
     at: datetime.datetime | None = None,
-    artefact: ReadArtefact | None = None,
+    policy_file: ReadFile | None = None,
     isolation: Isolation | None = None,
 ) -> bool:
     """Check a submission and store it.
@@ -82,7 +82,7 @@ def admit(
       store: the board.
       signed: the submission, its signature verified.
       at: time of arrival; now by default.
-      artefact: returns an artefact's bytes by digest, of the size in the submission; they are
+      policy_file: returns a file's bytes by digest, of the size in the submission; they are
         stored with the submission. By default the submitter's key has uploaded them.
       isolation: as in `receive`.
 
@@ -108,16 +108,16 @@ def admit(
     check_submission(store.document, submission, moment)
     check_name(store, submission.submitter)
     _check_quotas(store, key, moment)
-    _check_artefacts(store, submission, artefact, isolation)
-    if artefact is not None:
-        for digest in _artefacts(submission):
-            store.put_object(digest, [artefact(digest)], by=key)
+    _check_files(store, submission, policy_file, isolation)
+    if policy_file is not None:
+        for digest in _policies(submission):
+            store.put_object(digest, [policy_file(digest)], by=key)
     with store.transaction():  # no other submission can use the quota or the name in between
         check_name(store, submission.submitter)
         _check_quotas(store, key, moment)
         if key != store.document.key:
             check_room(store, len(signed.to_bytes()))
-        for declared in _artefacts(submission).values():  # nor can `gc` take an artefact
+        for declared in _policies(submission).values():  # nor can `gc` take a file
             check_stored(store, key, declared)
         return store.receive(signed)
 
@@ -125,7 +125,7 @@ def admit(
 def submit_bundle(
     store: Store, folder: str | os.PathLike[str], key: SigningKey | None = None
 ) -> str:
-    """Admit a bundle: its submission and the artefacts in its folder.
+    """Admit a bundle: its submission and the policy files in its folder.
 
     Args:
       store: the board.
@@ -140,7 +140,7 @@ def submit_bundle(
     """
     bundle = Bundle.read(folder)
     signed = bundle.signed if key is None else bundle.signed.for_board(store.document.key, key)
-    admit(store, signed, artefact=bundle.artefact, isolation=isolation_for_own())
+    admit(store, signed, policy_file=bundle.artefact, isolation=isolation_for_own())
     return signed.id
 
 
@@ -188,20 +188,20 @@ def check_daily_quota(store: Store, key: str, moment: datetime.datetime) -> None
         )
 
 
-def _artefacts(submission: Submission) -> dict[str, Artefact]:
-    """Each distinct artefact, by its digest, in the order of the runs."""
+def _policies(submission: Submission) -> dict[str, Artefact]:
+    """Each distinct policy file, by its digest, in the order of the runs."""
     return {run.artefact.sha256: run.artefact for run in submission.runs if run.artefact}
 
 
-def _check_artefacts(
+def _check_files(
     store: Store,
     submission: Submission,
-    artefact: ReadArtefact | None,
+    policy_file: ReadFile | None,
     isolation: Isolation | None,
 ) -> None:
     """Check that all are present with the declared sizes; then inspect one after the other."""
-    if artefact is None:
-        for declared in _artefacts(submission).values():
+    if policy_file is None:
+        for declared in _policies(submission).values():
             check_stored(store, submission.submitter.key, declared)
     instances = store.document.instances
     cases = dict.fromkeys(
@@ -209,10 +209,10 @@ def _check_artefacts(
         for run in submission.runs
         if run.artefact
     )
-    _inspect(artefact or store.objects.read, list(cases), isolation)
+    _inspect(policy_file or store.objects.read, list(cases), isolation)
 
 
-def _inspect(read: ReadArtefact, cases: list[_Case], isolation: Isolation | None) -> None:
+def _inspect(read: ReadFile, cases: list[_Case], isolation: Isolation | None) -> None:
     """Raise the gate's first verdict, which depends on bytes and widths only, and is kept."""
     if len(_verdicts) >= _VERDICTS_KEPT:
         _verdicts.clear()
@@ -232,7 +232,7 @@ def _inspect(read: ReadArtefact, cases: list[_Case], isolation: Isolation | None
 
 
 def check_stored(store: Store, key: str, declared: Artefact) -> None:
-    """Check that the key has uploaded an artefact; if not, say nothing about it."""
+    """Check that the key has uploaded a policy file; if not, say nothing about it."""
     digest = declared.sha256
     if not (store.possesses(key, digest) and store.objects.has(digest)):
         raise Rejection(

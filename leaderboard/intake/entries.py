@@ -16,7 +16,7 @@ from leaderboard.documents.entry import Entry, SignedEntry, SignedTicketRequest
 from leaderboard.documents.season import Season, read_answers
 from leaderboard.documents.submission import Artefact, Envelope
 from leaderboard.errors import Rejection
-from leaderboard.intake.admission import ReadArtefact, check_daily_quota, check_name, check_stored
+from leaderboard.intake.admission import ReadFile, check_daily_quota, check_name, check_stored
 from leaderboard.intake.uploads import check_room, uploader
 from leaderboard.store import Store, played_bytes
 
@@ -53,7 +53,7 @@ def enter(
     store: Store,
     signed: SignedEntry,
     at: datetime.datetime | None = None,
-    answers: ReadArtefact | None = None,
+    answers: ReadFile | None = None,
 ) -> bool:
     """Check an entry and store it.
 
@@ -109,7 +109,7 @@ def _check_newest(store: Store, season: Season, entry: Entry) -> None:
 
 
 def _check_answers(
-    store: Store, season: Season, signed: SignedEntry, read: ReadArtefact | None
+    store: Store, season: Season, signed: SignedEntry, read: ReadFile | None
 ) -> list[Artefact]:
     """The answers that are not null, each in the shape of its instance's challenge."""
     entry, hidden = signed.entry, list(season.hidden)

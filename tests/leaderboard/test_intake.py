@@ -170,13 +170,13 @@ def test_two_keys_that_send_a_name_at_once_do_not_share_it(store, key, monkeypat
         uploaded(store, each, n, submitter={"name": "A Lab", "key": each.public})
         for n, each in enumerate(keys)
     )
-    real = admission._check_artefacts
+    real = admission._check_files
 
     def meanwhile(*arguments):
         real(*arguments)
         store.receive(one)
 
-    monkeypatch.setattr(admission, "_check_artefacts", meanwhile)
+    monkeypatch.setattr(admission, "_check_files", meanwhile)
     assert code_of(lambda: receive(store, two)) == "name_taken"
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from leaderboard.errors import Rejection
-from leaderboard.scoring.behaviour import CONSTANT, FLOOR, Behaviours
+from leaderboard.scoring.score import CONSTANT, FLOOR, Behaviours
 from sme_registry import EvaluationProtocol
 from sme_registry.evaluation import reference_policy
 from sme_registry.spec import Suite

@@ -239,7 +239,7 @@ def test_a_rejected_artefact_rejects_the_submission_and_is_named(policy, code):
     result = score(None, policy, LINEAR)
     assert (result.status, result.code) == ("rejected", code)
     assert result.message.startswith(
-        f"runs.1 (class shallow, spec {SUITE.instances[1].digest}, artefact {sha256_of(policy)}): "
+        f"runs.1 (class shallow, spec {SUITE.instances[1].digest}, policy {sha256_of(policy)}): "
     )
     assert result.scores is None
     assert result.runs == ()
