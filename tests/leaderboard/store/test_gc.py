@@ -88,7 +88,7 @@ def test_gc_between_check_and_log_entry_refuses_the_submission(store, key, monke
     for digest, data in artefacts.items():
         store.put_object(digest, [data], by=key.public)
         age(store.folder.object(digest), DAY + 60)
-    real = admission._check_artefacts
+    real = admission._check_files
 
     def checked_then_collected(*arguments):
         real(*arguments)
@@ -96,7 +96,7 @@ def test_gc_between_check_and_log_entry_refuses_the_submission(store, key, monke
             assert collect_garbage(other).objects == len(artefacts)
 
     with monkeypatch.context() as patch:
-        patch.setattr(admission, "_check_artefacts", checked_then_collected)
+        patch.setattr(admission, "_check_files", checked_then_collected)
         with pytest.raises(Rejection) as refused:
             intake.admit(store, signed)
     assert refused.value.code == "artefact_missing"
