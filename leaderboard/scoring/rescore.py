@@ -62,9 +62,9 @@ def rescore(store: Store, id: str) -> list[RescoreNote]:
     assert stored is not None
     again = score_submission(store.document, store.submission(id).submission, store.objects.read)
     notes = [
-        RescoreNote(id, "versions", name, stored.versions.get(name, ""), here)
-        for name, here in again.versions.items()
-        if stored.versions.get(name, "") != here
+        RescoreNote(id, "versions", name, recorded, again.versions[name])
+        for name, recorded in stored.versions.items()
+        if recorded != again.versions.get(name, recorded)
     ]
     recorded, here = stored.code or "scored", again.code or "scored"
     if recorded != here:
