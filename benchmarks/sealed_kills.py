@@ -13,8 +13,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from tests.leaderboard.sealed.killing import LANES, step_through_kills
-from tests.leaderboard.sealed.playing import online_board
+from tests.leaderboard.seasons.killing import LANES, step_through_kills
+from tests.leaderboard.seasons.playing import online_board
 
 
 def main(tickets: int = 50, requests: int = 400, kills: int = 20) -> None:

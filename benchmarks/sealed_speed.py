@@ -22,8 +22,8 @@ import numpy as np
 
 from leaderboard.documents.keys import SigningKey
 from sme_registry import seasons
-from tests.leaderboard.sealed.killing import killable
-from tests.leaderboard.sealed.playing import online_board
+from tests.leaderboard.seasons.killing import killable
+from tests.leaderboard.seasons.playing import online_board
 
 CASES = ((1, 1), (1, 1), (1, 2), (1, 8), (16, 1), (256, 1))  # lanes, clients; the first warms up
 _WINDOW = 20  # requests

@@ -24,9 +24,9 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import spearmanr
 
-from leaderboard.documents.season import SeasonClass
-from leaderboard.sealed.instance import SteppedInstance
-from leaderboard.sealed.stepping import Lanes, Start
+from leaderboard.seasons.instance import SteppedInstance
+from leaderboard.seasons.season import SeasonClass
+from leaderboard.seasons.stepping import Lanes, Start
 from sme_registry import EvaluationProtocol, SMESpec, materialize
 from sme_registry.seasons.wire import StepFormat
 

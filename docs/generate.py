@@ -10,11 +10,11 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from leaderboard.documents.board import BoardDocument, Limits
-from leaderboard.documents.entry import Entry, TicketRequest
 from leaderboard.documents.result import ClassScore, Result, RunScore, Scores
-from leaderboard.documents.season import Season, SeasonClass
 from leaderboard.documents.submission import Artefact, Method, Run, Submission, Submitter, Training
 from leaderboard.errors import CODES
+from leaderboard.seasons.entry import Entry, TicketRequest
+from leaderboard.seasons.season import Season, SeasonClass
 from sme_registry.datasets import DatasetRecipe
 from sme_registry.datasets.documents import Behaviour
 from sme_registry.io import write_atomically

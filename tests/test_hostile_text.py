@@ -15,7 +15,7 @@ from leaderboard.cli.options import KEY_VARIABLE
 from leaderboard.documents.keys import SigningKey
 from sme_registry.io.checks import hidden_in
 from sme_registry.io.terminal import log_to_terminal
-from tests.leaderboard.sealing import tiny_season
+from tests.leaderboard.seasons.sealing import tiny_season
 from tests.leaderboard.web import boards
 from tests.leaderboard.web.test_client import bundle_of, scripted
 

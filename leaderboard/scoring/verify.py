@@ -32,7 +32,7 @@ from leaderboard.scoring.aggregation import (
 )
 from leaderboard.scoring.rescore import RESCORED, RescoreNote, draw, rescore
 from leaderboard.scoring.score import Progress, agent_names, evaluation_seed
-from leaderboard.scoring.verify_seasons import check_sealed_signatures, count_unlogged_of_seasons
+from leaderboard.seasons.verify import check_sealed_signatures, count_unlogged_of_seasons
 from leaderboard.store import (
     Index,
     IndexUnusable,

@@ -5,6 +5,7 @@ The signed log is authoritative, the other files hold the documents that it name
 next one continues from the state it leaves.
 """
 
+from leaderboard.seasons.events import SealedRow, SeasonRow, played_bytes
 from leaderboard.store.copies import Copies
 from leaderboard.store.files import digest_of, read_document
 from leaderboard.store.garbage import Garbage, collect_garbage, make_room
@@ -13,7 +14,6 @@ from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.objects import Objects
 from leaderboard.store.queue import LEASE_SECONDS, Claim, Queue
 from leaderboard.store.rows import EntryRow
-from leaderboard.store.seasons import SealedRow, SeasonRow, played_bytes
 from leaderboard.store.store import Store, unknown_submission
 
 __all__ = [

@@ -25,7 +25,8 @@ from leaderboard.documents.board import BoardDocument, Folder
 from leaderboard.documents.result import Result
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal
 from leaderboard.errors import TamperedError
-from leaderboard.store import copies, seasons
+from leaderboard.seasons import events as seasons
+from leaderboard.store import copies
 from leaderboard.store.copies import Copies
 from leaderboard.store.files import BUSY_SECONDS, digest_of, read_document
 from leaderboard.store.log import EMPTY, Head, LogEntry

@@ -13,11 +13,11 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Result
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal, now
 from leaderboard.errors import BoardError, Rejection
+from leaderboard.seasons.store import SealedStore
 from leaderboard.store.files import digest_of, read_document, write_document
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.queue import Queue
 from leaderboard.store.rows import EntryRow
-from leaderboard.store.sealed import SealedStore
 from sme_registry.io import build_folder
 from sme_registry.spec import EvaluationProtocol, Suite
 from sme_registry.spec.document import StrictModel

@@ -42,11 +42,11 @@ from leaderboard.documents.submission import (
 from leaderboard.errors import BoardError, Rejection, ScoringFault
 from leaderboard.gate.isolation import Isolation, available_isolation
 from leaderboard.scoring.worker import background_scorers
+from leaderboard.seasons.web import SeasonRoutes
 from leaderboard.store import Head, Store, unknown_submission
 from leaderboard.web import http
 from leaderboard.web.http import HTTP_CODES, RequestError
 from leaderboard.web.pages import Pages, content_type
-from leaderboard.web.seasons import SeasonRoutes
 from leaderboard.web.tables import TABS, public_view
 from sme_registry.errors import SMEError
 

@@ -17,12 +17,12 @@ from typing import Any
 
 from leaderboard.bundle import Bundle
 from leaderboard.documents.board import BoardDocument, hex_of
-from leaderboard.documents.entry import SignedEntry, SignedTicketRequest
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.season import Season
 from leaderboard.documents.submission import SignedWithdrawal
 from leaderboard.errors import CODES, BoardError, Rejection
 from leaderboard.intake import upload_header
+from leaderboard.seasons.entry import SignedEntry, SignedTicketRequest
+from leaderboard.seasons.season import Season
 from sme_registry.errors import MalformedDocumentError, OptionError, SealedError, SpecError
 from sme_registry.io import parse_json
 from sme_registry.seasons import Ticket

@@ -30,9 +30,9 @@ from leaderboard.documents.result import METRICS, Estimate, Metric, Result
 from leaderboard.documents.submission import SignedSubmission
 from leaderboard.errors import CODES, NotPublishable
 from leaderboard.scoring import ranking
+from leaderboard.seasons.web import season_page
 from leaderboard.store import EntryRow, SeasonRow, Store
 from leaderboard.web import charts, tables
-from leaderboard.web.seasons import season_page
 from leaderboard.web.tables import SHORT, TABS
 from sme_registry import SMESpec
 from sme_registry.io import to_json

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from leaderboard.documents.keys import SigningKey
-from leaderboard.scoring.sealed import instances
-from leaderboard.sealed.tickets import Attendant
+from leaderboard.seasons.scoring import instances
+from leaderboard.seasons.tickets import Attendant
 from leaderboard.store import Store
 from sme_registry.envs import SMEVectorEnv
 from sme_registry.seasons import Ticket
-from tests.leaderboard.sealed.playing import Board, online_board
-from tests.leaderboard.sealing import MASTER
+from tests.leaderboard.seasons.playing import Board, online_board
+from tests.leaderboard.seasons.sealing import MASTER
 from tests.leaderboard.serving import serving
 
 SETTING = {"state_dim": 3, "action_dim": 2, "complexity": 5, "hidden_width": 8, "horizon": 7}

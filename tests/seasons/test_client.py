@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from leaderboard.scoring.sealed import challenge
+from leaderboard.seasons.scoring import challenge
 from sme_registry import seasons
 from sme_registry.errors import (
     ActionError,
@@ -23,7 +23,7 @@ from sme_registry.errors import (
 from sme_registry.evaluation.references import NAMES, SHORT_NAMES
 from sme_registry.seasons import Instance, Ticket, actions_in, wire
 from sme_registry.spec import Setting
-from tests.leaderboard.sealed.playing import ROWS
+from tests.leaderboard.seasons.playing import ROWS
 from tests.seasons.server import BUDGET, serving_season
 
 WAYS_TO_FAIL = ["lose request", "lose answer", "cut answer", "503", "507"]

@@ -19,7 +19,7 @@ from sme_registry.sb3 import SMEVecEnv
 from sme_registry.seasons.sb3 import SealedVecEnv
 from sme_registry.seasons.wire import StepsAnswer
 from sme_registry.training.models import new_model
-from tests.leaderboard.sealed.playing import ROWS
+from tests.leaderboard.seasons.playing import ROWS
 from tests.seasons.server import BUDGET, serving_season
 
 ROOT = Path(__file__).resolve().parents[2]

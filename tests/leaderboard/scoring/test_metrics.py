@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from benchmarks.interval_coverage import DISTRIBUTIONS, simulate
-from leaderboard.documents.master import Place
-from leaderboard.documents.season import read_answers
 from leaderboard.errors import Rejection
 from leaderboard.scoring.aggregation import failed_run, run_metrics
 from leaderboard.scoring.ranking import rank_ranges
-from leaderboard.scoring.sealed import challenge, instances, score_run, sealed_result
-from leaderboard.scoring.season import EASY, table_regret
+from leaderboard.seasons.master import Place
+from leaderboard.seasons.ranking import EASY, table_regret
+from leaderboard.seasons.scoring import challenge, instances, score_run, sealed_result
+from leaderboard.seasons.season import read_answers
 from sme_registry import evaluate
 from sme_registry.seasons.wire import pack_table
 from sme_registry.spec import Setting
-from tests.leaderboard.sealing import MASTER, tiny_season
+from tests.leaderboard.seasons.sealing import MASTER, tiny_season
 
 LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 

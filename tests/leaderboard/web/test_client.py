@@ -7,10 +7,10 @@ from contextlib import contextmanager
 import pytest
 
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.entry import TicketRequest
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError, Rejection
+from leaderboard.seasons.entry import TicketRequest
 from leaderboard.web import client
 from sme_registry.errors import OptionError
 from sme_registry.seasons import wire

@@ -20,7 +20,7 @@ from leaderboard.web import client
 from sme_registry import seasons
 from sme_registry.io import sha256_of
 from sme_registry.seasons import wire
-from tests.leaderboard.sealed.playing import online_board
+from tests.leaderboard.seasons.playing import online_board
 from tests.leaderboard.serving import serving
 from tests.leaderboard.web import boards
 from tests.leaderboard.web.test_client import bundle_of

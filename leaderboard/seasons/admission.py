@@ -1,0 +1,210 @@
+"""Entries and requests for tickets of sealed seasons: read, checked, then stored in the signed log.
+
+The answers come first, as uploads of the entrant's key. Nothing is scored before the reveal.
+
+The answer to a request for a ticket has the ticket's password, and a board keeps requests where
+others may read them. So a request is sent with a header `Authorization` as for an upload, whose
+signature is at most ten minutes old, and nobody else can repeat it.
+"""
+
+from __future__ import annotations
+
+import datetime
+
+from leaderboard.documents.checks import check_board, check_names, check_time, skeleton
+from leaderboard.documents.submission import Artefact, Envelope
+from leaderboard.errors import Rejection
+from leaderboard.intake.admission import ReadFile, check_daily_quota, check_name, check_stored
+from leaderboard.intake.uploads import check_room, uploader
+from leaderboard.seasons.entry import Entry, SignedEntry, SignedTicketRequest
+from leaderboard.seasons.season import Season, read_answers
+from leaderboard.store import Store, played_bytes
+
+
+def receive_entry(store: Store, envelope: Envelope[SignedEntry], season: str) -> bool:
+    """Admit an entry that a server received.
+
+    Args:
+      store: the board.
+      envelope: the entry, its signature verified and its content not validated.
+      season: digest of the season that it was sent to.
+
+    Returns:
+      True if it is new, False if the board already has it.
+
+    Raises:
+      Rejection: with the code of the first fault.
+    """
+    check_board(store.document, envelope.board)
+    moment = datetime.datetime.now(datetime.UTC)
+    if store.entrant(envelope.id) is None:
+        check_daily_quota(store, envelope.key, moment)
+    signed = envelope.open()
+    if signed.entry.season != season:
+        raise Rejection(
+            "season_unknown",
+            f"season={signed.entry.season}: the entry was sent to the season {season}. Send "
+            "it to its own.",
+        )
+    return enter(store, signed, moment)
+
+
+def enter(
+    store: Store,
+    signed: SignedEntry,
+    at: datetime.datetime | None = None,
+    answers: ReadFile | None = None,
+) -> bool:
+    """Check an entry and store it.
+
+    Args:
+      store: the board.
+      signed: the entry, its signature verified.
+      at: time of arrival; now by default.
+      answers: returns the bytes of an answer by digest; they are stored with the entry. By default
+        the entrant's key has uploaded them.
+
+    Returns:
+      True if it is new, False if the board already has it.
+
+    Raises:
+      Rejection: with the code of the first fault.
+    """
+    check_board(store.document, signed.board)
+    if store.entrant(signed.id) is not None:
+        return False
+    entry, key = signed.entry, signed.entry.submitter.key
+    check_names(entry, store.document.key)
+    moment = at or datetime.datetime.now(datetime.UTC)
+    check_time(entry.created, moment, store.document.limits.age_days)
+    store.open_season(entry.season, "sealed-offline")
+    season = store.season(entry.season)
+    check_name(store, entry.submitter)
+    check_daily_quota(store, key, moment)
+    given = _check_answers(store, season, signed, answers)
+    if answers is not None:
+        for answer in given:
+            store.put_object(answer.sha256, [answers(answer.sha256)], by=key)
+    with store.transaction():  # no other entrant can take the name, nor `gc` an answer in between
+        check_name(store, entry.submitter)
+        check_daily_quota(store, key, moment)
+        _check_newest(store, season, entry)
+        check_room(store, len(signed.to_bytes()))
+        for answer in given:
+            check_stored(store, key, answer)
+        return store.enter(signed)
+
+
+def _check_newest(store: Store, season: Season, entry: Entry) -> None:
+    """Refuse an entry that would not count, as its key has signed a later one of its method."""
+    own = entry.submitter.key, skeleton(entry.method.name)
+    for row in store.entrants(season.digest):
+        if row.method == own and row.created > entry.created:
+            raise Rejection(
+                "stale_time",
+                f"created={entry.created}: entry {row.number} of the same key and method was "
+                f"signed later, at {row.created}. The one signed last counts: check your clock, "
+                "and sign this one again.",
+            )
+
+
+def _check_answers(
+    store: Store, season: Season, signed: SignedEntry, read: ReadFile | None
+) -> list[Artefact]:
+    """The answers that are not null, each in the shape of its instance's challenge."""
+    entry, hidden = signed.entry, list(season.hidden)
+    if len(entry.answers) != len(hidden):
+        raise Rejection(
+            "answer_missing",
+            f"answers: has {len(entry.answers)}: must have {len(hidden)}, one for each instance of "
+            f"the season {season.id}, null where the method failed.",
+        )
+    given, checked = [], set()
+    for number, (answer, each) in enumerate(zip(entry.answers, hidden, strict=True)):
+        if answer is None:
+            continue
+        if read is None:
+            check_stored(store, entry.submitter.key, answer)
+        # Many instances may have the same answers, which are read once for each shape.
+        form = answer.sha256, each.member.setting.action_dim
+        try:
+            if form not in checked:
+                data = (read or store.objects.read)(answer.sha256)
+                read_answers(data, each.member.setting, season.protocol)
+                checked.add(form)
+        except Rejection as error:
+            where = f"answers.{number} (class {each.member.name}, instance {each.instance})"
+            raise Rejection(error.code, f"{where}: {error.message}") from None
+        given.append(answer)
+    return given
+
+
+def refuse_other_sender(
+    store: Store, envelope: Envelope[SignedTicketRequest], header: str | None
+) -> None:
+    """Reject a request that its own key has not just sent.
+
+    Args:
+      store: the board.
+      envelope: the request.
+      header: the value of `Authorization`; None if there is none.
+
+    Raises:
+      Rejection: `bad_signature`, `wrong_board` or `stale_time`.
+    """
+    sender = uploader(header, envelope.id, board=store.document.key)
+    if sender != envelope.key:
+        raise Rejection(
+            "bad_signature",
+            f"Authorization: is signed by the key {sender[:16]}…: must be by {envelope.key[:16]}…, "
+            "which signed the request. Sign both with one key.",
+        )
+
+
+def start_ticket(
+    store: Store,
+    envelope: Envelope[SignedTicketRequest],
+    season: str,
+    at: datetime.datetime | None = None,
+) -> tuple[int, bool]:
+    """Start a ticket; the same request starts no second one, and has its number again.
+
+    Args:
+      store: the board.
+      envelope: the request, its signature verified and its content not validated.
+      season: digest of the season that it was sent to.
+      at: time of arrival; now by default.
+
+    Returns:
+      The ticket's number, and whether it is new.
+
+    Raises:
+      Rejection: with the code of the first fault.
+    """
+    check_board(store.document, envelope.board)
+    known = store.entrant(envelope.id)
+    if known is not None and known.season == season:
+        return known.number, False
+    signed = envelope.open()
+    request = signed.ticket
+    if request.season != season:
+        raise Rejection(
+            "season_unknown",
+            f"season={request.season}: the request was sent to the season {season}. Send it to "
+            "its own.",
+        )
+    if request.answers_key is None:
+        raise Rejection(
+            "schema",
+            "ticket.answers_key: missing: must be the public key that will sign the answers. "
+            "Create the request with `sme-leaderboard ticket`.",
+        )
+    check_names(request, store.document.key)
+    moment = at or datetime.datetime.now(datetime.UTC)
+    check_time(request.created, moment, store.document.limits.age_days)
+    size = len(signed.to_bytes()) + played_bytes(store.season(season))
+    with store.transaction():  # no other entrant can take the name, or the room, in between
+        check_name(store, request.submitter)
+        check_daily_quota(store, request.submitter.key, moment)
+        check_room(store, size)
+        return store.start_ticket(signed), True

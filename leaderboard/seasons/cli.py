@@ -1,0 +1,336 @@
+"""`sme-leaderboard season`: run a sealed season, from its plan to its replay."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from leaderboard.cli.options import BoardFolder, Json, open_board
+from leaderboard.documents.result import LABELS, Metric
+from leaderboard.errors import Rejection
+from leaderboard.scoring.ranking import REASONS
+from leaderboard.seasons.master import Master
+from leaderboard.seasons.publication import (
+    check_published,
+    create_season,
+    read_plan,
+    read_season,
+    refuse_large_answers,
+    refuse_unrankable,
+)
+from leaderboard.seasons.ranking import EASY, counting, ranking_facts, score_entries, table_regret
+from leaderboard.seasons.replay import verify_season
+from leaderboard.seasons.season import Reveal, Terms
+from leaderboard.store import SeasonRow, Store
+from sme_registry.errors import OptionError
+from sme_registry.io import check_new, read_json
+from sme_registry.io.markup import Table, plural
+from sme_registry.io.terminal import Progress, err, fixed, out, print_json, print_pairs
+
+SeasonId = Annotated[str, typer.Argument(metavar="SEASON", help="The season's id.")]
+SecretFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--secret",
+        help="File of the master secret; by default BOARD.SEASON.master beside the board.",
+    ),
+]
+
+season = typer.Typer(
+    no_args_is_help=True,
+    help="""Sealed seasons: tasks that nobody but the organiser knows until they are revealed.
+
+    Examples:
+
+      sme-leaderboard season new board plan.json --out autumn
+
+      sme-leaderboard season publish board autumn
+
+      sme-leaderboard season reveal board autumn
+    """,
+)
+
+
+@season.command()
+def new(
+    board: BoardFolder,
+    plan: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PLAN",
+            help="JSON with id, title, track, classes, opens, closes, protocol_name and, online, "
+            "ticket_hours, tickets and tickets_per_key.",
+        ),
+    ],
+    out_folder: Annotated[
+        Path | None, typer.Option("--out", "-o", help="A new folder; by default the season's id.")
+    ] = None,
+    secret: SecretFile = None,
+) -> None:
+    """Draw a master secret, and generate all that is published of a season.
+
+    The new folder has season.json and, offline, a data set and challenge states for each hidden
+    instance. The master is written into a file that only you can read: whoever has it knows every
+    task, and without it nobody can reveal the season.
+
+    Examples:
+
+      sme-leaderboard season new board plan.json --out autumn
+    """
+
+    fields = read_plan(read_json(plan), str(plan))
+    with Store.open(board, read_only=True) as store:
+        refuse_large_answers(fields, store.document.limits.artefact_bytes)
+        refuse_unrankable(fields, store.document.runs_to_rank)
+    folder = Path(fields.id) if out_folder is None else out_folder
+    check_new(folder)
+    _warn_of_easy_classes(fields)
+    path = _secret(board, fields.id, secret)
+    # First: a season whose master is lost cannot be revealed, and the reverse does no harm.
+    master = Master.generate()
+    master.write(path)
+    with Progress("generating", len(fields.published), console=err(), unit="instances") as progress:
+        try:
+            season = create_season(fields, master, folder, progress.update_of)
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
+    out().print(f"{escape(str(folder))}\ncommitment {season.commitment}", soft_wrap=True)
+    out().print(f"{escape(str(path))}: keep it secret, and keep a copy.", soft_wrap=True)
+    out().print(
+        f"Next: sme-leaderboard season publish {escape(str(board))} {escape(str(folder))}",
+        soft_wrap=True,
+    )
+
+
+@season.command()
+def publish(
+    board: BoardFolder,
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="As `season new` wrote it.")],
+) -> None:
+    """Announce a season: its terms and its commitment become an entry of the board's signed log.
+
+    Then give FOLDER to everyone, for example as an archive on a web server.
+
+    Examples:
+
+      sme-leaderboard season publish board autumn
+    """
+
+    season = read_season(folder)
+    with Progress("checking", len(season.published), console=err(), unit="instances") as progress:
+        check_published(season, folder, progress.update_of)
+    with Store.open(board) as store:
+        store.announce(season)
+    out().print(f"{season.id} {season.digest}", soft_wrap=True)
+    out().print(f"Open from {season.opens} to {season.closes}.")
+
+
+@season.command()
+def close(board: BoardFolder, season: SeasonId) -> None:
+    """List what counts after the close, and the log's digest to keep elsewhere.
+
+    The close itself is a time in the season's terms. Nothing changes.
+
+    Examples:
+
+      sme-leaderboard season close board autumn
+    """
+
+    with open_board(board) as store:
+        row = store.season_row(season)
+        if store.time < row.closes:
+            raise Rejection(
+                "season_not_closed",
+                f"season={row.id}: closes at {row.closes}, and it is {store.time}.",
+            )
+        table = Table(
+            f"What counts in {row.id}",
+            {"number": "number", "method": "text", "submitter": "text", "received": "name"},
+        )
+        for each in counting(store, store.season(season)):
+            entrant = each.entrant
+            names = f"{entrant.method} {entrant.version}", entrant.submitter
+            table.add_row(str(each.number), *map(escape, names), entrant.received)
+        head = store.head
+    out().print(table)
+    out().print(f"log entry {head.sequence} {head.digest}", soft_wrap=True)
+
+
+@season.command()
+def reveal(board: BoardFolder, season: SeasonId, secret: SecretFile = None) -> None:
+    """Publish the master of a season that is over, and score its offline entries.
+
+    If it is interrupted, repeat it.
+
+    Examples:
+
+      sme-leaderboard season reveal board autumn
+    """
+
+    with Store.open(board) as store:
+        row = store.season_row(season)
+        master = Master.read(_secret(board, row.id, secret))
+        store.reveal(Reveal(season=row.digest, master=master.raw.hex()))
+        count = len(store.entrants(row.digest))
+        with Progress("scoring", count, console=err(), unit="entries") as progress:
+            scored = score_entries(store, row.digest, progress.update_of)
+    entries = plural(scored, "entry", "entries")
+    out().print(f"{row.id}: revealed, {entries} scored.")
+
+
+@season.command()
+def verify(
+    board: BoardFolder,
+    season: SeasonId,
+    published: Annotated[
+        Path | None,
+        typer.Option(help="Also, or before the reveal: check this folder of published files."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Replay a revealed season: commitment, tasks, data sets, challenge states, scores.
+
+    Exit code 3 means that something does not follow from the master; the error names the file.
+    Other machines may round data sets otherwise than the organiser's: with --published their arrays
+    are compared, within 1e-6, where digests differ.
+
+    Examples:
+
+      sme-leaderboard season verify board autumn
+
+      sme-leaderboard season verify board autumn --published autumn
+    """
+
+    checked: dict[str, Any] = {}
+    with open_board(board) as store:
+        row = store.season_row(season)
+        if published is not None:
+            document = store.season(season)
+            count = len(document.published)
+            with Progress("checking", count, console=err(), unit="instances") as progress:
+                checked["published"] = check_published(document, published, progress.update_of)
+        if published is None or row.reveal is not None:
+            total = row.instances + len(store.entrants(row.digest))
+            with Progress("replaying", total, console=err(), unit="instances") as progress:
+                report = verify_season(store, row.digest, progress.update_of, published)
+            checked |= {
+                "instances": report.instances,
+                "rounded": report.rounded,
+                "entries": report.entries,
+                "results": report.results,
+            }
+    if json:
+        print_json({"season": row.digest, **checked})
+    else:
+        print_pairs(f"{row.id}: everything follows", checked)
+
+
+@season.command()
+def show(
+    board: BoardFolder,
+    season: Annotated[
+        str | None, typer.Argument(metavar="SEASON", help="Its id; without it, all are listed.")
+    ] = None,
+    metric: Annotated[
+        Metric, typer.Option(metavar="METRIC", help="wd_regret, ood_regret or ood_decay.")
+    ] = "wd_regret",
+    json: Json = False,
+) -> None:
+    """Show a board's seasons, or one with its ranking.
+
+    Methods that know the family are ranked apart from those that know nothing of the tasks.
+
+    Examples:
+
+      sme-leaderboard season show board
+
+      sme-leaderboard season show board autumn --metric ood_regret
+    """
+
+    with open_board(board) as store:
+        if season is None:
+            rows = [_facts(store, row) for row in store.seasons()]
+            if json:
+                print_json(rows)
+                return
+            columns = ("id", "track", "state", "opens", "closes", "entrants")
+            table = Table("Seasons", dict.fromkeys(columns, "text"))
+            for facts in rows:
+                table.add_row(*(escape(str(facts[name])) for name in columns))
+            out().print(table)
+            return
+        row, document = store.season_row(season), store.season(season)
+        facts, rankings = _facts(store, row), ranking_facts(store, document, metric)
+    if json:
+        print_json({**facts, "metric": metric, "ranking": rankings})
+        return
+    print_pairs(escape(row.title), facts)
+    for knowledge, entries in rankings.items():
+        if not entries:
+            continue
+        heads = ("rank", "method", "submitter", "value", "low", "high", "methods", "entrants")
+        table = Table(f"{LABELS[metric]}, knowledge: {knowledge}", dict.fromkeys(heads, "text"))
+        for entry in entries:
+            numbers = (entry[name] for name in ("value", "low", "high"))
+            table.add_row(
+                entry["ranks"] or REASONS[entry["reason"]],
+                escape(f"{entry['method']} {entry['version']}"),
+                escape(entry["submitter"]),
+                *("" if number is None else fixed(number) for number in numbers),
+                str(entry["methods_of_key"]),
+                str(entry["entrants_of_key"]),
+            )
+        out().print(table)
+    if any(rankings.values()):
+        out().print("methods, entrants: of the same key in this season.")
+
+
+def _warn_of_easy_classes(terms: Terms) -> None:
+
+    for member in terms.classes:
+        rows = member.data.transitions if member.data else member.budget or 0
+        regret = table_regret(member.setting, rows)
+        if regret < EASY:
+            err().print(
+                f"Warning: classes.{member.name}: a table of the nearest states, without any "
+                f"learning, has a normalised regret N₀ of about {fixed(regret)}: should be "
+                f"{EASY} or more, or ranks tell little. Use more state channels than "
+                f"{member.setting.state_dim}.",
+                soft_wrap=True,
+            )
+
+
+def _facts(store: Store, row: SeasonRow) -> dict[str, Any]:
+    """A season in short."""
+    time = store.time
+    state = "revealed" if row.reveal else "closed" if time >= row.closes else "open"
+    document = store.season(row.digest)
+    return {
+        "id": row.id,
+        "digest": row.digest,
+        "track": row.track,
+        "state": "announced" if time < row.opens else state,
+        "opens": row.opens,
+        "closes": row.closes,
+        "instances": row.instances,
+        "entrants": len(store.entrants(row.digest)),
+        "commitment": document.commitment,
+        "revealed": row.revealed or None,
+    }
+
+
+def _secret(board: Path, season: str, given: Path | None) -> Path:
+    """The file of the master; by default outside the board's folder, which may be published."""
+    folder = board.resolve()
+    path = folder.with_name(f"{folder.name}.{season}.master") if given is None else given
+    if path.is_dir():
+        raise OptionError(f"secret={path}: is a folder. Give the path of a file.")
+    return path
+
+
+app = typer.Typer()
+app.add_typer(season, name="season")

@@ -1,0 +1,345 @@
+"""`sme-leaderboard ticket · answer · enter`: take part in a sealed season."""
+
+from __future__ import annotations
+
+import secrets
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from leaderboard import intake
+from leaderboard.cli.options import (
+    DEFAULT_KEY,
+    ActionRange,
+    BoardOrUrl,
+    CodeLink,
+    Family,
+    KeyFile,
+    MethodName,
+    MethodVersion,
+    SealedKnowledge,
+    Statement,
+    SubmitterName,
+    answers_in,
+    board_document,
+    is_url,
+    manifest_fields,
+    policy_of_each,
+    read_file,
+)
+from leaderboard.documents.keys import SigningKey
+from leaderboard.errors import Rejection
+from leaderboard.seasons.entry import Entry, SignedTicketRequest, TicketRequest
+from leaderboard.seasons.publication import name_of, read_season
+from leaderboard.store import Store
+from leaderboard.web import client
+from sme_registry.errors import OptionError
+from sme_registry.io import check_new, check_writable, choice, sha256_of, write_atomically
+from sme_registry.io.markup import Table
+from sme_registry.io.terminal import Progress, err, out
+from sme_registry.seasons import Instance, Ticket, actions_in, prepare_policy
+from sme_registry.seasons.wire import TicketPlace, pack_table, unpack_table
+
+app = typer.Typer()
+
+ServedBoard = Annotated[
+    str, typer.Argument(metavar="URL", help="The URL of the board that serves the season.")
+]
+
+
+@app.command()
+def ticket(
+    url: ServedBoard,
+    season: Annotated[str, typer.Argument(metavar="SEASON", help="The season's id.")],
+    method: MethodName,
+    submitter: SubmitterName,
+    method_version: MethodVersion = "1",
+    family: Family = None,
+    knowledge: SealedKnowledge = "generic",
+    code: CodeLink = None,
+    statement: Statement = "",
+    out_file: Annotated[Path, typer.Option("--out", "-o", help="The ticket's new file.")] = Path(
+        "ticket.json"
+    ),
+    key: KeyFile = DEFAULT_KEY,
+) -> None:
+    """Start a ticket: hidden tasks of a season, for you alone.
+
+    Every ticket counts: instances without answers at its deadline score 1. The file holds the
+    ticket's password. If the command is interrupted, repeat it: it asks for the same ticket.
+
+    Examples:
+
+      sme-leaderboard ticket https://board.example winter --method PPO --submitter "A Lab"
+    """
+
+    check_new(out_file)
+    signing_key = SigningKey.read(key)
+    # Kept until the ticket is: a request that was sent and not answered may have started one.
+    request_file = out_file.with_name(f"{out_file.name}.request")
+    repeated = request_file.exists()
+    if repeated:
+        signed = SignedTicketRequest.read(read_file(request_file))
+        err().print(f"Repeating {escape(str(request_file))}.", soft_wrap=True)
+    else:
+        season_digest, board = client.season(url, season)
+        nonce = secrets.token_hex(32)
+        request = TicketRequest.from_dict(
+            {
+                **manifest_fields(
+                    signing_key.public,
+                    method=(method, method_version, family, knowledge),
+                    submitter=submitter,
+                    code=code,
+                    statement=statement,
+                ),
+                "season": season_digest,
+                "nonce": nonce,
+                "answers_key": signing_key.of_answers(nonce).public,
+            }
+        )
+        signed = request.signed(signing_key, board)
+        write_atomically(request_file, signed.to_bytes())
+    try:
+        started = client.request_ticket(url, season, signed, signing_key)
+    except Rejection as rejection:
+        # Refused is the request, which has started no ticket, or its sender: with another key, or
+        # a wrong clock.
+        if not (repeated and rejection.code in ("bad_signature", "stale_time")):
+            request_file.unlink()
+        raise
+    started.write(out_file)
+    request_file.unlink()
+
+    table = Table(
+        f"ticket {started.ticket} of {started.season}",
+        {"number": "number", "instance": "name", "S": "number", "A": "number", "steps": "number"},
+    )
+    for number, place in enumerate(started.places):
+        setting = place.member.setting
+        sizes = setting.state_dim, setting.action_dim, place.member.budget
+        table.add_row(str(number), place.name, *(f"{each:,}" for each in sizes))
+    out().print(table)
+    out().print(
+        f"{escape(str(out_file))}: keep it secret. Answer by {escape(started.deadline)}.",
+        soft_wrap=True,
+    )
+
+
+@app.command()
+def answer(
+    url: ServedBoard,
+    ticket_file: Annotated[Path, typer.Argument(metavar="TICKET", help="The ticket's file.")],
+    policy: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="POLICY",
+            help="A policy as `sme evaluate` takes it, or an .npy file of actions in the challenge "
+            "states. {name} stands for the instance, such as deep-0.",
+        ),
+    ] = None,
+    instance: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--instance",
+            "-i",
+            metavar="NAME",
+            help="Only this instance; repeatable. Default: all without answers.",
+        ),
+    ] = None,
+    challenges: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Instead of answers: write the challenge states of each instance into this "
+            "folder, for .npy files of actions.",
+        ),
+    ] = None,
+    end_steps: Annotated[
+        bool,
+        typer.Option(
+            "--end-steps", help="With --challenges: also of instances with steps left, for good."
+        ),
+    ] = False,
+    action_range: ActionRange = None,
+    algorithm: Annotated[
+        str | None, typer.Option(help="Class of a .zip that does not tell it.")
+    ] = None,
+) -> None:
+    """Answer the challenges of a ticket with trained policies.
+
+    It ends the steps of each instance that it answers. The last answers end the ticket.
+
+    Examples:
+
+      sme-leaderboard answer https://board.example ticket.json 'runs/{name}/model.zip'
+
+      sme-leaderboard answer https://board.example ticket.json policy.onnx --instance deep-0
+
+      sme-leaderboard answer https://board.example ticket.json --challenges challenges
+
+      sme-leaderboard answer https://board.example ticket.json 'actions/{name}.npy'
+    """
+    import numpy as np
+
+    if (policy is None) == (challenges is None):
+        raise OptionError("POLICY, --challenges: one of the two must be given.")
+    held = Ticket.read(ticket_file)
+    places = {place.name: number for number, place in enumerate(held.places)}
+    with Instance(url, held) as first:
+        phases = [each.phase for each in first.status().instances]
+    for name in instance or ():
+        choice("instance", name, places)
+    chosen = instance or [name for name in places if phases[places[name]] != "answered"]
+    stepped = [name for name in chosen if phases[places[name]] in ("waiting", "stepping")]
+    if challenges is not None:
+        if stepped and not end_steps:
+            raise OptionError(
+                f"{', '.join(stepped)}: steps are left, which the challenge ends for good. Add "
+                "--end-steps if you want no more of them, or name other instances with --instance."
+            )
+        _write_challenges(url, held, {name: places[name] for name in chosen}, challenges)
+        return
+    # All are loaded before the first instance's steps end for good.
+    own = {} if policy is None else policy_of_each(policy, chosen)
+    policies = {
+        places[name]: _prepared(each, held.place(places[name]), action_range, algorithm)
+        for name, each in own.items()
+    }
+    blind = [name for name in stepped if isinstance(policies[places[name]], np.ndarray)]
+    if blind:
+        raise OptionError(
+            f"{', '.join(blind)}: steps are left, so the challenge states are not known yet. Get "
+            "them with --challenges FOLDER before you give .npy files of actions."
+        )
+    with Progress("answering", len(policies), console=err(), unit="instances") as progress:
+        for done, (number, prepared) in enumerate(policies.items(), start=1):
+            with Instance(url, held, number) as hidden:
+                if not isinstance(prepared, np.ndarray):
+                    prepared = actions_in(hidden.challenge(), prepared, hidden.setting)
+                hidden.send_answers(prepared)
+            phases[number] = "answered"
+            progress.update(done)
+    left = sum(phase != "answered" for phase in phases)
+    out().print(f"{left} instances without answers" if left else "The ticket has ended.")
+
+
+def _prepared(
+    policy: str, place: TicketPlace, action_range: str | None, algorithm: str | None
+) -> Any:
+    """A policy, or the array of actions in a file."""
+
+    setting, given = place.member.setting, answers_in(policy)
+    if given is not None:
+        return unpack_table(given, setting.action_dim)
+    return prepare_policy(policy, setting, action_range=action_range, algorithm=algorithm)
+
+
+def _write_challenges(url: str, ticket: Ticket, places: dict[str, int], folder: Path) -> None:
+
+    check_writable(folder / "challenge.npy")
+    with Progress("writing", len(places), console=err(), unit="challenges") as progress:
+        for done, (name, number) in enumerate(places.items(), start=1):
+            with Instance(url, ticket, number) as hidden:
+                write_atomically(folder / f"{name}.npy", pack_table(hidden.challenge()))
+            progress.update(done)
+    out().print(f"{escape(str(folder))}: {len(places)} challenges", soft_wrap=True)
+
+
+@app.command()
+def enter(
+    board: BoardOrUrl,
+    published: Annotated[
+        Path,
+        typer.Argument(metavar="SEASON", help="The folder with what the organiser published."),
+    ],
+    policy: Annotated[
+        str,
+        typer.Argument(
+            metavar="POLICY",
+            help="A policy as `sme evaluate` takes it, or an .npy file of actions in the challenge "
+            "states. {name} stands for the instance, such as deep-0.",
+        ),
+    ],
+    method: MethodName,
+    submitter: SubmitterName,
+    method_version: MethodVersion = "1",
+    family: Family = None,
+    knowledge: SealedKnowledge = "generic",
+    failed: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="An instance without a policy; scores 1. Repeatable."),
+    ] = None,
+    action_range: ActionRange = None,
+    code: CodeLink = None,
+    statement: Statement = "",
+    key: KeyFile = DEFAULT_KEY,
+) -> None:
+    """Answer the challenges of a sealed-offline season, and send the answers.
+
+    Only arrays of actions are sent, and no policy. The last entry of your key and method before
+    the close counts; nothing is scored before the reveal.
+
+    Examples:
+
+      sme-leaderboard enter board autumn '{name}.npz' --method IQL --submitter "A Lab"
+
+      sme-leaderboard enter board autumn '{name}.npy' --method X --submitter Y --failed deep-3
+    """
+
+    season, signing_key = read_season(published), SigningKey.read(key)
+    hidden = {name_of(each): each.member.setting for each in season.hidden}
+    without = failed or []
+    for name in without:
+        if name not in hidden:
+            raise OptionError(f"failed={name!r}: must be one of {', '.join(hidden)}.")
+    policies = policy_of_each(policy, hidden)
+    files: list[bytes | None] = []
+    with Progress("answering", len(hidden), console=err(), unit="instances") as progress:
+        for done, (name, setting) in enumerate(hidden.items(), start=1):
+            states = published / "challenges" / f"{name}.npy"
+            files.append(
+                None if name in without else _answers(policies[name], states, setting, action_range)
+            )
+            progress.update(done)
+    digests = [None if data is None else sha256_of(data) for data in files]
+    data = {name: each for name, each in zip(digests, files, strict=True) if name and each}
+    entry = Entry.from_dict(
+        {
+            **manifest_fields(
+                signing_key.public,
+                method=(method, method_version, family, knowledge),
+                submitter=submitter,
+                code=code,
+                statement=statement,
+            ),
+            "season": season.digest,
+            "answers": [name and {"sha256": name, "size": len(data[name])} for name in digests],
+        }
+    )
+    signed = entry.signed(signing_key, board_document(board).key)
+    if is_url(board):
+        with Progress("uploading", len(data), console=err(), unit="answers") as progress:
+            client.enter(board, season.id, signed, data, signing_key, progress=progress.update_of)
+    else:
+        with Store.open(Path(board)) as store:
+            intake.enter(store, signed, answers=data.__getitem__)
+    out().print(signed.id, soft_wrap=True)
+    err().print(
+        f"The season closes at {season.closes}; until then a later entry of "
+        f"{escape(method)} replaces this one.",
+        soft_wrap=True,
+    )
+
+
+def _answers(policy: str, states: Path, setting: Any, action_range: str | None) -> bytes:
+    """The file of answers: the given one, or a policy's actions in the challenge states."""
+
+    given = answers_in(policy)
+    if given is not None:
+        return given
+    prepared = prepare_policy(policy, setting, action_range=action_range)
+    shown = unpack_table(read_file(states), setting.state_dim + 2)
+    return pack_table(actions_in(shown, prepared, setting))

@@ -1,0 +1,393 @@
+"""Sealed seasons in the index: the tables `season`, `sealed` (entries and tickets) and `answer`.
+
+They are a function of the log and of public documents, and hold nothing of a hidden instance.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from leaderboard.documents.board import Folder, SeasonFolder
+from leaderboard.documents.checks import skeleton
+from leaderboard.documents.result import SealedResult
+from leaderboard.errors import TamperedError
+from leaderboard.seasons.entry import SignedEntry, SignedSealed, SignedTicketRequest
+from leaderboard.seasons.master import Master
+from leaderboard.seasons.season import MAX_LANES, Reveal, SealedTrack, Season, rows_of
+from leaderboard.store.files import read_document
+from leaderboard.store.log import LogEntry
+from leaderboard.store.rows import EntryRow, name_object, scores_of, scores_text
+from sme_registry.seasons.wire import table_bytes
+
+DERIVED = {"season": "digest", "sealed": "id", "answer": "digest || entry"}
+"""Tables and their keys."""
+
+SCHEMA = """
+CREATE TABLE season (
+  digest TEXT PRIMARY KEY, sequence INTEGER NOT NULL, announced TEXT NOT NULL,
+  document TEXT NOT NULL, id TEXT NOT NULL UNIQUE, title TEXT NOT NULL, track TEXT NOT NULL,
+  opens TEXT NOT NULL, closes TEXT NOT NULL, instances INTEGER NOT NULL,
+  reveal TEXT, revealed TEXT NOT NULL DEFAULT ''
+) STRICT, WITHOUT ROWID;
+CREATE TABLE sealed (
+  id TEXT PRIMARY KEY, season TEXT NOT NULL, number INTEGER NOT NULL,
+  sequence INTEGER NOT NULL, received TEXT NOT NULL, created TEXT NOT NULL, document TEXT NOT NULL,
+  result TEXT, finished TEXT NOT NULL DEFAULT '',
+  method TEXT NOT NULL, version TEXT NOT NULL, family TEXT NOT NULL, knowledge TEXT NOT NULL,
+  submitter TEXT NOT NULL, key TEXT NOT NULL, code_link TEXT,
+  runs INTEGER NOT NULL, policies INTEGER NOT NULL, steps INTEGER NOT NULL DEFAULT 0,
+  oracle_like INTEGER NOT NULL DEFAULT 0, scores TEXT, bytes INTEGER NOT NULL,
+  played_bytes INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;
+CREATE UNIQUE INDEX sealed_number ON sealed (season, number);
+CREATE INDEX sealed_of_key ON sealed (key, received);
+CREATE TABLE answer (
+  digest TEXT NOT NULL, entry TEXT NOT NULL, PRIMARY KEY (digest, entry)
+) STRICT, WITHOUT ROWID;
+"""
+
+_Signed = TypeVar("_Signed", bound=SignedSealed)
+_RECORD_BYTES, _HEAD_BYTES = 12, 4096  # of a journal; heads with the signature's file
+
+
+def played_bytes(season: Season, result: SealedResult | None = None) -> int:
+    """The most bytes that the journals and answers of a ticket take.
+
+    A journal is longest where a single lane is stepped: then each step has a record of its own.
+
+    Args:
+      season: the ticket's.
+      result: the ticket's, after which nothing more is written; None before.
+    """
+    total = 0
+    rows = rows_of(season.protocol)
+    for number, (member, _) in enumerate(season.hidden):
+        A = member.setting.action_dim
+        steps = (member.budget or 0) if result is None else result.stepping[number].steps
+        answered = result is None or result.runs[number].artefact is not None
+        answers = table_bytes(rows, A) if answered else 0
+        last = 4 * MAX_LANES * A  # the record that ends a journal
+        total += steps * (_RECORD_BYTES + 4 * A) + last + answers + _HEAD_BYTES
+    return total
+
+
+@dataclass(frozen=True)
+class SeasonRow:
+    """One season, as pages need it.
+
+    Attributes:
+      digest: of season.json's content.
+      sequence, announced: of the log entry that announced it.
+      document: SHA-256 of season.json.
+      instances: number of hidden ones, of each ticket or of all entries.
+      reveal: SHA-256 of reveal.json; None until the reveal.
+      revealed: when; empty likewise.
+    """
+
+    digest: str
+    sequence: int
+    announced: str
+    document: str
+    id: str
+    title: str
+    track: SealedTrack
+    opens: str
+    closes: str
+    instances: int
+    reveal: str | None
+    revealed: str
+
+
+@dataclass(frozen=True)
+class SealedRow:
+    """One entry or ticket.
+
+    Attributes:
+      season: digest of its season.
+      number: 1 for the first of its season, in the log's order.
+      created: when it was signed, as the entrant says.
+      document: SHA-256 of its file.
+      result: SHA-256 of its result's file; None without one.
+      finished: when it got its result; empty likewise.
+      entrant: what rankings need of it. Its `received` is when the ticket started, `runs` the
+        number of hidden instances, and `policies` that of answers. `enough_runs` is false:
+        `scoring.season` counts them over all tickets of a method.
+    """
+
+    season: str
+    number: int
+    created: str
+    document: str
+    result: str | None
+    finished: str
+    entrant: EntryRow
+
+    @property
+    def method(self) -> tuple[str, str]:
+        """What it is of: a key, and a method up to look-alike spelling."""
+        return self.entrant.key, skeleton(self.entrant.method)
+
+
+class Seasons:
+    """The tables, in a database with `SCHEMA` and the index's other tables.
+
+    Args:
+      connection: to it.
+      folder: the board's.
+    """
+
+    def __init__(self, connection: sqlite3.Connection, folder: Folder) -> None:
+        self._connection = connection
+        self._folder = folder
+
+    def apply(self, entry: LogEntry) -> None:
+        """Apply a log entry of a season.
+
+        Raises:
+          TamperedError: the document that it names is missing or altered, or the entry contradicts
+            those before it.
+        """
+        match entry.event:
+            case "season":
+                self._season(entry)
+            case "entry":
+                self._entry(entry)
+            case "ticket":
+                self._ticket(entry)
+            case "ended" | "ranked":
+                self._result(entry)
+            case "revealed":
+                self._revealed(entry)
+
+    def rows(self) -> list[SeasonRow]:
+        """All seasons, in the order in which they were announced."""
+        return [SeasonRow(*row) for row in self._all(f"{_SEASONS} ORDER BY sequence")]
+
+    def row(self, name: str) -> SeasonRow | None:
+        """The season of this id or digest; None if there is none."""
+        rows = self._all(f"{_SEASONS} WHERE digest = ?1 OR id = ?1", name)
+        return SeasonRow(*rows[0]) if rows else None
+
+    def entrants(self, season: str) -> list[SealedRow]:
+        """The entries or tickets of a season, by its digest, in the log's order."""
+        return [
+            _sealed(row) for row in self._all(f"{_SEALED} WHERE season = ? ORDER BY number", season)
+        ]
+
+    def entrant(self, id: str) -> SealedRow | None:
+        """The entry or ticket of this id; None if there is none."""
+        rows = self._all(f"{_SEALED} WHERE id = ?", id)
+        return _sealed(rows[0]) if rows else None
+
+    def ticket(self, season: str, number: int) -> SealedRow | None:
+        """The entry or ticket of this number; None if there is none."""
+        rows = self._all(f"{_SEALED} WHERE season = ? AND number = ?", season, number)
+        return _sealed(rows[0]) if rows else None
+
+    def next_number(self, season: str) -> int:
+        """The number of a season's next entry or ticket."""
+        [(number,)] = self._all("SELECT count(*) + 1 FROM sealed WHERE season = ?", season)
+        return int(number)
+
+    def read(self, row: SeasonRow) -> Season:
+        """The document of a season.
+
+        Raises:
+          TamperedError: it is missing or altered.
+        """
+        return read_document(self._folder, self._at(row.digest).season, Season, row.document)
+
+    def _season(self, entry: LogEntry) -> None:
+        path = self._at(entry.subject).season
+        season = read_document(self._folder, path, Season, entry.document)
+        entry.check_subject(season.digest)
+        if self.row(season.digest) is not None or self.row(season.id) is not None:
+            raise entry.contradiction("announces a season twice")
+        values = {
+            "digest": entry.subject,
+            "sequence": entry.sequence,
+            "announced": entry.time,
+            "document": entry.document,
+            "id": season.id,
+            "title": season.title,
+            "track": season.track,
+            "opens": season.opens,
+            "closes": season.closes,
+            "instances": sum(1 for _ in season.hidden),
+        }
+        self._insert("season", values)
+
+    def _entry(self, entry: LogEntry) -> None:
+        season, signed, path = self._signed(
+            entry,
+            "sealed-offline",
+            SignedEntry,
+            lambda row: self._at(row.digest).entry(entry.subject),
+        )
+        answers = signed.entry.answers
+        if len(answers) != season.instances:
+            raise entry.contradiction("names more or fewer answers than there are instances")
+        given = [answer for answer in answers if answer is not None]
+        self._add(entry, season, signed, path, policies=len(given), played=0)
+        for answer in given:
+            key = signed.entry.submitter.key
+            name_object(self._connection, answer.sha256, answer.size, key, entry.time)
+            self._connection.execute(
+                "INSERT OR IGNORE INTO answer VALUES (?, ?)", (answer.sha256, entry.subject)
+            )
+
+    def _ticket(self, entry: LogEntry) -> None:
+        season, signed, path = self._signed(
+            entry,
+            "sealed-online",
+            SignedTicketRequest,
+            lambda row: self._at(row.digest).request(self.next_number(row.digest)),
+        )
+        played = played_bytes(self.read(season))
+        self._add(entry, season, signed, path, policies=season.instances, played=played)
+
+    def _signed(
+        self,
+        entry: LogEntry,
+        track: SealedTrack,
+        kind: type[_Signed],
+        path_of: Callable[[SeasonRow], Path],
+    ) -> tuple[SeasonRow, _Signed, Path]:
+        """The document that an entry names, and its season, which the entry does not name."""
+        fault: TamperedError | None = None
+        for row in self.rows():
+            path = path_of(row)
+            if row.track != track or not path.exists():
+                continue
+            try:
+                signed = read_document(self._folder, path, kind, entry.document)
+            except TamperedError as error:
+                fault = fault or error
+                continue
+            entry.check_subject(signed.id)
+            if signed.content.season != row.digest or row.reveal is not None:
+                raise entry.contradiction(
+                    "names a document of another season, or of a revealed one"
+                )
+            return row, signed, path
+        raise fault or entry.contradiction("its document is missing from every season")
+
+    def _add(
+        self,
+        entry: LogEntry,
+        season: SeasonRow,
+        signed: SignedSealed,
+        path: Path,
+        *,
+        policies: int,
+        played: int,
+    ) -> None:
+        if self.entrant(entry.subject) is not None:
+            raise entry.contradiction("receives an entry or ticket twice")
+        method, submitter = signed.content.method, signed.content.submitter
+        values = {
+            "id": entry.subject,
+            "season": season.digest,
+            "number": self.next_number(season.digest),
+            "sequence": entry.sequence,
+            "received": entry.time,
+            "created": signed.content.created,
+            "document": entry.document,
+            "method": method.name,
+            "version": method.version,
+            "family": method.family,
+            "knowledge": method.knowledge,
+            "submitter": submitter.name,
+            "key": submitter.key,
+            "code_link": signed.content.code,
+            "runs": season.instances,
+            "policies": policies,
+            "bytes": path.stat().st_size,
+            "played_bytes": played,
+        }
+        self._insert("sealed", values)
+
+    def _result(self, entry: LogEntry) -> None:
+        row = self.entrant(entry.subject)
+        season = None if row is None else self.row(row.season)
+        if row is None or season is None or row.result is not None:
+            raise entry.contradiction("the entry or ticket is unknown, or has a result")
+        online = season.track == "sealed-online"
+        if online != (entry.event == "ended") or not (online or season.reveal):
+            raise entry.contradiction("of another track, or before the reveal")
+        path = self._at(row.season).result(entry.subject)
+        result = read_document(self._folder, path, SealedResult, entry.document)
+        entry.check_subject(result.subject)
+        sizes = len(result.runs), len(result.stepping)
+        if result.season != row.season or sizes != (season.instances, season.instances * online):
+            raise entry.contradiction("names a result of another season")
+        self._connection.execute(
+            "UPDATE sealed SET result = ?, finished = ?, policies = ?, steps = ?, oracle_like = ?, "
+            "scores = ?, bytes = bytes + ?, played_bytes = ? WHERE id = ?",
+            (
+                *(entry.document, entry.time),
+                sum(run.artefact is not None for run in result.runs),
+                sum(each.steps for each in result.stepping),
+                *(result.oracle_like, scores_text(result.scores), path.stat().st_size),
+                played_bytes(self.read(season), result) if online else 0,
+                entry.subject,
+            ),
+        )
+
+    def _revealed(self, entry: LogEntry) -> None:
+        row = self.row(entry.subject)
+        if row is None or row.digest != entry.subject or row.reveal is not None:
+            raise entry.contradiction("the season is unknown or already revealed")
+        path = self._at(row.digest).reveal
+        reveal = read_document(self._folder, path, Reveal, entry.document)
+        entry.check_subject(reveal.season)
+        if not self.read(row).is_committed_to(Master(bytes.fromhex(reveal.master))):
+            raise entry.contradiction("the master does not match the season's commitment")
+        self._connection.execute(
+            "UPDATE season SET reveal = ?, revealed = ? WHERE digest = ?",
+            (entry.document, entry.time, entry.subject),
+        )
+
+    def _at(self, digest: str) -> SeasonFolder:
+        return self._folder.season(digest)
+
+    def _all(self, statement: str, *values: Any) -> list[tuple[Any, ...]]:
+        return self._connection.execute(statement, values).fetchall()
+
+    def _insert(self, table: str, values: dict[str, Any]) -> None:
+        self._connection.execute(
+            f"INSERT INTO {table} ({', '.join(values)}) VALUES (:{', :'.join(values)})", values
+        )
+
+
+_SEASONS = (
+    "SELECT digest, sequence, announced, document, id, title, track, opens, closes, instances, "
+    "reveal, revealed FROM season"
+)
+_OF_ENTRANT = (
+    *("id", "sequence", "received", "method", "version", "family", "knowledge", "submitter", "key"),
+    *("code_link", "runs", "steps", "policies", "oracle_like", "scores"),
+)
+_SEALED = (
+    f"SELECT season, number, created, document, result, finished, {', '.join(_OF_ENTRANT)} "
+    "FROM sealed"
+)
+
+
+def _sealed(row: tuple[Any, ...]) -> SealedRow:
+    season, number, created, document, result, finished, *rest = row
+    values = dict(zip(_OF_ENTRANT, rest, strict=True))
+    scores = values.pop("scores")
+    entrant = EntryRow(
+        **{**values, "oracle_like": bool(values["oracle_like"])},
+        status="waiting" if scores is None else "scored",
+        code="",
+        enough_runs=False,
+        reference=False,
+        scores=None if scores is None else scores_of(scores),
+    )
+    return SealedRow(season, number, created, document, result, finished, entrant)

@@ -1,0 +1,291 @@
+"""`Season`: a competition on tasks that nobody but the organiser knows until it is revealed.
+
+    commitment = SHA-256("sme-seal/1" ‖ master ‖ canonical JSON of the terms)
+
+The master is a secret of 32 bytes, from which `documents.master` derives every hidden task. The
+commitment fixes it, and with it the tasks, before anyone enters; `Reveal` publishes it at the end.
+
+    sealed-offline   entrants learn from published data sets, and act in challenge states
+    sealed-online    each ticket has hidden instances of its own, which the board's server steps
+"""
+
+from __future__ import annotations
+
+import datetime
+import hmac
+from collections.abc import Iterator
+from typing import Annotated, Literal, NamedTuple, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, field_validator, model_validator
+
+from leaderboard.documents.submission import UtcTime
+from leaderboard.errors import Rejection
+from leaderboard.seasons.master import Master
+from sme_registry.errors import ActionError, WireError
+from sme_registry.seasons.wire import unpack_table
+from sme_registry.spec import EvaluationProtocol, Setting
+from sme_registry.spec.document import (
+    Digest,
+    Document,
+    Integer,
+    Name,
+    Real,
+    SchemaVersion,
+    StrictModel,
+    matching,
+)
+
+LEAST_COMPLEXITY = 5
+MAX_INSTANCES = 1000
+"""Of all classes: a ticket has a run on each."""
+
+MAX_OFFLINE_INSTANCES = 400
+"""Of a sealed-offline season: an entry lists an answer of each, in at most 64 KiB."""
+
+MAX_LANES = 256
+"""Of an instance that the server steps: the most copies that one request advances."""
+
+SealedTrack = Literal["sealed-offline", "sealed-online"]
+
+Float32 = npt.NDArray[np.float32]
+
+
+class SealedData(StrictModel):
+    """The data set of each instance of a class, of a sealed-offline season.
+
+    Attributes:
+      nu: ν of the behaviour policy, a mixture of the optimum and a random network. With 0 the
+        data set's actions would be the optimum.
+      transitions: number of rows.
+    """
+
+    nu: Annotated[Real, Field(gt=0, le=1)]
+    transitions: Annotated[Integer, Field(ge=1, le=10**7)]
+
+
+class SeasonClass(Document):
+    """One kind of task. Its setting is public, the seeds of its instances are not.
+
+    Attributes:
+      setting: all of a spec but its seed.
+      instances: number of hidden tasks.
+      budget: steps that an entrant takes on each instance, over all lanes; null offline.
+      data: the data set of each instance; null online.
+    """
+
+    name: Name
+    setting: Setting
+    instances: Annotated[Integer, Field(ge=1, le=MAX_INSTANCES)]
+    budget: Annotated[Integer | None, Field(ge=1, le=10**8)] = None
+    data: SealedData | None = None
+
+    @field_validator("setting")
+    @classmethod
+    def _cannot_be_solved_by_hand(cls, setting: Setting) -> Setting:
+        if setting.complexity < LEAST_COMPLEXITY:
+            raise ValueError(
+                f"complexity={setting.complexity}: must be at least {LEAST_COMPLEXITY} in a sealed "
+                "season: three hundred random steps determine the optimum of a single layer "
+                "without any learning. Use a deeper setting."
+            )
+        if setting.team is not None or not setting.is_plain:
+            fields = ("team", "safety", "observation")
+            field = next(name for name in fields if getattr(setting, name) is not None)
+            raise ValueError(
+                f"{field}: must be null in a sealed season, whose scores are the normalised regret "
+                "of one agent. Leave it out."
+            )
+        return setting
+
+
+class Digests(StrictModel):
+    """What is published of one instance of a sealed-offline season, by the digests of its arrays.
+
+    Attributes:
+      class_name, instance: the class, and the number of the instance in it, from 0.
+      data: of the names, types, shapes and bytes of the arrays in the data set.
+      challenge: SHA-256 of the challenge states' .npy file.
+    """
+
+    class_name: Name
+    instance: Annotated[Integer, Field(ge=0)]
+    data: Digest
+    challenge: Digest
+
+
+class Hidden(NamedTuple):
+    """One hidden instance: its class and its number in it, from 0."""
+
+    member: SeasonClass
+    instance: int
+
+
+class Terms(Document):
+    """All that is public of a season, but for its commitment.
+
+    Attributes:
+      id: the season's name, in paths and addresses.
+      title: for its page.
+      opens, closes: entries count, and tickets start, from the first moment up to the second.
+      protocol_name, protocol: the regions and numbers of the challenge states; its seed is 0, as
+        the seed of each instance's states is secret.
+      ticket_hours: time from the start of a ticket to its deadline; null offline.
+      tickets, tickets_per_key: the most tickets of the season, and of one key; null offline.
+      published: of each instance in order; empty online.
+      versions: of the organiser's packages, by which data sets are rounded.
+    """
+
+    schema_version: SchemaVersion = 1
+    id: Name
+    title: Annotated[str, Field(min_length=1, max_length=80)]
+    track: SealedTrack
+    classes: Annotated[tuple[SeasonClass, ...], Field(min_length=1, max_length=64, strict=False)]
+    opens: UtcTime
+    closes: UtcTime
+    protocol_name: Name
+    protocol: EvaluationProtocol
+    ticket_hours: Annotated[Integer | None, Field(ge=1, le=8760)] = None
+    tickets: Annotated[Integer | None, Field(ge=1, le=100_000)] = None
+    tickets_per_key: Annotated[Integer | None, Field(ge=1, le=1000)] = None
+    published: Annotated[tuple[Digests, ...], Field(strict=False, max_length=MAX_INSTANCES)] = ()
+    versions: Annotated[dict[str, str], Field(default_factory=dict, max_length=16)]
+
+    @model_validator(mode="after")
+    def _classes_fit(self) -> Self:
+        names = [member.name for member in self.classes]
+        if len(set(names)) < len(names):
+            raise ValueError(f"classes={names}: must have different names. Rename one.")
+        count = sum(member.instances for member in self.classes)
+        online = self.track == "sealed-online"
+        most = MAX_INSTANCES if online else MAX_OFFLINE_INSTANCES
+        if count > most:
+            raise ValueError(
+                f"classes: have {count:,} instances: must be at most {most:,} together on the "
+                f"track {self.track}. Use fewer."
+            )
+        for member in self.classes:
+            for field, wanted in (("budget", online), ("data", not online)):
+                if (getattr(member, field) is not None) != wanted:
+                    raise ValueError(
+                        f"classes.{member.name}.{field}: must be "
+                        f"{'given' if wanted else 'null'} on the track {self.track}."
+                    )
+        return self
+
+    @model_validator(mode="after")
+    def _track_fits(self) -> Self:
+        online = self.track == "sealed-online"
+        for field in ("ticket_hours", "tickets", "tickets_per_key"):
+            if (getattr(self, field) is not None) != online:
+                raise ValueError(
+                    f"{field}: must be {'given' if online else 'null'} on the track {self.track}."
+                )
+        listed = [(each.class_name, each.instance) for each in self.published]
+        hidden = [] if online else [(each.member.name, each.instance) for each in self.hidden]
+        if listed != hidden:
+            raise ValueError(
+                "published: must list every instance in the order of the classes offline, and be "
+                "empty online. Create the season with `sme-leaderboard season new`."
+            )
+        return self
+
+    @field_validator("opens", "closes")
+    @classmethod
+    def _is_a_time(cls, value: str) -> str:
+        try:
+            datetime.datetime.fromisoformat(value)
+        except ValueError as error:
+            raise ValueError(f"{value}: is no date ({error}). Correct it.") from None
+        return value
+
+    @model_validator(mode="after")
+    def _times_are_ordered(self) -> Self:
+        if self.opens >= self.closes:  # as text: the form is fixed
+            raise ValueError(f"closes={self.closes}: must be after opens={self.opens}.")
+        return self
+
+    @field_validator("protocol")
+    @classmethod
+    def _states_are_secret(cls, protocol: EvaluationProtocol) -> EvaluationProtocol:
+        if protocol.seed:
+            raise ValueError(
+                f"seed={protocol.seed}: must be 0 in a season, which draws the challenge states of "
+                "each instance from its secret. Leave it out."
+            )
+        return protocol
+
+    @property
+    def hidden(self) -> Iterator[Hidden]:
+        """Every hidden instance, class by class."""
+        for member in self.classes:
+            for instance in range(member.instances):
+                yield Hidden(member, instance)
+
+    def commit(self, master: Master) -> Season:
+        """The season of these terms and this master."""
+        return Season.from_dict(
+            {**self.to_dict(), "commitment": master.commitment_to(self.canonical_json())}
+        )
+
+
+class Season(Terms):
+    """`season.json`.
+
+    Attributes:
+      commitment: to the master and the terms; see the head of this module.
+    """
+
+    commitment: Digest
+
+    @property
+    def terms(self) -> Terms:
+        """The season without its commitment."""
+        fields = self.to_dict()
+        del fields["commitment"]
+        return Terms.from_dict(fields)
+
+    def is_committed_to(self, master: Master) -> bool:
+        """Whether the commitment is to this master and these terms."""
+        return hmac.compare_digest(self.commitment, self.terms.commit(master).commitment)
+
+
+class Reveal(Document):
+    """`reveal.json`: the master, published after the season's close.
+
+    Attributes:
+      season: digest of the season.
+      master: 64 hex digits.
+    """
+
+    schema_version: SchemaVersion = 1
+    season: Digest
+    master: Annotated[str, matching(r"^[0-9a-f]{64}$", "a master secret, 64 hex digits")]
+
+
+def rows_of(protocol: EvaluationProtocol) -> int:
+    """The number of challenge states of an instance: of each region as many."""
+    return protocol.states_per_region * len(protocol.edges)
+
+
+def read_answers(data: bytes, setting: Setting, protocol: EvaluationProtocol) -> Float32:
+    """The answers in the bytes of a file.
+
+    Args:
+      data: the file.
+      setting: of the hidden task.
+      protocol: of its season.
+
+    Returns:
+      `[regions · n, A]` finite actions, which are not clipped yet.
+
+    Raises:
+      Rejection: `answer_shape` or `answer_not_finite`.
+    """
+    try:
+        return unpack_table(data, setting.action_dim, rows_of(protocol))
+    except WireError as error:
+        raise Rejection("answer_shape", str(error)) from None
+    except ActionError as error:
+        raise Rejection("answer_not_finite", str(error)) from None

@@ -1,0 +1,330 @@
+"""`SealedStore`: the seasons of a board's folder, each change under the board's transaction.
+
+What may change when follows from the board's clock. A clock set back reopens nothing: the time is
+never before that of the log's last entry.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from leaderboard.documents.board import SeasonFolder
+from leaderboard.documents.result import SealedResult
+from leaderboard.documents.submission import now
+from leaderboard.errors import BoardError, Rejection
+from leaderboard.seasons.entry import SignedEntry, SignedTicketRequest
+from leaderboard.seasons.events import SealedRow, SeasonRow
+from leaderboard.seasons.master import Master
+from leaderboard.seasons.season import Reveal, SealedTrack, Season
+from leaderboard.store.database import Database
+from leaderboard.store.files import read_document
+
+
+class SealedStore(Database):
+    """The seasons of a board."""
+
+    def announce(self, season: Season) -> bool:
+        """Publish a season and its commitment.
+
+        Returns:
+          False if the board already has it.
+
+        Raises:
+          BoardError: its id is taken, it is over, or it cannot be written.
+        """
+        with self.transaction() as index:
+            row = index.seasons.row(season.id)
+            if row is not None and row.digest == season.digest:
+                return False
+            if row is not None:
+                raise BoardError(
+                    f"id={season.id}: another season of this board has it. Choose another id."
+                )
+            if season.closes <= self.time:
+                raise BoardError(
+                    f"closes={season.closes}: must be after the board's time, {self.time}. "
+                    "Choose a later one."
+                )
+            self.record("season", season.digest, season, self.season_folder(season.digest).season)
+        return True
+
+    def seasons(self) -> list[SeasonRow]:
+        """All seasons, in the order in which they were announced."""
+        with self.reading() as index:
+            return index.seasons.rows()
+
+    def season_row(self, name: str) -> SeasonRow:
+        """The season of this id or digest.
+
+        Raises:
+          Rejection: `season_unknown`.
+        """
+        with self.reading() as index:
+            row = index.seasons.row(name)
+        if row is None:
+            raise Rejection(
+                "season_unknown",
+                f"season={name[:80]}: is not on this board. `sme-leaderboard season show` lists "
+                "its seasons.",
+            )
+        return row
+
+    def season(self, name: str) -> Season:
+        """The document of the season of this id or digest.
+
+        Raises:
+          Rejection: `season_unknown`.
+          TamperedError: its file differs from the logged one.
+        """
+        row = self.season_row(name)
+        with self.reading() as index:
+            return index.seasons.read(row)
+
+    def season_folder(self, digest: str) -> SeasonFolder:
+        """The folder of a season, by its digest."""
+        return self.folder.season(digest)
+
+    def enter(self, signed: SignedEntry) -> bool:
+        """Add an entry, which `intake` has checked, to an open season.
+
+        Returns:
+          False if the board already has it.
+
+        Raises:
+          Rejection: `season_unknown`, `season_track`, `season_not_open`, `season_closed` or
+            `season_revealed`.
+          BoardError: it cannot be written.
+        """
+        with self.transaction() as index:
+            if index.seasons.entrant(signed.id) is not None:
+                return False
+            time = self.time
+            row = self.open_season(signed.entry.season, "sealed-offline", time)
+            path = self.season_folder(row.digest).entry(signed.id)
+            self.record("entry", signed.id, signed, path, time)
+        return True
+
+    def start_ticket(self, signed: SignedTicketRequest) -> int:
+        """Start a ticket in an open season; the same request starts no second one.
+
+        Returns:
+          Its number: 1 for the season's first, in the log's order.
+
+        Raises:
+          Rejection: `season_unknown`, `season_track`, `season_not_open`, `season_closed`,
+            `season_revealed`, or `ticket_limit` of the submitter's key.
+          BoardError: it cannot be written.
+        """
+        with self.transaction() as index:
+            known = index.seasons.entrant(signed.id)
+            if known is not None:
+                return known.number
+            time = self.time
+            row = self.open_season(signed.ticket.season, "sealed-online", time)
+            season, key = index.seasons.read(row), signed.ticket.submitter.key
+            own = sum(each.entrant.key == key for each in index.seasons.entrants(row.digest))
+            assert season.tickets is not None  # the track is online
+            assert season.tickets_per_key is not None
+            if own >= season.tickets_per_key:
+                raise Rejection(
+                    "ticket_limit",
+                    f"key={key[:16]}…: has started {own} of {season.tickets_per_key} tickets of "
+                    f"the season {row.id}. Every one of them counts.",
+                )
+            number = index.seasons.next_number(row.digest)
+            if number > season.tickets:
+                raise Rejection(
+                    "ticket_limit",
+                    f"season={row.id}: all of its {season.tickets} tickets were started. Ask the "
+                    "board's owner for another season.",
+                )
+            path = self.season_folder(row.digest).request(number)
+            self.record("ticket", signed.id, signed, path, time)
+        return number
+
+    def end_ticket(self, season: str, number: int, result: SealedResult) -> bool:
+        """Log the result of a ticket.
+
+        Args:
+          season: digest of the season.
+          number: the ticket's.
+          result: of this season and ticket.
+
+        Returns:
+          False if it has one.
+
+        Raises:
+          Rejection: `ticket_unknown`.
+          BoardError: it cannot be written.
+        """
+        with self.transaction():
+            row = self.ticket(season, number)
+            return self._finish("ended", row, result)
+
+    def rank(self, result: SealedResult) -> bool:
+        """Log the result of an offline entry, after the reveal; False if it has one.
+
+        Raises:
+          Rejection: `season_not_closed` before the reveal.
+          BoardError: no such entry exists, or the result cannot be written.
+        """
+        with self.transaction() as index:
+            row = index.seasons.entrant(result.subject)
+            if row is None:
+                raise BoardError(f"entry={result.subject}: is not on this board.")
+            self.revealed_master(row.season)
+            return self._finish("ranked", row, result)
+
+    def reveal(self, reveal: Reveal) -> bool:
+        """Publish the master of a season that is over.
+
+        Returns:
+          False if the same one was published.
+
+        Raises:
+          Rejection: `season_unknown`, `season_not_closed` while entries or tickets are accepted or
+            a ticket runs, also of another season with this master, or `reveal_mismatch`.
+          BoardError: it cannot be written.
+        """
+        with self.transaction() as index:
+            time, row = self.time, self.season_row(reveal.season)
+            master = Master(bytes.fromhex(reveal.master))
+            if not index.seasons.read(row).is_committed_to(master):
+                raise Rejection(
+                    "reveal_mismatch",
+                    f"master: does not match the commitment of the season {row.id}. Give the file "
+                    "that `sme-leaderboard season new` wrote.",
+                )
+            if row.reveal is not None:
+                return False
+            self._refuse_not_over(row, time)
+            for other in index.seasons.rows():  # their tasks follow from the same secret
+                if other.reveal is None and index.seasons.read(other).is_committed_to(master):
+                    self._refuse_not_over(other, time)
+            path = self.season_folder(row.digest).reveal
+            self.record("revealed", row.digest, reveal, path, time)
+        return True
+
+    def _refuse_not_over(self, row: SeasonRow, time: str) -> None:
+        if time < row.closes:
+            raise Rejection(
+                "season_not_closed",
+                f"season={row.id}: closes at {row.closes}, and it is {time}. Its tasks stay secret "
+                "until then.",
+            )
+        running = [each.number for each in self.entrants(row.digest) if each.result is None]
+        if row.track == "sealed-online" and running:
+            raise Rejection(
+                "season_not_closed",
+                f"season={row.id}: {len(running)} tickets run, the first of them number "
+                f"{running[0]}. Serve the board until their deadlines have passed.",
+            )
+
+    def revealed_master(self, name: str) -> Master:
+        """The published master of the season of this id or digest.
+
+        Raises:
+          Rejection: `season_unknown`, or `season_not_closed` before the reveal.
+          TamperedError: its file differs from the logged one.
+        """
+        row = self.season_row(name)
+        if row.reveal is None:
+            raise Rejection(
+                "season_not_closed",
+                f"season={row.id}: is not revealed yet. `sme-leaderboard season reveal` publishes "
+                "its master after the close.",
+            )
+        path = self.season_folder(row.digest).reveal
+        reveal = read_document(self.folder, path, Reveal, row.reveal)
+        return Master(bytes.fromhex(reveal.master))
+
+    def entrants(self, season: str) -> list[SealedRow]:
+        """The entries or tickets of a season, by its digest, in the log's order."""
+        with self.reading() as index:
+            return index.seasons.entrants(season)
+
+    def entrant(self, id: str) -> SealedRow | None:
+        """The entry or ticket of this id; None if there is none."""
+        with self.reading() as index:
+            return index.seasons.entrant(id)
+
+    def ticket(self, season: str, number: int) -> SealedRow:
+        """A ticket by its season's digest and its number.
+
+        Raises:
+          Rejection: `ticket_unknown`.
+        """
+        with self.reading() as index:
+            row = index.seasons.ticket(season, number)
+        if row is None:
+            raise Rejection(
+                "ticket_unknown",
+                f"ticket={number}: the season has no ticket of this number. Start one with "
+                "`sme-leaderboard ticket`.",
+            )
+        return row
+
+    def entry_of(self, row: SealedRow) -> SignedEntry:
+        """An entry as it was signed; raises `TamperedError` if its file was altered."""
+        path = self.season_folder(row.season).entry(row.entrant.id)
+        return read_document(self.folder, path, SignedEntry, row.document)
+
+    def request_of(self, row: SealedRow) -> SignedTicketRequest:
+        """A ticket's request as it was signed; raises `TamperedError` if its file was altered."""
+        path = self.season_folder(row.season).request(row.number)
+        return read_document(self.folder, path, SignedTicketRequest, row.document)
+
+    def sealed_result(self, row: SealedRow) -> SealedResult | None:
+        """The result of an entry or ticket; None if it has none.
+
+        Raises:
+          TamperedError: its file differs from the logged one.
+        """
+        if row.result is None:
+            return None
+        path = self.season_folder(row.season).result(row.entrant.id)
+        return read_document(self.folder, path, SealedResult, row.result)
+
+    def open_season(self, name: str, track: SealedTrack, time: str | None = None) -> SeasonRow:
+        """The season of this id or digest, which must be of a track, and open at a time, or now.
+
+        Raises:
+          Rejection: `season_unknown`, `season_track`, `season_not_open`, `season_closed` or
+            `season_revealed`.
+        """
+        row, time = self.season_row(name), time or self.time
+        if row.track != track:
+            raise Rejection(
+                "season_track",
+                f"season={row.id}: its track is {row.track}: must be {track}. Offline seasons take "
+                "entries, online ones start tickets.",
+            )
+        if row.reveal is not None:
+            raise Rejection("season_revealed", f"season={row.id}: its tasks are public now.")
+        if time < row.opens:
+            raise Rejection(
+                "season_not_open",
+                f"season={row.id}: opens at {row.opens}, and it is {time}. Come back then.",
+            )
+        if time >= row.closes:
+            raise Rejection("season_closed", f"season={row.id}: closed at {row.closes}.")
+        return row
+
+    @property
+    def time(self) -> str:
+        """The board's time: never before that of the log's last entry."""
+        with self.reading() as index:
+            return max(now(), index.head.time)
+
+    def _finish(
+        self, event: Literal["ended", "ranked"], row: SealedRow, result: SealedResult
+    ) -> bool:
+        """Log a result; False if there is one."""
+        if (result.season, result.subject) != (row.season, row.entrant.id):
+            raise ValueError(f"result of {result.subject} does not match {row.entrant.id}")
+        if row.result is not None:
+            return False
+        self.record(
+            event, row.entrant.id, result, self.season_folder(row.season).result(row.entrant.id)
+        )
+        return True

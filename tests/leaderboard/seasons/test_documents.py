@@ -1,0 +1,164 @@
+"""Seasons: terms that fit their track, a commitment to the secret, secrets that do not collide."""
+
+import hashlib
+import itertools
+import stat
+from typing import get_args
+
+import pytest
+import rfc8785
+
+from leaderboard.errors import BoardError
+from leaderboard.seasons.master import Master, Place, Purpose
+from leaderboard.seasons.season import Reveal, Season, Terms
+from sme_registry import SMESpec
+from sme_registry.errors import SpecError
+
+MASTER = Master(bytes(range(32)))
+PURPOSES = get_args(Purpose)
+SETTING = {"state_dim": 3, "action_dim": 2, "complexity": 5}
+
+
+def online(**fields):
+    return {
+        "id": "autumn",
+        "title": "Autumn",
+        "track": "sealed-online",
+        "classes": [{"name": "deep", "setting": SETTING, "instances": 2, "budget": 1000}],
+        "opens": "2026-01-01T00:00:00Z",
+        "closes": "2026-02-01T00:00:00Z",
+        "protocol_name": "quick-v1",
+        "protocol": {},
+        "ticket_hours": 24,
+        "tickets": 100,
+        "tickets_per_key": 3,
+        **fields,
+    }
+
+
+def offline(**fields):
+    digests = {"data": "sha256:" + "1" * 64, "challenge": "sha256:" + "2" * 64}
+    data = {"nu": 0.5, "transitions": 100}
+    own = {
+        "track": "sealed-offline",
+        "ticket_hours": None,
+        "tickets": None,
+        "tickets_per_key": None,
+        "classes": [{"name": "deep", "setting": SETTING, "instances": 2, "data": data}],
+        "published": [{"class_name": "deep", "instance": i, **digests} for i in (0, 1)],
+    }
+    return online(**{**own, **fields})
+
+
+def test_a_season_round_trips_and_is_committed_to_its_master_and_to_every_term():
+    for fields in (online(), offline()):
+        season = Terms.from_dict(fields).commit(MASTER)
+        assert Season.from_dict(season.to_dict()) == season
+        assert season.is_committed_to(MASTER)
+        assert not season.is_committed_to(Master(bytes(32)))
+        later = Season.from_dict({**season.to_dict(), "closes": "2026-02-02T00:00:00Z"})
+        assert not later.is_committed_to(MASTER)
+        last = "1" if season.commitment[-1] == "0" else "0"
+        other = Season.from_dict({**season.to_dict(), "commitment": season.commitment[:-1] + last})
+        assert not other.is_committed_to(MASTER)
+
+
+@pytest.mark.parametrize("track", [online, offline])
+def test_the_commitment_is_the_documented_hash(track):
+    terms = Terms.from_dict(track(versions={"numpy": "2.0.0"}))
+    message = b"sme-seal/1" + MASTER.raw + rfc8785.dumps(terms.to_dict())
+    expected = "sha256:" + hashlib.sha256(message).hexdigest()
+    assert terms.commit(MASTER).commitment == expected
+    assert set(terms.to_dict()) == set(Terms.model_fields)
+
+
+def test_a_reveal_has_32_bytes():
+    season = Terms.from_dict(online()).commit(MASTER)
+    for master in ("", "0" * 63, "0" * 65, "G" * 64, "A" * 64):
+        with pytest.raises(SpecError, match="64 hex digits"):
+            Reveal.from_dict({"season": season.digest, "master": master})
+
+
+def test_every_purpose_and_place_has_a_secret_of_its_own():
+    places = [
+        Place(*parts)
+        for parts in itertools.product(
+            ("a", "b"), ("a", "ab"), (0, 1, 10), ("", "1", "b"), ("", "2", "b2")
+        )
+    ]
+    drawn = {MASTER.secret(purpose, place) for purpose in PURPOSES for place in places}
+    assert len(drawn) == len(PURPOSES) * len(places)
+    assert MASTER.secret("task", places[0]) != Master(bytes(32)).secret("task", places[0])
+
+
+def test_a_seed_has_256_bits_and_makes_a_spec():
+    places = [Place("autumn", "deep", i) for i in range(64)]
+    for purpose in ("task", "data"):  # a seed of hidden data could be tried out, too
+        seeds = [MASTER.seed(place, purpose) for place in places]
+        assert max(int(seed, 16).bit_length() for seed in seeds) > 250
+    assert seeds[0] != MASTER.seed(places[0])
+    seed = MASTER.seed(places[0])
+    assert SMESpec.from_dict({**SETTING, "seed": seed}).seed == seed
+    assert 0 <= MASTER.states_seed(places[0]) < 2**53
+
+
+def test_the_seed_of_published_states_has_no_bits_of_another_secret():
+    place = Place("autumn", "deep", 0)
+    first = {each: int.from_bytes(MASTER.secret(each, place)[:8]) >> 11 for each in PURPOSES}
+    assert {each for each in PURPOSES if first[each] == MASTER.states_seed(place)} == {"states"}
+
+
+def test_a_master_is_written_for_its_owner_only_and_never_shown(tmp_path):
+    path = MASTER.write(tmp_path / "new" / "season.master")
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert Master.read(path) == MASTER
+    assert MASTER.raw.hex() not in repr(MASTER)
+    assert repr(MASTER.raw) not in repr(MASTER)
+    with pytest.raises(BoardError, match="already exists"):
+        MASTER.write(path)
+    assert Master.read(path) == MASTER
+
+
+def test_a_file_without_a_master_is_named(tmp_path):
+    path = tmp_path / "season.master"
+    for content in ("", "00", "z" * 64, "0" * 66):
+        path.write_text(content)
+        with pytest.raises(BoardError, match=r"season\.master: no master secret"):
+            Master.read(path)
+    with pytest.raises(BoardError, match="no master secret"):
+        Master.read(tmp_path / "missing")
+
+
+def online_class(**fields):
+    """A season online whose class has other fields."""
+    return online(classes=[{**online()["classes"][0], **fields}])
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        (online_class(setting={"complexity": 4}), "at least 5"),
+        (
+            online_class(setting={"complexity": 5, "safety": {"tightness": 0.2}}),
+            "safety: must be null",
+        ),
+        (online(classes=online()["classes"] * 2), "different names"),
+        (online_class(instances=1001), "1000"),
+        (online_class(budget=None), r"budget: must be given"),
+        (online_class(data={"nu": 0.5, "transitions": 9}), r"deep\.data: must be null"),
+        # A data set of the optimum itself.
+        (
+            offline(classes=[offline()["classes"][0] | {"data": {"nu": 0, "transitions": 100}}]),
+            r"data\.nu",
+        ),
+        (online(ticket_hours=None), "ticket_hours: must be given"),
+        (offline() | {"tickets": 3}, "tickets: must be null"),
+        (offline() | {"published": offline()["published"][::-1]}, "published: must list every"),
+        (online(closes="2026-01-01T00:00:00Z"), "must be after opens"),
+        (online(opens="2025-02-30T00:00:00Z"), "2025-02-30T00:00:00Z: is no date"),
+        (online(protocol={"seed": 1}), "seed=1: must be 0"),
+    ],
+)
+def test_terms_that_do_not_fit_are_refused(fields, message):
+    with pytest.raises(SpecError, match=message):
+        Terms.from_dict(fields)

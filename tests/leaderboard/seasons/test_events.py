@@ -1,0 +1,298 @@
+"""Seasons on a board: the order of things, what the clock forbids, and an index that follows."""
+
+import pytest
+
+from leaderboard.documents.keys import SigningKey
+from leaderboard.errors import BoardError, Rejection, TamperedError
+from leaderboard.scoring.verify import verify
+from leaderboard.seasons.master import Master
+from leaderboard.seasons.season import Reveal
+from leaderboard.store import Store
+from leaderboard.store.files import write_document
+from tests.leaderboard.conftest import put_submission, tiny_board
+from tests.leaderboard.seasons.sealing import (
+    AFTERWARDS,
+    MASTER,
+    failed_result,
+    moment,
+    move_clock,
+    signed_entry,
+    signed_request,
+    tiny_season,
+)
+from tests.leaderboard.store.crashing import crashes_before
+
+ONLINE, OFFLINE = "sealed-online", "sealed-offline"
+ANSWER = {"sha256": "sha256:" + "a" * 64, "size": 512}
+
+
+def reveal(season, master=MASTER):
+    return Reveal(season=season.digest, master=master.raw.hex())
+
+
+def play(store, key, move):
+    """Both kinds of season, from their announcement to their results."""
+    offline, online = tiny_season(OFFLINE), tiny_season(ONLINE)
+    entry = signed_entry(store, offline, key, [ANSWER, None])
+    request = signed_request(store, online, key)
+    put_submission(store, key)
+    assert store.announce(offline)
+    assert store.announce(online)
+    assert store.enter(entry)
+    assert store.start_ticket(request) == 1
+    assert store.end_ticket(online.digest, 1, failed_result(online, request.id))
+    move()
+    for season in (offline, online):
+        assert store.reveal(reveal(season))
+    assert store.rank(failed_result(offline, entry.id))
+    return offline, online
+
+
+def derived(store):
+    with store.reading() as index:
+        return list(index.derived_rows())
+
+
+def test_a_season_is_played_from_its_announcement_to_its_results_and_reindexed(store, key, later):
+    offline, online = play(store, key, later)
+    assert [row.id for row in store.seasons()] == [OFFLINE, ONLINE]
+    assert store.season(OFFLINE) == store.season(offline.digest) == offline
+    events = [entry.event for entry in store.log()]
+    assert events == [
+        *("opened", "received", "season", "season", "entry", "ticket", "ended"),
+        *("revealed", "revealed", "ranked"),
+    ]
+    for season in (offline, online):
+        [row] = store.entrants(season.digest)
+        assert row.number == 1
+        assert row.entrant.status == "scored"
+        assert row.entrant.scores is not None
+        assert row.entrant.scores.wd_regret.value == 1.0
+        assert store.sealed_result(row) == failed_result(season, row.entrant.id)
+        assert store.revealed_master(season.id) == MASTER
+    assert store.entry_of(store.entrants(offline.digest)[0]).is_valid
+    assert store.request_of(store.ticket(online.digest, 1)).is_valid
+    grown = derived(store)
+    assert {row[0] for row in grown} >= {"season", "sealed", "answer"}
+    store.reindex()
+    assert derived(store) == grown
+    with Store.open(store.folder.path, read_only=True) as reader:
+        assert derived(reader) == grown
+    with pytest.raises(TamperedError, match="objects/aa"):
+        verify(store.folder.path)  # an entry names an answer that the board lost
+
+
+def test_nothing_in_the_index_or_the_log_is_secret_before_the_reveal(store, key):
+    season = tiny_season(ONLINE)
+    store.announce(season)
+    store.start_ticket(signed_request(store, season, key))
+    secrets = {MASTER.raw.hex(), repr(MASTER.raw)}
+    with store.reading() as index:
+        text = "\n".join(index.connection.iterdump())
+    files = [path.read_text() for path in store.folder.path.rglob("*.json")]
+    for content in (text, *files):
+        assert not any(secret in content for secret in secrets)
+
+
+def test_the_same_request_is_the_same_ticket_and_another_the_next(store, key):
+    season = tiny_season(ONLINE)
+    store.announce(season)
+    first = signed_request(store, season, key, 1)
+    assert [store.start_ticket(first) for _ in range(2)] == [1, 1]
+    assert store.start_ticket(signed_request(store, season, key, 2)) == 2
+    with pytest.raises(Rejection, match="ticket_limit"):
+        store.start_ticket(signed_request(store, season, key, 3))
+    other = SigningKey.generate()
+    assert store.start_ticket(signed_request(store, season, other, 3)) == 3
+    result = failed_result(season, first.id)
+    assert store.end_ticket(season.digest, 1, result)
+    assert not store.end_ticket(season.digest, 1, result)
+    with pytest.raises(ValueError, match="does not match"):
+        store.end_ticket(season.digest, 2, result)
+    with pytest.raises(Rejection, match="ticket_unknown"):
+        store.end_ticket(season.digest, 4, result)
+
+
+@pytest.mark.parametrize("track", [OFFLINE, ONLINE])
+def test_the_clock_decides_and_no_earlier_clock_reopens(store, key, track, monkeypatch):
+    def attempt(season):
+        if track == OFFLINE:
+            return store.enter(signed_entry(store, season, key, [None, None]))
+        return store.start_ticket(signed_request(store, season, key))
+
+    with pytest.raises(Rejection, match="season_unknown"):
+        attempt(tiny_season(track))
+    coming = tiny_season(track, id="coming", opens=moment(0.5))
+    other = tiny_season(ONLINE if track == OFFLINE else OFFLINE)
+    season = tiny_season(track)
+    for each in (coming, other, season):
+        store.announce(each)
+    with pytest.raises(Rejection, match="season_not_open"):
+        attempt(coming)
+    with pytest.raises(Rejection, match="season_track"):
+        attempt(other)
+    move_clock(monkeypatch)
+    with pytest.raises(Rejection, match="season_closed"):
+        attempt(season)
+    store.announce(tiny_season(track, id="later", opens=AFTERWARDS, closes=moment(9)))
+    monkeypatch.undo()
+    with pytest.raises(Rejection, match="season_closed"):
+        attempt(season)
+
+
+def test_a_reveal_follows_the_close_and_the_tickets_and_matches(store, key, later):
+    season = tiny_season(ONLINE)
+    store.announce(season)
+    request = signed_request(store, season, key)
+    store.start_ticket(request)
+    with pytest.raises(Rejection, match="reveal_mismatch"):
+        store.reveal(reveal(season, Master(bytes(32))))
+    with pytest.raises(Rejection, match="season_not_closed: season=sealed-online: closes at"):
+        store.reveal(reveal(season))
+    with pytest.raises(Rejection, match="season_not_closed"):
+        store.revealed_master(season.id)
+    later()
+    with pytest.raises(Rejection, match="1 tickets run, the first of them number 1"):
+        store.reveal(reveal(season))
+    store.end_ticket(season.digest, 1, failed_result(season, request.id))
+    assert store.reveal(reveal(season))
+    assert not store.reveal(reveal(season))
+    with pytest.raises(Rejection, match="season_revealed"):
+        store.start_ticket(signed_request(store, season, key, 2))
+
+
+def test_no_reveal_tells_the_tasks_of_another_season_that_is_not_over(store, key, later):
+    short, long = tiny_season(), tiny_season(id="long", closes=moment(9))
+    store.announce(short)
+    store.announce(long)
+    later()
+    with pytest.raises(Rejection, match="season_not_closed: season=long: closes at"):
+        store.reveal(reveal(short))
+    assert store.season_row(short.id).reveal is None
+
+
+def test_what_is_allowed_and_what_is_logged_are_of_the_same_moment(store, key, monkeypatch):
+    """The close may pass while an entry's file is being written."""
+    season = tiny_season()
+    store.announce(season)
+    monkeypatch.setattr("leaderboard.store.log.now", lambda: AFTERWARDS)
+    store.enter(signed_entry(store, season, key, [None, None]))
+    [row] = store.entrants(season.digest)
+    assert row.entrant.received < season.closes
+
+
+def test_files_of_seasons_that_no_entry_names_are_counted_or_named(store, key):
+    season, request = tiny_season(ONLINE), signed_request(store, tiny_season(ONLINE), key)
+    store.announce(season)
+    store.start_ticket(request)
+    report = verify(store.folder.path)
+    assert (report.seasons, report.sealed, report.unlogged) == (1, 1, 0)
+    folder = store.season_folder(season.digest)
+    journal = folder.ticket(1) / "0.journal"
+    journal.write_bytes(b"actions")
+    write_document(folder.request(2), request)
+    write_document(folder.result(request.id), failed_result(season, request.id))
+    write_document(folder.reveal, reveal(season))
+    assert verify(store.folder.path).unlogged == 3
+    offline = tiny_season(OFFLINE)
+    store.announce(offline)
+    entry = signed_entry(store, offline, key, [None, None])
+    store.enter(entry)
+    assert verify(store.folder.path).unlogged == 3
+    write_document(folder.entry(entry.id), entry)  # in another season's folder
+    assert verify(store.folder.path).unlogged == 4
+    stray = folder.path / "note.txt"
+    stray.write_text("")
+    with pytest.raises(TamperedError, match=r"note\.txt: is not a file of a board"):
+        verify(store.folder.path)
+
+
+def test_a_request_that_the_board_forged_or_that_was_signed_for_another_is_named(
+    store, tmp_path, key
+):
+    season = tiny_season(ONLINE)
+    signed = signed_request(store, season, key)
+    with tiny_board(tmp_path / "other") as other:
+        boards = {
+            store: signed.model_copy(update={"signature": "0" * 128}),
+            other: signed,
+        }
+        for board, request in boards.items():
+            board.announce(season)
+            board.start_ticket(request)
+            with pytest.raises(TamperedError, match="does not match the entrant's key"):
+                verify(board.folder.path)
+
+
+def test_an_id_is_one_seasons_and_a_season_ahead(store):
+    season = tiny_season()
+    assert store.announce(season)
+    assert not store.announce(season)
+    with pytest.raises(BoardError, match="another season of this board has it"):
+        store.announce(tiny_season(title="Another"))
+    with pytest.raises(BoardError, match="must be after the board's time"):
+        store.announce(tiny_season(id="past", opens=moment(-3), closes=moment(-2)))
+
+
+def test_an_altered_file_of_a_season_is_named(store, key, later):
+    play(store, key, later)
+    for name in ("season.json", "reveal.json", "entries/*", "tickets/*/*", "results/*"):
+        path = next(iter(sorted(store.folder.seasons.glob(f"*/{name}"))))
+        text = path.read_text()
+        path.write_text(text.replace(": ", ":  ", 1))
+        with pytest.raises(TamperedError) as error:
+            Store.open(store.folder.path, read_only=True)
+        assert error.value.where == path.relative_to(store.folder.path).as_posix()
+        path.write_text(text)
+    Store.open(store.folder.path, read_only=True).close()
+
+
+def test_an_entrants_name_is_nobody_elses_and_no_entry_is_ranked_before_the_reveal(store, key):
+    season, ada = tiny_season(), {"name": "Ada", "key": key.public}
+    store.announce(season)
+    entry = signed_entry(store, season, key, [None, None], submitter=ada)
+    store.enter(entry)
+    assert store.holder_of_name("ADA") == key.public
+    before = store.head
+    with pytest.raises(Rejection, match="season_not_closed"):  # nothing is ranked before the reveal
+        store.rank(failed_result(season, entry.id))
+    assert store.head == before
+
+
+def test_what_processes_that_die_write_of_seasons_is_logged_or_not(tmp_path, key, later):
+    season = tiny_season()
+    with tiny_board(tmp_path / "board") as store:
+        store.announce(season)
+        entry = signed_entry(store, season, key, [None, None])
+
+    online = tiny_season(ONLINE)
+    with Store.open(tmp_path / "board") as store:
+        store.announce(online)
+        request, other = (signed_request(store, online, key, nonce) for nonce in (0, 1))
+
+    def after_every_death(work):
+        def run():
+            with Store.open(tmp_path / "board") as opened:
+                work(opened)
+
+        call = 0
+        while crashes_before(call, run):
+            call += 1
+        assert call > 3
+        return Store.open(tmp_path / "board", read_only=True)
+
+    with after_every_death(lambda store: store.enter(entry)) as store:
+        assert [row.entrant.id for row in store.entrants(season.digest)] == [entry.id]
+    with after_every_death(lambda store: store.start_ticket(request)) as store:
+        assert [row.number for row in store.entrants(online.digest)] == [1]
+    with Store.open(tmp_path / "board") as store:
+        assert store.start_ticket(other) == 2
+        assert store.start_ticket(request) == 1
+        for number, each in ((1, request), (2, other)):
+            store.end_ticket(online.digest, number, failed_result(online, each.id))
+    later()
+    with after_every_death(lambda store: store.reveal(reveal(season))) as store:
+        assert store.revealed_master(season.id) == MASTER
+    with after_every_death(lambda store: store.rank(failed_result(season, entry.id))) as store:
+        assert [row.entrant.status for row in store.entrants(season.digest)] == ["scored"]
+    assert verify(tmp_path / "board").unlogged == 0

@@ -1,0 +1,215 @@
+"""The journal: whole records, whatever ends its writer."""
+
+import errno
+import os
+
+import numpy as np
+import pytest
+
+from leaderboard.errors import BoardError, TamperedError
+from leaderboard.seasons.journal import Journal
+from leaderboard.seasons.scores import measured_steps
+from leaderboard.seasons.stepping import Start
+from sme_registry import SMESpec
+from sme_registry.envs import SMEEnv
+
+LANES, A = 3, 2
+HEADER, RECORD = 28, 8 + 4 * LANES * A + 4
+
+
+def actions(number):
+    return bytes([number]) * (4 * LANES * A)
+
+
+def contents(journal):
+    for each in journal.actions():
+        assert each.shape == (LANES, A)
+    return [each.tobytes() for each in journal.actions()]
+
+
+def written(path, count):
+    journal = Journal.create(path, LANES, A)
+    for number in range(1, count + 1):
+        journal.append(actions(number))
+
+
+def test_a_journal_gives_back_what_was_added(tmp_path):
+    written(tmp_path / "0", 5)
+    journal = Journal.open(tmp_path / "0")
+    assert (journal.lanes, journal.action_dim) == (LANES, A)
+    assert (journal.requests, journal.steps, journal.ended) == (5, 15, False)
+    assert contents(journal) == [actions(number) for number in range(1, 6)]
+
+
+def test_a_torn_record_is_cut_off_and_the_next_one_takes_its_place(tmp_path):
+    for extra in range(RECORD):
+        path = tmp_path / str(extra)
+        written(path, 3)
+        os.truncate(path, HEADER + 2 * RECORD + extra)
+        journal = Journal.open(path)
+        journal.append(actions(9))
+        assert contents(Journal.open(path)) == [actions(1), actions(2), actions(9)]
+
+
+def lose_a_page(data):
+    """As a loss of power leaves a page that was not written."""
+    return data[: HEADER + RECORD] + bytes(RECORD - 1) + data[HEADER + 2 * RECORD - 1 :]
+
+
+def lose_a_record(data):
+    return data[: HEADER + RECORD] + data[HEADER + 2 * RECORD :]
+
+
+@pytest.mark.parametrize("fault", [lose_a_page, lose_a_record])
+def test_a_journal_ends_before_a_record_that_is_not_whole_or_out_of_order(tmp_path, fault):
+    path = tmp_path / "0"
+    written(path, 3)
+    path.write_bytes(fault(path.read_bytes()))
+    journal = Journal.open(path)
+    assert contents(journal) == [actions(1)]
+    journal.append(actions(9))
+    assert contents(Journal.open(path)) == [actions(1), actions(9)]
+    assert path.stat().st_size == HEADER + 2 * RECORD
+
+
+def test_an_ended_journal_stays_ended_and_accepts_nothing(tmp_path):
+    path = tmp_path / "0"
+    written(path, 2)
+    journal = Journal.open(path)
+    journal.end()
+    journal.end()
+    size = path.stat().st_size
+    with pytest.raises(BoardError, match="accepts no such record"):
+        journal.append(actions(3))
+    journal = Journal.open(path)
+    assert journal.ended
+    assert path.stat().st_size == size == HEADER + 3 * RECORD
+    assert contents(journal) == [actions(1), actions(2)]
+
+
+@pytest.mark.parametrize("written_before", [0, 1, RECORD - 1])
+@pytest.mark.parametrize("is_undone", [True, False])
+def test_a_full_disk_adds_nothing(tmp_path, monkeypatch, written_before, is_undone):
+    """Also where what was written could not be removed: the next record replaces it."""
+    path = tmp_path / "0"
+    journal = Journal.create(path, LANES, A)
+    journal.append(actions(1))
+    write, left = os.write, written_before
+
+    def fills_up(handle, data):
+        nonlocal left
+        if not left:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        count, left = min(left, len(data)), 0
+        return write(handle, data[:count])
+
+    def fails(handle, size):
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(os, "write", fills_up)
+    if not is_undone:
+        monkeypatch.setattr(os, "ftruncate", fails)
+    for _ in range(2):
+        with pytest.raises(OSError, match=r"No space|Input"):
+            journal.append(actions(2))
+    assert journal.requests == Journal.open(path).requests == 1
+    assert path.stat().st_size == HEADER + RECORD + (0 if is_undone else written_before)
+    monkeypatch.undo()
+    journal.append(actions(3))
+    assert contents(journal) == contents(Journal.open(path)) == [actions(1), actions(3)]
+
+
+def test_what_was_added_is_flushed_to_the_disk_once_and_again_if_that_failed(tmp_path, monkeypatch):
+    folders = []
+    flushed = []  # sizes of the file
+    failing = False
+
+    def flush(handle):
+        if failing:
+            raise OSError(errno.EIO, "Input/output error")
+        flushed.append(os.fstat(handle).st_size)
+
+    monkeypatch.setattr("leaderboard.seasons.journal.io.sync_folder", folders.append)
+    monkeypatch.setattr(os, "fdatasync", flush)
+    journal = Journal.create(tmp_path / "0", LANES, A)
+    assert folders == [tmp_path]
+    journal.sync()
+    assert flushed == []
+    journal.append(actions(1))
+    journal.append(actions(2))
+    failing = True
+    with pytest.raises(OSError, match="Input"):
+        journal.sync()
+    failing = False
+    journal.sync()
+    journal.sync()
+    assert flushed == [HEADER + 2 * RECORD]
+    journal.end()
+    assert flushed == [HEADER + 2 * RECORD, HEADER + 3 * RECORD]
+
+
+def test_another_file_is_no_journal_and_a_journal_is_never_replaced(tmp_path):
+    path = tmp_path / "0"
+    for content in (b"", b"x" * 20, b"x" * 100):
+        path.write_bytes(content)
+        with pytest.raises(TamperedError, match="is not a journal"):
+            Journal.open(path)
+    written(tmp_path / "1", 1)
+    with pytest.raises(FileExistsError):
+        Journal.create(tmp_path / "1", LANES, A)
+    assert Journal.open(tmp_path / "1").requests == 1
+
+
+SPEC = SMESpec(state_dim=3, action_dim=2, complexity=5, horizon=4, seed=12)
+START = Start(SPEC, 5)
+
+
+def journal(folder, actions):
+    """A journal of actions `[requests, L, A]`."""
+    made = Journal.create(folder / "0.journal", actions.shape[1], 2)
+    for each in actions:
+        made.append(each.astype("<f4").tobytes())
+    return made
+
+
+def regrets(actions):
+    """The regret of a single lane's actions, and of ½ in the same states, `[requests, 2]`."""
+    env, rows = SMEEnv(SPEC), []
+    env.reset(seed=START.seed)
+    for each in actions[:, 0]:
+        half = env.task.regret(env.state, np.full(2, 0.5))
+        *_, terminated, truncated, info = env.step(each)
+        rows.append((info["regret"], half))
+        if terminated or truncated:
+            env.reset()
+    return np.array(rows)
+
+
+@pytest.mark.parametrize(("taken", "budget"), [(250, 250), (130, 250), (5, 8)])
+def test_the_curve_has_the_regret_of_each_part_relative_to_the_constant(tmp_path, taken, budget):
+    """Steps that were not taken count like the constant's."""
+    actions = np.random.default_rng(1).random((taken, 1, 2), dtype=np.float32)
+    measured = measured_steps(START, journal(tmp_path, actions), budget)
+    rows, parts = regrets(actions), min(budget, 100)
+    part = np.arange(budget) * parts // budget
+    curve = np.ones(parts)
+    for number in range(parts):
+        own = rows[part[:taken] == number]
+        if len(own):
+            share = len(own) / (part == number).sum()
+            curve[number] = share * own[:, 0].sum() / own[:, 1].sum() + 1.0 - share
+    np.testing.assert_allclose(measured.learning_curve, curve, rtol=1e-12)
+    ratio = rows[:, 0].sum() / rows[:, 1].sum()
+    expected = (taken * ratio + budget - taken) / budget
+    assert measured.normalised_online_regret == pytest.approx(expected, rel=1e-12)
+    assert measured.steps == taken
+
+
+def test_the_constant_has_a_regret_of_one_with_any_lanes_and_without_a_start(tmp_path):
+    half = np.full((6, 3, 2), 0.5, np.float32)
+    measured = measured_steps(START, journal(tmp_path, half), 20)  # 18 of them can be taken
+    np.testing.assert_allclose(measured.learning_curve, [1.0] * 6, rtol=1e-12)
+    assert measured.steps == 18
+    never = measured_steps(START, None, 1000)
+    assert (never.steps, never.normalised_online_regret) == (0, 1.0)
+    assert never.learning_curve == (1.0,) * 100

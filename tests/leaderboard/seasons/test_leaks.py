@@ -1,0 +1,154 @@
+"""Before the reveal nothing that a server writes or answers holds what only the master tells."""
+
+import logging
+import pickle
+from unittest.mock import Mock
+
+import httpx
+import numpy as np
+import pytest
+
+from leaderboard.documents.keys import SigningKey
+from leaderboard.seasons.scores import score_ticket
+from leaderboard.seasons.scoring import instances
+from leaderboard.seasons.ticket import RunningTicket
+from leaderboard.seasons.tickets import Attendant
+from leaderboard.store import Store
+from sme_registry import SMEError, materialize, seasons
+from sme_registry.io import sha256_of
+from sme_registry.seasons import wire
+from tests.leaderboard.seasons.playing import LANES, online_board, playing, request
+from tests.leaderboard.seasons.sealing import MASTER
+from tests.leaderboard.serving import serving
+
+KEY = SigningKey.generate()
+
+
+def secrets_of(board, store):
+    """What must not be found: master, seeds and digests as texts and bytes, the task's numbers."""
+    row = store.ticket(board.season.digest, 1)
+    ticket = RunningTicket(store, board.season, MASTER, row)
+    nonce = store.request_of(row).ticket.nonce
+    texts = [MASTER.raw.hex()]
+    raw = [MASTER.raw]
+    for number, hidden in enumerate(instances(board.season, MASTER, "1", nonce)):
+        start = ticket.start(number)
+        digits = str(hidden.spec.seed)[2:]
+        texts += [digits, str(int(digits, 16)), hidden.spec.digest.removeprefix("sha256:")]
+        texts += [str(start.seed), f"{start.seed:x}", str(hidden.protocol.seed)]
+        raw += [start.seed.to_bytes(32), bytes.fromhex(digits.zfill(64))]
+        task = materialize(hidden.spec)
+        raw += [task.W[0].tobytes(), task.layers[0][0][0].tobytes()]
+        texts += [repr(float(task.W[0, 0])), repr(float(task.layers[0][0][0, 0]))]
+    return [*(text.encode() for text in texts), *raw]
+
+
+def everything(url, board, client):
+    """The answers to every request of an entrant, and to a refused one of each kind."""
+    signed = board.request(KEY)
+    started = board.send(url, signed, KEY)
+    yield started
+    ticket = seasons.Ticket.from_dict(started.json())
+    signer = signed.signer(KEY)
+    assert signer is not None
+    token = {"Authorization": f"Bearer {ticket.token}"}
+
+    def at(action):
+        return url + wire.instance_path(board.season.id, 1, 0, action)
+
+    def step(number, value=0.5):
+        return client.post(at("steps"), content=request(number, value), headers=token)
+
+    yield client.get(f"{url}/api/seasons")
+    yield client.get(f"{url}/api/seasons/{board.season.id}")
+    yield client.get(f"{url}/api/log")
+    yield client.get(url + wire.ticket_path(board.season.id, 1))
+    yield client.post(at("start?lanes=4"), headers=token)
+    for number in range(1, 17):
+        yield step(number)
+    yield from (step(1), step(18), step(17), step(16, np.nan), step(16, 0.1))
+    yield client.post(at("steps"), content=b"x", headers=token)
+    yield client.post(at("start?lanes=5"), headers=token)
+    yield client.post(at("start?lanes=x"), headers=token)
+    yield client.get(at("challenge"), headers=token)
+    yield client.put(at("answers"), content=b"x", headers=token)
+    answers = wire.pack_table(np.full((300, 1), 0.5))
+    yield client.put(at("answers"), content=answers, headers=token)
+    journal = client.get(at("journal"), headers=token)
+    yield journal
+    statement = wire.Statement(
+        request=signer.request,
+        ticket=1,
+        instance=0,
+        answers=sha256_of(answers),
+        journal=journal.json()["journal"],
+    )
+    last = f"answers?signature={signer.sign(statement)}"
+    yield client.put(at(last), content=answers, headers=token)
+    yield client.get(url + wire.ticket_path(board.season.id, 1), headers=token)
+
+
+def test_no_answer_file_or_log_holds_a_secret(tmp_path, caplog):
+    board = online_board(tmp_path)
+    answered = []
+
+    def record(answer):
+        answered.append(answer.read())
+        answered.extend(b": ".join(header) for header in answer.headers.raw)
+
+    with (
+        caplog.at_level(logging.DEBUG),
+        serving(board.path, season_secrets=[board.secret]) as url,
+        httpx.Client(event_hooks={"response": [record]}, timeout=60.0) as client,
+    ):
+        statuses = [each.status_code for each in everything(url, board, client)]
+    assert set(statuses) == {200, 201, 400, 403, 409, 422}
+    with Store.open(board.path) as store:
+        result = score_ticket(store, board.season, MASTER, 1)
+        store.end_ticket(board.season.digest, 1, result)
+        searched = secrets_of(board, store)
+    parts = {f"answer {i}": part for i, part in enumerate(answered)}
+    parts["log"] = caplog.text.encode()
+    files = [path for path in board.path.rglob("*") if path.is_file()]
+    assert {"index.sqlite", "0.journal", "0.npy"} <= {path.name for path in files}
+    parts |= {path.name: path.read_bytes() for path in files}
+    found = [name for name, part in parts.items() for each in searched if each in part]
+    assert found == []
+    assert any(each in board.secret.read_bytes() for each in searched)  # the search can find
+
+
+def test_answers_to_steps_have_one_form(tmp_path):
+    """The same head and size, whether episodes end or not, in any task."""
+    board = online_board(tmp_path)
+    size, heads = wire.StepFormat(LANES, 2, 1).answer_bytes, set()
+    with serving(board.path, season_secrets=[board.secret]) as url, httpx.Client() as client:
+        for nonce in range(2):
+            ticket = board.ticket(url, KEY, nonce)
+            token = {"Authorization": f"Bearer {ticket.token}"}
+            at = url + wire.instance_path(board.season.id, ticket.ticket, 0, "")
+            client.post(at + "start?lanes=4", headers=token)
+            for number in range(1, 17):
+                body = request(number, number / 16)
+                answer = client.post(at + "steps", content=body, headers=token)
+                assert len(answer.content) == size
+                heads.add(tuple((k, v) for k, v in answer.headers.raw if k.lower() != b"date"))
+    assert len(heads) == 1
+
+
+def test_a_fault_is_logged_without_its_text(caplog):
+    tickets = Mock()
+    tickets.sync.side_effect = SMEError("the seed is 0x5eed")
+    Attendant(tickets).attend()
+    assert "SMEError" in caplog.text
+    assert "5eed" not in caplog.text
+
+
+def test_what_holds_a_secret_shows_none(tmp_path):
+    with playing(online_board(tmp_path)) as played:
+        searched = secrets_of(played.board, played.store)
+        ticket = played.tickets.ticket(played.number)
+        holders = (MASTER, ticket, ticket.start(0), ticket.hidden(0), ticket.instance(0))
+        shown = [repr(each).encode() for each in (*holders, ticket.document)]
+    assert not any(each in text for text in shown for each in searched)
+    with pytest.raises(TypeError, match="pickle"):
+        pickle.dumps(ticket)

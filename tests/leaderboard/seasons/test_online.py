@@ -1,0 +1,250 @@
+"""Seasons over HTTP, with the client that entrants use, and what follows a ticket that is over."""
+
+import time
+
+import httpx
+import numpy as np
+import pytest
+
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.submission import Envelope
+from leaderboard.errors import Rejection
+from leaderboard.intake import start_ticket, upload_header
+from leaderboard.seasons.entry import SignedTicketRequest, TicketRequest
+from leaderboard.seasons.scores import score_ticket
+from leaderboard.store import Store
+from sme_registry import seasons
+from sme_registry.seasons import wire
+from tests.leaderboard.seasons.killing import step_through_kills
+from tests.leaderboard.seasons.playing import LANES, online_board, request
+from tests.leaderboard.seasons.sealing import MASTER, SETTING, manifest, moment, tiny_season
+from tests.leaderboard.serving import serving
+
+OTHER = SigningKey.generate()
+MORE_SEASONS = {"second": {}, "few": {"tickets": 1}, "coming": {"opens": moment(0.5)}}
+
+
+@pytest.fixture(scope="module")
+def board(tmp_path_factory):
+    """Several seasons of one master, in which each test plays with a key of its own."""
+    board = online_board(tmp_path_factory.mktemp("online"))
+    with Store.open(board.path) as store:
+        for name, fields in MORE_SEASONS.items():
+            store.announce(tiny_season("sealed-online", id=name, **fields))
+        store.announce(tiny_season("sealed-offline"))
+        ada = {"name": "Ada", "key": OTHER.public}
+        store.start_ticket(board.request(OTHER, submitter=ada))
+    return board
+
+
+@pytest.fixture(scope="module")
+def url(board):
+    with serving(board.path, season_secrets=[board.secret]) as url:
+        yield url
+
+
+def another(board, name):
+    """The same board, and another of its seasons."""
+    with Store.open(board.path, read_only=True) as store:
+        return board._replace(season=store.season(name))
+
+
+def outcome(answer):
+    return answer.status_code, answer.json().get("code", "")
+
+
+def played(url, ticket, number, steps):
+    """Random steps on an instance, then the constant ½ as answers."""
+    with seasons.Instance(url, ticket, number, lanes=LANES) as instance:
+        instance.begin()
+        random = np.random.default_rng(number)
+        for _ in range(steps):
+            instance.step(random.random((LANES, 1), dtype=np.float32))
+        states = instance.challenge()
+        instance.send_answers(np.full((len(states), 1), 0.5, np.float32))
+
+
+def test_a_ticket_of_any_season_is_played_and_then_scored_and_logged(url, board, key):
+    second = another(board, "second")
+    ticket = second.ticket(url, key)
+    assert (ticket.season, ticket.ticket) == ("second", 1)
+    played(url, ticket, 0, 16)
+    with seasons.Instance(url, ticket, 1) as instance:
+        assert instance.status().phase == "running"
+        played(url, ticket, 1, 5)
+        assert instance.status().phase == "ended"
+    with Store.open(board.path, read_only=True) as store:
+        deadline = time.monotonic() + 300
+        while (result := store.sealed_result(store.ticket(second.season.digest, 1))) is None:
+            assert time.monotonic() < deadline, "the server has scored no ticket"
+            time.sleep(0.1)
+    assert [run.wd_regret for run in result.runs] == [1.0, 1.0]
+    assert [each.steps for each in result.stepping] == [64, 20]
+
+
+def test_a_season_that_is_open_and_a_key_have_only_so_many_tickets(url, board, key):
+    few = another(board, "few")
+    few.ticket(url, OTHER)
+    assert outcome(few.send(url, few.request(key), key)) == (429, "ticket_limit")
+    first = board.request(key)
+    started, again = (board.send(url, first, key) for _ in range(2))
+    second = board.send(url, board.request(key, 1), key)
+    assert [started.status_code, again.status_code, second.status_code] == [201, 200, 201]
+    assert started.json() == again.json()
+    assert second.json()["ticket"] > started.json()["ticket"]
+    assert second.json()["token"] != started.json()["token"]
+    assert outcome(board.send(url, board.request(key, 2), key)) == (429, "ticket_limit")
+    coming = another(board, "coming")
+    assert outcome(coming.send(url, coming.request(key), key)) == (422, "season_not_open")
+
+
+def test_tickets_count_towards_the_quota_of_a_day(tmp_path, key):
+    board = online_board(tmp_path, limits={"submissions_per_day": 1})
+    with Store.open(board.path) as store:
+        store.start_ticket(board.request(key))
+        envelope = Envelope.read(board.request(key, 1).to_bytes(), SignedTicketRequest)
+        with pytest.raises(Rejection, match="quota"):
+            start_ticket(store, envelope, board.season.digest)
+
+
+def test_a_request_that_others_read_is_no_password(url, board, key):
+    request = board.request(key)
+    started = board.send(url, request, key)
+    assert started.status_code == 201
+    path = url + wire.tickets_path(board.season.id)
+    with Store.open(board.path, read_only=True) as store:
+        folder = store.season_folder(board.season.digest)
+    stored = folder.request(started.json()["ticket"])
+    without = httpx.post(path, content=stored.read_bytes())
+    stale = upload_header(key, request.id, moment(-0.1), board=request.board)
+    late = httpx.post(path, content=request.to_bytes(), headers={"Authorization": stale})
+    others = board.send(url, request, OTHER)
+    assert [outcome(each) for each in (without, late, others)] == [
+        (403, "bad_signature"),
+        (403, "stale_time"),
+        (403, "bad_signature"),
+    ]
+
+
+def test_the_ranking_grows_as_tickets_end(url, board, key):
+    season = tiny_season("sealed-online", id="ranked")
+    ranked = board._replace(season=season)
+    address = f"{url}/api/seasons/ranked/ranking"
+    with Store.open(board.path) as store:
+        store.announce(season)
+        store.start_ticket(ranked.request(key))
+        empty = httpx.get(address).json()
+        store.end_ticket(season.digest, 1, score_ticket(store, season, MASTER, 1))
+    grown = httpx.get(address, params={"metric": "ood_regret"}).json()
+    assert (empty["metric"], empty["ranking"]) == ("wd_regret", {"generic": [], "family": []})
+    [row] = grown["ranking"]["generic"]
+    assert (row["method"], row["value"], row["entrants_of_key"]) == ("Test", 1.0, 1)
+    assert (grown["id"], grown["metric"]) == ("ranked", "ood_regret")
+    assert outcome(httpx.get(address, params={"metric": "luck"})) == (400, "bad_request")
+    unknown = httpx.get(f"{url}/api/seasons/none/ranking")
+    assert outcome(unknown) == (404, "season_unknown")
+
+
+@pytest.mark.parametrize(
+    ("changes", "board_key", "status", "code"),
+    [
+        ({"nonce": "0" * 63}, True, 422, "schema"),
+        ({"nonce": "0" * 63 + "G"}, True, 422, "schema"),
+        ({"answers_key": None}, True, 422, "schema"),
+        ({"season": "sha256:" + "0" * 64}, True, 404, "season_unknown"),
+        ({"created": moment(-30)}, True, 403, "stale_time"),
+        ({"created": moment(1)}, True, 403, "stale_time"),
+        ({"submitter": {"name": "the board"}}, True, 400, "unsafe_name"),
+        ({"submitter": {"name": "ADA"}}, True, 422, "name_taken"),
+        ({}, False, 403, "wrong_board"),
+    ],
+)
+def test_requests_for_tickets_are_checked(url, board, key, changes, board_key, status, code):
+    with Store.open(board.path, read_only=True) as store:
+        before = len(store.entrants(board.season.digest))
+        board_name = store.document.key if board_key else None
+    plain = {**manifest(board.season, key), "nonce": "0" * 64, "answers_key": OTHER.public}
+    plain["submitter"] |= changes.get("submitter", {})
+    plain |= {name: value for name, value in changes.items() if name != "submitter"}
+    signed = TicketRequest.from_dict({**plain, "nonce": "0" * 64}).signed(key, board_name)
+    if "nonce" in changes:  # which no document of ours can have
+        ticket = TicketRequest.model_construct(**{**dict(signed.ticket), **changes})
+        signature = key.sign("ticket", ticket.digest, signed.board)
+        signed = signed.model_copy(update={"ticket": ticket, "signature": signature})
+    assert outcome(board.send(url, signed, key)) == (status, code)
+    with Store.open(board.path, read_only=True) as store:
+        assert len(store.entrants(board.season.digest)) == before
+
+
+def test_a_request_opens_no_ticket_of_another_season_or_board(board, key):
+    digest, other = board.season.digest, another(board, "second").season.digest
+    with Store.open(board.path) as store:
+        known, new = board.request(key), board.request(key, 1)
+        known, new = (Envelope.read(each.to_bytes(), SignedTicketRequest) for each in (known, new))
+        number, is_new = start_ticket(store, known, digest)
+        assert is_new
+        before = store.head
+        for envelope in (known, new):
+            with pytest.raises(Rejection, match="season_unknown"):
+                start_ticket(store, envelope, other)
+        elsewhere = board.request(key).ticket.signed(key, "ab" * 32)
+        envelope = Envelope.read(elsewhere.to_bytes(), SignedTicketRequest)
+        with pytest.raises(Rejection, match="wrong_board"):
+            start_ticket(store, envelope, digest)
+        assert start_ticket(store, known, digest) == (number, False)
+        assert store.head == before
+
+
+def test_a_server_steps_only_online_seasons_whose_master_it_has(url, board, key):
+    offline = httpx.post(url + wire.tickets_path("sealed-offline"), content=b"{}")
+    assert outcome(offline) == (422, "season_track")
+    with serving(board.path) as without:
+        answer = board.send(without, board.request(key), key)
+        unknown = httpx.post(f"{without}/api/seasons/none/tickets", content=b"{}")
+        listed = httpx.get(f"{without}/api/seasons").json()["seasons"]
+    assert outcome(answer) == (503, "season_not_served")
+    assert outcome(unknown) == (404, "season_unknown")
+    assert not any(each["served"] for each in listed)
+    served = {
+        each["id"] for each in httpx.get(f"{url}/api/seasons").json()["seasons"] if each["served"]
+    }
+    assert served == {board.season.id, *MORE_SEASONS}
+    season = httpx.get(f"{url}/api/seasons/{board.season.id}").json()
+    assert season["document"] == board.season.to_dict()
+    assert season["master"] is None
+
+
+def test_large_bodies_numbers_and_other_methods_are_refused(url, board, key):
+    ticket = board.ticket(url, key)
+    number = ticket.ticket
+    at = url + wire.instance_path(board.season.id, number, 0, "")
+    token = {"Authorization": f"Bearer {ticket.token}"}
+    with httpx.Client(trust_env=False, headers=token) as client:
+        client.post(at + "start?lanes=4")
+        answers = [
+            client.post(at + "steps", content=bytes(2000)),
+            client.put(at + "answers", content=bytes(2**16)),
+            client.post(at + "start?lanes=" + "9" * 30),
+            client.post(at.replace("/0/", f"/{10**30}/") + "steps"),
+            client.post(at.replace(f"/{number}/", f"/{10**30}/") + "finish"),
+            client.post(at.replace(f"/{number}/", f"/{'9' * 5000}/") + "steps"),
+            client.post(at.replace(f"/{number}/", "/one/") + "steps"),
+        ]
+        assert client.put(at + "steps", content=request(1)).status_code == 405
+        status = client.get(url + wire.ticket_path(board.season.id, number)).json()
+    assert [outcome(each) for each in answers] == [
+        (413, "too_large"),
+        (413, "too_large"),
+        (400, "bad_request"),
+        (404, "instance_unknown"),
+        (404, "ticket_unknown"),
+        (404, "ticket_unknown"),
+        (404, "not_found"),
+    ]
+    assert status["instances"][0]["used"] == 0
+
+
+def test_entrants_go_on_when_their_server_is_killed(tmp_path):
+    member = {"name": "deep", "setting": SETTING, "instances": 1, "budget": 60 * LANES}
+    board = online_board(tmp_path, classes=[member])
+    step_through_kills(board, tickets=3, requests=60, kills=1)

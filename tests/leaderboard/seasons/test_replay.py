@@ -1,0 +1,230 @@
+"""A revealed online season is replayed from its journals: what was altered is named."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from leaderboard.errors import TamperedError
+from leaderboard.scoring.verify import verify
+from leaderboard.seasons.journal import Journal
+from leaderboard.seasons.ranking import season_rankings
+from leaderboard.seasons.replay import verify_season
+from leaderboard.seasons.scores import score_ticket
+from leaderboard.seasons.season import Reveal
+from leaderboard.seasons.stepping import Lanes, Start
+from leaderboard.store import Store
+from leaderboard.store.log import Log
+from sme_registry import SMESpec
+from sme_registry.envs import SMEEnv
+from sme_registry.seasons import wire
+from tests.leaderboard.seasons.playing import LANES, ROWS, online_board, playing
+from tests.leaderboard.seasons.sealing import AFTERWARDS, MASTER, moment, move_clock, signed_request
+
+
+@pytest.fixture(scope="module")
+def revealed(tmp_path_factory):
+    """Two tickets, whose actions are all of one level. Nobody changes it."""
+    board = online_board(tmp_path_factory.mktemp("revealed"))
+    with playing(board) as played:
+        for number, level in ((1, 0.5), (2, 0.25)):
+            if played.number < number:
+                played.take_ticket(number)
+            for instance in range(2):
+                played.start(instance=instance)
+                for count in range(1, 9):
+                    played.step(count, level, instance)
+                played.finish(instance)
+                played.answer(np.full((ROWS, 1), level), instance)
+            played.score()
+        with pytest.MonkeyPatch.context() as patch:
+            move_clock(patch)
+            played.store.reveal(Reveal(season=board.season.digest, master=MASTER.raw.hex()))
+    return board
+
+
+def test_a_season_of_tickets_is_replayed_and_every_one_of_them_counts(revealed):
+    with Store.open(revealed.path, read_only=True) as store:
+        report = verify_season(store, revealed.season.id)
+        assert (report.entries, report.results) == (2, 2)
+        assert verify(revealed.path).sealed == 2
+        [row] = season_rankings(store, revealed.season, "wd_regret")["generic"]
+        results = [store.sealed_result(each) for each in store.entrants(revealed.season.digest)]
+    values = [result.scores.wd_regret.value for result in results if result is not None]
+    assert len(set(values)) == 2
+    assert row.value.value == pytest.approx(np.mean(values))
+    assert row.entry.runs == 4
+    assert row.entry.steps == 4 * 32
+    assert row.value.interval is not None
+
+
+def test_altered_journals_and_answers_are_found(revealed, tmp_path):
+    shutil.copytree(revealed.path, tmp_path / "board")
+    with Store.open(tmp_path / "board", read_only=True) as store:
+        folder = store.season_folder(revealed.season.digest).ticket(1)
+        files = [path for path in sorted(folder.iterdir()) if path.name != "ticket.json"]
+        assert len(files) == 6  # a journal, answers and their signature of each instance
+        for path in files:
+            whole = path.read_bytes()
+            middle = len(whole) // 2
+            altered = whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :]
+            path.write_bytes(altered)
+            with pytest.raises(TamperedError):
+                verify_season(store, revealed.season.id)
+            assert path.read_bytes() == altered
+            path.write_bytes(whole)
+        assert verify_season(store, revealed.season.id).results == 2
+
+
+def replace_answers(folder):
+    (folder / "0.npy").write_bytes(wire.pack_table(np.full((ROWS, 1), 0.75)))
+
+
+def replace_journal(folder):
+    (folder / "0.journal").unlink()
+    journal = Journal.create(folder / "0.journal", LANES, 1)
+    journal.append(np.full((LANES, 1), 0.75, "<f4").tobytes())
+    journal.end()
+
+
+def remove_signature(folder):
+    (folder / "0.json").unlink()
+
+
+@pytest.mark.parametrize("replace", [replace_answers, replace_journal, remove_signature])
+def test_what_an_organiser_replaces_before_the_result_is_found(tmp_path, monkeypatch, replace):
+    with playing(online_board(tmp_path)) as played:
+        played.start()
+        played.step(1, 0.5)
+        played.finish()
+        played.answer(np.full((ROWS, 1), 0.5))
+        move_clock(monkeypatch)
+        replace(played.folder)
+        played.score()
+        season = played.board.season
+        played.store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
+        with pytest.raises(TamperedError, match=r"tickets/1/0\.json: is not the entrant's"):
+            verify_season(played.store, season.id)
+
+
+@pytest.mark.parametrize(
+    ("part", "changes", "message"),
+    [
+        ("runs", {"normalised_regret": (0.5,) * 6}, "scored again"),
+        ("runs", {"similarity_loss": 0.0}, "scored again"),
+        ("runs", {"artefact": "sha256:" + "a" * 64}, "scored again"),
+        ("stepping", {"normalised_online_regret": 0.0}, "replayed from its journal"),
+        ("stepping", {"learning_curve": (*(1.0,) * 15, 0.0)}, "replayed from its journal"),
+        ("stepping", {"steps": 1}, "replayed from its journal"),
+        ("stepping", {"signed": "sha256:" + "a" * 64}, "names another signature"),
+        ("scores", {}, "its scores do not follow from its runs"),
+    ],
+)
+def test_a_result_that_does_not_follow_is_found(revealed, monkeypatch, part, changes, message):
+    with Store.open(revealed.path, read_only=True) as store:
+        stored = store.sealed_result
+
+        def lie(row):
+            result = stored(row)
+            assert result is not None
+            if part == "scores":
+                value = result.scores.wd_regret.model_copy(update={"value": 0.4})
+                scores = result.scores.model_copy(update={"wd_regret": value})
+                return result.model_copy(update={"scores": scores})
+            first, *others = getattr(result, part)
+            return result.model_copy(update={part: (first.model_copy(update=changes), *others)})
+
+        monkeypatch.setattr(store, "sealed_result", lie)
+        where = "" if part == "scores" else rf"{part}\.0: "
+        with pytest.raises(TamperedError, match=where + message):
+            verify_season(store, revealed.season.id)
+
+
+def logged(monkeypatch, time, store, *record):
+    """Log something that a board must refuse, at a time, as an organiser's own board may do."""
+    monkeypatch.setattr("leaderboard.store.log.now", lambda: time)
+    with store.transaction():
+        store.record(*record)
+
+
+def reveal(board, folder):
+    """What `Database.record` needs to log the reveal of a season."""
+    document = Reveal(season=board.season.digest, master=MASTER.raw.hex())
+    return "revealed", board.season.digest, document, folder.reveal
+
+
+@pytest.mark.parametrize(
+    ("fields", "days", "number", "message"),
+    [
+        ({}, -2, 1, "was logged at"),
+        ({}, 2, 1, "was logged at"),
+        ({}, 0, 3, "exceeds the 2 tickets of a key"),
+        ({"tickets": 1}, 0, 2, "exceeds the 1 tickets of the season"),
+    ],
+)
+def test_forbidden_tickets_are_found(tmp_path, monkeypatch, key, fields, days, number, message):
+    board = online_board(tmp_path, **fields)
+    monkeypatch.setattr(Log, "_refuse_wrong_clock", lambda *_: None)
+    with Store.open(board.path) as store:
+        folder = store.season_folder(board.season.digest)
+        for count in range(1, number + 1):
+            request = signed_request(store, board.season, key, count)
+            path = folder.request(count)
+            logged(monkeypatch, moment(days), store, "ticket", request.id, request, path)
+        logged(monkeypatch, AFTERWARDS, store, *reveal(board, folder))
+        with pytest.raises(TamperedError, match=rf"tickets/{number}/ticket\.json: {message}"):
+            verify_season(store, board.season.id)
+
+
+def test_a_ticket_that_ended_early_without_all_answers_is_found(tmp_path, monkeypatch, key):
+    board = online_board(tmp_path)
+    with Store.open(board.path) as store:
+        store.start_ticket(signed_request(store, board.season, key))
+        store.end_ticket(board.season.digest, 1, score_ticket(store, board.season, MASTER, 1))
+        folder = store.season_folder(board.season.digest)
+        logged(monkeypatch, AFTERWARDS, store, *reveal(board, folder))
+        with pytest.raises(TamperedError, match="without all answers: must not be before"):
+            verify_season(store, board.season.id)
+
+
+def test_a_reveal_before_the_close_is_found(tmp_path, monkeypatch):
+    board = online_board(tmp_path)
+    with Store.open(board.path) as store:
+        folder = store.season_folder(board.season.digest)
+        logged(monkeypatch, moment(0), store, *reveal(board, folder))
+        with pytest.raises(TamperedError, match=r"reveal\.json: was logged at"):
+            verify_season(store, board.season.id)
+
+
+SPEC = SMESpec(state_dim=3, action_dim=2, complexity=5, horizon=3, k=2, D=0.1, seed=11)
+SEED = 2**255 + 3
+
+
+def test_steps_and_regret_are_those_of_single_environments():
+    lanes, unmeasured = Lanes(Start(SPEC, SEED), 3), Lanes(Start(SPEC, SEED), 3)
+    singles = [SMEEnv(SPEC) for _ in range(3)]
+    first = [env.reset(seed=SEED + lane)[0] for lane, env in enumerate(singles)]
+    np.testing.assert_array_equal(lanes.observation, first)
+    random = np.random.default_rng(1)
+    seen = set()
+    for _ in range(60):
+        actions = random.random((3, 2), dtype=np.float32) * 1.2 - 0.1
+        regret = half = 0.0
+        expected = []
+        for lane, env in enumerate(singles):
+            half += float(env.task.regret(env.state, np.full(2, 0.5)))
+            observation, reward, terminated, truncated, info = env.step(actions[lane])
+            regret += info["regret"]
+            last = np.zeros(5, np.float32)
+            if terminated or truncated:
+                last, observation = observation, env.reset()[0]
+            expected.append((observation, np.float32(reward), terminated, truncated, last))
+            seen.add((terminated, truncated))
+        steps, measured = lanes.step_with_regret(actions)
+        plain = unmeasured.step(actions)
+        for got, same, wanted in zip(steps, plain, zip(*expected, strict=True), strict=True):
+            np.testing.assert_array_equal(got, wanted)
+            np.testing.assert_array_equal(same, wanted)
+        np.testing.assert_array_equal(lanes.observation, steps.observation)
+        np.testing.assert_allclose(measured, (regret, half), rtol=1e-12)
+    assert {(False, False), (True, False), (False, True)} <= seen

@@ -1,0 +1,521 @@
+"""Tickets without a server: what is refused, what survives, and what a restart changes."""
+
+import datetime
+import errno
+import os
+import pickle
+import time
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from leaderboard.documents.submission import Envelope
+from leaderboard.errors import BoardError, Rejection
+from leaderboard.intake import start_ticket
+from leaderboard.seasons import tickets as tickets_module
+from leaderboard.seasons.entry import SignedTicketRequest
+from leaderboard.seasons.instance import SteppedInstance
+from leaderboard.seasons.master import Master
+from leaderboard.seasons.scores import score_ticket
+from leaderboard.seasons.stepping import Lanes
+from leaderboard.seasons.ticket import RunningTicket
+from leaderboard.seasons.tickets import Attendant, Clock, Tickets, _score
+from leaderboard.store import played_bytes
+from leaderboard.store.files import to_bytes
+from sme_registry import materialize
+from sme_registry.io import sha256_of
+from sme_registry.seasons.wire import StepFormat, pack_table, unpack_table
+from tests.leaderboard.conftest import tiny_board
+from tests.leaderboard.seasons.playing import LANES, ROWS, online_board, playing, request
+from tests.leaderboard.seasons.sealing import MASTER, NOTHING, SETTING, moment, tiny_season
+
+WIRE = StepFormat(LANES, 2, 1)
+HALF = np.full((ROWS, 1), 0.5, np.float32)
+WALL, UPTIME = time.time, time.monotonic
+
+
+@pytest.fixture
+def played(tmp_path):
+    with playing(online_board(tmp_path)) as ready:
+        yield ready
+
+
+def set_clocks(monkeypatch, forward, passed=0.0):
+    """Let so many hours pass, and set the wall clock so many hours forward."""
+    monkeypatch.setattr(time, "time", lambda: WALL() + 3600.0 * (forward + passed))
+    monkeypatch.setattr(time, "monotonic", lambda: UPTIME() + 3600.0 * passed)
+
+
+def fails(number):
+    """A call of the system that fails."""
+
+    def call(*_, **__):
+        raise OSError(number, os.strerror(number))
+
+    return call
+
+
+def refused(code, *arguments, **others):
+    """The message of a refusal with this code."""
+    call, *rest = arguments
+    with pytest.raises(Rejection) as caught:
+        call(*rest, **others)
+    assert caught.value.code == code
+    return caught.value.message
+
+
+@pytest.fixture(scope="module")
+def many(tmp_path_factory):
+    """A board on which one key may take many tickets."""
+    folder, fields = tmp_path_factory.mktemp("many"), {"tickets": 1000, "tickets_per_key": 1000}
+    with playing(online_board(folder, {"submissions_per_day": 1000}, **fields)) as ready:
+        yield ready
+
+
+EVENTS = ("step", "again", "other", "ahead", "start", "restart", "release")
+FAULTS = ("full disk", "no memory")
+
+
+@settings(max_examples=25)
+@given(
+    events=st.lists(st.sampled_from(("step", *EVENTS, *FAULTS)), min_size=5, max_size=30),
+    lanes=st.sampled_from([4, 20, 48]),
+)
+@example(events=["step", "restart", "again", "full disk", "no memory", "again"], lanes=4)
+@example(events=[*["step"] * 17, "again", "restart", "again", "step"], lanes=4)
+def test_each_step_is_taken_once_whatever_happens(many, events, lanes):
+    many.take_ticket(many.number)
+    here, form = Lanes(many.tickets.ticket(many.number).start(0), lanes), StepFormat(lanes, 2, 1)
+    taken, last, most = 0, b"", 64 // lanes
+    many.start(lanes)
+    for event in events:
+        level = 0.03 * (taken + 1)
+        if event == "restart":
+            many.restart()
+        elif event == "release":
+            many.tickets.ticket(many.number).instance(0).release()
+        elif event == "start":
+            number, observation = form.unpack_start(many.start(lanes))
+            assert number == taken
+            np.testing.assert_array_equal(observation, here.observation)
+        elif event == "again":
+            if taken:
+                assert many.step(taken, 0.03 * taken, lanes=lanes) == last
+        elif event == "other":
+            refused("step_conflict", many.step, taken, 0.99, lanes=lanes)
+        elif event == "ahead":
+            refused("step_ahead", many.step, taken + 2, lanes=lanes)
+        elif taken == most:
+            refused("budget_spent", many.step, taken + 1, level, lanes=lanes)
+        elif event == "full disk":
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(os, "write", fails(errno.ENOSPC))
+                message = refused("storage_full", many.step, taken + 1, level, lanes=lanes)
+            assert "No space left on device" in message
+        else:
+            taken, last = taken + 1, form.pack_steps(here.step(np.full((lanes, 1), level, "f4")))
+            if event == "no memory":  # after the step was recorded
+                many.start(lanes)
+                with pytest.MonkeyPatch.context() as patch:
+                    patch.setattr(Lanes, "step", runs_out)
+                    with pytest.raises(MemoryError):
+                        many.step(taken, level, lanes=lanes)
+            assert many.step(taken, level, lanes=lanes) == last
+        status = many.status()
+        assert (status.requests, status.used) == (taken, lanes * taken)
+        assert status.phase == ("answering" if taken == most else "stepping")
+
+
+def runs_out(*_):
+    raise MemoryError
+
+
+@pytest.mark.parametrize(("budget", "most"), [(64, 64), (1000, 256)])
+def test_lanes_have_a_range_and_an_instance_keeps_them(tmp_path, budget, most):
+    member = {"name": "deep", "setting": SETTING, "instances": 1, "budget": budget}
+    with playing(online_board(tmp_path, classes=[member])) as played:
+        for lanes in (0, most + 1, 2**40):
+            refused("lanes_invalid", played.start, lanes)
+        played.start(most)
+        for _ in range(2):
+            refused("start_conflict", played.start, most - 1)
+            played.restart()
+        played.start(most)
+
+
+def test_a_step_has_one_size_and_finite_actions_which_are_clipped(played):
+    played.start()
+    body = request(1)
+    for other in (b"\1", body[:7], body[:8], body[:-1], body + b"\0"):
+        refused("step_invalid", played.send, other)
+    for value in (np.nan, np.inf, -np.inf):
+        refused("step_invalid", played.step, 1, value)
+    assert played.status().used == 0
+    high = played.step(1, 7.0)
+    played.restart()
+    assert played.step(1, 7.0) == high
+    assert played.status().used == LANES
+
+
+def test_phases_follow_each_other(played):
+    refused("instance_phase", played.step, 1)
+    refused("instance_phase", played.tickets.challenge, played.number, played.token, 0)
+    refused("instance_phase", played.answer, HALF)
+    played.start()
+    played.step(1)
+    refused("instance_phase", played.tickets.challenge, played.number, played.token, 0)
+    refused("instance_phase", played.answer, HALF)
+    played.finish()
+    played.finish()
+    refused("instance_phase", played.step, 2)
+    played.restart()
+    refused("instance_phase", played.step, 2)
+    states = unpack_table(played.tickets.challenge(played.number, played.token, 0), 4)
+    assert len(states) == ROWS
+    assert played.answer(HALF)
+    assert not played.answer(HALF)
+    refused("answer_conflict", played.answer, HALF * 0.5)
+    played.restart()
+    assert not played.answer(HALF)
+    refused("instance_phase", played.start)
+    refused("instance_phase", played.step, 1)
+    refused("instance_phase", played.step, 2)
+    played.finish()
+
+
+def test_answers_have_one_form(played):
+    played.finish()
+    wide = np.full((ROWS, 2), 0.5)
+    for table in (HALF[1:], wide, b"", pickle.dumps(HALF), pack_table(HALF) + b"\0"):
+        refused("answer_shape", played.answer, table)
+    refused("answer_not_finite", played.answer, HALF * np.nan)
+    assert played.answer(HALF)
+
+
+def test_answers_need_a_signature_of_them_and_the_journal(played):
+    played.start()
+    played.step(1)
+    played.finish()
+    data = pack_table(HALF)
+    instance = played.tickets.ticket(played.number).instance(0)
+    journal = instance.journal_digest()
+    assert journal == sha256_of(request(1))
+    others = [
+        "",
+        "0" * 128,
+        played.signature(data + b"x", journal),
+        played.signature(data, NOTHING),
+        played.signature(data, journal, instance=1),
+        played.key.sign("answers", played.request.id, played.request.board),
+    ]
+    for other in others:
+        refused("bad_signature", instance.answer, data, other)
+    assert not instance.answered
+    assert instance.answer(data, played.signature(data, journal))
+    assert instance.is_signed
+
+
+def test_requests_older_than_signed_answers_need_no_signature(played):
+    old = played.board.request(played.key, 1, answers_key=None)
+    assert "answers_key" not in old.to_dict()["ticket"]
+    number = played.store.start_ticket(old)
+    instance = played.tickets.ticket(number).instance(0)
+    instance.finish()
+    assert instance.answer(pack_table(HALF), "")
+    assert instance.is_signed
+    result = score_ticket(played.store, played.board.season, MASTER, number)
+    assert "signed" not in result.to_dict()["stepping"][0]
+
+
+def test_a_token_opens_one_ticket(played):
+    number, token, tickets = played.number, played.token, played.tickets
+    played.take_ticket(1)
+    for ticket, password in ((played.number, token), (number, ""), (number, "é")):
+        for call, *rest in (
+            (tickets.start, 0, 1),
+            (tickets.step, 0, request(1)),
+            (tickets.finish, 0),
+            (tickets.status,),
+            (tickets.refuse_challenge, 0),
+            (tickets.challenge, 0),
+            (tickets.journal_digest, 0),
+            (tickets.answer_bytes, 0),
+            (tickets.answer, 0, pack_table(HALF), ""),
+        ):
+            refused("token_wrong", call, ticket, password, *rest)
+    refused("ticket_unknown", tickets.start, 99, token, 0, 1)
+    refused("instance_unknown", tickets.start, number, token, 2, 1)
+
+
+def test_a_deadline_ends_everything(played, monkeypatch):
+    played.start()
+    played.step(1)
+    assert played.tickets.over() == []
+    set_clocks(monkeypatch, 23.9)
+    played.step(2)
+    set_clocks(monkeypatch, 24.1)
+    refused("ticket_ended", played.step, 3)
+    refused("ticket_ended", played.start)
+    refused("ticket_ended", played.finish)
+    refused("ticket_ended", played.answer, HALF)
+    assert played.tickets.status(played.number, played.token).phase == "ended"
+    set_clocks(monkeypatch, forward=-26, passed=25)  # set back, it extends no deadline
+    refused("ticket_ended", played.step, 3)
+
+
+def test_a_ticket_is_over_when_its_last_instance_is_answered(played):
+    for instance, over in ((0, []), (1, [played.number])):
+        played.finish(instance)
+        played.answer(HALF, instance)
+        assert played.tickets.over() == over
+        phase = played.tickets.status(played.number, played.token).phase
+        assert phase == ("ended" if over else "running")
+
+
+def test_an_altered_request_holds_up_no_other_ticket(played, monkeypatch):
+    second = played.board.request(played.key, 1)
+    played.store.start_ticket(second)
+    (played.folder / "ticket.json").write_bytes(second.to_bytes())
+    played.restart()
+    set_clocks(monkeypatch, 0, passed=25)
+    assert played.tickets.over() == [2]
+
+
+def test_a_clock_set_forward_ends_tickets_after_a_minute(played, monkeypatch):
+    def over(hours, seconds):
+        set_clocks(monkeypatch, hours, seconds / 3600.0)
+        return played.tickets.over()
+
+    looks = ((25, 0.0), (25, 50.0), (0, 60.0), (25, 70.0), (25, 129.0))
+    assert [over(*look) for look in looks] == [[]] * 5
+    assert over(25, 131.0) == [played.number]
+
+
+def test_the_clock_of_a_server_begins_no_earlier_than_the_log():
+    start = moment(2)
+    clock, expected = Clock(start), datetime.datetime.fromisoformat(start).timestamp()
+    assert clock.now >= expected
+    assert clock.sure >= expected
+
+
+def test_a_closed_ticket_takes_nothing_from_requests_in_progress(played):
+    played.start(instance=1)
+    instance, other = played.tickets.ticket(played.number).instances
+    played.finish()
+    played.tickets.close_ticket(played.number)
+    refused("ticket_ended", instance.answer, pack_table(HALF), "")
+    assert not instance.answered
+    refused("ticket_ended", other.start, LANES)
+    refused("ticket_ended", other.step, request(1))
+    refused("ticket_ended", other.finish)
+
+
+def test_steps_that_arrive_while_an_unplayed_ticket_is_closed_are_scored(played, monkeypatch):
+    def late(ticket):
+        ticket.instance(0).start(LANES)
+        ticket.instance(0).step(request(1))
+        close(ticket)
+
+    close = RunningTicket.close
+    monkeypatch.setattr(RunningTicket, "close", late)
+    assert played.tickets.end_unplayed([played.number], 100) == []
+    assert played.store.ticket(played.board.season.digest, played.number).result is None
+
+
+def test_tickets_that_nobody_played_score_one_without_a_process(played, monkeypatch):
+    played.take_ticket(1)
+    played.start(lanes=48)
+    store, season = played.store, played.board.season
+    set_clocks(monkeypatch, 0, passed=25)
+    monkeypatch.delattr(Attendant, "_start")
+    evaluated = [score_ticket(store, season, MASTER, number) for number in (1, 2)]
+    Attendant(played.tickets).attend()
+    assert played.tickets.over() == []
+    assert [store.sealed_result(row) for row in store.entrants(season.digest)] == evaluated
+    # Nor does such a ticket keep its name from others.
+    assert store.holder_of_name(f"Tester {played.key.public[:8]}") is None
+
+
+def test_a_ticket_takes_nothing_while_it_is_scored_and_what_it_took_is_flushed(played, monkeypatch):
+    played.start()
+    played.step(1)
+    flushed = []
+    monkeypatch.setattr(os, "fdatasync", fails(errno.EIO))
+    played.tickets.sync()  # a disk that fails for a moment ends no server
+    monkeypatch.setattr(os, "fdatasync", flushed.append)
+    Attendant(played.tickets).attend()
+    assert len(flushed) == 1
+    set_clocks(monkeypatch, 0, passed=25)
+    process = Mock()
+    monkeypatch.setattr(Attendant, "_start", lambda _: process)
+    attendant = Attendant(played.tickets)
+    attendant.attend()
+    instance = played.tickets.ticket(played.number).instance(0)
+    refused("ticket_ended", instance.step, request(2))
+    attendant.stop()
+    process.terminate.assert_called_once()
+    process.join.assert_called_once()
+
+
+def ended(code):
+    """A process that has ended."""
+    return Mock(exitcode=code, is_alive=lambda: False)
+
+
+def test_tickets_that_could_not_be_scored_are_tried_again_one_by_one(played, monkeypatch):
+    """The first process dies; then the journal of ticket 1 cannot be read for a while."""
+    broken = played.folder / "0.journal"
+    for number in (1, 2):
+        if played.number < number:
+            played.take_ticket(number)
+        played.start()
+        played.step(1)
+    started = []
+    codes = []
+
+    def start(attendant):
+        board = played.board
+        started.append(attendant._numbers)
+        if len(started) == 1:
+            return ended(1)
+        with pytest.raises(SystemExit) as end:
+            _score(board.path, board.season.digest, board.secret, attendant._numbers)
+        codes.append(bool(end.value.code))
+        return ended(int(codes[-1]))
+
+    def attend(seconds):
+        set_clocks(monkeypatch, 0, passed=25 + seconds / 3600)
+        attendant.attend()
+        attendant.attend()
+        return started
+
+    monkeypatch.setattr("leaderboard.seasons.tickets.signal.signal", lambda *_: None)
+    monkeypatch.setattr(Attendant, "_start", start)
+    whole = broken.read_bytes()
+    broken.write_bytes(b"no journal")
+    played.restart()
+    attendant = Attendant(played.tickets)
+    assert attend(seconds=0) == [[1, 2]]
+    assert attend(seconds=2) == [[1, 2], [1]]
+    assert attend(seconds=2) == [[1, 2], [1], [2]]
+    assert played.tickets.over() == [1]
+    broken.write_bytes(whole)
+    assert attend(seconds=60) == [[1, 2], [1], [2], [1]]
+    assert played.tickets.over() == []
+    assert codes == [True, False, False]
+
+
+@pytest.mark.parametrize("lanes", [1, LANES])
+def test_journals_and_answers_count_on_the_board(tmp_path, lanes):
+    member = {"name": "deep", "setting": SETTING, "instances": 1, "budget": 1024}
+    with playing(online_board(tmp_path, classes=[member])) as played:
+        season = played.board.season
+        played.start(lanes)
+        for number in range(1, 1024 // lanes):  # the budget, but for its last request
+            played.step(number, lanes=lanes)
+        played.finish()
+        played.answer(HALF)
+
+        def written():
+            return sum(path.stat().st_size for path in played.folder.glob("0.*"))
+
+        def counted():
+            return played.store.total_bytes() - len(played.request.to_bytes())
+
+        assert 4 * 1000 < written() <= counted() == played_bytes(season)
+        played.score()
+        [row] = played.store.entrants(season.digest)
+        result = played.store.sealed_result(row)
+        assert written() < counted() < played_bytes(season) + len(to_bytes(result))
+        assert played_bytes(season, result) >= written()
+
+
+def test_no_ticket_starts_without_room_for_its_steps(tmp_path):
+    member = {"name": "deep", "setting": SETTING, "instances": 2, "budget": 4096}
+    room = played_bytes(tiny_season("sealed-online", classes=[member])) * 3 // 2
+    board = online_board(tmp_path, limits={"total_bytes": room}, classes=[member])
+    with playing(board) as played:
+        second = Envelope.read(board.request(played.key, 1).to_bytes(), SignedTicketRequest)
+        refused("quota", start_ticket, played.store, second, board.season.digest)
+        assert len(played.store.entrants(board.season.digest)) == 1
+        played.start()
+        for number in range(1, 5):
+            played.step(number)
+        played.score()
+        assert start_ticket(played.store, second, board.season.digest) == (2, True)
+
+
+@pytest.mark.parametrize("confirmed", [False, True])
+def test_answers_that_do_not_reach_the_disk_are_sent_again(played, monkeypatch, confirmed):
+    """They are not stored, or only the folder could not be synced: then they are confirmed."""
+    played.finish()
+    if confirmed:
+        monkeypatch.setattr("leaderboard.seasons.instance.io.sync_folder", fails(errno.EIO))
+    else:
+        monkeypatch.setattr(os, "link", fails(errno.ENOSPC))
+    for _ in range(2):
+        refused("storage_full", played.answer, HALF)
+    monkeypatch.undo()
+    if not confirmed:
+        played.restart()
+        assert played.status().phase == "answering"
+    assert played.answer(HALF) is not confirmed
+    assert played.tickets.ticket(played.number).instance(0).answered
+
+
+def test_instances_used_long_ago_leave_memory_and_large_ones_take_more(played, monkeypatch):
+    def ready():
+        instances = played.tickets.ticket(played.number).instances
+        return [each.is_ready for each in instances]
+
+    monkeypatch.setattr(tickets_module, "MOST_HELD_LANES", 150)
+    played.start()
+    played.start(instance=1)
+    assert ready() == [False, True]
+    played.step(1)
+    assert ready() == [True, False]
+    played.restart()
+    monkeypatch.setattr(SteppedInstance, "weights", 2**20)
+    monkeypatch.setattr(tickets_module, "MOST_HELD_LANES", 2**21 // 100)
+    played.start()
+    assert ready() == [True, False]
+    played.start(instance=1)
+    assert ready() == [False, True]
+    monkeypatch.setattr(SteppedInstance, "weights", 2**22)  # no steps in the event loop
+    assert ready() == [False, False]
+
+
+def test_one_server_that_has_the_master_steps_a_season(played, tmp_path):
+    with pytest.raises(BoardError, match="another server steps it"):
+        Tickets(played.store, played.board.secret)
+    other = Master.generate().write(tmp_path / "other.master")
+    with pytest.raises(BoardError, match="the master of no sealed-online season"):
+        Tickets(played.store, other)
+    with tiny_board(tmp_path / "offline") as store:
+        store.announce(tiny_season("sealed-offline"))
+        with pytest.raises(BoardError, match="the master of no sealed-online season"):
+            Tickets(store, played.board.secret)
+
+
+def test_what_was_not_answered_scores_one(played):
+    played.start()
+    played.step(1)
+    played.finish()
+    hidden = played.tickets.ticket(played.number).hidden(0)
+    states = unpack_table(played.tickets.challenge(played.number, played.token, 0), 4)
+    played.answer(materialize(hidden.spec).optimal_action(states[:, :2]))
+    assert played.score()
+    assert not played.score()
+    [row] = played.store.entrants(played.board.season.digest)
+    result = played.store.sealed_result(row)
+    assert result is not None
+    assert result.runs[0].wd_regret < 1e-6
+    assert result.runs[1].wd_regret == result.runs[1].ood_decay == 1.0
+    assert [each.steps for each in result.stepping] == [LANES, 0]
+    assert result.stepping[1].normalised_online_regret == 1.0
+    assert all(run.spec is run.evaluation_seed is None for run in result.runs)
+    played.restart()
+    refused("ticket_ended", played.start)
