@@ -44,12 +44,29 @@ settings.register_profile(
 settings.load_profile("deterministic")
 
 
+KERNELS = """
+import gymnasium, numpy as np, sme_registry
+for env in {envs}:
+    env.reset(seed=0)
+    env.step(np.full(env.action_space.shape, 0.5, {dtype}))
+"""
+SINGLE, BATCH = "gymnasium.make('SME/Default-v1')", "gymnasium.make_vec('SME/Default-v1')"
+_compiling = []
+
+
 def pytest_configure(config):
-    """Compile the step once, before the workers and their children would each do it."""
-    if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
-        kernels = "sme_registry.compiled.kernels"
-        if importlib.util.find_spec("numba"):  # an extra
-            subprocess.run([sys.executable, "-c", f"import {kernels}"], check=True)
+    """Compile the steps while the workers collect, before they and their children would each."""
+    is_worker = not config.getoption("numprocesses", None) or hasattr(config, "workerinput")
+    if is_worker or not importlib.util.find_spec("numba"):  # an extra
+        return
+    for envs, dtype in ((f"[{SINGLE}]", "np.float32"), (f"[{BATCH}, {SINGLE}]", "float")):
+        script = KERNELS.format(envs=envs, dtype=dtype)
+        _compiling.append(subprocess.Popen([sys.executable, "-c", script]))
+
+
+def pytest_unconfigure():
+    for process in _compiling:
+        assert process.wait() == 0
 
 
 def pytest_collection_modifyitems(items):

@@ -75,9 +75,8 @@ class Engine:
     backend: Backend
     # The buffer of a single environment at t = 0, for its steps, and a view of its own entries.
     new_buffer: Callable[[], tuple[Array, Array]]
-    step_float32: StepOne
-    step_float64: StepOne
-    step_many: StepMany
+    step_one: Callable[[np.dtype[Any]], StepOne]  # for actions of float32 or float64
+    step_many: Callable[[], StepMany]
     seen: Network  # what agents see, of states and distractors
     optimal_action: Callable[[Array], Array]  # π* `[B, A]` of states `[B, S]`, in blocks
 
@@ -113,7 +112,7 @@ def network(
     with compiling():
         from sme_registry.compiled import kernels
     packed = kernels.pack_layers(layers)
-    run = kernels.network.get_overload(kernels.NETWORK)
+    run = machine_code(kernels.network, kernels.NETWORK)
 
     def compiled(x: Array) -> Array:
         out = np.empty((len(layers[-1].b), x.shape[1]))
@@ -147,6 +146,19 @@ def compiling() -> Iterator[None]:
         timer.cancel()
 
 
+def machine_code(function: Any, signature: Any) -> Callable[..., Any]:
+    """The entry point of a kernel for arrays of these types, compiled where it is not yet.
+
+    It skips Numba's dispatch on argument types, a tenth of a step's time, and requires arrays of
+    exactly these types and dimensions.
+    """
+    if signature.args not in function.overloads:
+        with compiling():
+            function.compile(signature)
+    entry: Callable[..., Any] = function.get_overload(signature)
+    return entry
+
+
 def _seen(task: Task, backend: Backend) -> Network:
     uniform = task.spec.mixing == "nonlinear"
     return network(task.mixing, uniform=uniform, backend=backend)
@@ -156,24 +168,25 @@ _packed: weakref.WeakKeyDictionary[Task, Array] = weakref.WeakKeyDictionary()
 
 
 def _numba_engine(task: Task) -> Engine:
-    with compiling():  # where nothing is cached yet; else it loads Numba: 0.3 s of CPU
+    with compiling():  # loads Numba: 0.3 s of CPU
         from sme_registry.compiled import kernels
 
     if task not in _packed:
         _packed[task] = kernels.pack(task)
     packed = _packed[task]
-    # The entry points skip Numba's dispatch on argument types, a tenth of a step's time. They
-    # require arrays of exactly these types and dimensions.
-    steps: list[StepOne]
-    if packed.size <= SMALL:
-        prefix = packed
-        signatures = kernels.PACKED_FLOAT32, kernels.PACKED_FLOAT64
-        steps = [kernels.step_packed.get_overload(types) for types in signatures]
-    else:
-        prefix = packed[:0]
-        signatures = kernels.ONE_FLOAT32, kernels.ONE_FLOAT64
-        one = kernels.step_one
-        steps = [functools.partial(one.get_overload(types), packed) for types in signatures]
+    is_small = packed.size <= SMALL
+    prefix = packed if is_small else packed[:0]
+
+    @functools.cache
+    def step_one(dtype: np.dtype[Any]) -> StepOne:
+        if is_small:
+            return machine_code(kernels.step_packed, kernels.STEP_PACKED[dtype])
+        return functools.partial(machine_code(kernels.step_one, kernels.STEP_ONE[dtype]), packed)
+
+    @functools.cache
+    def step_many() -> StepMany:
+        return functools.partial(machine_code(kernels.step_many, kernels.STEP_MANY), packed)
+
     start, size = prefix.size, kernels.buffer_size(packed)
 
     def new_buffer() -> tuple[Array, Array]:
@@ -193,9 +206,8 @@ def _numba_engine(task: Task) -> Engine:
                 channel += x.shape[1]
         return out
 
-    many = functools.partial(kernels.step_many.get_overload(kernels.STEP_MANY), packed)
     seen = _seen(task, "numba")
-    return Engine("numba", new_buffer, steps[0], steps[1], many, seen, optimal_action)
+    return Engine("numba", new_buffer, step_one, step_many, seen, optimal_action)
 
 
 def _numpy_engine(task: Task) -> Engine:
@@ -266,7 +278,7 @@ def _numpy_engine(task: Task) -> Engine:
         blocks = [task.policy(s[first : first + _BLOCK]) for first in range(0, len(s), _BLOCK)]
         return np.concatenate(blocks) if blocks else np.empty((0, A))
 
-    return Engine("numpy", new_buffer, step_one, step_one, step_many, seen, optimal_action)
+    return Engine("numpy", new_buffer, lambda _: step_one, lambda: step_many, seen, optimal_action)
 
 
 def _entries(task: Task) -> int:

@@ -410,13 +410,18 @@ def _one_step(p, buffer, start, action, actions, observation):  # type: ignore[n
 
 _RESULT = types.UniTuple(float64, 2)
 _REST = (float64[::1], float32[::1])
-ONE_FLOAT32 = _RESULT(_PACKED, float64[::1], float32[:], *_REST)
-ONE_FLOAT64 = _RESULT(_PACKED, float64[::1], float64[:], *_REST)
-PACKED_FLOAT32 = _RESULT(float64[::1], float32[:], *_REST)
-PACKED_FLOAT64 = _RESULT(float64[::1], float64[:], *_REST)
+# By the dtype of the actions; compiled when they are asked for, by `engine.machine_code`.
+STEP_ONE = {
+    np.dtype(np.float32): _RESULT(_PACKED, float64[::1], float32[:], *_REST),
+    np.dtype(np.float64): _RESULT(_PACKED, float64[::1], float64[:], *_REST),
+}
+STEP_PACKED = {
+    np.dtype(np.float32): _RESULT(float64[::1], float32[:], *_REST),
+    np.dtype(np.float64): _RESULT(float64[::1], float64[:], *_REST),
+}
 
 
-@njit([ONE_FLOAT32, ONE_FLOAT64], error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True)
 def step_one(p, buffer, action, actions, observation):  # type: ignore[no-untyped-def]
     """One step of one environment of a single agent.
 
@@ -430,7 +435,7 @@ def step_one(p, buffer, action, actions, observation):  # type: ignore[no-untype
     return _one_step(p, buffer, _U0, action, actions, observation)
 
 
-@njit([PACKED_FLOAT32, PACKED_FLOAT64], error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True)
 def step_packed(buffer, action, actions, observation):  # type: ignore[no-untyped-def]
     """`step_one` for an environment whose own numbers follow its packed task in one array."""
     return _one_step(buffer, buffer, np.uint64(buffer[8]), action, actions, observation)
@@ -776,7 +781,7 @@ STEP_MANY = boolean(
 )
 
 
-@njit(STEP_MANY, error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True)
 def step_many(p, s, t, accumulated, own, action, moved, observation, actions, values, ends):  # type: ignore[no-untyped-def]
     """One step of `B` environments of a team of n agents; a single agent is a team of one.
 
@@ -842,7 +847,7 @@ def step_many(p, s, t, accumulated, own, action, moved, observation, actions, va
 NETWORK = void(_PACKED, float64[:, ::1], boolean, float64[:, ::1])
 
 
-@njit(NETWORK, error_model="numpy", cache=True)
+@njit(error_model="numpy", cache=True)
 def network(p, s, uniform, out):  # type: ignore[no-untyped-def]
     """The output `[out, B]` of packed layers of inputs `[in, B]`; see `pack_layers`."""
     layers, widest = int(p[0]), int(p[1])

@@ -373,7 +373,7 @@ class Batch:
     def _put_in_force(self) -> None:
         """Prepare what depends on the segments: what steps the batch, and what is shown."""
         segments = np.unique(self._segment).tolist()
-        steps = [self._engine_of(segment).step_many for segment in segments]
+        steps = [self._engine_of(segment).step_many() for segment in segments]
         envs = [np.flatnonzero(self._segment == segment) for segment in segments]
         self._groups = [*zip(steps, envs, strict=True)]
         self._step_many: StepMany = steps[0] if len(steps) == 1 else self._step_groups

@@ -30,7 +30,7 @@ from sme_registry.spec.sme_spec import ActionRange, SpecLike
 from sme_registry.spec.stream import StreamLike
 from sme_registry.task import Task
 
-_FLOAT32 = np.dtype(np.float32)
+_FLOAT32, _FLOAT64 = np.dtype(np.float32), np.dtype(np.float64)
 _POOL_BYTES = 4096
 _AHEAD = 256  # lifetimes made at once: NumPy's numbers one by one cost a quarter of a step
 _ONLY: Indices = np.zeros(1, np.int64)
@@ -238,8 +238,9 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         more_to_do = self._rescaled or self.render_mode is not None
         # Actions of this dtype need no checks; none where they are rescaled or frames are drawn.
         no_checks = None if more_to_do else _FLOAT32
+        step_one = self._engine.step_one
+        plain_step = step_one(no_checks or _FLOAT64)
         more_to_do |= len(self._parts) > 1
-        step_float32, step_float64 = self._engine.step_float32, self._engine.step_float64
         buffer, next_rows = self._buffer, self._rows.pop
         similarity, step_reward, regret, accumulated_reward = (view for _, view in self._values)
         phase, lifetimes, is_stream = self._phase, self._lifetimes, self._schedule.is_stream
@@ -255,10 +256,10 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             except AttributeError:
                 plain = False
             if plain:
-                reward, end = step_float32(buffer, action, optimal, observation)
+                reward, end = plain_step(buffer, action, optimal, observation)
             else:
                 action = env._checked(action)
-                reward, end = step_float64(buffer, action, optimal, observation)
+                reward, end = step_one(_FLOAT64)(buffer, action, optimal, observation)
             info: dict[str, Any]
             if is_stream:  # written out: a dictionary that grows to seven keys costs twice as much
                 info = {

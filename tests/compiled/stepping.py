@@ -38,7 +38,7 @@ class Lane:
         """One step with a float32 or float64 action; None where it was refused."""
         A, S = self.task.spec.action_dim, self.task.spec.state_dim
         optimal, observation = np.empty(A), np.empty(S + 2, np.float32)
-        entry = self.engine.step_float32 if action.dtype == np.float32 else self.engine.step_float64
+        entry = self.engine.step_one(action.dtype)
         reward, end = entry(self.buffer, action, optimal, observation)
         if end < 0:
             return None
@@ -57,7 +57,7 @@ def step_batch(task, engine, states, t, r_cum, actions):
         np.empty((1, B, A)),
     )
     own, values, ends = np.zeros((2, B)), np.empty((5, n, B)), np.empty((2, B), bool)
-    if not engine.step_many(
+    if not engine.step_many()(
         np.ascontiguousarray(states.T), t.copy(), r_cum.T.copy(), own,
         actions, moved, observation, optimal, values, ends,
     ):  # fmt: skip
