@@ -13,7 +13,7 @@ from sme_registry.errors import SealedError
 from sme_registry.io.terminal import CommandGroup, application
 
 _SUBMIT, _RESULTS = f"{__name__}.submissions", f"{__name__}.results"
-_TICKETS, _SEASONS = "leaderboard.seasons.cli_tickets", "leaderboard.seasons.cli"
+_TICKETS, _SEASONS = "leaderboard.seasons.entrant", "leaderboard.seasons.cli"
 _ADMIN = f"{__name__}.admin"
 
 _PANELS = {

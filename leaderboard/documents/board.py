@@ -7,7 +7,7 @@
     withdrawals/<64 hex>.json    signed withdrawals, by the submission's id
     results/<64 hex>.json        by the submission's id
     objects/ab/cdef…             artefacts, by the SHA-256 of their bytes
-    seasons/<64 hex>/            sealed seasons, by the digest of season.json; see `SeasonFolder`
+    seasons/<64 hex>/            sealed seasons
     index.sqlite                 an index of all these, which `reindex` recreates
 
 The log is authoritative. A board has one suite and one protocol.
@@ -35,7 +35,6 @@ RULES: Final = 2
 
 FILE = "board.json"
 KEY = "board.key"
-STEPPING = ".stepping"
 MAX_BYTES = 2**20
 """Of board.json; that of the largest suite that fits a board has about a tenth."""
 
@@ -256,10 +255,6 @@ class Folder:
         """The path of a submission's result, by the submission's id."""
         return self.results / f"{hex_of(id)}.json"
 
-    def season(self, digest: str) -> SeasonFolder:
-        """The folder of a season, by its digest."""
-        return SeasonFolder(self.seasons / hex_of(digest))
-
     def object(self, digest: str) -> Path:
         """The path of an artefact, by its digest."""
         digits = hex_of(digest)
@@ -268,48 +263,6 @@ class Folder:
     def log_entry(self, sequence: int) -> Path:
         """The path of a log entry, by its number, 0 for the first."""
         return self.log / f"{sequence:08d}.json"
-
-
-class SeasonFolder:
-    """The paths of a season's files; creates and reads nothing by itself.
-
-        season.json                   the season
-        entries/<64 hex>.json         signed entries of an offline season, by id
-        tickets/<number>/ticket.json  signed requests of an online season, by the ticket's number
-        results/<64 hex>.json         by the id of the entry or request
-        reveal.json                   the master, after the close
-        .stepping                     the lock of the server that steps it
-
-    Answers of entries are among the board's objects.
-
-    Args:
-      path: the season's folder.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.season = path / "season.json"
-        self.entries = path / "entries"
-        self.tickets = path / "tickets"
-        self.results = path / "results"
-        self.reveal = path / "reveal.json"
-        self.stepping = path / STEPPING
-
-    def entry(self, id: str) -> Path:
-        """The path of an entry, by its id."""
-        return self.entries / f"{hex_of(id)}.json"
-
-    def ticket(self, number: int) -> Path:
-        """The folder of a ticket, by its number, 1 for the season's first."""
-        return self.tickets / str(number)
-
-    def request(self, number: int) -> Path:
-        """The path of the request that started a ticket."""
-        return self.ticket(number) / "ticket.json"
-
-    def result(self, id: str) -> Path:
-        """The path of a result, by the id of its entry or request."""
-        return self.results / f"{hex_of(id)}.json"
 
 
 def hex_of(digest: str) -> str:

@@ -16,7 +16,7 @@ how runs become scores. Fields younger than version 1 are left out of the JSON a
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
@@ -203,47 +203,3 @@ class Result(Document):
         if (self.status == "rejected") != (self.code in CODES):
             raise ValueError("code: required if status is 'rejected', not allowed otherwise.")
         return self
-
-
-class Stepping(Document):
-    """The steps taken on one instance of a ticket, as the board's journal has them.
-
-    Attributes:
-      steps: number taken; at most the budget.
-      normalised_online_regret: Σ regret / Σ regret of the constant ½ in the same states, over the
-        budget. Steps that were not taken count like the constant's.
-      learning_curve: the same over each of at most 100 equal parts of the budget, in order.
-      signed: digest of the file in which the entrant signed answers and journal; null without any.
-    """
-
-    fields_added_later: ClassVar[tuple[str, ...]] = ("signed",)
-
-    steps: Annotated[Integer, Field(ge=0)]
-    normalised_online_regret: Annotated[Real, Field(ge=0)]
-    learning_curve: Annotated[tuple[Real, ...], Field(strict=False, min_length=1, max_length=100)]
-    signed: Digest | None = None
-
-
-class SealedResult(Document):
-    """The outcome of a sealed entry or ticket.
-
-    Attributes:
-      season: digest of the season.
-      subject: id of the entry, or of the request for the ticket.
-      runs: one on each hidden instance, in the season's order. Their `spec` is null, as is
-        `evaluation_seed`: until the reveal, neither is public. `artefact` is the digest of the
-        answers; null where there are none, and the run scores 1.
-      stepping: online of each run, in the same order; empty offline.
-      oracle_like: as in `Result`.
-      versions: of the packages on which the numbers depend.
-    """
-
-    schema_version: SchemaVersion = 1
-    season: Digest
-    subject: Digest
-    scores: Scores
-    classes: Annotated[tuple[ClassScore, ...], Field(strict=False, min_length=1)]
-    runs: Annotated[tuple[RunScore, ...], Field(strict=False, min_length=1)]
-    stepping: Annotated[tuple[Stepping, ...], Field(strict=False)] = ()
-    oracle_like: bool = False
-    versions: dict[str, str] = Field(default_factory=dict)

@@ -11,13 +11,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from leaderboard.documents.board import Folder, SeasonFolder
+from leaderboard.documents.board import Folder
 from leaderboard.documents.checks import skeleton
-from leaderboard.documents.result import SealedResult
 from leaderboard.errors import TamperedError
 from leaderboard.seasons.entry import SignedEntry, SignedSealed, SignedTicketRequest
 from leaderboard.seasons.master import Master
-from leaderboard.seasons.season import MAX_LANES, Reveal, SealedTrack, Season, rows_of
+from leaderboard.seasons.season import (
+    MAX_LANES,
+    Reveal,
+    SealedResult,
+    SealedTrack,
+    Season,
+    SeasonFolder,
+    rows_of,
+)
 from leaderboard.store.files import read_document
 from leaderboard.store.log import LogEntry
 from leaderboard.store.rows import EntryRow, name_object, scores_of, scores_text
@@ -353,7 +360,7 @@ class Seasons:
         )
 
     def _at(self, digest: str) -> SeasonFolder:
-        return self._folder.season(digest)
+        return SeasonFolder(self._folder, digest)
 
     def _all(self, statement: str, *values: Any) -> list[tuple[Any, ...]]:
         return self._connection.execute(statement, values).fetchall()

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from leaderboard.documents.board import RULES
-from leaderboard.documents.result import Metric, RunScore, Scores, SealedResult
+from leaderboard.documents.result import Metric, RunScore, Scores
 from leaderboard.documents.submission import Artefact, Knowledge
 from leaderboard.scoring.aggregation import is_oracle_like, method_scores
 from leaderboard.scoring.ranking import RankedRow, ranking
@@ -30,7 +30,7 @@ from leaderboard.seasons.scoring import (
     score_runs,
     sealed_result,
 )
-from leaderboard.seasons.season import Float32, Season, read_answers
+from leaderboard.seasons.season import Float32, SealedResult, Season, read_answers
 from leaderboard.store import EntryRow, SealedRow, Store
 from sme_registry import SMESpec, materialize
 from sme_registry.spec import Setting

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
-from leaderboard.documents.result import RunScore, SealedResult, Stepping
+from leaderboard.documents.result import RunScore
 from leaderboard.documents.submission import utc
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.rescore import RESCORED
@@ -24,7 +24,7 @@ from leaderboard.seasons.publication import follows
 from leaderboard.seasons.ranking import counting, scored_entries
 from leaderboard.seasons.scores import score_ticket
 from leaderboard.seasons.scoring import instances, sealed_result
-from leaderboard.seasons.season import Season
+from leaderboard.seasons.season import SealedResult, Season, Stepping
 from leaderboard.seasons.ticket import RunningTicket, deadline
 from leaderboard.store import SealedRow, Store
 

@@ -14,12 +14,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from leaderboard.documents.result import SealedResult, Stepping
 from leaderboard.scoring.aggregation import failed_run
 from leaderboard.seasons.journal import Journal
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.scoring import score_run, sealed_result
-from leaderboard.seasons.season import Season
+from leaderboard.seasons.season import SealedResult, Season, Stepping
 from leaderboard.seasons.stepping import Lanes, Start
 from leaderboard.seasons.ticket import RunningTicket
 from leaderboard.store import Store

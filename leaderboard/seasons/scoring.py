@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from leaderboard.documents.board import RULES
-from leaderboard.documents.result import RunScore, SealedResult, Stepping
+from leaderboard.documents.result import RunScore
 from leaderboard.scoring.aggregation import (
     Groups,
     class_score,
@@ -25,7 +25,15 @@ from leaderboard.scoring.aggregation import (
     run_metrics,
 )
 from leaderboard.seasons.master import Master, Place
-from leaderboard.seasons.season import Float32, Hidden, Season, Terms, rows_of
+from leaderboard.seasons.season import (
+    Float32,
+    Hidden,
+    SealedResult,
+    Season,
+    Stepping,
+    Terms,
+    rows_of,
+)
 from sme_registry import EvaluationProtocol, SMESpec
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation import (

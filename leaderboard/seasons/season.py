@@ -14,12 +14,15 @@ from __future__ import annotations
 import datetime
 import hmac
 from collections.abc import Iterator
-from typing import Annotated, Literal, NamedTuple, Self
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field, field_validator, model_validator
 
+from leaderboard.documents.board import Folder, hex_of
+from leaderboard.documents.result import ClassScore, RunScore, Scores
 from leaderboard.documents.submission import UtcTime
 from leaderboard.errors import Rejection
 from leaderboard.seasons.master import Master
@@ -289,3 +292,93 @@ def read_answers(data: bytes, setting: Setting, protocol: EvaluationProtocol) ->
         raise Rejection("answer_shape", str(error)) from None
     except ActionError as error:
         raise Rejection("answer_not_finite", str(error)) from None
+
+
+STEPPING = ".stepping"
+
+
+class SeasonFolder:
+    """The paths of a season's files; creates and reads nothing by itself.
+
+        season.json                   the season
+        entries/<64 hex>.json         signed entries of an offline season, by id
+        tickets/<number>/ticket.json  signed requests of an online season, by the ticket's number
+        results/<64 hex>.json         by the id of the entry or request
+        reveal.json                   the master, after the close
+        .stepping                     the lock of the server that steps it
+
+    Answers of entries are among the board's objects.
+
+    Args:
+      folder: the board's.
+      digest: of the season.
+    """
+
+    def __init__(self, folder: Folder, digest: str) -> None:
+        self.path = path = folder.seasons / hex_of(digest)
+        self.season = path / "season.json"
+        self.entries = path / "entries"
+        self.tickets = path / "tickets"
+        self.results = path / "results"
+        self.reveal = path / "reveal.json"
+        self.stepping = path / STEPPING
+
+    def entry(self, id: str) -> Path:
+        """The path of an entry, by its id."""
+        return self.entries / f"{hex_of(id)}.json"
+
+    def ticket(self, number: int) -> Path:
+        """The folder of a ticket, by its number, 1 for the season's first."""
+        return self.tickets / str(number)
+
+    def request(self, number: int) -> Path:
+        """The path of the request that started a ticket."""
+        return self.ticket(number) / "ticket.json"
+
+    def result(self, id: str) -> Path:
+        """The path of a result, by the id of its entry or request."""
+        return self.results / f"{hex_of(id)}.json"
+
+
+class Stepping(Document):
+    """The steps taken on one instance of a ticket, as the board's journal has them.
+
+    Attributes:
+      steps: number taken; at most the budget.
+      normalised_online_regret: Σ regret / Σ regret of the constant ½ in the same states, over the
+        budget. Steps that were not taken count like the constant's.
+      learning_curve: the same over each of at most 100 equal parts of the budget, in order.
+      signed: digest of the file in which the entrant signed answers and journal; null without any.
+    """
+
+    fields_added_later: ClassVar[tuple[str, ...]] = ("signed",)
+
+    steps: Annotated[Integer, Field(ge=0)]
+    normalised_online_regret: Annotated[Real, Field(ge=0)]
+    learning_curve: Annotated[tuple[Real, ...], Field(strict=False, min_length=1, max_length=100)]
+    signed: Digest | None = None
+
+
+class SealedResult(Document):
+    """The outcome of a sealed entry or ticket.
+
+    Attributes:
+      season: digest of the season.
+      subject: id of the entry, or of the request for the ticket.
+      runs: one on each hidden instance, in the season's order. Their `spec` is null, as is
+        `evaluation_seed`: until the reveal, neither is public. `artefact` is the digest of the
+        answers; null where there are none, and the run scores 1.
+      stepping: online of each run, in the same order; empty offline.
+      oracle_like: as in `Result`.
+      versions: of the packages on which the numbers depend.
+    """
+
+    schema_version: SchemaVersion = 1
+    season: Digest
+    subject: Digest
+    scores: Scores
+    classes: Annotated[tuple[ClassScore, ...], Field(strict=False, min_length=1)]
+    runs: Annotated[tuple[RunScore, ...], Field(strict=False, min_length=1)]
+    stepping: Annotated[tuple[Stepping, ...], Field(strict=False)] = ()
+    oracle_like: bool = False
+    versions: dict[str, str] = Field(default_factory=dict)

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 from typing import Literal
 
-from leaderboard.documents.board import SeasonFolder
-from leaderboard.documents.result import SealedResult
 from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.seasons.entry import SignedEntry, SignedTicketRequest
 from leaderboard.seasons.events import SealedRow, SeasonRow
 from leaderboard.seasons.master import Master
-from leaderboard.seasons.season import Reveal, SealedTrack, Season
+from leaderboard.seasons.season import Reveal, SealedResult, SealedTrack, Season, SeasonFolder
 from leaderboard.store.database import Database
 from leaderboard.store.files import read_document
 
@@ -82,7 +80,7 @@ class SealedStore(Database):
 
     def season_folder(self, digest: str) -> SeasonFolder:
         """The folder of a season, by its digest."""
-        return self.folder.season(digest)
+        return SeasonFolder(self.folder, digest)
 
     def enter(self, signed: SignedEntry) -> bool:
         """Add an entry, which `intake` has checked, to an open season.

@@ -9,9 +9,9 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from leaderboard.documents.board import STEPPING
 from leaderboard.errors import TamperedError
 from leaderboard.seasons.entry import SignedEntry, SignedSealed, SignedTicketRequest
+from leaderboard.seasons.season import STEPPING, SeasonFolder
 from leaderboard.store import Index, SealedRow, SeasonRow, read_document
 from sme_registry.io import TEMPORARY
 
@@ -67,7 +67,7 @@ def check_sealed_signatures(index: Index) -> tuple[int, int]:
 
 
 def _signed(index: Index, season: SeasonRow, row: SealedRow) -> tuple[Path, SignedSealed]:
-    folder = index.folder.season(season.digest)
+    folder = SeasonFolder(index.folder, season.digest)
     if season.track == "sealed-online":
         path = folder.request(row.number)
         return path, read_document(index.folder, path, SignedTicketRequest, row.document)

@@ -5,7 +5,7 @@
     GET  /api/seasons/{id}/ranking?metric=wd_regret             its methods with results
     POST /api/seasons/{id}/entries                              201 an offline entry, 200 known
     POST /api/seasons/{id}/tickets                              201 a ticket, 200 the same again;
-                                                                signed, see `intake.tickets`
+                                                                signed, see `admission`
     GET  /api/seasons/{id}/tickets/{n}                          its status
     POST /api/seasons/{id}/tickets/{n}/instances/{i}/start      present observations
     POST /api/seasons/{id}/tickets/{n}/instances/{i}/steps      one step of all lanes
@@ -36,11 +36,11 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import Scope
 
-from leaderboard import intake
-from leaderboard.documents.result import RANKED_METRICS, SealedResult
+from leaderboard.documents.result import RANKED_METRICS
 from leaderboard.documents.submission import MAX_BYTES, Envelope, Knowledge
 from leaderboard.errors import Rejection
 from leaderboard.scoring.ranking import RankedRow
+from leaderboard.seasons.admission import receive_entry, refuse_other_sender, start_ticket
 from leaderboard.seasons.entry import SignedEntry, SignedTicketRequest
 from leaderboard.seasons.ranking import (
     OfKey,
@@ -49,7 +49,7 @@ from leaderboard.seasons.ranking import (
     ranking_facts,
     season_rankings,
 )
-from leaderboard.seasons.season import Season
+from leaderboard.seasons.season import SealedResult, Season
 from leaderboard.seasons.tickets import Tickets, attending
 from leaderboard.store import SealedRow, SeasonRow, Store
 from leaderboard.web import charts
@@ -169,8 +169,8 @@ class SeasonRoutes:
 
         def start() -> tuple[seasons.Ticket, bool]:
             envelope = Envelope.read(text, SignedTicketRequest)
-            intake.refuse_other_sender(self._store, envelope, header)
-            number, new = intake.start_ticket(self._store, envelope, tickets.digest)
+            refuse_other_sender(self._store, envelope, header)
+            number, new = start_ticket(self._store, envelope, tickets.digest)
             return tickets.ticket(number).document, new
 
         ticket, new = await _run(start, self._requests)
@@ -185,7 +185,7 @@ class SeasonRoutes:
 
         def enter() -> bool:
             season = self._store.season_row(name).digest
-            return intake.receive_entry(self._store, envelope, season)
+            return receive_entry(self._store, envelope, season)
 
         new = await _run(enter, self._entries)
         return JSONResponse({"id": envelope.id}, 201 if new else 200)

@@ -1,4 +1,4 @@
-"""Client of a served board: sends artefacts and submissions, reads status, withdraws, gets tickets.
+"""Client of a served board: sends artefacts and submissions, reads status, withdraws.
 
 Every object is addressed by its hash, so a lost request can be repeated unchanged. A rejection by
 the board is raised here as the same `Rejection`, with the board's code and message. A board that
@@ -11,8 +11,7 @@ import contextlib
 import functools
 import json
 import os
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 from leaderboard.bundle import Bundle
@@ -21,12 +20,9 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import SignedWithdrawal
 from leaderboard.errors import CODES, BoardError, Rejection
 from leaderboard.intake import upload_header
-from leaderboard.seasons.entry import SignedEntry, SignedTicketRequest
-from leaderboard.seasons.season import Season
 from sme_registry.errors import MalformedDocumentError, OptionError, SealedError, SpecError
 from sme_registry.io import parse_json
-from sme_registry.seasons import Ticket
-from sme_registry.seasons.wire import Connection, tickets_path
+from sme_registry.seasons.wire import Connection
 
 Progress = Callable[[int, int], None]
 
@@ -54,7 +50,7 @@ def submit(
     content = Bundle.read(bundle)
     runs = content.signed.submission.runs
     digests = dict.fromkeys(run.artefact.sha256 for run in runs if run.artefact)
-    with _Board(url, insecure=insecure) as served:
+    with ServedBoard(url, insecure=insecure) as served:
         board = served.document().key
         signed = content.signed.for_board(board, key)
         for done, digest in enumerate(digests, start=1):
@@ -62,7 +58,7 @@ def submit(
             if progress is not None:
                 progress(done, len(digests))
         answer = served.request("POST", "/api/submissions", signed.to_bytes())
-    return str(_answer_for(signed.id, answer, url)["id"])
+    return str(answer_for(signed.id, answer, url)["id"])
 
 
 def page_of(url: str, id: str) -> str:
@@ -75,73 +71,15 @@ def status(url: str, id: str, *, insecure: bool = False) -> dict[str, Any]:
 
     While the board withholds scores, the result is None and `withheld` has the reason.
     """
-    with _Board(url, insecure=insecure) as served:
+    with ServedBoard(url, insecure=insecure) as served:
         answer = served.request("GET", f"/api/submissions/{_digits(id)}")
-    return _answer_for(f"sha256:{_digits(id)}", answer, url)
+    return answer_for(f"sha256:{_digits(id)}", answer, url)
 
 
 def board_document(url: str, *, insecure: bool = False) -> BoardDocument:
     """The definition of a served board: suite, protocol and limits."""
-    with _Board(url, insecure=insecure) as served:
+    with ServedBoard(url, insecure=insecure) as served:
         return served.document()
-
-
-def season(url: str, id: str, *, insecure: bool = False) -> tuple[str, str]:
-    """The digest of a season of a served board, and the board's public key."""
-    with _Board(url, insecure=insecure) as served:
-        answer = served.request("GET", f"/api/seasons/{_name(id)}")
-        try:
-            found = Season.from_dict(answer["document"], "season.json")
-        except (SpecError, LookupError, TypeError) as error:
-            raise BoardError(f"{url}: answered with no season: {error}") from None
-        return found.digest, served.document().key
-
-
-def request_ticket(
-    url: str,
-    season: str,
-    signed: SignedTicketRequest,
-    key: SigningKey,
-    *,
-    insecure: bool = False,
-) -> Ticket:
-    """Start a ticket, or get the one that this request has started before.
-
-    `season` is its id, and `key` the entrant's, which signed the request for this board. The
-    ticket has the signer of its answers.
-    """
-    sign = functools.partial(upload_header, key, signed.id, board=signed.board)
-    with _Board(url, insecure=insecure) as served:
-        answer = served.request("POST", tickets_path(_name(season)), signed.to_bytes(), sign)
-    try:
-        ticket = Ticket.from_dict(answer, "ticket")
-    except SpecError as error:
-        raise BoardError(f"{url}: answered with no ticket: {error}") from None
-    return ticket.model_copy(update={"signer": signed.signer(key)})
-
-
-def enter(
-    url: str,
-    season: str,
-    signed: SignedEntry,
-    answers: Mapping[str, bytes],
-    key: SigningKey,
-    progress: Progress | None = None,
-    *,
-    insecure: bool = False,
-) -> str:
-    """Send an entry of a sealed-offline season to a board, and return its id.
-
-    `answers` are the files that it names, by their digests; the rest is as for `submit`.
-    """
-    with _Board(url, insecure=insecure) as served:
-        for done, (digest, data) in enumerate(answers.items(), start=1):
-            served.upload(digest, data, key, signed.board)
-            if progress is not None:
-                progress(done, len(answers))
-        path = f"/api/seasons/{_name(season)}/entries"
-        answer = served.request("POST", path, signed.to_bytes())
-    return str(_answer_for(signed.id, answer, url)["id"])
 
 
 def withdraw(
@@ -149,13 +87,13 @@ def withdraw(
 ) -> None:
     """Withdraw a submission that this key has signed; its page shows the reason."""
     id = f"sha256:{_digits(id)}"
-    with _Board(url, insecure=insecure) as served:
+    with ServedBoard(url, insecure=insecure) as served:
         signed = SignedWithdrawal.create(id, key, reason, board=served.document().key)
         served.request("POST", "/api/withdrawals", json.dumps(signed.to_dict()).encode())
 
 
-class _Board:
-    """One served board; errors are those of this module's functions.
+class ServedBoard:
+    """A served board, whose errors are those of this module's functions; a context manager.
 
     Digests identify objects and documents, so that every request is safe to repeat.
     """
@@ -164,7 +102,7 @@ class _Board:
         self._url = url
         self._connection = Connection(url, insecure=insecure, patience=_PATIENCE)
 
-    def __enter__(self) -> _Board:
+    def __enter__(self) -> ServedBoard:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -199,20 +137,11 @@ class _Board:
         return None
 
 
-def _answer_for(id: str, answer: Any, url: str) -> dict[str, Any]:
+def answer_for(id: str, answer: Any, url: str) -> dict[str, Any]:
     """The answer, checked to be of the submission that was asked for."""
     if not isinstance(answer, dict) or answer.get("id") != id:
         raise BoardError(f"{url}: answered for another submission. Contact the board's owner.")
     return answer
-
-
-def _name(id: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", id):
-        raise OptionError(
-            f"season={id!r:.80}: must be an id of letters, digits, '_' and '-'. Copy it from the "
-            "board."
-        )
-    return id
 
 
 def _digits(id: str) -> str:

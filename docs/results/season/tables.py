@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from leaderboard.documents.result import SealedResult
 from leaderboard.seasons.ranking import MOST_ROWS, counting, table_regret
+from leaderboard.seasons.season import SealedResult
 from leaderboard.store import Store
 
 PARTS = 25  # of a curve in the figure, of the 100 in a result

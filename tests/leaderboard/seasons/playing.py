@@ -12,13 +12,14 @@ import numpy as np
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import Envelope
 from leaderboard.errors import Rejection
-from leaderboard.intake import start_ticket, upload_header
+from leaderboard.intake import upload_header
+from leaderboard.seasons.admission import start_ticket
+from leaderboard.seasons.entrant import request_ticket
 from leaderboard.seasons.entry import SignedTicketRequest
 from leaderboard.seasons.scores import score_ticket
 from leaderboard.seasons.season import Season
 from leaderboard.seasons.tickets import Tickets
 from leaderboard.store import Store
-from leaderboard.web import client
 from sme_registry.io import sha256_of
 from sme_registry.seasons import wire
 from tests.leaderboard.conftest import tiny_board
@@ -49,7 +50,7 @@ class Board(NamedTuple):
 
     def ticket(self, url, key, nonce=0):
         """A new ticket of a served board."""
-        return client.request_ticket(url, self.season.id, self.request(key, nonce), key)
+        return request_ticket(url, self.season.id, self.request(key, nonce), key)
 
 
 def online_board(folder, limits=None, **fields):

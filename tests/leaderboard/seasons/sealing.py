@@ -2,13 +2,12 @@
 
 import datetime
 
-from leaderboard.documents.result import Stepping
 from leaderboard.documents.submission import now, shifted, utc
 from leaderboard.scoring.aggregation import failed_run
 from leaderboard.seasons.entry import Entry, TicketRequest
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.scoring import sealed_result
-from leaderboard.seasons.season import Terms
+from leaderboard.seasons.season import Stepping, Terms
 from sme_registry import EvaluationProtocol
 
 MASTER = Master(bytes(range(32)))
@@ -25,8 +24,8 @@ def moment(days):
 
 def move_clock(monkeypatch, time=AFTERWARDS):
     """Set the clock by which boards decide on seasons and date their log."""
-    for module in ("sealed", "log"):
-        monkeypatch.setattr(f"leaderboard.store.{module}.now", lambda: time)
+    for module in ("seasons.store", "store.log"):
+        monkeypatch.setattr(f"leaderboard.{module}.now", lambda: time)
 
 
 OPENS, CLOSES = moment(-1), moment(1)  # the same in every document of a run

@@ -4,7 +4,6 @@ import httpx
 import numpy as np
 import pytest
 
-from leaderboard import intake
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, Envelope
 from leaderboard.errors import BoardError, Rejection
@@ -33,7 +32,7 @@ def entry(store, key, *answers, **fields):
 
 
 def send(store, signed, *answers):
-    return intake.enter(
+    return entries.enter(
         store, signed, answers={sha256_of(data): data for data in answers}.__getitem__
     )
 
@@ -75,9 +74,9 @@ def test_answers_are_uploads_of_the_entrants_key(store, key):
         if other is not None:
             store.put_object(sha256_of(GOOD), [GOOD], by=other.public)
         with pytest.raises(Rejection, match="artefact_missing"):
-            intake.enter(store, signed)
+            entries.enter(store, signed)
     store.put_object(sha256_of(GOOD), [GOOD], by=key.public)
-    assert intake.enter(store, signed)
+    assert entries.enter(store, signed)
 
 
 def test_bad_answers_are_refused(store, key):
@@ -158,8 +157,8 @@ def test_an_entry_that_is_sent_to_another_season_is_refused(store, key):
     store.announce(other)
     envelope = Envelope.read(entry(store, key, None, None).to_bytes(), SignedEntry)
     with pytest.raises(Rejection, match="season_unknown"):
-        intake.receive_entry(store, envelope, other.digest)
-    assert intake.receive_entry(store, envelope, SEASON.digest)
+        entries.receive_entry(store, envelope, other.digest)
+    assert entries.receive_entry(store, envelope, SEASON.digest)
 
 
 def test_entries_over_http_have_the_same_codes(store, key):

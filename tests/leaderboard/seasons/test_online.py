@@ -9,7 +9,8 @@ import pytest
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import Envelope
 from leaderboard.errors import Rejection
-from leaderboard.intake import start_ticket, upload_header
+from leaderboard.intake import upload_header
+from leaderboard.seasons.admission import start_ticket
 from leaderboard.seasons.entry import SignedTicketRequest, TicketRequest
 from leaderboard.seasons.scores import score_ticket
 from leaderboard.store import Store

@@ -3,10 +3,9 @@
 import pytest
 
 from leaderboard import intake
-from leaderboard.documents.result import Stepping
 from leaderboard.scoring.aggregation import failed_run
 from leaderboard.seasons.scoring import sealed_result
-from leaderboard.seasons.season import Reveal
+from leaderboard.seasons.season import Reveal, Stepping
 from leaderboard.web.pages import Pages
 from leaderboard.web.server import write_site
 from tests.leaderboard.seasons.sealing import (

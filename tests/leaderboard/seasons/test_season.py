@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from leaderboard import intake
 from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import BoardError, Rejection, TamperedError
+from leaderboard.seasons import admission
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.publication import (
     challenge_path,
@@ -80,7 +80,7 @@ def enter(store, season, key, answers, **fields):
     ]
     signed = signed_entry(store, season, key, named, **fields)
     data = dict(zip(digests, files, strict=True))
-    assert intake.enter(store, signed, answers=lambda digest: data[digest] or b"")
+    assert admission.enter(store, signed, answers=lambda digest: data[digest] or b"")
     return signed.id
 
 
@@ -185,7 +185,7 @@ def test_a_plan_with_a_fault_is_refused_and_leaves_no_folder(tmp_path):
 
 
 def test_the_plan_in_the_documentation_is_one():
-    page = (Path(__file__).parents[2] / "docs" / "guides" / "seasons.md").read_text()
+    page = (Path(__file__).parents[3] / "docs" / "guides" / "seasons.md").read_text()
     [text] = re.findall(r"```json\n(.*?)```", page, re.S)
     terms = read_plan(json.loads(text))
     assert len(terms.published) == 10
@@ -391,7 +391,7 @@ def test_a_replay_finds_entries_that_their_key_has_not_signed(store, key, season
         verify_season(store, season.id)
 
 
-BOARD = Path(__file__).resolve().parents[2] / "docs" / "results" / "season" / "board"
+BOARD = Path(__file__).resolve().parents[3] / "docs" / "results" / "season" / "board"
 
 
 def results(store, season):

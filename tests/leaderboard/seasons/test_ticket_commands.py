@@ -9,9 +9,9 @@ import pytest
 from leaderboard.cli.options import KEY_VARIABLE
 from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import BoardError
+from leaderboard.seasons import entrant
 from leaderboard.seasons.tickets import Attendant
 from leaderboard.store import Store
-from leaderboard.web import client
 from sme_registry.seasons import Instance, Ticket
 from tests.leaderboard.seasons.playing import online_board
 from tests.leaderboard.serving import serving
@@ -111,16 +111,16 @@ def test_files_of_actions_answer_challenges_that_were_fetched(url, board):
 
 
 def test_an_interrupted_request_gets_the_same_ticket(url, monkeypatch):
-    request = client.request_ticket
+    request = entrant.request_ticket
 
     def interrupted(*arguments):
         request(*arguments)  # type: ignore[arg-type]
         raise BoardError("the answer was lost")
 
-    monkeypatch.setattr(client, "request_ticket", interrupted)
+    monkeypatch.setattr(entrant, "request_ticket", interrupted)
     start(2, url)
     assert not Path("ticket.json").exists()
-    monkeypatch.setattr(client, "request_ticket", request)
+    monkeypatch.setattr(entrant, "request_ticket", request)
     other = SigningKey.generate().write(Path("other.key"))
     assert "bad_signature" in start(1, url, "--key", other)  # and the request is kept
     assert "Repeating ticket.json.request." in start(0, url)

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from leaderboard.documents.submission import Envelope
 from leaderboard.errors import BoardError, Rejection
-from leaderboard.intake import start_ticket
 from leaderboard.seasons import tickets as tickets_module
+from leaderboard.seasons.admission import start_ticket
 from leaderboard.seasons.entry import SignedTicketRequest
 from leaderboard.seasons.instance import SteppedInstance
 from leaderboard.seasons.master import Master

@@ -10,6 +10,7 @@ from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError, Rejection
+from leaderboard.seasons.entrant import request_ticket
 from leaderboard.seasons.entry import TicketRequest
 from leaderboard.web import client
 from sme_registry.errors import OptionError
@@ -212,7 +213,7 @@ def test_a_ticket_that_is_too_large_is_refused_by_its_size(key, field, value):
         scripted(lambda *_: (201, json.dumps(ticket).encode())) as (url, _),
         pytest.raises(BoardError) as caught,
     ):
-        client.request_ticket(url, "autumn", signed, key)
+        request_ticket(url, "autumn", signed, key)
     assert len(str(caught.value)) < 1000
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import functools
+import re
 import secrets
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
 
-from leaderboard import intake
 from leaderboard.cli.options import (
     DEFAULT_KEY,
     ActionRange,
@@ -30,28 +32,32 @@ from leaderboard.cli.options import (
     read_file,
 )
 from leaderboard.documents.keys import SigningKey
-from leaderboard.errors import Rejection
-from leaderboard.seasons.entry import Entry, SignedTicketRequest, TicketRequest
+from leaderboard.errors import BoardError, Rejection
+from leaderboard.intake import upload_header
+from leaderboard.seasons.admission import enter as enter_folder
+from leaderboard.seasons.entry import Entry, SignedEntry, SignedTicketRequest, TicketRequest
 from leaderboard.seasons.publication import name_of, read_season
+from leaderboard.seasons.season import Season
 from leaderboard.store import Store
-from leaderboard.web import client
-from sme_registry.errors import OptionError
+from leaderboard.web.client import Progress as Sent
+from leaderboard.web.client import ServedBoard, answer_for
+from sme_registry.errors import OptionError, SpecError
 from sme_registry.io import check_new, check_writable, choice, sha256_of, write_atomically
 from sme_registry.io.markup import Table
 from sme_registry.io.terminal import Progress, err, out
 from sme_registry.seasons import Instance, Ticket, actions_in, prepare_policy
-from sme_registry.seasons.wire import TicketPlace, pack_table, unpack_table
+from sme_registry.seasons.wire import TicketPlace, pack_table, tickets_path, unpack_table
 
 app = typer.Typer()
 
-ServedBoard = Annotated[
+BoardUrl = Annotated[
     str, typer.Argument(metavar="URL", help="The URL of the board that serves the season.")
 ]
 
 
 @app.command()
 def ticket(
-    url: ServedBoard,
+    url: BoardUrl,
     season: Annotated[str, typer.Argument(metavar="SEASON", help="The season's id.")],
     method: MethodName,
     submitter: SubmitterName,
@@ -84,7 +90,7 @@ def ticket(
         signed = SignedTicketRequest.read(read_file(request_file))
         err().print(f"Repeating {escape(str(request_file))}.", soft_wrap=True)
     else:
-        season_digest, board = client.season(url, season)
+        season_digest, board = served_season(url, season)
         nonce = secrets.token_hex(32)
         request = TicketRequest.from_dict(
             {
@@ -103,7 +109,7 @@ def ticket(
         signed = request.signed(signing_key, board)
         write_atomically(request_file, signed.to_bytes())
     try:
-        started = client.request_ticket(url, season, signed, signing_key)
+        started = request_ticket(url, season, signed, signing_key)
     except Rejection as rejection:
         # Refused is the request, which has started no ticket, or its sender: with another key, or
         # a wrong clock.
@@ -130,7 +136,7 @@ def ticket(
 
 @app.command()
 def answer(
-    url: ServedBoard,
+    url: BoardUrl,
     ticket_file: Annotated[Path, typer.Argument(metavar="TICKET", help="The ticket's file.")],
     policy: Annotated[
         str | None,
@@ -322,10 +328,10 @@ def enter(
     signed = entry.signed(signing_key, board_document(board).key)
     if is_url(board):
         with Progress("uploading", len(data), console=err(), unit="answers") as progress:
-            client.enter(board, season.id, signed, data, signing_key, progress=progress.update_of)
+            send_entry(board, season.id, signed, data, signing_key, progress=progress.update_of)
     else:
         with Store.open(Path(board)) as store:
-            intake.enter(store, signed, answers=data.__getitem__)
+            enter_folder(store, signed, answers=data.__getitem__)
     out().print(signed.id, soft_wrap=True)
     err().print(
         f"The season closes at {season.closes}; until then a later entry of "
@@ -343,3 +349,70 @@ def _answers(policy: str, states: Path, setting: Any, action_range: str | None) 
     prepared = prepare_policy(policy, setting, action_range=action_range)
     shown = unpack_table(read_file(states), setting.state_dim + 2)
     return pack_table(actions_in(shown, prepared, setting))
+
+
+def served_season(url: str, id: str, *, insecure: bool = False) -> tuple[str, str]:
+    """The digest of a season of a served board, and the board's public key."""
+    with ServedBoard(url, insecure=insecure) as served:
+        answer = served.request("GET", f"/api/seasons/{_name(id)}")
+        try:
+            found = Season.from_dict(answer["document"], "season.json")
+        except (SpecError, LookupError, TypeError) as error:
+            raise BoardError(f"{url}: answered with no season: {error}") from None
+        return found.digest, served.document().key
+
+
+def request_ticket(
+    url: str,
+    season: str,
+    signed: SignedTicketRequest,
+    key: SigningKey,
+    *,
+    insecure: bool = False,
+) -> Ticket:
+    """Start a ticket, or get the one that this request has started before.
+
+    `season` is its id, and `key` the entrant's, which signed the request for this board. The
+    ticket has the signer of its answers.
+    """
+    sign = functools.partial(upload_header, key, signed.id, board=signed.board)
+    with ServedBoard(url, insecure=insecure) as served:
+        answer = served.request("POST", tickets_path(_name(season)), signed.to_bytes(), sign)
+    try:
+        ticket = Ticket.from_dict(answer, "ticket")
+    except SpecError as error:
+        raise BoardError(f"{url}: answered with no ticket: {error}") from None
+    return ticket.model_copy(update={"signer": signed.signer(key)})
+
+
+def send_entry(
+    url: str,
+    season: str,
+    signed: SignedEntry,
+    answers: Mapping[str, bytes],
+    key: SigningKey,
+    progress: Sent | None = None,
+    *,
+    insecure: bool = False,
+) -> str:
+    """Send an entry of a sealed-offline season to a board, and return its id.
+
+    `answers` are the files that it names, by their digests; the rest is as for `submit`.
+    """
+    with ServedBoard(url, insecure=insecure) as served:
+        for done, (digest, data) in enumerate(answers.items(), start=1):
+            served.upload(digest, data, key, signed.board)
+            if progress is not None:
+                progress(done, len(answers))
+        path = f"/api/seasons/{_name(season)}/entries"
+        answer = served.request("POST", path, signed.to_bytes())
+    return str(answer_for(signed.id, answer, url)["id"])
+
+
+def _name(id: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", id):
+        raise OptionError(
+            f"season={id!r:.80}: must be an id of letters, digits, '_' and '-'. Copy it from the "
+            "board."
+        )
+    return id
