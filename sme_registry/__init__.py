@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from sme_registry import envs as envs
     from sme_registry import errors as errors
     from sme_registry import evaluation as evaluation
-    from sme_registry import export as export
     from sme_registry import plots as plots
     from sme_registry import sb3 as sb3
     from sme_registry import seasons as seasons
@@ -109,7 +108,6 @@ _SUBMODULES = (
     "envs",
     "errors",
     "evaluation",
-    "export",
     "plots",
     "sb3",
     "seasons",

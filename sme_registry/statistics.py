@@ -35,9 +35,7 @@ Array = npt.NDArray[np.float64]
 Statistic = Callable[[npt.ArrayLike], Array]  # of [n, …] over the first axis: […]
 
 __all__ = [
-    "Array",
     "Estimate",
-    "Statistic",
     "aggregate",
     "iqm",
     "mean",

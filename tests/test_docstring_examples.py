@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 import sme_registry
 from sme_registry.datasets import make_dataset
-from sme_registry.evaluation import resolve_protocol
+from sme_registry.evaluation.evaluate import resolve_protocol
 from sme_registry.seasons import Ticket
 from sme_registry.seasons.wire import TicketClass
 from sme_registry.spec import Setting, StreamSpec, StudyAlgorithm, StudyFile, StudyPlan, SuiteClass

@@ -9,8 +9,9 @@ import pytest
 from sme_registry import SMESpec, evaluate, materialize
 from sme_registry.errors import OptionError, PolicyError
 from sme_registry.spec.study import Cell
-from sme_registry.training import RunRecord, read_episodes, train
+from sme_registry.training import train
 from sme_registry.training.algorithms import check_hyperparameters
+from sme_registry.training.record import RunRecord, read_episodes
 
 pytest.importorskip("stable_baselines3")
 
@@ -23,9 +24,9 @@ from sme_registry.export import export_onnx
 from sme_registry.sb3 import PPOLagrangian, PPOProjection, SMEVecEnv
 from sme_registry.sb3.vec_env import episodes_of, finished_in
 from sme_registry.studies.engine.cell import run_cell
-from sme_registry.training import numpy_policy
 from sme_registry.training.algorithms import find
 from sme_registry.training.models import load_checkpoint
+from sme_registry.training.numpy_policy import numpy_policy
 
 SPEC = SMESpec(state_dim=3, action_dim=2, horizon=20, safety={"tightness": 0.2}, seed=5)
 SMALL = {"n_steps": 64, "n_epochs": 2, "seed": 3}

@@ -11,7 +11,7 @@ import sme_registry
 from sme_registry import SMESpec
 from sme_registry.errors import OptionError
 from sme_registry.task import materialize
-from sme_registry.training import read_episodes
+from sme_registry.training.record import read_episodes
 from sme_registry.wrappers import (
     RecordRegret,
     RecordVectorRegret,

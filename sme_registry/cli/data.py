@@ -24,17 +24,10 @@ from sme_registry.cli.arguments import (
     print_training,
     with_options,
 )
-from sme_registry.datasets import (
-    Dataset,
-    list_datasets,
-    make_dataset,
-    open_dataset,
-    replay,
-    train_offline,
-    train_sealed,
-)
+from sme_registry.datasets import Dataset, make_dataset, open_dataset, replay, train_offline
 from sme_registry.datasets.documents import PolicyScore, check_algorithm
-from sme_registry.datasets.storage import check_location, datasets_folder
+from sme_registry.datasets.offline import train_sealed
+from sme_registry.datasets.storage import check_location, datasets_folder, list_datasets
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.io import check_new
 from sme_registry.io.markup import Table

@@ -28,8 +28,10 @@ from sme_registry.cli.arguments import (
     with_options,
 )
 from sme_registry.diagnosis.figures import draw
+from sme_registry.diagnosis.subject import load_cell
 from sme_registry.errors import OptionError
-from sme_registry.evaluation import EvaluationReport, Policy, StreamReport, TeamPolicy
+from sme_registry.evaluation import EvaluationReport, Policy, StreamReport
+from sme_registry.evaluation.policies import TeamPolicy
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.io import check_new, integer_in, write_atomically
 from sme_registry.io.terminal import Progress, err, out, print_json
@@ -232,7 +234,7 @@ class SubjectOptions:
             if fields:
                 raise OptionError("--set: changes the task of a policy. Add --task, or remove it.")
             if self.cell is not None:
-                return diagnosis.load_cell(what, self.cell)
+                return load_cell(what, self.cell)
             return diagnosis.load_run(what)
         is_policy = what.endswith(_POLICY_FILES) or (":" in what and not what.startswith("sha256:"))
         if is_policy or not or_task:
@@ -247,9 +249,9 @@ class SubjectOptions:
         if self.task is None and not Path(against).exists():
             study, colon, key = against.rpartition(":")
             if colon:
-                return diagnosis.load_cell(study, key)
+                return load_cell(study, key)
             if self.cell is not None:
-                return diagnosis.load_cell(what, against)
+                return load_cell(what, against)
         return replace(self, cell=None, log=None).subject(against)
 
 

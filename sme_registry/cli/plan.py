@@ -25,7 +25,7 @@ from sme_registry.cli.arguments import (
 )
 from sme_registry.cli.task import ClassOptions
 from sme_registry.errors import MissingDependencyError, OptionError, SMEError
-from sme_registry.evaluation import resolve_protocol
+from sme_registry.evaluation.evaluate import resolve_protocol
 from sme_registry.io import read_json
 from sme_registry.io.markup import Table
 from sme_registry.io.system import available_cores

@@ -28,7 +28,7 @@ from sme_registry.cli.plan import Jobs, warn_of_uneven_rollouts
 from sme_registry.cli.study import check_complete, print_status
 from sme_registry.diagnosis import load_run
 from sme_registry.errors import OptionError, SMEError
-from sme_registry.evaluation import resolve_protocol
+from sme_registry.evaluation.evaluate import resolve_protocol
 from sme_registry.io.markup import Table
 from sme_registry.io.terminal import err, print_note
 from sme_registry.spec import (

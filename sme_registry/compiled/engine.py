@@ -42,8 +42,8 @@ from sme_registry.compiled.arrays import (
     Observation,
 )
 from sme_registry.io import choice, is_installed, require_packages
-from sme_registry.task import Layer, Task, step
-from sme_registry.task.draw import counted
+from sme_registry.task import Task, step
+from sme_registry.task.draw import Layer, counted
 
 Backend = Literal["numba", "numpy"]
 BACKEND_VARIABLE = "SME_BACKEND"

@@ -9,12 +9,11 @@ Importing this module does not import PyTorch.
 """
 
 from sme_registry.datasets.collect import collect
-from sme_registry.datasets.documents import BCHyperparameters, DatasetRecipe, IQLHyperparameters
-from sme_registry.datasets.offline import train_offline, train_sealed
+from sme_registry.datasets.documents import DatasetRecipe
+from sme_registry.datasets.offline import train_offline
 from sme_registry.datasets.storage import (
     Dataset,
     SealedDataset,
-    list_datasets,
     make_dataset,
     open_dataset,
 )
@@ -25,24 +24,20 @@ from sme_registry.datasets.transitions import (
     replay,
     to_d3rlpy,
 )
-from sme_registry.evaluation import OfflinePolicy
+from sme_registry.evaluation.networks import OfflinePolicy
 
 __all__ = [
-    "BCHyperparameters",
     "Dataset",
     "DatasetRecipe",
-    "IQLHyperparameters",
     "OfflinePolicy",
     "SealedDataset",
     "Transitions",
     "collect",
     "exact_return",
-    "list_datasets",
     "make_dataset",
     "open_dataset",
     "positions",
     "replay",
     "to_d3rlpy",
     "train_offline",
-    "train_sealed",
 ]

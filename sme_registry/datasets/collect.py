@@ -46,7 +46,7 @@ from sme_registry.datasets.documents import (
 from sme_registry.datasets.transitions import Arrays, Transitions
 from sme_registry.envs.batch import Batch
 from sme_registry.errors import OptionError
-from sme_registry.evaluation import TeamPolicy, as_policy
+from sme_registry.evaluation.policies import TeamPolicy, as_policy
 from sme_registry.evaluation.regions import expansion
 from sme_registry.evaluation.rollouts import PlayStep, play
 from sme_registry.spec import SMESpec

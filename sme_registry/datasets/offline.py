@@ -28,7 +28,8 @@ from sme_registry.datasets.documents import (
 from sme_registry.datasets.storage import Dataset, SealedDataset, open_dataset
 from sme_registry.datasets.transitions import Transitions
 from sme_registry.errors import OptionError, SpecError
-from sme_registry.evaluation import EvaluationReport, evaluate, resolve_protocol
+from sme_registry.evaluation import EvaluationReport, evaluate
+from sme_registry.evaluation.evaluate import resolve_protocol
 from sme_registry.evaluation.networks import OfflinePolicy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import (
@@ -190,18 +191,6 @@ def train_sealed(
     """Train BC or IQL on a sealed data set, or that in a folder, on the CPU and one thread.
 
     As `train_offline`, but nothing is evaluated: only the season's board can.
-
-    Examples:
-      >>> from sme_registry.datasets import DatasetRecipe, SealedDataset, train_sealed
-      >>> recipe = DatasetRecipe(
-      ...     spec=sme_registry.load("Default"),
-      ...     behaviours=[{"kind": "mixture", "nu": 0.5}],
-      ...     transitions=100,
-      ... )
-      >>> data = SealedDataset.collect(recipe)
-      >>> policy = train_sealed(data, algorithm="bc", steps=10, batch_size=32)
-      >>> policy(data.observations[:2]).shape
-      (2, 4)
     """
     rows = data if isinstance(data, SealedDataset) else SealedDataset.read(data)
     learner = _learner(rows, algorithm, hyperparameters, steps, batch_size, seed)

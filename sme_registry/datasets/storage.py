@@ -50,7 +50,7 @@ from sme_registry.errors import (
     UnknownNameError,
     did_you_mean,
 )
-from sme_registry.evaluation import resolve_protocol
+from sme_registry.evaluation.evaluate import resolve_protocol
 from sme_registry.io import (
     build_folder,
     check_writable,
@@ -405,14 +405,7 @@ def check_location(dataset: Dataset, folder: str | os.PathLike[str] | None = Non
 def list_datasets(
     folder: str | os.PathLike[str] | None = None,
 ) -> tuple[list[Dataset], dict[Path, str]]:
-    """All data sets of this package in a root, by id, and by its path the error of each broken one.
-
-    Examples:
-      >>> from sme_registry.datasets import list_datasets
-      >>> valid, broken = list_datasets("data")
-      >>> [dataset.id for dataset in valid], broken
-      (['sme/Default-v1-nu50-seed0-v0'], {})
-    """
+    """This package's data sets in a root, by id, and by its path the error of each broken one."""
     root = datasets_folder(folder)
     datasets: list[Dataset] = []
     errors: dict[Path, str] = {}

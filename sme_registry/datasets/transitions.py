@@ -29,14 +29,15 @@ from sme_registry.datasets.documents import DatasetRecipe
 from sme_registry.envs.arguments import initial_states, to_unit
 from sme_registry.envs.batch import Batch
 from sme_registry.errors import FingerprintMismatchError, OptionError, SpecError, StateError
-from sme_registry.evaluation import as_policy
+from sme_registry.evaluation.policies import as_policy
 from sme_registry.evaluation.regions import expansion
 from sme_registry.evaluation.rollouts import MOST_ENVS
 from sme_registry.evaluation.rollouts import rollouts as run_rollouts
 from sme_registry.io import integer_in, number_in
 from sme_registry.spec import SMESpec
 from sme_registry.spec.sme_spec import SpecLike
-from sme_registry.task import Task, load_task, step
+from sme_registry.task import Task, step
+from sme_registry.task.loading import load_task
 from sme_registry.task.task import Step
 
 Arrays = dict[str, npt.NDArray[Any]]

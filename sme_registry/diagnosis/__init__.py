@@ -6,13 +6,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from sme_registry.diagnosis.document import Diagnosis
-from sme_registry.diagnosis.questions import Verdict
 from sme_registry.diagnosis.stream import diagnose_stream
 from sme_registry.diagnosis.subject import (
     AnySubject,
     StreamSubject,
     Subject,
-    load_cell,
     load_policy,
     load_run,
 )
@@ -21,13 +19,10 @@ from sme_registry.errors import OptionError
 from sme_registry.io import integer_in
 
 __all__ = [
-    "AnySubject",
     "Diagnosis",
     "StreamSubject",
     "Subject",
-    "Verdict",
     "diagnose",
-    "load_cell",
     "load_policy",
     "load_run",
 ]

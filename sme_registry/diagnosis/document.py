@@ -47,8 +47,8 @@ from sme_registry.diagnosis.questions import (
 )
 from sme_registry.diagnosis.subject import AnySubject
 from sme_registry.errors import UnknownNameError
-from sme_registry.evaluation import ObservationReport
 from sme_registry.evaluation.references import LABELS, beside_safety
+from sme_registry.evaluation.regions import ObservationReport
 from sme_registry.io import choice, versions
 from sme_registry.io.markup import Table, fixed, percent, plural
 from sme_registry.spec import SMESpec, StreamSpec, catalogue

@@ -18,8 +18,15 @@ import numpy as np
 
 from sme_registry.compiled import engine
 from sme_registry.compiled.arrays import Observation
-from sme_registry.evaluation import Policy, SafetyReport, references, regions
-from sme_registry.evaluation.regions import TOLERANCE, SafetyScore, SafetyStats, States, Uniform
+from sme_registry.evaluation import Policy, references, regions
+from sme_registry.evaluation.regions import (
+    TOLERANCE,
+    SafetyReport,
+    SafetyScore,
+    SafetyStats,
+    States,
+    Uniform,
+)
 from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf
 from sme_registry.task import Task

@@ -12,7 +12,7 @@ from typing import Any
 from sme_registry.diagnosis.document import TaskDiagnosis
 from sme_registry.diagnosis.measure import LINEAR, POLICY, DistractorRegret, Violations
 from sme_registry.diagnosis.questions import THRESHOLDS, Decision, Questions, add_to
-from sme_registry.evaluation import ObservationReport
+from sme_registry.evaluation.regions import ObservationReport
 
 WHERE: Questions = {}
 """Questions about the policy, in order."""

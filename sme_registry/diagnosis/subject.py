@@ -17,25 +17,19 @@ from pydantic import JsonValue
 from sme_registry.compiled.arrays import Observation
 from sme_registry.diagnosis.behaviour import Log, exploration
 from sme_registry.errors import OptionError, SMEError, SpecError, UnknownNameError
-from sme_registry.evaluation import (
-    EvaluationReport,
-    Policy,
-    StreamReport,
-    TeamPolicy,
-    as_policy,
-    load_sb3,
-)
+from sme_registry.evaluation import EvaluationReport, Policy, StreamReport
+from sme_registry.evaluation.models import load_sb3
 from sme_registry.evaluation.networks import Perceptron
+from sme_registry.evaluation.policies import TeamPolicy, as_policy
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.io import read_json
 from sme_registry.plots.maps import STREAM
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.study import Cell
-from sme_registry.training import RunRecord
 from sme_registry.training import record as run_files
 from sme_registry.training.algorithms import find, in_jax, parse_uses
 from sme_registry.training.numpy_policy import numpy_policy
-from sme_registry.training.record import CHECKPOINT
+from sme_registry.training.record import CHECKPOINT, RunRecord
 
 _MIN_DIGITS = 6
 Networks = tuple[Perceptron | None, ...]
@@ -162,14 +156,6 @@ def load_cell(study: str | Path, key: str) -> AnySubject:
     """A finished cell of a study that kept its model; a life in a stream also without its models.
 
     `key` is the cell's digest, with or without `sha256:`, or its first digits.
-
-    Examples:
-      >>> from sme_registry.diagnosis import load_cell
-      >>> from sme_registry.studies import study_status
-      >>> cells = study_status("study").cells
-      >>> key = next(cell.key for cell in cells if cell.planned.algorithm == "PPO")
-      >>> load_cell("study", key).plan["algorithm"]
-      'PPO'
     """
     study = Path(study)
     path = cell_path(study, key)

@@ -42,7 +42,8 @@ from sme_registry.diagnosis.questions import (
 from sme_registry.diagnosis.rules import WHERE, WHY
 from sme_registry.diagnosis.subject import Subject, perceptron_of
 from sme_registry.errors import UnknownNameError
-from sme_registry.evaluation import Policy, TeamPolicy, evaluate
+from sme_registry.evaluation import Policy, evaluate
+from sme_registry.evaluation.policies import TeamPolicy
 from sme_registry.io import choice
 from sme_registry.io.markup import percent
 from sme_registry.spec import EvaluationProtocol, SMESpec

@@ -28,7 +28,8 @@ from sme_registry.errors import (
 from sme_registry.io import choice, integer_in
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.sme_spec import ACTION_RANGES, SpecLike
-from sme_registry.task import Task, load_task
+from sme_registry.task import Task
+from sme_registry.task.loading import load_task
 
 MAX_LIFETIME = 2**62  # at which a life may begin: its steps are counted in 64 bits
 

@@ -5,17 +5,15 @@ from sme_registry.evaluation.dynamic_regret import (
     expected_regret,
     reference_regret,
 )
-from sme_registry.evaluation.evaluate import (
-    evaluate,
-    evaluate_many,
-    evaluation_observations,
-    resolve_protocol,
-)
-from sme_registry.evaluation.models import load_sb3
-from sme_registry.evaluation.networks import OfflinePolicy, Perceptron
-from sme_registry.evaluation.policies import Policy, TeamPolicy, as_policy, interface_of
+from sme_registry.evaluation.evaluate import evaluate, evaluate_many
+from sme_registry.evaluation.evaluate import evaluation_observations as evaluation_observations
+from sme_registry.evaluation.evaluate import resolve_protocol as resolve_protocol
+from sme_registry.evaluation.models import load_sb3 as load_sb3
+from sme_registry.evaluation.networks import Perceptron
+from sme_registry.evaluation.policies import Policy
+from sme_registry.evaluation.policies import as_policy as as_policy
+from sme_registry.evaluation.policies import interface_of as interface_of
 from sme_registry.evaluation.references import reference_policy
-from sme_registry.evaluation.regions import ObservationReport, RegionReport, SafetyReport
 from sme_registry.evaluation.report import EvaluationReport
 from sme_registry.evaluation.streams import (
     StreamReport,
@@ -25,25 +23,15 @@ from sme_registry.evaluation.streams import (
 
 __all__ = [
     "EvaluationReport",
-    "ObservationReport",
-    "OfflinePolicy",
     "Perceptron",
     "Policy",
-    "RegionReport",
-    "SafetyReport",
     "StreamReport",
-    "TeamPolicy",
     "across_seeds",
-    "as_policy",
     "dynamic_regret",
     "evaluate",
     "evaluate_many",
     "evaluate_stream",
-    "evaluation_observations",
     "expected_regret",
-    "interface_of",
-    "load_sb3",
     "reference_policy",
     "reference_regret",
-    "resolve_protocol",
 ]

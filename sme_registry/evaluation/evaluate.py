@@ -138,11 +138,6 @@ def evaluation_observations(
     """The observations `[regions · n, O]` in which `evaluate` asks a single agent for actions.
 
     Of a task with distractors, those of the regions: it is asked about other distractors as well.
-
-    Examples:
-      >>> from sme_registry.evaluation import evaluation_observations
-      >>> evaluation_observations("Default", {"states_per_region": 10}).shape
-      (60, 10)
     """
     task, protocol = materialize(load(spec_or_id, SMESpec)), resolve_protocol(protocol)
     arguments.single_agent(task)
@@ -156,13 +151,7 @@ def evaluation_observations(
 
 
 def resolve_protocol(protocol: ProtocolLike) -> EvaluationProtocol:
-    """A protocol from itself, its fields, its name in the catalogue, or the path of its file.
-
-    Examples:
-      >>> from sme_registry.evaluation import resolve_protocol
-      >>> resolve_protocol("paper-v1").states_per_region
-      50000
-    """
+    """A protocol from itself, its fields, its name in the catalogue, or the path of its file."""
     if isinstance(protocol, EvaluationProtocol):
         return protocol
     if isinstance(protocol, dict):

@@ -287,11 +287,6 @@ def load_sb3(path: str | os.PathLike[str], algorithm: str | None = None) -> Any:
     Loading can run code of the file's author. `algorithm` is its class, such as "PPO" or
     "sb3_contrib:TQC". None reads it from the file: of `sme train`, of a study, or of an algorithm
     of stable-baselines3, sb3-contrib or sbx (a DDPG loads as TD3, which acts equally).
-
-    Examples:
-      >>> from sme_registry.evaluation import load_sb3
-      >>> type(load_sb3("runs/ppo/model.zip")).__name__
-      'PPO'
     """
     path = Path(path)
     fields = _saved_fields(path)

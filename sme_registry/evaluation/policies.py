@@ -200,14 +200,6 @@ def as_policy(
       observed_phases: entries at the end of its observations for the phase of a stream, one-hot.
 
     A recurrent model acts from its initial state in each observation, until `Policy.start`.
-
-    Examples:
-      >>> from sme_registry.evaluation import as_policy
-      >>> def centre(observations):
-      ...     return np.zeros((len(observations), 4))
-      >>> policy = as_policy(centre, sme_registry.load("Default"), action_range="symmetric")
-      >>> policy(np.full((1, 10), 0.5, np.float32))  # in the unit range
-      array([[0.5, 0.5, 0.5, 0.5]])
     """
     if action_range is not None:
         choice("action_range", action_range, ACTION_RANGES)
@@ -229,11 +221,6 @@ def interface_of(spec: SMESpec, observed_phases: int = 0) -> Interface:
     """The widths of a policy for a task; of a team's, for the one that all agents share.
 
     `observed_phases` are the phases of a stream that the policy observes, for a single agent.
-
-    Examples:
-      >>> from sme_registry.evaluation import interface_of
-      >>> interface_of(sme_registry.load("Default")).observation_dim
-      10
     """
     if spec.team is None:
         S, A, m = spec.state_dim, spec.action_dim, spec.distractors

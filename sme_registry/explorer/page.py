@@ -27,7 +27,8 @@ from sme_registry.diagnosis.behaviour import Log, rollout
 from sme_registry.diagnosis.measure import MAX_NUMBERS, fit_references
 from sme_registry.diagnosis.subject import AnySubject, StreamSubject, Subject, cell_path, read_cell
 from sme_registry.errors import OptionError, ResourceLimitError
-from sme_registry.evaluation import EvaluationReport, Policy, TeamPolicy
+from sme_registry.evaluation import EvaluationReport, Policy
+from sme_registry.evaluation.policies import TeamPolicy
 from sme_registry.evaluation.references import LABELS, References
 from sme_registry.explorer import program as programs
 from sme_registry.explorer.policies import policy_program

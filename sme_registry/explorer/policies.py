@@ -16,8 +16,9 @@ import numpy.typing as npt
 
 from sme_registry.diagnosis.subject import perceptron_of
 from sme_registry.errors import PolicyError, ResourceLimitError
-from sme_registry.evaluation import Perceptron, Policy, TeamPolicy
+from sme_registry.evaluation import Perceptron, Policy
 from sme_registry.evaluation.models import ModulePredictor, OnnxNetwork
+from sme_registry.evaluation.policies import TeamPolicy
 from sme_registry.explorer.program import OPERATIONS, NetworkProgram, ProgramBuilder, point_width
 from sme_registry.export.networks import traced
 from sme_registry.io import is_installed

@@ -16,8 +16,15 @@ from typing import Any
 import numpy as np
 
 from sme_registry.errors import OptionError, PolicyError
-from sme_registry.evaluation import OfflinePolicy, Perceptron, load_sb3
-from sme_registry.evaluation.models import ACTION_RANGE, Interface, start_session, torch_policy
+from sme_registry.evaluation import Perceptron
+from sme_registry.evaluation.models import (
+    ACTION_RANGE,
+    Interface,
+    load_sb3,
+    start_session,
+    torch_policy,
+)
+from sme_registry.evaluation.networks import OfflinePolicy
 from sme_registry.evaluation.policies import interface_of
 from sme_registry.export.networks import (
     INPUT,

@@ -24,7 +24,9 @@ from sme_registry.jax.env import EnvState, Info
 from sme_registry.jax.task import TaskParams, task_params
 from sme_registry.spec.catalogue import title
 from sme_registry.spec.sme_spec import ACTION_RANGES, ActionRange, SpecLike
-from sme_registry.task import load_task
+from sme_registry.task.loading import load_task
+
+__all__ = ["Environment"]
 
 Step = tuple[jax.Array, EnvState, jax.Array, jax.Array, jax.Array, Info]
 

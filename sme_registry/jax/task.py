@@ -34,7 +34,8 @@ from sme_registry.errors import OptionError, SpecError
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.document import short_repr
 from sme_registry.spec.sme_spec import SpecLike
-from sme_registry.task import Task, load_task
+from sme_registry.task import Task
+from sme_registry.task.loading import load_task
 
 SUPPORTED_FIELDS = frozenset(
     (

@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from sme_registry.compiled import engine
 from sme_registry.errors import OptionError
-from sme_registry.evaluation import StreamReport, as_policy
+from sme_registry.evaluation import StreamReport
+from sme_registry.evaluation.policies import as_policy
 from sme_registry.evaluation.retention import Retention
 from sme_registry.evaluation.streams import check_same_stream
 from sme_registry.io import integer_in, number_in

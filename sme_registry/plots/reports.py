@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 import numpy as np
 
 from sme_registry.errors import OptionError
-from sme_registry.evaluation import EvaluationReport, SafetyReport, StreamReport
+from sme_registry.evaluation import EvaluationReport, StreamReport
 from sme_registry.evaluation.references import LABELS, beside_safety
-from sme_registry.evaluation.regions import SafetyScore
+from sme_registry.evaluation.regions import SafetyReport, SafetyScore
 from sme_registry.evaluation.streams import Visit
 from sme_registry.plots.curves import (
     Run,

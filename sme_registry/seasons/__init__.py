@@ -9,28 +9,16 @@
 `seasons.sb3.SealedVecEnv` is for Stable-Baselines3. `wire` says what server and client send.
 """
 
-from sme_registry.seasons.client import (
-    WITHOUT_TASK,
-    Instance,
-    SealedEnv,
-    SealedVectorEnv,
-    actions_in,
-    answer,
-    make,
-    make_vec,
-    prepare_policy,
-)
+from sme_registry.seasons.client import WITHOUT_TASK as WITHOUT_TASK
+from sme_registry.seasons.client import Instance, answer, make, make_vec
+from sme_registry.seasons.client import actions_in as actions_in
+from sme_registry.seasons.client import prepare_policy as prepare_policy
 from sme_registry.seasons.wire import Ticket
 
 __all__ = [
-    "WITHOUT_TASK",
     "Instance",
-    "SealedEnv",
-    "SealedVectorEnv",
     "Ticket",
-    "actions_in",
     "answer",
     "make",
     "make_vec",
-    "prepare_policy",
 ]

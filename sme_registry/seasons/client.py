@@ -26,7 +26,8 @@ from sme_registry.errors import (
     SealedError,
     SpecError,
 )
-from sme_registry.evaluation import Policy, as_policy
+from sme_registry.evaluation import Policy
+from sme_registry.evaluation.policies import as_policy
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.evaluation.regions import batch_rows
 from sme_registry.io import integer_in, parse_json, sha256_of
@@ -379,12 +380,6 @@ def prepare_policy(
     """A policy for the hidden tasks of a setting; arguments as `evaluate` accepts them.
 
     A reference policy that depends on the hidden task is refused.
-
-    Examples:
-      >>> from sme_registry.seasons import prepare_policy
-      >>> from sme_registry.spec import Setting
-      >>> prepare_policy("constant", Setting())(np.zeros((1, 10), np.float32))
-      array([[0.5, 0.5, 0.5, 0.5]])
     """
     if isinstance(policy, str) and policy in POLICIES and policy not in WITHOUT_TASK:
         raise PolicyError(
@@ -397,14 +392,7 @@ def prepare_policy(
 
 
 def actions_in(states: Float32, policy: Any, setting: Setting) -> Float32:
-    """A policy's actions `[rows, A]` in challenge states `[rows, S + 2]`: finite, not clipped.
-
-    Examples:
-      >>> from sme_registry.seasons import actions_in
-      >>> from sme_registry.spec import Setting
-      >>> actions_in(np.zeros((3, 10), np.float32), "constant", Setting()).shape
-      (3, 4)
-    """
+    """A policy's actions `[rows, A]` in challenge states `[rows, S + 2]`: finite, not clipped."""
     prepared, rows = prepare_policy(policy, setting), batch_rows(_any_spec(setting))
     batches = [prepared(states[at : at + rows].copy()) for at in range(0, len(states), rows)]
     return np.concatenate([np.empty((0, setting.action_dim)), *batches]).astype(np.float32)

@@ -16,33 +16,26 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sme_registry.spec.study import sweep
     from sme_registry.studies.engine.cell import run_cell
-    from sme_registry.studies.engine.ledger import CellStatus, study_status
-    from sme_registry.studies.engine.result import CellResult
+    from sme_registry.studies.engine.ledger import CellStatus as CellStatus
+    from sme_registry.studies.engine.ledger import study_status as study_status
+    from sme_registry.studies.engine.result import CellResult as CellResult
     from sme_registry.studies.engine.runner import run_study
-    from sme_registry.studies.report.frames import StreamFrames, StudyFrames, load, load_streams
-    from sme_registry.studies.report.write import compare, write_comparison, write_report
+    from sme_registry.studies.report.frames import load, load_streams
+    from sme_registry.studies.report.write import compare, write_report
 
 __all__ = [
-    "CellResult",
-    "CellStatus",
-    "StreamFrames",
-    "StudyFrames",
     "compare",
     "load",
     "load_streams",
     "run_cell",
     "run_study",
-    "study_status",
     "sweep",
-    "write_comparison",
     "write_report",
 ]
 
 _LAZY = {
     "CellResult": "studies.engine.result",
     "CellStatus": "studies.engine.ledger",
-    "StreamFrames": "studies.report.frames",
-    "StudyFrames": "studies.report.frames",
     "compare": "studies.report.write",
     "load": "studies.report.frames",
     "load_streams": "studies.report.frames",
@@ -50,7 +43,6 @@ _LAZY = {
     "run_study": "studies.engine.runner",
     "study_status": "studies.engine.ledger",
     "sweep": "spec.study",
-    "write_comparison": "studies.report.write",
     "write_report": "studies.report.write",
 }
 

@@ -116,11 +116,6 @@ def load_task(task: SpecLike, **overrides: Any) -> Task:
     """Draw the task of a name or spec; one of a file must have its file's fingerprint.
 
     A derived task, with `overrides` of fields, has no published numbers.
-
-    Examples:
-      >>> from sme_registry.task import load_task
-      >>> load_task("Default", action_dim=2).W.shape
-      (2, 8)
     """
     resolved = resolve(task, SMESpec)
     fingerprints = () if overrides else resolved.fingerprints

@@ -7,17 +7,11 @@
 Importing this module imports neither PyTorch nor JAX.
 """
 
-from sme_registry.envs.episodes import Episode
-from sme_registry.training.numpy_policy import numpy_policy
-from sme_registry.training.record import RunRecord, model_of_cell, read_episodes
+from sme_registry.training.record import RunRecord as RunRecord
+from sme_registry.training.record import model_of_cell as model_of_cell
 from sme_registry.training.run import TrainingResult, train
 
 __all__ = [
-    "Episode",
-    "RunRecord",
     "TrainingResult",
-    "model_of_cell",
-    "numpy_policy",
-    "read_episodes",
     "train",
 ]

@@ -17,7 +17,8 @@ from rich.console import Console
 from sme_registry.compiled.arrays import Array
 from sme_registry.envs.episodes import Episode, Episodes
 from sme_registry.errors import PolicyError
-from sme_registry.evaluation import Policy, TeamPolicy, as_policy
+from sme_registry.evaluation import Policy
+from sme_registry.evaluation.policies import TeamPolicy, as_policy
 from sme_registry.io.system import defer_interrupts
 from sme_registry.io.terminal import Progress, err
 from sme_registry.spec import SMESpec, StreamSpec

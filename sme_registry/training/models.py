@@ -37,8 +37,9 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sme_registry.envs.episodes import Episode, info_of_envs
 from sme_registry.errors import OptionError, PolicyError
-from sme_registry.evaluation import Perceptron, Policy, TeamPolicy
+from sme_registry.evaluation import Perceptron, Policy
 from sme_registry.evaluation.models import saved_sb3, torch_policy
+from sme_registry.evaluation.policies import TeamPolicy
 from sme_registry.io import import_object, is_installed, write_atomically
 from sme_registry.sb3 import SMETeamVecEnv, SMEVecEnv
 from sme_registry.sb3.vec_env import log_episode

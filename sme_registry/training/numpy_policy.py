@@ -19,9 +19,10 @@ from typing import Any
 import numpy as np
 
 from sme_registry.errors import PolicyError, SpecError
-from sme_registry.evaluation import Policy, TeamPolicy, as_policy
+from sme_registry.evaluation import Policy
 from sme_registry.evaluation.models import torch_policy
 from sme_registry.evaluation.networks import Layer, Perceptron
+from sme_registry.evaluation.policies import TeamPolicy, as_policy
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.task import draw
 
@@ -37,13 +38,6 @@ def numpy_policy(
     Maps observations `[B, O]` (of a stream that shows the phase, with its one-hot) to actions
     `[B, A]` of the unit range, which the environment clips. The network of a model is copied, so
     later training does not change it; what is no such model is called directly.
-
-    Examples:
-      >>> from sme_registry.evaluation import load_sb3
-      >>> from sme_registry.training import numpy_policy
-      >>> policy = numpy_policy(load_sb3("runs/ppo/model.zip"), sme_registry.load("Default"))
-      >>> policy(np.full((3, 10), 0.5, np.float32)).shape
-      (3, 4)
     """
     spec, phases = document.specs[0], document.observed_phases
     policy = as_policy(model, spec, action_range=action_range, observed_phases=phases)

@@ -184,14 +184,7 @@ _TYPES = (int, int, float, int, float, float, int, float)
 
 
 def read_episodes(path: Path) -> list[Episode]:
-    """All complete rows; one that was cut off by a kill is skipped.
-
-    Examples:
-      >>> from pathlib import Path
-      >>> from sme_registry.training import read_episodes
-      >>> read_episodes(Path("runs/ppo/episodes.csv"))[0].length
-      100
-    """
+    """All complete rows; one that was cut off by a kill is skipped."""
     try:
         rows = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"))))
     except (OSError, UnicodeDecodeError) as error:
@@ -256,14 +249,7 @@ def _row(episode: Episode) -> list[int | str]:
 
 
 def model_of_cell(study: Path, key: str) -> Path:
-    """Where a study keeps the trained model of a cell, by its digest.
-
-    Examples:
-      >>> from pathlib import Path
-      >>> from sme_registry.training import model_of_cell
-      >>> model_of_cell(Path("study"), "66e9b7a9a266").suffix
-      '.zip'
-    """
+    """Where a study keeps the trained model of a cell, by its digest."""
     return study / MODELS_OF_STUDY / f"{key.removeprefix('sha256:')}.zip"
 
 

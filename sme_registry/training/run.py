@@ -34,8 +34,8 @@ from sme_registry.evaluation import (
     evaluate,
     evaluate_stream,
     reference_regret,
-    resolve_protocol,
 )
+from sme_registry.evaluation.evaluate import resolve_protocol
 from sme_registry.io import (
     Lock,
     choice,

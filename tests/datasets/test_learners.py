@@ -5,7 +5,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from sme_registry.datasets import BCHyperparameters, IQLHyperparameters  # noqa: E402
+from sme_registry.datasets.documents import BCHyperparameters, IQLHyperparameters  # noqa: E402
 from sme_registry.datasets.learners import BC, IQL, Minibatch, minibatches, mlp  # noqa: E402
 from tests.datasets.sets import transitions_of  # noqa: E402
 

@@ -16,9 +16,9 @@ from sme_registry.datasets import (
     collect,
     make_dataset,
     train_offline,
-    train_sealed,
 )
 from sme_registry.datasets.documents import OfflineRecord
+from sme_registry.datasets.offline import train_sealed
 from sme_registry.errors import (
     DigestMismatchError,
     MissingDependencyError,

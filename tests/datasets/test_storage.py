@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 
 import sme_registry
-from sme_registry.datasets import list_datasets, make_dataset, open_dataset, replay, storage
+from sme_registry.datasets import make_dataset, open_dataset, replay, storage
 from sme_registry.datasets.collect import collect
+from sme_registry.datasets.storage import list_datasets
 from sme_registry.errors import (
     DigestMismatchError,
     MalformedDocumentError,

@@ -4,14 +4,14 @@ import numpy as np
 
 from sme_registry import SMESpec, StreamSpec
 from sme_registry.diagnosis import StreamSubject, diagnose
-from sme_registry.evaluation import dynamic_regret, evaluate_stream, resolve_protocol
+from sme_registry.evaluation import dynamic_regret, evaluate_stream
+from sme_registry.evaluation.evaluate import resolve_protocol
 from sme_registry.evaluation.models import saved_sb3
 from sme_registry.evaluation.networks import Perceptron
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.io import write_atomically
-from sme_registry.training import RunRecord
 from sme_registry.training.models import new_sb3_model
-from sme_registry.training.record import SNAPSHOTS, Snapshots
+from sme_registry.training.record import SNAPSHOTS, RunRecord, Snapshots
 
 SPEC = SMESpec(state_dim=3, action_dim=2, hidden_width=8, horizon=10, complexity=2)
 PROTOCOL = {"states_per_region": 64, "epsilons": [0.5]}

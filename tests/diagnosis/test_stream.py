@@ -9,14 +9,7 @@ import numpy as np
 import pytest
 
 from sme_registry import SMESpec, StreamSpec
-from sme_registry.diagnosis import (
-    Diagnosis,
-    StreamSubject,
-    diagnose,
-    load_cell,
-    load_policy,
-    load_run,
-)
+from sme_registry.diagnosis import Diagnosis, StreamSubject, diagnose, load_policy, load_run
 from sme_registry.diagnosis.behaviour import NetworkState, network_state
 from sme_registry.diagnosis.questions import DOUBTS
 from sme_registry.diagnosis.stream import (
@@ -26,6 +19,7 @@ from sme_registry.diagnosis.stream import (
     VisitDiagnosis,
     outcome_of,
 )
+from sme_registry.diagnosis.subject import load_cell
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.evaluation import evaluate
 from sme_registry.evaluation.models import saved_sb3

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import sme_registry
-from sme_registry.diagnosis import Diagnosis, behaviour, diagnose, load_cell, load_run
+from sme_registry.diagnosis import Diagnosis, behaviour, diagnose, load_run
+from sme_registry.diagnosis.subject import load_cell
 from sme_registry.errors import DigestMismatchError, OptionError, PolicyError, UnknownNameError
 from sme_registry.wrappers import RecordRegret
 from tests.commands import good, refused

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from sme_registry import SMESpec, evaluate, load
-from sme_registry.diagnosis import Diagnosis, diagnose, load_cell, load_policy, load_run
+from sme_registry.diagnosis import Diagnosis, diagnose, load_policy, load_run
 from sme_registry.diagnosis.measure import LINEAR, POLICY
+from sme_registry.diagnosis.subject import load_cell
 from sme_registry.diagnosis.task import TEAM_QUESTIONS, TeamDiagnosis
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.evaluation.references import reference_policy

@@ -8,7 +8,8 @@ import pytest
 from sme_registry import SMESpec, evaluate
 from sme_registry.compiled import engine
 from sme_registry.errors import PolicyError
-from sme_registry.evaluation import as_policy, evaluate_many
+from sme_registry.evaluation import evaluate_many
+from sme_registry.evaluation.policies import as_policy
 from sme_registry.spec import EvaluationProtocol
 
 SPEC = SMESpec(state_dim=3, action_dim=2, complexity=2, hidden_width=8)

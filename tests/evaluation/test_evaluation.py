@@ -8,7 +8,8 @@ import pytest
 import sme_registry
 from sme_registry import evaluate, materialize
 from sme_registry.errors import MalformedDocumentError, SpecError, UnknownNameError
-from sme_registry.evaluation import evaluation_observations, references, regions
+from sme_registry.evaluation import references, regions
+from sme_registry.evaluation.evaluate import evaluation_observations
 from sme_registry.spec import EvaluationProtocol, ProtocolFile
 from tests.evaluation.kinds import (
     NAMES,

@@ -9,7 +9,7 @@ import pytest
 
 from sme_registry import SMESpec, evaluate
 from sme_registry.errors import OptionError, PolicyError
-from sme_registry.evaluation import OfflinePolicy
+from sme_registry.evaluation.networks import OfflinePolicy
 
 SPEC = SMESpec(state_dim=2, action_dim=2)
 OBSERVATIONS = np.random.default_rng(0).random((50, 4), dtype=np.float32)

@@ -15,10 +15,12 @@ from sme_registry.errors import (
     PolicyError,
     UnknownNameError,
 )
-from sme_registry.evaluation import OfflinePolicy, as_policy, evaluate, load_sb3, references
-from sme_registry.evaluation.models import saved_sb3
+from sme_registry.evaluation import evaluate, references
+from sme_registry.evaluation.models import load_sb3, saved_sb3
+from sme_registry.evaluation.networks import OfflinePolicy
+from sme_registry.evaluation.policies import as_policy
 from sme_registry.spec import SMESpec
-from sme_registry.training import numpy_policy
+from sme_registry.training.numpy_policy import numpy_policy
 from tests.commands import good, sme
 
 SPEC = SMESpec(state_dim=3, action_dim=2)

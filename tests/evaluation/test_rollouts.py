@@ -12,7 +12,8 @@ import pytest
 import sme_registry
 from sme_registry import SMESpec, load, make_parallel, materialize
 from sme_registry.errors import ActionError, SpecError, StateError
-from sme_registry.evaluation import Perceptron, as_policy
+from sme_registry.evaluation import Perceptron
+from sme_registry.evaluation.policies import as_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.training.algorithms import one_thread
 from sme_registry.training.numpy_policy import numpy_policy

@@ -14,7 +14,8 @@ from sme_registry.envs.team import (
     shared_observation_dim,
 )
 from sme_registry.errors import PolicyError
-from sme_registry.evaluation import as_policy, references, regions
+from sme_registry.evaluation import references, regions
+from sme_registry.evaluation.policies import as_policy
 from tests.evaluation.kinds import (
     NAMES,
     PROTOCOL,

@@ -3,7 +3,8 @@
 import numpy as np
 
 from sme_registry import SMESpec, materialize
-from sme_registry.evaluation import OfflinePolicy, Perceptron
+from sme_registry.evaluation import Perceptron
+from sme_registry.evaluation.networks import OfflinePolicy
 
 HIDDEN = 24
 

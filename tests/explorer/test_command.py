@@ -8,6 +8,7 @@ import pytest
 import sme_registry
 from sme_registry import SMESpec, load, materialize
 from sme_registry.diagnosis import StreamSubject, load_policy, load_run
+from sme_registry.envs.episodes import Episode
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import evaluate
 from sme_registry.evaluation.models import saved_sb3
@@ -15,8 +16,7 @@ from sme_registry.evaluation.rollouts import rollouts
 from sme_registry.explorer import FILE, facts, run_report, write_explorer
 from sme_registry.explorer.page import json_in_html
 from sme_registry.task import draw
-from sme_registry.training import Episode, RunRecord
-from sme_registry.training.record import EpisodeLog
+from sme_registry.training.record import EpisodeLog, RunRecord
 from tests.commands import good, refused
 from tests.explorer.networks import fitted, offline
 

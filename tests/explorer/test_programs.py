@@ -6,7 +6,7 @@ import pytest
 from sme_registry import SMESpec, export_onnx, load, make, materialize
 from sme_registry.diagnosis import load_policy
 from sme_registry.errors import ResourceLimitError
-from sme_registry.evaluation import as_policy
+from sme_registry.evaluation.policies import as_policy
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.explorer import policies, program
 from sme_registry.explorer.policies import GraphNode, program_of_graph

@@ -8,7 +8,8 @@ import pytest
 from leaderboard.gate.sandbox import inspect_own
 from sme_registry import SMESpec, evaluate, export_onnx
 from sme_registry.errors import MissingDependencyError, OptionError, PolicyError
-from sme_registry.evaluation import OfflinePolicy, Perceptron
+from sme_registry.evaluation import Perceptron
+from sme_registry.evaluation.networks import OfflinePolicy
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")

@@ -17,7 +17,7 @@ import numpy as np
 
 from sme_registry.io import write_atomically
 from sme_registry.spec import EnvFile, ProtocolFile, StreamFile, StudyFile, SuiteFile, catalogue
-from sme_registry.task import load_task
+from sme_registry.task.loading import load_task
 
 FOLDER = Path(__file__).parent
 TASKS = (

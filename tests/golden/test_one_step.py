@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sme_registry.compiled import engine
-from sme_registry.task import load_task
+from sme_registry.task.loading import load_task
 from tests.compiled.stepping import Lane
 from tests.golden import regenerate
 

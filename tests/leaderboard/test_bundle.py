@@ -16,9 +16,10 @@ from leaderboard.gate.reference import constant_onnx, optimal_onnx
 from sme_registry import SMESpec, save
 from sme_registry.errors import OptionError, SMEError, SpecError
 from sme_registry.spec import StudyFile, StudyPlan, Suite, SuiteFile
-from sme_registry.studies import CellResult, run_study
-from sme_registry.studies.engine.result import CellFailure
-from sme_registry.training import RunRecord, train
+from sme_registry.studies import run_study
+from sme_registry.studies.engine.result import CellFailure, CellResult
+from sme_registry.training import train
+from sme_registry.training.record import RunRecord
 
 SUITE = Suite.from_dict(
     {

@@ -1,8 +1,10 @@
-"""The leaderboard uses the registry as any other package would: by its public names."""
+"""The leaderboard uses the registry by what its top-level modules export, documented or not."""
 
 import ast
 import importlib
+import inspect
 import pkgutil
+import re
 from pathlib import Path
 
 import pytest
@@ -24,19 +26,26 @@ def submodules(module):
     return {each.name for each in pkgutil.iter_modules(getattr(module, "__path__", ()))}
 
 
+def exported(module):
+    """The documented names, those that the module defines, and those imported as themselves."""
+    source = inspect.getsource(module)
+    again = re.findall(r"import (\w+) as \1\n", source)
+    defined = re.findall(r"^(\w+) = ", source, re.M)
+    return {*getattr(module, "__all__", dir(module)), *again, *defined, *submodules(module)}
+
+
 def private_imports(source):
-    """Imports from the registry that are not of a public name of a top-level module."""
+    """Imports from the registry that are not of a name that a top-level module exports."""
     private = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("sme_registry"):
             module = importlib.import_module(node.module)
-            public = {*getattr(module, "__all__", dir(module)), *submodules(module)}
             top_level = node.module.count(".") < 2 or node.module == PROTOCOL
             top_level |= node.module.startswith(SHARED)
             private += [
                 f"{node.module}.{alias.name}"
                 for alias in node.names
-                if not top_level or alias.name.startswith("_") or alias.name not in public
+                if not top_level or alias.name.startswith("_") or alias.name not in exported(module)
             ]
     return private
 

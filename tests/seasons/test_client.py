@@ -21,7 +21,8 @@ from sme_registry.errors import (
     SealedError,
 )
 from sme_registry.evaluation.references import NAMES, SHORT_NAMES
-from sme_registry.seasons import Instance, Ticket, actions_in, wire
+from sme_registry.seasons import Instance, Ticket, wire
+from sme_registry.seasons.client import actions_in
 from sme_registry.spec import Setting
 from tests.leaderboard.seasons.playing import ROWS
 from tests.seasons.server import BUDGET, serving_season

@@ -16,8 +16,8 @@ from sme_registry.errors import (
 )
 from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, StudyFile, SuiteFile, catalogue
 from sme_registry.spec.catalogue import Fingerprint
-from sme_registry.task import load, load_task, materialize
-from sme_registry.task.loading import _draw_cached, check_fingerprint, fingerprint_of
+from sme_registry.task import load, materialize
+from sme_registry.task.loading import _draw_cached, check_fingerprint, fingerprint_of, load_task
 from tests.strategies import specs
 
 

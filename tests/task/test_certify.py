@@ -9,8 +9,9 @@ import pytest
 
 from sme_registry import SMESpec, load
 from sme_registry.errors import OptionError
-from sme_registry.task import Layer, Task, materialize
+from sme_registry.task import Task, materialize
 from sme_registry.task.certificate import certify
+from sme_registry.task.draw import Layer
 
 SMALL = SMESpec(state_dim=3, action_dim=2, seed=1)
 

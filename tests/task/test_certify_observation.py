@@ -7,8 +7,9 @@ import pytest
 
 from sme_registry import SMESpec
 from sme_registry.errors import ResourceLimitError
-from sme_registry.task import Layer, Task, materialize
+from sme_registry.task import Task, materialize
 from sme_registry.task.certificate import _limits, _observation, certify
+from sme_registry.task.draw import Layer
 from tests.task.test_certify import check
 
 MOVING = {"distractor_row_sums", "uniform_distractors", "distinct_distractors"}

@@ -12,10 +12,11 @@ from sme_registry.errors import OptionError, PolicyError, SpecError
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.spec.study import Cell
 from sme_registry.studies import load as load_frames
-from sme_registry.studies import run_study, study_status
+from sme_registry.studies import run_study
 from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.training import RunRecord, train
+from sme_registry.studies.engine.ledger import Ledger, study_status
+from sme_registry.training import train
+from sme_registry.training.record import RunRecord
 from tests import commands
 
 SPEC = SMESpec(state_dim=2, action_dim=3, horizon=10, seed=5)

@@ -20,14 +20,14 @@ from sme_registry.errors import (
     PolicyError,
     SMEError,
 )
-from sme_registry.evaluation import StreamReport, load_sb3
-from sme_registry.evaluation.models import saved_sb3
+from sme_registry.evaluation import StreamReport
+from sme_registry.evaluation.models import load_sb3, saved_sb3
 from sme_registry.export import export_onnx
 from sme_registry.io import read_arrays, write_arrays
 from sme_registry.jax.run import new_program
-from sme_registry.training import RunRecord, jax_agents, train
+from sme_registry.training import jax_agents, train
 from sme_registry.training.models import new_sb3_model, set_weights
-from sme_registry.training.record import CHECKPOINT, read_episodes
+from sme_registry.training.record import CHECKPOINT, RunRecord, read_episodes
 from tests.training.runs import NARROW, PROTOCOL, TINY
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")

@@ -8,9 +8,10 @@ import pytest
 
 from sme_registry import SMESpec, StreamSpec
 from sme_registry.errors import OptionError, SMEError
-from sme_registry.evaluation import StreamReport, evaluate_stream, load_sb3
-from sme_registry.training import RunRecord, train
-from sme_registry.training.record import VisitEnds, read_episodes
+from sme_registry.evaluation import StreamReport, evaluate_stream
+from sme_registry.evaluation.models import load_sb3
+from sme_registry.training import train
+from sme_registry.training.record import RunRecord, VisitEnds, read_episodes
 from tests.training.runs import PROTOCOL, TINY
 
 pytest.importorskip("stable_baselines3")

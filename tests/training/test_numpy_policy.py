@@ -7,7 +7,8 @@ import pytest
 
 from sme_registry import SMESpec, StreamSpec
 from sme_registry.errors import SpecError
-from sme_registry.evaluation import Perceptron, Policy, as_policy
+from sme_registry.evaluation import Perceptron, Policy
+from sme_registry.evaluation.policies import as_policy
 from sme_registry.training.numpy_policy import numpy_policy
 
 sb3 = pytest.importorskip("stable_baselines3")

@@ -13,8 +13,7 @@ from sme_registry.errors import (
     OptionError,
     PolicyError,
 )
-from sme_registry.training import RunRecord
-from sme_registry.training.record import read_episodes
+from sme_registry.training.record import RunRecord, read_episodes
 from tests.training.runs import TINY, copy_files, short, without_figures
 
 pytest.importorskip("stable_baselines3")

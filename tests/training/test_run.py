@@ -21,8 +21,8 @@ from sme_registry.errors import (
 )
 from sme_registry.io import file_lock
 from sme_registry.spec import Suite
-from sme_registry.training import RunRecord, train
-from sme_registry.training.record import COLUMNS, Episode, EpisodeLog, read_episodes
+from sme_registry.training import train
+from sme_registry.training.record import COLUMNS, Episode, EpisodeLog, RunRecord, read_episodes
 from tests.training.runs import NARROW, PROTOCOL, TINY, copy_files, short
 
 pytest.importorskip("stable_baselines3")

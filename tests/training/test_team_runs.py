@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sme_registry import EvaluationReport, SMESpec, evaluate
-from sme_registry.training import RunRecord, train
-from sme_registry.training.record import COLUMNS, read_episodes
+from sme_registry.training import train
+from sme_registry.training.record import COLUMNS, RunRecord, read_episodes
 from tests.training.runs import PROTOCOL, copy_files
 
 pytest.importorskip("stable_baselines3")

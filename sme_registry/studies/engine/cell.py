@@ -20,7 +20,8 @@ import numpy as np
 from sme_registry.datasets import DatasetRecipe, collect, train_offline
 from sme_registry.envs.schedule import Schedule
 from sme_registry.errors import OptionError, PolicyError, SpecError
-from sme_registry.evaluation import EvaluationReport, Policy, TeamPolicy, as_policy, evaluate
+from sme_registry.evaluation import EvaluationReport, Policy, evaluate
+from sme_registry.evaluation.policies import TeamPolicy, as_policy
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import write_atomically

@@ -367,11 +367,6 @@ def study_status(
 
     `only` has patterns `class=GLOB`, `algorithm=GLOB`; it is empty for every cell of the plan.
     `scale` is applied to the folder's plan first.
-
-    Examples:
-      >>> from sme_registry.studies import study_status
-      >>> study_status("study").count("done")
-      6
     """
     ledger = Ledger(folder)
     return plan_status(ledger, scale(ledger.study_file()), only)

@@ -27,8 +27,9 @@ from typing import Any
 import numpy as np
 
 from sme_registry.errors import OptionError, PolicyError
-from sme_registry.evaluation import EvaluationReport, Policy, StreamReport, as_policy, evaluate_many
+from sme_registry.evaluation import EvaluationReport, Policy, StreamReport, evaluate_many
 from sme_registry.evaluation.models import saved_sb3
+from sme_registry.evaluation.policies import as_policy
 from sme_registry.evaluation.rollouts import start_states
 from sme_registry.io import Arrays, to_json
 from sme_registry.jax import find_device

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import pandas as pd
 from markupsafe import Markup
 
-from sme_registry.diagnosis import load_cell
+from sme_registry.diagnosis.subject import load_cell
 from sme_registry.errors import OptionError, SMEError, UnknownNameError, did_you_mean
 from sme_registry.explorer import explorer_page, facts, run_report
 from sme_registry.io import check_writable, to_json, write_atomically
@@ -313,14 +313,7 @@ def write_comparison(
     second: str,
     metrics: Sequence[str] = DEFAULT_METRICS,
 ) -> list[Path]:
-    """Write a comparison into a folder: differences.csv and .json, a .tex for each metric, figures.
-
-    Examples:
-      >>> from sme_registry import studies
-      >>> files = studies.write_comparison("study", "compared", "linear", "constant", ["wd_regret"])
-      >>> sorted({path.suffix for path in files})
-      ['.csv', '.json', '.pdf', '.png', '.tex']
-    """
+    """Write a comparison: differences.csv and .json, a .tex for each metric, and figures."""
     check_writable(Path(out) / "differences.csv")
     table = compare(folder, first, second, metrics)
     contents: dict[str, str | bytes] = {

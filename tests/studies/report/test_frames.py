@@ -15,6 +15,7 @@ from sme_registry.statistics import iqm
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.report import frames
 from sme_registry.studies.report.design import ALL, metrics_of
+from sme_registry.studies.report.frames import StudyFrames
 from sme_registry.studies.report.texts import comparison_tables
 from tests.commands import good
 
@@ -99,7 +100,7 @@ def test_only_results_need_pandas():
         "import sys; sys.modules['pandas'] = None\n"
         "from sme_registry import studies\n"
         "from sme_registry.errors import MissingDependencyError\n"
-        "studies.run_study, studies.study_status, studies.CellResult\n"
+        "studies.run_study, studies.study_status\n"
         "try:\n"
         "    studies.load\n"
         "except MissingDependencyError as error:\n"
@@ -144,7 +145,7 @@ def test_the_difference_the_other_way_round_is_its_mirror_image(loaded):
 
 
 def test_a_single_pair_has_no_interval(loaded):
-    first = studies.StudyFrames(loaded.results[loaded.results.run == 0], loaded.curves)
+    first = StudyFrames(loaded.results[loaded.results.run == 0], loaded.curves)
     table = studies.compare(first, "Alpha", "Beta")
     assert table.low.isna().all()
     assert set(table.verdict) == {"open"}
@@ -185,6 +186,6 @@ def test_pairs_that_share_an_instance_are_no_independent_draws_of_the_task(loade
     assert (table.instances == table.pairs).all()
     assert "share an instance" not in comparison_tables(table)[0].note
     shared = loaded.results.assign(spec_digest=loaded.results.class_name)
-    table = studies.compare(studies.StudyFrames(shared, loaded.curves), "Alpha", "Beta")
+    table = studies.compare(StudyFrames(shared, loaded.curves), "Alpha", "Beta")
     assert set(table[table.class_name != ALL].instances) == {1}
     assert "share an instance" in comparison_tables(table)[0].note

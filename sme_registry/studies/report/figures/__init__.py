@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from sme_registry.errors import SMEError
-from sme_registry.evaluation import as_policy
+from sme_registry.evaluation.policies import as_policy
 from sme_registry.io.markup import conjunction
 from sme_registry.plots import maps, style
 from sme_registry.plots.style import GREY, literal, new_figure, wrapped
