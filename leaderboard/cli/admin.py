@@ -6,6 +6,7 @@ import math
 import os
 import shutil
 from collections import Counter
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -220,13 +221,22 @@ def site(
 
       sme-leaderboard site board --explorers
     """
+    from leaderboard.web.pages import Section
     from leaderboard.web.server import write_site
+
+    sections: list[Section] = []
+    if find_spec("leaderboard.seasons") is not None:
+        from leaderboard.seasons.pages import SECTION
+
+        sections.append(SECTION)
 
     target = board / "site" if out_folder is None else out_folder
     with open_board(board) as store:
         total = len(store.entries())
         with Progress("writing", total, console=err(), unit="pages") as progress:
-            index = write_site(store, target, progress=progress.update_of, explorers=explorers)
+            index = write_site(
+                store, target, progress.update_of, explorers=explorers, sections=sections
+            )
     out().print(str(index.resolve()), soft_wrap=True, markup=False)
 
 

@@ -15,21 +15,17 @@
     PUT  /api/seasons/{id}/tickets/{n}/instances/{i}/answers    201 stored, 200 the same again
 
 Steps of an instance that is ready are taken in the event loop; what replays a journal or waits for
-the disk runs in threads. `season_page` is what the page of a season shows.
+the disk runs in threads.
 """
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
-import numpy as np
 from anyio import CapacityLimiter, to_thread
-from markupsafe import Markup
 from starlette.datastructures import Headers
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
@@ -37,24 +33,17 @@ from starlette.routing import Route
 from starlette.types import Scope
 
 from leaderboard.documents.result import RANKED_METRICS
-from leaderboard.documents.submission import MAX_BYTES, Envelope, Knowledge
+from leaderboard.documents.submission import MAX_BYTES, Envelope
 from leaderboard.errors import Rejection
-from leaderboard.scoring.ranking import RankedRow
 from leaderboard.seasons.admission import receive_entry, refuse_other_sender, start_ticket
 from leaderboard.seasons.entry import SignedEntry, SignedTicketRequest
+from leaderboard.seasons.pages import SECTION
 from leaderboard.seasons.ranking import (
-    OfKey,
-    by_key,
-    counting,
     ranking_facts,
-    season_rankings,
 )
-from leaderboard.seasons.season import SealedResult, Season
 from leaderboard.seasons.tickets import Tickets, attending
-from leaderboard.store import SealedRow, SeasonRow, Store
-from leaderboard.web import charts
+from leaderboard.store import SeasonRow, Store
 from leaderboard.web.http import HTTP_CODES, RequestError, read_body
-from leaderboard.web.tables import setting_text
 from sme_registry import seasons
 from sme_registry.io import to_json
 from sme_registry.seasons import wire
@@ -71,6 +60,8 @@ _T = TypeVar("_T")
 
 class SeasonRoutes:
     """The handlers; `secrets` are paths of the masters of the seasons that this server steps."""
+
+    section = SECTION
 
     def __init__(self, store: Store, secrets: Iterable[str | os.PathLike[str]]) -> None:
         self._store = store
@@ -286,87 +277,3 @@ def _token(scope: Scope) -> str:
 
 def _octets(data: bytes) -> Response:
     return Response(data, media_type="application/octet-stream")
-
-
-@dataclass(frozen=True)
-class EntrantRow:
-    """An entry or ticket in the table of a season."""
-
-    row: SealedRow
-    counts: bool  # a later entry of its key and method replaces it otherwise
-    online_regret: float | None  # mean over the instances; None offline, and before its end
-    curve: Markup  # of that over the budget, drawn; empty likewise
-
-
-@dataclass(frozen=True)
-class SeasonPage:
-    row: SeasonRow
-    season: Season
-    settings: list[str]  # of each class, the fields that differ from a spec's defaults
-    entrants: list[EntrantRow]
-    rankings: dict[Knowledge, list[RankedRow]]  # by declared knowledge, of methods with results
-    keys: dict[str, OfKey]  # how often each takes part
-    master: str  # 64 hex digits after the reveal; empty before
-
-    @property
-    def online(self) -> bool:
-        """Whether the server steps its tasks."""
-        return self.row.track == "sealed-online"
-
-
-def season_page(store: Store, row: SeasonRow) -> SeasonPage:
-    """What is public of a season now."""
-    season = store.season(row.digest)
-    counted = {each.entrant.id for each in counting(store, season)}
-    rows = store.entrants(row.digest)
-    stepped = [_stepped(store, each) for each in rows]
-    curves = [each.curve for each in stepped if each.curve]
-    drawn = iter(charts.sparklines(curves, "From the first step"))
-    entrants = [
-        EntrantRow(
-            row=each,
-            counts=each.entrant.id in counted,
-            online_regret=of.regret,
-            curve=next(drawn) if of.curve else Markup(""),
-        )
-        for each, of in zip(rows, stepped, strict=True)
-    ]
-    return SeasonPage(
-        row=row,
-        season=season,
-        settings=[setting_text(member.setting) for member in season.classes],
-        entrants=entrants,
-        rankings=season_rankings(store, season, "wd_regret"),
-        keys=by_key(store, season),
-        master=store.revealed_master(row.digest).raw.hex() if row.reveal else "",
-    )
-
-
-class _Stepped(NamedTuple):
-    """What the table shows of a ticket's steps; nothing offline, and before its end."""
-
-    regret: float | None
-    curve: list[float]
-
-
-@functools.lru_cache(4096)  # results may have megabytes, and never change
-def _stepped(store: Store, row: SealedRow) -> _Stepped:
-    result = store.sealed_result(row)
-    return _Stepped(_online_regret(result), _mean_curve(result))
-
-
-def _online_regret(result: SealedResult | None) -> float | None:
-    if result is None or not result.stepping:
-        return None
-    return float(np.mean([each.normalised_online_regret for each in result.stepping]))
-
-
-def _mean_curve(result: SealedResult | None) -> list[float]:
-    """The mean learning curve over the instances, at equal shares of their budgets."""
-    if result is None or not result.stepping:
-        return []
-    share = np.linspace(0.0, 1.0, _CURVE_POINTS)
-    curves = [each.learning_curve for each in result.stepping]
-    values = [np.interp(share, np.linspace(0.0, 1.0, len(curve)), curve) for curve in curves]
-    mean: list[float] = np.mean(values, axis=0).tolist()
-    return mean

@@ -8,7 +8,7 @@
     POST /api/withdrawals                200
     GET  /api/board?metric=wd_regret     the ranking
     GET  /api/log?start=0                a hundred entries of the signed log
-         /api/seasons/…                  sealed seasons, see `seasons`
+         /api/seasons/…                  sealed seasons, see `seasons.web`
     GET  /healthz                        200 while the server runs; scoring: ok, waiting or fault
 
 An error is {"code", "message"}: the code of a `Rejection`, or one of `http.HTTP_CODES`. The
@@ -21,7 +21,8 @@ import contextlib
 import hashlib
 import os
 import re
-from collections.abc import AsyncIterator, Callable, Iterable
+from collections.abc import AsyncIterator, Callable, Iterable, Sequence
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import anyio
@@ -42,13 +43,15 @@ from leaderboard.documents.submission import (
 from leaderboard.errors import BoardError, Rejection, ScoringFault
 from leaderboard.gate.isolation import Isolation, available_isolation
 from leaderboard.scoring.worker import background_scorers
-from leaderboard.seasons.web import SeasonRoutes
 from leaderboard.store import Head, Store, unknown_submission
 from leaderboard.web import http
 from leaderboard.web.http import HTTP_CODES, RequestError
-from leaderboard.web.pages import Pages, content_type
+from leaderboard.web.pages import Pages, Section, content_type
 from leaderboard.web.tables import TABS, public_view
 from sme_registry.errors import SMEError
+
+if find_spec("leaderboard.seasons") is not None:  # without them, a board has the open track only
+    from leaderboard.seasons.web import SeasonRoutes
 
 _Render = Callable[[Pages, str], bytes]
 _PAGES_KEPT, _BYTES_KEPT = 256, 2**26
@@ -77,12 +80,16 @@ def create_app(
     """
     _refuse_missing(isolation)
     store = Store.open(os.fspath(path))
-    routes = _Routes(store, _PageCache(store, url), isolation)
-    seasons = SeasonRoutes(store, season_secrets)
+    tracks = [SeasonRoutes(store, season_secrets)] if find_spec("leaderboard.seasons") else []
+    pages = _PageCache(store, url, [track.section for track in tracks])
+    routes = _Routes(store, pages, isolation)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        with store, background_scorers(os.fspath(path), score_workers, isolation), seasons.open():
+        with store, contextlib.ExitStack() as stack:
+            stack.enter_context(background_scorers(os.fspath(path), score_workers, isolation))
+            for track in tracks:
+                stack.enter_context(track.open())
             yield
 
     app = FastAPI(
@@ -100,7 +107,8 @@ def create_app(
     )
     app.state.scores = score_workers > 0  # see `http.on_board_error`
     app.add_middleware(http.SecurityHeaders)
-    app.router.routes.extend(seasons.routes)
+    for track in tracks:
+        app.router.routes.extend(track.routes)
     app.add_api_route("/healthz", routes.health)
     app.add_api_route("/api/objects/{digits}", routes.put_object, methods=["PUT"])
     app.add_api_route("/api/objects/{digits}", routes.get_object, methods=["GET", "HEAD"])
@@ -269,8 +277,8 @@ class _PageCache:
     cached wait for one rendering of it.
     """
 
-    def __init__(self, store: Store, url: str) -> None:
-        self._store = store
+    def __init__(self, store: Store, url: str, sections: Sequence[Section]) -> None:
+        self._store, self._sections = store, sections
         # A copy without its key accepts no submissions.
         self._address = url if store.folder.key.is_file() else None
         self._head: tuple[Head, int] | None = None
@@ -279,7 +287,8 @@ class _PageCache:
     def get(self, render: _Render, name: str) -> _CachedFile:
         head = self._store.head, self._store.queue.faults()
         if head != self._head:
-            self._head, self._pages = head, Pages(self._store, self._address)
+            self._head = head
+            self._pages = Pages(self._store, self._address, sections=self._sections)
             self._files.clear()
         file = self._files.pop((render, name), None) or _rendered(self._pages, render, name)
         self._files[render, name] = file

@@ -6,7 +6,6 @@
     log.html, log-<n>.html              the log, `LOG_ROWS` entries a page, and how to verify it
     method.html, suite.html             the formulas; the tasks
     explorers/<64 hex>-<n>.html         on request, the explorer of run n of a scored submission
-    seasons.html, seasons/<id>.html     sealed seasons, where the board has any
     suite.json, definition.json         the suite, to train on it, and the board's definition
     board.json, .csv, .tex              the board by N₀ as data; so are ood_regret.*, ood_decay.*
 
@@ -18,10 +17,10 @@ themselves.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
@@ -30,14 +29,13 @@ from leaderboard.documents.result import METRICS, Estimate, Metric, Result
 from leaderboard.documents.submission import SignedSubmission
 from leaderboard.errors import CODES, NotPublishable
 from leaderboard.scoring import ranking
-from leaderboard.seasons.web import season_page
-from leaderboard.store import EntryRow, SeasonRow, Store
+from leaderboard.store import EntryRow, Store
 from leaderboard.web import charts, tables
 from leaderboard.web.tables import SHORT, TABS
 from sme_registry import SMESpec
 from sme_registry.io import to_json
 
-STATIC = Path(__file__).parent / "static"
+_HERE = Path(__file__).parent
 LOG_ROWS = 200  # entries on a page of the log; a full page never changes again
 
 _TYPES = {
@@ -52,6 +50,20 @@ _TYPES = {
 _NEED_SCORES = (*(tab.page for tab in TABS), "compare.html")
 
 
+class Section(NamedTuple):
+    """Further pages of a site: those of a track.
+
+    Attributes:
+      link: address and text of the link to them, which every page has if the address is a page.
+      folder: with their `templates` and `static` files.
+      files: functions that render them, by their paths.
+    """
+
+    link: tuple[str, str]
+    folder: Path
+    files: Callable[[Pages], dict[str, Callable[[], str]]]
+
+
 class Pages:
     """The pages of a board in its present state. Create another when its log has grown.
 
@@ -60,9 +72,15 @@ class Pages:
     """
 
     def __init__(
-        self, store: Store, address: str | None = None, *, explorers: bool = False
+        self,
+        store: Store,
+        address: str | None = None,
+        *,
+        explorers: bool = False,
+        sections: Sequence[Section] = (),
     ) -> None:
         self.store = store
+        self._sections = sections
         self._explorers = explorers
         self._address = address
         self.document = store.document
@@ -97,9 +115,7 @@ class Pages:
             return self._document(folder, name)
         if folder == "explorers":
             return self._explorer(name)
-        if folder == "seasons":
-            return self._season(name)
-        render = None if folder else self._top.get(name)
+        render = self._top.get(path)
         return render().encode() if render is not None else None
 
     def paths(self) -> Iterator[str]:
@@ -113,7 +129,6 @@ class Pages:
                 yield f"results/{digits}.json"
             yield from (f"explorers/{digits}-{n}.html" for n in self._explored(entry.id))
             yield f"submissions/{digits}.html"
-        yield from (f"seasons/{id}.html" for id in self._seasons)
         yield from self._top
 
     @cached_property
@@ -123,7 +138,7 @@ class Pages:
 
     @cached_property
     def _top(self) -> dict[str, Callable[[], str]]:
-        """The files of the top folder by name: functions that render them."""
+        """The other files by path: functions that render them."""
         logs = range(self.store.head[0] // LOG_ROWS + 1)
         return {
             **{_log_page(number): partial(self._log, number) for number in logs},
@@ -132,7 +147,7 @@ class Pages:
             "method.html": self._method,
             "suite.html": self._suite,
             "compare.html": self._compare,
-            **({"seasons.html": self._season_list} if self._seasons else {}),
+            **{path: render for part in self._files for path, render in part.items()},
             **{
                 f"{tab.stem}.{kind}": partial(self._file, tab.key, kind)
                 for tab in TABS
@@ -145,16 +160,10 @@ class Pages:
         """A file without scores, while the reference rows wait."""
         if folder == "submissions":
             return self._document(folder, name)
-        if folder == "seasons":
-            id = name.removesuffix(".html")
-            # The scorer of the reference rows has scored the entries, too.
-            if id in self._seasons and any(self._season_page(id).rankings.values()):
-                return self._preparation("../").encode()
-            return self._season(name)
-        if folder or name not in self._top:
+        path = f"{folder}/{name}" if folder else name
+        if path not in self._top:
             return None
-        render = self._preparation if name in _NEED_SCORES else self._top[name]
-        return render().encode()
+        return (self.preparation() if path in _NEED_SCORES else self._top[path]()).encode()
 
     def _board(self, tab: tables.MetricTab) -> str:
         ranked = ranking.ranking(self.entries, tab.key)
@@ -162,7 +171,7 @@ class Pages:
         regrets = [[each.value for each in one.normalised_regret] for one in scores]
         sparks = charts.sparklines(regrets)
         submitted = [row for row in ranked if not row.entry.reference]
-        return self._render(
+        return self.render(
             "board.html",
             here="index.html",
             title=tab.label,
@@ -180,14 +189,14 @@ class Pages:
             sparks=dict(zip((row.entry.id for row in ranked), sparks, strict=True)),
         )
 
-    def _preparation(self, root: str = "") -> str:
+    def preparation(self, root: str = "") -> str:
         """The page of a board whose reference rows wait, which reloads itself.
 
         `root` is the path from the page's folder to the top one.
         """
         here = "" if root else "index.html"
         overview = self._overview
-        return self._render("preparing.html", here=here, root=root, title="Preparing", **overview)
+        return self.render("preparing.html", here=here, root=root, title="Preparing", **overview)
 
     @cached_property
     def _overview(self) -> dict[str, Any]:
@@ -222,7 +231,7 @@ class Pages:
             sparks = charts.sparklines([each.normalised_regret for each in result.classes])
             classes = list(zip(result.classes, sparks, strict=True))
         versions = tables.versions_of(entry, self._listed)
-        return self._render(
+        return self.render(
             "submission.html",
             here="",
             root="../",
@@ -251,14 +260,14 @@ class Pages:
         """The page on which `board.js` compares chosen entries."""
         estimates = [each for entry in self._scored for each in entry.scores.normalised_regret]
         chart = charts.comparison_chart(estimates, self.document.protocol.edges)
-        return self._render(
+        return self.render(
             "compare.html", here="compare.html", title="Compare entries", chart=chart
         )
 
     def _log(self, page: int) -> str:
         """A page of the log, 0 for the oldest entries, with instructions to verify it."""
         last = self.store.head[0]
-        return self._render(
+        return self.render(
             "log.html",
             here="log.html",
             title="Log and verification",
@@ -273,30 +282,13 @@ class Pages:
 
     def _method(self) -> str:
         regions = charts.region_labels(self.document.protocol.edges)
-        return self._render("method.html", here="method.html", title="Method", regions=regions)
+        return self.render("method.html", here="method.html", title="Method", regions=regions)
 
     def _suite(self) -> str:
         classes, seeds = tables.task_rows(self.document), self._overview["seeds"]
-        return self._render(
+        return self.render(
             "suite.html", here="suite.html", title="Suite", classes=classes, seeds=seeds
         )
-
-    def _season_list(self) -> str:
-        return self._render("seasons.html", here="seasons.html", title="Sealed seasons")
-
-    def _season_page(self, id: str) -> Any:
-        return season_page(self.store, self._seasons[id])
-
-    def _season(self, name: str) -> bytes | None:
-        """The page of a season, before, during and after it."""
-        id, _, kind = name.rpartition(".")
-        if kind != "html" or id not in self._seasons:
-            return None
-        page = self._season_page(id)
-        title, reasons = page.row.title, ranking.REASONS
-        return self._render(
-            "season.html", here="", root="../", title=title, page=page, reasons=reasons
-        ).encode()
 
     def _data_js(self) -> str:
         """`board-data.js`: the data of the comparison. A script, since `file:` forbids `fetch`."""
@@ -386,15 +378,17 @@ class Pages:
     @cached_property
     def _static(self) -> dict[str, bytes]:
         """The files in static/, by name."""
+        files = _static(*self._folders)
         if not self._explorers:
-            return _static()
+            return files
         from sme_registry.explorer import STATIC as of_explorers
 
-        return {**_static(), **{name: text.encode() for name, text in of_explorers.items()}}
+        return {**files, **{name: text.encode() for name, text in of_explorers.items()}}
 
     @cached_property
-    def _seasons(self) -> dict[str, SeasonRow]:
-        return {row.id: row for row in self.store.seasons()}
+    def _files(self) -> list[dict[str, Callable[[], str]]]:
+        """The files of each section."""
+        return [section.files(self) for section in self._sections]
 
     @cached_property
     def _by_id(self) -> dict[str, EntryRow]:
@@ -434,15 +428,25 @@ class Pages:
                 "protocol": document.protocol.digest,
             },
             "learned": ranking.LEARNED,
-            "seasons": list(self._seasons.values()),
+            "links": tuple(
+                section.link
+                for section, files in zip(self._sections, self._files, strict=True)
+                if section.link[0] in files
+            ),
             "marks": tables.MARKS,
             "address_digits": SHORT,
             "metrics": TABS,
             "places": tables.places(self._listed),
         }
 
-    def _render(self, template: str, **values: Any) -> str:
-        return _environment().get_template(template).render({**self._common, **values})
+    def render(self, template: str, **values: Any) -> str:
+        """A page from a template, with what every page needs."""
+        environment = _environment(*self._folders)
+        return environment.get_template(template).render({**self._common, **values})
+
+    @property
+    def _folders(self) -> list[Path]:
+        return [_HERE, *(section.folder for section in self._sections)]
 
 
 def content_type(path: str) -> str:
@@ -450,9 +454,9 @@ def content_type(path: str) -> str:
 
 
 @cache
-def _environment() -> Environment:
+def _environment(*folders: Path) -> Environment:
     environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent / "templates"),
+        loader=FileSystemLoader([folder / "templates" for folder in folders]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -472,8 +476,10 @@ def _environment() -> Environment:
 
 
 @cache
-def _static() -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted(STATIC.iterdir())}
+def _static(*folders: Path) -> dict[str, bytes]:
+    """The files in static/ of these folders, by name."""
+    paths = [path for folder in folders for path in sorted((folder / "static").iterdir())]
+    return {path.name: path.read_bytes() for path in paths}
 
 
 def _log_page(number: int) -> str:

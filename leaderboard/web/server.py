@@ -14,7 +14,7 @@ import re
 import signal
 import socket
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,7 +23,7 @@ from leaderboard.documents.board import Folder
 from leaderboard.errors import BoardError
 from leaderboard.store import Store
 from leaderboard.store.files import write_file
-from leaderboard.web.pages import Pages
+from leaderboard.web.pages import Pages, Section
 from sme_registry.errors import OptionError
 from sme_registry.io import require_packages
 
@@ -156,6 +156,7 @@ def write_site(
     progress: Callable[[int, int], None] | None = None,
     *,
     explorers: bool = False,
+    sections: Sequence[Section] = (),
 ) -> Path:
     """Write the board's pages into a folder, and return the path of `index.html`.
 
@@ -165,7 +166,7 @@ def write_site(
     """
     out = Path(out)
     _refuse_board(out)
-    pages = Pages(store, explorers=explorers)
+    pages = Pages(store, explorers=explorers, sections=sections)
     paths = list(pages.paths())
 
     def write(path: str, content: bytes) -> None:

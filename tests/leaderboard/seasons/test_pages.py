@@ -4,6 +4,7 @@ import pytest
 
 from leaderboard import intake
 from leaderboard.scoring.aggregation import failed_run
+from leaderboard.seasons.pages import SECTION
 from leaderboard.seasons.scoring import sealed_result
 from leaderboard.seasons.season import Reveal, Stepping
 from leaderboard.web.pages import Pages
@@ -43,11 +44,11 @@ def board(tmp_path):
 
 
 def page(store, path, **options):
-    return Page(Pages(store, **options).read(path).decode())
+    return Page(Pages(store, sections=[SECTION], **options).read(path).decode())
 
 
 def test_a_board_without_seasons_has_no_page_of_them(board):
-    assert Pages(board).read("seasons.html") is None
+    assert Pages(board, sections=[SECTION]).read("seasons.html") is None
     assert "Seasons" not in page(board, "index.html").words
 
 
@@ -121,7 +122,7 @@ def test_the_site_of_a_board_with_seasons_is_well_formed_and_its_links_work(boar
     board.announce(ONLINE)
     entry(board, key)
     board.start_ticket(signed_request(board, ONLINE, key))
-    site = write_site(board, tmp_path / "site").parent
+    site = write_site(board, tmp_path / "site", sections=[SECTION]).parent
     pages = {
         path.relative_to(site).as_posix(): Page(path.read_text()) for path in site.rglob("*.html")
     }

@@ -21,7 +21,7 @@ from leaderboard.errors import BoardError, NotPublishable
 from leaderboard.store import Copies, Store
 from leaderboard.web import charts, tables
 from leaderboard.web import pages as site_pages
-from leaderboard.web.pages import STATIC, Pages, content_type
+from leaderboard.web.pages import Pages, content_type
 from leaderboard.web.server import write_site
 from sme_registry.errors import OptionError
 from tests.leaderboard.web import boards
@@ -530,7 +530,7 @@ def test_steps_are_short_and_only_https_becomes_a_link():
         assert tables.https_only(link) is None
 
 
-def test_contrast_is_enough_in_light_and_dark():
+def test_contrast_is_enough_in_light_and_dark(board):
     """WCAG 2: 4.5 for text, 3 for what is drawn."""
 
     def luminance(colour):
@@ -542,7 +542,7 @@ def test_contrast_is_enough_in_light_and_dark():
         high, low = sorted((luminance(one), luminance(other)), reverse=True)
         return (high + 0.05) / (low + 0.05)
 
-    css = (STATIC / "board.css").read_text()
+    css = Pages(board[0]).read("static/board.css").decode()
     pairs = re.findall(r"--([\w-]+): light-dark\((#[0-9a-f]{6}), (#[0-9a-f]{6})\);", css)
     assert len(pairs) == 20
     for scheme in (1, 2):
