@@ -6,14 +6,19 @@ interrupted.
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import ClassVar
 
 from leaderboard.errors import Rejection, TamperedError
 from sme_registry.errors import SealedError
 from sme_registry.io.terminal import CommandGroup, application
 
+if find_spec("leaderboard.seasons") is not None:
+    from leaderboard.seasons import COMMANDS
+else:
+    COMMANDS = {}
+
 _SUBMIT, _RESULTS = f"{__name__}.submissions", f"{__name__}.results"
-_TICKETS, _SEASONS = "leaderboard.seasons.entrant", "leaderboard.seasons.cli"
 _ADMIN = f"{__name__}.admin"
 
 _PANELS = {
@@ -25,12 +30,7 @@ _PANELS = {
         "submit": (_SUBMIT, "Send a submission to a board's folder or to a served board."),
         "withdraw": (_SUBMIT, "Withdraw your submission; its page stays and says so."),
     },
-    "Seasons": {
-        "ticket": (_TICKETS, "Start a ticket: hidden tasks of a season, for you alone."),
-        "answer": (_TICKETS, "Answer the challenges of a ticket with trained policies."),
-        "enter": (_TICKETS, "Take part in a sealed-offline season."),
-        "season": (_SEASONS, "Sealed seasons: tasks that nobody but the organiser knows."),
-    },
+    "Seasons": COMMANDS,
     "Results": {
         "rank": (_RESULTS, "Rank the entries by a metric."),
         "show": (_RESULTS, "Show one submission: its method, runs and scores."),

@@ -4,23 +4,18 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated
 
 import typer
 
 from leaderboard.documents.board import FILE, BoardDocument, Folder, refuse_unscored
-from leaderboard.documents.submission import now
 from leaderboard.store import Store
 from leaderboard.web import client
 from sme_registry.errors import OptionError
-from sme_registry.io import read_regular
 from sme_registry.io.terminal import Progress, err
-from sme_registry.seasons import WITHOUT_TASK
 from sme_registry.spec import ProtocolFile, SuiteFile, catalogue
 
-_FILE_BYTES = 2**28  # of answers
 _LONG_LOG = 2000  # entries, read in two seconds or so
 _HOST = re.compile(r"[A-Za-z0-9.-]+:\d+(/.*)?|localhost(/.*)?|[A-Za-z0-9-]+(\.[A-Za-z0-9-]+)+/.*")
 
@@ -179,83 +174,6 @@ Family = Annotated[
 ]
 CodeLink = Annotated[str | None, typer.Option("--code", help="An https link to the code.")]
 Statement = Annotated[str, typer.Option(help="A note for readers of the board.")]
-SealedKnowledge = Annotated[
-    Literal["generic", "family"],
-    typer.Option(
-        metavar="LEVEL",
-        help="What the method knows of the tasks. generic: nothing. family: that they are SMEs. "
-        "The two are ranked apart.",
-    ),
-]
-
-
-ActionRange = Annotated[
-    str | None,
-    typer.Option(metavar="RANGE", help="unit or symmetric; an SB3 model's own by default."),
-]
-
-
-def policy_of_each(policy: str, names: Collection[str]) -> dict[str, str]:
-    """The policy of each instance, by its name, which replaces `{name}`.
-
-    Raises:
-      OptionError: there are several instances, and all would have the same policy, which is none
-        of the references that need no task.
-    """
-
-    if len(names) > 1 and "{name}" not in policy and policy not in WITHOUT_TASK:
-        raise OptionError(
-            f"policy={policy!r}: must contain {{name}}, the name of the instance, such as "
-            f"{next(iter(names))}: each task has a policy of its own."
-        )
-    return {name: policy.replace("{name}", name) for name in names}
-
-
-def answers_in(path: str) -> bytes | None:
-    """The bytes of a file of actions, if a policy is given by one; None for other policies.
-
-    Raises:
-      OptionError: the file cannot be read.
-    """
-    return read_file(Path(path)) if path.endswith(".npy") else None
-
-
-def read_file(path: Path) -> bytes:
-    """The bytes of a file; raises `OptionError` if it cannot be read, as a pipe cannot."""
-    try:
-        return read_regular(path, _FILE_BYTES, links=True)
-    except OSError as error:
-        raise OptionError(f"{path}: cannot be read: {error.strerror}. Correct the path.") from None
-
-
-def manifest_fields(
-    key: str,
-    *,
-    method: tuple[str, str, str | None, str],
-    submitter: str,
-    code: str | None,
-    statement: str,
-) -> dict[str, Any]:
-    """The fields of a `Manifest`, signed now.
-
-    Args:
-      key: the submitter's public key.
-      method: name, version, family (None for the name) and knowledge.
-      submitter, code, statement: as given.
-    """
-    name, version, family, knowledge = method
-    return {
-        "method": {
-            "name": name,
-            "version": version,
-            "family": family or name,
-            "knowledge": knowledge,
-        },
-        "code": code,
-        "submitter": {"name": submitter, "key": key},
-        "created": now(),
-        "statement": statement,
-    }
 
 
 def find_suite(name: str) -> SuiteFile:

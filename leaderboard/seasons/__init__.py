@@ -1,1 +1,15 @@
-"""Seasons: tasks that nobody sees before they count, offline and online, of one board."""
+"""Seasons: tasks that nobody sees before they count, offline and online, of one board.
+
+`COMMANDS` are their commands, by name: module and summary. A board gets the rest where it is
+opened (`events`: kinds of log entries and their tables), served (`web`: routes), shown (`pages`)
+and checked (`verify`).
+"""
+
+_ENTRANT, _ORGANISER = f"{__name__}.entrant", f"{__name__}.cli"
+
+COMMANDS = {
+    "ticket": (_ENTRANT, "Start a ticket: hidden tasks of a season, for you alone."),
+    "answer": (_ENTRANT, "Answer the challenges of a ticket with trained policies."),
+    "enter": (_ENTRANT, "Take part in a sealed-offline season."),
+    "season": (_ORGANISER, "Sealed seasons: tasks that nobody but the organiser knows."),
+}

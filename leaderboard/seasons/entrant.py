@@ -5,33 +5,28 @@ from __future__ import annotations
 import functools
 import re
 import secrets
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.markup import escape
 
 from leaderboard.cli.options import (
     DEFAULT_KEY,
-    ActionRange,
     BoardOrUrl,
     CodeLink,
     Family,
     KeyFile,
     MethodName,
     MethodVersion,
-    SealedKnowledge,
     Statement,
     SubmitterName,
-    answers_in,
     board_document,
     is_url,
-    manifest_fields,
-    policy_of_each,
-    read_file,
 )
 from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.intake import upload_header
 from leaderboard.seasons.admission import enter as enter_folder
@@ -42,13 +37,36 @@ from leaderboard.store import Store
 from leaderboard.web.client import Progress as Sent
 from leaderboard.web.client import ServedBoard, answer_for
 from sme_registry.errors import OptionError, SpecError
-from sme_registry.io import check_new, check_writable, choice, sha256_of, write_atomically
+from sme_registry.io import (
+    check_new,
+    check_writable,
+    choice,
+    read_regular,
+    sha256_of,
+    write_atomically,
+)
 from sme_registry.io.markup import Table
 from sme_registry.io.terminal import Progress, err, out
-from sme_registry.seasons import Instance, Ticket, actions_in, prepare_policy
+from sme_registry.seasons import WITHOUT_TASK, Instance, Ticket, actions_in, prepare_policy
 from sme_registry.seasons.wire import TicketPlace, pack_table, tickets_path, unpack_table
 
 app = typer.Typer()
+
+_FILE_BYTES = 2**28  # of answers
+
+ActionRange = Annotated[
+    str | None,
+    typer.Option(metavar="RANGE", help="unit or symmetric; an SB3 model's own by default."),
+]
+
+Knowledge = Annotated[
+    Literal["generic", "family"],
+    typer.Option(
+        metavar="LEVEL",
+        help="What the method knows of the tasks. generic: nothing. family: that they are SMEs. "
+        "The two are ranked apart.",
+    ),
+]
 
 BoardUrl = Annotated[
     str, typer.Argument(metavar="URL", help="The URL of the board that serves the season.")
@@ -63,7 +81,7 @@ def ticket(
     submitter: SubmitterName,
     method_version: MethodVersion = "1",
     family: Family = None,
-    knowledge: SealedKnowledge = "generic",
+    knowledge: Knowledge = "generic",
     code: CodeLink = None,
     statement: Statement = "",
     out_file: Annotated[Path, typer.Option("--out", "-o", help="The ticket's new file.")] = Path(
@@ -273,7 +291,7 @@ def enter(
     submitter: SubmitterName,
     method_version: MethodVersion = "1",
     family: Family = None,
-    knowledge: SealedKnowledge = "generic",
+    knowledge: Knowledge = "generic",
     failed: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME", help="An instance without a policy; scores 1. Repeatable."),
@@ -416,3 +434,66 @@ def _name(id: str) -> str:
             "board."
         )
     return id
+
+
+def policy_of_each(policy: str, names: Collection[str]) -> dict[str, str]:
+    """The policy of each instance, by its name, which replaces `{name}`.
+
+    Raises:
+      OptionError: there are several instances, and all would have the same policy, which is none
+        of the references that need no task.
+    """
+
+    if len(names) > 1 and "{name}" not in policy and policy not in WITHOUT_TASK:
+        raise OptionError(
+            f"policy={policy!r}: must contain {{name}}, the name of the instance, such as "
+            f"{next(iter(names))}: each task has a policy of its own."
+        )
+    return {name: policy.replace("{name}", name) for name in names}
+
+
+def answers_in(path: str) -> bytes | None:
+    """The bytes of a file of actions, if a policy is given by one; None for other policies.
+
+    Raises:
+      OptionError: the file cannot be read.
+    """
+    return read_file(Path(path)) if path.endswith(".npy") else None
+
+
+def read_file(path: Path) -> bytes:
+    """The bytes of a file; raises `OptionError` if it cannot be read, as a pipe cannot."""
+    try:
+        return read_regular(path, _FILE_BYTES, links=True)
+    except OSError as error:
+        raise OptionError(f"{path}: cannot be read: {error.strerror}. Correct the path.") from None
+
+
+def manifest_fields(
+    key: str,
+    *,
+    method: tuple[str, str, str | None, str],
+    submitter: str,
+    code: str | None,
+    statement: str,
+) -> dict[str, Any]:
+    """The fields of a `Manifest`, signed now.
+
+    Args:
+      key: the submitter's public key.
+      method: name, version, family (None for the name) and knowledge.
+      submitter, code, statement: as given.
+    """
+    name, version, family, knowledge = method
+    return {
+        "method": {
+            "name": name,
+            "version": version,
+            "family": family or name,
+            "knowledge": knowledge,
+        },
+        "code": code,
+        "submitter": {"name": submitter, "key": key},
+        "created": now(),
+        "statement": statement,
+    }
