@@ -42,6 +42,7 @@ _PANELS = {
         "site": (_ADMIN, "Write the board as static pages."),
         "serve": (_ADMIN, "Serve the board: its pages, and an API for submissions."),
         "reindex": (_ADMIN, "Rebuild the index from the log and the documents."),
+        "clock": (_ADMIN, "Go on after the machine's clock was wrong."),
         "gc": (_ADMIN, "Remove what no submission needs."),
         "demo": (_ADMIN, "Put a trained run through the whole pipeline."),
     },

@@ -307,6 +307,37 @@ def reindex(board: BoardFolder = Path("board")) -> None:
 
 
 @app.command()
+def clock(
+    board: BoardFolder = Path("board"),
+    correct: Annotated[
+        bool,
+        typer.Option(
+            "--correct", help="Log that all entries dated later than now were received now."
+        ),
+    ] = False,
+) -> None:
+    """Go on writing, after you have set the machine's clock right.
+
+    A board writes nothing while the clock is more than a minute behind the log's last entry, or
+    after it has jumped by more than five minutes while the board was served.
+
+    Examples:
+
+      sme-leaderboard clock board
+
+      sme-leaderboard clock board --correct
+    """
+
+    with Store.open(board) as store:
+        store.note_clock(anew=True)
+        if correct:
+            first = store.correct_clock()
+            entries = f"entries {first} and later" if first else "no entry"
+            out().print(f"The log dates {entries} as of now.")
+        out().print(f"It is {store.time}; the board is written again.")
+
+
+@app.command()
 def gc(
     board: BoardFolder = Path("board"),
     older_than_hours: Annotated[

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import datetime
 import re
+import time
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
 
@@ -473,5 +474,5 @@ def shifted(moment: datetime.datetime, by: datetime.timedelta) -> datetime.datet
 
 
 def now() -> str:
-    """The current time as documents write it."""
-    return utc(datetime.datetime.now(datetime.UTC))
+    """The machine's time as documents write it."""
+    return utc(datetime.datetime.fromtimestamp(time.time(), datetime.UTC))

@@ -27,7 +27,7 @@ from leaderboard.documents.submission import (
 from leaderboard.errors import Rejection
 from leaderboard.gate.isolation import Isolation, isolation_for_own
 from leaderboard.gate.sandbox import Confined, widths
-from leaderboard.intake.uploads import check_room, quota_window
+from leaderboard.intake.uploads import a_day_ago, check_room
 from leaderboard.store import Store
 
 _DAY = datetime.timedelta(days=1)
@@ -44,7 +44,6 @@ _verdicts: dict[_Case, Rejection | None] = {}
 def receive(
     store: Store,
     envelope: Envelope[SignedSubmission],
-    at: datetime.datetime | None = None,
     isolation: Isolation | None = None,
 ) -> bool:
     """Admit a submission that a server received.
@@ -52,7 +51,6 @@ def receive(
     Args:
       store: the board.
       envelope: the submission, its signature verified and its content not validated.
-      at: time of arrival; now by default.
       isolation: of the process that reads its policies; None for the one that this machine has.
 
     Returns:
@@ -63,16 +61,14 @@ def receive(
       ScoringFault: that process does not start; nothing is judged.
     """
     check_board(store.document, envelope.board)
-    moment = at or datetime.datetime.now(datetime.UTC)
     if store.entry(envelope.id) is None:
-        _check_quotas(store, envelope.key, moment)
-    return admit(store, envelope.open(), moment, isolation=isolation)
+        _check_quotas(store, envelope.key)
+    return admit(store, envelope.open(), isolation=isolation)
 
 
 def admit(
     store: Store,
     signed: SignedSubmission,
-    at: datetime.datetime | None = None,
     policy_file: ReadFile | None = None,
     isolation: Isolation | None = None,
 ) -> bool:
@@ -81,7 +77,6 @@ def admit(
     Args:
       store: the board.
       signed: the submission, its signature verified.
-      at: time of arrival; now by default.
       policy_file: returns a file's bytes by digest, of the size in the submission; they are
         stored with the submission. By default the submitter's key has uploaded them.
       isolation: as in `receive`.
@@ -93,7 +88,6 @@ def admit(
       Rejection, ScoringFault: as in `receive`.
     """
     check_board(store.document, signed.board)
-    moment = at or datetime.datetime.now(datetime.UTC)
     known = store.entry(signed.id)
     if known is not None:
         if known.status == "withdrawn":
@@ -105,16 +99,18 @@ def admit(
         return False
     submission = signed.submission
     key = submission.submitter.key
-    check_submission(store.document, submission, moment)
+    # The board's own rows are signed at its opening, and added at any time.
+    time = submission.created if key == store.document.key else store.time
+    check_submission(store.document, submission, datetime.datetime.fromisoformat(time))
     check_name(store, submission.submitter)
-    _check_quotas(store, key, moment)
+    _check_quotas(store, key)
     _check_files(store, submission, policy_file, isolation)
     if policy_file is not None:
         for digest in _policies(submission):
             store.put_object(digest, [policy_file(digest)], by=key)
     with store.transaction():  # no other submission can use the quota or the name in between
         check_name(store, submission.submitter)
-        _check_quotas(store, key, moment)
+        _check_quotas(store, key)
         if key != store.document.key:
             check_room(store, len(signed.to_bytes()))
         for declared in _policies(submission).values():  # nor can `gc` take a file
@@ -156,7 +152,7 @@ def check_name(store: Store, submitter: Submitter) -> None:
         )
 
 
-def _check_quotas(store: Store, key: str, moment: datetime.datetime) -> None:
+def _check_quotas(store: Store, key: str) -> None:
     """Reject one more submission of a key if its quota, or the queue, is full.
 
     The board's own key has no quota, because nothing is shown without the reference rows.
@@ -164,7 +160,7 @@ def _check_quotas(store: Store, key: str, moment: datetime.datetime) -> None:
     limits = store.document.limits
     if key == store.document.key:
         return
-    check_daily_quota(store, key, moment)
+    check_daily_quota(store, key)
     waiting = store.queue.queued()  # those that faults have stopped take nobody's place
     if waiting >= limits.waiting_submissions:
         raise Rejection(
@@ -174,10 +170,10 @@ def _check_quotas(store: Store, key: str, moment: datetime.datetime) -> None:
         )
 
 
-def check_daily_quota(store: Store, key: str, moment: datetime.datetime) -> None:
+def check_daily_quota(store: Store, key: str) -> None:
     """Reject (`quota`) one more submission or entry of a key that has sent a day's number."""
     limits = store.document.limits
-    times = store.submission_times(key, *quota_window(moment))
+    times = store.submission_times(key, a_day_ago(store))
     if len(times) >= limits.submissions_per_day:
         first = datetime.datetime.fromisoformat(times[-limits.submissions_per_day])
         free = shifted(first, _DAY)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
@@ -75,7 +74,6 @@ def submit_references(store: Store) -> list[str]:
         admit(
             store,
             signed,
-            datetime.datetime.fromisoformat(opened),
             artefacts.__getitem__,
             isolation_for_own(),
         )

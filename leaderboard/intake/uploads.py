@@ -15,7 +15,7 @@ from leaderboard.errors import Rejection
 from leaderboard.store import Store, make_room
 
 UPLOAD_MINUTES = 10
-_DAY, _SKEW = datetime.timedelta(days=1), datetime.timedelta(minutes=UPLOAD_MINUTES)
+_DAY = datetime.timedelta(days=1)
 _HEADER = re.compile(
     r"SME-Ed25519 key=([0-9a-f]{64}),"
     r"(?:board=([0-9a-f]{64}),)?"
@@ -78,7 +78,7 @@ def uploader(
             "Authorization: the signature does not match this object, this time and the key "
             f"{key[:16]}…. Sign each upload separately.",
         )
-    moment = at or datetime.datetime.now(datetime.UTC)
+    moment = at or datetime.datetime.fromisoformat(now())
     try:
         age = abs(moment - datetime.datetime.fromisoformat(time))
         fresh = age <= datetime.timedelta(minutes=UPLOAD_MINUTES)
@@ -93,19 +93,15 @@ def uploader(
     return key
 
 
-def quota_window(moment: datetime.datetime) -> tuple[str, str]:
-    """The times after and up to which submissions and uploads count: a day ago, soon.
-
-    What is dated later was received while the board's clock was wrong, and counts no longer.
-    """
-    return utc(shifted(moment, -_DAY)), utc(shifted(moment, _SKEW))
+def a_day_ago(store: Store) -> str:
+    """After which submissions and uploads count towards a day's quotas."""
+    return utc(shifted(datetime.datetime.fromisoformat(store.time), -_DAY))
 
 
 def check_upload(
     store: Store,
     key: str,
     size: int,
-    at: datetime.datetime | None = None,
 ) -> None:
     """Reject an upload that is too large, or exceeds the key's or the board's quota.
 
@@ -113,7 +109,6 @@ def check_upload(
       store: the board.
       key: the uploader's public key.
       size: of the object, in bytes.
-      at: time of arrival; now by default.
 
     Raises:
       Rejection: `too_large` or `quota`.
@@ -125,8 +120,7 @@ def check_upload(
             f"object: {size:,} bytes: must be at most {limits.artefact_bytes:,}. "
             "Export a smaller network.",
         )
-    moment = at or datetime.datetime.now(datetime.UTC)
-    used = store.uploaded_bytes(key, *quota_window(moment))
+    used = store.uploaded_bytes(key, a_day_ago(store))
     if used + size > limits.upload_bytes_per_day:
         raise Rejection(
             "quota",

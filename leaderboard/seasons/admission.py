@@ -36,9 +36,8 @@ def receive_entry(store: Store, envelope: Envelope[SignedEntry], season: str) ->
       Rejection: with the code of the first fault.
     """
     check_board(store.document, envelope.board)
-    moment = datetime.datetime.now(datetime.UTC)
     if store.entrant(envelope.id) is None:
-        check_daily_quota(store, envelope.key, moment)
+        check_daily_quota(store, envelope.key)
     signed = envelope.open()
     if signed.entry.season != season:
         raise Rejection(
@@ -46,13 +45,12 @@ def receive_entry(store: Store, envelope: Envelope[SignedEntry], season: str) ->
             f"season={signed.entry.season}: the entry was sent to the season {season}. Send "
             "it to its own.",
         )
-    return enter(store, signed, moment)
+    return enter(store, signed)
 
 
 def enter(
     store: Store,
     signed: SignedEntry,
-    at: datetime.datetime | None = None,
     answers: ReadFile | None = None,
 ) -> bool:
     """Check an entry and store it.
@@ -60,7 +58,6 @@ def enter(
     Args:
       store: the board.
       signed: the entry, its signature verified.
-      at: time of arrival; now by default.
       answers: returns the bytes of an answer by digest; they are stored with the entry. By default
         the entrant's key has uploaded them.
 
@@ -75,19 +72,19 @@ def enter(
         return False
     entry, key = signed.entry, signed.entry.submitter.key
     check_names(entry, store.document.key)
-    moment = at or datetime.datetime.now(datetime.UTC)
+    moment = datetime.datetime.fromisoformat(store.time)
     check_time(entry.created, moment, store.document.limits.age_days)
     store.open_season(entry.season, "sealed-offline")
     season = store.season(entry.season)
     check_name(store, entry.submitter)
-    check_daily_quota(store, key, moment)
+    check_daily_quota(store, key)
     given = _check_answers(store, season, signed, answers)
     if answers is not None:
         for answer in given:
             store.put_object(answer.sha256, [answers(answer.sha256)], by=key)
     with store.transaction():  # no other entrant can take the name, nor `gc` an answer in between
         check_name(store, entry.submitter)
-        check_daily_quota(store, key, moment)
+        check_daily_quota(store, key)
         _check_newest(store, season, entry)
         check_room(store, len(signed.to_bytes()))
         for answer in given:
@@ -165,7 +162,6 @@ def start_ticket(
     store: Store,
     envelope: Envelope[SignedTicketRequest],
     season: str,
-    at: datetime.datetime | None = None,
 ) -> tuple[int, bool]:
     """Start a ticket; the same request starts no second one, and has its number again.
 
@@ -173,7 +169,6 @@ def start_ticket(
       store: the board.
       envelope: the request, its signature verified and its content not validated.
       season: digest of the season that it was sent to.
-      at: time of arrival; now by default.
 
     Returns:
       The ticket's number, and whether it is new.
@@ -200,11 +195,11 @@ def start_ticket(
             "Create the request with `sme-leaderboard ticket`.",
         )
     check_names(request, store.document.key)
-    moment = at or datetime.datetime.now(datetime.UTC)
+    moment = datetime.datetime.fromisoformat(store.time)
     check_time(request.created, moment, store.document.limits.age_days)
     size = len(signed.to_bytes()) + played_bytes(store.season(season))
     with store.transaction():  # no other entrant can take the name, or the room, in between
         check_name(store, request.submitter)
-        check_daily_quota(store, request.submitter.key, moment)
+        check_daily_quota(store, request.submitter.key)
         check_room(store, size)
         return store.start_ticket(signed), True

@@ -142,10 +142,10 @@ def close(board: BoardFolder, season: SeasonId) -> None:
 
     with open_board(board) as store:
         row = store.season_row(season)
-        if store.time < row.closes:
+        if store.clock.time < row.closes:
             raise Rejection(
                 "season_not_closed",
-                f"season={row.id}: closes at {row.closes}, and it is {store.time}.",
+                f"season={row.id}: closes at {row.closes}, and it is {store.clock.time}.",
             )
         table = Table(
             f"What counts in {row.id}",
@@ -306,7 +306,7 @@ def _warn_of_easy_classes(terms: Terms) -> None:
 
 def _facts(store: Store, row: SeasonRow) -> dict[str, Any]:
     """A season in short."""
-    time = store.time
+    time = store.clock.time
     state = "revealed" if row.reveal else "closed" if time >= row.closes else "open"
     document = store.season(row.digest)
     return {

@@ -33,6 +33,14 @@ from sme_registry.seasons.wire import table_bytes
 DERIVED = {"season": "digest", "sealed": "id", "answer": "digest || entry"}
 """Tables and their keys."""
 
+TIMES = (
+    ("season", "announced"),
+    ("season", "revealed"),
+    ("sealed", "received"),
+    ("sealed", "finished"),
+)
+"""Tables and their columns with times of log entries."""
+
 SCHEMA = """
 CREATE TABLE season (
   digest TEXT PRIMARY KEY, sequence INTEGER NOT NULL, announced TEXT NOT NULL,

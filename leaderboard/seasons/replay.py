@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import NoReturn
 
 from leaderboard.documents.result import RunScore
-from leaderboard.documents.submission import utc
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.rescore import RESCORED
 from leaderboard.scoring.verify import EXACT, close
@@ -124,7 +123,7 @@ def _check_rules(store: Store, season: Season, rows: Sequence[SealedRow]) -> Non
         if season.tickets is not None and row.number > season.tickets:
             _refuse(store, path, f"exceeds the {season.tickets} tickets of the season")
         if online and row.entrant.policies < row.entrant.runs and row.result is not None:
-            end = utc(deadline(season, row))
+            end = deadline(season, row)
             if row.finished < end:
                 message = f"was logged at {row.finished}, without all answers: must not be before "
                 _refuse(store, folder.result(row.entrant.id), f"{message}{end}, its deadline")

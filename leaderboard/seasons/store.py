@@ -1,14 +1,12 @@
 """`SealedStore`: the seasons of a board's folder, each change under the board's transaction.
 
-What may change when follows from the board's clock. A clock set back reopens nothing: the time is
-never before that of the log's last entry.
+What may change when follows from the time at which the log receives it.
 """
 
 from __future__ import annotations
 
 from typing import Literal
 
-from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.seasons.entry import SignedEntry, SignedTicketRequest
 from leaderboard.seasons.events import SealedRow, SeasonRow
@@ -38,9 +36,9 @@ class SealedStore(Database):
                 raise BoardError(
                     f"id={season.id}: another season of this board has it. Choose another id."
                 )
-            if season.closes <= self.time:
+            if season.closes <= self.clock.time:
                 raise BoardError(
-                    f"closes={season.closes}: must be after the board's time, {self.time}. "
+                    f"closes={season.closes}: must be after the board's time, {self.clock.time}. "
                     "Choose a later one."
                 )
             self.record("season", season.digest, season, self.season_folder(season.digest).season)
@@ -96,7 +94,7 @@ class SealedStore(Database):
         with self.transaction() as index:
             if index.seasons.entrant(signed.id) is not None:
                 return False
-            time = self.time
+            time = self.clock.received()
             row = self.open_season(signed.entry.season, "sealed-offline", time)
             path = self.season_folder(row.digest).entry(signed.id)
             self.record("entry", signed.id, signed, path, time)
@@ -117,7 +115,7 @@ class SealedStore(Database):
             known = index.seasons.entrant(signed.id)
             if known is not None:
                 return known.number
-            time = self.time
+            time = self.clock.received()
             row = self.open_season(signed.ticket.season, "sealed-online", time)
             season, key = index.seasons.read(row), signed.ticket.submitter.key
             own = sum(each.entrant.key == key for each in index.seasons.entrants(row.digest))
@@ -185,7 +183,7 @@ class SealedStore(Database):
           BoardError: it cannot be written.
         """
         with self.transaction() as index:
-            time, row = self.time, self.season_row(reveal.season)
+            time, row = self.clock.received(), self.season_row(reveal.season)
             master = Master(bytes.fromhex(reveal.master))
             if not index.seasons.read(row).is_committed_to(master):
                 raise Rejection(
@@ -290,7 +288,7 @@ class SealedStore(Database):
           Rejection: `season_unknown`, `season_track`, `season_not_open`, `season_closed` or
             `season_revealed`.
         """
-        row, time = self.season_row(name), time or self.time
+        row, time = self.season_row(name), time or self.clock.time
         if row.track != track:
             raise Rejection(
                 "season_track",
@@ -307,12 +305,6 @@ class SealedStore(Database):
         if time >= row.closes:
             raise Rejection("season_closed", f"season={row.id}: closed at {row.closes}.")
         return row
-
-    @property
-    def time(self) -> str:
-        """The board's time: never before that of the log's last entry."""
-        with self.reading() as index:
-            return max(now(), index.head.time)
 
     def _finish(
         self, event: Literal["ended", "ranked"], row: SealedRow, result: SealedResult

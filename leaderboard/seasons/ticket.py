@@ -20,11 +20,11 @@ from sme_registry import seasons
 from sme_registry.seasons import wire
 
 
-def deadline(season: Season, row: SealedRow) -> datetime.datetime:
+def deadline(season: Season, row: SealedRow) -> str:
     """When a ticket of an online season ends at the latest."""
     assert season.ticket_hours is not None  # the track is online
     started = datetime.datetime.fromisoformat(row.entrant.received)
-    return shifted(started, datetime.timedelta(hours=season.ticket_hours))
+    return utc(shifted(started, datetime.timedelta(hours=season.ticket_hours)))
 
 
 class RunningTicket:
@@ -37,6 +37,7 @@ class RunningTicket:
 
     Attributes:
       number: in the season, from 1.
+      deadline: its end.
       instances: in the season's order.
     """
 
@@ -47,8 +48,7 @@ class RunningTicket:
         self._nonce = request.ticket.nonce
         place = Place(season.id, "", 0, str(row.number), self._nonce)
         self._token = master.secret("token", place).hex()
-        self._deadline = deadline(season, row)
-        self._ends = self._deadline.timestamp()
+        self.deadline = deadline(season, row)
         self._closed = row.result is not None
         folder = store.season_folder(row.season).ticket(row.number)
         self.instances = tuple(
@@ -67,7 +67,7 @@ class RunningTicket:
                 "season": self._season.id,
                 "ticket": self.number,
                 "token": self._token,
-                "deadline": utc(self._deadline),
+                "deadline": self.deadline,
                 "lanes": MAX_LANES,
                 "classes": [member.model_dump(exclude={"data"}) for member in self._season.classes],
             }
@@ -82,30 +82,30 @@ class RunningTicket:
                 "Send `Bearer` and the token that the board answered when the ticket started.",
             )
 
-    def is_over(self, now: float) -> bool:
-        """Whether nothing can change any more, at a time in seconds since 1970."""
-        return self._closed or now >= self._ends or all(each.answered for each in self.instances)
+    def is_over(self, now: str) -> bool:
+        """Whether nothing can change any more, at a time of the board."""
+        return self._closed or now >= self.deadline or all(each.answered for each in self.instances)
 
     @property
     def is_unplayed(self) -> bool:
         """Whether it has neither steps nor answers."""
         return not any(each.is_played for each in self.instances)
 
-    def refuse_over(self, now: float) -> None:
+    def refuse_over(self, now: str) -> None:
         """Raise `Rejection` (`ticket_ended`) if the ticket is over."""
-        if self._closed or now >= self._ends:
+        if self._closed or now >= self.deadline:
             raise Rejection(
                 "ticket_ended",
-                f"ticket={self.number}: has ended, at the latest at {utc(self._deadline)}. What it "
+                f"ticket={self.number}: has ended, at the latest at {self.deadline}. What it "
                 "had counts.",
             )
 
-    def status(self, now: float) -> wire.TicketStatus:
+    def status(self, now: str) -> wire.TicketStatus:
         """How far the entrant is."""
         return wire.TicketStatus(
             ticket=self.number,
             phase="ended" if self.is_over(now) else "running",
-            deadline=utc(self._deadline),
+            deadline=self.deadline,
             instances=tuple(each.status for each in self.instances),
         )
 

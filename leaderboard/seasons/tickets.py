@@ -8,9 +8,7 @@ scored is tried again after all others, after growing pauses of up to five minut
 from __future__ import annotations
 
 import contextlib
-import datetime
 import logging
-import math
 import multiprocessing
 import os
 import signal
@@ -26,7 +24,7 @@ from leaderboard.seasons.instance import SteppedInstance
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.scores import score_ticket, unplayed_result
 from leaderboard.seasons.season import MAX_LANES, Season
-from leaderboard.seasons.ticket import RunningTicket
+from leaderboard.seasons.ticket import RunningTicket, deadline
 from leaderboard.store import Store
 from sme_registry.io import file_lock
 from sme_registry.seasons.wire import StepFormat, TicketStatus
@@ -36,38 +34,6 @@ MOST_HELD_LANES, _FIXED_LANES, _WEIGHTS_OF_A_LANE = 2**17, 128, 100
 
 Those used longest ago are replayed when they go on.
 """
-
-_SURE_SECONDS = 60.0
-
-
-class Clock:
-    """The board's time, which does not go back while the server runs.
-
-    Args:
-      start: the store's time, as documents write it.
-    """
-
-    def __init__(self, start: str) -> None:
-        first = max(datetime.datetime.fromisoformat(start).timestamp(), time.time())
-        self._offset = first - time.monotonic()
-        self._forward_since = math.inf  # uptime
-
-    @property
-    def now(self) -> float:
-        """Seconds since 1970."""
-        return max(time.time(), self._offset + time.monotonic())
-
-    @property
-    def sure(self) -> float:
-        """The same for what cannot be undone: a clock set forward counts after a minute."""
-        uptime = time.monotonic()
-        if time.time() - uptime - self._offset < _SURE_SECONDS:
-            self._forward_since = math.inf
-        else:
-            self._forward_since = min(self._forward_since, uptime)
-            if uptime - self._forward_since >= _SURE_SECONDS:
-                self._offset = time.time() - uptime
-        return self._offset + uptime
 
 
 class Tickets:
@@ -103,7 +69,6 @@ class Tickets:
         self._process_lock = lock
         self._store = store
         self.board, self.secret = store.folder.path, Path(secret)
-        self._clock = Clock(store.time)
         self._lock = threading.Lock()
         self._running: dict[int, RunningTicket] = {}
         self._held: OrderedDict[SteppedInstance, int] = OrderedDict()
@@ -130,11 +95,6 @@ class Tickets:
         return found
 
     @property
-    def now(self) -> float:
-        """The board's time in seconds since 1970."""
-        return self._clock.now
-
-    @property
     def step_bytes(self) -> int:
         """The most bytes of a request for steps, of any instance."""
         dims = (member.setting.action_dim for member in self.season.classes)
@@ -144,7 +104,7 @@ class Tickets:
         """How far an entrant is, with the password of the ticket."""
         ticket = self.ticket(number)
         ticket.refuse_token(token)
-        return ticket.status(self.now)
+        return ticket.status(self._store.clock.time)
 
     def answer_bytes(self, number: int, token: str, instance: int) -> int:
         """The most bytes of an instance's answers, with the password of the ticket."""
@@ -205,23 +165,25 @@ class Tickets:
         chosen = ticket.instance(instance)
         if chosen.has_stored(data):
             return False
-        ticket.refuse_over(self.now)
+        ticket.refuse_over(self._store.clock.received())
         return chosen.answer(data, signature)
 
     def over(self) -> list[int]:
         """The numbers of tickets that are over and have no result, in order."""
-        waiting, now = [], self._clock.sure
+        waiting, now = [], self._store.time
         for row in self._store.entrants(self.digest):
             if row.result is None:
-                waiting.append(row.number)
+                waiting.append(row)
             else:
                 self._running.pop(row.number, None)  # closed, and so its files are final
         over = []
-        for number in waiting:
+        for row in waiting:
             # An altered request holds up no other ticket; `verify` names its file.
             with contextlib.suppress(TamperedError):
-                if self.ticket(number).is_over(now):
-                    over.append(number)
+                ticket = self.ticket(row.number)
+                ticket.deadline = deadline(self.season, row)  # a wrong clock's date is corrected
+                if ticket.is_over(now):
+                    over.append(row.number)
         return over
 
     def close_ticket(self, number: int) -> None:
@@ -265,7 +227,7 @@ class Tickets:
     def _chosen(self, number: int, token: str, instance: int) -> SteppedInstance:
         ticket = self.ticket(number)
         ticket.refuse_token(token)
-        ticket.refuse_over(self.now)
+        ticket.refuse_over(self._store.clock.received())
         return ticket.instance(instance)
 
     def _hold(self, instance: SteppedInstance) -> None:

@@ -18,11 +18,11 @@ from typing import Self
 
 from leaderboard.documents.board import RULES, BoardDocument, Folder
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import shifted, utc
+from leaderboard.documents.submission import now, shifted, utc
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.store.files import FolderLock, digest_of, unwritable, write_document
 from leaderboard.store.index import Index, IndexUnusable
-from leaderboard.store.log import EMPTY, Event, Head, Log
+from leaderboard.store.log import EMPTY, Clock, Event, Head, Log, clock_offset, uptime
 from leaderboard.store.objects import Objects
 from sme_registry.io import sync_folder, temporary_beside
 from sme_registry.spec.document import StrictModel
@@ -44,6 +44,7 @@ class Database:
         self.document: BoardDocument = self.folder.read()
         self.read_only = read_only
         self.objects = Objects(self.folder)
+        self.clock = Clock()
         self._log = Log(self.folder, self.document.key)
         self._thread_lock = threading.RLock()
         self._in_transaction = False
@@ -131,6 +132,7 @@ class Database:
                 index = self._connected
                 with index.transaction():
                     self._catch_up(index)
+                    self._follow_clock(index)
                     self._in_transaction = True
                     try:
                         yield index
@@ -143,6 +145,7 @@ class Database:
         with self._thread_lock, self._explained():
             if not self._in_transaction:
                 self._refresh()
+                self._follow_clock(self._connected)
             yield self._connected
 
     def record(
@@ -155,12 +158,67 @@ class Database:
     ) -> None:
         """Write a document's file, its log entry and its rows; call it in a transaction.
 
-        `time` is the log entry's, if what is allowed depends on it; the clock's by default.
+        `time` is the log entry's, if what is allowed depends on it; by default the board's.
+
+        Raises:
+          BoardError: they cannot be written, or the machine's clock is wrong.
         """
         key = self.signing_key()
-        index = self._connected
+        index, time = self._connected, time or self.clock.received()
+        entry = self._log.entry(key, index.head, event, subject, digest_of(document), time)
         write_document(path, document)
-        index.apply(self._log.append(key, index.head, event, subject, digest_of(document), time))
+        self._log.write(entry)
+        index.apply(entry)
+        self.clock.last = entry.time
+
+    @property
+    def time(self) -> str:
+        """When the board receives what comes now.
+
+        Raises:
+          BoardError: the machine's clock is wrong.
+        """
+        with self.reading():
+            return self.clock.received()
+
+    def note_clock(self, *, anew: bool = False) -> None:
+        """Note how the machine's clock stands, once after each start of the machine, or anew.
+
+        From then on, nothing is written if it jumps.
+        """
+        with self.transaction() as index:
+            row = clock_offset()
+            if anew or index.one("SELECT 1 FROM clock WHERE boot = ?", row[0]) is None:
+                index.connection.execute("DELETE FROM clock")
+                index.connection.execute("INSERT INTO clock VALUES (?, ?)", row)
+            self._follow_clock(index)
+
+    def correct_clock(self) -> int:
+        """Date all entries of the log that are dated later than now as of now.
+
+        Returns:
+          The number of the first of them; 0 if there is none.
+
+        Raises:
+          BoardError: it cannot be written.
+        """
+        key = self.signing_key()
+        with self.transaction() as index:
+            time = now()
+            first = self._log.first_after(index.head, time)
+            if first is None:
+                return 0
+            subject, document = first.digest, digest_of(first)
+            entry = self._log.entry(key, index.head, "clock", subject, document, time)
+            self._log.write(entry)
+            index.apply(entry)
+            self.clock.last = time
+        return first.sequence
+
+    def _follow_clock(self, index: Index) -> None:
+        self.clock.last = index.head.time
+        row = index.one("SELECT offset FROM clock WHERE boot = ?", uptime()[0])
+        self.clock.offset = None if row is None else row[0]
 
     def signing_key(self) -> SigningKey:
         """The board's key.

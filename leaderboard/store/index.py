@@ -3,6 +3,7 @@
 The tables `head`, `entry`, `run`, `object` and `artefact`, and those of `seasons`, are a function
 of the log alone, so a rebuilt index equals one that grew. `lease` and `upload` are temporary state:
 the claims of scorers and the faults that ended them, and artefacts that no submission names yet.
+`clock` is how the machine's clock stood when the board was first served since the machine started.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from leaderboard.seasons import events as seasons
 from leaderboard.store import copies
 from leaderboard.store.copies import Copies
 from leaderboard.store.files import BUSY_SECONDS, digest_of, read_document
-from leaderboard.store.log import EMPTY, Head, LogEntry
+from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.rows import EntryRow, Status, name_object, scores_of, scores_text
 
 DERIVED = {  # tables and their keys
@@ -40,6 +41,9 @@ DERIVED = {  # tables and their keys
     "artefact": "digest || submission",
     **seasons.DERIVED,
 }
+
+TIMES = (("entry", "received"), ("object", "received"), ("upload", "time"), *seasons.TIMES)
+"""Tables and their columns with times of entries, which an entry of the event "clock" corrects."""
 
 SCHEMA = f"""
 CREATE TABLE head (
@@ -76,6 +80,7 @@ CREATE TABLE upload (
   digest TEXT NOT NULL, size INTEGER NOT NULL, key TEXT NOT NULL, time TEXT NOT NULL,
   PRIMARY KEY (digest, key)
 ) STRICT, WITHOUT ROWID;
+CREATE TABLE clock (boot TEXT PRIMARY KEY, offset REAL NOT NULL) STRICT, WITHOUT ROWID;
 """
 VERSION = zlib.crc32(SCHEMA.encode()) & 0x7FFFFFFF  # changes with the schema's text
 
@@ -195,6 +200,8 @@ class Index:
                 self._result(entry)
             case "withdrawn":
                 self._withdrawn(entry)
+            case "clock":
+                self._clock(entry)
             case _:
                 self.seasons.apply(entry)
         self.connection.execute(
@@ -274,6 +281,15 @@ class Index:
             (entry.document, path.stat().st_size, entry.subject),
         )
         self.connection.execute("DELETE FROM lease WHERE submission = ?", (entry.subject,))
+
+    def _clock(self, entry: LogEntry) -> None:
+        first = Log(self.folder, self.document.key).first_after(self.head, entry.time)
+        if first is None or (first.digest, digest_of(first)) != (entry.subject, entry.document):
+            raise entry.contradiction("does not name the first entry that is dated later")
+        for table, column in TIMES:
+            self.connection.execute(
+                f"UPDATE {table} SET {column} = ?1 WHERE {column} > ?1", (entry.time,)
+            )
 
     def one(self, statement: str, *values: Any) -> tuple[Any, ...] | None:
         """The first row of a query; None if there is none."""

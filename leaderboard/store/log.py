@@ -3,8 +3,9 @@
 entry_n.previous  = digest(entry_{n−1})          64 zeros for the first
 entry_n.signature = by the board's key, over the entry without it
 
-The number orders the entries. The time is the clock's own, which may have been wrong: it may go
-back from one entry to the next, but not to before the first.
+The number orders the entries. The time of an entry is when it was received, by the machine's clock
+and never earlier than the entry before it; what is open, closed, over or counted follows from it.
+An entry of the event "clock" corrects the times after its own, which a wrong clock has made.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from __future__ import annotations
 import datetime
 import functools
 import hashlib
+import time
+from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, field_validator
@@ -26,10 +29,10 @@ from sme_registry.spec.document import Digest, Integer, SchemaVersion
 SealedEvent = Literal["season", "entry", "ticket", "ended", "ranked", "revealed"]
 """Of a season: announced, an entry, a ticket started, their results, the master published."""
 
-Event = Literal["opened", "received", "result", "withdrawn"] | SealedEvent
+Event = Literal["opened", "received", "result", "withdrawn", "clock"] | SealedEvent
 NOTHING = "sha256:" + "0" * 64
-LONGEST_PAUSE = datetime.timedelta(days=3653)
-"""Between two entries: ten years; a clock that shows more is wrong."""
+MOST_BEHIND, LONGEST_JUMP = 60.0, 300.0
+"""Seconds of the machine's clock: behind the log's last entry, and against the uptime."""
 
 
 class Head(NamedTuple):
@@ -53,13 +56,15 @@ class LogEntry(PlainDocument):
     Attributes:
       sequence: its number, 0 for the first.
       previous: digest of the entry before; 64 zeros for the first.
-      time: of the event by the board's clock, which may have been set back since the entry before.
-      event: "opened" (once, the first), "received", "result" or "withdrawn"; or of a season, see
-        `SealedEvent`.
+      time: when it was received.
+      event: "opened" (once, the first), "received", "result" or "withdrawn"; "clock", which dates
+        all entries with a later time as its own; or of a season, see `SealedEvent`.
       subject: the submission's id, or that of a sealed entry or ticket; for "opened" the board
-        document's digest, for "season" and "revealed" the season's.
+        document's digest, for "season" and "revealed" the season's, for "clock" that of the first
+        entry that it dates.
       document: SHA-256 of the file written: the signed submission, entry or request for a ticket,
-        a result, the signed withdrawal, board.json, season.json or reveal.json.
+        a result, the signed withdrawal, board.json, season.json or reveal.json; for "clock" the
+        entry that is its subject.
       signature: by the board's key.
     """
 
@@ -140,53 +145,100 @@ class Log:
             raise TamperedError(where, "only the first entry may open a board")
         return entry
 
-    def append(
-        self,
-        key: SigningKey,
-        head: Head,
-        event: Event,
-        subject: str,
-        document: str,
-        time: str | None = None,
+    def entry(
+        self, key: SigningKey, head: Head, event: Event, subject: str, document: str, time: str
     ) -> LogEntry:
-        """Write the entry after `head`, of a given time or of the clock's.
-
-        Raises:
-          BoardError: it cannot be written, another process has used its number, or the clock is
-            plainly wrong: before the first entry, or ten years after the last.
-        """
-        clock = now()
-        if head.sequence >= 0:
-            self._refuse_wrong_clock(clock, head)
+        """The entry after `head`, which is not written yet."""
         fields = {
             "schema_version": 1,
             "sequence": head.sequence + 1,
             "previous": head.digest,
-            "time": clock if time is None else time,
+            "time": time,
             "event": event,
             "subject": subject,
             "document": document,
         }
-        entry = LogEntry.from_dict({**fields, "signature": key.sign("log", _digest(fields))})
+        return LogEntry.from_dict({**fields, "signature": key.sign("log", _digest(fields))})
+
+    def write(self, entry: LogEntry) -> None:
+        """Write an entry.
+
+        Raises:
+          BoardError: it cannot be written, or another process has used its number.
+        """
         write_document(self.folder.log_entry(entry.sequence), entry, new=True)
-        return entry
 
-    @functools.cached_property
-    def _opened(self) -> str:
-        return self.read(0).time
+    def first_after(self, head: Head, time: str) -> LogEntry | None:
+        """The first of the last entries, up to `head`, with a later time; None if there is none."""
+        first = None
+        for sequence in range(head.sequence, 0, -1):
+            entry = self.read(sequence)
+            if entry.time <= time:
+                break
+            first = entry
+        return first
 
-    def _refuse_wrong_clock(self, time: str, head: Head) -> None:
-        moment, last = (datetime.datetime.fromisoformat(each) for each in (time, head.time))
-        if time < self._opened:
-            fault = f"before the board was opened, at {self._opened}"
-        elif moment - last > LONGEST_PAUSE:
-            fault = f"more than ten years after the log's last entry, of {head.time}"
-        else:
-            return
-        raise BoardError(
-            f"clock={time}: is {fault}. Nothing was changed. Set the machine's clock, then try "
-            'again; docs/guides/leaderboard.md, "A wrong clock", has the rest.'
-        )
+
+class Clock:
+    """When a board receives something: by the machine's clock, not before the log's last entry.
+
+    Attributes:
+      last: time of the log's last entry; empty if there is none.
+      offset: of the machine's clock against its uptime when a server first noted it, in seconds;
+        None if no server has, since the machine was started.
+    """
+
+    def __init__(self) -> None:
+        self.last = ""
+        self.offset: float | None = None
+
+    @property
+    def time(self) -> str:
+        """The board's time, for readers."""
+        return max(now(), self.last)
+
+    def received(self) -> str:
+        """The board's time, for what is written or expires.
+
+        Raises:
+          BoardError: the machine's clock is more than a minute behind the log's last entry, or has
+            jumped by more than five minutes.
+        """
+        if _seconds(self.last) - time.time() > MOST_BEHIND:
+            raise BoardError(
+                f"clock={now()}: is behind the log's last entry, of {self.last}. Nothing was "
+                "changed. Set the machine's clock; if it is right, that entry is dated wrongly: "
+                "correct it with `sme-leaderboard clock --correct`."
+            )
+        if self.offset is not None and abs(clock_offset()[1] - self.offset) > LONGEST_JUMP:
+            raise BoardError(
+                f"clock={now()}: has jumped since the board was first served. Nothing was changed. "
+                "Set the machine's clock; if it is right, go on with `sme-leaderboard clock`."
+            )
+        return self.time
+
+
+@functools.lru_cache(8)  # asked for at every step of a ticket
+def _seconds(text: str) -> float:
+    """Since 1970."""
+    return datetime.datetime.fromisoformat(text).timestamp() if text else 0.0
+
+
+def uptime() -> tuple[str, float]:
+    """The machine's boot id, and seconds since boot, also in suspend: no clock changes them."""
+    return _boot(), time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
+
+
+@functools.cache
+def _boot() -> str:
+    path = Path("/proc/sys/kernel/random/boot_id")
+    return path.read_text().strip() if path.exists() else ""
+
+
+def clock_offset() -> tuple[str, float]:
+    """The boot id, and what the machine's clock is ahead of its uptime, in seconds."""
+    boot, seconds = uptime()
+    return boot, time.time() - seconds
 
 
 def _digest(fields: dict[str, Any]) -> str:

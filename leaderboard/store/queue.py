@@ -11,14 +11,13 @@ scored.
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from leaderboard.documents.result import Result
 from leaderboard.store.database import Database
 from leaderboard.store.index import Index
+from leaderboard.store.log import uptime
 
 LEASE_SECONDS = 60.0
 RETRY_SECONDS, LONGEST_RETRY_SECONDS = 10.0, 3600.0
@@ -83,7 +82,7 @@ class Queue:
         """
         with self._database.transaction() as index:
             _end_lost(index)
-            boot, at = _uptime()
+            boot, at = uptime()
             row = index.one(_NEXT, boot, at)
             if row is None:
                 return None
@@ -101,7 +100,7 @@ class Queue:
         Returns:
           False if it is lost: the submission was claimed again, finished or withdrawn.
         """
-        boot, at = _uptime()
+        boot, at = uptime()
         with self._database.transaction() as index:
             if not _is_current(index, claim):
                 return False
@@ -188,11 +187,11 @@ class Queue:
 
     def claimable(self) -> int:
         """Number of waiting submissions that are neither claimed nor postponed."""
-        return self._count(_CLAIMABLE, *_uptime())
+        return self._count(_CLAIMABLE, *uptime())
 
     def claimed(self) -> int:
         """Number of submissions that scorers work on."""
-        return self._count(f"FROM lease WHERE {_CLAIMED}", *_uptime())
+        return self._count(f"FROM lease WHERE {_CLAIMED}", *uptime())
 
     def faults(self) -> int:
         """Number of faults that waiting submissions have met."""
@@ -214,7 +213,7 @@ def retry_seconds(faults: int) -> float:
 def _end_lost(index: Index) -> None:
     """End the claims that have expired."""
     lost = f"SELECT submission, worker FROM lease WHERE held AND NOT ({_CLAIMED})"
-    for id, worker in index.connection.execute(lost, _uptime()).fetchall():
+    for id, worker in index.connection.execute(lost, uptime()).fetchall():
         # It keeps its worker, who may be slow, and finish before anyone claims it again.
         _end(index, id, worker, fault=_NO_NEWS)
 
@@ -224,7 +223,7 @@ def _end(index: Index, id: str, worker: str = "", *, fault: str = "") -> None:
 
     `worker` is who may still finish it.
     """
-    boot, at = _uptime()
+    boot, at = uptime()
     faults = index.number("SELECT faults FROM lease WHERE submission = ?", id) + bool(fault)
     text = " ".join(fault.split())[:MAX_FAULT]
     index.connection.execute(
@@ -242,10 +241,3 @@ def _is_current(index: Index, claim: Claim) -> bool:
         )
         is not None
     )
-
-
-def _uptime() -> tuple[str, float]:
-    """The machine's boot id, and seconds since boot: setting the clock changes neither."""
-    boot = Path("/proc/sys/kernel/random/boot_id")
-    clock = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
-    return (boot.read_text().strip() if boot.exists() else ""), time.clock_gettime(clock)

@@ -22,7 +22,6 @@ from sme_registry.io import build_folder
 from sme_registry.spec import EvaluationProtocol, Suite
 from sme_registry.spec.document import StrictModel
 
-LAST_TIME = "9999-12-31T23:59:59Z"
 _Model = TypeVar("_Model", bound=StrictModel)
 
 
@@ -160,7 +159,7 @@ class Store(SealedStore):
             if self.possesses(by, digest):
                 return False
             index.connection.execute(
-                "INSERT INTO upload VALUES (?, ?, ?, ?)", (digest, size, by, now())
+                "INSERT INTO upload VALUES (?, ?, ?, ?)", (digest, size, by, self.clock.received())
             )
         return True
 
@@ -299,24 +298,22 @@ class Store(SealedStore):
         with self.reading() as index:
             return index.head
 
-    def uploaded_bytes(self, key: str, since: str, until: str = LAST_TIME) -> int:
-        """Bytes that a key has sent or caused after `since` and not after `until`.
+    def uploaded_bytes(self, key: str, since: str) -> int:
+        """Bytes that a key has sent or caused after a time, as documents write it.
 
-        These are its artefacts and submissions, and their results and withdrawals. Both times have
-        the form of `submission.now()`. An upload dated after `until` was made while the clock was
-        wrong.
+        These are its artefacts and submissions, and their results and withdrawals.
         """
         with self.reading() as index:
             return index.number(
                 "SELECT (SELECT coalesce(sum(size), 0) FROM object "
-                "WHERE key = ?1 AND received > ?2 AND received <= ?3) + "
+                "WHERE key = ?1 AND received > ?2) + "
                 "(SELECT coalesce(sum(size), 0) FROM upload "
-                "WHERE key = ?1 AND time > ?2 AND time <= ?3) + "
+                "WHERE key = ?1 AND time > ?2) + "
                 "(SELECT coalesce(sum(bytes), 0) FROM entry "
-                "WHERE key = ?1 AND received > ?2 AND received <= ?3) + "
+                "WHERE key = ?1 AND received > ?2) + "
                 "(SELECT coalesce(sum(bytes), 0) FROM sealed "
-                "WHERE key = ?1 AND received > ?2 AND received <= ?3)",
-                *(key, since, until),
+                "WHERE key = ?1 AND received > ?2)",
+                *(key, since),
             )
 
     def total_bytes(self) -> int:
@@ -332,17 +329,14 @@ class Store(SealedStore):
                 " + (SELECT coalesce(sum(bytes + played_bytes), 0) FROM sealed)"
             )
 
-    def submission_times(self, key: str, since: str, until: str = LAST_TIME) -> list[str]:
-        """When each submission, or sealed entry, of a key was received, in order.
-
-        After `since`, up to `until`.
-        """
+    def submission_times(self, key: str, since: str) -> list[str]:
+        """When each submission, or sealed entry, of a key was received after a time, in order."""
         with self.reading() as index:
             rows = index.connection.execute(
                 "SELECT received FROM (SELECT key, received FROM entry "
                 "UNION ALL SELECT key, received FROM sealed) "
-                "WHERE key = ? AND received > ? AND received <= ? ORDER BY received",
-                (key, since, until),
+                "WHERE key = ? AND received > ? ORDER BY received",
+                (key, since),
             )
             return [received for (received,) in rows]
 
@@ -387,7 +381,8 @@ def _write_board(folder: Folder, document: BoardDocument, key: SigningKey) -> No
         part.mkdir()
     key.write(folder.key)
     write_document(folder.board, document, new=True)
-    Log(folder, key.public).append(key, EMPTY, "opened", document.digest, digest_of(document))
+    log, digest = Log(folder, key.public), digest_of(document)
+    log.write(log.entry(key, EMPTY, "opened", document.digest, digest, now()))
 
 
 def unknown_submission(id: str) -> Rejection:

@@ -16,7 +16,7 @@ from leaderboard.store import Store
 from sme_registry import EvaluationProtocol
 from sme_registry.io import sha256_of
 from sme_registry.spec import Suite
-from tests.leaderboard.seasons.sealing import move_clock
+from tests.leaderboard.clocks import move_clock
 
 Submit = Callable[..., SignedSubmission]
 

@@ -86,7 +86,7 @@ def test_faults_leave_a_submission_waiting_and_others_are_scored(
 ):
     """Here the reference rows: a board needs them, however often they failed."""
     broken, whole = intake.submit_references(store), submit(1)
-    monkeypatch.setattr("leaderboard.store.queue._uptime", lambda: ("boot", 1000.0))
+    monkeypatch.setattr("leaderboard.store.queue.uptime", lambda: ("boot", 1000.0))
     errors = []
 
     def fails(document, submission, *arguments, **options):
@@ -192,7 +192,7 @@ def test_heartbeats_keep_a_claim_for_as_long_as_it_is_scored(store, submit, monk
             claims.append(store.queue.claim("other"))
         return failed_result(*arguments)
 
-    monkeypatch.setattr("leaderboard.store.queue._uptime", lambda: ("boot", uptime[0]))
+    monkeypatch.setattr("leaderboard.store.queue.uptime", lambda: ("boot", uptime[0]))
     monkeypatch.setattr(Queue, "heartbeat", heartbeat)
     monkeypatch.setattr(scorer, "score_submission", lambda *some, **_: slow(*some))
     assert run_scorer(store.folder.path, lease_seconds=0.2) == 1

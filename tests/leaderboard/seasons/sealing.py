@@ -2,7 +2,7 @@
 
 import datetime
 
-from leaderboard.documents.submission import now, shifted, utc
+from leaderboard.documents.submission import now, utc
 from leaderboard.scoring.aggregation import failed_run
 from leaderboard.seasons.entry import Entry, TicketRequest
 from leaderboard.seasons.master import Master
@@ -11,21 +11,12 @@ from leaderboard.seasons.season import Stepping, Terms
 from sme_registry import EvaluationProtocol
 
 MASTER = Master(bytes(range(32)))
-AFTERWARDS = utc(shifted(datetime.datetime.now(datetime.UTC), datetime.timedelta(days=3)))
-"""When tiny seasons, and the deadlines of their tickets, are over."""
-
 SETTING = {"state_dim": 2, "action_dim": 1, "complexity": 5, "hidden_width": 8}
 
 
 def moment(days):
     """The time so many days from now."""
     return utc(datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days))
-
-
-def move_clock(monkeypatch, time=AFTERWARDS):
-    """Set the clock by which boards decide on seasons and date their log."""
-    for module in ("seasons.store", "store.log"):
-        monkeypatch.setattr(f"leaderboard.{module}.now", lambda: time)
 
 
 OPENS, CLOSES = moment(-1), moment(1)  # the same in every document of a run

@@ -9,13 +9,13 @@ from leaderboard.seasons.master import Master
 from leaderboard.seasons.season import Reveal
 from leaderboard.store import Store
 from leaderboard.store.files import write_document
+from leaderboard.store.log import Clock
+from tests.leaderboard.clocks import AFTERWARDS, move_clock
 from tests.leaderboard.conftest import put_submission, tiny_board
 from tests.leaderboard.seasons.sealing import (
-    AFTERWARDS,
     MASTER,
     failed_result,
     moment,
-    move_clock,
     signed_entry,
     signed_request,
     tiny_season,
@@ -136,7 +136,7 @@ def test_the_clock_decides_and_no_earlier_clock_reopens(store, key, track, monke
         attempt(season)
     store.announce(tiny_season(track, id="later", opens=AFTERWARDS, closes=moment(9)))
     monkeypatch.undo()
-    with pytest.raises(Rejection, match="season_closed"):
+    with pytest.raises(BoardError, match="is behind the log's last entry"):
         attempt(season)
 
 
@@ -171,11 +171,12 @@ def test_no_reveal_tells_the_tasks_of_another_season_that_is_not_over(store, key
     assert store.season_row(short.id).reveal is None
 
 
-def test_what_is_allowed_and_what_is_logged_are_of_the_same_moment(store, key, monkeypatch):
+def test_what_is_allowed_and_what_is_logged_are_of_the_same_moment(store, key, later, monkeypatch):
     """The close may pass while an entry's file is being written."""
     season = tiny_season()
     store.announce(season)
-    monkeypatch.setattr("leaderboard.store.log.now", lambda: AFTERWARDS)
+    real = Clock.received
+    monkeypatch.setattr(Clock, "received", lambda clock: (real(clock), later())[0])
     store.enter(signed_entry(store, season, key, [None, None]))
     [row] = store.entrants(season.digest)
     assert row.entrant.received < season.closes

@@ -9,9 +9,9 @@ from leaderboard.seasons.scoring import sealed_result
 from leaderboard.seasons.season import Reveal, Stepping
 from leaderboard.web.pages import Pages
 from leaderboard.web.server import write_site
+from tests.leaderboard.clocks import move_clock
 from tests.leaderboard.seasons.sealing import (
     MASTER,
-    move_clock,
     signed_entry,
     signed_request,
     tiny_season,

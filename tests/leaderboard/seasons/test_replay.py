@@ -14,12 +14,13 @@ from leaderboard.seasons.scores import score_ticket
 from leaderboard.seasons.season import Reveal
 from leaderboard.seasons.stepping import Lanes, Start
 from leaderboard.store import Store
-from leaderboard.store.log import Log
+from leaderboard.store.log import Clock
 from sme_registry import SMESpec
 from sme_registry.envs import SMEEnv
 from sme_registry.seasons import wire
+from tests.leaderboard.clocks import AFTERWARDS, move_clock
 from tests.leaderboard.seasons.playing import LANES, ROWS, online_board, playing
-from tests.leaderboard.seasons.sealing import AFTERWARDS, MASTER, moment, move_clock, signed_request
+from tests.leaderboard.seasons.sealing import MASTER, moment, signed_request
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +143,7 @@ def test_a_result_that_does_not_follow_is_found(revealed, monkeypatch, part, cha
 
 def logged(monkeypatch, time, store, *record):
     """Log something that a board must refuse, at a time, as an organiser's own board may do."""
-    monkeypatch.setattr("leaderboard.store.log.now", lambda: time)
+    monkeypatch.setattr(Clock, "received", lambda _: time)
     with store.transaction():
         store.record(*record)
 
@@ -164,7 +165,6 @@ def reveal(board, folder):
 )
 def test_forbidden_tickets_are_found(tmp_path, monkeypatch, key, fields, days, number, message):
     board = online_board(tmp_path, **fields)
-    monkeypatch.setattr(Log, "_refuse_wrong_clock", lambda *_: None)
     with Store.open(board.path) as store:
         folder = store.season_folder(board.season.digest)
         for count in range(1, number + 1):

@@ -5,6 +5,7 @@ from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.verify import verify
 from leaderboard.store import EMPTY, LogEntry, Store
 from sme_registry.errors import SpecError
+from tests.leaderboard.clocks import move_clock
 from tests.leaderboard.conftest import put_submission, signed_withdrawal, tiny_board
 
 
@@ -47,40 +48,18 @@ def test_a_range_of_the_log_stops_at_its_end(store, submit):
     assert store.log(4, 100) == []
 
 
-@pytest.fixture
-def clock(monkeypatch):
-    """The board's clock, a list of one time."""
-    time = ["2030-01-01T00:00:00Z"]
-    monkeypatch.setattr("leaderboard.store.log.now", lambda: time[0])
-    monkeypatch.setattr("leaderboard.store.store.now", lambda: time[0])
-    return time
-
-
-def test_entries_have_the_clocks_own_time_which_may_go_back(tmp_path, key, clock):
-    times = ["2030-01-01T00:00:00Z", "2039-12-31T23:59:59Z", "2030-01-01T00:00:01Z"]
+def test_entries_are_dated_by_the_clock_and_never_before_the_last(tmp_path, key, monkeypatch):
+    move_clock(monkeypatch, "2030-01-01T00:00:00Z")
     with tiny_board(tmp_path / "board") as store:
-        for number, time in enumerate(times):
-            clock[0] = time
-            put_submission(store, key, number)
-        assert [entry.time for entry in store.log(1)] == times
-        assert [row.received for row in store.entries()] == times
-        store.reindex()
-        assert [row.received for row in store.entries()] == times
-    verify(tmp_path / "board")
-    with Store.open(tmp_path / "board", read_only=True) as store:
-        assert store.head.time == times[-1]
-
-
-def test_a_clock_that_is_plainly_wrong_writes_nothing(tmp_path, key, clock):
-    with tiny_board(tmp_path / "board") as store:
-        for wrong in ("2029-12-31T23:59:59Z", "2040-01-03T00:00:00Z", "9999-12-31T23:59:59Z"):
-            clock[0] = wrong
-            with pytest.raises(BoardError, match=f"clock={wrong}"):
-                put_submission(store, key)
-            assert store.entries() == []
-        clock[0] = "2030-01-02T00:00:00Z"
-        put_submission(store, key)
-    assert verify(tmp_path / "board").entries == 2
+        put_submission(store, key, 0)
+        move_clock(monkeypatch, "2029-12-31T23:59:00Z")  # a minute is no fault
+        put_submission(store, key, 1)
+        move_clock(monkeypatch, "2029-12-31T23:58:59Z")
+        with pytest.raises(BoardError, match=r"clock=2029-12-31T23:58:59Z: is behind .*\. Set"):
+            put_submission(store, key, 2)
+        assert {entry.time for entry in store.log()} == {"2030-01-01T00:00:00Z"}
+        assert {row.received for row in store.entries()} == {"2030-01-01T00:00:00Z"}
+    assert verify(tmp_path / "board").entries == 3
 
 
 def test_a_board_without_its_own_key_can_be_read_but_not_written(tmp_path, key):

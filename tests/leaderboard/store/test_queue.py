@@ -15,7 +15,7 @@ from tests.leaderboard.store.synthetic import synthetic_result
 def clock(monkeypatch):
     """The machine's uptime, in seconds, as a list of one number."""
     at = [1000.0]
-    monkeypatch.setattr("leaderboard.store.queue._uptime", lambda: ("boot", at[0]))
+    monkeypatch.setattr("leaderboard.store.queue.uptime", lambda: ("boot", at[0]))
     return at
 
 
@@ -69,9 +69,9 @@ def test_a_heartbeat_renews_a_claim(store, submit, clock):
 
 def test_a_claim_does_not_survive_a_reboot(store, submit, monkeypatch):
     submit()
-    monkeypatch.setattr("leaderboard.store.queue._uptime", lambda: ("boot one", 1e6))
+    monkeypatch.setattr("leaderboard.store.queue.uptime", lambda: ("boot one", 1e6))
     store.queue.claim("worker", seconds=1e6)
-    monkeypatch.setattr("leaderboard.store.queue._uptime", lambda: ("boot two", 5.0))
+    monkeypatch.setattr("leaderboard.store.queue.uptime", lambda: ("boot two", 5.0))
     assert store.queue.claim("other").attempt == 2
 
 
