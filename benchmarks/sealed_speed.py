@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import SigningKey
 from sme_registry import seasons
 from tests.leaderboard.seasons.killing import killable
 from tests.leaderboard.seasons.playing import online_board

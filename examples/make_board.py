@@ -32,7 +32,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 import sme_registry
 from leaderboard.bundle import make_bundle
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import SigningKey
 from leaderboard.documents.submission import Training
 from leaderboard.intake import submit_bundle, submit_references
 from leaderboard.scoring.verify import verify

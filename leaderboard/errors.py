@@ -21,7 +21,7 @@ CODES = {
     "schema": "a field is invalid, missing or unknown",
     "too_large": "the submission or an artefact is larger than the limit",
     "bad_signature": "the signature is missing, or does not match the document and the key",
-    "wrong_board": "the signature is for another board, or for none",
+    "wrong_board": "the signature is for another board or address, or for none",
     "stale_time": "the submission's time differs too much from the board's",
     "unknown_suite": "the suite, protocol or track is not the board's",
     "unknown_spec": "a run's spec digest is not an instance of the suite",

@@ -12,14 +12,13 @@ from leaderboard.bundle.reading import Bundle
 from leaderboard.bundle.runs import SubmittedRun, listed_by_class, refuse_other_specs, runs_of
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.checks import check_names, check_runs
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import NOBODY, Receiver, Signed, SigningKey
 from leaderboard.documents.submission import (
     ARTEFACTS,
     FILE,
     MAX_ARTEFACT_BYTES,
     Artefact,
     Knowledge,
-    SignedSubmission,
     Submission,
     Training,
     now,
@@ -58,7 +57,7 @@ def make_bundle(
     runs_started: dict[str, int] | None = None,
     training: Training | None = None,
     algorithm: str | None = None,
-    board: str | None = None,
+    receiver: Receiver = NOBODY,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Bundle:
@@ -81,7 +80,7 @@ def make_bundle(
         of listed runs.
       training: facts of the training; None takes them from the records of the runs.
       algorithm: of folders with runs of several, the only one to submit.
-      board: the public key of the only board that accepts it; None leaves it open, until
+      receiver: the only board that accepts it, and its address. By default it is open, until
         `submit_bundle` or `client.submit` signs for the board that it is sent to.
       force: replace an existing bundle.
       progress: called after each run with the number of finished runs and of all runs.
@@ -116,7 +115,7 @@ def make_bundle(
     }
     # Everything that does not depend on the policies is checked before they are exported.
     unexported = _submission(fields, suite, listed, _placeholders(listed))
-    SignedSubmission.read(unexported.signed(key, board).to_bytes())
+    Signed[Submission].read(unexported.signed(key, receiver).to_bytes())
     with build_folder(folder, force=force) as building:
         (building / ARTEFACTS).mkdir()
         artefacts = []
@@ -124,7 +123,7 @@ def make_bundle(
             artefacts.append(_put_artefact(run, building))
             if progress is not None:
                 progress(done, len(listed))
-        signed = _submission(fields, suite, listed, artefacts).signed(key, board)
+        signed = _submission(fields, suite, listed, artefacts).signed(key, receiver)
         write_atomically(building / FILE, signed.to_bytes())
         Bundle.read(building)
         _refuse_existing(folder, force)

@@ -14,13 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.submission import (
-    ARTEFACTS,
-    FILE,
-    MAX_ARTEFACT_BYTES,
-    MAX_BYTES,
-    SignedSubmission,
-)
+from leaderboard.documents.signed import MAX_BYTES, Signed
+from leaderboard.documents.submission import ARTEFACTS, FILE, MAX_ARTEFACT_BYTES, Submission
 from leaderboard.errors import Rejection
 from sme_registry.errors import OptionError
 from sme_registry.io import sha256_of
@@ -36,7 +31,7 @@ class Bundle:
     """
 
     folder: Path
-    signed: SignedSubmission
+    signed: Signed[Submission]
 
     @classmethod
     def read(cls, folder: str | os.PathLike[str]) -> Bundle:
@@ -44,7 +39,7 @@ class Bundle:
 
         Raises:
           Rejection: `artefact_path` if the file is a link or not a regular file, and the codes of
-            `SignedSubmission.read`.
+            `Signed[Submission].read`.
           OptionError: the folder or its submission is missing.
         """
         folder = Path(folder)
@@ -53,7 +48,7 @@ class Bundle:
             raise OptionError(
                 f"{folder}: contains no {FILE}. Create a bundle with `sme-leaderboard new`."
             )
-        return cls(folder, SignedSubmission.read(text))
+        return cls(folder, Signed[Submission].read(text))
 
     def artefact(self, digest: str) -> bytes:
         """The bytes of an artefact that the submission names.
@@ -64,7 +59,7 @@ class Bundle:
         """
         sizes = {
             run.artefact.size
-            for run in self.signed.submission.runs
+            for run in self.signed.content.runs
             if run.artefact is not None and run.artefact.sha256 == digest
         }
         if not sizes:

@@ -26,7 +26,7 @@ from leaderboard.cli.options import (
     open_board,
 )
 from leaderboard.documents.board import RUNS_TO_RANK, Folder
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.errors import BoardError
 from leaderboard.gate.isolation import Isolation, available_isolation, isolation_for_own
 from leaderboard.scoring.worker import run_scorers
@@ -249,7 +249,11 @@ def serve(
         int, typer.Option("--workers", "-w", min=0, max=256, help="Number of scorer processes.")
     ] = 1,
     url: Annotated[
-        str, typer.Option(help="The board's public address, which its pages show to submitters.")
+        str,
+        typer.Option(
+            help="The board's public address, for which submissions must be signed; by default "
+            "where it listens."
+        ),
     ] = "",
     behind_proxy: Annotated[
         bool,
@@ -428,7 +432,7 @@ def _create_board(folder: Path, run: Path, record: RunRecord) -> None:
         make_bundle(
             folder / "bundle",
             suite=file,
-            board=store.document.key,
+            receiver=Receiver(store.document.key),
             key=SigningKey.generate(),
             runs=[run],
             method=record.algorithm,

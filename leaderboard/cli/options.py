@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from leaderboard.documents.board import FILE, BoardDocument, Folder, refuse_unscored
+from leaderboard.documents.signed import Receiver
 from leaderboard.store import Store
 from leaderboard.web import client
 from sme_registry.errors import OptionError
@@ -199,3 +200,8 @@ def board_document(board: str) -> BoardDocument:
     """
 
     return client.board_document(board) if is_url(board) else Folder(board).read()
+
+
+def receiver_of(board: str) -> Receiver:
+    """For whom to sign what is given to a board, by its folder or URL; errors as above."""
+    return client.receiver_of(board) if is_url(board) else Receiver(Folder(board).read().key)

@@ -186,7 +186,7 @@ def _public_view(board: str, id: str) -> PublicView:
 
 def _print_submission(view: PublicView) -> None:
 
-    submission = view.signed.submission
+    submission = view.signed.content
     method, runs = submission.method, submission.runs
     total = sum(run.steps for run in runs)
     steps = sorted({run.steps for run in runs if run.artefact is not None})
@@ -210,7 +210,7 @@ def _print_submission(view: PublicView) -> None:
     for id, count in view.copy_of:
         pairs[f"{count} of {len(runs)} runs act like"] = id
     if view.withdrawal is not None:
-        pairs["reason for withdrawal"] = view.withdrawal.withdrawal.reason or "not stated"
+        pairs["reason for withdrawal"] = view.withdrawal.content.reason or "not stated"
     title = f"{method.name} {method.version}", submission.submitter.name, view.status
     name, submitter, status = map(escape, title)
     print_pairs(f"[bold]{name}[/] by {submitter}: {status}", pairs)

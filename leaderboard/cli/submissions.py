@@ -28,13 +28,14 @@ from leaderboard.cli.options import (
     complete_protocol,
     find_suite,
     is_url,
+    receiver_of,
 )
 from leaderboard.cli.results import find_entry
 from leaderboard.documents.board import RULES, BoardDocument
 from leaderboard.documents.checks import check_submission
-from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import LABELS, SYMBOLS, Result
-from leaderboard.documents.submission import Knowledge, SignedWithdrawal
+from leaderboard.documents.signed import NOBODY, Receiver, SigningKey
+from leaderboard.documents.submission import Knowledge, Withdrawal, now
 from leaderboard.errors import Rejection
 from leaderboard.gate.isolation import isolation_for_own
 from leaderboard.scoring.score import score_submission
@@ -175,6 +176,7 @@ def new(
     folders = _expanded(runs)
     document = None if board is None else board_document(board)
     file = find_suite(suite or "smoke-v1") if document is None else document.suite_file
+    receiver = NOBODY if board is None else receiver_of(board)
     with Progress("exporting", max(1, len(folders)), console=err(), unit="runs") as progress:
         new_bundle = make_bundle(
             bundle,
@@ -190,11 +192,11 @@ def new(
             statement=statement,
             runs_started=_runs_started(started or []),
             algorithm=algorithm,
-            board=None if document is None else document.key,
+            receiver=receiver,
             force=force,
             progress=progress.update_of,
         )
-    runs_listed = len(new_bundle.signed.submission.runs)
+    runs_listed = len(new_bundle.signed.content.runs)
     out().print(f"{new_bundle.signed.id}\n{runs_listed} runs", soft_wrap=True)
     target = escape(board or "BOARD")
     out().print(f"Next: sme-leaderboard check {escape(str(bundle))} {target}", soft_wrap=True)
@@ -260,7 +262,7 @@ def check(
     """
 
     content = Bundle.read(bundle)
-    submission = content.signed.submission
+    submission = content.signed.content
     if board is None:
         document = _board_of(find_suite(suite or submission.suite.name), protocol or "paper-v1")
     elif suite is None and protocol is None:
@@ -333,7 +335,7 @@ def submit(
 
     signed = Bundle.read(bundle).signed
     if is_url(board):
-        total = len(signed.submission.runs)
+        total = len(signed.content.runs)
         with Progress("uploading", total, console=err(), unit="artefacts") as progress:
             id = client.submit(board, bundle, SigningKey.read(key), progress=progress.update_of)
         out().print(id, soft_wrap=True)
@@ -375,6 +377,6 @@ def withdraw(
     else:
         with Store.open(Path(board)) as store:
             id = find_entry(store, id).id
-            withdrawal = SignedWithdrawal.create(id, signing_key, reason, board=store.document.key)
-            store.withdraw(withdrawal)
+            withdrawal = Withdrawal(submission=id, created=now(), reason=reason)
+            store.withdraw(withdrawal.signed(signing_key, Receiver(store.document.key)))
     out().print(f"{id} withdrawn", soft_wrap=True)

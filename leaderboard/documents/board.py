@@ -22,7 +22,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer
 
-from leaderboard.documents.keys import PublicKey, SigningKey
+from leaderboard.documents.signed import PublicKey, SigningKey
 from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, SuiteReference, Track
 from leaderboard.errors import BoardError
 from sme_registry.errors import SMEError, SpecError

@@ -26,15 +26,14 @@ from collections import Counter
 from collections.abc import Sequence
 
 from leaderboard.documents.board import RULES, BoardDocument
+from leaderboard.documents.signed import MAX_BYTES, Receiver, Signed
 from leaderboard.documents.submission import (
     MAX_ARTEFACT_BYTES,
-    MAX_BYTES,
     MAX_RUNS,
     Artefact,
     Manifest,
     Method,
     Run,
-    SignedSubmission,
     Submission,
     Submitter,
 )
@@ -89,12 +88,16 @@ def check_submission(board: BoardDocument, submission: Submission, at: datetime.
             )
 
 
-def check_board(board: BoardDocument, signed_for: str | None) -> None:
-    """Reject (`wrong_board`) a document whose signature is not for this board.
+def check_receiver(board: BoardDocument, receiver: Receiver, address: str | None = None) -> None:
+    """Reject (`wrong_board`) a signature that is not for this board, or not for its address.
+
+    Otherwise a server that stands between could pass on what it was sent, and take part in another
+    board under the sender's name.
 
     Args:
       board: the board.
-      signed_for: the public key of the board that the signature is for; None if it is for none.
+      receiver: that the signature is for.
+      address: of the server that it was sent to; None if it was given to the board's folder.
     """
     if board.signatures_for is None:
         raise Rejection(
@@ -102,13 +105,20 @@ def check_board(board: BoardDocument, signed_for: str | None) -> None:
             f"board={board.key[:16]}…: follows earlier rules ({board.rules}) and accepts nothing. "
             "Submit to a board that was created later.",
         )
-    if signed_for != board.signatures_for:
-        stated = "none" if signed_for is None else f"{signed_for[:16]}…"
+    if receiver.board != board.signatures_for:
+        stated = "none" if receiver.board is None else f"{receiver.board[:16]}…"
         raise Rejection(
             "wrong_board",
             f"board={stated}: the signature must be for this board, {board.key[:16]}…. Send a "
             "bundle that is signed for no board with `sme-leaderboard submit`, or create it with "
             "`sme-leaderboard new --board`.",
+        )
+    if address not in (None, receiver.address):
+        raise Rejection(
+            "wrong_board",
+            f"address={receiver.address or 'none'}: the signature must be for this board's "
+            f"address, {address}. Send it there, with a present version of sme-registry; if the "
+            "board has another address by now, its owner must state it (`serve --url`).",
         )
 
 
@@ -261,7 +271,7 @@ def most_runs(board: BoardDocument) -> int:
         runs_started={member.name: 100 for member in board.suite.classes},
     )
     one, two = (
-        len(SignedSubmission(submission=each, signature="0" * 128).to_bytes())
+        len(Signed[Submission](content=each, signature="0" * 128).to_bytes())
         for each in (submission, submission.model_copy(update={"runs": (run, run)}))
     )
     return 1 + (MAX_BYTES - one) // (two - one)

@@ -2,28 +2,21 @@
 
     id = "sha256:" + hex(SHA-256(canonical JSON of the submission))
 
-A bundle is the submitted folder: `submission.json` (a `SignedSubmission`) and one file
+A bundle is the submitted folder: `submission.json` (a `Signed[Submission]`) and one file
 `artefacts/<64 hex digits of its SHA-256>.onnx` for each artefact.
 """
 
 from __future__ import annotations
 
 import datetime
-import re
 import time
-from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal
 
-import rfc8785
 from pydantic import BeforeValidator, Field, SerializerFunctionWrapHandler, model_serializer
 
-from leaderboard.documents.keys import PlainDocument, PublicKey, Signature, SigningKey, verifies
-from leaderboard.errors import Rejection
-from sme_registry.errors import MalformedDocumentError, SpecError
-from sme_registry.io import parse_json, sha256_of, to_json
+from leaderboard.documents.signed import PublicKey, Signable
 from sme_registry.spec.document import (
     Digest,
-    Document,
     Integer,
     Name,
     SchemaVersion,
@@ -33,7 +26,6 @@ from sme_registry.spec.document import (
 
 FILE = "submission.json"
 ARTEFACTS = "artefacts"
-MAX_BYTES = 64 * 2**10
 MAX_ARTEFACT_BYTES = 8 * 2**20
 MAX_ENTRIES = 1000
 """Most runs listed, and most classes counted."""
@@ -43,7 +35,6 @@ MAX_RUNS = 1000
 Track = Literal["open"]
 Knowledge = Literal["generic", "family", "oracle"]
 
-_Model = TypeVar("_Model", bound=StrictModel)
 _Line = Annotated[str, Field(min_length=1, max_length=80)]
 _Text = Annotated[str, Field(max_length=2000)]
 _Link = Annotated[
@@ -135,7 +126,7 @@ class Training(StrictModel):
     hardware: Annotated[str, Field(max_length=200)] = ""
 
 
-class Manifest(PlainDocument):
+class Manifest(Signable):
     """What every track asks of an entrant.
 
     Attributes:
@@ -152,6 +143,11 @@ class Manifest(PlainDocument):
     training: Training = Training()
     statement: _Text = ""
 
+    @property
+    def signer(self) -> str:
+        """The submitter's key."""
+        return self.submitter.key
+
 
 class Submission(Manifest):
     """The signed content of the open track.
@@ -161,6 +157,8 @@ class Submission(Manifest):
       runs_started: all runs ever started with this method, by class. Runs that are not listed in
         `runs` score 1 in every metric, so omitting a run helps only if it was worse than that.
     """
+
+    PURPOSE, FIELD, COMMAND = "submission", "submission", "new"
 
     track: Track = "open"
     suite: SuiteReference
@@ -178,10 +176,6 @@ class Submission(Manifest):
         plain: dict[str, Any] = handler(self)
         return {name: plain[name] for name in _ORDER}
 
-    def signed(self, key: SigningKey, board: str | None = None) -> SignedSubmission:
-        """This submission, signed as `SignedManifest.sign` says."""
-        return SignedSubmission.sign(self, key, board)
-
 
 _ORDER = (
     *("schema_version", "track", "suite", "method", "code", "submitter", "created"),
@@ -189,272 +183,15 @@ _ORDER = (
 )
 
 
-class SignedDocument(StrictModel):
-    """A document with the signature of the submitter's key, for one board or for none.
-
-    Attributes:
-      signature: of the submitter's key, for this document and board.
-      board: the public key of the only board that accepts it; None if it is not known yet. It is
-        left out of the JSON where it is None, as in boards of rules 1.
-    """
-
-    signature: Signature
-    board: PublicKey | None = None
-
-    @model_serializer(mode="wrap")
-    def _content_first(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        plain: dict[str, Any] = handler(self)
-        signature, board = plain.pop("signature"), plain.pop("board")
-        return {**plain, "signature": signature, **({} if board is None else {"board": board})}
-
-
-class SignedManifest(SignedDocument):
-    """A manifest, in the field `KIND`, with its signature.
-
-    Attributes:
-      KIND: the field, and the purpose of the signature.
-      COMMAND: of `sme-leaderboard`, which writes the file.
-    """
-
-    KIND: ClassVar[Literal["submission", "entry", "ticket"]]
-    COMMAND: ClassVar[str]
-
-    @classmethod
-    def sign(cls, content: Manifest, key: SigningKey, board: str | None = None) -> Self:
-        """A manifest, signed with the submitter's key.
-
-        Args:
-          content: of the type that the field has.
-          key: the submitter's.
-          board: the public key of the only board that accepts it; None if it is not known yet.
-        """
-        signature = key.sign(cls.KIND, content.digest, board)
-        fields: dict[str, Any] = {cls.KIND: content, "signature": signature, "board": board}
-        return cls(**fields)
-
-    @classmethod
-    def read(cls, text: bytes) -> Self:
-        """Read a document from the bytes of a file and verify its signature.
-
-        Raises:
-          Rejection: `too_large`, `not_json`, `schema` or `bad_signature`.
-        """
-        return Envelope.read(text, cls).open()
-
-    @property
-    def content(self) -> Manifest:
-        """What is signed."""
-        content: Manifest = getattr(self, self.KIND)
-        return content
-
-    @property
-    def is_valid(self) -> bool:
-        """Whether the submitter's key made the signature, for this content and board."""
-        key = self.content.submitter.key
-        return verifies(key, self.signature, self.KIND, self.id, self.board)
-
-    def for_board(self, board: str, key: SigningKey) -> Self:
-        """The same content, signed for a board if it is signed for none.
-
-        Args:
-          board: the board's public key.
-          key: the submitter's.
-
-        Raises:
-          Rejection: `bad_signature` if `key` is not the submitter's.
-        """
-        if self.board is not None:
-            return self
-        own = self.content.submitter.key
-        if key.public != own:
-            raise Rejection(
-                "bad_signature",
-                f"key={key.public[:16]}…: must be the {self.KIND}'s, {own[:16]}…, to sign it for "
-                "this board. Give that key's file (option --key).",
-            )
-        return self.sign(self.content, key, board)
-
-    @property
-    def id(self) -> str:
-        """The id of the document: the digest of its content."""
-        return self.content.digest
-
-    def to_bytes(self) -> bytes:
-        """The bytes of the file."""
-        return to_json(self.to_dict()).encode()
-
-
-_SignedKind = TypeVar("_SignedKind", bound=SignedManifest)
-
-
-class SignedSubmission(SignedManifest):
-    """`submission.json`."""
-
-    KIND = "submission"
-    COMMAND = "new"
-
-    submission: Submission
-
-
-@dataclass(frozen=True)
-class Envelope(Generic[_SignedKind]):
-    """A signed manifest whose signature is verified, and whose content is not validated yet.
-
-    Anyone can send a document, so what costs time, and answers at length, follows the signature.
-
-    Attributes:
-      id: the digest of the content's canonical JSON.
-      key: the submitter's public key, which made the signature.
-      board: the public key of the board that the signature is for; None if it is for none.
-      plain: the whole document.
-      kind: its type.
-    """
-
-    id: str
-    key: str
-    board: str | None
-    plain: dict[str, Any]
-    kind: type[_SignedKind]
-
-    @classmethod
-    def read(cls, text: bytes, kind: type[_SignedKind]) -> Envelope[_SignedKind]:
-        """Parse the bytes of a file and verify the signature.
-
-        Raises:
-          Rejection: `too_large`, `not_json`, `schema` or `bad_signature`.
-        """
-        plain = _parse(text, f"{kind.KIND}.json", "List fewer runs, or shorten the texts.")
-        if isinstance(plain, dict) and "signature" not in plain:
-            raise Rejection(
-                "bad_signature",
-                f"signature: missing. Sign it with `sme-leaderboard {kind.COMMAND} --key`.",
-            )
-        content, key, signature, board = _parts(plain, kind)
-        id = _raw_digest(content, f"{kind.KIND}.json")
-        if not verifies(key, signature, kind.KIND, id, board):
-            raise Rejection(
-                "bad_signature",
-                f"signature={signature[:16]}…: invalid for this {kind.KIND}, its board and the key "
-                f"{key[:16]}…. Sign it again after the last change.",
-            )
-        return cls(id, key, board, plain, kind)
-
-    def open(self) -> _SignedKind:
-        """The validated document.
-
-        Raises:
-          Rejection: `schema`.
-        """
-        name = self.kind.KIND
-        signed = _validate(self.kind, self.plain, f"{name}.json")
-        if signed.id != self.id:
-            raise Rejection(
-                "schema",
-                f"{name}.json: the signature must cover every field of the {name}, those at their "
-                f"defaults included. Create it with `sme-leaderboard {self.kind.COMMAND}`.",
-            )
-        return signed
-
-
-def _parts(plain: Any, kind: type[SignedManifest]) -> tuple[dict[str, Any], str, str, str | None]:
-    """Content, public key, signature and board of a document that nothing has validated."""
-    match plain:
-        case {"signature": str(signature), **others}:
-            content: Any = others.pop(kind.KIND, None)
-            board: Any = others.pop("board", None)
-            match content:
-                case {"submitter": {"key": str(key)}}:
-                    keys = [key] if board is None else [key, board]
-                    digits = _is_hex(signature, 128) and all(_is_hex(each, 64) for each in keys)
-                    if digits and not others:
-                        return content, key, signature, board
-    raise Rejection(
-        "schema",
-        f"{kind.KIND}.json: must have the fields {kind.KIND}, with the key of its submitter, "
-        "signature, and board unless it is signed for none: keys of 64 and a signature of 128 hex "
-        f"digits. Create it with `sme-leaderboard {kind.COMMAND}`.",
-    )
-
-
-def _is_hex(value: Any, digits: int) -> bool:
-    return isinstance(value, str) and re.fullmatch(rf"[0-9a-f]{{{digits}}}", value) is not None
-
-
-def _raw_digest(content: dict[str, Any], file: str) -> str:
-    """The digest of a document's content as it arrived."""
-    try:
-        return sha256_of(rfc8785.dumps(content))
-    except RecursionError:
-        raise Rejection(
-            "not_json", f"{file}: nested too deeply. Valid documents have at most ten levels."
-        ) from None
-    except ValueError:  # rfc8785's errors, and those of lone surrogates
-        raise Rejection(
-            "schema",
-            f"{file}: contains a number or a character that JSON cannot exchange (RFC 8785): "
-            "integers must be in [-(2^53 - 1), 2^53 - 1], and other numbers finite. Correct it.",
-        ) from None
-
-
-class Withdrawal(Document):
+class Withdrawal(Signable):
     """Signed by a submitter to withdraw a submission; its page remains, marked as withdrawn."""
+
+    PURPOSE, FIELD, COMMAND = "withdrawal", "withdrawal", "withdraw"
 
     schema_version: SchemaVersion = 1
     submission: Digest
     created: UtcTime
     reason: Annotated[str, Field(max_length=300)] = ""
-
-
-class SignedWithdrawal(SignedDocument):
-    """A withdrawal, signed with the key of the submission."""
-
-    withdrawal: Withdrawal
-
-    @classmethod
-    def create(
-        cls, id: str, key: SigningKey, reason: str = "", *, board: str | None = None
-    ) -> SignedWithdrawal:
-        """A new withdrawal.
-
-        Args:
-          id: the submission's.
-          key: the one that signed the submission.
-          reason: shown on the submission's page; up to 300 characters.
-          board: the public key of the submission's board.
-        """
-        withdrawal = Withdrawal(submission=id, created=now(), reason=reason)
-        signature = key.sign("withdrawal", withdrawal.digest, board)
-        return cls(withdrawal=withdrawal, signature=signature, board=board)
-
-    def is_valid(self, key: str) -> bool:
-        """Whether this public key made the signature, for this withdrawal and board."""
-        return verifies(key, self.signature, "withdrawal", self.withdrawal.digest, self.board)
-
-    @classmethod
-    def read(cls, text: bytes) -> SignedWithdrawal:
-        """Parse a withdrawal. `Store.withdraw` verifies the signature, with the submission's key.
-
-        Raises:
-          Rejection: `too_large`, `not_json` or `schema`.
-        """
-        plain = _parse(text, "withdrawal", f"It has {len(text):,}. Shorten the reason.")
-        return _validate(cls, plain, "withdrawal")
-
-
-def _parse(text: bytes, name: str, remedy: str) -> Any:
-    if len(text) > MAX_BYTES:
-        raise Rejection("too_large", f"{name}: must be at most {MAX_BYTES:,} bytes. {remedy}")
-    try:
-        return parse_json(text, name)
-    except MalformedDocumentError as error:
-        raise Rejection("not_json", str(error)) from None
-
-
-def _validate(kind: type[_Model], plain: Any, name: str) -> _Model:
-    try:
-        return kind.from_dict(plain, name)
-    except SpecError as error:
-        raise Rejection("schema", str(error)) from None
 
 
 def utc(moment: datetime.datetime) -> str:

@@ -1,9 +1,10 @@
 """Submissions: read, checked against the board and its quotas, then stored.
 
-    read → for this board? → known? → document → name → quotas → policies present → gate → store
+    for this board? → known? → document → policies present → gate → name → quotas → room → store
 
-The order is fixed with cheap steps first, so that one fault always has one code, and megabytes
-are read only after everything declared about them has passed.
+The order is fixed, so that one fault always has one code. What another submission can change is
+decided once, in the transaction that stores it. The gate's verdicts are kept, so a key that is
+beyond its quota costs no more than the files that it has uploaded.
 """
 
 from __future__ import annotations
@@ -13,17 +14,9 @@ import os
 from collections.abc import Callable
 
 from leaderboard.bundle import Bundle
-from leaderboard.documents.checks import check_board, check_submission
-from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import (
-    Artefact,
-    Envelope,
-    SignedSubmission,
-    Submission,
-    Submitter,
-    shifted,
-    utc,
-)
+from leaderboard.documents.checks import check_receiver, check_submission
+from leaderboard.documents.signed import Receiver, Signed, SigningKey
+from leaderboard.documents.submission import Artefact, Submission, Submitter, shifted, utc
 from leaderboard.errors import Rejection
 from leaderboard.gate.isolation import Isolation, isolation_for_own
 from leaderboard.gate.sandbox import Confined, widths
@@ -41,36 +34,12 @@ _verdicts: dict[_Case, Rejection | None] = {}
 """Of the gate."""
 
 
-def receive(
-    store: Store,
-    envelope: Envelope[SignedSubmission],
-    isolation: Isolation | None = None,
-) -> bool:
-    """Admit a submission that a server received.
-
-    Args:
-      store: the board.
-      envelope: the submission, its signature verified and its content not validated.
-      isolation: of the process that reads its policies; None for the one that this machine has.
-
-    Returns:
-      True if it is new, False if the board already has it.
-
-    Raises:
-      Rejection: with the code of the first fault.
-      ScoringFault: that process does not start; nothing is judged.
-    """
-    check_board(store.document, envelope.board)
-    if store.entry(envelope.id) is None:
-        _check_quotas(store, envelope.key)
-    return admit(store, envelope.open(), isolation=isolation)
-
-
 def admit(
     store: Store,
-    signed: SignedSubmission,
+    signed: Signed[Submission],
     policy_file: ReadFile | None = None,
     isolation: Isolation | None = None,
+    address: str | None = None,
 ) -> bool:
     """Check a submission and store it.
 
@@ -79,15 +48,17 @@ def admit(
       signed: the submission, its signature verified.
       policy_file: returns a file's bytes by digest, of the size in the submission; they are
         stored with the submission. By default the submitter's key has uploaded them.
-      isolation: as in `receive`.
+      isolation: of the process that reads its policies; None for the one that this machine has.
+      address: of the server that it was sent to; None if it was given to the board's folder.
 
     Returns:
       True if it is new, False if the board already has it.
 
     Raises:
-      Rejection, ScoringFault: as in `receive`.
+      Rejection: with the code of the first fault.
+      ScoringFault: that process does not start; nothing is judged.
     """
-    check_board(store.document, signed.board)
+    check_receiver(store.document, signed.receiver, address)
     known = store.entry(signed.id)
     if known is not None:
         if known.status == "withdrawn":
@@ -97,23 +68,20 @@ def admit(
                 "Sign a new one.",
             )
         return False
-    submission = signed.submission
+    submission = signed.content
     key = submission.submitter.key
     # The board's own rows are signed at its opening, and added at any time.
     time = submission.created if key == store.document.key else store.time
     check_submission(store.document, submission, datetime.datetime.fromisoformat(time))
-    check_name(store, submission.submitter)
-    _check_quotas(store, key)
     _check_files(store, submission, policy_file, isolation)
-    if policy_file is not None:
-        for digest in _policies(submission):
-            store.put_object(digest, [policy_file(digest)], by=key)
     with store.transaction():  # no other submission can use the quota or the name in between
         check_name(store, submission.submitter)
         _check_quotas(store, key)
         if key != store.document.key:
             check_room(store, len(signed.to_bytes()))
-        for declared in _policies(submission).values():  # nor can `gc` take a file
+        for digest, declared in _policies(submission).items():  # nor can `gc` take a file
+            if policy_file is not None:
+                store.put_object(digest, [policy_file(digest)], by=key)
             check_stored(store, key, declared)
         return store.receive(signed)
 
@@ -135,7 +103,11 @@ def submit_bundle(
       Rejection: with the code of the first fault; nothing is stored.
     """
     bundle = Bundle.read(folder)
-    signed = bundle.signed if key is None else bundle.signed.for_board(store.document.key, key)
+    signed = (
+        bundle.signed
+        if key is None
+        else bundle.signed.for_receiver(Receiver(store.document.key), key)
+    )
     admit(store, signed, policy_file=bundle.artefact, isolation=isolation_for_own())
     return signed.id
 

@@ -7,16 +7,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from leaderboard.documents.checks import REFERENCE_FAMILY, THE_BOARD
-from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import (
-    Artefact,
-    Knowledge,
-    Method,
-    Run,
-    SignedSubmission,
-    Submission,
-    Submitter,
-)
+from leaderboard.documents.signed import Receiver, Signed, SigningKey
+from leaderboard.documents.submission import Artefact, Knowledge, Method, Run, Submission, Submitter
 from leaderboard.gate.isolation import isolation_for_own
 from leaderboard.gate.reference import constant_onnx, optimal_onnx
 from leaderboard.intake.admission import admit
@@ -83,7 +75,7 @@ def submit_references(store: Store) -> list[str]:
 
 def _submission(
     store: Store, key: SigningKey, opened: str, reference: Reference
-) -> tuple[SignedSubmission, dict[str, bytes]]:
+) -> tuple[Signed[Submission], dict[str, bytes]]:
     """A reference row with one run on each instance, and its artefacts by digest."""
     artefacts: dict[str, bytes] = {}
     runs = []
@@ -110,4 +102,4 @@ def _submission(
         runs_started=dict(Counter(class_name for class_name, _ in instances.values())),
         statement=reference.statement,
     )
-    return submission.signed(key, key.public), artefacts
+    return submission.signed(key, Receiver(key.public)), artefacts

@@ -1,7 +1,7 @@
 """Uploads: a signed permission for one object and ten minutes, and the quotas in bytes.
 
-Authorization: SME-Ed25519 key=<64 hex>,board=<64 hex>,time=<utc>,signature=<128 hex>
-signature = Ed25519(key, "sme-leaderboard/upload/" board "/" digest " " time)
+Authorization: SME-Ed25519 key=<64 hex>,board=<64 hex>,address=<url>,time=<utc>,signature=<128 hex>
+signature = Ed25519(key, "sme-leaderboard/upload/" board "/" address "/" digest " " time)
 """
 
 from __future__ import annotations
@@ -9,7 +9,9 @@ from __future__ import annotations
 import datetime
 import re
 
-from leaderboard.documents.keys import SigningKey, verifies
+from leaderboard.documents.board import BoardDocument
+from leaderboard.documents.checks import check_receiver
+from leaderboard.documents.signed import Receiver, SigningKey, verifies
 from leaderboard.documents.submission import now, shifted, utc
 from leaderboard.errors import Rejection
 from leaderboard.store import Store, make_room
@@ -19,42 +21,42 @@ _DAY = datetime.timedelta(days=1)
 _HEADER = re.compile(
     r"SME-Ed25519 key=([0-9a-f]{64}),"
     r"(?:board=([0-9a-f]{64}),)?"
+    r"(?:address=([!-+\--~]{1,300}),)?"
     r"time=(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ),"
     r"signature=([0-9a-f]{128})"
 )
 
 
-def upload_header(
-    key: SigningKey, digest: str, time: str | None = None, *, board: str | None = None
-) -> str:
+def upload_header(key: SigningKey, digest: str, receiver: Receiver, time: str | None = None) -> str:
     """The value of `Authorization` that lets a key upload one object within ten minutes.
 
     Args:
       key: the submitter's.
       digest: of the object.
+      receiver: the board, and the address that the object is sent to.
       time: of signing, as documents write it; now by default.
-      board: the public key of the board.
     """
     time = time or now()
-    signature = key.sign("upload", f"{digest} {time}", board)
-    named = "" if board is None else f"board={board},"
+    signature = key.sign("upload", f"{digest} {time}", receiver)
+    named = "".join(f"{name}={value}," for name, value in receiver._asdict().items() if value)
     return f"SME-Ed25519 key={key.public},{named}time={time},signature={signature}"
 
 
 def uploader(
+    board: BoardDocument,
     header: str | None,
     digest: str,
+    address: str,
     at: datetime.datetime | None = None,
-    *,
-    board: str | None = None,
 ) -> str:
     """The public key that signed an upload.
 
     Args:
+      board: the board.
       header: the value of `Authorization`; None if there is none.
       digest: of the object.
+      address: of the server that it was sent to.
       at: time of arrival; now by default.
-      board: the public key of the board.
 
     Raises:
       Rejection: `bad_signature`, `wrong_board` or `stale_time`.
@@ -63,16 +65,13 @@ def uploader(
     if match is None:
         raise Rejection(
             "bad_signature",
-            "Authorization: must be `SME-Ed25519 key=…,board=…,time=…,signature=…`. Sign the "
-            "upload.",
+            "Authorization: must be `SME-Ed25519 key=…,board=…,address=…,time=…,signature=…`. Sign "
+            "the upload.",
         )
-    key, signed_for, time, signature = match.groups()
-    if signed_for != board:
-        raise Rejection(
-            "wrong_board",
-            f"Authorization: board={signed_for}: must be {board}. Sign the upload for this board.",
-        )
-    if not verifies(key, signature, "upload", f"{digest} {time}", board):
+    key, for_board, for_address, time, signature = match.groups()
+    receiver = Receiver(for_board, for_address)
+    check_receiver(board, receiver, address)
+    if not verifies(key, signature, "upload", f"{digest} {time}", receiver):
         raise Rejection(
             "bad_signature",
             "Authorization: the signature does not match this object, this time and the key "

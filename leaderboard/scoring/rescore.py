@@ -60,7 +60,7 @@ def rescore(store: Store, id: str) -> list[RescoreNote]:
     """
     stored = store.result(id)
     assert stored is not None
-    again = score_submission(store.document, store.submission(id).submission, store.objects.read)
+    again = score_submission(store.document, store.submission(id).content, store.objects.read)
     notes = [
         RescoreNote(id, "versions", name, recorded, again.versions[name])
         for name, recorded in stored.versions.items()

@@ -21,7 +21,8 @@ from typing import Any, Literal, NoReturn
 
 from leaderboard.documents.board import BoardDocument, Folder, hex_of
 from leaderboard.documents.result import Result, RunScore
-from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal
+from leaderboard.documents.signed import Signed
+from leaderboard.documents.submission import Submission, Withdrawal
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.scoring.aggregation import (
     failed_run,
@@ -296,17 +297,17 @@ class _Verifier:
         for id, withdrawal in self.index.connection.execute(
             "SELECT id, withdrawal FROM entry ORDER BY sequence"
         ):
-            key = self._submission(id).submission.submitter.key
+            key = self._submission(id).content.submitter.key
             if withdrawal is not None:
                 path = self.folder.withdrawal(id)
-                signed = read_document(self.folder, path, SignedWithdrawal)
-                if signed.board != self.document.signatures_for or not signed.is_valid(key):
+                signed = read_document(self.folder, path, Signed[Withdrawal])
+                if not signed.is_valid(self.document.signatures_for, key):
                     self._refuse(path, "its signature does not match the submission's key")
 
-    def _submission(self, id: str) -> SignedSubmission:
+    def _submission(self, id: str) -> Signed[Submission]:
         path = self.folder.submission(id)
-        signed = read_document(self.folder, path, SignedSubmission)
-        if signed.board != self.document.signatures_for or not signed.is_valid:
+        signed = read_document(self.folder, path, Signed[Submission])
+        if not signed.is_valid(self.document.signatures_for):
             self._refuse(path, "its signature does not match the submitter's key")
         return signed
 
@@ -380,7 +381,7 @@ def _refuse_result(id: str, message: str) -> NoReturn:
 def _check_runs(store: Store, result: Result) -> None:
     """Check that the scores are of the submitted runs on their own states; failed runs score 1."""
     document, instances = store.document, store.document.instances
-    submission = store.submission(result.submission).submission
+    submission = store.submission(result.submission).content
     regions = len(document.protocol.edges)
     listed = result.runs[: len(submission.runs)]
     for number, (run, score) in enumerate(itertools.zip_longest(submission.runs, listed)):
@@ -409,7 +410,7 @@ def _by_region(run: RunScore) -> list[tuple[float, ...]]:
 def _check_scores(store: Store, result: Result) -> None:
     """Check that each run's metrics follow from its regions, and the scores from the runs."""
     document = store.document
-    submission = store.submission(result.submission).submission
+    submission = store.submission(result.submission).content
     for number, run in enumerate(result.runs):
         for name, value in run_metrics(
             run.normalised_regret, run.similarity, levels_of(document.protocol)

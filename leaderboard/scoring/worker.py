@@ -106,7 +106,7 @@ def _score(
 ) -> Result | None:
     """Score a claimed submission; None after a fault, which postpones it."""
     try:
-        submission = store.submission(claim.id).submission
+        submission = store.submission(claim.id).content
         return score_submission(
             store.document, submission, store.objects.read, progress, isolation=isolation
         )

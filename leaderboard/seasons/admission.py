@@ -11,47 +11,38 @@ from __future__ import annotations
 
 import datetime
 
-from leaderboard.documents.checks import check_board, check_names, check_time, skeleton
-from leaderboard.documents.submission import Artefact, Envelope
+from leaderboard.documents.checks import (
+    check_names,
+    check_receiver,
+    check_time,
+    skeleton,
+)
+from leaderboard.documents.signed import Signed
+from leaderboard.documents.submission import Artefact
 from leaderboard.errors import Rejection
 from leaderboard.intake.admission import ReadFile, check_daily_quota, check_name, check_stored
 from leaderboard.intake.uploads import check_room, uploader
-from leaderboard.seasons.entry import Entry, SignedEntry, SignedTicketRequest
+from leaderboard.seasons.entry import Entry, TicketRequest
 from leaderboard.seasons.season import Season, read_answers
 from leaderboard.store import Store, played_bytes
 
 
-def receive_entry(store: Store, envelope: Envelope[SignedEntry], season: str) -> bool:
-    """Admit an entry that a server received.
-
-    Args:
-      store: the board.
-      envelope: the entry, its signature verified and its content not validated.
-      season: digest of the season that it was sent to.
-
-    Returns:
-      True if it is new, False if the board already has it.
-
-    Raises:
-      Rejection: with the code of the first fault.
-    """
-    check_board(store.document, envelope.board)
-    if store.entrant(envelope.id) is None:
-        check_daily_quota(store, envelope.key)
-    signed = envelope.open()
-    if signed.entry.season != season:
+def receive_entry(store: Store, signed: Signed[Entry], season: str, address: str) -> bool:
+    """Admit an entry that a server at an address received for the season of this digest."""
+    if signed.content.season != season:
         raise Rejection(
             "season_unknown",
-            f"season={signed.entry.season}: the entry was sent to the season {season}. Send "
+            f"season={signed.content.season}: the entry was sent to the season {season}. Send "
             "it to its own.",
         )
-    return enter(store, signed)
+    return enter(store, signed, address=address)
 
 
 def enter(
     store: Store,
-    signed: SignedEntry,
+    signed: Signed[Entry],
     answers: ReadFile | None = None,
+    address: str | None = None,
 ) -> bool:
     """Check an entry and store it.
 
@@ -60,6 +51,7 @@ def enter(
       signed: the entry, its signature verified.
       answers: returns the bytes of an answer by digest; they are stored with the entry. By default
         the entrant's key has uploaded them.
+      address: of the server that it was sent to; None if it was given to the board's folder.
 
     Returns:
       True if it is new, False if the board already has it.
@@ -67,27 +59,24 @@ def enter(
     Raises:
       Rejection: with the code of the first fault.
     """
-    check_board(store.document, signed.board)
+    check_receiver(store.document, signed.receiver, address)
     if store.entrant(signed.id) is not None:
         return False
-    entry, key = signed.entry, signed.entry.submitter.key
+    entry, key = signed.content, signed.content.submitter.key
     check_names(entry, store.document.key)
     moment = datetime.datetime.fromisoformat(store.time)
     check_time(entry.created, moment, store.document.limits.age_days)
     store.open_season(entry.season, "sealed-offline")
     season = store.season(entry.season)
-    check_name(store, entry.submitter)
-    check_daily_quota(store, key)
     given = _check_answers(store, season, signed, answers)
-    if answers is not None:
-        for answer in given:
-            store.put_object(answer.sha256, [answers(answer.sha256)], by=key)
     with store.transaction():  # no other entrant can take the name, nor `gc` an answer in between
         check_name(store, entry.submitter)
         check_daily_quota(store, key)
         _check_newest(store, season, entry)
         check_room(store, len(signed.to_bytes()))
         for answer in given:
+            if answers is not None:
+                store.put_object(answer.sha256, [answers(answer.sha256)], by=key)
             check_stored(store, key, answer)
         return store.enter(signed)
 
@@ -106,10 +95,10 @@ def _check_newest(store: Store, season: Season, entry: Entry) -> None:
 
 
 def _check_answers(
-    store: Store, season: Season, signed: SignedEntry, read: ReadFile | None
+    store: Store, season: Season, signed: Signed[Entry], read: ReadFile | None
 ) -> list[Artefact]:
     """The answers that are not null, each in the shape of its instance's challenge."""
-    entry, hidden = signed.entry, list(season.hidden)
+    entry, hidden = signed.content, list(season.hidden)
     if len(entry.answers) != len(hidden):
         raise Rejection(
             "answer_missing",
@@ -137,38 +126,42 @@ def _check_answers(
 
 
 def refuse_other_sender(
-    store: Store, envelope: Envelope[SignedTicketRequest], header: str | None
+    store: Store, signed: Signed[TicketRequest], header: str | None, address: str
 ) -> None:
-    """Reject a request that its own key has not just sent.
+    """Reject a request that its own key has not just sent, to this board at this address.
 
     Args:
       store: the board.
-      envelope: the request.
+      signed: the request.
       header: the value of `Authorization`; None if there is none.
+      address: of the server that it was sent to.
 
     Raises:
       Rejection: `bad_signature`, `wrong_board` or `stale_time`.
     """
-    sender = uploader(header, envelope.id, board=store.document.key)
-    if sender != envelope.key:
+    sender = uploader(store.document, header, signed.id, address)
+    key = signed.content.submitter.key
+    if sender != key:
         raise Rejection(
             "bad_signature",
-            f"Authorization: is signed by the key {sender[:16]}…: must be by {envelope.key[:16]}…, "
+            f"Authorization: is signed by the key {sender[:16]}…: must be by {key[:16]}…, "
             "which signed the request. Sign both with one key.",
         )
 
 
 def start_ticket(
     store: Store,
-    envelope: Envelope[SignedTicketRequest],
+    signed: Signed[TicketRequest],
     season: str,
+    address: str | None = None,
 ) -> tuple[int, bool]:
     """Start a ticket; the same request starts no second one, and has its number again.
 
     Args:
       store: the board.
-      envelope: the request, its signature verified and its content not validated.
+      signed: the request, its signature verified.
       season: digest of the season that it was sent to.
+      address: of the server that it was sent to; None if it was given to the board's folder.
 
     Returns:
       The ticket's number, and whether it is new.
@@ -176,12 +169,11 @@ def start_ticket(
     Raises:
       Rejection: with the code of the first fault.
     """
-    check_board(store.document, envelope.board)
-    known = store.entrant(envelope.id)
+    check_receiver(store.document, signed.receiver, address)
+    known = store.entrant(signed.id)
     if known is not None and known.season == season:
         return known.number, False
-    signed = envelope.open()
-    request = signed.ticket
+    request = signed.content
     if request.season != season:
         raise Rejection(
             "season_unknown",

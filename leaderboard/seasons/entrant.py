@@ -22,15 +22,15 @@ from leaderboard.cli.options import (
     MethodVersion,
     Statement,
     SubmitterName,
-    board_document,
     is_url,
+    receiver_of,
 )
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.intake import upload_header
 from leaderboard.seasons.admission import enter as enter_folder
-from leaderboard.seasons.entry import Entry, SignedEntry, SignedTicketRequest, TicketRequest
+from leaderboard.seasons.entry import Entry, TicketRequest, signer_of
 from leaderboard.seasons.publication import name_of, read_season
 from leaderboard.seasons.season import Season
 from leaderboard.store import Store
@@ -105,10 +105,10 @@ def ticket(
     request_file = out_file.with_name(f"{out_file.name}.request")
     repeated = request_file.exists()
     if repeated:
-        signed = SignedTicketRequest.read(read_file(request_file))
+        signed = Signed[TicketRequest].read(read_file(request_file))
         err().print(f"Repeating {escape(str(request_file))}.", soft_wrap=True)
     else:
-        season_digest, board = served_season(url, season)
+        season_digest, receiver = served_season(url, season)
         nonce = secrets.token_hex(32)
         request = TicketRequest.from_dict(
             {
@@ -124,7 +124,7 @@ def ticket(
                 "answers_key": signing_key.of_answers(nonce).public,
             }
         )
-        signed = request.signed(signing_key, board)
+        signed = request.signed(signing_key, receiver)
         write_atomically(request_file, signed.to_bytes())
     try:
         started = request_ticket(url, season, signed, signing_key)
@@ -343,7 +343,7 @@ def enter(
             "answers": [name and {"sha256": name, "size": len(data[name])} for name in digests],
         }
     )
-    signed = entry.signed(signing_key, board_document(board).key)
+    signed = entry.signed(signing_key, receiver_of(board))
     if is_url(board):
         with Progress("uploading", len(data), console=err(), unit="answers") as progress:
             send_entry(board, season.id, signed, data, signing_key, progress=progress.update_of)
@@ -369,21 +369,21 @@ def _answers(policy: str, states: Path, setting: Any, action_range: str | None) 
     return pack_table(actions_in(shown, prepared, setting))
 
 
-def served_season(url: str, id: str, *, insecure: bool = False) -> tuple[str, str]:
-    """The digest of a season of a served board, and the board's public key."""
+def served_season(url: str, id: str, *, insecure: bool = False) -> tuple[str, Receiver]:
+    """The digest of a season of a served board, and for whom to sign what is sent to it."""
     with ServedBoard(url, insecure=insecure) as served:
         answer = served.request("GET", f"/api/seasons/{_name(id)}")
         try:
             found = Season.from_dict(answer["document"], "season.json")
         except (SpecError, LookupError, TypeError) as error:
             raise BoardError(f"{url}: answered with no season: {error}") from None
-        return found.digest, served.document().key
+        return found.digest, served.receiver()
 
 
 def request_ticket(
     url: str,
     season: str,
-    signed: SignedTicketRequest,
+    signed: Signed[TicketRequest],
     key: SigningKey,
     *,
     insecure: bool = False,
@@ -393,20 +393,20 @@ def request_ticket(
     `season` is its id, and `key` the entrant's, which signed the request for this board. The
     ticket has the signer of its answers.
     """
-    sign = functools.partial(upload_header, key, signed.id, board=signed.board)
+    sign = functools.partial(upload_header, key, signed.id, signed.receiver)
     with ServedBoard(url, insecure=insecure) as served:
         answer = served.request("POST", tickets_path(_name(season)), signed.to_bytes(), sign)
     try:
         ticket = Ticket.from_dict(answer, "ticket")
     except SpecError as error:
         raise BoardError(f"{url}: answered with no ticket: {error}") from None
-    return ticket.model_copy(update={"signer": signed.signer(key)})
+    return ticket.model_copy(update={"signer": signer_of(signed, key)})
 
 
 def send_entry(
     url: str,
     season: str,
-    signed: SignedEntry,
+    signed: Signed[Entry],
     answers: Mapping[str, bytes],
     key: SigningKey,
     progress: Sent | None = None,
@@ -419,7 +419,7 @@ def send_entry(
     """
     with ServedBoard(url, insecure=insecure) as served:
         for done, (digest, data) in enumerate(answers.items(), start=1):
-            served.upload(digest, data, key, signed.board)
+            served.upload(digest, data, key, signed.receiver)
             if progress is not None:
                 progress(done, len(answers))
         path = f"/api/seasons/{_name(season)}/entries"

@@ -1,4 +1,4 @@
-"""`Entry`, `TicketRequest`, `SignedAnswers`: what an entrant of a sealed season signs.
+"""`Entry`, `TicketRequest`, `Answers`: what an entrant of a sealed season signs.
 
     id = "sha256:" + hex(SHA-256(canonical JSON of the entry or request))
 
@@ -13,14 +13,8 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field, field_validator
 
-from leaderboard.documents.keys import PublicKey, SigningKey, verifies
-from leaderboard.documents.submission import (
-    Artefact,
-    Manifest,
-    Method,
-    SignedDocument,
-    SignedManifest,
-)
+from leaderboard.documents.signed import PublicKey, Signable, Signed, SigningKey
+from leaderboard.documents.submission import Artefact, Manifest, Method
 from leaderboard.seasons.season import MAX_OFFLINE_INSTANCES
 from sme_registry.seasons.wire import Signer, Statement
 from sme_registry.spec.document import Digest, matching
@@ -53,14 +47,12 @@ class Entry(SealedManifest):
       answers: of each hidden instance; null where the method failed, which scores 1 there.
     """
 
+    PURPOSE, FIELD, COMMAND = "entry", "entry", "enter"
+
     answers: Annotated[
         tuple[Artefact | None, ...],
         Field(strict=False, min_length=1, max_length=MAX_OFFLINE_INSTANCES),
     ]
-
-    def signed(self, key: SigningKey, board: str | None = None) -> SignedEntry:
-        """This entry, signed as `SignedManifest.sign` says."""
-        return SignedEntry.sign(self, key, board)
 
 
 class TicketRequest(SealedManifest):
@@ -72,64 +64,27 @@ class TicketRequest(SealedManifest):
       answers_key: signs the answers; null in requests that are older than it.
     """
 
+    PURPOSE, FIELD, COMMAND = "ticket", "ticket", "ticket"
     fields_added_later: ClassVar[tuple[str, ...]] = ("answers_key",)
 
     nonce: Annotated[str, matching(r"^[0-9a-f]{64}$", "64 hex digits, drawn at random")]
     answers_key: PublicKey | None = None
 
-    def signed(self, key: SigningKey, board: str | None = None) -> SignedTicketRequest:
-        """This request, signed as `SignedManifest.sign` says."""
-        return SignedTicketRequest.sign(self, key, board)
 
+class Answers(Signable, Statement):
+    """What the key that a ticket's request names signs of one instance.
 
-class SignedSealed(SignedManifest):
-    """A signed entry, or a signed request for a ticket."""
-
-    @property
-    def content(self) -> SealedManifest:
-        """What is signed."""
-        content: SealedManifest = getattr(self, self.KIND)
-        return content
-
-
-class SignedEntry(SignedSealed):
-    """`entries/<64 hex>.json` of a season, and the entrant's `entry.json`."""
-
-    KIND = "entry"
-    COMMAND = "enter"
-
-    entry: Entry
-
-
-class SignedTicketRequest(SignedSealed):
-    """`tickets/<number>/ticket.json` of a season."""
-
-    KIND = "ticket"
-    COMMAND = "ticket"
-
-    ticket: TicketRequest
-
-    def signer(self, key: SigningKey) -> Signer | None:
-        """What signs the answers of the ticket, if the request names `SigningKey.of_answers`.
-
-        Args:
-          key: the entrant's.
-        """
-        answers = key.of_answers(self.ticket.nonce)
-        if self.board is None or self.ticket.answers_key != answers.public:
-            return None
-        return Signer(board=self.board, request=self.id, key=answers.secret)
-
-
-class SignedAnswers(SignedDocument):
-    """`tickets/<number>/<instance>.json` of a season, beside the answers and the journal.
-
-    Attributes:
-      statement: what the key that the ticket's request names has signed.
+    Signed, it is `tickets/<number>/<instance>.json`, beside the answers and the journal.
     """
 
-    statement: Statement
+    PURPOSE, FIELD, COMMAND = "answers", "statement", "answer"
 
-    def is_valid(self, key: str) -> bool:
-        """Whether this public key made the signature, for this statement and board."""
-        return verifies(key, self.signature, "answers", self.statement.digest, self.board)
+
+def signer_of(request: Signed[TicketRequest], key: SigningKey) -> Signer | None:
+    """What signs the answers of a ticket, if the request names `SigningKey.of_answers` of a key."""
+    answers = key.of_answers(request.content.nonce)
+    if request.board is None or request.content.answers_key != answers.public:
+        return None
+    return Signer(
+        board=request.board, address=request.address, request=request.id, key=answers.secret
+    )

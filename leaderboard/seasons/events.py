@@ -13,8 +13,9 @@ from typing import Any, TypeVar
 
 from leaderboard.documents.board import Folder
 from leaderboard.documents.checks import skeleton
+from leaderboard.documents.signed import Signed
 from leaderboard.errors import TamperedError
-from leaderboard.seasons.entry import SignedEntry, SignedSealed, SignedTicketRequest
+from leaderboard.seasons.entry import Entry, SealedManifest, TicketRequest
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.season import (
     MAX_LANES,
@@ -65,7 +66,7 @@ CREATE TABLE answer (
 ) STRICT, WITHOUT ROWID;
 """
 
-_Signed = TypeVar("_Signed", bound=SignedSealed)
+_Signed = TypeVar("_Signed", bound=Signed[SealedManifest])
 _RECORD_BYTES, _HEAD_BYTES = 12, 4096  # of a journal; heads with the signature's file
 
 
@@ -240,16 +241,16 @@ class Seasons:
         season, signed, path = self._signed(
             entry,
             "sealed-offline",
-            SignedEntry,
+            Signed[Entry],
             lambda row: self._at(row.digest).entry(entry.subject),
         )
-        answers = signed.entry.answers
+        answers = signed.content.answers
         if len(answers) != season.instances:
             raise entry.contradiction("names more or fewer answers than there are instances")
         given = [answer for answer in answers if answer is not None]
         self._add(entry, season, signed, path, policies=len(given), played=0)
         for answer in given:
-            key = signed.entry.submitter.key
+            key = signed.content.submitter.key
             name_object(self._connection, answer.sha256, answer.size, key, entry.time)
             self._connection.execute(
                 "INSERT OR IGNORE INTO answer VALUES (?, ?)", (answer.sha256, entry.subject)
@@ -259,7 +260,7 @@ class Seasons:
         season, signed, path = self._signed(
             entry,
             "sealed-online",
-            SignedTicketRequest,
+            Signed[TicketRequest],
             lambda row: self._at(row.digest).request(self.next_number(row.digest)),
         )
         played = played_bytes(self.read(season))
@@ -295,7 +296,7 @@ class Seasons:
         self,
         entry: LogEntry,
         season: SeasonRow,
-        signed: SignedSealed,
+        signed: Signed[SealedManifest],
         path: Path,
         *,
         policies: int,

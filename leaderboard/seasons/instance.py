@@ -15,8 +15,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Literal
 
+from leaderboard.documents.signed import Signed
 from leaderboard.errors import Rejection, TamperedError
-from leaderboard.seasons.entry import SignedAnswers
+from leaderboard.seasons.entry import Answers
 from leaderboard.seasons.journal import Journal
 from leaderboard.seasons.season import MAX_LANES, Float32, SeasonClass, read_answers, rows_of
 from leaderboard.seasons.signatory import Signatory
@@ -152,7 +153,7 @@ class SteppedInstance:
         _, answers = self.stored_answers
         try:
             data = read_regular(self._signed_path, _MAX_SIGNED)
-            stored = SignedAnswers.from_dict(io.parse_json(data, "signature"))
+            stored = Signed[Answers].from_dict(io.parse_json(data, "signature"))
             return stored == self._signed(str(answers), stored.signature)
         except (OSError, SMEError):
             return False
@@ -343,7 +344,7 @@ class SteppedInstance:
                 self.sync()
             self._lanes = self._format = None
 
-    def _signed(self, answers: str, signature: str) -> SignedAnswers:
+    def _signed(self, answers: str, signature: str) -> Signed[Answers]:
         assert self._signatory is not None
         return self._signatory.signed(self._number, answers, self.journal_digest(), signature)
 

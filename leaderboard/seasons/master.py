@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from leaderboard.documents.keys import parse_secret, plain_json, write_secret
+from leaderboard.documents.signed import parse_secret, plain_json, write_secret
 from leaderboard.errors import BoardError
 from sme_registry.io import read_regular, sha256_of
 

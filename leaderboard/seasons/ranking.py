@@ -157,7 +157,7 @@ def scored_entries(
 def _scored_at_once(
     store: Store, season: Season, master: Master, rows: Sequence[SealedRow]
 ) -> Iterator[SealedResult]:
-    answers = [store.entry_of(row).entry.answers for row in rows]
+    answers = [store.entry_of(row).content.answers for row in rows]
     runs: list[list[RunScore]] = [[] for _ in rows]
     versions: list[dict[str, str]] = [{} for _ in rows]
     for number, instance in enumerate(instances(season, master)):

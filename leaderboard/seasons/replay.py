@@ -146,7 +146,7 @@ def _check_signature(store: Store, season: Season, row: SealedRow) -> None:
     online = season.track == "sealed-online"
     signed = store.request_of(row) if online else store.entry_of(row)
     path = folder.request(row.number) if online else folder.entry(row.entrant.id)
-    if not signed.is_valid or signed.board != store.document.signatures_for:
+    if not signed.is_valid(store.document.signatures_for):
         _refuse(store, path, "its signature does not match the entrant's key")
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from leaderboard.documents.signed import Receiver, Signed
 from leaderboard.errors import Rejection
-from leaderboard.seasons.entry import SignedAnswers, SignedTicketRequest
+from leaderboard.seasons.entry import Answers, TicketRequest
 from sme_registry.errors import SpecError
-from sme_registry.seasons.wire import Statement
 
 
 @dataclass(frozen=True)
@@ -16,23 +16,23 @@ class Signatory:
 
     Attributes:
       key: public key of the answers.
-      board: that the signatures are for; None as in the request.
+      receiver: that the signatures are for, as in the request.
       request: id of the request.
       ticket: its number.
     """
 
     key: str
-    board: str | None
+    receiver: Receiver
     request: str
     ticket: int
 
     @classmethod
-    def named_in(cls, request: SignedTicketRequest, ticket: int) -> Signatory | None:
+    def named_in(cls, request: Signed[TicketRequest], ticket: int) -> Signatory | None:
         """That of a request; None if it is older than signed answers."""
-        key = request.ticket.answers_key
-        return None if key is None else cls(key, request.board, request.id, ticket)
+        key = request.content.answers_key
+        return None if key is None else cls(key, request.receiver, request.id, ticket)
 
-    def signed(self, instance: int, answers: str, journal: str, signature: str) -> SignedAnswers:
+    def signed(self, instance: int, answers: str, journal: str, signature: str) -> Signed[Answers]:
         """The signed statement of an instance.
 
         Args:
@@ -43,7 +43,7 @@ class Signatory:
         Raises:
           Rejection: `bad_signature`.
         """
-        statement = Statement(
+        statement = Answers(
             request=self.request,
             ticket=self.ticket,
             instance=instance,
@@ -51,8 +51,10 @@ class Signatory:
             journal=journal,
         )
         try:
-            signed = SignedAnswers(statement=statement, signature=signature, board=self.board)
-            valid = signed.is_valid(self.key)
+            signed = Signed[Answers](
+                content=statement, signature=signature, **self.receiver._asdict()
+            )
+            valid = signed.is_valid(self.receiver.board, self.key)
         except SpecError:
             valid = False
         if not valid:

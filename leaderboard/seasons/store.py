@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from typing import Literal
 
+from leaderboard.documents.signed import Signed
 from leaderboard.errors import BoardError, Rejection
-from leaderboard.seasons.entry import SignedEntry, SignedTicketRequest
+from leaderboard.seasons.entry import Entry, TicketRequest
 from leaderboard.seasons.events import SealedRow, SeasonRow
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.season import Reveal, SealedResult, SealedTrack, Season, SeasonFolder
@@ -80,7 +81,7 @@ class SealedStore(Database):
         """The folder of a season, by its digest."""
         return SeasonFolder(self.folder, digest)
 
-    def enter(self, signed: SignedEntry) -> bool:
+    def enter(self, signed: Signed[Entry]) -> bool:
         """Add an entry, which `intake` has checked, to an open season.
 
         Returns:
@@ -95,12 +96,12 @@ class SealedStore(Database):
             if index.seasons.entrant(signed.id) is not None:
                 return False
             time = self.clock.received()
-            row = self.open_season(signed.entry.season, "sealed-offline", time)
+            row = self.open_season(signed.content.season, "sealed-offline", time)
             path = self.season_folder(row.digest).entry(signed.id)
             self.record("entry", signed.id, signed, path, time)
         return True
 
-    def start_ticket(self, signed: SignedTicketRequest) -> int:
+    def start_ticket(self, signed: Signed[TicketRequest]) -> int:
         """Start a ticket in an open season; the same request starts no second one.
 
         Returns:
@@ -116,8 +117,8 @@ class SealedStore(Database):
             if known is not None:
                 return known.number
             time = self.clock.received()
-            row = self.open_season(signed.ticket.season, "sealed-online", time)
-            season, key = index.seasons.read(row), signed.ticket.submitter.key
+            row = self.open_season(signed.content.season, "sealed-online", time)
+            season, key = index.seasons.read(row), signed.content.submitter.key
             own = sum(each.entrant.key == key for each in index.seasons.entrants(row.digest))
             assert season.tickets is not None  # the track is online
             assert season.tickets_per_key is not None
@@ -260,15 +261,15 @@ class SealedStore(Database):
             )
         return row
 
-    def entry_of(self, row: SealedRow) -> SignedEntry:
+    def entry_of(self, row: SealedRow) -> Signed[Entry]:
         """An entry as it was signed; raises `TamperedError` if its file was altered."""
         path = self.season_folder(row.season).entry(row.entrant.id)
-        return read_document(self.folder, path, SignedEntry, row.document)
+        return read_document(self.folder, path, Signed[Entry], row.document)
 
-    def request_of(self, row: SealedRow) -> SignedTicketRequest:
+    def request_of(self, row: SealedRow) -> Signed[TicketRequest]:
         """A ticket's request as it was signed; raises `TamperedError` if its file was altered."""
         path = self.season_folder(row.season).request(row.number)
-        return read_document(self.folder, path, SignedTicketRequest, row.document)
+        return read_document(self.folder, path, Signed[TicketRequest], row.document)
 
     def sealed_result(self, row: SealedRow) -> SealedResult | None:
         """The result of an entry or ticket; None if it has none.

@@ -45,7 +45,7 @@ class RunningTicket:
         self.number = row.number
         self._season, self._master = season, master
         request = store.request_of(row)
-        self._nonce = request.ticket.nonce
+        self._nonce = request.content.nonce
         place = Place(season.id, "", 0, str(row.number), self._nonce)
         self._token = master.secret("token", place).hex()
         self.deadline = deadline(season, row)

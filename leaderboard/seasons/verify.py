@@ -9,8 +9,9 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from leaderboard.documents.signed import Signed
 from leaderboard.errors import TamperedError
-from leaderboard.seasons.entry import SignedEntry, SignedSealed, SignedTicketRequest
+from leaderboard.seasons.entry import Entry, SealedManifest, TicketRequest
 from leaderboard.seasons.season import STEPPING, SeasonFolder
 from leaderboard.store import Index, SealedRow, SeasonRow, read_document
 from sme_registry.io import TEMPORARY
@@ -59,20 +60,20 @@ def check_sealed_signatures(index: Index) -> tuple[int, int]:
     for season in seasons:
         for row in index.seasons.entrants(season.digest):
             path, signed = _signed(index, season, row)
-            if signed.board != index.document.signatures_for or not signed.is_valid:
+            if not signed.is_valid(index.document.signatures_for):
                 where = path.relative_to(index.folder.path).as_posix()
                 raise TamperedError(where, "its signature does not match the entrant's key")
             count += 1
     return len(seasons), count
 
 
-def _signed(index: Index, season: SeasonRow, row: SealedRow) -> tuple[Path, SignedSealed]:
+def _signed(index: Index, season: SeasonRow, row: SealedRow) -> tuple[Path, Signed[SealedManifest]]:
     folder = SeasonFolder(index.folder, season.digest)
     if season.track == "sealed-online":
         path = folder.request(row.number)
-        return path, read_document(index.folder, path, SignedTicketRequest, row.document)
+        return path, read_document(index.folder, path, Signed[TicketRequest], row.document)
     path = folder.entry(row.entrant.id)
-    return path, read_document(index.folder, path, SignedEntry, row.document)
+    return path, read_document(index.folder, path, Signed[Entry], row.document)
 
 
 def _is_logged(index: Index, name: str, season: str, part: str = "") -> bool:

@@ -33,10 +33,10 @@ from starlette.routing import Route
 from starlette.types import Scope
 
 from leaderboard.documents.result import RANKED_METRICS
-from leaderboard.documents.submission import MAX_BYTES, Envelope
+from leaderboard.documents.signed import MAX_BYTES, Signed
 from leaderboard.errors import Rejection
 from leaderboard.seasons.admission import receive_entry, refuse_other_sender, start_ticket
-from leaderboard.seasons.entry import SignedEntry, SignedTicketRequest
+from leaderboard.seasons.entry import Entry, TicketRequest
 from leaderboard.seasons.pages import SECTION
 from leaderboard.seasons.ranking import (
     ranking_facts,
@@ -59,12 +59,17 @@ _T = TypeVar("_T")
 
 
 class SeasonRoutes:
-    """The handlers; `secrets` are paths of the masters of the seasons that this server steps."""
+    """The handlers of a server at an address.
+
+    `secrets` are paths of the masters of the seasons that it steps.
+    """
 
     section = SECTION
 
-    def __init__(self, store: Store, secrets: Iterable[str | os.PathLike[str]]) -> None:
-        self._store = store
+    def __init__(
+        self, store: Store, secrets: Iterable[str | os.PathLike[str]], address: str
+    ) -> None:
+        self._store, self._address = store, address
         self._tickets = {
             each.season.id: each for path in secrets for each in Tickets.of_master(store, path)
         }
@@ -159,9 +164,9 @@ class SeasonRoutes:
         header = request.headers.get("Authorization")
 
         def start() -> tuple[seasons.Ticket, bool]:
-            envelope = Envelope.read(text, SignedTicketRequest)
-            refuse_other_sender(self._store, envelope, header)
-            number, new = start_ticket(self._store, envelope, tickets.digest)
+            signed = Signed[TicketRequest].read(text)
+            refuse_other_sender(self._store, signed, header, self._address)
+            number, new = start_ticket(self._store, signed, tickets.digest, address=self._address)
             return tickets.ticket(number).document, new
 
         ticket, new = await _run(start, self._requests)
@@ -172,14 +177,14 @@ class SeasonRoutes:
         text = await read_body(request, MAX_BYTES, "entry")
 
         # Garbage without a valid signature never waits with entries, whose check is longer.
-        envelope = await _run(lambda: Envelope.read(text, SignedEntry), self._requests)
+        signed = await _run(lambda: Signed[Entry].read(text), self._requests)
 
         def enter() -> bool:
             season = self._store.season_row(name).digest
-            return receive_entry(self._store, envelope, season)
+            return receive_entry(self._store, signed, season, self._address)
 
         new = await _run(enter, self._entries)
-        return JSONResponse({"id": envelope.id}, 201 if new else 200)
+        return JSONResponse({"id": signed.id}, 201 if new else 200)
 
     async def get_ticket(self, request: Request) -> Response:
         tickets = self.tickets_of(request.path_params["season"])

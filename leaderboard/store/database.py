@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Self
 
 from leaderboard.documents.board import RULES, BoardDocument, Folder
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import SigningKey
 from leaderboard.documents.submission import now, shifted, utc
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.store.files import FolderLock, digest_of, unwritable, write_document

@@ -24,7 +24,8 @@ from typing import Any
 
 from leaderboard.documents.board import BoardDocument, Folder
 from leaderboard.documents.result import Result
-from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal
+from leaderboard.documents.signed import Signed
+from leaderboard.documents.submission import Submission, Withdrawal
 from leaderboard.errors import TamperedError
 from leaderboard.seasons import events as seasons
 from leaderboard.store import copies
@@ -213,7 +214,7 @@ class Index:
         if self.one("SELECT 1 FROM entry WHERE id = ?", entry.subject) is not None:
             raise entry.contradiction("receives a submission twice")
         path = self.folder.submission(entry.subject)
-        submission = read_document(self.folder, path, SignedSubmission, entry.document).submission
+        submission = read_document(self.folder, path, Signed[Submission], entry.document).content
         entry.check_subject(submission.digest)
         method, submitter = submission.method, submission.submitter
         values = {
@@ -274,8 +275,8 @@ class Index:
         if self.status(entry.subject) in (None, "withdrawn"):
             raise entry.contradiction("the submission is unknown or already withdrawn")
         path = self.folder.withdrawal(entry.subject)
-        signed = read_document(self.folder, path, SignedWithdrawal, entry.document)
-        entry.check_subject(signed.withdrawal.submission)
+        signed = read_document(self.folder, path, Signed[Withdrawal], entry.document)
+        entry.check_subject(signed.content.submission)
         self.connection.execute(
             "UPDATE entry SET status = 'withdrawn', withdrawal = ?, bytes = bytes + ? WHERE id = ?",
             (entry.document, path.stat().st_size, entry.subject),

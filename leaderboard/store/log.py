@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import Field, field_validator
 
 from leaderboard.documents.board import Folder
-from leaderboard.documents.keys import PlainDocument, Signature, SigningKey, plain_json, verifies
+from leaderboard.documents.signed import PlainDocument, Signature, SigningKey, plain_json, verifies
 from leaderboard.documents.submission import UtcTime, now
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.store.files import MAX_LOG_ENTRY_BYTES, read_document, write_document

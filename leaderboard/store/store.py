@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from leaderboard.documents.board import RULES, BoardDocument, Folder
-from leaderboard.documents.checks import check_board, check_text, refuse_unsubmittable, skeleton
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.checks import check_receiver, check_text, refuse_unsubmittable, skeleton
 from leaderboard.documents.result import Result
-from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal, now
+from leaderboard.documents.signed import Signed, SigningKey
+from leaderboard.documents.submission import Submission, Withdrawal, now
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.seasons.store import SealedStore
 from leaderboard.store.files import digest_of, read_document, write_document
@@ -199,7 +199,7 @@ class Store(SealedStore):
             alike = skeleton(name)
             return next((key for submitter, key in rows if skeleton(submitter) == alike), None)
 
-    def receive(self, signed: SignedSubmission) -> bool:
+    def receive(self, signed: Signed[Submission]) -> bool:
         """Add a submission, which `intake` has checked, to the queue.
 
         Returns:
@@ -214,8 +214,12 @@ class Store(SealedStore):
             self.record("received", signed.id, signed, self.folder.submission(signed.id))
         return True
 
-    def withdraw(self, signed: SignedWithdrawal) -> bool:
+    def withdraw(self, signed: Signed[Withdrawal], address: str | None = None) -> bool:
         """Withdraw a submission; its page stays and shows the withdrawal.
+
+        Args:
+          signed: the withdrawal, its signature not verified yet.
+          address: of the server that it was sent to; None if it was given to the board's folder.
 
         Returns:
           False if it was withdrawn before.
@@ -225,14 +229,14 @@ class Store(SealedStore):
             `bad_signature`, if the submission's own key did not sign it.
           BoardError: it cannot be written.
         """
-        withdrawal = signed.withdrawal
+        withdrawal = signed.content
         with self.transaction() as index:
             row = index.one("SELECT key FROM entry WHERE id = ?", withdrawal.submission)
             if row is None:
                 raise unknown_submission(withdrawal.submission)
             check_text("reason", withdrawal.reason)
-            check_board(self.document, signed.board)
-            if not signed.is_valid(row[0]):
+            check_receiver(self.document, signed.receiver, address)
+            if not signed.is_valid(signed.board, row[0]):
                 raise Rejection(
                     "bad_signature",
                     f"signature={signed.signature[:16]}…: does not match this withdrawal and the "
@@ -244,14 +248,14 @@ class Store(SealedStore):
             self.record("withdrawn", withdrawal.submission, signed, path)
         return True
 
-    def submission(self, id: str) -> SignedSubmission:
+    def submission(self, id: str) -> Signed[Submission]:
         """A submission as it was signed.
 
         Raises:
           Rejection: `unknown_submission`.
           TamperedError: its file differs from the logged one.
         """
-        signed = self._read("document", id, self.folder.submission, SignedSubmission)
+        signed = self._read("document", id, self.folder.submission, Signed[Submission])
         if signed is None:
             raise unknown_submission(id)
         return signed
@@ -264,13 +268,13 @@ class Store(SealedStore):
         """
         return self._read("result", id, self.folder.result, Result)
 
-    def withdrawal(self, id: str) -> SignedWithdrawal | None:
+    def withdrawal(self, id: str) -> Signed[Withdrawal] | None:
         """A submission's withdrawal; None if there is none.
 
         Raises:
           TamperedError: its file differs from the logged one.
         """
-        return self._read("withdrawal", id, self.folder.withdrawal, SignedWithdrawal)
+        return self._read("withdrawal", id, self.folder.withdrawal, Signed[Withdrawal])
 
     def _read(
         self, column: str, id: str, path_of: Callable[[str], Path], kind: type[_Model]

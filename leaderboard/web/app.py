@@ -34,12 +34,8 @@ from starlette.responses import JSONResponse, Response
 
 from leaderboard import intake
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.submission import (
-    MAX_BYTES,
-    Envelope,
-    SignedSubmission,
-    SignedWithdrawal,
-)
+from leaderboard.documents.signed import MAX_BYTES, Signed
+from leaderboard.documents.submission import Submission, Withdrawal
 from leaderboard.errors import BoardError, Rejection, ScoringFault
 from leaderboard.gate.isolation import Isolation, available_isolation
 from leaderboard.scoring.worker import background_scorers
@@ -49,6 +45,7 @@ from leaderboard.web.http import HTTP_CODES, RequestError
 from leaderboard.web.pages import Pages, Section, content_type
 from leaderboard.web.tables import TABS, public_view
 from sme_registry.errors import SMEError
+from sme_registry.io import server_address
 
 if find_spec("leaderboard.seasons") is not None:  # without them, a board has the open track only
     from leaderboard.seasons.web import SeasonRoutes
@@ -62,9 +59,9 @@ _OBJECTS = 8  # uploads and downloads in memory at the same time
 
 def create_app(
     path: str | os.PathLike[str],
+    url: str,
     *,
     score_workers: int = 0,
-    url: str = "",
     isolation: Isolation = "bwrap",
     season_secrets: Iterable[str | os.PathLike[str]] = (),
 ) -> FastAPI:
@@ -72,17 +69,19 @@ def create_app(
 
     Args:
       path: the board's folder.
+      url: the board's address, which its pages show, and for which whatever is sent must be signed.
+        It is never taken from a request, whose Host header anyone can choose.
       score_workers: number of scorer processes that run as long as the application does.
-      url: the board's public address, shown on its pages; empty if it is not known. It is never
-        taken from a request, whose Host header anyone can choose.
       isolation: of the processes that read and run policies; "process" if nobody else can submit.
       season_secrets: the masters of the sealed-online seasons that this server steps.
     """
     _refuse_missing(isolation)
     store = Store.open(os.fspath(path))
-    tracks = [SeasonRoutes(store, season_secrets)] if find_spec("leaderboard.seasons") else []
-    pages = _PageCache(store, url, [track.section for track in tracks])
-    routes = _Routes(store, pages, isolation)
+    address = server_address(url, insecure=True).url
+    with_seasons = find_spec("leaderboard.seasons") is not None
+    tracks = [SeasonRoutes(store, season_secrets, address)] if with_seasons else []
+    pages = _PageCache(store, address, [track.section for track in tracks])
+    routes = _Routes(store, pages, isolation, address)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -142,8 +141,8 @@ class _Routes:
     can share the last free place of a quota; neither can two uploads.
     """
 
-    def __init__(self, store: Store, pages: _PageCache, isolation: Isolation) -> None:
-        self._store, self._isolation = store, isolation
+    def __init__(self, store: Store, pages: _PageCache, isolation: Isolation, address: str) -> None:
+        self._store, self._isolation, self._address = store, isolation, address
         self._documents = CapacityLimiter(1)
         self._admissions = CapacityLimiter(1)
         self._objects = CapacityLimiter(_OBJECTS)
@@ -171,8 +170,8 @@ class _Routes:
 
     async def put_object(self, request: Request, digits: str) -> Response:
         digest = _digest(digits)
-        header, board = request.headers.get("Authorization"), self._store.document.key
-        key = intake.uploader(header, digest, board=board)
+        header = request.headers.get("Authorization")
+        key = intake.uploader(self._store.document, header, digest, self._address)
 
         def put(data: bytes) -> bool:
             intake.check_upload(self._store, key, len(data))
@@ -203,16 +202,15 @@ class _Routes:
         text = await http.read_body(request, MAX_BYTES, "submission")
 
         # Garbage without a valid signature never waits with submissions, whose check is longer.
-        def read() -> Envelope[SignedSubmission]:
-            return Envelope.read(text, SignedSubmission)
+        signed = await to_thread.run_sync(Signed[Submission].read, text, limiter=self._documents)
 
-        envelope = await to_thread.run_sync(read, limiter=self._documents)
+        def admit() -> bool:
+            return intake.admit(
+                self._store, signed, isolation=self._isolation, address=self._address
+            )
 
-        def receive() -> bool:
-            return intake.receive(self._store, envelope, isolation=self._isolation)
-
-        new = await to_thread.run_sync(receive, limiter=self._admissions)
-        id = envelope.id
+        new = await to_thread.run_sync(admit, limiter=self._admissions)
+        id = signed.id
         url = f"/api/submissions/{hex_of(id)}"
         return JSONResponse({"id": id, "url": url}, 202 if new else 200, headers={"Location": url})
 
@@ -223,9 +221,9 @@ class _Routes:
         text = await http.read_body(request, MAX_BYTES, "withdrawal")
 
         def withdraw() -> str:
-            signed = SignedWithdrawal.read(text)
-            self._store.withdraw(signed)
-            return signed.withdrawal.submission
+            signed = Signed[Withdrawal].read_unverified(text)
+            self._store.withdraw(signed, self._address)
+            return signed.content.submission
 
         id = await to_thread.run_sync(withdraw, limiter=self._documents)
         return JSONResponse({"id": id, "status": "withdrawn"})

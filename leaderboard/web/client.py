@@ -16,12 +16,12 @@ from typing import Any
 
 from leaderboard.bundle import Bundle
 from leaderboard.documents.board import BoardDocument, hex_of
-from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import SignedWithdrawal
+from leaderboard.documents.signed import Receiver, SigningKey
+from leaderboard.documents.submission import Withdrawal, now
 from leaderboard.errors import CODES, BoardError, Rejection
 from leaderboard.intake import upload_header
 from sme_registry.errors import MalformedDocumentError, OptionError, SealedError, SpecError
-from sme_registry.io import parse_json
+from sme_registry.io import parse_json, server_address
 from sme_registry.seasons.wire import Connection
 
 Progress = Callable[[int, int], None]
@@ -48,17 +48,22 @@ def submit(
       insecure: allow plain http to other machines, in a network that you trust.
     """
     content = Bundle.read(bundle)
-    runs = content.signed.submission.runs
+    runs = content.signed.content.runs
     digests = dict.fromkeys(run.artefact.sha256 for run in runs if run.artefact)
     with ServedBoard(url, insecure=insecure) as served:
-        board = served.document().key
-        signed = content.signed.for_board(board, key)
+        signed = content.signed.for_receiver(served.receiver(), key)
         for done, digest in enumerate(digests, start=1):
-            served.upload(digest, content.artefact(digest), key, board)
+            served.upload(digest, content.artefact(digest), key, signed.receiver)
             if progress is not None:
                 progress(done, len(digests))
         answer = served.request("POST", "/api/submissions", signed.to_bytes())
     return str(answer_for(signed.id, answer, url)["id"])
+
+
+def receiver_of(url: str, *, insecure: bool = False) -> Receiver:
+    """A served board and its address, for which whatever is sent to it must be signed."""
+    with ServedBoard(url, insecure=insecure) as served:
+        return served.receiver()
 
 
 def page_of(url: str, id: str) -> str:
@@ -88,7 +93,8 @@ def withdraw(
     """Withdraw a submission that this key has signed; its page shows the reason."""
     id = f"sha256:{_digits(id)}"
     with ServedBoard(url, insecure=insecure) as served:
-        signed = SignedWithdrawal.create(id, key, reason, board=served.document().key)
+        withdrawal = Withdrawal(submission=id, created=now(), reason=reason)
+        signed = withdrawal.signed(key, served.receiver())
         served.request("POST", "/api/withdrawals", json.dumps(signed.to_dict()).encode())
 
 
@@ -100,6 +106,7 @@ class ServedBoard:
 
     def __init__(self, url: str, *, insecure: bool) -> None:
         self._url = url
+        self._address = server_address(url, insecure=insecure).url
         self._connection = Connection(url, insecure=insecure, patience=_PATIENCE)
 
     def __enter__(self) -> ServedBoard:
@@ -116,9 +123,13 @@ class ServedBoard:
         except SpecError as error:
             raise BoardError(f"{self._url}: its definition is invalid: {error}") from None
 
-    def upload(self, digest: str, data: bytes, key: SigningKey, board: str | None) -> None:
+    def receiver(self) -> Receiver:
+        """Who takes signatures: the address is where this client has reached the board."""
+        return Receiver(self.document().key, self._address)
+
+    def upload(self, digest: str, data: bytes, key: SigningKey, receiver: Receiver) -> None:
         """Send an object, also if the board has it: only who has its bytes may submit it."""
-        sign = functools.partial(upload_header, key, digest, board=board)
+        sign = functools.partial(upload_header, key, digest, receiver)
         self.request("PUT", f"/api/objects/{hex_of(digest)}", data, sign)
 
     def request(

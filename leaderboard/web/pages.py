@@ -26,7 +26,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.result import METRICS, Estimate, Metric, Result
-from leaderboard.documents.submission import SignedSubmission
+from leaderboard.documents.signed import Signed
+from leaderboard.documents.submission import Submission
 from leaderboard.errors import CODES, NotPublishable
 from leaderboard.scoring import ranking
 from leaderboard.store import EntryRow, Store
@@ -67,8 +68,8 @@ class Section(NamedTuple):
 class Pages:
     """The pages of a board in its present state. Create another when its log has grown.
 
-    `address` is the URL at which the board accepts submissions; empty if it is served at an unknown
-    URL; None for a copy that accepts none. Explorers take a second each, so a server has none.
+    `address` is the URL at which the board accepts submissions; None for a copy that accepts none.
+    Explorers take a second each, so a server has none.
     """
 
     def __init__(
@@ -84,7 +85,7 @@ class Pages:
         self._explorers = explorers
         self._address = address
         self.document = store.document
-        self._latest: tuple[str, tuple[SignedSubmission, Result | None]] | None = None
+        self._latest: tuple[str, tuple[Signed[Submission], Result | None]] | None = None
 
     @cached_property
     def entries(self) -> list[EntryRow]:
@@ -222,7 +223,7 @@ class Pages:
         withheld = self.preparing and result is not None and result.scores is not None
         result = None if withheld else result
         withdrawal = self.store.withdrawal(id)
-        submission = signed.submission
+        submission = signed.content
         edges = self.document.protocol.edges
         chart, classes = "", []
         if result is not None and result.scores is not None:
@@ -246,7 +247,7 @@ class Pages:
             copies=[(each, self._by_id[each.id]) for each in entry.copy_of],
             versions=[(other, self._reasons.get(other.id, "")) for other in versions],
             entry=entry,
-            withdrawal=withdrawal and withdrawal.withdrawal,
+            withdrawal=withdrawal and withdrawal.content,
             codes=CODES,
             chart=chart,
             classes=classes,
@@ -339,7 +340,7 @@ class Pages:
             return self.store.folder.submission(id).read_bytes()  # verified by the store
         return self.store.folder.result(id).read_bytes() if result is not None else None
 
-    def _documents(self, id: str) -> tuple[SignedSubmission, Result | None]:
+    def _documents(self, id: str) -> tuple[Signed[Submission], Result | None]:
         """A submission and its result; the latest are kept, because three files need them."""
         latest = self._latest  # read once: a server's threads share these pages
         if latest is None or latest[0] != id:
@@ -350,7 +351,7 @@ class Pages:
         """The runs of a submission that have an explorer."""
         if not self._explorers or self._by_id[id].status != "scored":
             return []
-        runs = enumerate(self._documents(id)[0].submission.runs)
+        runs = enumerate(self._documents(id)[0].content.runs)
         return [n for n, run in runs if run.artefact is not None and run.spec in self._shown]
 
     def _explorer(self, name: str) -> bytes | None:
@@ -359,7 +360,7 @@ class Pages:
         id = f"sha256:{digits}"
         if id not in self._by_id or number not in map(str, self._explored(id)):
             return None
-        submission = self._documents(id)[0].submission
+        submission = self._documents(id)[0].content
         run, method = submission.runs[int(number)], submission.method
         assert run.artefact is not None  # it is explored
         data = self.store.objects.read(run.artefact.sha256)

@@ -59,7 +59,8 @@ def serve(
       port: 0 for any free port.
       workers: number of scorer processes; 0 for none.
       announce: called with the board's URL once it listens.
-      url: the board's public address, which its pages show; empty if it is not known.
+      url: the board's public address, which its pages show, and for which whatever is sent must be
+        signed; by default where it listens.
       behind_proxy: only a reverse proxy reaches this address, as in docs/guides/deployment.md.
       unsafe_no_sandbox: score without bubblewrap. Submitted policies could then read the files of
         this account and use the network, so nobody else may be able to submit. Not with the master
@@ -83,19 +84,24 @@ def serve(
             "unsafe_no_sandbox=True: must be False with season_secrets, which submitted policies "
             "could read. Install bubblewrap, or score no submissions (--workers 0)."
         )
+    if behind_proxy and not url:
+        raise OptionError(
+            "url='': must be the address at which the proxy is reached, such as "
+            "https://board.example: what is sent to a board is signed for its address."
+        )
     require_packages("serving a board", {"fastapi": "FastAPI", "uvicorn": "uvicorn"}, "leaderboard")
     import uvicorn
 
     from leaderboard.web.app import create_app
 
-    app = create_app(
-        path,
-        score_workers=workers,
-        url=url.rstrip("/"),
-        isolation="process" if unsafe_no_sandbox else "bwrap",
-        season_secrets=secrets,
-    )
     with listen(host, port) as listener:
+        app = create_app(
+            path,
+            url or url_of(listener),
+            score_workers=workers,
+            isolation="process" if unsafe_no_sandbox else "bwrap",
+            season_secrets=secrets,
+        )
         announce(url_of(listener))
         # Uvicorn shuts down on both signals, then raises the one it received.
         previous = signal.signal(signal.SIGTERM, signal.default_int_handler)

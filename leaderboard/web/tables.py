@@ -22,7 +22,8 @@ from leaderboard.documents.result import (
     Result,
     RunScore,
 )
-from leaderboard.documents.submission import Run, SignedSubmission, SignedWithdrawal, Submission
+from leaderboard.documents.signed import Receiver, Signed
+from leaderboard.documents.submission import Run, Submission, Withdrawal
 from leaderboard.errors import NotPublishable
 from leaderboard.scoring import ranking
 from leaderboard.scoring.aggregation import class_mean, groups_of, never_listed
@@ -345,10 +346,10 @@ class PublicView:
     id: str
     status: str
     received: str
-    signed: SignedSubmission
+    signed: Signed[Submission]
     result: Result | None
     withheld: str
-    withdrawal: SignedWithdrawal | None
+    withdrawal: Signed[Withdrawal] | None
     not_ranked: str = ""
     copy_of: tuple[tuple[str, int], ...] = ()
     place: int = 0
@@ -361,15 +362,15 @@ class PublicView:
         try:
             result, withdrawal = plain["result"], plain["withdrawal"]
             signed = {name: plain[name] for name in ("submission", "signature")}
-            signed["board"] = plain.get("board")  # absent on boards of rules 1
+            signed |= {name: plain.get(name) for name in Receiver._fields}  # absent in older ones
             view = cls(
                 id=str(plain["id"]),
                 status=str(plain["status"]),
                 received=str(plain["received"]),
-                signed=SignedSubmission.from_dict(signed),
+                signed=Signed[Submission].from_dict(signed),
                 result=None if result is None else Result.from_dict(result),
                 withheld=str(plain["withheld"]),
-                withdrawal=None if withdrawal is None else SignedWithdrawal.from_dict(withdrawal),
+                withdrawal=None if withdrawal is None else Signed[Withdrawal].from_dict(withdrawal),
                 not_ranked=str(plain.get("not_ranked", "")),
                 copy_of=tuple((str(x["id"]), int(x["runs"])) for x in plain.get("copy_of", ())),
                 place=int(plain.get("place", 0)),

@@ -57,9 +57,9 @@ def choice(
 
 
 class Address(NamedTuple):
-    """Where a server is reached; `url` and `path` end in no slash."""
+    """Where a server is reached; `path` ends in no slash."""
 
-    url: str
+    url: str  # the same text for each way to write the address
     is_https: bool
     host: str  # without brackets
     port: int | None  # None is the usual one
@@ -86,13 +86,11 @@ def server_address(url: str, *, insecure: bool = False) -> Address:
         raise OptionError(
             f"url={url!r:.80}: must be http(s)://host[:port][/path]. Copy it from the board's page."
         )
-    address = Address(
-        f"{parts.scheme}://{parts.netloc}{parts.path}".rstrip("/"),
-        parts.scheme == "https",
-        parts.hostname,
-        port,
-        parts.path.rstrip("/"),
-    )
+    host, path = parts.hostname, parts.path.rstrip("/")
+    name = "127.0.0.1" if host == "localhost" else f"[{host}]" if ":" in host else host
+    usual = {"http": 80, "https": 443}[parts.scheme]
+    place = name if port in (None, usual) else f"{name}:{port}"
+    address = Address(f"{parts.scheme}://{place}{path}", parts.scheme == "https", host, port, path)
     if not (address.is_https or address.is_local or insecure):
         raise OptionError(
             f"url={url!r:.80}: must be https for another machine. "

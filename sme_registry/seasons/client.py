@@ -30,7 +30,7 @@ from sme_registry.evaluation import Policy
 from sme_registry.evaluation.policies import as_policy
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.evaluation.regions import batch_rows
-from sme_registry.io import integer_in, parse_json, sha256_of
+from sme_registry.io import integer_in, parse_json, server_address, sha256_of
 from sme_registry.seasons.wire import (
     PATIENCE,
     Connection,
@@ -88,6 +88,7 @@ class Instance:
     ) -> None:
         ticket = ticket if isinstance(ticket, Ticket) else Ticket.read(ticket)
         member = ticket.place(instance).member
+        _check_address(ticket, server_address(url, insecure=insecure).url)
         self.setting: Setting = member.setting
         self.budget = member.budget
         self.number = 0
@@ -182,6 +183,15 @@ class Instance:
         ticket = self._ticket
         path = instance_path(ticket.season, ticket.ticket, self._instance, action)
         return self._connection.request(method, path, body, most=most)
+
+
+def _check_address(ticket: Ticket, address: str) -> None:
+    own = None if ticket.signer is None else ticket.signer.address
+    if own not in (None, address):
+        raise OptionError(
+            f"url={address!r:.80}: must be {own}, where the ticket was started: another server "
+            "could take its steps."
+        )
 
 
 class SealedVectorEnv(VectorEnv[Observation, Array, Array]):

@@ -29,7 +29,9 @@ Arrays travel as .npy files of version 1.0, type `<f4`, C order and two axes; no
 
 Answers are signed, so that no board can replace them, or the steps, unnoticed:
 
-    signature = Ed25519(key, "sme-leaderboard/answers/" board "/" digest of the `Statement`)
+    signature = Ed25519(key, "sme-leaderboard/answers/" board "/" address "/" digest)
+
+of the `Statement`; `address "/"` is left out for tickets that were started by earlier versions.
 
 The request for the ticket names the key's public half, and is signed by the entrant's own key. The
 ticket's file has the private half, so that a machine can step and answer without the entrant's.
@@ -114,6 +116,7 @@ class Signer(Document):
     """The key of a ticket's answers; `repr` does not show it."""
 
     board: _Hex  # its public key
+    address: Annotated[str, Field(max_length=300)] | None = None  # at which it gave the ticket
     request: Digest  # id of the request for the ticket
     key: _Secret  # Ed25519's 32 private bytes
 
@@ -122,7 +125,8 @@ class Signer(Document):
         require_signatures()
         from nacl.signing import SigningKey
 
-        message = f"sme-leaderboard/answers/{self.board}/{statement.digest}".encode()
+        parts = ["sme-leaderboard", "answers", self.board, self.address, statement.digest]
+        message = "/".join(filter(None, parts)).encode()
         return SigningKey(bytes.fromhex(self.key)).sign(message).signature.hex()
 
 

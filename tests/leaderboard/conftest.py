@@ -5,20 +5,15 @@ from collections.abc import Callable
 
 import pytest
 
-from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import (
-    SignedSubmission,
-    SignedWithdrawal,
-    Submission,
-    now,
-)
+from leaderboard.documents.signed import Receiver, Signed, SigningKey
+from leaderboard.documents.submission import Submission, Withdrawal, now
 from leaderboard.store import Store
 from sme_registry import EvaluationProtocol
 from sme_registry.io import sha256_of
 from sme_registry.spec import Suite
 from tests.leaderboard.clocks import move_clock
 
-Submit = Callable[..., SignedSubmission]
+Submit = Callable[..., Signed[Submission]]
 
 
 def tiny_suite(instances=1):
@@ -103,7 +98,7 @@ def tiny_submission(store, key, number=0, **fields):
         },
         **fields,
     }
-    return Submission.from_dict(plain).signed(key, store.document.key), {digest: data}
+    return Submission.from_dict(plain).signed(key, Receiver(store.document.key)), {digest: data}
 
 
 def put_submission(store, key, number=0, **fields):
@@ -128,9 +123,10 @@ def put_policy(store, key, data, number=0):
     return put_submission(store, key, number, runs=[run])
 
 
-def signed_withdrawal(store, id, key, reason="a test"):
+def signed_withdrawal(store, id, key, reason="a test", address=None):
     """A withdrawal of a submission of a board, signed by this key."""
-    return SignedWithdrawal.create(id, key, reason, board=store.document.key)
+    withdrawal = Withdrawal(submission=id, created=now(), reason=reason)
+    return withdrawal.signed(key, Receiver(store.document.key, address))
 
 
 @pytest.fixture

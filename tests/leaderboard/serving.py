@@ -10,6 +10,7 @@ from pathlib import Path
 import httpx
 import uvicorn
 
+from leaderboard.documents.signed import Receiver
 from leaderboard.intake import upload_header
 from leaderboard.web.app import create_app
 from leaderboard.web.server import listen, server_config, url_of
@@ -28,10 +29,10 @@ serve(sys.argv[1], port=0, workers=int(sys.argv[2]), announce=lambda url: print(
 @contextlib.contextmanager
 def serving(path, seen=None, **options):
     """A server in a thread; yields its URL. A list `seen` gets the application's requests."""
-    app = create_app(path, **options)
-    if seen is not None:
-        app.add_middleware(_Seen, seen=seen)
     with listen("127.0.0.1", 0) as listener:
+        app = create_app(path, options.pop("url", url_of(listener)), **options)
+        if seen is not None:
+            app.add_middleware(_Seen, seen=seen)
         server = uvicorn.Server(server_config(app))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
@@ -62,8 +63,13 @@ class _Seen:
 
 def authorization(url, key, digest, time=None):
     """The header that lets a key upload an object to the board at this address."""
+    return upload_header(key, digest, receiver(url), time)
+
+
+def receiver(url, address=None):
+    """For whom to sign what is sent to a board, by default at the address where it is reached."""
     board = httpx.get(f"{url}/definition.json", trust_env=False).json()["key"]
-    return upload_header(key, digest, time, board=board)
+    return Receiver(board, address or url)
 
 
 @contextlib.contextmanager

@@ -9,8 +9,8 @@ import pytest
 
 from leaderboard.bundle import Bundle, make_bundle
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, MAX_BYTES, Submission, Training
+from leaderboard.documents.signed import MAX_BYTES, SigningKey
+from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, Submission, Training
 from leaderboard.errors import Rejection
 from leaderboard.gate.reference import constant_onnx, optimal_onnx
 from sme_registry import SMESpec, save
@@ -76,7 +76,7 @@ def bundle(tmp_path, whole):
 
 
 def digest_of(bundle, index=0):
-    return bundle.signed.submission.runs[index].artefact.sha256
+    return bundle.signed.content.runs[index].artefact.sha256
 
 
 def artefact_path(bundle):
@@ -95,7 +95,7 @@ def refused(code, match, act, *arguments, **kwargs):
 def test_a_table_becomes_a_signed_submission_that_reads_as_it_was_made(whole):
     read = Bundle.read(str(whole.folder))
     assert read == whole
-    submission = read.signed.submission
+    submission = read.signed.content
     assert read.signed.id == submission.digest
     for run, spec in zip(submission.runs[:2], (A0, A1), strict=True):
         assert read.artefact(run.artefact.sha256) == optimal_onnx(spec)
@@ -148,7 +148,7 @@ def test_bytes_that_are_not_the_signed_ones_are_refused(bundle):
         match = "must be .* bytes of sha256:"
         refused("artefact_digest", match, bundle.artefact, digest_of(bundle))
     path.write_bytes(data)
-    submission = bundle.signed.submission.to_dict()
+    submission = bundle.signed.content.to_dict()
     submission["runs"][0]["artefact"]["size"] = 5
     lying = Bundle(bundle.folder, Submission.from_dict(submission).signed(KEY))
     refused("artefact_digest", "must be 5 bytes", lying.artefact, digest_of(bundle))
@@ -209,7 +209,7 @@ def test_specs_of_a_table_may_be_ids_digests_or_paths(tmp_path, table):
         {**row(A0, None if seed else "default.onnx", seed), "spec": spec}
         for seed, spec in enumerate(["SME/Default-v1", SMESpec().digest, "one.json"])
     ]
-    submission = made(tmp_path / "bundle", rewritten(table, rows), suite=file).signed.submission
+    submission = made(tmp_path / "bundle", rewritten(table, rows), suite=file).signed.content
     default, other = suite.instances
     assert [run.spec for run in submission.runs] == [default.digest, default.digest, other.digest]
 
@@ -238,7 +238,7 @@ def failed(table):
 
 def test_trained_runs_are_exported_with_their_records(tmp_path, trained, failed):
     bundle = made(tmp_path / "bundle", trained, failed)
-    submission = Bundle.read(bundle.folder).signed.submission
+    submission = Bundle.read(bundle.folder).signed.content
     run = submission.runs[0]
     assert (run.spec, run.seed, run.steps) == (A0.digest, 3, 10)
     assert bundle.artefact(run.artefact.sha256)
@@ -257,7 +257,7 @@ def test_a_saved_model_may_stand_in_a_table_and_facts_that_are_given_are_taken(
     facts = Training(library="own", hyperparameters="own", hardware="a laptop")
     bundle = made(tmp_path / "bundle", rewritten(table, rows), training=facts)
     assert bundle.artefact(digest_of(bundle))
-    assert bundle.signed.submission.training == facts
+    assert bundle.signed.content.training == facts
 
 
 def test_records_of_runs_are_cut_and_unfinished_repeated_or_missing_runs_refused(
@@ -267,7 +267,7 @@ def test_records_of_runs_are_cut_and_unfinished_repeated_or_missing_runs_refused
     folder = copied / "A2C" / "0"
     long = {"hyperparameters": {"x": "x" * 3000}, "versions": {"torch": "y" * 300}}
     RunRecord.read(folder).updated(**long).write(folder)
-    facts = made(tmp_path / "long", copied, failed).signed.submission.training
+    facts = made(tmp_path / "long", copied, failed).signed.content.training
     assert len(facts.hyperparameters) == 2000  # what a submission holds
     assert len(facts.library) == 200
 
@@ -401,7 +401,7 @@ def test_one_policy_may_stand_for_two_instances_and_more_runs_may_have_started(t
     )
     assert len(list((bundle.folder / "artefacts").iterdir())) == 1
     assert seen == [(1, 3), (2, 3), (3, 3)]
-    assert bundle.signed.submission.runs_started == {"A": 2, "B": 7}
+    assert bundle.signed.content.runs_started == {"A": 2, "B": 7}
 
 
 @pytest.fixture(scope="module")
@@ -427,12 +427,12 @@ def study(tmp_path_factory):
 
 def test_the_runs_of_a_study_are_submitted_with_their_records(tmp_path, study):
     bundle = made(tmp_path / "bundle", study)  # the only algorithm that ran
-    submission = Bundle.read(bundle.folder).signed.submission
+    submission = Bundle.read(bundle.folder).signed.content
     assert {run.spec for run in submission.runs} == {spec.digest for spec in SUITE.instances}
     assert all(run.steps >= 10 and run.artefact is not None for run in submission.runs)
     assert "stable_baselines3" in submission.training.library
     assert submission.training.hyperparameters.startswith("A2C, default hyperparameters")
-    assert made(tmp_path / "same", study, algorithm="a2c").signed.submission.runs
+    assert made(tmp_path / "same", study, algorithm="a2c").signed.content.runs
     with pytest.raises(OptionError, match=r"4 of 4 runs are not finished"):
         made(tmp_path / "other", study, algorithm="Other")
     with pytest.raises(OptionError, match=r"algorithm='TD3': .* has runs of A2C"):
@@ -448,7 +448,7 @@ def test_a_failed_run_of_a_study_is_submitted_without_a_policy(tmp_path, study):
     (copy / "failed").mkdir(exist_ok=True)
     (copy / "failed" / result.name).write_text(json.dumps(failure.to_dict()))
     result.unlink()
-    runs = made(tmp_path / "bundle", copy).signed.submission.runs
+    runs = made(tmp_path / "bundle", copy).signed.content.runs
     failed = [run for run in runs if run.artefact is None]
     assert [(run.spec, run.seed) for run in failed] == [(cell.cell.spec.digest, cell.cell.seed)]
     shutil.rmtree(copy / "models")

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from leaderboard.cli import app
 from leaderboard.cli.options import KEY_VARIABLE
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import SigningKey
 from leaderboard.gate import isolation
 from leaderboard.store import Store
 from sme_registry import EvaluationProtocol
@@ -367,7 +367,7 @@ def test_score_lists_what_it_could_not_score_and_why_and_counts_its_own(scored):
     id = make_bundle("other", "--method", "Other")
     good("submit", "other", "board")
     with Store.open("board", read_only=True) as store:
-        run = next(run for run in store.submission(id).submission.runs if run.artefact)
+        run = next(run for run in store.submission(id).content.runs if run.artefact)
         path = store.folder.object(run.artefact.sha256)
     artefact = path.read_bytes()
     path.chmod(0o644)

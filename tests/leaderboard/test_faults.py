@@ -7,6 +7,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
+from leaderboard.documents.signed import Receiver
 from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import run_scorers
 from leaderboard.store import collect_garbage
@@ -102,13 +103,13 @@ def test_rows_of_many_entries_are_read_from_the_index_alone(tmp_path, key, monke
     monkeypatch.setattr(os, "fsync", lambda handle: None)
     with tiny_board(tmp_path / "board", instances=runs) as store:
         with store.transaction():
-            first = put_submission(store, key).submission
+            first = put_submission(store, key).content
             result = synthetic_result(store, first.digest)
             for number in range(entries):
                 if number > 0:
                     method = first.method.model_copy(update={"name": f"Method {number}"})
                     other = first.model_copy(update={"method": method})
-                    store.receive(other.signed(key, store.document.key))
+                    store.receive(other.signed(key, Receiver(store.document.key)))
                 claim = store.queue.claim("filler")
                 update = {"submission": claim.id}
                 assert store.queue.finish(claim, result.model_copy(update=update))

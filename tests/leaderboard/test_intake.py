@@ -5,15 +5,9 @@ import pytest
 
 from leaderboard import intake
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Result
-from leaderboard.documents.submission import (
-    Envelope,
-    SignedSubmission,
-    SignedWithdrawal,
-    Submission,
-    utc,
-)
+from leaderboard.documents.signed import Receiver, Signed, SigningKey
+from leaderboard.documents.submission import Submission, utc
 from leaderboard.errors import Rejection, ScoringFault
 from leaderboard.gate import gate, sandbox
 from leaderboard.intake import admission, references
@@ -57,13 +51,13 @@ def code_of(call):
 
 def receive(store, signed):
     """Admit a submission from its bytes, as a server does."""
-    read = SignedSubmission.read(signed.to_bytes())
+    read = Signed[Submission].read(signed.to_bytes())
     intake.admit(store, read)
     return read.id
 
 
 def resigned(store, key, plain):
-    return Submission.from_dict(plain).signed(key, store.document.key)
+    return Submission.from_dict(plain).signed(key, Receiver(store.document.key))
 
 
 def uploaded(store, key, number=0, **fields):
@@ -77,7 +71,7 @@ def with_artefact(store, key, data):
     """A submission of a file that is on the board, whatever it is."""
     digest = sha256_of(data)
     put(store, key, {digest: data})
-    plain = tiny_submission(store, key)[0].submission.to_dict()
+    plain = tiny_submission(store, key)[0].content.to_dict()
     for run in plain["runs"]:
         run["artefact"] = {"sha256": digest, "size": len(data)}
     return resigned(store, key, plain)
@@ -189,16 +183,16 @@ def test_public_documents_that_strangers_send_again_count_for_nobody(tmp_path, k
     with tiny_board(tmp_path / "b", limits={"submissions_per_day": 2}) as store:
         gone = put_submission(store, key, 1)
         store.withdraw(signed_withdrawal(store, gone.id, key))
-        elsewhere = gone.submission.signed(key, "a" * 64)
+        elsewhere = gone.content.signed(key, Receiver("a" * 64))
         for signed, code in 2 * ((gone, "withdrawn"), (elsewhere, "wrong_board")):
-            envelope = Envelope.read(signed.to_bytes(), SignedSubmission)
-            assert code_of(partial(intake.receive, store, envelope)) == code
-        last = Envelope.read(uploaded(store, key, 2).to_bytes(), SignedSubmission)
-        assert intake.receive(store, last)
+            envelope = Signed[Submission].read(signed.to_bytes())
+            assert code_of(partial(intake.admit, store, envelope)) == code
+        last = Signed[Submission].read(uploaded(store, key, 2).to_bytes())
+        assert intake.admit(store, last)
 
 
 def test_an_artefact_of_another_size_or_width_is_refused_and_a_failed_run_needs_none(store, key):
-    plain = uploaded(store, key).submission.to_dict()
+    plain = uploaded(store, key).content.to_dict()
     (run,) = plain["runs"]
     other = {**run, "artefact": {**run["artefact"], "size": run["artefact"]["size"] - 1}}
     small = resigned(store, key, {**plain, "runs": [other]})
@@ -260,12 +254,12 @@ def test_a_submission_is_for_one_board(tmp_path, store, key):
     with tiny_board(tmp_path / "other") as other:
         put(other, key, artefacts)
         assert code_of(lambda: receive(other, signed)) == "wrong_board"
-        for_none = signed.submission.signed(key)
+        for_none = signed.content.signed(key)
         assert code_of(lambda: receive(other, for_none)) == "wrong_board"
         # Whoever has no key of the submitter cannot write another board into the envelope.
         relabelled = signed.model_copy(update={"board": other.document.key})
         assert code_of(lambda: receive(other, relabelled)) == "bad_signature"
-        assert receive(other, for_none.for_board(other.document.key, key)) == signed.id
+        assert receive(other, for_none.for_receiver(Receiver(other.document.key), key)) == signed.id
     assert store.entries() == []
 
 
@@ -294,11 +288,13 @@ def test_a_bundle_that_is_refused_leaves_nothing(tmp_path, store, key):
 
 def test_a_bundle_for_no_board_is_signed_for_the_board_it_is_sent_to(tmp_path, store, key):
     signed, artefacts = tiny_submission(store, key)
-    folder = bundle(tmp_path / "bundle", signed.submission.signed(key), artefacts)
+    folder = bundle(tmp_path / "bundle", signed.content.signed(key), artefacts)
     assert code_of(lambda: intake.submit_bundle(store, folder)) == "wrong_board"
     other = SigningKey.generate()
     assert code_of(lambda: intake.submit_bundle(store, folder, other)) == "bad_signature"
-    elsewhere = bundle(tmp_path / "other", signed.submission.signed(key, "a" * 64), artefacts)
+    elsewhere = bundle(
+        tmp_path / "other", signed.content.signed(key, Receiver("a" * 64)), artefacts
+    )
     assert code_of(lambda: intake.submit_bundle(store, elsewhere, key)) == "wrong_board"
     assert intake.submit_bundle(store, folder, key) == signed.id
     assert store.submission(signed.id) == signed
@@ -317,7 +313,7 @@ def test_reference_rows_exist_once_however_often_submitted(tmp_path, monkeypatch
         assert [row.knowledge for row in rows] == ["oracle", "family"]
         assert all(row.reference and row.runs == 2 for row in rows)
         opened = store.log(0, 1)[0].time
-        created = {store.submission(id).submission.created for id in ids}
+        created = {store.submission(id).content.created for id in ids}
         assert created == {opened}
         # Other versions may write other bytes.
         others = [each._replace(onnx=lambda _: linear_onnx(7)) for each in references.REFERENCES]
@@ -359,7 +355,8 @@ def test_only_the_submitter_withdraws_for_this_board_and_in_plain_text(store, ke
         (signed_withdrawal(store, "sha256:" + "0" * 64, key), "unknown_submission"),
     ]
     for board in (None, "a" * 64):
-        elsewhere = SignedWithdrawal.create(signed.id, key, board=board)
+        withdrawal = signed_withdrawal(store, signed.id, key).content
+        elsewhere = withdrawal.signed(key, Receiver(board))
         relabelled = elsewhere.model_copy(update={"board": store.document.key})
         refused += [(elsewhere, "wrong_board"), (relabelled, "bad_signature")]
     for letter in "\x1b\x00\r\u202e\u2028":
@@ -374,37 +371,49 @@ def test_only_the_submitter_withdraws_for_this_board_and_in_plain_text(store, ke
 # Uploads.
 
 
-def test_an_upload_is_signed_for_one_object_and_one_board(key):
+def test_an_upload_is_signed_for_one_object_one_board_and_one_address(store, key):
     this, that = "sha256:" + "1" * 64, "sha256:" + "2" * 64
-    board, other = "a" * 64, "b" * 64
-    unbound = intake.upload_header(key, this)
-    assert intake.uploader(unbound, this) == key.public
-    assert code_of(lambda: intake.uploader(unbound, that)) == "bad_signature"
-    assert code_of(lambda: intake.uploader(None, this)) == "bad_signature"
-    assert code_of(lambda: intake.uploader(unbound, this, board=board)) == "wrong_board"
+    here, there = "https://board.example", "https://other.example"
 
-    header = intake.upload_header(key, this, board=board)
-    assert intake.uploader(header, this, board=board) == key.public
-    assert code_of(lambda: intake.uploader(header, this, board=other)) == "wrong_board"
-    assert code_of(lambda: intake.uploader(header, this)) == "wrong_board"
-    relabelled = header.replace(board, other)
-    assert code_of(lambda: intake.uploader(relabelled, this, board=other)) == "bad_signature"
+    def sender(header, digest=this, address=here):
+        return intake.uploader(store.document, header, digest, address)
+
+    header = intake.upload_header(key, this, Receiver(store.document.key, here))
+    assert sender(header) == key.public
+    assert code_of(lambda: sender(header, that)) == "bad_signature"
+    assert code_of(lambda: sender(None)) == "bad_signature"
+    assert code_of(lambda: sender(header, address=there)) == "wrong_board"
+    for name, value, other in (
+        ("board", store.document.key, "b" * 64),
+        ("address", here, there),
+    ):
+        changed = intake.upload_header(
+            key, this, Receiver(store.document.key, here)._replace(**{name: other})
+        )
+        without = header.replace(f"{name}={value},", "")
+        assert code_of(partial(sender, changed)) == "wrong_board"
+        assert code_of(partial(sender, without)) == "wrong_board"
+        assert code_of(partial(sender, changed.replace(other, value))) == "bad_signature"
 
     time = utc(datetime.datetime.now(datetime.UTC))  # what signs a submission signs no upload
-    signature = key.sign("submission", f"{this} {time}")
-    header = f"SME-Ed25519 key={key.public},time={time},signature={signature}"
-    assert code_of(lambda: intake.uploader(header, this)) == "bad_signature"
+    receiver = Receiver(store.document.key, here)
+    forged = header.rpartition("=")[0] + "=" + key.sign("submission", f"{this} {time}", receiver)
+    assert code_of(lambda: sender(forged)) == "bad_signature"
 
 
 @pytest.mark.parametrize("minutes", [-11, 11])
-def test_an_upload_is_signed_for_ten_minutes(key, minutes):
-    digest = "sha256:" + "1" * 64
-    header = intake.upload_header(key, digest)
+def test_an_upload_is_signed_for_ten_minutes(store, key, minutes):
+    digest, receiver = "sha256:" + "1" * 64, Receiver(store.document.key, "https://board.example")
+    header = intake.upload_header(key, digest, receiver)
     moment = datetime.datetime.now(datetime.UTC)
     nearly = moment + datetime.timedelta(minutes=minutes * 9 / 11)
     past = moment + datetime.timedelta(minutes=minutes)
-    assert intake.uploader(header, digest, at=nearly) == key.public
-    assert code_of(lambda: intake.uploader(header, digest, at=past)) == "stale_time"
+
+    def sender(at):
+        return intake.uploader(store.document, header, digest, receiver.address, at)
+
+    assert sender(nearly) == key.public
+    assert code_of(lambda: sender(past)) == "stale_time"
 
 
 def test_upload_quotas_count_stored_bytes(tmp_path, key, monkeypatch):
@@ -422,7 +431,7 @@ def test_upload_quotas_count_stored_bytes(tmp_path, key, monkeypatch):
 
 def test_documents_count_like_artefacts(store, key):
     signed = put_submission(store, key)
-    (artefact,) = {run.artefact.size for run in signed.submission.runs if run.artefact}
+    (artefact,) = {run.artefact.size for run in signed.content.runs if run.artefact}
     used = artefact + len(signed.to_bytes())
     assert store.uploaded_bytes(key.public, ANY_TIME) == store.total_bytes() == used
     assert run_scorer(store.folder.path) == 1

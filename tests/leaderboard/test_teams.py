@@ -9,7 +9,7 @@ import pytest
 from leaderboard import intake
 from leaderboard.bundle import make_bundle
 from leaderboard.documents.board import BoardDocument
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import Rejection, TamperedError
 from leaderboard.gate import sandbox
 from leaderboard.gate.isolation import available_isolation

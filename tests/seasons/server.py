@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import SigningKey
 from leaderboard.seasons.scoring import instances
 from leaderboard.seasons.tickets import Attendant
 from leaderboard.store import Store
@@ -35,9 +35,9 @@ NONCE = 7
 class Server:
     """A served season, and one ticket of it."""
 
-    behind: str  # URL of the board's own server
     board: Board
     url: str = ""  # of the relay
+    behind: str = ""  # of the board's own server
     ticket: Ticket = field(init=False)
     requests: list[str] = field(default_factory=list)
     """Methods and last parts of the paths, as they arrived at the relay."""
@@ -48,7 +48,8 @@ class Server:
     def start(self):
         """Get a new ticket, as another entrant."""
         self.requests, self.faults = [], []
-        self.ticket = self.board.ticket(self.behind, SigningKey.generate(), NONCE)
+        key = SigningKey.generate()
+        self.ticket = self.board.ticket(self.behind, key, NONCE, address=self.url)
 
     def hidden(self, instance):
         """What is hidden of an instance."""
@@ -79,17 +80,18 @@ def serving_season(folder):
     board = online_board(folder, classes=CLASSES)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Attendant, "_start", lambda _: None)
-        with serving(board.path, season_secrets=[board.secret]) as url:
-            server = Server(url, board)
-            with _relay(server):
-                server.start()
-                yield server
+        server = Server(board)
+        with (
+            _relay(server),
+            serving(board.path, url=server.url, season_secrets=[board.secret]) as server.behind,
+        ):
+            server.start()
+            yield server
 
 
 @contextlib.contextmanager
 def _relay(server):
     """Let a server be reached through a relay, below the path /board."""
-    behind = urlsplit(server.behind).netloc
 
     class Handler(http.server.BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
@@ -122,7 +124,7 @@ def _relay(server):
             pass
 
     def forwarded(method, path, headers, body):
-        connection = http.client.HTTPConnection(behind)
+        connection = http.client.HTTPConnection(urlsplit(server.behind).netloc)
         with contextlib.closing(connection):
             chosen = {name: headers[name] for name in ("Authorization", "Content-Type")}
             connection.request(method, path.removeprefix("/board"), body, chosen)

@@ -144,8 +144,15 @@ def test_another_process_goes_on_where_one_was_killed(server):
         killed.step(parts[0])
 
 
+def test_a_ticket_is_shown_only_to_the_server_that_gave_it(server):
+    with pytest.raises(OptionError, match=f"url='{server.behind}': must be {server.url}"):
+        seasons.make(server.behind, server.ticket)
+    assert server.requests == []
+
+
 def test_after_an_interrupted_step_a_reset_goes_on(server, monkeypatch):
-    hidden = seasons.make_vec(server.behind, server.ticket, 0, 2)  # the relay is a client, too
+    ticket = server.ticket.model_copy(update={"signer": None})
+    hidden = seasons.make_vec(server.behind, ticket, 0, 2)  # the relay is a client, too
     hidden.reset()
     first, second, third = random_actions(2, 3)
     read = http.client.HTTPResponse.read

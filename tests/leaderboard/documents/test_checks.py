@@ -14,7 +14,8 @@ from leaderboard.documents.checks import (
     most_runs,
     refuse_unsubmittable,
 )
-from leaderboard.documents.submission import MAX_BYTES, SignedSubmission, Submission
+from leaderboard.documents.signed import MAX_BYTES, Signed
+from leaderboard.documents.submission import Submission
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.store import Store
 from sme_registry import EvaluationProtocol
@@ -213,7 +214,7 @@ def signed_runs(board, count, **changes):
         for number in range(count)
     ]
     made = submission(runs=runs, **changes)
-    return SignedSubmission(submission=made, signature="0" * 128).to_bytes()
+    return Signed[Submission](submission=made, signature="0" * 128).to_bytes()
 
 
 def test_the_most_runs_of_a_submission_fit_and_a_tenth_more_do_not():

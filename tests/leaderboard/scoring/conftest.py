@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from leaderboard.documents.board import Folder
-from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Result
-from leaderboard.documents.submission import SignedSubmission
+from leaderboard.documents.signed import Signed, SigningKey
+from leaderboard.documents.submission import Submission
 from leaderboard.scoring.aggregation import never_listed, result_of
 from leaderboard.scoring.worker import run_scorer
 from leaderboard.store import LogEntry, Store, digest_of
@@ -52,7 +52,7 @@ def make_board(folder):
     path, key = folder / "board", SigningKey.generate()
     with tiny_board(path) as store:
         put_policy(store, key, linear_onnx(0), 0)
-        (run,) = tiny_submission(store, key, 1)[0].submission.to_dict()["runs"]
+        (run,) = tiny_submission(store, key, 1)[0].content.to_dict()["runs"]
         failed = {**run, "seed": 7, "artefact": None}
         withdrawn = put_submission(store, key, 1, runs=[run, failed], runs_started={"Tiny": 3})
         put_policy(store, key, sensitive_onnx(), 2)
@@ -85,7 +85,7 @@ def with_runs(board, result, runs, **fields):
     """A result whose scores follow from these runs."""
     folder = Folder(board)
     signed = json.loads(folder.submission(result.submission).read_text())
-    submission = SignedSubmission.from_dict(signed).submission
+    submission = Signed[Submission].from_dict(signed).content
     unlisted = fields.pop("unlisted", never_listed(folder.read(), submission))
     return result_of(
         *(folder.read(), result.submission, runs, result.versions),
@@ -114,7 +114,7 @@ def resign(board, key, start=1):
             document = {"document": digest_of(result)}
         if entry.event == "received":
             text = folder.submission(entry.subject).read_text()
-            document = {"document": digest_of(SignedSubmission.from_dict(json.loads(text)))}
+            document = {"document": digest_of(Signed[Submission].from_dict(json.loads(text)))}
         entry = entry.model_copy(update={"previous": previous.digest, **document})
         signature = key.sign("log", entry.signed_digest)
         previous = entry.model_copy(update={"signature": signature})

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from leaderboard.documents.board import BoardDocument
-from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Estimate, Scores
+from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import NotPublishable
 from leaderboard.scoring.ranking import ranking, refuse_unpublishable, superseded
 from leaderboard.store import Copies, EntryRow

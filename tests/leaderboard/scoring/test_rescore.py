@@ -102,7 +102,7 @@ def test_a_rejected_policy_that_is_scored_here_is_not_confirmed(board, code):
 def test_scores_of_a_policy_that_is_rejected_are_found(board):
     scored, refused = result_on(board, STEADY), result_on(board, REFUSED)
     with Store.open(board, read_only=True) as store:
-        (run,) = store.submission(refused.submission).submission.runs
+        (run,) = store.submission(refused.submission).content.runs
     artefact = run.artefact.sha256
     seed = evaluation_seed(Folder(board).read().protocol.digest, run.spec, artefact)
     copy = scored.runs[0].model_copy(update={"artefact": artefact, "evaluation_seed": seed})

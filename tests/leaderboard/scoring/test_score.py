@@ -13,8 +13,8 @@ import pytest
 from onnx import numpy_helper
 
 from leaderboard.documents.board import BoardDocument
-from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import METRICS, Result
+from leaderboard.documents.signed import SigningKey
 from leaderboard.documents.submission import Submission
 from leaderboard.errors import BoardError
 from leaderboard.gate.isolation import available_isolation

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from leaderboard.documents.board import Folder, hex_of
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.ranking import ranking, refuse_unpublishable
 from leaderboard.scoring.verify import VerifyReport, close, verify

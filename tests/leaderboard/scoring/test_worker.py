@@ -115,7 +115,7 @@ def test_an_altered_file_of_one_entry_stops_no_other(store, submit, monkeypatch)
     document, artefact, whole = submit(1), submit(2), submit(3)
     paths = [
         store.folder.submission(document.id),
-        store.folder.object(artefact.submission.runs[0].artefact.sha256),
+        store.folder.object(artefact.content.runs[0].artefact.sha256),
     ]
     paths[0].write_bytes(paths[0].read_bytes().replace(b"Tester ", b"Somebo "))
     paths[1].write_bytes(bytes(paths[1].stat().st_size))

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import SigningKey
 from leaderboard.seasons.journal import Journal
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.stepping import Lanes

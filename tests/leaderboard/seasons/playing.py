@@ -9,13 +9,12 @@ from typing import NamedTuple
 import httpx
 import numpy as np
 
-from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import Envelope
+from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.errors import Rejection
 from leaderboard.intake import upload_header
 from leaderboard.seasons.admission import start_ticket
 from leaderboard.seasons.entrant import request_ticket
-from leaderboard.seasons.entry import SignedTicketRequest
+from leaderboard.seasons.entry import TicketRequest, signer_of
 from leaderboard.seasons.scores import score_ticket
 from leaderboard.seasons.season import Season
 from leaderboard.seasons.tickets import Tickets
@@ -24,6 +23,7 @@ from sme_registry.io import sha256_of
 from sme_registry.seasons import wire
 from tests.leaderboard.conftest import tiny_board
 from tests.leaderboard.seasons.sealing import MASTER, NOTHING, signed_request, tiny_season
+from tests.leaderboard.serving import receiver
 
 LANES = 4
 ROWS = 6 * 50
@@ -45,12 +45,15 @@ class Board(NamedTuple):
     def send(self, url, request, key):
         """What a served board answers to a request for a ticket that a key sends."""
         path = url + wire.tickets_path(self.season.id)
-        headers = {"Authorization": upload_header(key, request.id, board=request.board)}
+        if request.content.signer == key.public:
+            request = request.content.signed(key, Receiver(request.board, url))
+        headers = {"Authorization": upload_header(key, request.id, request.receiver)}
         return httpx.post(path, content=request.to_bytes(), headers=headers, trust_env=False)
 
-    def ticket(self, url, key, nonce=0):
-        """A new ticket of a served board."""
-        return request_ticket(url, self.season.id, self.request(key, nonce), key)
+    def ticket(self, url, key, nonce=0, address=None):
+        """A new ticket of a served board, whose address may not be where it is reached."""
+        request = self.request(key, nonce).for_receiver(receiver(url, address), key)
+        return request_ticket(url, self.season.id, request, key)
 
 
 def online_board(folder, limits=None, **fields):
@@ -85,7 +88,7 @@ class Played:
     def take_ticket(self, nonce=0):
         """Start a ticket; what follows is of this one."""
         self.request = self.board.request(self.key, nonce)
-        envelope = Envelope.read(self.request.to_bytes(), SignedTicketRequest)
+        envelope = Signed[TicketRequest].read(self.request.to_bytes())
         self.number, _ = start_ticket(self.store, envelope, self.board.season.digest)
         self.token = self.tickets.ticket(self.number).document.token
 
@@ -124,7 +127,7 @@ class Played:
 
     def signature(self, data, journal, instance=0):
         """The entrant's, of these answers and this digest of the steps."""
-        signer = self.request.signer(self.key)
+        signer = signer_of(self.request, self.key)
         assert signer is not None
         statement = wire.Statement(
             request=self.request.id,

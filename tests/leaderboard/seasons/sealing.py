@@ -2,6 +2,7 @@
 
 import datetime
 
+from leaderboard.documents.signed import Receiver
 from leaderboard.documents.submission import now, utc
 from leaderboard.scoring.aggregation import failed_run
 from leaderboard.seasons.entry import Entry, TicketRequest
@@ -84,11 +85,11 @@ def failed_result(season, subject):
 def signed_entry(store, season, key, answers, **fields):
     """An entry for a board, of answers that need not be on it."""
     plain = manifest(season, key, answers=answers, **fields)
-    return Entry.from_dict(plain).signed(key, store.document.key)
+    return Entry.from_dict(plain).signed(key, Receiver(store.document.key))
 
 
 def signed_request(store, season, key, nonce=0, **fields):
     """A request for a ticket of a board."""
     names = {"nonce": f"{nonce:064x}", "answers_key": key.of_answers(f"{nonce:064x}").public}
     plain = manifest(season, key, **{**names, **fields})
-    return TicketRequest.from_dict(plain).signed(key, store.document.key)
+    return TicketRequest.from_dict(plain).signed(key, Receiver(store.document.key))

@@ -4,12 +4,12 @@ import httpx
 import numpy as np
 import pytest
 
-from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, Envelope
+from leaderboard.documents.signed import Receiver, Signed, SigningKey
+from leaderboard.documents.submission import MAX_ARTEFACT_BYTES
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.scoring.verify import verify
 from leaderboard.seasons import admission as entries
-from leaderboard.seasons.entry import Entry, SignedEntry
+from leaderboard.seasons.entry import Entry
 from leaderboard.seasons.season import MAX_OFFLINE_INSTANCES
 from sme_registry.errors import SpecError
 from sme_registry.io import sha256_of
@@ -110,7 +110,9 @@ def test_what_changes_between_the_check_and_the_record_is_checked_again(store, k
     room = "leaderboard.seasons.admission.check_room"
     with monkeypatch.context() as patch:  # as `gc` of another process
         patch.setattr(room, lambda *_: path.unlink())
-        assert refused(store, signed, GOOD) == "artefact_missing"
+        store.put_object(sha256_of(GOOD), [GOOD], by=key.public)
+        with pytest.raises(Rejection, match="artefact_missing"):
+            entries.enter(store, signed)
 
     def taken(*arguments):
         other = SigningKey.generate()
@@ -134,7 +136,7 @@ def test_bad_entries_are_refused_with_stable_codes(store, key):
     assert refused(store, entry(store, key, None, None, submitter=reserved)) == "unsafe_name"
     elsewhere = signed_entry(store, tiny_season(id="elsewhere"), key, [None, None])
     assert refused(store, elsewhere) == "season_unknown"
-    unbound = entry(store, key, None, None).entry.signed(key, None)
+    unbound = entry(store, key, None, None).content.signed(key)
     assert refused(store, unbound) == "wrong_board"
     name = {"submitter": {"name": "Ada", "key": key.public}}
     assert send(store, entry(store, key, None, None, **name))
@@ -155,20 +157,25 @@ def test_an_entry_that_was_signed_before_one_of_its_method_is_refused(store, key
 def test_an_entry_that_is_sent_to_another_season_is_refused(store, key):
     other = tiny_season(id="other")
     store.announce(other)
-    envelope = Envelope.read(entry(store, key, None, None).to_bytes(), SignedEntry)
+    envelope = Signed[Entry].read(entry(store, key, None, None).to_bytes())
     with pytest.raises(Rejection, match="season_unknown"):
-        entries.receive_entry(store, envelope, other.digest)
-    assert entries.receive_entry(store, envelope, SEASON.digest)
+        entries.receive_entry(store, envelope, other.digest, None)
+    assert entries.receive_entry(store, envelope, SEASON.digest, None)
 
 
 def test_entries_over_http_have_the_same_codes(store, key):
-    signed, digits = entry(store, key, GOOD, None), sha256_of(GOOD)[7:]
-    elsewhere = signed_entry(store, tiny_season(id="elsewhere"), key, [None, None])
-    changed = signed.to_bytes().replace(b'"Test"', b'"Best"')
+    digits = sha256_of(GOOD)[7:]
+    known = entry(store, key, GOOD, None)
     with (
         serving(store.folder.path) as url,
         httpx.Client(base_url=url, trust_env=False) as client,
     ):
+        here = Receiver(store.document.key, url)
+        signed = known.content.signed(key, here)
+        elsewhere = signed_entry(store, tiny_season(id="elsewhere"), key, [None, None])
+        elsewhere = elsewhere.content.signed(key, here)
+        changed = signed.to_bytes().replace(b'"Test"', b'"Best"')
+        relayed = signed.content.signed(key, here._replace(address="https://relay.example"))
 
         def post(season, data):
             answer = client.post(f"/api/seasons/{season}/entries", content=data)
@@ -182,6 +189,8 @@ def test_entries_over_http_have_the_same_codes(store, key):
         assert post(SEASON.id, elsewhere.to_bytes()) == (404, "season_unknown")
         assert post(SEASON.id, changed) == (403, "bad_signature")
         assert post(SEASON.id, b"{") == (400, "not_json")
+        assert post(SEASON.id, known.to_bytes()) == (403, "wrong_board")
+        assert post(SEASON.id, relayed.to_bytes()) == (403, "wrong_board")
         assert [post(SEASON.id, signed.to_bytes()) for _ in range(2)] == [(201, ""), (200, "")]
         assert client.get(f"/api/objects/{digits}").status_code == 404  # nobody copies answers
     [row] = store.entrants(SEASON.digest)
@@ -192,9 +201,9 @@ def test_the_largest_season_has_entries_that_can_be_sent(store, key):
     most = MAX_OFFLINE_INSTANCES
     answers = [{"sha256": f"sha256:{i:064x}", "size": MAX_ARTEFACT_BYTES} for i in range(most)]
     signed = signed_entry(store, SEASON, key, answers, statement="x" * 2000)
-    envelope = Envelope.read(signed.to_bytes(), SignedEntry)
-    assert envelope.open() == signed
-    assert signed.is_valid
+    envelope = Signed[Entry].read(signed.to_bytes())
+    assert envelope == signed
+    assert signed.is_valid(store.document.key)
     tiny_season(instances=most)
     with pytest.raises(SpecError, match="must be at most 400 together"):
         tiny_season(instances=most + 1)

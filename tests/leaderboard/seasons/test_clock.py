@@ -46,7 +46,7 @@ def events(board, seconds=0.0, until=""):
 
 
 def withdraw(url, store, key, signed):
-    body = to_bytes(signed_withdrawal(store, signed.id, key))
+    body = to_bytes(signed_withdrawal(store, signed.id, key, address=url))
     return httpx.post(f"{url}/api/withdrawals", content=body, trust_env=False).status_code
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from leaderboard.cli.options import KEY_VARIABLE
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import SigningKey
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.publication import read_season
 from leaderboard.store import Store
@@ -109,7 +109,7 @@ def entered(*arguments):
     with Store.open("board", read_only=True) as store:
         row = store.entrant(id)
         assert row is not None
-        answers = store.entry_of(row).entry.answers
+        answers = store.entry_of(row).content.answers
         return [
             None if each is None else unpack_table(store.objects.read(each.sha256), 1)
             for each in answers

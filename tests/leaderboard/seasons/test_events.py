@@ -2,7 +2,7 @@
 
 import pytest
 
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.scoring.verify import verify
 from leaderboard.seasons.master import Master
@@ -70,8 +70,8 @@ def test_a_season_is_played_from_its_announcement_to_its_results_and_reindexed(s
         assert row.entrant.scores.wd_regret.value == 1.0
         assert store.sealed_result(row) == failed_result(season, row.entrant.id)
         assert store.revealed_master(season.id) == MASTER
-    assert store.entry_of(store.entrants(offline.digest)[0]).is_valid
-    assert store.request_of(store.ticket(online.digest, 1)).is_valid
+    assert store.entry_of(store.entrants(offline.digest)[0]).is_valid(store.document.key)
+    assert store.request_of(store.ticket(online.digest, 1)).is_valid(store.document.key)
     grown = derived(store)
     assert {row[0] for row in grown} >= {"season", "sealed", "answer"}
     store.reindex()

@@ -8,7 +8,8 @@ import httpx
 import numpy as np
 import pytest
 
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import SigningKey
+from leaderboard.seasons.entry import signer_of
 from leaderboard.seasons.scores import score_ticket
 from leaderboard.seasons.scoring import instances
 from leaderboard.seasons.ticket import RunningTicket
@@ -19,7 +20,7 @@ from sme_registry.io import sha256_of
 from sme_registry.seasons import wire
 from tests.leaderboard.seasons.playing import LANES, online_board, playing, request
 from tests.leaderboard.seasons.sealing import MASTER
-from tests.leaderboard.serving import serving
+from tests.leaderboard.serving import receiver, serving
 
 KEY = SigningKey.generate()
 
@@ -28,7 +29,7 @@ def secrets_of(board, store):
     """What must not be found: master, seeds and digests as texts and bytes, the task's numbers."""
     row = store.ticket(board.season.digest, 1)
     ticket = RunningTicket(store, board.season, MASTER, row)
-    nonce = store.request_of(row).ticket.nonce
+    nonce = store.request_of(row).content.nonce
     texts = [MASTER.raw.hex()]
     raw = [MASTER.raw]
     for number, hidden in enumerate(instances(board.season, MASTER, "1", nonce)):
@@ -45,11 +46,11 @@ def secrets_of(board, store):
 
 def everything(url, board, client):
     """The answers to every request of an entrant, and to a refused one of each kind."""
-    signed = board.request(KEY)
+    signed = board.request(KEY).for_receiver(receiver(url), KEY)
     started = board.send(url, signed, KEY)
     yield started
     ticket = seasons.Ticket.from_dict(started.json())
-    signer = signed.signer(KEY)
+    signer = signer_of(signed, KEY)
     assert signer is not None
     token = {"Authorization": f"Bearer {ticket.token}"}
 

@@ -6,12 +6,11 @@ import httpx
 import numpy as np
 import pytest
 
-from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import Envelope
+from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.errors import Rejection
 from leaderboard.intake import upload_header
 from leaderboard.seasons.admission import start_ticket
-from leaderboard.seasons.entry import SignedTicketRequest, TicketRequest
+from leaderboard.seasons.entry import TicketRequest
 from leaderboard.seasons.scores import score_ticket
 from leaderboard.store import Store
 from sme_registry import seasons
@@ -103,7 +102,7 @@ def test_tickets_count_towards_the_quota_of_a_day(tmp_path, key):
     board = online_board(tmp_path, limits={"submissions_per_day": 1})
     with Store.open(board.path) as store:
         store.start_ticket(board.request(key))
-        envelope = Envelope.read(board.request(key, 1).to_bytes(), SignedTicketRequest)
+        envelope = Signed[TicketRequest].read(board.request(key, 1).to_bytes())
         with pytest.raises(Rejection, match="quota"):
             start_ticket(store, envelope, board.season.digest)
 
@@ -117,7 +116,8 @@ def test_a_request_that_others_read_is_no_password(url, board, key):
         folder = store.season_folder(board.season.digest)
     stored = folder.request(started.json()["ticket"])
     without = httpx.post(path, content=stored.read_bytes())
-    stale = upload_header(key, request.id, moment(-0.1), board=request.board)
+    request = request.content.signed(key, Receiver(request.board, url))
+    stale = upload_header(key, request.id, request.receiver, moment(-0.1))
     late = httpx.post(path, content=request.to_bytes(), headers={"Authorization": stale})
     others = board.send(url, request, OTHER)
     assert [outcome(each) for each in (without, late, others)] == [
@@ -125,6 +125,26 @@ def test_a_request_that_others_read_is_no_password(url, board, key):
         (403, "stale_time"),
         (403, "bad_signature"),
     ]
+
+
+def test_a_request_that_a_server_in_the_middle_passes_on_starts_no_ticket(url, board, key):
+    """Of an entrant who signs for this board's key, which the server tells, and its address."""
+    honest, middle = board.request(key), "https://middle.example"
+    path = url + wire.tickets_path(board.season.id)
+    here, there = (Receiver(honest.board, address) for address in (url, middle))
+    unaddressed = Receiver(honest.board)
+    for of_request, of_header in (
+        (there, there),
+        (there, here),
+        (here, there),
+        (unaddressed, here),
+    ):
+        signed = honest.content.signed(key, of_request)
+        header = {"Authorization": upload_header(key, signed.id, of_header)}
+        answer = httpx.post(path, content=signed.to_bytes(), headers=header)
+        assert outcome(answer) == (403, "wrong_board")
+    with Store.open(board.path, read_only=True) as store:
+        assert store.entrant(honest.id) is None
 
 
 def test_the_ranking_grows_as_tickets_end(url, board, key):
@@ -167,11 +187,10 @@ def test_requests_for_tickets_are_checked(url, board, key, changes, board_key, s
     plain = {**manifest(board.season, key), "nonce": "0" * 64, "answers_key": OTHER.public}
     plain["submitter"] |= changes.get("submitter", {})
     plain |= {name: value for name, value in changes.items() if name != "submitter"}
-    signed = TicketRequest.from_dict({**plain, "nonce": "0" * 64}).signed(key, board_name)
+    signed = TicketRequest.from_dict({**plain, "nonce": "0" * 64}).signed(key, Receiver(board_name))
     if "nonce" in changes:  # which no document of ours can have
-        ticket = TicketRequest.model_construct(**{**dict(signed.ticket), **changes})
-        signature = key.sign("ticket", ticket.digest, signed.board)
-        signed = signed.model_copy(update={"ticket": ticket, "signature": signature})
+        ticket = TicketRequest.model_construct(**{**dict(signed.content), **changes})
+        signed = signed.model_copy(update={"content": ticket})
     assert outcome(board.send(url, signed, key)) == (status, code)
     with Store.open(board.path, read_only=True) as store:
         assert len(store.entrants(board.season.digest)) == before
@@ -181,15 +200,15 @@ def test_a_request_opens_no_ticket_of_another_season_or_board(board, key):
     digest, other = board.season.digest, another(board, "second").season.digest
     with Store.open(board.path) as store:
         known, new = board.request(key), board.request(key, 1)
-        known, new = (Envelope.read(each.to_bytes(), SignedTicketRequest) for each in (known, new))
+        known, new = (Signed[TicketRequest].read(each.to_bytes()) for each in (known, new))
         number, is_new = start_ticket(store, known, digest)
         assert is_new
         before = store.head
         for envelope in (known, new):
             with pytest.raises(Rejection, match="season_unknown"):
                 start_ticket(store, envelope, other)
-        elsewhere = board.request(key).ticket.signed(key, "ab" * 32)
-        envelope = Envelope.read(elsewhere.to_bytes(), SignedTicketRequest)
+        elsewhere = board.request(key).content.signed(key, Receiver("ab" * 32))
+        envelope = Signed[TicketRequest].read(elsewhere.to_bytes())
         with pytest.raises(Rejection, match="wrong_board"):
             start_ticket(store, envelope, digest)
         assert start_ticket(store, known, digest) == (number, False)

@@ -90,7 +90,7 @@ def test_a_tickets_learning_curve_is_shown_when_it_ends(board, key):
     running = page(board, "seasons/winter.html")
     assert "running" in running.words
     assert "an entrant may stop after a lucky ticket" in running.words
-    assert request.ticket.nonce not in running.words
+    assert request.content.nonce not in running.words
     assert request.signature not in running.words
     board.end_ticket(ONLINE.digest, 1, result(ONLINE, request.id))
     ended = page(board, "seasons/winter.html")

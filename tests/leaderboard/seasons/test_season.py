@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.seasons import admission
 from leaderboard.seasons.master import Master
@@ -380,7 +380,7 @@ def test_a_replay_finds_entries_that_their_key_has_not_signed(store, key, season
     store.announce(season)
     signed = signed_entry(store, season, key, [None, None])
     if fault == "board":
-        signed = signed.entry.signed(key, "ab" * 32)
+        signed = signed.content.signed(key, Receiver("ab" * 32))
     else:
         signed = signed.model_copy(update={"signature": "0" * 128})
     store.enter(signed)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from leaderboard.cli.options import KEY_VARIABLE
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError
 from leaderboard.seasons import entrant
 from leaderboard.seasons.tickets import Attendant
@@ -63,7 +63,7 @@ def test_a_ticket_is_started_stepped_and_answered(url, board):
     assert not Path("ticket.json.request").exists()
     with Store.open(board.path) as store:
         row = store.ticket(board.season.digest, ticket.ticket)
-        assert store.request_of(row).ticket.method.knowledge == "family"
+        assert store.request_of(row).content.method.knowledge == "family"
     with Instance(url, ticket, 0, 4) as hidden:
         hidden.begin()
         hidden.step(np.zeros((4, 1)))

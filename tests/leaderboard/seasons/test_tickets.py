@@ -10,11 +10,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from leaderboard.documents.submission import Envelope
+from leaderboard.documents.signed import Signed
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.seasons import tickets as tickets_module
 from leaderboard.seasons.admission import start_ticket
-from leaderboard.seasons.entry import SignedTicketRequest
+from leaderboard.seasons.entry import TicketRequest
 from leaderboard.seasons.instance import SteppedInstance
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.scores import score_ticket
@@ -414,7 +414,7 @@ def test_no_ticket_starts_without_room_for_its_steps(tmp_path):
     room = played_bytes(tiny_season("sealed-online", classes=[member])) * 3 // 2
     board = online_board(tmp_path, limits={"total_bytes": room}, classes=[member])
     with playing(board) as played:
-        second = Envelope.read(board.request(played.key, 1).to_bytes(), SignedTicketRequest)
+        second = Signed[TicketRequest].read(board.request(played.key, 1).to_bytes())
         refused("quota", start_ticket, played.store, second, board.season.digest)
         assert len(played.store.entrants(board.season.digest)) == 1
         played.start()

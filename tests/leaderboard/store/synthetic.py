@@ -20,7 +20,7 @@ def synthetic_result(store, id, *, code="", level=0.5):
     levels = [high for _, high in document.protocol.edges]
     instances = document.instances
     runs = []
-    for number, run in enumerate(store.submission(id).submission.runs):
+    for number, run in enumerate(store.submission(id).content.runs):
         assert run.artefact is not None
         regret = tuple(level + 0.01 * number + 0.1 * epsilon for epsilon in levels)
         similarity = tuple(1 - 0.25 * each for each in regret)

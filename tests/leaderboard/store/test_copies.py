@@ -5,8 +5,8 @@ import base64
 import numpy as np
 import pytest
 
-from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Result
+from leaderboard.documents.signed import SigningKey
 from leaderboard.scoring.ranking import ranking
 from leaderboard.scoring.worker import run_scorer
 from tests.leaderboard.conftest import put_submission, signed_withdrawal, tiny_board

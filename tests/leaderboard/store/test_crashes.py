@@ -29,7 +29,7 @@ def put(board, key):
 def receive(board, key):
     with Store.open(board) as store:
         signed, artefacts = tiny_submission(store, key, 0, created="2026-01-01T00:00:00Z")
-        assert set(artefacts) == {run.artefact.sha256 for run in signed.submission.runs}
+        assert set(artefacts) == {run.artefact.sha256 for run in signed.content.runs}
         return store.receive(signed)
 
 

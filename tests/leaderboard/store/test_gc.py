@@ -29,7 +29,7 @@ def age(path, seconds):
 def litter(store, key, submit):
     """Old and young files of each kind; the objects of a submission are old."""
     old, young = put(store, key, b"old and not submitted"), put(store, key, b"young")
-    named = submit().submission.runs[0].artefact.sha256
+    named = submit().content.runs[0].artefact.sha256
     for digest in (old, named):
         age(store.folder.object(digest), DAY + 60)
     for folder in (store.folder.log, store.folder.results, store.folder.object(old).parent):

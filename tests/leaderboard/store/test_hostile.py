@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from leaderboard.documents.board import Folder
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.verify import verify
 from leaderboard.store import Store
@@ -134,7 +134,7 @@ def test_readers_refuse_what_is_no_plain_file(board, harm, file):
     folder = Folder(board)
     with Store.open(board, read_only=True) as store:
         row, last = store.entries()[0], store.head.sequence
-        artefact = store.submission(row.id).submission.runs[0].artefact
+        artefact = store.submission(row.id).content.runs[0].artefact
     path = {
         "board": folder.board,
         "log": folder.log_entry(1),

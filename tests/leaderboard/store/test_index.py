@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.scoring.aggregation import result_of
 from leaderboard.store import Index, Store, collect_garbage

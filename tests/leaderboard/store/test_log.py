@@ -1,6 +1,6 @@
 import pytest
 
-from leaderboard.documents.keys import SigningKey, verifies
+from leaderboard.documents.signed import SigningKey, verifies
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.verify import verify
 from leaderboard.store import EMPTY, LogEntry, Store

@@ -81,7 +81,7 @@ def test_bytes_count_for_their_uploader_before_and_after_submission(store, key, 
     store.put_object(sha256_of(b"12345"), [b"12345"], by=key.public)
     assert store.uploaded_bytes(key.public, since) == store.total_bytes() == 5
     signed = submit()
-    size = 5 + signed.submission.runs[0].artefact.size + len(signed.to_bytes())
+    size = 5 + signed.content.runs[0].artefact.size + len(signed.to_bytes())
     assert store.uploaded_bytes(key.public, since) == store.total_bytes() == size
     assert store.uploaded_bytes(key.public, "2999-01-01T00:00:00Z") == 0
     assert store.uploaded_bytes(KEY, since) == 0

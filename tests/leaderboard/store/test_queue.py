@@ -3,7 +3,7 @@ import time
 import pytest
 
 from leaderboard import intake
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError
 from leaderboard.store import Store
 from leaderboard.store.queue import retry_seconds

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import ClassScore, Estimate, Result, RunScore, Scores
+from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.documents.submission import Submission
 from leaderboard.scoring.aggregation import failed_run, levels_of, run_metrics
 from leaderboard.store import Store
@@ -83,7 +83,7 @@ def submit(
         "runs_started": dict.fromkeys(specs, runs + missing),
         **fields,
     }
-    signed = Submission.from_dict(plain).signed(key, document.key)
+    signed = Submission.from_dict(plain).signed(key, Receiver(document.key))
     store.receive(signed)
     if profile is not None:
         assert score(store, profile, spread, missing, oracle_like) == signed.id
@@ -107,7 +107,7 @@ def finish(store, claim, **result):
 def score(store, profile, spread=0.0, missing=0, oracle_like=False):
     """Write a result of about this profile for the submission whose turn it is; its id."""
     document, claim = store.document, claimed(store)
-    submission = store.submission(claim.id).submission
+    submission = store.submission(claim.id).content
     levels = levels_of(document.protocol)
     # Not from the id, which holds a key that is new each time.
     name = f"{submission.method.name} {submission.method.version}"

@@ -17,8 +17,8 @@ import pytest
 
 from leaderboard import intake
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import SignedSubmission, utc
+from leaderboard.documents.signed import Receiver, Signed, SigningKey
+from leaderboard.documents.submission import Submission, utc
 from leaderboard.errors import BoardError
 from leaderboard.gate import isolation
 from leaderboard.web import app
@@ -45,6 +45,7 @@ HTTP = httpx.Client(timeout=60, limits=httpx.Limits(max_keepalive_connections=0)
 CPU_SECONDS = 10.0
 
 JSON = {"Accept": "application/json"}
+URL = "https://board.example"
 BROWSER = {"Accept": "text/html,application/xhtml+xml"}
 
 
@@ -250,7 +251,8 @@ def test_the_pages_say_how_to_submit_at_the_configured_address(tmp_path):
         with serving(store.folder.path, url="https://board.example/sme") as url:
             known = HTTP.get(url, headers=forged).text
         with serving(store.folder.path) as url:
-            unknown = HTTP.get(url, headers=forged).text
+            default = HTTP.get(url, headers=forged).text
+            where = url
             assert 'href="index.html#submit"' in HTTP.get(f"{url}/method").text
         store.folder.key.unlink()
         with serving(store.folder.path, url="https://board.example") as url:
@@ -258,11 +260,10 @@ def test_the_pages_say_how_to_submit_at_the_configured_address(tmp_path):
     assert "curl -O https://board.example/sme/suite.json" in known
     assert "sme-leaderboard submit ppo https://board.example/sme\n" in known
     assert "ADDRESS" not in known
-    assert "curl -O ADDRESS/suite.json" in unknown
-    assert "ADDRESS below stands for the address of this board" in unknown
+    assert f"curl -O {where}/suite.json" in default
     assert "accepts no submissions" in copy
     assert "curl" not in copy
-    assert "evil" not in known + unknown + copy
+    assert "evil" not in known + default + copy
 
 
 def test_serve_refuses_what_it_cannot_do(store):
@@ -271,10 +272,12 @@ def test_serve_refuses_what_it_cannot_do(store):
         with pytest.raises(OptionError, match="host="):
             serve(path, host=host, port=0, workers=0)
     with pytest.raises(BoardError, match="cannot listen here"):  # an address of others
-        serve(path, host="192.0.2.1", port=0, workers=0, behind_proxy=True)
+        serve(path, "192.0.2.1", 0, workers=0, behind_proxy=True, url="https://board.example")
     for url in ("board.example", "ftp://x", "https://x/$(id)", 'https://x"', "https://"):
         with pytest.raises(OptionError, match="url="):
             serve(path, port=0, workers=0, url=url)
+    with pytest.raises(OptionError, match="url=''"):  # of the proxy, which nothing here tells
+        serve(path, port=0, workers=0, behind_proxy=True)
     with pytest.raises(OptionError, match="unsafe_no_sandbox=True"):  # policies could read it
         serve(path, port=0, unsafe_no_sandbox=True, season_secrets=["a.master"])
     with (
@@ -318,9 +321,9 @@ def test_a_board_is_not_served_without_bubblewrap_unless_told(store, tmp_path, m
     with pytest.raises(BoardError, match=r"bubblewrap is .*--unsafe-no-sandbox"):
         serve(store.folder.path, port=0)
     with pytest.raises(BoardError, match="bubblewrap is not installed"):
-        app.create_app(store.folder.path, score_workers=0)
-    app.create_app(store.folder.path, isolation="process")
-    app.create_app(store.folder.path, score_workers=1, isolation="process")
+        app.create_app(store.folder.path, URL, score_workers=0)
+    app.create_app(store.folder.path, URL, isolation="process")
+    app.create_app(store.folder.path, URL, score_workers=1, isolation="process")
 
 
 def test_the_ranking_as_json_is_sorted(published):
@@ -379,7 +382,7 @@ def test_a_submission_is_served_with_its_result(published):
     assert scored["submission"]["method"]["name"] == "SAC"
     assert (rejected["status"], rejected["result"]["code"]) == ("rejected", "onnx_op")
     assert (waiting["status"], waiting["result"]) == ("waiting", None)
-    read = SignedSubmission.read(
+    read = Signed[Submission].read(
         json.dumps({name: scored[name] for name in ("submission", "signature", "board")}).encode()
     )
     assert read.id == ids["sac"]
@@ -474,7 +477,7 @@ def test_an_artefact_is_public_once_it_is_scored(tmp_path, key):
 
 def test_policies_of_reference_rows_are_public_and_verified_if_their_file_changes(url, store):
     (optimal, _) = intake.submit_references(store)
-    (run,) = store.submission(optimal).submission.runs
+    (run,) = store.submission(optimal).content.runs
     digest = run.artefact.sha256
     path, file = f"{url}/api/objects/{hex_of(digest)}", store.folder.object(digest)
     with ThreadPoolExecutor(8) as pool:  # as many readers at once
@@ -589,7 +592,7 @@ def uploaded(url, store, key, number=0):
     signed, artefacts = tiny_submission(store, key, number)
     for data in artefacts.values():
         assert put(url, key, data).status_code == 201
-    return signed
+    return signed.for_receiver(Receiver(signed.board, url), key)
 
 
 def test_a_policy_is_stored_and_its_submission_accepted_once(url, store, key):
@@ -640,21 +643,21 @@ def changed(plain, path, value):
 )
 def test_an_invalid_submission_has_its_code(refusing, key, path, value, code):
     url, store = refusing
-    plain = uploaded(url, store, key).submission.to_dict()
+    plain = uploaded(url, store, key).content.to_dict()
     changed(plain, path, plain["runs"] * 2 if value == "twice" else value)
-    answer = post(url, _signed_anyway(plain, key, store.document.key))
+    answer = post(url, _signed_anyway(plain, key, Receiver(store.document.key, url)))
     assert (answer.json()["code"], 400 <= answer.status_code < 500) == (code, True)
     assert set(answer.json()) == {"code", "message"}
     assert store.entries() == []
 
 
-def _signed_anyway(plain, key, board):
+def _signed_anyway(plain, key, receiver):
     """A submission signed rightly, whatever it holds."""
     import rfc8785
 
     digest = "sha256:" + hashlib.sha256(rfc8785.dumps(plain)).hexdigest()
-    signature = key.sign("submission", digest, board)
-    return json.dumps({"submission": plain, "signature": signature, "board": board}).encode()
+    signature = key.sign("submission", digest, receiver)
+    return json.dumps({"submission": plain, "signature": signature, **receiver._asdict()}).encode()
 
 
 @pytest.mark.parametrize(
@@ -693,12 +696,12 @@ def test_a_withdrawal_by_the_submitter_is_final(url, store, key):
     signed = uploaded(url, store, key)
     post(url, signed.to_bytes())
     path = f"{url}/api/withdrawals"
-    by_another_key = signed_withdrawal(store, signed.id, SigningKey.generate())
+    by_another_key = signed_withdrawal(store, signed.id, SigningKey.generate(), address=url)
     answer = HTTP.post(path, json=by_another_key.to_dict())
     assert refusal(answer) == (403, "bad_signature")
-    unknown = signed_withdrawal(store, "sha256:" + "0" * 64, key)
+    unknown = signed_withdrawal(store, "sha256:" + "0" * 64, key, address=url)
     assert refusal(HTTP.post(path, json=unknown.to_dict())) == (404, "unknown_submission")
-    valid = signed_withdrawal(store, signed.id, key, "a bug")
+    valid = signed_withdrawal(store, signed.id, key, "a bug", url)
     for _ in range(2):
         answer = HTTP.post(path, json=valid.to_dict())
         assert (answer.status_code, answer.json()["status"]) == (200, "withdrawn")

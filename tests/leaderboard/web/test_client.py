@@ -4,16 +4,18 @@ import json
 import threading
 from contextlib import contextmanager
 
+import httpx
 import pytest
 
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.seasons.entrant import request_ticket
 from leaderboard.seasons.entry import TicketRequest
 from leaderboard.web import client
 from sme_registry.errors import OptionError
+from sme_registry.io import server_address
 from sme_registry.seasons import wire
 from sme_registry.spec import Setting
 from tests.leaderboard.conftest import tiny_submission
@@ -46,18 +48,19 @@ def bundle_of(folder, store, key, number=0, **fields):
 
 
 @contextmanager
-def scripted(script):
+def scripted(script, bodies=False):
     """A server with scripted answers (None: it hangs up); yields its URL and its requests.
 
-    An answer is a status, a body, and headers.
+    An answer is a status, a body, and headers. With `bodies`, the script gets body and headers.
     """
     asked = []
 
     class Handler(http.server.BaseHTTPRequestHandler):
         def answer(self):
             asked.append(f"{self.command} {self.path}")
-            self.rfile.read(int(self.headers.get("Content-Length", 0)))
-            answer = script(self.command, self.path)
+            body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+            more = (body, self.headers) if bodies else ()
+            answer = script(self.command, self.path, *more)
             if answer is None:
                 self.close_connection = True
                 return
@@ -93,14 +96,14 @@ def test_a_bundle_arrives_whole_and_once_and_has_a_status(tmp_path, url, store, 
     assert client.submit(url + "/", folder, key) == signed.id
     assert seen == [(1, 1)]
     assert [entry.id for entry in store.entries()] == [signed.id]
-    assert all(store.objects.has(run.artefact.sha256) for run in signed.submission.runs)
+    assert all(store.objects.has(run.artefact.sha256) for run in signed.content.runs)
     assert client.status(url, signed.id)["status"] == "waiting"
     with pytest.raises(Rejection) as caught:
         client.withdraw(url, signed.id, SigningKey.generate())
     assert caught.value.code == "bad_signature"
     client.withdraw(url, signed.id, key, "a bug")
     assert client.status(url, hex_of(signed.id))["status"] == "withdrawn"
-    assert store.withdrawal(signed.id).withdrawal.reason == "a bug"
+    assert store.withdrawal(signed.id).content.reason == "a bug"
 
 
 def test_bytes_are_sent_even_if_the_board_has_them_and_lost_requests_are_repeated(
@@ -208,7 +211,7 @@ def test_a_ticket_that_is_too_large_is_refused_by_its_size(key, field, value):
             "answers_key": key.of_answers("0" * 64).public,
         }
     )
-    signed = request.signed(key, key.public)
+    signed = request.signed(key, Receiver(key.public))
     with (
         scripted(lambda *_: (201, json.dumps(ticket).encode())) as (url, _),
         pytest.raises(BoardError) as caught,
@@ -235,3 +238,56 @@ def test_an_artefact_that_was_changed_is_not_sent(tmp_path, store, key):
         client.submit(url, folder, key)
     assert caught.value.code == "artefact_digest"
     assert not [line for line in asked if line.startswith("PUT")]
+
+
+# A server in the middle, which passes everything on to a board that its visitors do not know.
+
+
+@pytest.fixture
+def relay(url):
+    def forward(method, path, body, headers):
+        sent = {"Authorization": headers["Authorization"].strip()}
+        answer = httpx.request(method, url + path, content=body, headers=sent, trust_env=False)
+        return answer.status_code, answer.content
+
+    with scripted(forward, bodies=True) as (middle, _):
+        yield middle
+
+
+def test_a_server_in_the_middle_passes_on_no_submission(tmp_path, url, relay, store, key):
+    folder, signed = bundle_of(tmp_path / "bundle", store, key)
+    with pytest.raises(Rejection, match=rf"wrong_board: address={relay}: .* {url}\. Send it there"):
+        client.submit(relay, folder, key)
+    assert not store.objects.has(next(iter(artefacts_of(signed))))
+
+    receiver = Receiver(store.document.key, relay)
+    for digest in artefacts_of(signed):  # as if the board had them
+        store.put_object(
+            digest, [(folder / "artefacts" / f"{hex_of(digest)}.onnx").read_bytes()], by=key.public
+        )
+    relayed = signed.content.signed(key, receiver)
+    for each in (relayed, signed, relayed.model_copy(update={"address": url})):
+        answer = httpx.post(f"{url}/api/submissions", content=each.to_bytes(), trust_env=False)
+        assert answer.status_code == 403
+        assert answer.json()["code"] in ("wrong_board", "bad_signature")
+    assert store.entries() == []
+
+    assert client.submit(url, folder, key) == signed.id
+    with pytest.raises(Rejection, match="wrong_board"):
+        client.withdraw(relay, signed.id, key)
+    assert store.withdrawal(signed.id) is None
+
+
+def test_a_name_for_this_machine_and_the_usual_port_are_the_same_address(tmp_path, store, key):
+    folder, signed = bundle_of(tmp_path / "bundle", store, key)
+    with serving(store.folder.path) as url:
+        assert client.submit(url.replace("127.0.0.1", "LOCALHOST") + "/", folder, key) == signed.id
+    for one, other in (
+        ("https://Board.example", "https://board.example:443/"),
+        ("http://board.example/b/", "http://board.example:80/b"),
+    ):
+        assert server_address(one, insecure=True).url == server_address(other, insecure=True).url
+
+
+def artefacts_of(signed):
+    return {run.artefact.sha256 for run in signed.content.runs}

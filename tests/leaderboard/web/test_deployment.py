@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.signed import SigningKey
 from leaderboard.web import client
 from sme_registry import seasons
 from sme_registry.io import sha256_of
@@ -59,26 +59,29 @@ def seen():
 @pytest.fixture
 def proxied(tmp_path, board, seen):
     """Opens nginx in front of the board, with changes of its configuration; its URL."""
+    url = free_url()
     with contextlib.ExitStack() as opened:
-        upstream = opened.enter_context(serving(board.folder.path, seen))
-        yield lambda **changes: opened.enter_context(
-            nginx(tmp_path, urlsplit(upstream).netloc, **changes)
-        )
+        upstream = opened.enter_context(serving(board.folder.path, seen, url=url))
+        yield lambda **changes: opened.enter_context(nginx(tmp_path, upstream, url, **changes))
+
+
+def free_url():
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return f"http://127.0.0.1:{free.getsockname()[1]}"
 
 
 @contextlib.contextmanager
-def nginx(folder, upstream, **changes):
-    """Nginx with the example's configuration, but for addresses and TLS; yields its URL.
+def nginx(folder, upstream, url, **changes):
+    """Nginx at a URL with the example's configuration, but for addresses and TLS; yields the URL.
 
     A directive's argument changes as in `send_timeout="1s"`. The header X-From names a client.
     """
     assert NGINX is not None, "CI=true and no nginx: apt-get install nginx-light"
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+    port = urlsplit(url).port
     text = CONFIGURATION.read_text()
     servers = text.index("server {"), text.rindex("server {")  # the first only redirects to https
     text = text[: servers[0]] + text[servers[1] :]
-    text = text.replace("server 127.0.0.1:8000;", f"server {upstream};")
+    text = text.replace("server 127.0.0.1:8000;", f"server {urlsplit(upstream).netloc};")
     text = text.replace("listen 443 ssl;", f"listen 127.0.0.1:{port};")
     text = re.sub(r"\n *(ssl_certificate|listen \[::\]).*", "", text)
     for name, value in changes.items():
@@ -97,7 +100,7 @@ def nginx(folder, upstream, **changes):
     process = subprocess.Popen([NGINX, "-p", str(folder), "-c", str(configuration)])
     try:
         wait_for(lambda: accepts(port), process)
-        yield f"http://127.0.0.1:{port}"
+        yield url
     finally:
         process.terminate()
         process.wait(PATIENCE)
@@ -232,11 +235,11 @@ def test_only_steps_have_a_high_rate_and_no_body_is_larger_than_an_artefact():
 
 
 def test_steps_pass_through_nginx(tmp_path):
-    season = online_board(tmp_path)
+    season, url = online_board(tmp_path), free_url()
     with (
-        serving(season.path, season_secrets=[season.secret]) as upstream,
-        nginx(tmp_path, urlsplit(upstream).netloc) as url,
-        seasons.Instance(url, season.ticket(upstream, SigningKey.generate()), 0, 4) as instance,
+        serving(season.path, url=url, season_secrets=[season.secret]) as upstream,
+        nginx(tmp_path, upstream, url),
+        seasons.Instance(url, season.ticket(url, SigningKey.generate()), 0, 4) as instance,
     ):
         instance.begin()
         for _ in range(3):

@@ -14,9 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Estimate
-from leaderboard.documents.submission import SignedWithdrawal
+from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError, NotPublishable
 from leaderboard.store import Copies, Store
 from leaderboard.web import charts, tables
@@ -24,6 +23,7 @@ from leaderboard.web import pages as site_pages
 from leaderboard.web.pages import Pages, content_type
 from leaderboard.web.server import write_site
 from sme_registry.errors import OptionError
+from tests.leaderboard.conftest import signed_withdrawal
 from tests.leaderboard.web import boards
 
 EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "board"  # of rules 1
@@ -78,8 +78,7 @@ def board(tmp_path_factory):
         key = SigningKey.generate()
         gone = boards.submit(store, key, "Gone", [0.3] * 6)
         ids = boards.furnish(store)
-        signed_for = store.document.key
-        assert store.withdraw(SignedWithdrawal.create(gone, key, boards.HOSTILE, board=signed_for))
+        assert store.withdraw(signed_withdrawal(store, gone, key, boards.HOSTILE))
         yield store, {**ids, "gone": gone}
 
 
@@ -351,7 +350,7 @@ def test_the_page_of_a_submission_shows_its_status(board, pages, site):
     }.items():
         digits = hex_of(ids[kind])
         words = pages[f"submissions/{digits}.html"].words
-        key = store.submission(ids[kind]).submission.submitter.key
+        key = store.submission(ids[kind]).content.submitter.key
         assert all(text in words for text in (key, ids[kind], *texts)), kind
         assert (site / f"results/{digits}.json").is_file() == (kind != "waiting")
         assert ("Reason:" in words) == (kind == "gone")

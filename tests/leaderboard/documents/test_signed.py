@@ -1,9 +1,9 @@
-"""Signatures: one key, one document, one purpose, one board."""
+"""Signatures: one key, one document, one purpose, one board, one address."""
 
 import hashlib
 import itertools
 
-from leaderboard.documents.keys import SigningKey, verifies
+from leaderboard.documents.signed import Receiver, SigningKey, verifies
 
 DIGEST, BOARD, OTHER = "sha256:" + "1" * 64, "a" * 64, "b" * 64
 P = 2**255 - 19
@@ -57,19 +57,21 @@ def small_order_keys():
     return keys
 
 
-def test_a_signature_is_for_one_document_purpose_and_board():
-    key = SigningKey.generate()
-    uses = list(
-        itertools.product(("submission", "withdrawal", "upload", "log"), (BOARD, OTHER, None))
+def test_a_signature_is_for_one_document_purpose_board_and_address():
+    key, here = SigningKey.generate(), Receiver(BOARD, "https://board.example")
+    receivers = (
+        *(Receiver(), Receiver(BOARD), Receiver(OTHER), here),
+        *(Receiver(OTHER, here.address), Receiver(BOARD, "https://board.example/sme")),
     )
+    uses = list(itertools.product(("submission", "withdrawal", "upload", "log"), receivers))
     for signed, checked in itertools.product(uses, repeat=2):
         signature = key.sign(signed[0], DIGEST, signed[1])
         assert verifies(key.public, signature, checked[0], DIGEST, checked[1]) == (
             signed == checked
         )
-    signature = key.sign("submission", DIGEST, BOARD)
-    assert not verifies(key.public, signature, "submission", "sha256:" + "2" * 64, BOARD)
-    assert not verifies(SigningKey.generate().public, signature, "submission", DIGEST, BOARD)
+    signature = key.sign("submission", DIGEST, here)
+    assert not verifies(key.public, signature, "submission", "sha256:" + "2" * 64, here)
+    assert not verifies(SigningKey.generate().public, signature, "submission", DIGEST, here)
 
 
 def test_keys_of_small_order_sign_nothing():
@@ -79,7 +81,7 @@ def test_keys_of_small_order_sign_nothing():
     digests = [f"sha256:{number:064x}" for number in range(8)]
     for case in itertools.product(small_order_keys(), signatures, digests):
         public, signature, digest = case
-        assert not verifies(public, signature, "submission", digest, BOARD), case
+        assert not verifies(public, signature, "submission", digest, Receiver(BOARD)), case
 
 
 def test_a_key_with_a_part_of_small_order_signs_nothing():
@@ -97,9 +99,12 @@ def test_a_key_with_a_part_of_small_order_signs_nothing():
             h = int.from_bytes(hashed, "little") % L
             signature = R + ((r + h * a) % L).to_bytes(32, "little")
             if h % 2 == 0:
-                assert verifies(public, signature.hex(), "submission", digest, BOARD) == expected
+                assert (
+                    verifies(public, signature.hex(), "submission", digest, Receiver(BOARD))
+                    == expected
+                )
 
 
 def test_what_is_no_key_signs_nothing():
     for public in ("", "0" * 64, "f" * 64, "x" * 64, "0" * 63):
-        assert not verifies(public, "0" * 128, "submission", DIGEST, BOARD)
+        assert not verifies(public, "0" * 128, "submission", DIGEST, Receiver(BOARD))
