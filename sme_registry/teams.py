@@ -17,10 +17,10 @@ from pettingzoo import AECEnv
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from sme_registry.compiled.arrays import Observation
 from sme_registry.envs.team import SMETeamEnv
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.spec.sme_spec import SpecLike
+from sme_registry.task.task import Observation
 
 __all__ = ["SMETeamEnv", "env", "parallel_env"]
 

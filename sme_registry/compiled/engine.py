@@ -21,29 +21,24 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from sme_registry.compiled.arrays import (
+from sme_registry.io import choice, is_installed, require_packages
+from sme_registry.task import Task, step
+from sme_registry.task.draw import Layer, counted
+from sme_registry.task.task import (
     ACCUMULATED_REWARD,
     BUFFER_STATE,
     BUFFER_T,
     BUFFER_VALUES,
-    COST,
     OWN_DISTRACTORS,
     OWN_DRAWN,
     OWN_KEY,
-    REGRET,
     REWARD,
     ROWS_WITH_SAFETY,
-    SAFE_REGRET,
-    SIMILARITY,
-    STEP_REWARD,
     Array,
     Indices,
     Mask,
     Observation,
 )
-from sme_registry.io import choice, is_installed, require_packages
-from sme_registry.task import Task, step
-from sme_registry.task.draw import Layer, counted
 
 Backend = Literal["numba", "numpy"]
 BACKEND_VARIABLE = "SME_BACKEND"
@@ -212,7 +207,7 @@ def _numba_engine(task: Task) -> Engine:
 
 def _numpy_engine(task: Task) -> Engine:
     S, A, m = task.spec.state_dim, task.spec.action_dim, task.spec.distractors
-    seen, limiting = _seen(task, "numpy"), network(task.limiting, backend="numpy")
+    seen = _seen(task, "numpy")
 
     def new_buffer() -> tuple[Array, Array]:
         buffer = np.zeros(_entries(task))
@@ -251,23 +246,13 @@ def _numpy_engine(task: Task) -> Engine:
         if not np.isfinite(action).all():
             return False
         result = step(task, np.ascontiguousarray(s.T), t, accumulated.T, action)
-        values[SIMILARITY] = result.similarity.T
-        values[STEP_REWARD] = result.step_reward.T
-        values[REGRET] = 1.0 - result.step_reward.T
-        values[REWARD] = result.reward.T
-        values[ACCUMULATED_REWARD] = accumulated[:] = result.accumulated_reward.T
+        result.write(actions, values)
+        accumulated[:] = result.accumulated_reward.T
         ends[:] = result.terminated, result.truncated
         t += 1
-        clipped, actions[0] = np.clip(action, 0.0, 1.0), result.optimal_action
-        if task.limiting:
-            actions[1] = task.limit_of(limiting(s).T)
-            actions[2] = np.minimum(actions[0], actions[1])
-            values[COST, 0] = task.cost_of(clipped, actions[1])
-            safe_reward = task.safe_reward_of(actions[0], actions[1])
-            values[SAFE_REGRET, 0] = safe_reward - values[STEP_REWARD, 0]
         moved[:] = result.state.T
         if m:
-            own[OWN_DISTRACTORS:] = _next_distractors(task, own, clipped).T
+            own[OWN_DISTRACTORS:] = _next_distractors(task, own, np.clip(action, 0.0, 1.0)).T
         observation[:, : S + m] = seen(np.concatenate([moved, own[OWN_DISTRACTORS:]])).T
         observation[:, S + m] = t / task.spec.horizon
         waiting = np.minimum(result.accumulated_reward / task.spec.k, 1.0)
@@ -282,7 +267,7 @@ def _numpy_engine(task: Task) -> Engine:
 
 
 def _entries(task: Task) -> int:
-    """The entries of a single environment that `compiled.arrays` names."""
+    """The entries of a single environment that `task.task` names."""
     return BUFFER_STATE + task.spec.state_dim + OWN_DISTRACTORS + task.spec.distractors
 
 

@@ -15,7 +15,7 @@ A task travels as one flat float64 array, because each array argument costs a ca
     the limiting layers, W [A, m] and b [m] of distractors with a transition, the mixing layers.
 The buffer of a single environment follows it in the same array where the task is small (another
 40 ns), and stands alone where it is not, so that environments can share it:
-    t, the values of the last step [7] (of `compiled.arrays`; r_cum is among them), s [S],
+    t, the values of the last step [7] (`task.NUMBERS`; r_cum is among them), s [S],
     its own distractors [2 + m], room for two layers [2 × widest].
 
 Numba's disk cache does not know a function's flags: never compile one of these a second way.
@@ -33,7 +33,9 @@ from numba import boolean, float32, float64, int64, njit, types, uint64, void
 from numba.extending import intrinsic
 from scipy.special import ndtr
 
-from sme_registry.compiled.arrays import (
+from sme_registry.task import Task
+from sme_registry.task.draw import FIRST_MIX, GOLDEN, SECOND_MIX, Layer
+from sme_registry.task.task import (
     ACCUMULATED_REWARD,
     BUFFER_STATE,
     BUFFER_T,
@@ -49,8 +51,6 @@ from sme_registry.compiled.arrays import (
     STEP_REWARD,
     Array,
 )
-from sme_registry.task import Task
-from sme_registry.task.draw import FIRST_MIX, GOLDEN, SECOND_MIX, Layer
 
 _BLOCK_NUMBERS = 4096  # of one layer's block: 32 KiB, so that a block stays in cache
 _HEADER = 16
@@ -206,7 +206,7 @@ def _clipped(a):  # type: ignore[no-untyped-def]
 @njit(inline="always", error_model="numpy")
 def _reward_of(similarity, r_min):  # type: ignore[no-untyped-def]
     graded = 4.0 * (similarity - 0.75)
-    return graded if graded > 0.0 and graded > r_min else 0.0
+    return graded if graded > r_min else 0.0  # r_min is at least 0
 
 
 @njit(inline="always", error_model="numpy")
@@ -639,9 +639,7 @@ def _block_rewards(p, first, count, distance, owned, team_distance, values, ends
             similarity = 1.0 - distance[agent, env] / owned[agent]
             finite &= similarity == similarity
             paid_for = 1.0 - team_distance[env] / A if pays_the_team else similarity
-            graded = 4.0 * (paid_for - 0.75)
-            graded = graded if graded > 0.0 else 0.0
-            step_reward = graded if graded > r_min else 0.0
+            step_reward = _reward_of(paid_for, r_min)
             values[SIMILARITY, agent, i] = similarity
             values[STEP_REWARD, agent, i] = step_reward
             values[REGRET, agent, i] = 1.0 - step_reward
@@ -798,7 +796,7 @@ def step_many(p, s, t, accumulated, own, action, moved, observation, actions, va
       moved: `[S, B]`, written: the next states.
       observation: `[B, …]`, of which is written: M(s, d), t/T, and each agent's r_cum/k.
       actions: `[1 or 3, B, A]`, written: π* of the states acted in, the limits, the safe actions.
-      values: `[5 or 7, n, B]`, written: the rows of `compiled.arrays`.
+      values: `[5 or 7, n, B]`, written: the rows of `task.task`.
       ends: `[2, B]`, written: terminated, truncated.
 
     Returns:

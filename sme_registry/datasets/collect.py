@@ -25,18 +25,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled.arrays import (
-    COST,
-    REGRET,
-    REWARD,
-    SAFE_REGRET,
-    SIMILARITY,
-    STEP_REWARD,
-    Array,
-    Indices,
-    Mask,
-    Observation,
-)
 from sme_registry.datasets.documents import (
     DatasetRecipe,
     EpisodeScores,
@@ -53,6 +41,18 @@ from sme_registry.spec import SMESpec
 from sme_registry.task import Task, draw
 from sme_registry.task.draw import bit_generator, to_uniform
 from sme_registry.task.loading import check_memory
+from sme_registry.task.task import (
+    COST,
+    REGRET,
+    REWARD,
+    SAFE_REGRET,
+    SIMILARITY,
+    STEP_REWARD,
+    Array,
+    Indices,
+    Mask,
+    Observation,
+)
 
 ReportProgress = Callable[[int, int], None]
 Act = Callable[[Array, Observation], Array]

@@ -19,7 +19,6 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled.arrays import Array, Mask, Observation
 from sme_registry.datasets.collect import ReportProgress, collect, reference_scores
 from sme_registry.datasets.documents import (
     KEY,
@@ -64,6 +63,7 @@ from sme_registry.spec import SMESpec, catalogue
 from sme_registry.spec.sme_spec import ACTION_RANGES, SpecLike
 from sme_registry.spec.suite import ProtocolLike
 from sme_registry.task import load, materialize
+from sme_registry.task.task import Array, Mask, Observation
 
 _NAMESPACE = "namespace_metadata.json"
 _ID = re.compile(r"([A-Za-z0-9_-]+/)*[A-Za-z0-9_-]+-v[0-9]+")

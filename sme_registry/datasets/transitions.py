@@ -24,7 +24,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import stdtrit
 
-from sme_registry.compiled.arrays import Array, Indices, Mask, Observation
 from sme_registry.datasets.documents import DatasetRecipe
 from sme_registry.envs.arguments import initial_states, to_unit
 from sme_registry.envs.batch import Batch
@@ -38,7 +37,7 @@ from sme_registry.spec import SMESpec
 from sme_registry.spec.sme_spec import SpecLike
 from sme_registry.task import Task, step
 from sme_registry.task.loading import load_task
-from sme_registry.task.task import Step
+from sme_registry.task.task import Array, Indices, Mask, Observation, Step
 
 Arrays = dict[str, npt.NDArray[Any]]
 

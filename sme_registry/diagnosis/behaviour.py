@@ -29,7 +29,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled.arrays import REWARD, STEP_REWARD, Mask, Observation
 from sme_registry.diagnosis.measure import LINEAR, MAX_NUMBERS, POLICY, Score, observed, states_of
 from sme_registry.diagnosis.questions import THRESHOLDS
 from sme_registry.envs import arguments
@@ -43,6 +42,7 @@ from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf
 from sme_registry.statistics import smoothed
 from sme_registry.task import Task, draw
 from sme_registry.task.draw import Array
+from sme_registry.task.task import REWARD, STEP_REWARD, Mask, Observation
 from sme_registry.training.algorithms import one_thread, quiet
 
 CONSTANTS = ("best_constant", "constant_half")

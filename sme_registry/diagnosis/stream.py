@@ -14,7 +14,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sme_registry.compiled.arrays import Observation
 from sme_registry.diagnosis import measure
 from sme_registry.diagnosis.behaviour import NetworkState, network_state
 from sme_registry.diagnosis.document import Diagnosis, Part, cells, table
@@ -24,6 +23,7 @@ from sme_registry.evaluation import regions
 from sme_registry.evaluation.networks import Perceptron
 from sme_registry.spec import StreamSpec
 from sme_registry.spec.document import Digest, Integer, Real, StrictModel, TupleOf
+from sme_registry.task.task import Observation
 
 PhaseOutcome = Literal["retained", "forgotten", "not_learnt"]
 

@@ -14,7 +14,6 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias
 import numpy as np
 from pydantic import JsonValue
 
-from sme_registry.compiled.arrays import Observation
 from sme_registry.diagnosis.behaviour import Log, exploration
 from sme_registry.errors import OptionError, SMEError, SpecError, UnknownNameError
 from sme_registry.evaluation import EvaluationReport, Policy, StreamReport
@@ -26,6 +25,7 @@ from sme_registry.io import read_json
 from sme_registry.plots.maps import STREAM
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.study import Cell
+from sme_registry.task.task import Observation
 from sme_registry.training import record as run_files
 from sme_registry.training.algorithms import find, in_jax, parse_uses
 from sme_registry.training.numpy_policy import numpy_policy

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from pydantic import JsonValue
 
-from sme_registry.compiled.arrays import Observation
 from sme_registry.diagnosis import behaviour, measure
 from sme_registry.diagnosis.behaviour import CapacityProbe
 from sme_registry.diagnosis.document import (
@@ -50,6 +49,7 @@ from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.spec.document import Digest, Integer, Real, StrictModel, TupleOf
 from sme_registry.task import Task, materialize
 from sme_registry.task.draw import Array
+from sme_registry.task.task import Observation
 
 TASK_QUESTIONS = {**WHERE, **WHY}
 

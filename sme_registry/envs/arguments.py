@@ -15,7 +15,6 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled.arrays import Array, Mask
 from sme_registry.errors import (
     ActionError,
     OptionError,
@@ -30,6 +29,7 @@ from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.sme_spec import ACTION_RANGES, SpecLike
 from sme_registry.task import Task
 from sme_registry.task.loading import load_task
+from sme_registry.task.task import Array, Mask
 
 MAX_LIFETIME = 2**62  # at which a life may begin: its steps are counted in 64 bits
 

@@ -14,7 +14,14 @@ import numpy as np
 from gymnasium.utils import seeding
 
 from sme_registry.compiled import Engine, engine
-from sme_registry.compiled.arrays import (
+from sme_registry.compiled.engine import StepMany, draw
+from sme_registry.envs.arguments import not_finite_error
+from sme_registry.envs.schedule import Schedule
+from sme_registry.errors import ActionError
+from sme_registry.spec import SMESpec, StreamSpec
+from sme_registry.task import Task
+from sme_registry.task.loading import check_memory
+from sme_registry.task.task import (
     OWN_DISTRACTORS,
     OWN_DRAWN,
     OWN_KEY,
@@ -23,13 +30,6 @@ from sme_registry.compiled.arrays import (
     Mask,
     Observation,
 )
-from sme_registry.compiled.engine import StepMany, draw
-from sme_registry.envs.arguments import not_finite_error
-from sme_registry.envs.schedule import Schedule
-from sme_registry.errors import ActionError
-from sme_registry.spec import SMESpec, StreamSpec
-from sme_registry.task import Task
-from sme_registry.task.loading import check_memory
 
 _FLOAT64 = np.dtype(np.float64)
 _AHEAD = 16  # states drawn at once for an environment
@@ -43,7 +43,7 @@ class BatchStep(NamedTuple):
 
     observation: Observation  # `[B, …]`: s or M(s, d), t/T, each agent's r_cum/k, a shown phase
     actions: Array  # `[1 or 3, B, A]` of the unit range: π*; with `safety` limits and safe actions
-    values: Array  # `[5 or 7, n, B]`: the rows of `compiled.arrays`
+    values: Array  # `[5 or 7, n, B]`: the rows of `task.task`
     terminated: Mask
     truncated: Mask
 

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled.arrays import Array
 from sme_registry.errors import OptionError
 from sme_registry.spec import SMESpec
+from sme_registry.task.task import Array
 
 # Excess over the limits, summed over channels, up to which an action is safe: evaluation's
 # tolerance of one channel or, where A > 16, what rounding to float32 can add to a safe action.

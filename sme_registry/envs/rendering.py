@@ -11,7 +11,6 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled.arrays import Array
 from sme_registry.envs import arguments
 from sme_registry.envs.batch import Batch, BatchStep
 from sme_registry.envs.schedule import ScheduleMixin
@@ -21,6 +20,7 @@ from sme_registry.io.markup import card, folded, pairs_html
 from sme_registry.spec import SMESpec, StreamSpec, cards
 from sme_registry.spec.catalogue import title
 from sme_registry.task import Task
+from sme_registry.task.task import Array
 
 if TYPE_CHECKING:
     import pygame

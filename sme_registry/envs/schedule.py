@@ -16,19 +16,6 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from sme_registry.compiled.arrays import (
-    ACCUMULATED_REWARD,
-    COST,
-    REGRET,
-    ROWS,
-    ROWS_WITH_SAFETY,
-    SAFE_REGRET,
-    SIMILARITY,
-    STEP_REWARD,
-    Array,
-    Indices,
-    Observation,
-)
 from sme_registry.envs import arguments
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.catalogue import DYNAMICS_VERSION, NAMESPACE, Resolved, content_id, resolve
@@ -36,6 +23,16 @@ from sme_registry.spec.sme_spec import SpecLike
 from sme_registry.spec.stream import StreamLike
 from sme_registry.task import Task
 from sme_registry.task.loading import materialize_segments
+from sme_registry.task.task import (
+    ACTIONS,
+    NUMBERS,
+    REWARD,
+    ROWS,
+    ROWS_WITH_SAFETY,
+    Array,
+    Indices,
+    Observation,
+)
 
 _NAN = np.float64(np.nan)
 
@@ -43,13 +40,15 @@ _NAN = np.float64(np.nan)
 class StepColumns(NamedTuple):
     """What a step computes of a task."""
 
-    rows: int  # of `values`; see `compiled.arrays`
+    rows: int  # of `values`; see `task.task`
     numbers: dict[str, int]  # keys of infos whose values are numbers, and their rows
     actions: tuple[str, ...]  # keys whose values are `[A]`, in the environment's action range
 
     @classmethod
     def of(cls, spec: SMESpec) -> StepColumns:
-        return _PLAIN if spec.safety is None else _WITH_SAFETY
+        rows, actions = (ROWS, 1) if spec.safety is None else (ROWS_WITH_SAFETY, len(ACTIONS))
+        numbers = {name: row for row, name in enumerate(NUMBERS[:rows]) if row != REWARD}
+        return cls(rows, numbers, ACTIONS[:actions])
 
     def at_reset(self, width: int) -> dict[str, Any]:
         """The info of a reset: NaN for every key, those of actions as fresh arrays `[width]`."""
@@ -68,23 +67,6 @@ class StepColumns(NamedTuple):
         for row, key in enumerate(self.actions):
             info[key] = in_range[row]
         return info
-
-
-_PLAIN = StepColumns(
-    ROWS,
-    {
-        "similarity": SIMILARITY,
-        "step_reward": STEP_REWARD,
-        "regret": REGRET,
-        "accumulated_reward": ACCUMULATED_REWARD,
-    },
-    ("optimal_action",),
-)
-_WITH_SAFETY = StepColumns(
-    ROWS_WITH_SAFETY,
-    {**_PLAIN.numbers, "cost": COST, "safe_regret": SAFE_REGRET},
-    ("optimal_action", "limit", "safe_action"),
-)
 
 
 class Schedule:

@@ -11,15 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.compiled import engine
-from sme_registry.compiled.arrays import (
-    ACCUMULATED_REWARD,
-    BUFFER_STATE,
-    BUFFER_VALUES,
-    Action,
-    Array,
-    Indices,
-    Observation,
-)
 from sme_registry.envs import arguments
 from sme_registry.envs.batch import Distractors
 from sme_registry.envs.rendering import RENDER_MODES, RenderMixin, html_card
@@ -29,6 +20,15 @@ from sme_registry.spec.catalogue import title
 from sme_registry.spec.sme_spec import ActionRange, SpecLike
 from sme_registry.spec.stream import StreamLike
 from sme_registry.task import Task
+from sme_registry.task.task import (
+    ACCUMULATED_REWARD,
+    BUFFER_STATE,
+    BUFFER_VALUES,
+    Action,
+    Array,
+    Indices,
+    Observation,
+)
 
 _FLOAT32, _FLOAT64 = np.dtype(np.float32), np.dtype(np.float64)
 _POOL_BYTES = 4096

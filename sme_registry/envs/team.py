@@ -25,7 +25,6 @@ import numpy as np
 import numpy.typing as npt
 from pettingzoo import ParallelEnv
 
-from sme_registry.compiled.arrays import REWARD, Array, Indices, Observation
 from sme_registry.envs import arguments
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.rendering import RENDER_MODES, RenderMixin, html_card
@@ -34,6 +33,7 @@ from sme_registry.errors import ActionError, EpisodeError, OptionError, did_you_
 from sme_registry.spec.catalogue import title
 from sme_registry.spec.sme_spec import ActionRange, SpecLike
 from sme_registry.task import Task
+from sme_registry.task.task import REWARD, Array, Indices, Observation
 
 _ONLY: Indices = np.zeros(1, np.int64)
 

@@ -11,7 +11,6 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from sme_registry.compiled.arrays import REWARD, Array, Indices, Mask, Observation
 from sme_registry.envs import arguments
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.rendering import METADATA, Frame, batch_renderer, html_card
@@ -23,6 +22,7 @@ from sme_registry.spec.catalogue import title
 from sme_registry.spec.sme_spec import ActionRange, SpecLike
 from sme_registry.spec.stream import StreamLike
 from sme_registry.task import Task
+from sme_registry.task.task import REWARD, Array, Indices, Mask, Observation
 
 _NONE: Indices = np.empty(0, np.int64)
 

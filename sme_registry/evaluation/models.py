@@ -22,10 +22,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sme_registry.compiled.arrays import Observation
 from sme_registry.errors import PolicyError, did_you_mean
 from sme_registry.io import import_object, require_packages
 from sme_registry.spec.sme_spec import ACTION_RANGES, ActionRange
+from sme_registry.task.task import Observation
 
 Act = Callable[[Observation], Any]
 

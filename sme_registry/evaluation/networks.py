@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled.arrays import Observation
 from sme_registry.errors import OptionError, PolicyError, SMEError
 from sme_registry.io import choice, parse_json, to_json, write_atomically
+from sme_registry.task.task import Observation
 
 Weights = npt.NDArray[np.float32]
 Layer = tuple[Weights, Weights, str]

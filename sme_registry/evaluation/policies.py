@@ -18,7 +18,6 @@ from typing import Any, ClassVar, Literal, NamedTuple, cast
 
 import numpy as np
 
-from sme_registry.compiled.arrays import Array, Observation
 from sme_registry.envs import arguments
 from sme_registry.envs.team import shared_observation_of
 from sme_registry.errors import (
@@ -35,6 +34,7 @@ from sme_registry.evaluation.references import POLICIES, reference_policy
 from sme_registry.io import choice, import_object
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.sme_spec import ACTION_RANGES, ActionRange
+from sme_registry.task.task import Array, Observation
 
 
 @dataclass(frozen=True)

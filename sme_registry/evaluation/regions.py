@@ -34,13 +34,13 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from sme_registry.compiled.arrays import Observation
 from sme_registry.errors import OptionError, PolicyError
 from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf
 from sme_registry.task import Task
 from sme_registry.task.certificate import held_out_r2
 from sme_registry.task.draw import Array, bit_generator, to_uniform
+from sme_registry.task.task import Observation
 
 Observations = npt.NDArray[np.float32]
 

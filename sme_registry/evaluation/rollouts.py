@@ -8,7 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled.arrays import (
+from sme_registry.envs.arguments import initial_states, single_agent
+from sme_registry.envs.batch import Batch, BatchStep
+from sme_registry.evaluation.policies import Policy, TeamPolicy
+from sme_registry.task import Task, draw
+from sme_registry.task.task import (
     REGRET,
     REWARD,
     SIMILARITY,
@@ -17,10 +21,6 @@ from sme_registry.compiled.arrays import (
     Mask,
     Observation,
 )
-from sme_registry.envs.arguments import initial_states, single_agent
-from sme_registry.envs.batch import Batch, BatchStep
-from sme_registry.evaluation.policies import Policy, TeamPolicy
-from sme_registry.task import Task, draw
 
 MOST_ENVS = 4096
 """Most episodes in parallel, so that memory does not grow with their number."""

@@ -25,12 +25,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sme_registry.compiled.arrays import Observation
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation import Perceptron
 from sme_registry.evaluation.models import Interface, device_of, evaluating, start_session
 from sme_registry.io import require_packages
 from sme_registry.spec.sme_spec import ActionRange
+from sme_registry.task.task import Observation
 
 if TYPE_CHECKING:
     import torch

@@ -15,7 +15,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from sme_registry.compiled.arrays import REWARD, Array, Mask, Observation
 from sme_registry.envs import arguments
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.episodes import Episode, Episodes, info_of_envs
@@ -30,6 +29,7 @@ from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.catalogue import title
 from sme_registry.spec.sme_spec import ActionRange, SpecLike
 from sme_registry.spec.stream import StreamLike
+from sme_registry.task.task import REWARD, Array, Mask, Observation
 
 StepResult: TypeAlias = tuple[Observation, npt.NDArray[np.float32], Mask, list[dict[str, Any]]]
 """Observations, rewards, dones and infos."""

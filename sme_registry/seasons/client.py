@@ -16,7 +16,6 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from sme_registry.compiled.arrays import Action, Array, Mask, Observation
 from sme_registry.envs import arguments
 from sme_registry.errors import (
     EpisodeError,
@@ -50,6 +49,7 @@ from sme_registry.seasons.wire import (
 from sme_registry.spec import Setting, SMESpec
 from sme_registry.spec.document import StrictModel
 from sme_registry.spec.sme_spec import ActionRange
+from sme_registry.task.task import Action, Array, Mask, Observation
 
 TicketLike = Ticket | str | os.PathLike[str]
 _Document = TypeVar("_Document", bound=StrictModel)

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from sme_registry.compiled.arrays import Observation
 from sme_registry.sb3.vec_env import LanesVecEnv, StepResult
 from sme_registry.seasons.client import Instance, SealedVectorEnv, TicketLike
 from sme_registry.seasons.wire import PATIENCE
 from sme_registry.spec.sme_spec import ActionRange
+from sme_registry.task.task import Observation
 
 
 class SealedVecEnv(LanesVecEnv):

@@ -58,7 +58,6 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from sme_registry.compiled.arrays import Mask, Observation
 from sme_registry.errors import (
     ActionError,
     BudgetSpentError,
@@ -87,6 +86,7 @@ from sme_registry.spec.document import (
     TupleOf,
     matching,
 )
+from sme_registry.task.task import Mask, Observation
 
 Float32 = npt.NDArray[np.float32]
 

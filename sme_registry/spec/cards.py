@@ -4,21 +4,39 @@ from __future__ import annotations
 
 import itertools
 import re
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 from rich.markup import escape
 
 from sme_registry.io.markup import Table, card, pairs_html, table_html
 from sme_registry.spec import catalogue
-from sme_registry.spec.sme_spec import ObservationSpec, SafetySpec, Setting, SMESpec
+from sme_registry.spec.sme_spec import Setting, SMESpec
 from sme_registry.spec.stream import StreamSpec
 
 SHORT = len("sha256:") + 12
 """Characters of a digest that name a task."""
 
 _SYMBOL = re.compile(r"^([A-Zθτm]), ")  # with which a description begins
-_BLOCKS: dict[str, type[BaseModel]] = {"safety": SafetySpec, "observation": ObservationSpec}
+BLOCKS: dict[str, type[BaseModel]] = {
+    name: kind
+    for name, field in Setting.model_fields.items()
+    for kind in get_args(field.annotation)
+    if isinstance(kind, type) and issubclass(kind, BaseModel)
+}
+"""The fields of a spec that are documents themselves, such as `safety`."""
+
+
+def fields_of_block(name: str) -> dict[str, FieldInfo]:
+    """The fields of a block, in its own order; none of another field."""
+    return BLOCKS[name].model_fields if name in BLOCKS else {}
+
+
+def number_type(field: FieldInfo) -> type | None:
+    """int or float, the type of a field that is a number, or may be one."""
+    parts = [getattr(part, "__origin__", part) for part in get_args(field.annotation)]
+    return next((kind for kind in (int, float) if kind in (field.annotation, *parts)), None)
 
 
 def html(document: SMESpec | StreamSpec) -> str:
@@ -181,6 +199,17 @@ def symbol(name: str) -> str:
     return name if name in ("k", "D", "r_min") else ""
 
 
+def axis(name: str) -> str:
+    """What a field is called in words and by its symbol: `reward interval k`, `rotation θ`."""
+    if not symbol(name):
+        return name
+    return f"{_field(name).title or name.rpartition('.')[2].replace('_', ' ')} {symbol(name)}"
+
+
 def _description(name: str) -> str:
+    return _field(name).description or ""
+
+
+def _field(name: str) -> FieldInfo:
     block, _, inner = name.rpartition(".")
-    return _BLOCKS.get(block, SMESpec).model_fields[inner].description or ""
+    return BLOCKS.get(block, SMESpec).model_fields[inner]

@@ -252,11 +252,11 @@ class Setting(Document):
     fields_added_later: ClassVar[tuple[str, ...]] = ("rotation", "safety", "observation")
 
     schema_version: SchemaVersion = 1
-    state_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM)] = 8
-    action_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM)] = 4
-    k: Annotated[Integer, Field(ge=1, le=2**31 - 1)] = 1
-    r_min: Annotated[Real, Field(ge=0, lt=1)] = 0.0
-    D: Annotated[Real, Field(ge=0, lt=1)] = 0.0
+    state_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM, title="state dimension")] = 8
+    action_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM, title="action dimension")] = 4
+    k: Annotated[Integer, Field(ge=1, le=2**31 - 1, title="reward interval")] = 1
+    r_min: Annotated[Real, Field(ge=0, lt=1, title="minimum reward")] = 0.0
+    D: Annotated[Real, Field(ge=0, lt=1, title="survival threshold")] = 0.0
     complexity: Annotated[Integer, Field(ge=1, le=10_000)] = 1
     horizon: Annotated[Integer, Field(ge=1, le=2**31 - 1)] = 100
     hidden_width: Annotated[Integer, Field(ge=1, le=4096)] = 64

@@ -38,7 +38,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -46,7 +46,37 @@ from scipy.special import ndtr, ndtri
 
 from sme_registry.errors import ActionError, SpecError, StateError
 from sme_registry.spec import SMESpec
-from sme_registry.task.draw import Array, Layer
+from sme_registry.task.draw import Array as Array
+from sme_registry.task.draw import Layer
+
+Observation: TypeAlias = npt.NDArray[np.float32]
+"""Observations, each entry in [0, 1]."""
+
+Action: TypeAlias = npt.NDArray[np.floating[Any]]
+"""Actions of an agent, in its environment's range."""
+
+Mask: TypeAlias = npt.NDArray[np.bool_]
+"""`[B]` which environments."""
+
+Indices: TypeAlias = npt.NDArray[np.int64]
+"""Indices of environments, or a count for each of them."""
+
+NUMBERS = (
+    "similarity", "step_reward", "regret", "reward", "accumulated_reward",
+    "cost", "safe_regret",  # of tasks with safety
+)  # fmt: skip
+"""What one step computes for n agents in B environments: the rows of `values` `[5 or 7, n, B]`."""
+SIMILARITY, STEP_REWARD, REGRET, REWARD, ACCUMULATED_REWARD, COST, SAFE_REGRET = range(len(NUMBERS))
+ROWS, ROWS_WITH_SAFETY = COST, len(NUMBERS)
+
+ACTIONS = ("optimal_action", "limit", "safe_action")
+"""The rows of `actions` `[1 or 3, B, A]`; only π* without safety."""
+
+# A single environment is one buffer: t, the values of its last step, of which it keeps r_cum, the
+# state s `[S]`, and its own distractors: the key of their random numbers, how many it has drawn,
+# and d `[m]`.
+BUFFER_T, BUFFER_VALUES, BUFFER_STATE = 0, 1, 1 + ROWS_WITH_SAFETY
+OWN_KEY, OWN_DRAWN, OWN_DISTRACTORS = range(3)
 
 _LARGEST = 1e300  # beyond it W s could overflow, and π* be NaN
 
@@ -143,10 +173,7 @@ class Task:
 
     def limit(self, s: npt.ArrayLike) -> Array:
         """ℓ, the limits of the action channels, `[B, A]` or `[A]` in [1 − 2τ, 1]; else 1."""
-        s = self._states(s)
-        if not self.limiting:
-            return np.ones((*s.shape[:-1], self.spec.action_dim))
-        return self.limit_of(through(self.limiting, s))
+        return self._limit(self._states(s))
 
     def safe_action(self, s: npt.ArrayLike) -> Array:
         """min(π*, ℓ), `[B, A]` or `[A]`: the action of cost 0 nearest to π*; none earns more."""
@@ -269,6 +296,11 @@ class Task:
             actions.append(through(layers, x))
         return np.concatenate(actions, axis=-1) if len(actions) > 1 else actions[0]
 
+    def _limit(self, s: Array) -> Array:
+        if not self.limiting:
+            return np.ones((*s.shape[:-1], self.spec.action_dim))
+        return self.limit_of(through(self.limiting, s))
+
     def _pairs(self, s: npt.ArrayLike, a: npt.ArrayLike) -> tuple[Array, Array]:
         """Checked states and actions; one of them may be single while the other is a batch."""
         s, a = self._states(s), self._actions(a)
@@ -291,22 +323,39 @@ class Step(NamedTuple):
     Attributes:
       state: `[B, S]` next states.
       optimal_action: `[B, A]` π*.
+      limit: `[B, A]` ℓ, 1 without `safety`.
+      safe_action: `[B, A]`.
       similarity: `[B, n]` r̃ over the agent's own channels.
       step_reward: `[B, n]` r.
+      regret: `[B, n]` 1 − r.
       reward: `[B, n]` R, the payout.
       accumulated_reward: `[B, n]` r_cum, after a payout's reset.
+      cost: `[B, 1]`, 0 without `safety`.
+      safe_regret: `[B, n]` r of the safe action − r.
       terminated: `[B]`.
       truncated: `[B]`.
     """
 
     state: Array
     optimal_action: Array
+    limit: Array
+    safe_action: Array
     similarity: Array
     step_reward: Array
+    regret: Array
     reward: Array
     accumulated_reward: Array
-    terminated: npt.NDArray[np.bool_]
-    truncated: npt.NDArray[np.bool_]
+    cost: Array
+    safe_regret: Array
+    terminated: Mask
+    truncated: Mask
+
+    def write(self, actions: Array, values: Array) -> None:
+        """Write the rows that `actions` `[1 or 3, B, A]` and `values` `[5 or 7, n, B]` have."""
+        for row, name in zip(actions, ACTIONS, strict=False):
+            row[:] = getattr(self, name)
+        for row, name in zip(values, NUMBERS, strict=False):
+            row[:] = getattr(self, name).T
 
 
 def step(
@@ -334,6 +383,9 @@ def step(
         paid_for = np.broadcast_to(task.similarity_of(a, optimal)[:, None], similarity.shape)
     step_reward = task.reward_of(paid_for)
 
+    limit = task._limit(s[:, None, :])[:, 0, :]
+    safe_reward = task.safe_reward_of(optimal, limit)[:, None]
+
     total = accumulated_reward + step_reward
     t = t + 1
     truncated = t >= spec.horizon
@@ -341,10 +393,15 @@ def step(
     return Step(
         state=task.transition(s, a),
         optimal_action=optimal,
+        limit=limit,
+        safe_action=np.minimum(optimal, limit),
         similarity=similarity,
         step_reward=step_reward,
+        regret=1.0 - step_reward,
         reward=np.where(paid, total, 0.0),
         accumulated_reward=np.where(paid, 0.0, total),
+        cost=task.cost_of(a, limit)[:, None],
+        safe_regret=safe_reward - step_reward,
         terminated=np.asarray((step_reward < spec.D).any(axis=-1)),
         truncated=truncated,
     )

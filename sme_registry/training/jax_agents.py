@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.logger import Logger, configure
 
-from sme_registry.compiled.arrays import Array
 from sme_registry.envs.episodes import Episode
 from sme_registry.errors import OptionError
 from sme_registry.evaluation.models import saved_sb3
@@ -17,6 +16,7 @@ from sme_registry.io import is_installed, read_arrays, write_arrays, write_atomi
 from sme_registry.jax.program import StepLog
 from sme_registry.jax.run import new_program, run
 from sme_registry.spec import StreamSpec
+from sme_registry.task.task import Array
 from sme_registry.training.learn import Learner, Run, Steps, Watch
 from sme_registry.training.models import log_of_run, new_sb3_model, set_weights, unloadable
 

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich.console import Console
 
-from sme_registry.compiled.arrays import Array
 from sme_registry.envs.episodes import Episode, Episodes
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation import Policy
@@ -23,6 +22,7 @@ from sme_registry.io.system import defer_interrupts
 from sme_registry.io.terminal import Progress, err
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.sme_spec import ActionRange
+from sme_registry.task.task import Array
 from sme_registry.training.algorithms import short_name
 from sme_registry.training.record import (
     CHECKPOINT,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sme_registry.compiled.arrays import BUFFER_STATE, BUFFER_VALUES, REWARD, ROWS
+from sme_registry.task.task import BUFFER_STATE, BUFFER_VALUES, REWARD, ROWS
 
 
 @dataclass

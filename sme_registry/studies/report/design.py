@@ -8,8 +8,17 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from sme_registry.evaluation.retention import LABELS
-from sme_registry.spec import ObservationSpec, StreamSpec, StudyAlgorithm, StudyPlan, SuiteClass
-from sme_registry.spec.cards import symbol
+from sme_registry.spec import (
+    Setting,
+    StreamSpec,
+    StudyAlgorithm,
+    StudyPlan,
+    SuiteClass,
+    TeamSpec,
+    cards,
+)
+from sme_registry.spec.cards import BLOCKS, fields_of_block, number_type, symbol
+from sme_registry.spec.document import Document
 from sme_registry.training.algorithms import parse_uses
 
 
@@ -71,22 +80,13 @@ WITHIN, OUTSIDE = "WD", "OOD"
 ALL = "all classes"
 SEVERAL = "several axes"
 TASKS, SCHEDULE = "tasks", "schedule"  # axes of streams
-_AXES = {
-    "state_dim": "state dimension",
-    "action_dim": "action dimension",
-    "k": "reward interval",
-    "r_min": "minimum reward",
-    "D": "survival threshold",
-    "complexity": "complexity",
-    "horizon": "horizon",
-    "hidden_width": "hidden width",
-    "rotation": "rotation",
-    "safety.tightness": "tightness",
-}
-AXES = {field: (symbol(field), f"{words} {symbol(field)}") for field, words in _AXES.items()} | {
-    field: (field, field) for field in ("observation", "policy_init")
-}
-"""Symbol and name of each field that studies vary, in the order of reports."""
+AXES = tuple(
+    name
+    for field in Setting.model_fields
+    if field not in ("schema_version", "team")
+    for name in (*(f"{field}.{inner}" for inner in fields_of_block(field)), field)
+)
+"""Each field that studies vary, in the order of reports."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class ClassInfo:
 
     `axis` is the field in which it differs, dotted within a team (`team.reward`) or an observation;
     "" for the first; `SEVERAL`. `policy_init` counts only if nothing else differs: deep tasks need
-    another one. `setting` has every field; the tightness is 0 without safety.
+    another one. `setting` has every field; without safety its tightness is 0.
     """
 
     name: str
@@ -178,7 +178,7 @@ def groups(
 
 def axis_label(axis: str) -> str:
     """What an axis is called: `reward interval k`."""
-    return AXES[axis][1] if axis in AXES else axis
+    return cards.axis(axis) if axis in AXES else axis
 
 
 def is_numeric(values: Sequence[Any]) -> bool:
@@ -191,39 +191,45 @@ def setting_label(field: str, value: Any, *, with_symbol: bool = True) -> str:
     if not isinstance(value, str):
         as_json = json.dumps(value, separators=(",", ":"), ensure_ascii=False)
         text = f"{value:g}" if is_numeric([value]) else as_json
-    return f"{AXES.get(field, (field,))[0]} = {text}" if with_symbol else text
+    name = (field in AXES and symbol(field)) or field
+    return f"{name} = {text}" if with_symbol else text
 
 
 def _class_info(member: SuiteClass, first: SuiteClass) -> ClassInfo:
     setting, base = _setting(member), _setting(first)
-    differing = [name for name in AXES if name != "observation" and setting[name] != base[name]]
-    for block in ("observation", "team"):
-        within = [n for n in dict.fromkeys((*base, *setting)) if n.partition(".")[0] == block]
-        within = [name for name in within if setting.get(name) != base.get(name)]
+    changed = [n for n in dict.fromkeys((*base, *setting)) if setting.get(n) != base.get(n)]
+    differing = [name for name in changed if name.partition(".")[0] not in BLOCKS]
+    for block in BLOCKS:
+        within = [name for name in changed if name.startswith(f"{block}.")]
         both = getattr(member.setting, block) and getattr(first.setting, block)
-        differing += within if len(within) == 1 and both else [block] * bool(within)
+        values = [of.get(name) for of in (setting, base) for name in within]
+        is_axis = len(within) == 1 and (both or is_numeric(values))
+        differing += within if is_axis else [block] * bool(within)
+        setting[block] = _block_text(getattr(member.setting, block))
     if len(differing) > 1 and "policy_init" in differing:
         differing.remove("policy_init")
-    agents = 0 if member.setting.team is None else len(member.setting.team.agents)
-    setting["team"] = f"{agents} agents" if agents else "none"
-    setting["observation"] = _observation(member.setting.observation)
     axis = differing[0] if len(differing) == 1 else SEVERAL if differing else ""
     label = ", ".join(setting_label(name, setting[name]) for name in differing)
     return ClassInfo(member.name, axis, label, setting)
 
 
 def _setting(member: SuiteClass) -> dict[str, Any]:
-    return {"safety.tightness": 0.0} | _flat(member.setting.every_field())
+    """Every field by its dotted name; numbers of a block that the setting lacks are 0."""
+    setting = _flat(member.setting.every_field())
+    for block in BLOCKS:
+        if setting.pop(block, 0) is None:
+            fields = fields_of_block(block).items()
+            numbers = (n for n, field in fields if number_type(field) and field.default is not None)
+            setting |= {f"{block}.{name}": 0 for name in numbers}
+    return setting
 
 
-def _observation(observation: ObservationSpec | None) -> str:
-    """An observation in words: `32 driven, nonlinear 1`."""
-    if observation is None:
-        return "state"
-    distractors = f"{observation.distractors} {observation.dynamics}"
-    mixing = " ".join(str(part) for part in (observation.mixing, observation.mixing_depth) if part)
-    parts = [distractors] * bool(observation.distractors) + [mixing] * (mixing != "none")
-    return ", ".join(parts)
+def _block_text(block: TeamSpec | Document | None) -> str:
+    """A block in words: `2 agents`, `32 driven nonlinear 1`."""
+    if isinstance(block, TeamSpec):
+        return f"{len(block.agents)} agents"
+    values = {} if block is None else block.model_dump(exclude_defaults=True)
+    return " ".join(str(value) for value in values.values()) or "none"
 
 
 def _flat(fields: Any, prefix: str = "") -> dict[str, Any]:

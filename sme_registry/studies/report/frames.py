@@ -104,7 +104,8 @@ import pandas as pd
 
 from sme_registry.evaluation import EvaluationReport, StreamReport, retention
 from sme_registry.evaluation.retention import BY_VISIT, StreamRegion
-from sme_registry.spec import StudyPlan
+from sme_registry.spec import Setting, StudyPlan
+from sme_registry.spec.cards import BLOCKS, fields_of_block, number_type
 from sme_registry.spec.study import PlannedCell
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellResult
@@ -118,25 +119,37 @@ def _metric_columns(needs: str) -> str:
     return " ".join(metric.key for metric in metrics_of("run") if metric.needs == needs)
 
 
+def _block_columns(block: str) -> str:
+    """The fields of a block, of which runs without it have none."""
+    fields = fields_of_block(block).items()
+    return " ".join(
+        f"{name}:{_OPTIONAL.get(number_type(field), 'string')}" for name, field in fields
+    )
+
+
+_DTYPES: dict[type | None, str] = {int: "int64", float: "float64"}
+_OPTIONAL: dict[type | None, str] = {int: "Int64", float: "float64"}
 _REGION = """region:str epsilon_low epsilon_high states:int64 similarity similarity_sd mae
     normalised_regret similarity_decay similarity_loss clipped_share linear_normalised_regret
     best_constant_normalised_regret random_normalised_regret constant_similarity """
-_RUN = f"""{_metric_columns("")} uses:str action_range:str steps:int64
-    state_dim:int64 action_dim:int64 k:int64 r_min D complexity:int64 horizon:int64
-    hidden_width:int64 policy_init:str rotation spec_seed:str spec_digest:str seed:int64 nu
-    transitions:Int64 dataset_digest:string behaviour_similarity behaviour_similarity_sd
-    offline_similarity offline_similarity_sd improvement seconds steps_per_second key:str"""
+_SPEC = " ".join(
+    f"{name}:{_DTYPES.get(number_type(field), 'str')}"
+    for name, field in Setting.model_fields.items()
+    if name not in ("schema_version", *BLOCKS)
+)
+_RUN = f"""{_metric_columns("")} uses:str action_range:str steps:int64 {_SPEC}
+    spec_seed:str spec_digest:str seed:int64 nu transitions:Int64 dataset_digest:string
+    behaviour_similarity behaviour_similarity_sd offline_similarity offline_similarity_sd
+    improvement seconds steps_per_second key:str"""
+_OF_REGIONS = {
+    "safety": "cost violating_share safe_regret price_of_safety",
+    "observation": "invariance",
+}
 # Columns of a run, and of its regions, only where the plan has tasks with these fields.
 _OF_TASKS = {
-    "safety": (
-        f"tightness {_metric_columns('safety')}",
-        "cost violating_share safe_regret price_of_safety",
-    ),
-    "observation": (
-        "distractors:Int64 dynamics:string mixing:string mixing_depth:Int64 "
-        f"{_metric_columns('observation')}",
-        "invariance",
-    ),
+    block: (f"{_block_columns(block)} {_metric_columns(block)}", _OF_REGIONS.get(block, ""))
+    for block in BLOCKS
+    if block != "team"
 }
 CURVES = RUN_COLUMNS + "step:int64 episode_return regret similarity length"
 # Columns of each agent of a team, as in `wd_regret/agent_0`.
@@ -299,8 +312,9 @@ def _run_columns(result: CellResult, report: EvaluationReport) -> dict[str, Any]
         "spec_seed": str(cell.spec.seed),
         "spec_digest": cell.spec.digest,
     }
-    for block in (cell.spec.safety, cell.spec.observation):
-        columns |= {} if block is None else block.to_dict()
+    for block in _OF_TASKS:
+        fields = getattr(cell.spec, block)
+        columns |= {} if fields is None else fields.to_dict()
     for name, agent in report.agents.items():
         wd, *shells = (region.normalised_regret for region in agent.regions)
         columns |= {

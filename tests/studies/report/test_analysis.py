@@ -90,12 +90,12 @@ def test_limits_and_observations_are_axes():
     assert infos_of({}, *seen)[1:] == [
         ("observation", "observation = 32 driven"),
         ("observation", "observation = nonlinear 3"),
-        ("observation", "observation = 32 driven, nonlinear 3"),
+        ("observation", "observation = 32 driven nonlinear 3"),
     ]
     assert infos_of({"observation": driven | {"dynamics": "noise"}}, *seen)[1:] == [
         ("observation.dynamics", "observation.dynamics = driven"),
         ("observation", "observation = nonlinear 3"),
-        ("observation", "observation = 32 driven, nonlinear 3"),
+        ("observation", "observation = 32 driven nonlinear 3"),
     ]
 
 
