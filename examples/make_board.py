@@ -31,10 +31,10 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 import sme_registry
+from leaderboard.admission import submit_bundle, submit_references
 from leaderboard.bundle import make_bundle
 from leaderboard.documents.signed import SigningKey
 from leaderboard.documents.submission import Training
-from leaderboard.intake import submit_bundle, submit_references
 from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import run_scorers
 from leaderboard.store import Store

@@ -11,7 +11,6 @@ from typing import Any
 from leaderboard.bundle.reading import Bundle
 from leaderboard.bundle.runs import SubmittedRun, listed_by_class, refuse_other_specs, runs_of
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.checks import check_names, check_runs
 from leaderboard.documents.signed import NOBODY, Receiver, Signed, SigningKey
 from leaderboard.documents.submission import (
     ARTEFACTS,
@@ -21,6 +20,8 @@ from leaderboard.documents.submission import (
     Knowledge,
     Submission,
     Training,
+    check_names,
+    check_runs,
     now,
 )
 from leaderboard.errors import Rejection

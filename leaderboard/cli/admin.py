@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from leaderboard import intake
+from leaderboard import admission
 from leaderboard.bundle import make_bundle
 from leaderboard.cli import results
 from leaderboard.cli.options import (
@@ -107,7 +107,7 @@ def init(
         suite_tags=file.tags,
         runs_to_rank=runs_to_rank,
     ) as store:
-        intake.submit_references(store)
+        admission.submit_references(store)
         document = store.document
     folder = escape(str(board))
     classes, instances = len(file.suite.classes), len(file.suite.instances)
@@ -428,7 +428,7 @@ def _create_board(folder: Path, run: Path, record: RunRecord) -> None:
         protocol_name=_name_of(record.protocol),
         protocol=record.protocol,
     ) as store:
-        intake.submit_references(store)
+        admission.submit_references(store)
         make_bundle(
             folder / "bundle",
             suite=file,
@@ -441,7 +441,7 @@ def _create_board(folder: Path, run: Path, record: RunRecord) -> None:
             knowledge="generic",
             submitter="Demonstration",
         )
-        intake.submit_bundle(store, folder / "bundle")
+        admission.submit_bundle(store, folder / "bundle")
 
 
 def _refuse_other_files(folder: Path) -> None:

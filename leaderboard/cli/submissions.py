@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from leaderboard import intake
+from leaderboard import admission
+from leaderboard.admission import check_submission
 from leaderboard.bundle import Bundle, make_bundle
 from leaderboard.cli.options import (
     DEFAULT_KEY,
@@ -32,7 +33,6 @@ from leaderboard.cli.options import (
 )
 from leaderboard.cli.results import find_entry
 from leaderboard.documents.board import RULES, BoardDocument
-from leaderboard.documents.checks import check_submission
 from leaderboard.documents.result import LABELS, SYMBOLS, Result
 from leaderboard.documents.signed import NOBODY, Receiver, SigningKey
 from leaderboard.documents.submission import Knowledge, Withdrawal, now
@@ -344,7 +344,7 @@ def submit(
     else:
         with Store.open(Path(board)) as store:
             signing_key = SigningKey.read(key) if signed.board is None else None
-            out().print(intake.submit_bundle(store, bundle, signing_key), soft_wrap=True)
+            out().print(admission.submit_bundle(store, bundle, signing_key), soft_wrap=True)
 
 
 @app.command()

@@ -22,9 +22,19 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer
 
-from leaderboard.documents.signed import PublicKey, SigningKey
-from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, SuiteReference, Track
-from leaderboard.errors import BoardError
+from leaderboard.documents.signed import MAX_BYTES as MAX_SIGNED_BYTES
+from leaderboard.documents.signed import PublicKey, Receiver, Signed, SigningKey
+from leaderboard.documents.submission import (
+    MAX_ARTEFACT_BYTES,
+    Artefact,
+    Method,
+    Run,
+    Submission,
+    Submitter,
+    SuiteReference,
+    Track,
+)
+from leaderboard.errors import BoardError, Rejection
 from sme_registry.errors import SMEError, SpecError
 from sme_registry.io import parse_json, read_regular
 from sme_registry.spec import EvaluationProtocol, SMESpec, Suite, SuiteFile
@@ -275,3 +285,79 @@ def hex_of(digest: str) -> str:
     if len(digits) != 64 or not set(digits) <= set("0123456789abcdef"):
         raise ValueError(f"not a digest: {digest!r:.90}")
     return digits
+
+
+def check_receiver(board: BoardDocument, receiver: Receiver, address: str | None = None) -> None:
+    """Reject (`wrong_board`) a signature that is not for this board, or not for its address.
+
+    Otherwise a server that stands between could pass on what it was sent, and take part in another
+    board under the sender's name.
+
+    Args:
+      board: the board.
+      receiver: that the signature is for.
+      address: of the server that it was sent to; None if it was given to the board's folder.
+    """
+    if board.signatures_for is None:
+        raise Rejection(
+            "wrong_board",
+            f"board={board.key[:16]}…: follows earlier rules ({board.rules}) and accepts nothing. "
+            "Submit to a board that was created later.",
+        )
+    if receiver.board != board.signatures_for:
+        stated = "none" if receiver.board is None else f"{receiver.board[:16]}…"
+        raise Rejection(
+            "wrong_board",
+            f"board={stated}: the signature must be for this board, {board.key[:16]}…. Send a "
+            "bundle that is signed for no board with `sme-leaderboard submit`, or create it with "
+            "`sme-leaderboard new --board`.",
+        )
+    if address not in (None, receiver.address):
+        raise Rejection(
+            "wrong_board",
+            f"address={receiver.address or 'none'}: the signature must be for this board's "
+            f"address, {address}. Send it there, with a present version of sme-registry; if the "
+            "board has another address by now, its owner must state it (`serve --url`).",
+        )
+
+
+def refuse_unsubmittable(board: BoardDocument) -> None:
+    """Refuse a board whose suite needs more runs than a submission can list.
+
+    An entry needs `runs_to_rank` runs in each class, the same number on each instance.
+
+    Raises:
+      BoardError: they exceed the size limit of a submission.
+    """
+    needed, most = board.runs_needed, most_runs(board)
+    if needed > most:
+        raise BoardError(
+            f"suite={board.suite_name}: a ranked entry needs {needed:,} runs, "
+            f"{board.runs_to_rank} in each class and as many on each instance: must be at most "
+            f"{most}, which fit into the {MAX_SIGNED_BYTES:,} bytes of a submission. Use fewer "
+            "classes or instances, or lower runs_to_rank."
+        )
+
+
+def most_runs(board: BoardDocument) -> int:
+    """Number of runs that fit into a submission to a board, with short texts."""
+    digest = board.suite.digest
+    run = Run(
+        spec=digest,
+        seed=10**6,
+        steps=10**7,
+        artefact=Artefact(sha256=digest, size=MAX_ARTEFACT_BYTES),
+    )
+    submission = Submission(
+        suite=board.suite_reference,
+        method=Method(name="x" * 20, version="1.0", family="x" * 20, knowledge="generic"),
+        submitter=Submitter(name="x" * 20, key=board.key),
+        created="2026-01-01T00:00:00Z",
+        runs=(run,),
+        runs_started={member.name: 100 for member in board.suite.classes},
+    )
+    one, two = (
+        len(Signed[Submission](content=each, signature="0" * 128).to_bytes())
+        for each in (submission, submission.model_copy(update={"runs": (run, run)}))
+    )
+    return 1 + (MAX_SIGNED_BYTES - one) // (two - one)

@@ -1,4 +1,6 @@
-"""`Submission`: the document that a submitter signs. It names policies by hash and has no scores.
+"""`Submission`: the document that a submitter signs, and the checks that its schema cannot express.
+
+It names policies by hash and has no scores.
 
     id = "sha256:" + hex(SHA-256(canonical JSON of the submission))
 
@@ -9,12 +11,18 @@ A bundle is the submitted folder: `submission.json` (a `Signed[Submission]`) and
 from __future__ import annotations
 
 import datetime
+import re
 import time
+import unicodedata
+from collections import Counter
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, SerializerFunctionWrapHandler, model_serializer
 
 from leaderboard.documents.signed import PublicKey, Signable
+from leaderboard.errors import Rejection
+from sme_registry.spec import Suite
 from sme_registry.spec.document import (
     Digest,
     Integer,
@@ -30,7 +38,21 @@ MAX_ARTEFACT_BYTES = 8 * 2**20
 MAX_ENTRIES = 1000
 """Most runs listed, and most classes counted."""
 MAX_RUNS = 1000
-"""Largest total of `runs_started`."""
+"""Largest total of `runs_started`; by rules 1, ten times as many."""
+
+THE_BOARD, REFERENCE_FAMILY = "the board", "reference"
+"""Submitter and family reserved for the board's own reference rows."""
+
+# ASCII only: a similar letter of another script would let one method imitate another.
+_NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._+()-]| (?=[A-Za-z0-9._+()-]))*")
+_LINK = re.compile(r"https://[A-Za-z0-9._~:/?#\[\]@!$&'()*+,;=%-]+")
+_LOOK_ALIKE = str.maketrans(
+    {"0": "o", "1": "l", "i": "l", "2": "z", "3": "e", "4": "a", "5": "s", "8": "b"}
+)
+_PAIRS_ALIKE = {"rn": "m", "vv": "w", "cl": "d"}  # cl after i and 1 have become l
+# Control characters, format characters (some reverse the direction of text), surrogates,
+# line separators and paragraph separators.
+_UNSAFE_CATEGORIES = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 Track = Literal["open"]
 Knowledge = Literal["generic", "family", "oracle"]
@@ -213,3 +235,157 @@ def shifted(moment: datetime.datetime, by: datetime.timedelta) -> datetime.datet
 def now() -> str:
     """The machine's time as documents write it."""
     return utc(datetime.datetime.fromtimestamp(time.time(), datetime.UTC))
+
+
+def check_names(manifest: Manifest, board_key: str | None = None) -> None:
+    """Reject what is unsafe to show: markup, formulas, control characters, the board's own names.
+
+    Args:
+      manifest: a submission, an entry or a request for a ticket.
+      board_key: the key that may use the board's names; None if the board is not known yet.
+
+    Raises:
+      Rejection: `unsafe_name`.
+    """
+    method, training = manifest.method, manifest.training
+    for field, name in (
+        ("method.name", method.name),
+        ("method.version", method.version),
+        ("method.family", method.family),
+        ("submitter.name", manifest.submitter.name),
+    ):
+        if not _NAME.fullmatch(name):
+            raise Rejection(
+                "unsafe_name",
+                f"{field}={name!a}: must begin with a letter or digit, and contain only "
+                "letters a–z, digits, single spaces and '._+-()'. Rename it.",
+            )
+    for field, name, reserved in (
+        ("submitter.name", manifest.submitter.name, THE_BOARD),
+        ("method.family", method.family, REFERENCE_FAMILY),
+    ):
+        if skeleton(name) == skeleton(reserved) and manifest.submitter.key != board_key:
+            raise Rejection(
+                "unsafe_name",
+                f"{field}={name!a}: reserved for the board's own reference rows. Rename it.",
+            )
+    if manifest.code is not None and not _LINK.fullmatch(manifest.code):
+        raise Rejection(
+            "unsafe_name",
+            f"code={manifest.code!a}: must contain only the characters of a URL. "
+            "Write others as %XX.",
+        )
+    for field, text in (
+        ("training.library", training.library),
+        ("training.hyperparameters", training.hyperparameters),
+        ("training.hardware", training.hardware),
+        ("statement", manifest.statement),
+    ):
+        check_text(field, text)
+
+
+def check_text(field: str, text: str) -> None:
+    """Reject (`unsafe_name`) a text whose invisible characters could disguise other text."""
+    for letter in text:
+        if letter != "\n" and unicodedata.category(letter) in _UNSAFE_CATEGORIES:
+            raise Rejection(
+                "unsafe_name",
+                f"{field}: contains {letter!a}: must contain no control characters except line "
+                "breaks. Remove it.",
+            )
+
+
+def skeleton(name: str) -> str:
+    """What is left of a name without the differences that readers overlook.
+
+    Case, spaces and punctuation do not matter, and letters and digits that look alike are one
+    letter, such as O and 0; l, I and 1; or m and rn. The result is for comparison only.
+    """
+    folded = unicodedata.normalize("NFKC", name).casefold()
+    letters = "".join(letter for letter in folded if letter.isalnum())
+    letters = letters.translate(_LOOK_ALIKE)
+    for pair, letter in _PAIRS_ALIKE.items():
+        letters = letters.replace(pair, letter)
+    return letters
+
+
+def check_runs(
+    suite: Suite, submission: Submission, sources: Sequence[str] = (), rules: int = 2
+) -> None:
+    """Reject runs that are not on the suite's instances, listed twice, missing or not counted.
+
+    Args:
+      suite: the board's suite.
+      submission: the submission.
+      sources: what to call each run in an error, such as its folder; empty for `runs.0`, ….
+      rules: of the board. Rules 1 admit submissions without a policy and 10,000 runs started.
+
+    Raises:
+      Rejection: `unknown_spec`, `duplicate_run`, `missing_run`, or `schema` if more runs were
+        started than are allowed.
+    """
+    class_of = {spec.digest: member.name for member in suite.classes for spec in member.instances}
+    for index, run in enumerate(submission.runs):
+        if run.spec not in class_of:
+            raise Rejection(
+                "unknown_spec",
+                f"runs.{index}.spec={run.spec}: must be the digest of one of the suite's "
+                f"{len(class_of)} instances (`sme show {submission.suite.name}`). Train on those, "
+                "or submit to a board of its suite.",
+            )
+    _check_duplicates(submission, sources or [f"runs.{i}" for i in range(len(submission.runs))])
+    ran = {run.spec for run in submission.runs}
+    for digest, name in class_of.items():
+        if digest not in ran:
+            raise Rejection(
+                "missing_run",
+                f"runs: none on {digest} of class {name}: every instance must have one. "
+                "Train on it, or list a failed run (policy null in runs.json), which scores 1.",
+            )
+    if rules > 1 and all(run.artefact is None for run in submission.runs):
+        raise Rejection(
+            "missing_run", "runs: none has a policy: at least one must. Submit a trained policy."
+        )
+    listed = Counter(class_of[run.spec] for run in submission.runs)
+    _check_started(submission, listed, MAX_RUNS * (1 if rules > 1 else 10))
+
+
+def _check_duplicates(submission: Submission, sources: Sequence[str]) -> None:
+    first: dict[tuple[str, str, int | str], int] = {}
+    for index, run in enumerate(submission.runs):
+        values: list[tuple[str, int | str]] = [("seed", run.seed)]
+        if run.artefact is not None:
+            values.append(("policy", run.artefact.sha256))
+        for name, value in values:
+            before = first.setdefault((run.spec, name, value), index)
+            if before != index:
+                raise Rejection(
+                    "duplicate_run",
+                    f"{sources[index]}: {name}={value}: {sources[before]} has the same spec and "
+                    f"{name}. Remove one of them.",
+                )
+
+
+def _check_started(submission: Submission, listed: Counter[str], most: int) -> None:
+    started = submission.runs_started
+    for name in started:
+        if name not in listed:
+            raise Rejection(
+                "missing_run",
+                f"runs_started.{name}: must be a class of the suite: {', '.join(listed)}. "
+                "Rename or remove it (option --started).",
+            )
+    for name, count in listed.items():
+        if started.get(name, 0) < count:
+            raise Rejection(
+                "missing_run",
+                f"runs_started.{name}={started.get(name)}: must be at least {count}, the number of "
+                "listed runs. Count every run that was ever started with this method (option "
+                "--started).",
+            )
+    if sum(started.values()) > most:
+        raise Rejection(
+            "schema",
+            f"runs_started={sum(started.values())}: must be at most {most:,} in total. "
+            "Count the runs of this version of the method only.",
+        )

@@ -34,7 +34,6 @@ from typing import Any
 import numpy as np
 
 from leaderboard.documents.board import BoardDocument
-from leaderboard.documents.checks import check_runs
 from leaderboard.documents.result import (
     METRICS,
     ClassScore,
@@ -44,7 +43,7 @@ from leaderboard.documents.result import (
     RunScore,
     Scores,
 )
-from leaderboard.documents.submission import Submission
+from leaderboard.documents.submission import Submission, check_runs
 from sme_registry.spec import EvaluationProtocol
 from sme_registry.statistics import Array, Statistic, aggregate, iqm, mean, stratified_bootstrap
 

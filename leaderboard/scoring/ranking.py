@@ -25,8 +25,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from leaderboard.documents.checks import skeleton
 from leaderboard.documents.result import Estimate, Metric, Scores
+from leaderboard.documents.submission import skeleton
 from leaderboard.errors import NotPublishable
 from leaderboard.store import EntryRow
 

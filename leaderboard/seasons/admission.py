@@ -11,17 +11,19 @@ from __future__ import annotations
 
 import datetime
 
-from leaderboard.documents.checks import (
-    check_names,
-    check_receiver,
+from leaderboard.admission import (
+    ReadFile,
+    check_daily_quota,
+    check_name,
+    check_room,
+    check_stored,
     check_time,
-    skeleton,
+    uploader,
 )
+from leaderboard.documents.board import check_receiver
 from leaderboard.documents.signed import Signed
-from leaderboard.documents.submission import Artefact
+from leaderboard.documents.submission import Artefact, check_names, skeleton
 from leaderboard.errors import Rejection
-from leaderboard.intake.admission import ReadFile, check_daily_quota, check_name, check_stored
-from leaderboard.intake.uploads import check_room, uploader
 from leaderboard.seasons.entry import Entry, TicketRequest
 from leaderboard.seasons.season import Season, read_answers
 from leaderboard.store import Store, played_bytes

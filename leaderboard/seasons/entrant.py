@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.markup import escape
 
+from leaderboard.admission import upload_header
 from leaderboard.cli.options import (
     DEFAULT_KEY,
     BoardOrUrl,
@@ -28,7 +29,6 @@ from leaderboard.cli.options import (
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError, Rejection
-from leaderboard.intake import upload_header
 from leaderboard.seasons.admission import enter as enter_folder
 from leaderboard.seasons.entry import Entry, TicketRequest, signer_of
 from leaderboard.seasons.publication import name_of, read_season

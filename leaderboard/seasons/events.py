@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from leaderboard.documents.board import Folder
-from leaderboard.documents.checks import skeleton
 from leaderboard.documents.signed import Signed
+from leaderboard.documents.submission import skeleton
 from leaderboard.errors import TamperedError
 from leaderboard.seasons.entry import Entry, SealedManifest, TicketRequest
 from leaderboard.seasons.master import Master

@@ -82,7 +82,7 @@ class SealedStore(Database):
         return SeasonFolder(self.folder, digest)
 
     def enter(self, signed: Signed[Entry]) -> bool:
-        """Add an entry, which `intake` has checked, to an open season.
+        """Add an entry, which was admitted, to an open season.
 
         Returns:
           False if the board already has it.

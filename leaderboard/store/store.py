@@ -7,11 +7,16 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from leaderboard.documents.board import RULES, BoardDocument, Folder
-from leaderboard.documents.checks import check_receiver, check_text, refuse_unsubmittable, skeleton
+from leaderboard.documents.board import (
+    RULES,
+    BoardDocument,
+    Folder,
+    check_receiver,
+    refuse_unsubmittable,
+)
 from leaderboard.documents.result import Result
 from leaderboard.documents.signed import Signed, SigningKey
-from leaderboard.documents.submission import Submission, Withdrawal, now
+from leaderboard.documents.submission import Submission, Withdrawal, check_text, now, skeleton
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.seasons.store import SealedStore
 from leaderboard.store.files import digest_of, read_document, write_document
@@ -200,7 +205,7 @@ class Store(SealedStore):
             return next((key for submitter, key in rows if skeleton(submitter) == alike), None)
 
     def receive(self, signed: Signed[Submission]) -> bool:
-        """Add a submission, which `intake` has checked, to the queue.
+        """Add a submission, which was admitted, to the queue.
 
         Returns:
           False if the board already has it.

@@ -1,7 +1,7 @@
 """`create_app`: a board over HTTP, with its pages and a small API.
 
     GET  /…                              the pages, at the paths of `pages`
-    PUT  /api/objects/<hex>              upload an artefact; signed, see `intake.uploads`
+    PUT  /api/objects/<hex>              upload an artefact; signed, see `admission.uploads`
     GET  /api/objects/<hex>              its bytes, once it is scored, so that anyone can rescore it
     POST /api/submissions                202 accepted, 200 already known
     GET  /api/submissions/<hex>          status and result; reference rows may withhold scores
@@ -32,7 +32,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
-from leaderboard import intake
+from leaderboard import admission
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.signed import MAX_BYTES, Signed
 from leaderboard.documents.submission import Submission, Withdrawal
@@ -171,10 +171,10 @@ class _Routes:
     async def put_object(self, request: Request, digits: str) -> Response:
         digest = _digest(digits)
         header = request.headers.get("Authorization")
-        key = intake.uploader(self._store.document, header, digest, self._address)
+        key = admission.uploader(self._store.document, header, digest, self._address)
 
         def put(data: bytes) -> bool:
-            intake.check_upload(self._store, key, len(data))
+            admission.check_upload(self._store, key, len(data))
             return self._store.put_object(digest, [data], by=key)
 
         async with self._objects:
@@ -205,7 +205,7 @@ class _Routes:
         signed = await to_thread.run_sync(Signed[Submission].read, text, limiter=self._documents)
 
         def admit() -> bool:
-            return intake.admit(
+            return admission.admit(
                 self._store, signed, isolation=self._isolation, address=self._address
             )
 

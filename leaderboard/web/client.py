@@ -14,12 +14,12 @@ import os
 from collections.abc import Callable
 from typing import Any
 
+from leaderboard.admission import upload_header
 from leaderboard.bundle import Bundle
 from leaderboard.documents.board import BoardDocument, hex_of
 from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.documents.submission import Withdrawal, now
 from leaderboard.errors import CODES, BoardError, Rejection
-from leaderboard.intake import upload_header
 from sme_registry.errors import MalformedDocumentError, OptionError, SealedError, SpecError
 from sme_registry.io import parse_json, server_address
 from sme_registry.seasons.wire import Connection

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from leaderboard.documents.board import BoardDocument, hex_of
-from leaderboard.documents.checks import skeleton
 from leaderboard.documents.result import (
     LABELS,
     METRICS,
@@ -23,7 +22,7 @@ from leaderboard.documents.result import (
     RunScore,
 )
 from leaderboard.documents.signed import Receiver, Signed
-from leaderboard.documents.submission import Run, Submission, Withdrawal
+from leaderboard.documents.submission import Run, Submission, Withdrawal, skeleton
 from leaderboard.errors import NotPublishable
 from leaderboard.scoring import ranking
 from leaderboard.scoring.aggregation import class_mean, groups_of, never_listed

@@ -10,8 +10,8 @@ from pathlib import Path
 import httpx
 import uvicorn
 
+from leaderboard.admission import upload_header
 from leaderboard.documents.signed import Receiver
-from leaderboard.intake import upload_header
 from leaderboard.web.app import create_app
 from leaderboard.web.server import listen, server_config, url_of
 

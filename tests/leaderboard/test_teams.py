@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from leaderboard import intake
+from leaderboard import admission
 from leaderboard.bundle import make_bundle
 from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.signed import SigningKey
@@ -80,8 +80,8 @@ def board(tmp_path_factory):
     """A board whose references and shared policy are scored; nobody changes it."""
     folder = tmp_path_factory.mktemp("teams")
     with Store.create(folder / "board", **FIELDS) as store:
-        intake.submit_references(store)
-        intake.submit_bundle(store, bundle(folder / "mine", linear_onnx(400, *WIDTHS)), KEY)
+        admission.submit_references(store)
+        admission.submit_bundle(store, bundle(folder / "mine", linear_onnx(400, *WIDTHS)), KEY)
     run_scorer(folder / "board")
     return folder / "board"
 

@@ -343,7 +343,7 @@ def test_scoring_loads_no_parser_and_nothing_needs_posix_to_be_imported():
         "sys.modules |= dict.fromkeys(('fcntl', 'resource', 'termios', 'pwd', 'grp'))\n"
         "for name in ('SIGXCPU', 'SIGKILL', 'SIGHUP'): delattr(signal, name)\n"
         "import leaderboard.bundle, leaderboard.gate.sandbox, leaderboard.scoring.score\n"
-        "from leaderboard.intake import receive\n"
+        "from leaderboard.admission import admit\n"
         "assert not {'onnx', 'onnxruntime', 'torch', 'google.protobuf'} & set(sys.modules)\n"
         "from leaderboard.gate.sandbox import inspect_own\n"
         f"inspect_own({linear().SerializeToString()!r}, 4, 2)\n"

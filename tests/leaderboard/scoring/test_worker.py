@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from leaderboard import intake
+from leaderboard import admission
 from leaderboard.errors import BoardError, ScoringFault, TamperedError
 from leaderboard.scoring import worker as scorer
 from leaderboard.scoring.aggregation import failed_run, result_of
@@ -85,7 +85,7 @@ def test_faults_leave_a_submission_waiting_and_others_are_scored(
     store, submit, monkeypatch, caplog
 ):
     """Here the reference rows: a board needs them, however often they failed."""
-    broken, whole = intake.submit_references(store), submit(1)
+    broken, whole = admission.submit_references(store), submit(1)
     monkeypatch.setattr("leaderboard.store.queue.uptime", lambda: ("boot", 1000.0))
     errors = []
 

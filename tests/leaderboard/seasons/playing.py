@@ -9,9 +9,9 @@ from typing import NamedTuple
 import httpx
 import numpy as np
 
+from leaderboard.admission import upload_header
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.errors import Rejection
-from leaderboard.intake import upload_header
 from leaderboard.seasons.admission import start_ticket
 from leaderboard.seasons.entrant import request_ticket
 from leaderboard.seasons.entry import TicketRequest, signer_of

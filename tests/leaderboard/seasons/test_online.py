@@ -6,9 +6,9 @@ import httpx
 import numpy as np
 import pytest
 
+from leaderboard.admission import upload_header
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.errors import Rejection
-from leaderboard.intake import upload_header
 from leaderboard.seasons.admission import start_ticket
 from leaderboard.seasons.entry import TicketRequest
 from leaderboard.seasons.scores import score_ticket

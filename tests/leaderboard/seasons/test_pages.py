@@ -2,7 +2,7 @@
 
 import pytest
 
-from leaderboard import intake
+from leaderboard import admission
 from leaderboard.scoring.aggregation import failed_run
 from leaderboard.seasons.pages import SECTION
 from leaderboard.seasons.scoring import sealed_result
@@ -104,7 +104,7 @@ def test_a_season_is_shown_before_the_boards_reference_rows_but_not_its_scores(
 ):
     monkeypatch.setattr(boards, "submit", lambda *args, **fields: None)
     with boards.create(tmp_path / "board", classes=1) as board:
-        intake.submit_references(board)
+        admission.submit_references(board)
         board.announce(ONLINE)
         request = signed_request(board, ONLINE, key)
         board.start_ticket(request)

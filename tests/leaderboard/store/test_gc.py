@@ -3,9 +3,8 @@ import time
 
 import pytest
 
-from leaderboard import intake
+from leaderboard import admission
 from leaderboard.errors import Rejection
-from leaderboard.intake import admission
 from leaderboard.store import Store, collect_garbage
 from leaderboard.store.objects import Objects
 from sme_registry.io import sha256_of
@@ -98,12 +97,12 @@ def test_gc_between_check_and_log_entry_refuses_the_submission(store, key, monke
     with monkeypatch.context() as patch:
         patch.setattr(admission, "_check_files", checked_then_collected)
         with pytest.raises(Rejection) as refused:
-            intake.admit(store, signed)
+            admission.admit(store, signed)
     assert refused.value.code == "artefact_missing"
     assert store.entries() == []
     for digest, data in artefacts.items():
         assert store.put_object(digest, [data], by=key.public)
-    assert intake.admit(store, signed)
+    assert admission.admit(store, signed)
     assert collect_garbage(store, objects_older_than=0).objects == 0
 
 

@@ -2,7 +2,7 @@ import time
 
 import pytest
 
-from leaderboard import intake
+from leaderboard import admission
 from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError
 from leaderboard.store import Store
@@ -160,7 +160,7 @@ def test_a_slow_scorer_may_still_finish_after_its_claim_ended_in_a_fault(store, 
 
 def test_reference_rows_are_first_and_wait_like_others_after_a_fault(store, submit, clock):
     other = submit()
-    references = intake.submit_references(store)
+    references = admission.submit_references(store)
     claims = [store.queue.claim(f"worker {number}") for number in range(3)]
     assert [claim.id for claim in claims] == [*references, other.id]
     for _ in range(9):
@@ -203,7 +203,7 @@ def test_nothing_is_claimed_without_the_boards_key(store, submit):
 
 def test_a_row_rejected_by_an_earlier_version_stays_rejected(store):
     """As scorers did before: such a board is still read, and its log followed."""
-    first, second = intake.submit_references(store)
+    first, second = admission.submit_references(store)
     claim = store.queue.claim("worker")
     assert store.queue.finish(claim, synthetic_result(store, first, code="scoring_failed"))
     store.reindex()

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 
-from leaderboard import intake
+from leaderboard import admission
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import Submission, utc
@@ -179,7 +179,7 @@ def test_a_board_without_references_shows_nothing(url):
 
 
 def test_a_new_board_says_that_it_prepares_and_how_to_submit(store):
-    intake.submit_references(store)
+    admission.submit_references(store)
     key = SigningKey.generate()
     waiting = boards.submit(store, key, "Early", None)
     with serving(store.folder.path) as url:
@@ -236,7 +236,7 @@ def test_what_does_not_last_is_announced_only_by_a_server_that_scores(store, mon
     monkeypatch.setattr(app, "background_scorers", lambda *_: contextlib.nullcontext())
     with serving(store.folder.path, score_workers=1) as url:  # a reference row is missing
         assert "refresh" not in HTTP.get(url, headers=BROWSER).text
-    intake.submit_references(store)
+    admission.submit_references(store)
     for workers in (0, 1):
         with serving(store.folder.path, score_workers=workers) as url:
             answer = HTTP.get(f"{url}/api/board", headers=JSON)
@@ -404,7 +404,7 @@ def test_scores_are_withheld_until_the_references_are_right(url, store):
     assert "0.123" not in json.dumps(view())
     assert (view(rejected)["status"], view(rejected)["result"]["code"]) == ("rejected", "onnx_op")
 
-    intake.submit_references(store)
+    admission.submit_references(store)
     page = HTTP.get(f"{url}/submissions/{hex_of(scored)}.html").text
     assert "the scores are withheld" in page
     assert "0.123" not in page
@@ -476,7 +476,7 @@ def test_an_artefact_is_public_once_it_is_scored(tmp_path, key):
 
 
 def test_policies_of_reference_rows_are_public_and_verified_if_their_file_changes(url, store):
-    (optimal, _) = intake.submit_references(store)
+    (optimal, _) = admission.submit_references(store)
     (run,) = store.submission(optimal).content.runs
     digest = run.artefact.sha256
     path, file = f"{url}/api/objects/{hex_of(digest)}", store.folder.object(digest)
@@ -747,7 +747,7 @@ def test_every_code_of_the_server_is_explained():
 
 def test_serving_outlives_its_scorers_and_stops_cleanly(tmp_path):
     with tiny_board(tmp_path / "board") as store:
-        intake.submit_references(store)
+        admission.submit_references(store)
         with serving_process(store.folder.path, workers=1) as (url, process):
             killed, deadline = [], time.monotonic() + 300
             while store.queue.waiting():

@@ -5,7 +5,7 @@ import re
 import pytest
 from playwright.sync_api import expect
 
-from leaderboard import intake
+from leaderboard import admission
 from leaderboard.documents.board import hex_of
 from leaderboard.web.server import write_site
 from tests.browser import needs_chromium, serving_files
@@ -261,7 +261,7 @@ def test_a_fresh_board_says_that_it_prepares_and_then_shows_its_rows(opened, tmp
         boards.create(tmp_path / "board", classes=1, references=False) as store,
         serving(store.folder.path) as url,
     ):
-        intake.submit_references(store)
+        admission.submit_references(store)
         page = opened(url)
         expect(page.get_by_text("Preparing.")).to_be_visible()
         for level in (0.0, 1.0):

@@ -5,17 +5,12 @@ import datetime
 import pytest
 from typer.testing import CliRunner
 
+from leaderboard.admission import check_submission
 from leaderboard.cli import app
 from leaderboard.cli.options import find_suite
-from leaderboard.documents.board import BoardDocument, Limits
-from leaderboard.documents.checks import (
-    check_names,
-    check_submission,
-    most_runs,
-    refuse_unsubmittable,
-)
+from leaderboard.documents.board import BoardDocument, Limits, most_runs, refuse_unsubmittable
 from leaderboard.documents.signed import MAX_BYTES, Signed
-from leaderboard.documents.submission import Submission
+from leaderboard.documents.submission import Submission, check_names
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.store import Store
 from sme_registry import EvaluationProtocol

@@ -3,14 +3,13 @@ from functools import partial
 
 import pytest
 
-from leaderboard import intake
+from leaderboard import admission
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.result import Result
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import Submission, utc
 from leaderboard.errors import Rejection, ScoringFault
 from leaderboard.gate import gate, sandbox
-from leaderboard.intake import admission, references
 from leaderboard.scoring.worker import run_scorer
 from sme_registry.io import sha256_of
 from tests.leaderboard.clocks import move_clock
@@ -52,7 +51,7 @@ def code_of(call):
 def receive(store, signed):
     """Admit a submission from its bytes, as a server does."""
     read = Signed[Submission].read(signed.to_bytes())
-    intake.admit(store, read)
+    admission.admit(store, read)
     return read.id
 
 
@@ -186,9 +185,9 @@ def test_public_documents_that_strangers_send_again_count_for_nobody(tmp_path, k
         elsewhere = gone.content.signed(key, Receiver("a" * 64))
         for signed, code in 2 * ((gone, "withdrawn"), (elsewhere, "wrong_board")):
             envelope = Signed[Submission].read(signed.to_bytes())
-            assert code_of(partial(intake.admit, store, envelope)) == code
+            assert code_of(partial(admission.admit, store, envelope)) == code
         last = Signed[Submission].read(uploaded(store, key, 2).to_bytes())
-        assert intake.admit(store, last)
+        assert admission.admit(store, last)
 
 
 def test_an_artefact_of_another_size_or_width_is_refused_and_a_failed_run_needs_none(store, key):
@@ -246,7 +245,7 @@ def test_a_full_queue_accepts_only_references_and_faults_make_room_in_it(tmp_pat
         store.queue.fault(claim, "no memory")
         assert receive(store, signed) == signed.id
         assert (store.queue.waiting(), store.queue.queued()) == (2, 1)
-        assert len(intake.submit_references(store)) == 2  # without them nothing is ever shown
+        assert len(admission.submit_references(store)) == 2  # without them nothing is ever shown
 
 
 def test_a_submission_is_for_one_board(tmp_path, store, key):
@@ -270,7 +269,7 @@ def test_a_bundle_is_stored_with_its_artefacts(tmp_path, store, key):
     signed, artefacts = tiny_submission(store, key)
     folder = bundle(tmp_path / "bundle", signed, artefacts)
     for _ in range(2):
-        assert intake.submit_bundle(store, folder) == signed.id
+        assert admission.submit_bundle(store, folder) == signed.id
     assert len(store.entries()) == 1
     for digest, data in artefacts.items():
         assert store.objects.read(digest) == data
@@ -279,24 +278,24 @@ def test_a_bundle_is_stored_with_its_artefacts(tmp_path, store, key):
 def test_a_bundle_that_is_refused_leaves_nothing(tmp_path, store, key):
     signed, artefacts = tiny_submission(store, key, created=ANY_TIME)
     folder = bundle(tmp_path / "old", signed, artefacts)
-    assert code_of(lambda: intake.submit_bundle(store, folder)) == "stale_time"
+    assert code_of(lambda: admission.submit_bundle(store, folder)) == "stale_time"
     signed, artefacts = tiny_submission(store, key)
     folder = bundle(tmp_path / "changed", signed, dict.fromkeys(artefacts, b"?"))
-    assert code_of(lambda: intake.submit_bundle(store, folder)) == "artefact_digest"
+    assert code_of(lambda: admission.submit_bundle(store, folder)) == "artefact_digest"
     assert (objects(store), store.entries()) == ([], [])
 
 
 def test_a_bundle_for_no_board_is_signed_for_the_board_it_is_sent_to(tmp_path, store, key):
     signed, artefacts = tiny_submission(store, key)
     folder = bundle(tmp_path / "bundle", signed.content.signed(key), artefacts)
-    assert code_of(lambda: intake.submit_bundle(store, folder)) == "wrong_board"
+    assert code_of(lambda: admission.submit_bundle(store, folder)) == "wrong_board"
     other = SigningKey.generate()
-    assert code_of(lambda: intake.submit_bundle(store, folder, other)) == "bad_signature"
+    assert code_of(lambda: admission.submit_bundle(store, folder, other)) == "bad_signature"
     elsewhere = bundle(
         tmp_path / "other", signed.content.signed(key, Receiver("a" * 64)), artefacts
     )
-    assert code_of(lambda: intake.submit_bundle(store, elsewhere, key)) == "wrong_board"
-    assert intake.submit_bundle(store, folder, key) == signed.id
+    assert code_of(lambda: admission.submit_bundle(store, elsewhere, key)) == "wrong_board"
+    assert admission.submit_bundle(store, folder, key) == signed.id
     assert store.submission(signed.id) == signed
 
 
@@ -305,8 +304,8 @@ def test_a_bundle_for_no_board_is_signed_for_the_board_it_is_sent_to(tmp_path, s
 
 def test_reference_rows_exist_once_however_often_submitted(tmp_path, monkeypatch):
     with tiny_board(tmp_path / "b", instances=2) as store:
-        ids = intake.submit_references(store)
-        assert intake.submit_references(store) == ids
+        ids = admission.submit_references(store)
+        assert admission.submit_references(store) == ids
         rows = store.entries()
         assert [row.id for row in rows] == ids
         assert [row.method for row in rows] == ["optimal", "constant"]
@@ -316,9 +315,9 @@ def test_reference_rows_exist_once_however_often_submitted(tmp_path, monkeypatch
         created = {store.submission(id).content.created for id in ids}
         assert created == {opened}
         # Other versions may write other bytes.
-        others = [each._replace(onnx=lambda _: linear_onnx(7)) for each in references.REFERENCES]
-        monkeypatch.setattr(references, "REFERENCES", others)
-        assert intake.submit_references(store) == ids
+        others = [each._replace(onnx=lambda _: linear_onnx(7)) for each in admission.REFERENCES]
+        monkeypatch.setattr(admission, "REFERENCES", others)
+        assert admission.submit_references(store) == ids
         assert len(store.entries()) == 2
 
 
@@ -329,7 +328,7 @@ def test_an_old_board_accepts_its_reference_rows_whatever_else_has_their_name(
     monkeypatch.setattr(store, "log", lambda *_: [entry])
     method = {"name": "optimal", "version": "1", "family": "reference", "knowledge": "oracle"}
     put_submission(store, key, method=method)
-    assert len(intake.submit_references(store)) == 2
+    assert len(admission.submit_references(store)) == 2
     assert [row.reference for row in store.entries()] == [False, True, True]
 
 
@@ -376,9 +375,9 @@ def test_an_upload_is_signed_for_one_object_one_board_and_one_address(store, key
     here, there = "https://board.example", "https://other.example"
 
     def sender(header, digest=this, address=here):
-        return intake.uploader(store.document, header, digest, address)
+        return admission.uploader(store.document, header, digest, address)
 
-    header = intake.upload_header(key, this, Receiver(store.document.key, here))
+    header = admission.upload_header(key, this, Receiver(store.document.key, here))
     assert sender(header) == key.public
     assert code_of(lambda: sender(header, that)) == "bad_signature"
     assert code_of(lambda: sender(None)) == "bad_signature"
@@ -387,7 +386,7 @@ def test_an_upload_is_signed_for_one_object_one_board_and_one_address(store, key
         ("board", store.document.key, "b" * 64),
         ("address", here, there),
     ):
-        changed = intake.upload_header(
+        changed = admission.upload_header(
             key, this, Receiver(store.document.key, here)._replace(**{name: other})
         )
         without = header.replace(f"{name}={value},", "")
@@ -404,13 +403,13 @@ def test_an_upload_is_signed_for_one_object_one_board_and_one_address(store, key
 @pytest.mark.parametrize("minutes", [-11, 11])
 def test_an_upload_is_signed_for_ten_minutes(store, key, minutes):
     digest, receiver = "sha256:" + "1" * 64, Receiver(store.document.key, "https://board.example")
-    header = intake.upload_header(key, digest, receiver)
+    header = admission.upload_header(key, digest, receiver)
     moment = datetime.datetime.now(datetime.UTC)
     nearly = moment + datetime.timedelta(minutes=minutes * 9 / 11)
     past = moment + datetime.timedelta(minutes=minutes)
 
     def sender(at):
-        return intake.uploader(store.document, header, digest, receiver.address, at)
+        return admission.uploader(store.document, header, digest, receiver.address, at)
 
     assert sender(nearly) == key.public
     assert code_of(lambda: sender(past)) == "stale_time"
@@ -421,12 +420,12 @@ def test_upload_quotas_count_stored_bytes(tmp_path, key, monkeypatch):
     with tiny_board(tmp_path / "b", limits=limits) as store:
         put(store, key, {sha256_of(bytes(500)): bytes(500)})
         me, other = key.public, SigningKey.generate().public
-        intake.check_upload(store, me, 500)
-        intake.check_upload(store, other, 900)
-        assert code_of(lambda: intake.check_upload(store, me, 501)) == "quota"
-        assert code_of(lambda: intake.check_upload(store, other, 901)) == "too_large"
+        admission.check_upload(store, me, 500)
+        admission.check_upload(store, other, 900)
+        assert code_of(lambda: admission.check_upload(store, me, 501)) == "quota"
+        assert code_of(lambda: admission.check_upload(store, other, 901)) == "too_large"
         move_clock(monkeypatch, utc(after(days=1, seconds=2)))
-        intake.check_upload(store, me, 900)
+        admission.check_upload(store, me, 900)
 
 
 def test_documents_count_like_artefacts(store, key):
@@ -473,15 +472,17 @@ def test_old_uploads_without_a_submission_make_room(tmp_path):
             return {store.objects.read(digest)[:1] for digest, _ in store.objects.paths()}
 
         other = SigningKey.generate().public
-        assert code_of(lambda: intake.check_upload(store, other, 150)) == "quota"  # they are young
+        assert (
+            code_of(lambda: admission.check_upload(store, other, 150)) == "quota"
+        )  # they are young
         date(b"1", 30)
         date(b"2", 40)
-        intake.check_upload(store, other, 100)
+        admission.check_upload(store, other, 100)
         assert left() == {b"1", b"2", b"3"}  # it fits without
         put(store, SigningKey.generate(), {sha256_of(b"1" * 300): b"1" * 300})  # by another key
-        intake.check_upload(store, other, 150)
+        admission.check_upload(store, other, 150)
         assert left() == {b"1", b"3"}
         date(b"1", 30)
         date(b"3", -60 * 24 * 365)  # in the future, by a clock that was wrong
-        intake.check_upload(store, other, 900)
+        admission.check_upload(store, other, 900)
         assert (left(), store.total_bytes()) == (set(), 0)

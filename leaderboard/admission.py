@@ -1,0 +1,472 @@
+"""What a board accepts: uploads, submissions, and its own reference rows.
+
+An upload is permitted by a signature for one object and ten minutes:
+
+    Authorization: SME-Ed25519 key=…,board=…,address=…,time=<utc>,signature=<128 hex digits>
+    signature = Ed25519(key, "sme-leaderboard/upload/" board "/" address "/" digest " " time)
+
+A submission of uploaded policies is checked, then stored:
+
+    for this board? → known? → document → policies present → gate → name → quotas → room → store
+
+The order is fixed, so that one fault always has one code. What another submission can change is
+decided once, in the transaction that stores it. The gate's verdicts are kept, so a key that is
+beyond its quota costs no more than the files that it has uploaded.
+"""
+
+from __future__ import annotations
+
+import datetime
+import os
+import re
+from collections import Counter
+from collections.abc import Callable
+from typing import NamedTuple
+
+from leaderboard.bundle import Bundle
+from leaderboard.documents.board import BoardDocument, check_receiver
+from leaderboard.documents.signed import Receiver, Signed, SigningKey, verifies
+from leaderboard.documents.submission import (
+    REFERENCE_FAMILY,
+    THE_BOARD,
+    Artefact,
+    Knowledge,
+    Method,
+    Run,
+    Submission,
+    Submitter,
+    check_names,
+    check_runs,
+    now,
+    shifted,
+    utc,
+)
+from leaderboard.errors import Rejection
+from leaderboard.gate.isolation import Isolation, isolation_for_own
+from leaderboard.gate.reference import constant_onnx, optimal_onnx
+from leaderboard.gate.sandbox import Confined, widths
+from leaderboard.store import Store, make_room
+from sme_registry.io import sha256_of
+from sme_registry.spec import SMESpec
+
+UPLOAD_MINUTES = 10
+MINUTES_AHEAD = 10
+_DAY = datetime.timedelta(days=1)
+_HEADER = re.compile(
+    r"SME-Ed25519 key=([0-9a-f]{64}),"
+    r"(?:board=([0-9a-f]{64}),)?"
+    r"(?:address=([!-+\--~]{1,300}),)?"
+    r"time=(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ),"
+    r"signature=([0-9a-f]{128})"
+)
+
+_VERDICTS_KEPT = 10_000
+ReadFile = Callable[[str], bytes]
+
+_Case = tuple[str, int, int]
+"""The digest of a policy file, and the widths of a task."""
+
+_verdicts: dict[_Case, Rejection | None] = {}
+"""Of the gate."""
+
+
+def upload_header(key: SigningKey, digest: str, receiver: Receiver, time: str | None = None) -> str:
+    """The value of `Authorization` that lets a key upload one object within ten minutes.
+
+    `digest` is the object's, and `time` that of signing, as documents write it; now by default.
+    """
+    time = time or now()
+    signature = key.sign("upload", f"{digest} {time}", receiver)
+    named = "".join(f"{name}={value}," for name, value in receiver._asdict().items() if value)
+    return f"SME-Ed25519 key={key.public},{named}time={time},signature={signature}"
+
+
+def uploader(
+    board: BoardDocument,
+    header: str | None,
+    digest: str,
+    address: str,
+    at: datetime.datetime | None = None,
+) -> str:
+    """The public key that signed an upload of the object of this digest.
+
+    Args:
+      board: the board.
+      header: the value of `Authorization`; None if there is none.
+      digest: of the object.
+      address: of the server that it was sent to.
+      at: time of arrival; now by default.
+
+    Raises:
+      Rejection: `bad_signature`, `wrong_board` or `stale_time`.
+    """
+    match = _HEADER.fullmatch(header or "")
+    if match is None:
+        raise Rejection(
+            "bad_signature",
+            "Authorization: must be `SME-Ed25519 key=…,board=…,address=…,time=…,signature=…`. Sign "
+            "the upload.",
+        )
+    key, for_board, for_address, time, signature = match.groups()
+    receiver = Receiver(for_board, for_address)
+    check_receiver(board, receiver, address)
+    if not verifies(key, signature, "upload", f"{digest} {time}", receiver):
+        raise Rejection(
+            "bad_signature",
+            "Authorization: the signature does not match this object, this time and the key "
+            f"{key[:16]}…. Sign each upload separately.",
+        )
+    moment = at or datetime.datetime.fromisoformat(now())
+    try:
+        age = abs(moment - datetime.datetime.fromisoformat(time))
+        fresh = age <= datetime.timedelta(minutes=UPLOAD_MINUTES)
+    except ValueError:
+        fresh = False
+    if not fresh:
+        raise Rejection(
+            "stale_time",
+            f"time={time}: must be within {UPLOAD_MINUTES} minutes of the board's {utc(moment)}. "
+            "Set your clock, and sign each upload just before sending it.",
+        )
+    return key
+
+
+def a_day_ago(store: Store) -> str:
+    """After which submissions and uploads count towards a day's quotas."""
+    return utc(shifted(datetime.datetime.fromisoformat(store.time), -_DAY))
+
+
+def check_upload(store: Store, key: str, size: int) -> None:
+    """Reject so many bytes (`too_large`), or so many more of a key or on the board (`quota`)."""
+    limits = store.document.limits
+    if size > limits.artefact_bytes:
+        raise Rejection(
+            "too_large",
+            f"object: {size:,} bytes: must be at most {limits.artefact_bytes:,}. "
+            "Export a smaller network.",
+        )
+    used = store.uploaded_bytes(key, a_day_ago(store))
+    if used + size > limits.upload_bytes_per_day:
+        raise Rejection(
+            "quota",
+            f"key={key[:16]}…: has uploaded {used:,} of {limits.upload_bytes_per_day:,} bytes "
+            "within 24 hours. Upload the rest 24 hours after the first of them.",
+        )
+    check_room(store, size)
+
+
+def check_room(store: Store, size: int) -> None:
+    """Reject (`quota`) so many bytes that do not fit onto a board, even without old uploads."""
+    if not make_room(store, size):
+        raise Rejection(
+            "quota",
+            f"board: its {store.document.limits.total_bytes:,} bytes are full. "
+            "Send it again in a few minutes, or ask the board's owner to raise the limit.",
+        )
+
+
+def admit(
+    store: Store,
+    signed: Signed[Submission],
+    policy_file: ReadFile | None = None,
+    isolation: Isolation | None = None,
+    address: str | None = None,
+) -> bool:
+    """Check a submission and store it.
+
+    Args:
+      store: the board.
+      signed: the submission, its signature verified.
+      policy_file: returns a file's bytes by digest, of the size in the submission; they are
+        stored with the submission. By default the submitter's key has uploaded them.
+      isolation: of the process that reads its policies; None for the one that this machine has.
+      address: of the server that it was sent to; None if it was given to the board's folder.
+
+    Returns:
+      True if it is new, False if the board already has it.
+
+    Raises:
+      Rejection: with the code of the first fault.
+      ScoringFault: that process does not start; nothing is judged.
+    """
+    check_receiver(store.document, signed.receiver, address)
+    known = store.entry(signed.id)
+    if known is not None:
+        if known.status == "withdrawn":
+            raise Rejection(
+                "withdrawn",
+                f"submission={signed.id}: was withdrawn by its submitter, which is final. "
+                "Sign a new one.",
+            )
+        return False
+    submission = signed.content
+    key = submission.submitter.key
+    # The board's own rows are signed at its opening, and added at any time.
+    time = submission.created if key == store.document.key else store.time
+    check_submission(store.document, submission, datetime.datetime.fromisoformat(time))
+    _check_files(store, submission, policy_file, isolation)
+    with store.transaction():  # no other submission can use the quota or the name in between
+        check_name(store, submission.submitter)
+        _check_quotas(store, key)
+        if key != store.document.key:
+            check_room(store, len(signed.to_bytes()))
+        for digest, declared in _policies(submission).items():  # nor can `gc` take a file
+            if policy_file is not None:
+                store.put_object(digest, [policy_file(digest)], by=key)
+            check_stored(store, key, declared)
+        return store.receive(signed)
+
+
+def submit_bundle(
+    store: Store, folder: str | os.PathLike[str], key: SigningKey | None = None
+) -> str:
+    """Admit a bundle: its submission and the policy files in its folder; returns the id.
+
+    `key` is the submitter's, to sign a submission that is signed for no board yet. A `Rejection`
+    has the code of the first fault, and nothing is stored.
+    """
+    bundle = Bundle.read(folder)
+    signed = bundle.signed
+    if key is not None:
+        signed = signed.for_receiver(Receiver(store.document.key), key)
+    admit(store, signed, policy_file=bundle.artefact, isolation=isolation_for_own())
+    return signed.id
+
+
+def check_submission(board: BoardDocument, submission: Submission, at: datetime.datetime) -> None:
+    """Reject what a board does not accept at its time `at`, whatever else is on it.
+
+    The first failure is reported: `unsafe_name`, `unknown_suite`, `schema` (a time that does not
+    exist), `stale_time`, those of `check_runs`, `too_large`.
+    """
+    check_names(submission, board.key)
+    expected = board.suite_reference
+    if submission.suite != expected:
+        raise Rejection(
+            "unknown_suite",
+            f"suite={submission.suite.name}, {submission.suite.digest}: must be "
+            f"{expected.name}, {expected.digest}. Create a bundle for this board's suite.",
+        )
+    check_time(submission.created, at, board.limits.age_days)
+    check_runs(board.suite, submission)
+    for index, run in enumerate(submission.runs):
+        if run.artefact is not None and run.artefact.size > board.limits.artefact_bytes:
+            raise Rejection(
+                "too_large",
+                f"runs.{index}.artefact.size={run.artefact.size:,}: must be at most "
+                f"{board.limits.artefact_bytes:,} bytes on this board. Submit a smaller network.",
+            )
+
+
+def check_time(created: str, at: datetime.datetime, age_days: int) -> None:
+    """Reject a time that does not exist (`schema`), or is not near the board's (`stale_time`)."""
+    try:
+        moment = datetime.datetime.fromisoformat(created)
+    except ValueError:
+        raise Rejection(
+            "schema", f"created={created!r}: must be an existing time. Correct it."
+        ) from None
+    if moment - at > datetime.timedelta(minutes=MINUTES_AHEAD):
+        raise Rejection(
+            "stale_time",
+            f"created={created}: must be at most {MINUTES_AHEAD} minutes ahead of the board's "
+            "clock. Set your clock, and sign again.",
+        )
+    if at - moment > datetime.timedelta(days=age_days):
+        raise Rejection(
+            "stale_time",
+            f"created={created}: must be at most {age_days} days old. Sign again.",
+        )
+
+
+def check_name(store: Store, submitter: Submitter) -> None:
+    """Reject (`name_taken`) a name that another key has used, or one that looks like it."""
+    holder = store.holder_of_name(submitter.name)
+    if holder not in (None, submitter.key):
+        raise Rejection(
+            "name_taken",
+            f"submitter.name={submitter.name!a}: on this board it belongs to the key "
+            f"{holder[:16]}…, which was the first to use it, or a name that looks like it. Choose "
+            "another name, or sign with that key.",
+        )
+
+
+def _check_quotas(store: Store, key: str) -> None:
+    """Reject one more submission of a key if its quota, or the queue, is full.
+
+    The board's own key has no quota, because nothing is shown without the reference rows.
+    """
+    limits = store.document.limits
+    if key == store.document.key:
+        return
+    check_daily_quota(store, key)
+    waiting = store.queue.queued()  # those that faults have stopped take nobody's place
+    if waiting >= limits.waiting_submissions:
+        raise Rejection(
+            "quota",
+            f"board: the queue is full, with {waiting} of {limits.waiting_submissions} waiting "
+            "submissions. Send it again when some of them are scored.",
+        )
+
+
+def check_daily_quota(store: Store, key: str) -> None:
+    """Reject (`quota`) one more submission or entry of a key that has sent a day's number."""
+    limits = store.document.limits
+    times = store.submission_times(key, a_day_ago(store))
+    if len(times) >= limits.submissions_per_day:
+        first = datetime.datetime.fromisoformat(times[-limits.submissions_per_day])
+        free = shifted(first, _DAY)
+        raise Rejection(
+            "quota",
+            f"key={key[:16]}…: has sent {len(times)} of {limits.submissions_per_day} submissions "
+            f"within 24 hours. Send the next one after {utc(free)}.",
+        )
+
+
+def _policies(submission: Submission) -> dict[str, Artefact]:
+    """Each distinct policy file, by its digest, in the order of the runs."""
+    return {run.artefact.sha256: run.artefact for run in submission.runs if run.artefact}
+
+
+def _check_files(
+    store: Store,
+    submission: Submission,
+    policy_file: ReadFile | None,
+    isolation: Isolation | None,
+) -> None:
+    """Check that all are present with the declared sizes; then inspect one after the other."""
+    if policy_file is None:
+        for declared in _policies(submission).values():
+            check_stored(store, submission.submitter.key, declared)
+    instances = store.document.instances
+    cases = dict.fromkeys(
+        (run.artefact.sha256, *widths(instances[run.spec][1]))
+        for run in submission.runs
+        if run.artefact
+    )
+    _inspect(policy_file or store.objects.read, list(cases), isolation)
+
+
+def _inspect(read: ReadFile, cases: list[_Case], isolation: Isolation | None) -> None:
+    """Raise the gate's first verdict, which depends on bytes and widths only, and is kept."""
+    if len(_verdicts) >= _VERDICTS_KEPT:
+        _verdicts.clear()
+    unknown = [case for case in cases if case not in _verdicts]
+    if unknown:
+        with Confined(isolation=isolation) as confined:
+            for digest, observation_dim, action_dim in unknown:
+                try:
+                    confined.inspect(read(digest), observation_dim, action_dim)
+                except Rejection as rejection:
+                    _verdicts[digest, observation_dim, action_dim] = rejection
+                    break
+                _verdicts[digest, observation_dim, action_dim] = None
+    for case in cases:
+        if (verdict := _verdicts.get(case)) is not None:
+            raise Rejection(verdict.code, verdict.message)
+
+
+def check_stored(store: Store, key: str, declared: Artefact) -> None:
+    """Check that the key has uploaded a policy file; if not, say nothing about it."""
+    digest = declared.sha256
+    if not (store.possesses(key, digest) and store.objects.has(digest)):
+        raise Rejection(
+            "artefact_missing",
+            f"artefact={digest}: the submission's key has not uploaded it. Upload it before the "
+            "submission.",
+        )
+    size = store.folder.object(digest).stat().st_size
+    if size != declared.size:
+        raise Rejection(
+            "artefact_digest",
+            f"artefact={digest}: has {size:,} bytes, but the submission declares "
+            f"{declared.size:,}. Recreate the bundle with `sme-leaderboard new`.",
+        )
+
+
+class Reference(NamedTuple):
+    """A reference policy; `onnx` makes its artefact for a spec."""
+
+    name: str
+    knowledge: Knowledge
+    onnx: Callable[[SMESpec], bytes]
+    statement: str
+
+
+REFERENCES: tuple[Reference, ...] = (
+    Reference(
+        "optimal",
+        "oracle",
+        optimal_onnx,
+        "The optimal policy, computed from the public specs. Its regret is 0.",
+    ),
+    Reference(
+        "constant",
+        "family",
+        constant_onnx,
+        "The action ½ in every state, the best policy that ignores its input. Its regret is 1.",
+    ),
+)
+
+
+def submit_references(store: Store) -> list[str]:
+    """Submit π* and the constant ½ through the pipeline that every policy takes.
+
+    The board's own key signs them at the time when the board was opened. A row that exists is
+    kept, so a board has one of each, however often this is called.
+
+    Returns:
+      The ids of `optimal` and `constant`.
+
+    Raises:
+      BoardError: the board's key is missing.
+    """
+    opened = store.log(0, 1)[0].time
+    key = store.folder.signing_key()
+    existing = {row.method: row.id for row in store.entries() if row.reference}
+    ids = []
+    for reference in REFERENCES:
+        if reference.name in existing:  # another version of `onnx` would write other bytes
+            ids.append(existing[reference.name])
+            continue
+        signed, artefacts = _submission(store, key, opened, reference)
+        admit(
+            store,
+            signed,
+            artefacts.__getitem__,
+            isolation_for_own(),
+        )
+        ids.append(signed.id)
+    return ids
+
+
+def _submission(
+    store: Store, key: SigningKey, opened: str, reference: Reference
+) -> tuple[Signed[Submission], dict[str, bytes]]:
+    """A reference row with one run on each instance, and its artefacts by digest."""
+    artefacts: dict[str, bytes] = {}
+    runs = []
+    instances = store.document.instances
+    for digest, (_, spec) in instances.items():
+        data = reference.onnx(spec)
+        sha256 = sha256_of(data)
+        artefacts[sha256] = data
+        runs.append(
+            Run(spec=digest, seed=0, steps=0, artefact=Artefact(sha256=sha256, size=len(data)))
+        )
+    submission = Submission(
+        track=store.document.track,
+        suite=store.document.suite_reference,
+        method=Method(
+            name=reference.name,
+            version="1",
+            family=REFERENCE_FAMILY,
+            knowledge=reference.knowledge,
+        ),
+        submitter=Submitter(name=THE_BOARD, key=key.public),
+        created=opened,
+        runs=tuple(runs),
+        runs_started=dict(Counter(class_name for class_name, _ in instances.values())),
+        statement=reference.statement,
+    )
+    return submission.signed(key, Receiver(key.public)), artefacts
