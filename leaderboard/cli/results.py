@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -18,12 +19,13 @@ from leaderboard.scoring import ranking
 from leaderboard.scoring.ranking import REASONS, RankedRow
 from leaderboard.scoring.verify import VerifyReport
 from leaderboard.scoring.verify import verify as verify_board
+from leaderboard.seasons.verify import verify_seasons
 from leaderboard.store import EntryRow, Store
 from leaderboard.web import client
 from leaderboard.web.tables import PublicView, RankingFile, public_view, steps_text
 from sme_registry.errors import OptionError
 from sme_registry.io.markup import Table
-from sme_registry.io.terminal import Progress, err, fixed, out, print_json, print_pairs
+from sme_registry.io.terminal import err, fixed, out, print_json, print_pairs
 
 app = typer.Typer()
 
@@ -37,8 +39,8 @@ def rank(
         Metric,
         typer.Option(
             metavar="METRIC",
-            help="wd_regret: inside the training cube. ood_regret: outside it. ood_decay: their "
-            "difference.",
+            help="wd_regret: inside the training cube. ood_regret: outside it. ood_decay: what is "
+            "lost outside.",
         ),
     ] = "wd_regret",
     json: Json = False,
@@ -47,8 +49,9 @@ def rank(
 ) -> None:
     """Rank the entries by a metric, with the ranks that each entry's interval allows.
 
-    All metrics are normalised regret: 0 is the optimal policy and 1 the constant ½. OOD decay
-    is ranked only if the upper bound of WD regret is at most 0.5: a policy that has learned nothing
+    Regrets are normalised: 0 is the optimal policy and 1 the constant ½. OOD decay is the share of
+    similarity that is lost outside (on boards of rules 2 the difference of the regrets), ranked
+    only if the upper bound of WD regret is at most 0.5: a policy that has learned nothing
     inside the cube has nothing to lose outside it.
 
     Examples:
@@ -275,12 +278,18 @@ def verify(
         str | None,
         typer.Option(metavar="DIGEST", help="Digest that an earlier `verify` printed."),
     ] = None,
+    published: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of a season's published files, if the board has no copy."),
+    ] = None,
     json: Json = False,
 ) -> None:
-    """Check every signature, hash, log entry and score, and name the first altered row.
+    """Check every signature, digest, log entry and score, seasons included.
 
-    The exit code is 3 if a row was altered. --rescore draws from all results and prints its seed.
-    The exit code is 1 if an entry is not confirmed here: its numbers or its verdict differ. Other
+    The table at the end says what was checked, and what was not and why.
+
+    The exit code is 3 if something was altered, and names it. It is 1 if an entry is not confirmed
+    here, because its numbers or its verdict differ, or if a published file is missing. Other
     processors and versions round otherwise, so repeat it on another machine.
 
     Entries cut off the end of the log leave no trace in it: keep the printed digest and pass it to
@@ -292,39 +301,43 @@ def verify(
 
       sme-leaderboard verify board --contains sha256:3f2a…
     """
-    from dataclasses import asdict
-
-    with Progress("verifying", 1, console=err(), unit="rows", enabled=not json) as progress:
+    seasons = partial(verify_seasons, published=published or ())
+    with err().status("verifying") as status:
         report = verify_board(
             board,
             rescore=_rescore_count(rescore),
             seed=seed,
             contains=contains,
-            progress=progress.update_of,
+            parts=[seasons],
+            progress=lambda what: status.update(f"verifying {escape(what)}"),
         )
-    pairs = asdict(report)
-    confirmed = all(note.kind == "versions" for note in report.notes)
     if json:
-        print_json(pairs)
+        print_json(report.to_dict())
     else:
-        _print_verification(report, pairs, confirmed=confirmed)
-    if not confirmed:
+        _print_verification(report)
+    if not report.is_confirmed:
         raise typer.Exit(1)
 
 
-def _print_verification(report: VerifyReport, pairs: dict[str, object], *, confirmed: bool) -> None:
-    last, digest = pairs.pop("log_sequence"), pairs.pop("log_digest")
-    del pairs["notes"]
-    if not report.rescored:
-        del pairs["rescore_seed"], pairs["tolerance"]
-    outcome = "[green]Verified[/]" if confirmed else "[yellow]Not confirmed here, see below[/]"
-    print_pairs(f"{outcome}: no row was altered.", pairs)
+def _print_verification(report: VerifyReport) -> None:
+    columns = {"": "text", "checked": "number", "not checked": "number", "why": "text"}
+    table = Table("What was checked", columns)
+    for row in report.rows:
+        table.add_row(escape(row.what), f"{row.checked:,}", f"{row.unchecked:,}", escape(row.why))
+    out().print(table)
     for note in report.notes:
-        what = "note" if note.kind == "versions" else "not confirmed here"
-        line = f"{what}: entry {note.submission}: {note.kind}: {note.where}: "
-        line += f"recorded {note.recorded or 'nothing'}, here {note.here}"
+        path, recorded, here = note.difference
+        line = f"not confirmed here: {note.entry}: {path}: recorded {recorded}, here {here}"
         out().print(escape(line), soft_wrap=True)
-    out().print(f"Digest of the last log entry, {last}:\n{digest}", soft_wrap=True)
+    for digest in report.missing:
+        out().print(f"missing: {digest}", soft_wrap=True)
+    outcome = "[green]Verified[/]" if report.is_confirmed else "[yellow]Not confirmed here[/]"
+    out().print(f"{outcome}: nothing was altered.")
+    if report.rescore_seed is not None:
+        out().print(f"Repeat the draw with --seed {report.rescore_seed}.")
+    out().print(
+        f"Digest of the last log entry, {report.log_sequence}:\n{report.log_digest}", soft_wrap=True
+    )
 
 
 def _rescore_count(text: str) -> int | Literal["all"]:

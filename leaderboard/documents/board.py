@@ -3,14 +3,12 @@
     board.json                   the board: suite, protocol, limits, public key
     board.key                    its private key
     log/00000000.json …          signed entries, each with the digest of the one before
-    submissions/<64 hex>.json    signed submissions, by id
-    withdrawals/<64 hex>.json    signed withdrawals, by the submission's id
-    results/<64 hex>.json        by the submission's id
-    objects/ab/cdef…             artefacts, by the SHA-256 of their bytes
-    seasons/<64 hex>/            sealed seasons
+    objects/ab/cdef…             documents that the log names, and policy files, by their SHA-256
+    seasons/<64 hex>/            files of sealed seasons, by the digest of the season
     index.sqlite                 an index of all these, which `reindex` recreates
 
-The log is authoritative. A board has one suite and one protocol.
+The log is authoritative. A board has one suite and one protocol. Boards of rules 2, which are only
+read, have their documents in submissions/, withdrawals/, results/ and seasons/.
 """
 
 from __future__ import annotations
@@ -40,7 +38,7 @@ from sme_registry.io import parse_json, read_regular
 from sme_registry.spec import EvaluationProtocol, SMESpec, Suite, SuiteFile
 from sme_registry.spec.document import Document, Integer, Name, SchemaVersion, StrictModel
 
-RULES: Final = 2
+RULES: Final = 3
 """The rules of new boards."""
 
 FILE = "board.json"
@@ -97,8 +95,8 @@ class BoardDocument(Document):
       suite_description, suite_tags: of the suite's file.
       protocol_name: the protocol's, such as `paper-v1`.
       key: the public key of the log's signatures.
-      rules: version of the rules of signatures, scores and intervals. Boards of version 1, whose
-        JSON has no such field, can be read and verified, and accept nothing.
+      rules: version of the rules of files and scores. Boards of version 2 can be read and verified,
+        and accept nothing.
       runs_to_rank: runs that a ranked entry needs in each class, spread over its instances; below
         10 the board is for practice, and says so.
       draws: number of bootstrap resamples.
@@ -114,7 +112,7 @@ class BoardDocument(Document):
     protocol_name: Name
     protocol: EvaluationProtocol
     key: PublicKey
-    rules: Literal[1, 2] = 1
+    rules: Literal[2, 3]
     runs_to_rank: Annotated[Integer, Field(ge=1, le=1000)] = RUNS_TO_RANK
     draws: Annotated[Integer, Field(ge=100, le=10**6)] = 10_000
     limits: Limits = Limits()
@@ -134,19 +132,12 @@ class BoardDocument(Document):
         for field in ("suite_description", "suite_tags"):
             if not plain[field]:
                 del plain[field]
-        if self.rules == 1:
-            del plain["rules"]
         return plain
 
     @property
     def practice(self) -> bool:
         """Whether entries are ranked by so few runs that the ranking proves little."""
         return self.runs_to_rank < RUNS_TO_RANK
-
-    @property
-    def signatures_for(self) -> str | None:
-        """The board that its submissions and withdrawals are signed for; None with rules 1."""
-        return None if self.rules == 1 else self.key
 
     @property
     def runs_needed(self) -> int:
@@ -206,9 +197,6 @@ class Folder:
         self.board = self.path / FILE
         self.key = self.path / KEY
         self.log = self.path / "log"
-        self.submissions = self.path / "submissions"
-        self.withdrawals = self.path / "withdrawals"
-        self.results = self.path / "results"
         self.objects = self.path / "objects"
         self.seasons = self.path / "seasons"
         self.index = self.path / "index.sqlite"
@@ -226,7 +214,12 @@ class Folder:
             )
         try:
             data = read_regular(self.board, MAX_BYTES)
-            document = BoardDocument.from_dict(parse_json(data, str(self.board)), str(self.board))
+            plain = parse_json(data, str(self.board))
+            if isinstance(plain, dict) and plain.get("rules", 1) == 1:
+                raise BoardError(
+                    f"{self.board}: is of rules 1, which commit 37293a8d is the last to read."
+                )
+            document = BoardDocument.from_dict(plain, str(self.board))
         except OSError as error:
             raise BoardError(f"{self.board}: cannot be read: {error.strerror}.") from None
         except SMEError as error:
@@ -253,20 +246,8 @@ class Folder:
             ) from None
         return SigningKey.parse(data, self.key)
 
-    def submission(self, id: str) -> Path:
-        """The path of a submission, by its id."""
-        return self.submissions / f"{hex_of(id)}.json"
-
-    def withdrawal(self, id: str) -> Path:
-        """The path of a submission's withdrawal, by the submission's id."""
-        return self.withdrawals / f"{hex_of(id)}.json"
-
-    def result(self, id: str) -> Path:
-        """The path of a submission's result, by the submission's id."""
-        return self.results / f"{hex_of(id)}.json"
-
     def object(self, digest: str) -> Path:
-        """The path of an artefact, by its digest."""
+        """The path of a document or policy file, by its digest."""
         digits = hex_of(digest)
         return self.objects / digits[:2] / digits[2:]
 
@@ -298,13 +279,13 @@ def check_receiver(board: BoardDocument, receiver: Receiver, address: str | None
       receiver: that the signature is for.
       address: of the server that it was sent to; None if it was given to the board's folder.
     """
-    if board.signatures_for is None:
+    if board.rules != RULES:
         raise Rejection(
             "wrong_board",
             f"board={board.key[:16]}…: follows earlier rules ({board.rules}) and accepts nothing. "
             "Submit to a board that was created later.",
         )
-    if receiver.board != board.signatures_for:
+    if receiver.board != board.key:
         stated = "none" if receiver.board is None else f"{receiver.board[:16]}…"
         raise Rejection(
             "wrong_board",

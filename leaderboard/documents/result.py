@@ -5,9 +5,9 @@ Per run, ρ_m the mean |a − a*| of region m and ρ⁰_m the same of the consta
     N_m = ρ_m / ρ⁰_m         normalised regret: 0 the optimum, 1 the constant policy
     N₀                       WD regret
     N̄ = mean N₁ … N_M        OOD regret
-    N̄ − N₀                   OOD decay
+    OOD decay                mean over m ≥ 1 of (r̃_WD − r̃_m) / r̃_WD; on boards of rules 2 N̄ − N₀
     regret slope             of N_m on ε_m, least squares over m = 0 … M
-    similarity loss          100 (r̃_WD − mean r̃_OOD) points, the paper's form
+    similarity loss          100 (r̃_WD − mean r̃_OOD) points
 
 A run that failed, or was started and not listed, scores 1 in every region and every metric, and
 loses 100 points of similarity: a missing policy never improves a score. `scoring.aggregation` says
@@ -36,11 +36,11 @@ Metric = Literal["wd_regret", "ood_regret", "ood_decay"]
 
 RANKED_METRICS: tuple[Metric, ...] = get_args(Metric)
 
-SYMBOLS = {"wd_regret": "N₀", "ood_regret": "N̄", "ood_decay": "N̄ − N₀"}
+SYMBOLS = {"wd_regret": "N₀", "ood_regret": "N̄", "ood_decay": "decay"}
 LABELS = {
     "wd_regret": "WD regret N₀",
     "ood_regret": "OOD regret N̄",
-    "ood_decay": "OOD decay N̄ − N₀",
+    "ood_decay": "OOD decay",
     "regret_slope": "regret slope on ε",
     "similarity_loss": "similarity loss, points",
 }
@@ -60,7 +60,7 @@ class RunScore(StrictModel):
     """One run.
 
     Attributes:
-      spec: digest of the instance; null in results of rules 1 for runs started and not listed.
+      spec: digest of the instance; null where it is hidden.
       class_name: the suite's class that the instance belongs to.
       artefact: digest of the policy; null where the run failed.
       evaluation_seed: of the states, derived from protocol, spec and artefact; null likewise.
@@ -164,14 +164,13 @@ class Result(Document):
       status: "scored" or "rejected".
       code, message: why it was rejected; empty where it was scored.
       scores, classes, runs: null and empty where it was rejected.
-      runs: those that the submission lists, in its order; by rules 1 then those that it does not.
-      enough_runs: whether each instance (by rules 1, each class) has the runs that ranking needs.
+      runs: those that the submission lists, in its order.
+      enough_runs: whether each instance has the runs that ranking needs.
       oracle_like: whether the method, or any run, has a WD or OOD regret of at most 0.01, or a WD
-        regret of at most 0.05 and an |OOD decay| of at most 0.01: the page asks for code. By rules
-        1 the method, with an OOD regret of at most 0.01, or a WD regret of at most 0.02 and an
-        |OOD decay| of at most 0.01.
+        regret of at most 0.05 from which the OOD regret differs by at most 0.01: the page asks for
+        code.
       versions: of the packages on which the numbers depend.
-      isolation: of the sandbox, "bwrap" or "process"; empty in results of rules 1.
+      isolation: of the sandbox, "bwrap" or "process"; empty where nothing ran.
     """
 
     schema_version: SchemaVersion = 1

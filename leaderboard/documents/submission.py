@@ -38,7 +38,7 @@ MAX_ARTEFACT_BYTES = 8 * 2**20
 MAX_ENTRIES = 1000
 """Most runs listed, and most classes counted."""
 MAX_RUNS = 1000
-"""Largest total of `runs_started`; by rules 1, ten times as many."""
+"""Largest total of `runs_started`."""
 
 THE_BOARD, REFERENCE_FAMILY = "the board", "reference"
 """Submitter and family reserved for the board's own reference rows."""
@@ -309,16 +309,13 @@ def skeleton(name: str) -> str:
     return letters
 
 
-def check_runs(
-    suite: Suite, submission: Submission, sources: Sequence[str] = (), rules: int = 2
-) -> None:
+def check_runs(suite: Suite, submission: Submission, sources: Sequence[str] = ()) -> None:
     """Reject runs that are not on the suite's instances, listed twice, missing or not counted.
 
     Args:
       suite: the board's suite.
       submission: the submission.
       sources: what to call each run in an error, such as its folder; empty for `runs.0`, ….
-      rules: of the board. Rules 1 admit submissions without a policy and 10,000 runs started.
 
     Raises:
       Rejection: `unknown_spec`, `duplicate_run`, `missing_run`, or `schema` if more runs were
@@ -342,12 +339,12 @@ def check_runs(
                 f"runs: none on {digest} of class {name}: every instance must have one. "
                 "Train on it, or list a failed run (policy null in runs.json), which scores 1.",
             )
-    if rules > 1 and all(run.artefact is None for run in submission.runs):
+    if all(run.artefact is None for run in submission.runs):
         raise Rejection(
             "missing_run", "runs: none has a policy: at least one must. Submit a trained policy."
         )
     listed = Counter(class_of[run.spec] for run in submission.runs)
-    _check_started(submission, listed, MAX_RUNS * (1 if rules > 1 else 10))
+    _check_started(submission, listed, MAX_RUNS)
 
 
 def _check_duplicates(submission: Submission, sources: Sequence[str]) -> None:

@@ -1,22 +1,18 @@
 """`result_of`: from the runs of a submission to a method's scores, with their intervals.
 
-                    rules 2, of new boards               rules 1, of earlier boards
-    group           the runs on one instance             the runs of one class
+    group           the runs on one instance; runs that are not listed count for the instance of
+                    their class with the fewest
     class score     mean over groups of the interquartile mean (IQM) of a group
     θ               mean over the classes
     a rank needs    ⌈runs_to_rank / groups of the class⌉ runs in every group
-    unlisted runs   count for the instance of their      are runs of the result,
-                    class with the fewest runs           without an instance
-    bootstrap       of sorted columns, seeded by suite   of runs, seeded by the
-                    and protocol                         submission's id
 
 Groups prevent an instance that a method gives up from being trimmed: the IQM of a class of two
 instances and of a method with ten runs on one of them and a failed one on the other would be the
 ten runs alone. θ is not the pooled IQM of all runs, which hardly changes when a method fails on a
 whole class.
 
-Rules 2 leave a submitter no influence on the random numbers of the bootstrap: its seed is the
-board's, and the order of runs does not matter. Sorting each column is allowed, because runs are
+A submitter has no influence on the random numbers of the bootstrap: its seed is that of suite and
+protocol, and the order of runs does not matter. Sorting each column is allowed, because runs are
 exchangeable and each interval is of one column.
 
 The bootstrap's strata are the groups of two or more runs. The single runs of a class's other
@@ -33,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from leaderboard.documents.board import BoardDocument
+from leaderboard.documents.board import RULES, BoardDocument
 from leaderboard.documents.result import (
     METRICS,
     ClassScore,
@@ -47,11 +43,10 @@ from leaderboard.documents.submission import Submission, check_runs
 from sme_registry.spec import EvaluationProtocol
 from sme_registry.statistics import Array, Statistic, aggregate, iqm, mean, stratified_bootstrap
 
-OPTIMAL, NEAR_OPTIMAL, NEAR_OPTIMAL_1, FLAT = 0.01, 0.05, 0.02, 0.01
+OPTIMAL, NEAR_OPTIMAL, FLAT = 0.01, 0.05, 0.01
 """Oracle-like: N₀ or N̄ at most the first, or N₀ at most the second and |N̄ − N₀| at most the last.
 
-A regret as small inside as outside is typical of π* scaled or blended by a few per cent. By rules 1
-only N̄ counts for the first, and the third is the limit of N₀.
+A regret as small inside as outside is typical of π* scaled or blended by a few per cent.
 """
 
 _SIGNED = ("ood_decay", "regret_slope", "similarity_loss")  # may be negative
@@ -81,11 +76,7 @@ def result_of(
     """
     counted = [*runs, *unlisted]
     groups = groups_of(board, counted)
-    if board.rules == 1:
-        scores = method_scores(groups, board.draws, submission, arrange=np.array)
-    else:
-        seed = f"{board.suite.digest}\n{board.protocol.digest}"
-        scores = method_scores(groups, board.draws, seed)
+    scores = method_scores(groups, board.draws, f"{board.suite.digest}\n{board.protocol.digest}")
     return Result(
         submission=submission,
         suite=board.suite.digest,
@@ -93,7 +84,7 @@ def result_of(
         status="scored",
         scores=scores,
         classes=tuple(class_score(name, members) for name, members in groups.items()),
-        runs=tuple(counted if board.rules == 1 else runs),
+        runs=tuple(runs),
         enough_runs=all(
             len(group) >= board.runs_on_each(len(members))
             for members in groups.values()
@@ -108,13 +99,13 @@ def result_of(
 def never_listed(board: BoardDocument, submission: Submission) -> list[RunScore]:
     """A score of 1 for each run that was started and is not listed, in the order of classes.
 
-    By rules 2 each is on the instance of its class with the fewest runs so far, the first of these
-    in the suite's order.
+    Each is on the instance of its class with the fewest runs so far, the first of these in the
+    suite's order.
 
     Raises:
       Rejection: a code of `check_runs`.
     """
-    check_runs(board.suite, submission, rules=board.rules)
+    check_runs(board.suite, submission)
     listed = Counter(run.spec for run in submission.runs)
     runs = []
     for member in board.suite.classes:
@@ -122,25 +113,17 @@ def never_listed(board: BoardDocument, submission: Submission) -> list[RunScore]
         for _ in range(submission.runs_started[member.name] - sum(counts.values())):
             fewest = min(counts, key=lambda digest: counts[digest])
             counts[fewest] += 1
-            runs.append(
-                failed_run(board.protocol, member.name, None if board.rules == 1 else fewest)
-            )
+            runs.append(failed_run(board.protocol, member.name, fewest))
     return runs
 
 
 def groups_of(board: BoardDocument, runs: Sequence[RunScore]) -> Groups:
-    """All runs of a submission, listed or not, in the groups of the board's rules.
-
-    Groups are in the suite's order, and none is empty.
-    """
-    if board.rules == 1:
-        names = [member.name for member in board.suite.classes]
-        return {name: {name: [run for run in runs if run.class_name == name]} for name in names}
+    """All runs of a submission, listed or not, by instance, in the suite's order; none is empty."""
     groups: Groups = {member.name: {} for member in board.suite.classes}
     for digest, (name, _) in board.instances.items():
         groups[name][digest] = []
     for run in runs:
-        assert run.spec is not None  # by rules 2, `never_listed` gives each run an instance
+        assert run.spec is not None  # only hidden instances have no digest
         groups[run.class_name][run.spec].append(run)
     return groups
 
@@ -174,24 +157,13 @@ def class_score(name: str, members: dict[str, list[RunScore]]) -> ClassScore:
     )
 
 
-def _sorted(columns: list[list[float]]) -> Array:
-    return np.sort(columns, axis=0)
-
-
-def method_scores(
-    groups: Groups,
-    draws: int,
-    seed: str,
-    *,
-    arrange: Callable[[list[list[float]]], Array] = _sorted,
-) -> Scores:
+def method_scores(groups: Groups, draws: int, seed: str) -> Scores:
     """θ of each metric and each region, with intervals.
 
     Args:
       groups: the runs by class, and in each class by group.
       draws: number of bootstrap resamples.
       seed: of the bootstrap.
-      arrange: makes an array of the runs' columns; by rules 1 they are not sorted.
     """
     strata: dict[str, Array] = {}
     statistics: dict[str, Statistic] = {}
@@ -200,7 +172,7 @@ def method_scores(
         columns = [
             [*(getattr(run, metric) for metric in METRICS), *run.normalised_regret] for run in runs
         ]
-        strata[name] = arrange(columns)
+        strata[name] = np.sort(columns, axis=0)
         statistics[name], weights[name] = statistic, weight
     value = aggregate(strata, statistics, weights)
     low, high = stratified_bootstrap(strata, draws, seed, statistics, weights)
@@ -232,25 +204,26 @@ def _strata(groups: Groups) -> Iterator[tuple[str, list[RunScore], Statistic, fl
 
 
 def is_oracle_like(scores: Scores, rules: int, runs: Sequence[RunScore] = ()) -> bool:
-    """Whether the method, or by rules 2 any of its runs, acts nearly as π* does.
+    """Whether the method, or any of its runs, acts nearly as π* does.
 
     A method that is π* on some instances only need have no small mean.
     """
-    means = scores.wd_regret.value, scores.ood_regret.value, scores.ood_decay.value
-    if rules == 1:
-        wd, ood, decay = means
-        return ood <= OPTIMAL or (wd <= NEAR_OPTIMAL_1 and abs(decay) <= FLAT)
+    wd, ood = scores.wd_regret.value, scores.ood_regret.value
+    growth = scores.ood_decay.value if rules == 2 else ood - wd
     return any(
-        min(wd, ood) <= OPTIMAL or (wd <= NEAR_OPTIMAL and abs(decay) <= FLAT)
-        for wd, ood, decay in (
-            means,
-            *((run.wd_regret, run.ood_regret, run.ood_decay) for run in runs),
+        min(wd, ood) <= OPTIMAL or (wd <= NEAR_OPTIMAL and abs(growth) <= FLAT)
+        for wd, ood, growth in (
+            (wd, ood, growth),
+            *((run.wd_regret, run.ood_regret, run.ood_regret - run.wd_regret) for run in runs),
         )
     )
 
 
 def run_metrics(
-    normalised_regret: Sequence[float], similarity: Sequence[float] | None, levels: Sequence[float]
+    normalised_regret: Sequence[float],
+    similarity: Sequence[float] | None,
+    levels: Sequence[float],
+    rules: int = RULES,
 ) -> dict[str, float]:
     """The metrics of one run by name, as defined in `documents.result`.
 
@@ -258,6 +231,7 @@ def run_metrics(
       normalised_regret: N_m of each region, WD first.
       similarity: mean r̃ of each region, in [0, 1]; None without a policy.
       levels: ε_m, 0 for WD.
+      rules: of the board.
 
     Returns:
       `wd_regret`, `ood_regret`, `ood_decay` and `regret_slope`, dimensionless, and
@@ -272,7 +246,7 @@ def run_metrics(
     return {
         "wd_regret": wd,
         "ood_regret": ood,
-        "ood_decay": ood - wd,
+        "ood_decay": ood - wd if rules == 2 else float(np.mean((r[0] - r[1:]) / r[0])),
         "regret_slope": float(offset @ (N - wd) / (offset @ offset)),  # exactly 0 where N is flat
         "similarity_loss": 100.0 * float(r[0] - r[1:].mean()),
     }
@@ -289,7 +263,7 @@ def failed_run(protocol: EvaluationProtocol, class_name: str, spec: str | None) 
     `spec` is the digest of the instance, None if the run is not listed.
     """
     regrets = (1.0,) * len(protocol.edges)
-    metrics: dict[str, Any] = {**run_metrics(regrets, None, levels_of(protocol))}
+    metrics: dict[str, Any] = {**run_metrics(regrets, None, levels_of(protocol), RULES)}
     return RunScore(
         spec=spec,
         class_name=class_name,

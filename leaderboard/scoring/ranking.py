@@ -229,13 +229,14 @@ def refuse_unpublishable(entries: list[EntryRow]) -> None:
 def _known_scores(scores: Scores, regret: float) -> Iterator[tuple[str, float, float]]:
     """Field, value and expected value of a reference row with this regret in every region.
 
-    Excludes the similarity loss: the constant policy's similarity differs between regions.
+    Excludes what follows from the similarity, where the constant policy's differs between regions.
     """
     for region, estimate in enumerate(scores.normalised_regret):
         yield f"normalised_regret.{region}", estimate.value, regret
     yield "wd_regret", scores.wd_regret.value, regret
     yield "ood_regret", scores.ood_regret.value, regret
-    yield "ood_decay", scores.ood_decay.value, 0.0
+    if not regret:
+        yield "ood_decay", scores.ood_decay.value, 0.0
     yield "regret_slope", scores.regret_slope.value, 0.0
 
 

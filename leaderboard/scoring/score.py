@@ -234,7 +234,7 @@ def _evaluate(
         policy = _CheckedPolicy(sandbox, states, agents)
         report = _report(board, spec, policy, digest, progress)
         with _sandbox_errors():
-            actions = observe(sandbox) if board.rules > 1 else None
+            actions = observe(sandbox)
     used = {name: version for name, version in report.versions.items() if name not in _UNUSED}
     machine.versions |= {**used, "onnxruntime": sandbox.runtime}
     return report, actions
@@ -306,7 +306,8 @@ def _run_score(
 ) -> RunScore:
     regrets = tuple(region.normalised_regret for region in report.regions)
     similarity = tuple(region.similarity for region in report.regions)
-    metrics: dict[str, Any] = {**run_metrics(regrets, similarity, levels_of(board.protocol))}
+    levels = levels_of(board.protocol)
+    metrics: dict[str, Any] = {**run_metrics(regrets, similarity, levels, board.rules)}
     return RunScore(
         spec=report.spec_digest,
         class_name=class_name,

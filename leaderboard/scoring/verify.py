@@ -1,29 +1,35 @@
-"""`verify`: check a board's files against its signed log, and its numbers against its runs.
+"""`verify`: follow a board's log, score again, and compare.
 
-The order decides which altered row is named first: the log's chain and signatures, the document of
-each entry, files that the log does not name, the index, the submitters' signatures, the artefacts
-and the numbers.
+Opening a board follows its log: chain, signatures, the rules for each entry, and every document
+that an entry names. Then come the entrants' signatures, the policy files, and the numbers, twice:
 
-Entries cut off the log's end leave no trace in it, and neither does a log that the board itself
-has rewritten and signed. Both show if an entry's digest was kept elsewhere: `contains`.
+    from its runs      a result must follow from the regrets of its runs in each region, within 1e-9
+    scored again       a submission must have its result's numbers, within 1e-5, and its verdict
+
+Whatever contradicts the log, or a result's own runs, was altered. Other numbers, or another
+verdict, mean that this machine does not confirm the entry, and are no proof of tampering: other
+processors and versions of libraries round otherwise. Whoever repeats it on another machine learns
+which it is.
+
+Entries cut off the log's end leave no trace in it, and neither does a log that the board itself has
+rewritten and signed. Both show if an entry's digest was kept elsewhere: `contains`.
 """
 
 from __future__ import annotations
 
-import contextlib
-import itertools
-import os
+import random
 import re
 import secrets
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal, NamedTuple
 
 from leaderboard.documents.board import BoardDocument, Folder, hex_of
 from leaderboard.documents.result import Result, RunScore
-from leaderboard.documents.signed import Signed
-from leaderboard.documents.submission import Submission, Withdrawal
-from leaderboard.errors import BoardError, Rejection, TamperedError
+from leaderboard.documents.submission import Run
+from leaderboard.errors import Rejection, TamperedError
 from leaderboard.scoring.aggregation import (
     failed_run,
     levels_of,
@@ -31,28 +37,53 @@ from leaderboard.scoring.aggregation import (
     result_of,
     run_metrics,
 )
-from leaderboard.scoring.rescore import RESCORED, RescoreNote, draw, rescore
-from leaderboard.scoring.score import Progress, agent_names, evaluation_seed
-from leaderboard.seasons.verify import check_sealed_signatures, count_unlogged_of_seasons
-from leaderboard.store import (
-    Index,
-    IndexUnusable,
-    Log,
-    LogEntry,
-    Objects,
-    Store,
-    digest_of,
-    read_document,
-)
+from leaderboard.scoring.score import agent_names, evaluation_seed, score_submission
+from leaderboard.store import LogEntry, Store, digest_of, read_document
+from leaderboard.store.files import MAX_LOG_ENTRY_BYTES
+from sme_registry import SMESpec
 from sme_registry.errors import OptionError
 from sme_registry.io import TEMPORARY, integer_in
 
 EXACT = 1e-9
 """Tolerance for numbers recomputed from the same runs: another machine may sum in another order."""
 
+RESCORED = 1e-5
+"""Tolerance for new scores of the same policy: another machine or version of onnxruntime changes
+its float32 actions by about 1e-7, and similar actions are divided by a regret as small as 0.1."""
 
-# An index that is larger than its log can explain is not copied into memory.
-_INDEX_BYTES, _INDEX_BYTES_OF_ENTRY = 2**26, 2**17
+_MARKS = ("rounding", "sketch", "actions")
+_NOT_COMPARED = ("versions", "isolation", "message", *_MARKS)
+
+Progress = Callable[[str], None]
+"""Called with what was just checked."""
+
+
+class Row(NamedTuple):
+    """How much of a kind was checked, how much was not, and why."""
+
+    what: str
+    checked: int
+    unchecked: int = 0
+    why: str = ""
+
+
+class Difference(NamedTuple):
+    """The first value that differs: its path, as in `runs.0.wd_regret`, and both values."""
+
+    path: str
+    recorded: str
+    here: str
+
+
+class Note(NamedTuple):
+    """An entry that this machine does not confirm, and the first value that differs."""
+
+    entry: str
+    difference: Difference
+
+
+Part = Callable[[Store, Progress], tuple[list[Row], list[Note]]]
+"""Verifies a part of a board whose log was followed."""
 
 
 @dataclass(frozen=True)
@@ -60,35 +91,34 @@ class VerifyReport:
     """What was verified.
 
     Attributes:
-      entries: number of log entries.
-      log_sequence, log_digest: of the last entry. Keep the digest elsewhere to detect later
+      log_sequence, log_digest: of the last log entry. Keep the digest elsewhere to detect later
         whether the log was cut or rewritten.
-      submissions, withdrawals, results, objects: number of each.
-      unlogged: number of submissions and withdrawals, and of documents of seasons, whose process
-        died before it logged them; the board does not show them.
-      seasons, sealed: number of seasons, and of their entries and tickets.
-      rows: number of index rows, equal to those of a rebuilt index; 0 if there is no index.
-      rescored: number of submissions scored again.
-      rescore_seed: of their draw, which repeats it; None if none was scored again.
-      tolerance: of their new numbers, where no note states a larger one.
-      notes: differences that prove no tampering.
+      rows: what was checked, and what was not.
+      notes: the entries that are not confirmed here.
+      missing: published files that are not in this folder.
+      rescore_seed: of the draw of the submissions that were scored again, which repeats it.
     """
 
-    entries: int
     log_sequence: int
     log_digest: str
-    submissions: int
-    withdrawals: int
-    results: int
-    objects: int
-    unlogged: int
-    rows: int
-    rescored: int = 0
-    rescore_seed: int | None = None
-    tolerance: float = RESCORED
-    seasons: int = 0
-    sealed: int = 0
-    notes: tuple[RescoreNote, ...] = ()
+    rows: tuple[Row, ...]
+    notes: tuple[Note, ...]
+    missing: tuple[str, ...]
+    rescore_seed: int | None
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether nothing that was checked differs, and nothing that is public is missing."""
+        return not self.notes and not self.missing
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, for JSON."""
+        return {
+            **asdict(self),
+            "rows": [row._asdict() for row in self.rows],
+            "notes": [{"entry": note.entry, **note.difference._asdict()} for note in self.notes],
+            "is_confirmed": self.is_confirmed,
+        }
 
 
 def verify(
@@ -97,22 +127,21 @@ def verify(
     rescore: int | Literal["all"] = 0,
     seed: int | None = None,
     contains: str | None = None,
+    parts: Sequence[Part] = (),
     progress: Progress | None = None,
 ) -> VerifyReport:
-    """Verify everything about a board without writing anything.
+    """Verify a board without writing anything.
 
     Args:
       path: the board's folder.
-      rescore: number of results, drawn at random, whose submissions to score again; or "all".
-      seed: of that draw, to repeat one; None for the system's randomness, which nobody predicts.
+      rescore: number of results, rejections too, whose submissions to score again; or "all".
+      seed: of their draw, to repeat one; None for the system's randomness, which nobody predicts.
       contains: digest of an entry that the log once had; None to skip this check.
-      progress: called with the rows done and the rows in all.
-
-    Returns:
-      The counts.
+      parts: what else to verify, such as its seasons.
+      progress: called with what was just checked.
 
     Raises:
-      TamperedError: names the first altered row, such as `results/….json`.
+      TamperedError: names the first altered file or value.
       BoardError: the folder holds no board.
       ScoringFault: this machine cannot score a submission again.
       OptionError: `rescore` or `seed` is negative, or `contains` is not a digest.
@@ -121,43 +150,93 @@ def verify(
         integer_in("rescore", rescore, 0, advice="Leave it out for none.")
     seed = secrets.randbits(53) if seed is None else integer_in("seed", seed, 0)
     digest = None if contains is None else _entry_digest(contains)
-    folder = Folder(path)
-    folder.read()
-    document = read_document(folder, folder.board, BoardDocument)
-    with contextlib.closing(Index.empty(folder, document)) as index:
-        verifier = _Verifier(index, rescore, progress)
-        verifier.check_opening()
-        verifier.follow_log()
-        with Store.open(path, read_only=True) as store:
-            with store.locked():
-                verifier.follow_log()  # entries logged in the meantime
-                verifier.check_numbering()
-                verifier.check_contains(digest)
-                unlogged = verifier.count_unlogged() + count_unlogged_of_seasons(index)
-                rows = verifier.check_index()
-            verifier.check_signatures()
-            seasons, entrants = check_sealed_signatures(index)
-            objects = verifier.check_objects()
-            results = verifier.check_numbers(store)
-            drawn = draw(verifier.scored_ids(), rescore, seed)
-            notes = [note for id in drawn for note in verifier.rescore(store, id)]
-        entries, head = index.entries(), index.head
+    _check_opening(Folder(path))
+    with Store.open(path, read_only=True) as store:
+        with store.locked():
+            head = store.head
+            _check_numbering(store, head.sequence + 1)
+        if digest is not None:
+            _check_contains(store, digest)
+        verifier = _Verifier(store, progress or (lambda _: None))
+        verifier.check_signatures()
+        verifier.check_files()
+        scored = verifier.check_results()
+        drawn = draw(scored, rescore, seed)
+        verifier.score_again(drawn, len(scored))
+        for part in parts:
+            rows, notes = part(store, verifier.progress)
+            verifier.rows += rows
+            verifier.notes += notes
     return VerifyReport(
-        entries=head.sequence + 1,
         log_sequence=head.sequence,
         log_digest=head.digest,
-        submissions=len(entries),
-        withdrawals=sum(entry.status == "withdrawn" for entry in entries),
-        results=results,
-        objects=objects,
-        unlogged=unlogged,
-        rows=rows,
-        rescored=len(drawn),
+        rows=(Row("log entries, and their documents", head.sequence + 1), *verifier.rows),
+        notes=tuple(verifier.notes),
+        missing=tuple(verifier.missing),
         rescore_seed=seed if drawn else None,
-        seasons=seasons,
-        sealed=entrants,
-        notes=tuple(notes),
     )
+
+
+def draw(ids: Sequence[str], count: int | Literal["all"], seed: int) -> list[str]:
+    """The submissions to score again, in the order of `ids`."""
+    if count == "all" or count >= len(ids):
+        return list(ids)
+    drawn = set(random.Random(seed).sample(ids, count))
+    return [id for id in ids if id in drawn]
+
+
+def difference(recorded: Any, here: Any, tolerance: float, path: str = "") -> Difference | None:
+    """The first value of plain data that differs by more than a tolerance; None if none does."""
+    match recorded, here:
+        case {"low": float(low), "high": float(high), "value": float(value)}, {"low": None}:
+            if low == high == value:  # earlier versions gave single runs an interval of no width
+                return difference(value, here["value"], tolerance, f"{path}.value")
+        case dict(), dict() if recorded.keys() == here.keys():
+            return _first(recorded, here, recorded, tolerance, path)
+        case list() | tuple(), list() | tuple() if len(recorded) == len(here):
+            return _first(recorded, here, range(len(here)), tolerance, path)
+        case float(), float() if abs(recorded - here) <= tolerance * max(1.0, abs(here)):
+            return None
+    return None if recorded == here else Difference(path, _short(recorded), _short(here))
+
+
+def _first(
+    recorded: Any, here: Any, keys: Iterable[Any], tolerance: float, path: str
+) -> Difference | None:
+    for key in keys:
+        where = f"{path}.{key}" if path else str(key)
+        found = difference(recorded[key], here[key], tolerance, where)
+        if found is not None:
+            return found
+    return None
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return f"{len(value)} values"
+    return f"{value}"[:80]
+
+
+def compared(result: Any) -> dict[str, Any]:
+    """What is compared of a result, or of one of its runs: all but versions, marks and messages."""
+    plain = result.to_dict()
+    runs = [{k: v for k, v in run.items() if k not in _NOT_COMPARED} for run in plain["runs"]]
+    return {"runs": runs} | {k: v for k, v in plain.items() if k not in (*_NOT_COMPARED, "runs")}
+
+
+def contradiction(recorded: Any, again: Any) -> Difference | None:
+    """The first value of a result that does not follow from its runs; these come first."""
+    one, other = recorded.to_dict(), again.to_dict()
+    return difference({"runs": one["runs"], **one}, {"runs": other["runs"], **other}, EXACT)
+
+
+def refuse_contradiction(found: Difference | None, entry: str) -> None:
+    """Raise `TamperedError` if an entry's result contradicts itself."""
+    if found is not None:
+        raise TamperedError(
+            f"result of {entry}: {found.path}",
+            f"is {found.recorded}, and {found.here} follows from its runs",
+        )
 
 
 def _entry_digest(text: str) -> str:
@@ -170,285 +249,190 @@ def _entry_digest(text: str) -> str:
         ) from None
 
 
-class _Verifier:
-    """The checks of one board; `follow_log` fills its empty index from the log."""
-
-    def __init__(
-        self, index: Index, rescore: int | Literal["all"], progress: Progress | None
-    ) -> None:
-        self.index = index
-        self.folder, self.document = index.folder, index.document
-        self.log = Log(self.folder, self.document.key)
-        self.objects = Objects(self.folder)
-        self.digests: set[str] = set()
-        self._progress = progress
-        self._done = 0
-        results = len(_names(self.folder.results))
-        self._total = sum(1 for _ in self.objects.paths()) + len(_names(self.folder.log)) + results
-        self._total += results if rescore == "all" else min(rescore, results)
-
-    def count_row(self) -> None:
-        """Report one more row as done; the total is an estimate."""
-        self._done += 1
-        if self._progress is not None:
-            self._progress(self._done, max(self._done, self._total))
-
-    def check_opening(self) -> None:
-        """Check that the log is this board's, so that board.json is named if it is not."""
-        if not self.log.has(0):
-            raise TamperedError("log/00000000.json", "is missing; every log starts with it")
-        first = read_document(self.folder, self.folder.log_entry(0), LogEntry)
-        if first.document != digest_of(self.document):
+def _check_opening(folder: Folder) -> None:
+    """Check that the log opens with board.json, and that a private key is the board's."""
+    folder.read()
+    document = read_document(folder, folder.board, BoardDocument)
+    if folder.log_entry(0).exists():  # otherwise the log says so
+        first = read_document(folder, folder.log_entry(0), LogEntry, limit=MAX_LOG_ENTRY_BYTES)
+        if first.document != digest_of(document):
             raise TamperedError("board.json", "differs from the board that the log opened")
-        key = self.folder.key
-        if key.exists() and self.folder.signing_key().public != self.document.key:
-            raise TamperedError("board.key", "is not the key in board.json")
+    if folder.key.exists() and folder.signing_key().public != document.key:
+        raise TamperedError("board.key", "is not the key in board.json")
 
-    def follow_log(self) -> None:
-        """Check chain, signatures and documents, from the index's last entry to the log's end."""
-        head = self.index.head
-        while self.log.has(head.sequence + 1):
-            entry = self.log.read_after(head)
-            self.index.apply(entry)
-            head = entry.head
-            self.digests.add(head.digest)
-            self.count_row()
 
-    def check_numbering(self) -> None:
-        """Check that the log's folder has no gap and no other files."""
-        following = self.index.head.sequence + 1
-        for name in _names(self.folder.log):
-            if not re.fullmatch(r"[0-9]{8,}\.json", name):
-                raise TamperedError(f"log/{name}", "is not a log entry")
-            if int(name[:-5]) >= following:
-                self._refuse(
-                    self.folder.log_entry(following), "is missing, but later entries exist"
-                )
+def _check_numbering(store: Store, following: int) -> None:
+    """Check that the log's folder has no gap and no other files."""
+    names = sorted(each.name for each in store.folder.log.iterdir() if not each.match(TEMPORARY))
+    for name in names:
+        if not re.fullmatch(r"[0-9]{8,}\.json", name):
+            raise TamperedError(f"log/{name}", "is not a log entry")
+        if int(name[:-5]) >= following:
+            raise TamperedError(f"log/{following:08d}.json", "is missing, but later entries exist")
 
-    def check_contains(self, digest: str | None) -> None:
-        """Check that the log has the entry with this digest."""
-        if digest is not None and digest not in self.digests:
-            raise TamperedError(
-                "log",
-                f"has no entry with the digest {digest}. If it was an entry of this board, the log "
-                "was cut or rewritten since",
-            )
 
-    def count_unlogged(self) -> int:
-        """Check that no file passes for a logged one; count those about to be logged."""
-        unlogged = 0
-        for part, column in (
-            (self.folder.submissions, "document"),
-            (self.folder.withdrawals, "withdrawal"),
-            (self.folder.results, "result"),
-        ):
-            for name in _names(part):
-                where = f"{part.name}/{name}"
-                if not re.fullmatch(r"[0-9a-f]{64}\.json", name):
-                    raise TamperedError(where, "is not a file of a board")
-                id = f"sha256:{name[:64]}"
-                if self.index.one(f"SELECT 1 FROM entry WHERE id = ? AND {column} IS NOT NULL", id):
-                    continue
-                if column == "result":
-                    raise TamperedError(
-                        where,
-                        "is in no log entry. If a scorer was killed while writing it, opening the "
-                        "board for writing removes it, as `sme-leaderboard score` does",
-                    )
-                if column == "document" and self._submission(id).id != id:
-                    raise TamperedError(where, "holds another submission than its name says")
-                unlogged += 1
-        return unlogged
+def _check_contains(store: Store, digest: str) -> None:
+    entries: Iterator[LogEntry] = (
+        entry for start in range(0, store.head.sequence + 1, 100) for entry in store.log(start)
+    )
+    if all(entry.digest != digest for entry in entries):
+        raise TamperedError(
+            "log",
+            f"has no entry with the digest {digest}. If it was an entry of this board, the log was "
+            "cut or rewritten since",
+        )
 
-    def check_index(self) -> int:
-        """Compare the board's index with the rebuilt one, row by row; returns the rows."""
-        try:
-            limit = _INDEX_BYTES + _INDEX_BYTES_OF_ENTRY * (self.index.head.sequence + 1)
-            index = Index.open(self.folder, self.document, in_memory=True, limit=limit)
-        except IndexUnusable as error:
-            if not os.path.lexists(self.folder.index):
-                return 0
-            _refuse_index("index.sqlite", str(error))
-        rows = 0
-        with contextlib.closing(index):
-            last = self.index.head.sequence
-            if index.head.sequence > last:
-                self._refuse(
-                    self.folder.log_entry(last + 1), "is missing, but the index recorded it"
-                )
-            try:
-                while index.head.sequence < last:  # a process died between log entry and index
-                    index.apply(self.log.read(index.head.sequence + 1))
-            except TamperedError as error:  # of a log that was verified before
-                _refuse_index("index.sqlite: head 0", f"contradicts its rows: {error}")
-            for pair in itertools.zip_longest(index.derived_rows(), self.index.derived_rows()):
-                if pair[0] != pair[1]:
-                    # Tables are sorted by their keys: the lesser row is extra, missing or altered.
-                    present = (row for row in pair if row is not None)
-                    table, key, _ = min(present, key=lambda row: row[:2])
-                    _refuse_index(
-                        f"index.sqlite: {table} {key}", "does not follow from log and documents"
-                    )
-                rows += 1
-        return rows
+
+@dataclass
+class _Verifier:
+    """The checks of one board, whose log was followed, and what they have found."""
+
+    store: Store
+    progress: Progress
+    rows: list[Row] = field(default_factory=list)
+    notes: list[Note] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
 
     def check_signatures(self) -> None:
         """Check the submitters' signatures, which the board's own key cannot forge."""
-        for id, withdrawal in self.index.connection.execute(
-            "SELECT id, withdrawal FROM entry ORDER BY sequence"
-        ):
-            key = self._submission(id).content.submitter.key
-            if withdrawal is not None:
-                path = self.folder.withdrawal(id)
-                signed = read_document(self.folder, path, Signed[Withdrawal])
-                if not signed.is_valid(self.document.signatures_for, key):
-                    self._refuse(path, "its signature does not match the submission's key")
-
-    def _submission(self, id: str) -> Signed[Submission]:
-        path = self.folder.submission(id)
-        signed = read_document(self.folder, path, Signed[Submission])
-        if not signed.is_valid(self.document.signatures_for):
-            self._refuse(path, "its signature does not match the submitter's key")
-        return signed
-
-    def check_objects(self) -> int:
-        """Check that every artefact has its digest and its signed size; returns their number."""
         count = 0
-        for digest, path in self.objects.paths():
-            try:
-                size = len(self.objects.read(digest))
-            except ValueError:
-                self._refuse(path, "is not an artefact")
-            except BoardError as error:
-                self._refuse(path, f"cannot be read: {error}")
-            signed = self.index.one("SELECT size FROM object WHERE digest = ?", digest)
-            if signed is not None and signed[0] != size:
-                self._refuse(path, f"has {size:,} bytes, not {signed[0]:,}")
-            count += 1
-            self.count_row()
-        for (digest,) in self.index.connection.execute("SELECT digest FROM object ORDER BY digest"):
-            if not self.objects.has(digest):
-                self._refuse(self.folder.object(digest), "is missing")
-        return count
-
-    def scored_ids(self) -> list[str]:
-        """The submissions with a result, rejections too, in the order of submission."""
-        rows = self.index.connection.execute(
-            "SELECT id FROM entry WHERE result IS NOT NULL ORDER BY sequence"
-        )
-        return [id for (id,) in rows]
-
-    def check_numbers(self, store: Store) -> int:
-        """Check that the scores of each result follow from its runs; returns their number."""
-        ids = self.scored_ids()
-        for id in ids:
-            result = store.result(id)
-            assert result is not None
-            if result.status == "scored":
-                _check_runs(store, result)
-                _check_scores(store, result)
-            self.count_row()
-        return len(ids)
-
-    def rescore(self, store: Store, id: str) -> list[RescoreNote]:
-        """Score a submission again and compare."""
-        notes = rescore(store, id)
-        self.count_row()
-        return notes
-
-    def _refuse(self, path: Path, message: str) -> NoReturn:
-        raise TamperedError(path.relative_to(self.folder.path).as_posix(), message)
-
-
-def _refuse_index(where: str, message: str) -> NoReturn:
-    raise TamperedError(
-        where,
-        f"{message}. Nothing else is altered: rebuild the index with `sme-leaderboard reindex`",
-    )
-
-
-def _names(folder: Path) -> list[str]:
-    """The names of a folder's files, sorted, without half-written ones."""
-    if not folder.is_dir():  # version control keeps no empty folders
-        return []
-    return sorted(path.name for path in folder.iterdir() if not path.match(TEMPORARY))
-
-
-def _refuse_result(id: str, message: str) -> NoReturn:
-    raise TamperedError(f"results/{hex_of(id)}.json", message)
-
-
-def _check_runs(store: Store, result: Result) -> None:
-    """Check that the scores are of the submitted runs on their own states; failed runs score 1."""
-    document, instances = store.document, store.document.instances
-    submission = store.submission(result.submission).content
-    regions = len(document.protocol.edges)
-    listed = result.runs[: len(submission.runs)]
-    for number, (run, score) in enumerate(itertools.zip_longest(submission.runs, listed)):
-        if score is None:
-            matches = False
-        elif run.artefact is None:
-            matches = score == failed_run(document.protocol, instances[run.spec][0], run.spec)
-        else:
-            class_name, spec = instances[run.spec]
-            digest = run.artefact.sha256
-            seed = evaluation_seed(document.protocol.digest, run.spec, digest)
-            matches = (score.spec, score.class_name, score.artefact, score.evaluation_seed) == (
-                *(run.spec, class_name, digest, seed),
-            ) and [agent.name for agent in score.agents] == agent_names(spec)
-            matches = matches and all(len(each) == regions for each in _by_region(score))
-        if not matches:
-            _refuse_result(result.submission, f"runs.{number}: does not match the submitted run")
-
-
-def _by_region(run: RunScore) -> list[tuple[float, ...]]:
-    """The lists of numbers of a run with a policy that have one for each region."""
-    agents = [agent.normalised_regret for agent in run.agents]
-    return [run.normalised_regret, run.similarity or (), *agents]
-
-
-def _check_scores(store: Store, result: Result) -> None:
-    """Check that each run's metrics follow from its regions, and the scores from the runs."""
-    document = store.document
-    submission = store.submission(result.submission).content
-    for number, run in enumerate(result.runs):
-        for name, value in run_metrics(
-            run.normalised_regret, run.similarity, levels_of(document.protocol)
-        ).items():
-            if not close(value, getattr(run, name), EXACT):
-                _refuse_result(
-                    result.submission, f"runs.{number}.{name}: does not follow from its regions"
+        for entry in self.store.entries():
+            signed, withdrawal = self.store.submission(entry.id), self.store.withdrawal(entry.id)
+            board = self.store.document.key
+            ours = signed.is_valid(board)
+            ours = ours and (withdrawal is None or withdrawal.is_valid(board, entry.key))
+            if not ours:
+                what = "submission, or its withdrawal," if withdrawal else "submission"
+                raise TamperedError(
+                    entry.id, f"the signature of this {what} does not match the submitter's key"
                 )
-    try:
-        unlisted = never_listed(document, submission)
-    except Rejection as error:
-        _refuse_result(result.submission, f"its submission cannot be scored: {error}")
-    expected = result_of(
-        document,
-        result.submission,
-        result.runs[: len(submission.runs)],
-        result.versions,
-        unlisted=unlisted,
-        isolation=result.isolation,
+            count += 1 + (withdrawal is not None)
+        self.rows.append(Row("signatures of submitters", count))
+
+    def check_files(self) -> None:
+        """Check that every file in objects/ has its digest, and that none is missing."""
+        count = 0
+        for digest, path in self.store.objects.paths():
+            if not re.fullmatch(r"sha256:[0-9a-f]{64}", digest):
+                where = path.relative_to(self.store.folder.path).as_posix()
+                raise TamperedError(where, "is not a file of a board")
+            self.store.objects.read(digest)
+            count += 1
+            self.progress(digest)
+        named = self.store.named_objects()
+        absent = [digest for digest in named if not self.store.objects.has(digest)]
+        self.missing += [digest for digest in absent if self.store.is_public(digest)]
+        secret = len(absent) - len(self.missing)
+        self.rows.append(
+            Row("files by their digests", count, secret, "not published" * bool(secret))
+        )
+        if self.missing:
+            self.rows.append(Row("published files", 0, len(self.missing), "not in this folder"))
+
+    def check_results(self) -> list[str]:
+        """Check that the scores of each result follow from its runs; returns the submissions."""
+        ids, runs = [], 0
+        for entry in self.store.entries():
+            result = self.store.result(entry.id)
+            if result is None:
+                continue
+            if result.status == "scored":
+                refuse_contradiction(self._contradiction(result), entry.id)
+            ids.append(entry.id)
+            runs += sum(run.artefact is not None for run in result.runs)
+            self.progress(entry.id)
+        self.rows.append(Row("results, from their runs", len(ids)))
+        if runs:
+            reason = "copies show only where all bits of actions are equal"
+            if self.store.document.rules == 2:
+                reason = "earlier versions computed rounding, sketches and copies"
+            self.rows.append(Row("marks of runs", 0, runs, reason))
+        return ids
+
+    def score_again(self, drawn: Sequence[str], scored: int) -> None:
+        """Score submissions again, through gate, sandbox and evaluation, and compare."""
+        count, others = 0, Counter[str]()
+        for id in drawn:
+            submission, recorded = self.store.submission(id).content, self.store.result(id)
+            assert recorded is not None
+            files = [run.artefact.sha256 for run in submission.runs if run.artefact is not None]
+            if not all(map(self.store.objects.has, files)):
+                continue
+            again = score_submission(self.store.document, submission, self.store.objects.read)
+            verdicts = recorded.code or "scored", again.code or "scored"
+            if verdicts[0] != verdicts[1]:
+                found: Difference | None = Difference("verdict", *verdicts)
+            else:
+                found = difference(compared(recorded), compared(again), RESCORED)
+            if found is not None:
+                self.notes.append(Note(id, found))
+            others.update(_other_versions(recorded.versions, again.versions))
+            count += 1
+            self.progress(id)
+        left = (scored - len(drawn), "not drawn: --rescore")
+        absent = (len(drawn) - count, "their policy files are not here")
+        why = "; ".join(f"{number} {reason}" for number, reason in (left, absent) if number)
+        self.rows.append(Row("results, scored again", count, scored - count, why))
+        for other, number in others.items():
+            self.rows.append(Row("results of other versions", number, 0, other))
+
+    def _contradiction(self, result: Result) -> Difference | None:
+        """The first value of a result that does not follow from the regrets of its runs."""
+        board = self.store.document
+        submission = self.store.submission(result.submission).content
+        try:
+            unlisted = never_listed(board, submission)
+        except Rejection as error:
+            return Difference("status", "scored", error.code)
+        if len(result.runs) != len(submission.runs):
+            return Difference("runs", str(len(result.runs)), str(len(submission.runs)))
+        expected, instances = [], board.instances
+        for number, (run, score) in enumerate(zip(submission.runs, result.runs, strict=True)):
+            of_run = _expected_run(board, *instances[run.spec], run, score)
+            if of_run is None:
+                return Difference(f"runs.{number}", "other regions or agents", "those of its spec")
+            expected.append(of_run)
+        again = result_of(
+            board,
+            result.submission,
+            expected,
+            result.versions,
+            unlisted=unlisted,
+            isolation=result.isolation,
+        )
+        return contradiction(result, again)
+
+
+def _expected_run(
+    board: BoardDocument, class_name: str, spec: SMESpec, run: Run, score: RunScore
+) -> RunScore | None:
+    """What follows from the regrets of a submitted run; None if these do not fit its instance."""
+    if run.artefact is None:
+        return failed_run(board.protocol, class_name, run.spec)
+    if [agent.name for agent in score.agents] != agent_names(spec):
+        return None
+    of_agents = [agent.normalised_regret for agent in score.agents]
+    lists = (score.normalised_regret, score.similarity or (), *of_agents)
+    if any(len(each) != len(board.protocol.edges) for each in lists):
+        return None
+    digest = run.artefact.sha256
+    metrics = run_metrics(
+        score.normalised_regret, score.similarity, levels_of(board.protocol), board.rules
     )
-    if not close(expected.to_dict(), result.to_dict(), EXACT):
-        _refuse_result(result.submission, "its runs or scores do not follow from its submission")
+    return score.model_copy(
+        update={
+            "spec": run.spec,
+            "class_name": class_name,
+            "artefact": digest,
+            "evaluation_seed": evaluation_seed(board.protocol.digest, run.spec, digest),
+            **metrics,
+        }
+    )
 
 
-def close(one: Any, other: Any, tolerance: float) -> bool:
-    """Whether two pieces of plain data are equal up to a tolerance of their numbers."""
-    match one, other:
-        case {"low": None}, {"low": float(low), "high": float(high), "value": float(value)}:
-            # Earlier versions gave single runs an interval of zero width.
-            return low == high == value and close(one["value"], value, tolerance)
-        case dict(), dict():
-            return one.keys() == other.keys() and all(
-                close(value, other[key], tolerance) for key, value in one.items()
-            )
-        case ((list() | tuple()), (list() | tuple())):
-            return len(one) == len(other) and all(
-                close(left, right, tolerance) for left, right in zip(one, other, strict=True)
-            )
-        case float(), float():
-            return abs(one - other) <= tolerance * max(1.0, abs(one))
-    return bool(one == other)
+def _other_versions(recorded: dict[str, str], here: dict[str, str]) -> list[str]:
+    return [
+        f"{name} {version}, here {here[name]}"
+        for name, version in recorded.items()
+        if version != here.get(name, version)
+    ]

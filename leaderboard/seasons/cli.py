@@ -1,4 +1,4 @@
-"""`sme-leaderboard season`: run a sealed season, from its plan to its replay."""
+"""`sme-leaderboard season`: run a sealed season, from its plan to its reveal."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from leaderboard.scoring.ranking import REASONS
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.publication import (
     check_published,
+    copy_published,
     create_season,
     read_plan,
     read_season,
@@ -22,7 +23,6 @@ from leaderboard.seasons.publication import (
     refuse_unrankable,
 )
 from leaderboard.seasons.ranking import EASY, counting, ranking_facts, score_entries, table_regret
-from leaderboard.seasons.replay import verify_season
 from leaderboard.seasons.season import Reveal, Terms
 from leaderboard.store import SeasonRow, Store
 from sme_registry.errors import OptionError
@@ -113,7 +113,7 @@ def publish(
 ) -> None:
     """Announce a season: its terms and its commitment become an entry of the board's signed log.
 
-    Then give FOLDER to everyone, for example as an archive on a web server.
+    The board gets a copy of the data sets and challenge states, which `fetch` downloads.
 
     Examples:
 
@@ -125,6 +125,8 @@ def publish(
         check_published(season, folder, progress.update_of)
     with Store.open(board) as store:
         store.announce(season)
+        if season.published:
+            copy_published(season, folder, store.season_folder(season.digest).published)
     out().print(f"{season.id} {season.digest}", soft_wrap=True)
     out().print(f"Open from {season.opens} to {season.closes}.")
 
@@ -180,53 +182,6 @@ def reveal(board: BoardFolder, season: SeasonId, secret: SecretFile = None) -> N
             scored = score_entries(store, row.digest, progress.update_of)
     entries = plural(scored, "entry", "entries")
     out().print(f"{row.id}: revealed, {entries} scored.")
-
-
-@season.command()
-def verify(
-    board: BoardFolder,
-    season: SeasonId,
-    published: Annotated[
-        Path | None,
-        typer.Option(help="Also, or before the reveal: check this folder of published files."),
-    ] = None,
-    json: Json = False,
-) -> None:
-    """Replay a revealed season: commitment, tasks, data sets, challenge states, scores.
-
-    Exit code 3 means that something does not follow from the master; the error names the file.
-    Other machines may round data sets otherwise than the organiser's: with --published their arrays
-    are compared, within 1e-6, where digests differ.
-
-    Examples:
-
-      sme-leaderboard season verify board autumn
-
-      sme-leaderboard season verify board autumn --published autumn
-    """
-
-    checked: dict[str, Any] = {}
-    with open_board(board) as store:
-        row = store.season_row(season)
-        if published is not None:
-            document = store.season(season)
-            count = len(document.published)
-            with Progress("checking", count, console=err(), unit="instances") as progress:
-                checked["published"] = check_published(document, published, progress.update_of)
-        if published is None or row.reveal is not None:
-            total = row.instances + len(store.entrants(row.digest))
-            with Progress("replaying", total, console=err(), unit="instances") as progress:
-                report = verify_season(store, row.digest, progress.update_of, published)
-            checked |= {
-                "instances": report.instances,
-                "rounded": report.rounded,
-                "entries": report.entries,
-                "results": report.results,
-            }
-    if json:
-        print_json({"season": row.digest, **checked})
-    else:
-        print_pairs(f"{row.id}: everything follows", checked)
 
 
 @season.command()

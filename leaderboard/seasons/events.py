@@ -6,15 +6,11 @@ They are a function of the log and of public documents, and hold nothing of a hi
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, TypeVar
 
-from leaderboard.documents.board import Folder
 from leaderboard.documents.signed import Signed
 from leaderboard.documents.submission import skeleton
-from leaderboard.errors import TamperedError
 from leaderboard.seasons.entry import Entry, SealedManifest, TicketRequest
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.season import (
@@ -23,11 +19,10 @@ from leaderboard.seasons.season import (
     SealedResult,
     SealedTrack,
     Season,
-    SeasonFolder,
     rows_of,
 )
-from leaderboard.store.files import read_document
 from leaderboard.store.log import LogEntry
+from leaderboard.store.objects import Objects
 from leaderboard.store.rows import EntryRow, name_object, scores_of, scores_text
 from sme_registry.seasons.wire import table_bytes
 
@@ -56,8 +51,7 @@ CREATE TABLE sealed (
   method TEXT NOT NULL, version TEXT NOT NULL, family TEXT NOT NULL, knowledge TEXT NOT NULL,
   submitter TEXT NOT NULL, key TEXT NOT NULL, code_link TEXT,
   runs INTEGER NOT NULL, policies INTEGER NOT NULL, steps INTEGER NOT NULL DEFAULT 0,
-  oracle_like INTEGER NOT NULL DEFAULT 0, scores TEXT, bytes INTEGER NOT NULL,
-  played_bytes INTEGER NOT NULL
+  oracle_like INTEGER NOT NULL DEFAULT 0, scores TEXT, played_bytes INTEGER NOT NULL
 ) STRICT, WITHOUT ROWID;
 CREATE UNIQUE INDEX sealed_number ON sealed (season, number);
 CREATE INDEX sealed_of_key ON sealed (key, received);
@@ -153,12 +147,12 @@ class Seasons:
 
     Args:
       connection: to it.
-      folder: the board's.
+      objects: the board's documents.
     """
 
-    def __init__(self, connection: sqlite3.Connection, folder: Folder) -> None:
+    def __init__(self, connection: sqlite3.Connection, objects: Objects) -> None:
         self._connection = connection
-        self._folder = folder
+        self._objects = objects
 
     def apply(self, entry: LogEntry) -> None:
         """Apply a log entry of a season.
@@ -215,11 +209,10 @@ class Seasons:
         Raises:
           TamperedError: it is missing or altered.
         """
-        return read_document(self._folder, self._at(row.digest).season, Season, row.document)
+        return self._objects.document(Season, row.document)
 
     def _season(self, entry: LogEntry) -> None:
-        path = self._at(entry.subject).season
-        season = read_document(self._folder, path, Season, entry.document)
+        season = self._objects.document(Season, entry.document)
         entry.check_subject(season.digest)
         if self.row(season.digest) is not None or self.row(season.id) is not None:
             raise entry.contradiction("announces a season twice")
@@ -238,17 +231,12 @@ class Seasons:
         self._insert("season", values)
 
     def _entry(self, entry: LogEntry) -> None:
-        season, signed, path = self._signed(
-            entry,
-            "sealed-offline",
-            Signed[Entry],
-            lambda row: self._at(row.digest).entry(entry.subject),
-        )
+        season, signed = self._signed(entry, "sealed-offline", Signed[Entry])
         answers = signed.content.answers
         if len(answers) != season.instances:
             raise entry.contradiction("names more or fewer answers than there are instances")
         given = [answer for answer in answers if answer is not None]
-        self._add(entry, season, signed, path, policies=len(given), played=0)
+        self._add(entry, season, signed, policies=len(given), played=0)
         for answer in given:
             key = signed.content.submitter.key
             name_object(self._connection, answer.sha256, answer.size, key, entry.time)
@@ -257,47 +245,26 @@ class Seasons:
             )
 
     def _ticket(self, entry: LogEntry) -> None:
-        season, signed, path = self._signed(
-            entry,
-            "sealed-online",
-            Signed[TicketRequest],
-            lambda row: self._at(row.digest).request(self.next_number(row.digest)),
-        )
+        season, signed = self._signed(entry, "sealed-online", Signed[TicketRequest])
         played = played_bytes(self.read(season))
-        self._add(entry, season, signed, path, policies=season.instances, played=played)
+        self._add(entry, season, signed, policies=season.instances, played=played)
 
     def _signed(
-        self,
-        entry: LogEntry,
-        track: SealedTrack,
-        kind: type[_Signed],
-        path_of: Callable[[SeasonRow], Path],
-    ) -> tuple[SeasonRow, _Signed, Path]:
-        """The document that an entry names, and its season, which the entry does not name."""
-        fault: TamperedError | None = None
-        for row in self.rows():
-            path = path_of(row)
-            if row.track != track or not path.exists():
-                continue
-            try:
-                signed = read_document(self._folder, path, kind, entry.document)
-            except TamperedError as error:
-                fault = fault or error
-                continue
-            entry.check_subject(signed.id)
-            if signed.content.season != row.digest or row.reveal is not None:
-                raise entry.contradiction(
-                    "names a document of another season, or of a revealed one"
-                )
-            return row, signed, path
-        raise fault or entry.contradiction("its document is missing from every season")
+        self, entry: LogEntry, track: SealedTrack, kind: type[_Signed]
+    ) -> tuple[SeasonRow, _Signed]:
+        """The document that an entry names, and its season."""
+        signed = self._objects.document(kind, entry.document)
+        entry.check_subject(signed.id)
+        row = self.row(signed.content.season)
+        if row is None or row.track != track or row.reveal is not None:
+            raise entry.contradiction("names no season of its track, or a revealed one")
+        return row, signed
 
     def _add(
         self,
         entry: LogEntry,
         season: SeasonRow,
         signed: Signed[SealedManifest],
-        path: Path,
         *,
         policies: int,
         played: int,
@@ -322,7 +289,6 @@ class Seasons:
             "code_link": signed.content.code,
             "runs": season.instances,
             "policies": policies,
-            "bytes": path.stat().st_size,
             "played_bytes": played,
         }
         self._insert("sealed", values)
@@ -335,20 +301,19 @@ class Seasons:
         online = season.track == "sealed-online"
         if online != (entry.event == "ended") or not (online or season.reveal):
             raise entry.contradiction("of another track, or before the reveal")
-        path = self._at(row.season).result(entry.subject)
-        result = read_document(self._folder, path, SealedResult, entry.document)
+        result = self._objects.document(SealedResult, entry.document)
         entry.check_subject(result.subject)
         sizes = len(result.runs), len(result.stepping)
         if result.season != row.season or sizes != (season.instances, season.instances * online):
             raise entry.contradiction("names a result of another season")
         self._connection.execute(
             "UPDATE sealed SET result = ?, finished = ?, policies = ?, steps = ?, oracle_like = ?, "
-            "scores = ?, bytes = bytes + ?, played_bytes = ? WHERE id = ?",
+            "scores = ?, played_bytes = ? WHERE id = ?",
             (
                 *(entry.document, entry.time),
                 sum(run.artefact is not None for run in result.runs),
                 sum(each.steps for each in result.stepping),
-                *(result.oracle_like, scores_text(result.scores), path.stat().st_size),
+                *(result.oracle_like, scores_text(result.scores)),
                 played_bytes(self.read(season), result) if online else 0,
                 entry.subject,
             ),
@@ -358,8 +323,7 @@ class Seasons:
         row = self.row(entry.subject)
         if row is None or row.digest != entry.subject or row.reveal is not None:
             raise entry.contradiction("the season is unknown or already revealed")
-        path = self._at(row.digest).reveal
-        reveal = read_document(self._folder, path, Reveal, entry.document)
+        reveal = self._objects.document(Reveal, entry.document)
         entry.check_subject(reveal.season)
         if not self.read(row).is_committed_to(Master(bytes.fromhex(reveal.master))):
             raise entry.contradiction("the master does not match the season's commitment")
@@ -367,9 +331,6 @@ class Seasons:
             "UPDATE season SET reveal = ?, revealed = ? WHERE digest = ?",
             (entry.document, entry.time, entry.subject),
         )
-
-    def _at(self, digest: str) -> SeasonFolder:
-        return SeasonFolder(self._folder, digest)
 
     def _all(self, statement: str, *values: Any) -> list[tuple[Any, ...]]:
         return self._connection.execute(statement, values).fetchall()

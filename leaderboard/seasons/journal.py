@@ -60,6 +60,10 @@ class Journal:
           OSError: it exists, or cannot be written.
         """
         header = _HEADER.pack(_MAGIC, lanes, action_dim)
+        if not path.parent.is_dir():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            io.sync_folder(path.parent.parent)
+            io.sync_folder(path.parent.parent.parent)
         with io.atomic_file(path, new=True) as stream:
             stream.write(header + _crc(header))
         io.sync_folder(path.parent)

@@ -10,6 +10,7 @@ All of it follows from the terms and the master, and `season.json` has its diges
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -168,6 +169,23 @@ def read_season(folder: str | os.PathLike[str]) -> Season:
     return Season.from_dict(read_json(path), str(path))
 
 
+def copy_published(season: Season, source: Path, target: Path) -> None:
+    """Copy what is published of a season, and nothing else, completely or not at all."""
+    if target.exists():
+        return
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with build_folder(target) as building:
+        shutil.copy(source / SEASON, building)
+        for hidden in season.hidden:
+            path = challenge_path(Path(building), hidden)
+            path.parent.mkdir(exist_ok=True)
+            shutil.copy(challenge_path(source, hidden), path)
+            shutil.copytree(
+                dataset_path(source, season.id, hidden),
+                dataset_path(Path(building), season.id, hidden),
+            )
+
+
 def check_published(
     season: Season, folder: str | os.PathLike[str], progress: Progress | None = None
 ) -> int:
@@ -216,11 +234,8 @@ def _refuse_other_sizes(path: Path, data: SealedDataset, hidden: Hidden) -> None
 
 
 def follows(
-    instance: Instance,
-    master: Master,
-    expected: Digests,
-    folder: str | os.PathLike[str] | None = None,
-) -> Literal["exactly", "within rounding", "no"]:
+    instance: Instance, master: Master, expected: Digests, folder: Path | None = None
+) -> Literal["exactly", "within rounding", "unknown", "no"]:
     """Whether what was published of an instance is what the master gives when generated again.
 
     Args:
@@ -228,10 +243,13 @@ def follows(
       master: the season's secret.
       expected: the digests in the season's document.
       folder: a copy of all that was published, to compare data sets where digests differ: other
-        processors and other versions of NumPy round some rewards otherwise.
+        processors and other versions of NumPy may round a value otherwise.
+
+    Returns:
+      "unknown" if the data set's digest differs and there is no copy.
 
     Raises:
-      BoardError: the data set's digest differs and there is no copy, or the copy has another.
+      BoardError: the copy's data set has another digest.
     """
     data, states = _generate(instance, master)
     again = _digests(instance.hidden, data, states)
@@ -239,15 +257,9 @@ def follows(
         return "exactly"
     if again.challenge != expected.challenge:
         return "no"
-    name = name_of(instance.hidden)
     if folder is None:
-        raise BoardError(
-            f"{name}: its data set, generated again on this machine, has the digest "
-            f"{again.data[:19]}…, and the published one {expected.data[:19]}…. Other processors "
-            "and other versions of packages round otherwise. Give the published folder, whose "
-            f"arrays are then compared: --published FOLDER. {SEASON} has the organiser's versions."
-        )
-    path = dataset_path(Path(folder), instance.place.season, instance.hidden)
+        return "unknown"
+    path = dataset_path(folder, instance.place.season, instance.hidden)
     published = SealedDataset.read(path)
     _refuse_other_digest(path, published.digest, expected.data)
     return "within rounding" if data.agrees_with(published) else "no"

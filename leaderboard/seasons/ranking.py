@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from leaderboard.documents.board import RULES
 from leaderboard.documents.result import Metric, RunScore, Scores
 from leaderboard.documents.submission import Artefact, Knowledge
 from leaderboard.scoring.aggregation import is_oracle_like, method_scores
@@ -162,12 +161,12 @@ def _scored_at_once(
     versions: list[dict[str, str]] = [{} for _ in rows]
     for number, instance in enumerate(instances(season, master)):
         answered = [_read(store, instance, of[number]) for of in answers]
-        for entry, (run, used) in enumerate(score_runs(instance, answered)):
+        for entry, (run, used) in enumerate(score_runs(instance, answered, store.document.rules)):
             runs[entry].append(run)
             versions[entry] |= used
-    draws = store.document.draws
     for row, of_entry, used in zip(rows, runs, versions, strict=True):
-        yield sealed_result(season, row.entrant.id, of_entry, used, draws)
+        draws, rules = store.document.draws, store.document.rules
+        yield sealed_result(season, row.entrant.id, of_entry, used, draws, rules=rules)
 
 
 def _read(
@@ -213,7 +212,7 @@ def _score_together(store: Store, digest: str, rows: tuple[SealedRow, ...]) -> t
     runs = [result.runs for result in _results(store, rows)]
     groups = groups_of_season(season, runs)
     scores = method_scores(groups, store.document.draws, season.digest)
-    return scores, is_oracle_like(scores, RULES, _all(runs))
+    return scores, is_oracle_like(scores, store.document.rules, _all(runs))
 
 
 def _results(store: Store, rows: Iterable[SealedRow]) -> Iterator[SealedResult]:

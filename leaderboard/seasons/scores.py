@@ -41,13 +41,16 @@ def score_ticket(store: Store, season: Season, master: Master, number: int) -> S
     runs, stepping = [], []
     versions: dict[str, str] = {}
     for index, instance in enumerate(ticket.instances):
-        run, used = score_run(ticket.hidden(index), *instance.stored_answers)
+        answers, digest = instance.stored_answers
+        run, used = score_run(ticket.hidden(index), answers, digest, store.document.rules)
         runs.append(run)
         versions |= used
         steps = measured_steps(ticket.start(index), instance.journal, instance.budget)
         stepping.append(steps.model_copy(update={"signed": instance.signed_digest}))
-    draws = store.document.draws
-    return sealed_result(season, row.entrant.id, runs, versions, draws, stepping)
+    document = store.document
+    return sealed_result(
+        season, row.entrant.id, runs, versions, document.draws, stepping, document.rules
+    )
 
 
 def unplayed_result(store: Store, season: Season, ticket: RunningTicket) -> SealedResult:

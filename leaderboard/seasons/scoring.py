@@ -104,7 +104,7 @@ def challenge(spec: SMESpec, protocol: EvaluationProtocol) -> Float32:
 
 
 def score_run(
-    instance: Instance, answers: Float32 | None, digest: str | None
+    instance: Instance, answers: Float32 | None, digest: str | None, rules: int = RULES
 ) -> tuple[RunScore, dict[str, str]]:
     """The score of the answers on an instance, and the versions of packages behind it.
 
@@ -113,13 +113,14 @@ def score_run(
       answers: `[regions · n, A]` actions in its challenge states; None where there are none, which
         scores 1 in every metric.
       digest: of the answers' file; None likewise.
+      rules: of the board.
     """
-    [scored] = score_runs(instance, [(answers, digest)])
+    [scored] = score_runs(instance, [(answers, digest)], rules)
     return scored
 
 
 def score_runs(
-    instance: Instance, answered: Sequence[tuple[Float32 | None, str | None]]
+    instance: Instance, answered: Sequence[tuple[Float32 | None, str | None]], rules: int
 ) -> list[tuple[RunScore, dict[str, str]]]:
     """`score_run` of several answers on an instance, whose optimum takes most of the time."""
     replies = [None if answers is None else _Replies(answers) for answers, _ in answered]
@@ -139,14 +140,17 @@ def score_runs(
         if isinstance(report, PolicyError):
             raise report
         each.refuse_unused()
-        scores.append((_run_score(instance, report, digest), _versions(report)))
+        scores.append((_run_score(instance, report, digest, rules), _versions(report)))
     return scores
 
 
-def _run_score(instance: Instance, report: EvaluationReport, digest: str | None) -> RunScore:
+def _run_score(
+    instance: Instance, report: EvaluationReport, digest: str | None, rules: int
+) -> RunScore:
     regrets = tuple(region.normalised_regret for region in report.regions)
     similarity = tuple(region.similarity for region in report.regions)
-    metrics: dict[str, Any] = {**run_metrics(regrets, similarity, levels_of(instance.protocol))}
+    levels = levels_of(instance.protocol)
+    metrics: dict[str, Any] = {**run_metrics(regrets, similarity, levels, rules)}
     return RunScore(
         spec=None,
         class_name=instance.hidden.member.name,
@@ -186,6 +190,7 @@ def sealed_result(
     versions: dict[str, str],
     draws: int,
     stepping: Sequence[Stepping] = (),
+    rules: int = RULES,
 ) -> SealedResult:
     """The result of scored runs: θ, intervals and flags.
 
@@ -196,6 +201,7 @@ def sealed_result(
       versions: of packages.
       draws: number of bootstrap resamples, the board's.
       stepping: online, of each run.
+      rules: of the board.
     """
     groups = groups_of_season(season, [runs])
     scores = method_scores(groups, draws, season.digest)
@@ -206,7 +212,7 @@ def sealed_result(
         classes=tuple(class_score(name, members) for name, members in groups.items()),
         runs=tuple(runs),
         stepping=tuple(stepping),
-        oracle_like=is_oracle_like(scores, RULES, runs),
+        oracle_like=is_oracle_like(scores, rules, runs),
         versions=versions,
     )
 

@@ -300,14 +300,9 @@ STEPPING = ".stepping"
 class SeasonFolder:
     """The paths of a season's files; creates and reads nothing by itself.
 
-        season.json                   the season
-        entries/<64 hex>.json         signed entries of an offline season, by id
-        tickets/<number>/ticket.json  signed requests of an online season, by the ticket's number
-        results/<64 hex>.json         by the id of the entry or request
-        reveal.json                   the master, after the close
-        .stepping                     the lock of the server that steps it
-
-    Answers of entries are among the board's objects.
+        published/         data sets and challenge states of an offline season
+        tickets/<number>/  what was played of an online season, by the ticket's number
+        .stepping          the lock of the server that steps it
 
     Args:
       folder: the board's.
@@ -315,29 +310,14 @@ class SeasonFolder:
     """
 
     def __init__(self, folder: Folder, digest: str) -> None:
-        self.path = path = folder.seasons / hex_of(digest)
-        self.season = path / "season.json"
-        self.entries = path / "entries"
-        self.tickets = path / "tickets"
-        self.results = path / "results"
-        self.reveal = path / "reveal.json"
-        self.stepping = path / STEPPING
-
-    def entry(self, id: str) -> Path:
-        """The path of an entry, by its id."""
-        return self.entries / f"{hex_of(id)}.json"
+        self.path = folder.seasons / hex_of(digest)
+        self.published = self.path / "published"
+        self.tickets = self.path / "tickets"
+        self.stepping = self.path / STEPPING
 
     def ticket(self, number: int) -> Path:
         """The folder of a ticket, by its number, 1 for the season's first."""
         return self.tickets / str(number)
-
-    def request(self, number: int) -> Path:
-        """The path of the request that started a ticket."""
-        return self.ticket(number) / "ticket.json"
-
-    def result(self, id: str) -> Path:
-        """The path of a result, by the id of its entry or request."""
-        return self.results / f"{hex_of(id)}.json"
 
 
 class Stepping(Document):

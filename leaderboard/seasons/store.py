@@ -14,7 +14,6 @@ from leaderboard.seasons.events import SealedRow, SeasonRow
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.season import Reveal, SealedResult, SealedTrack, Season, SeasonFolder
 from leaderboard.store.database import Database
-from leaderboard.store.files import read_document
 
 
 class SealedStore(Database):
@@ -42,7 +41,7 @@ class SealedStore(Database):
                     f"closes={season.closes}: must be after the board's time, {self.clock.time}. "
                     "Choose a later one."
                 )
-            self.record("season", season.digest, season, self.season_folder(season.digest).season)
+            self.record("season", season.digest, season)
         return True
 
     def seasons(self) -> list[SeasonRow]:
@@ -96,9 +95,8 @@ class SealedStore(Database):
             if index.seasons.entrant(signed.id) is not None:
                 return False
             time = self.clock.received()
-            row = self.open_season(signed.content.season, "sealed-offline", time)
-            path = self.season_folder(row.digest).entry(signed.id)
-            self.record("entry", signed.id, signed, path, time)
+            self.open_season(signed.content.season, "sealed-offline", time)
+            self.record("entry", signed.id, signed, time)
         return True
 
     def start_ticket(self, signed: Signed[TicketRequest]) -> int:
@@ -135,8 +133,7 @@ class SealedStore(Database):
                     f"season={row.id}: all of its {season.tickets} tickets were started. Ask the "
                     "board's owner for another season.",
                 )
-            path = self.season_folder(row.digest).request(number)
-            self.record("ticket", signed.id, signed, path, time)
+            self.record("ticket", signed.id, signed, time)
         return number
 
     def end_ticket(self, season: str, number: int, result: SealedResult) -> bool:
@@ -198,8 +195,7 @@ class SealedStore(Database):
             for other in index.seasons.rows():  # their tasks follow from the same secret
                 if other.reveal is None and index.seasons.read(other).is_committed_to(master):
                     self._refuse_not_over(other, time)
-            path = self.season_folder(row.digest).reveal
-            self.record("revealed", row.digest, reveal, path, time)
+            self.record("revealed", row.digest, reveal, time)
         return True
 
     def _refuse_not_over(self, row: SeasonRow, time: str) -> None:
@@ -231,8 +227,7 @@ class SealedStore(Database):
                 f"season={row.id}: is not revealed yet. `sme-leaderboard season reveal` publishes "
                 "its master after the close.",
             )
-        path = self.season_folder(row.digest).reveal
-        reveal = read_document(self.folder, path, Reveal, row.reveal)
+        reveal = self.objects.document(Reveal, row.reveal)
         return Master(bytes.fromhex(reveal.master))
 
     def entrants(self, season: str) -> list[SealedRow]:
@@ -263,13 +258,11 @@ class SealedStore(Database):
 
     def entry_of(self, row: SealedRow) -> Signed[Entry]:
         """An entry as it was signed; raises `TamperedError` if its file was altered."""
-        path = self.season_folder(row.season).entry(row.entrant.id)
-        return read_document(self.folder, path, Signed[Entry], row.document)
+        return self.objects.document(Signed[Entry], row.document)
 
     def request_of(self, row: SealedRow) -> Signed[TicketRequest]:
         """A ticket's request as it was signed; raises `TamperedError` if its file was altered."""
-        path = self.season_folder(row.season).request(row.number)
-        return read_document(self.folder, path, Signed[TicketRequest], row.document)
+        return self.objects.document(Signed[TicketRequest], row.document)
 
     def sealed_result(self, row: SealedRow) -> SealedResult | None:
         """The result of an entry or ticket; None if it has none.
@@ -277,10 +270,7 @@ class SealedStore(Database):
         Raises:
           TamperedError: its file differs from the logged one.
         """
-        if row.result is None:
-            return None
-        path = self.season_folder(row.season).result(row.entrant.id)
-        return read_document(self.folder, path, SealedResult, row.result)
+        return None if row.result is None else self.objects.document(SealedResult, row.result)
 
     def open_season(self, name: str, track: SealedTrack, time: str | None = None) -> SeasonRow:
         """The season of this id or digest, which must be of a track, and open at a time, or now.
@@ -315,7 +305,5 @@ class SealedStore(Database):
             raise ValueError(f"result of {result.subject} does not match {row.entrant.id}")
         if row.result is not None:
             return False
-        self.record(
-            event, row.entrant.id, result, self.season_folder(row.season).result(row.entrant.id)
-        )
+        self.record(event, row.entrant.id, result)
         return True

@@ -61,6 +61,7 @@ class Tickets:
         self.season = seasons[0] if season is None else store.season(season)
         self.digest = self.season.digest
         folder = store.season_folder(self.digest)
+        folder.path.mkdir(parents=True, exist_ok=True)
         lock = file_lock(folder.stepping)
         if lock is None:
             raise BoardError(

@@ -1,103 +1,259 @@
-"""The part of `verify` that is about sealed seasons: files that the log names, and signatures.
+"""`verify_seasons`: what follows from the terms and the master of each season, scored again.
 
-What follows from a reveal is replayed by `sealed.verify_season`.
+Opening the board has checked each document against the log, and each master against its commitment.
+What is left are the signatures, the terms, and after the reveal data sets, challenge states and
+scores: of offline entries from their answers, of tickets from what was played, which the entrants
+signed.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NoReturn
 
-from leaderboard.documents.signed import Signed
+from leaderboard.documents.result import RunScore
 from leaderboard.errors import TamperedError
-from leaderboard.seasons.entry import Entry, SealedManifest, TicketRequest
-from leaderboard.seasons.season import STEPPING, SeasonFolder
-from leaderboard.store import Index, SealedRow, SeasonRow, read_document
-from sme_registry.io import TEMPORARY
-
-_HEX, _NUMBER = r"[0-9a-f]{64}", r"[1-9][0-9]*"
-_FILES = (
-    rf"({_HEX})/season\.json",
-    rf"({_HEX})/reveal\.json",
-    rf"({_HEX})/entries/({_HEX})\.json",
-    rf"({_HEX})/results/({_HEX})\.json",
-    rf"({_HEX})/tickets/({_NUMBER})/ticket\.json",
+from leaderboard.scoring.aggregation import failed_run, levels_of, run_metrics
+from leaderboard.scoring.verify import (
+    RESCORED,
+    Difference,
+    Note,
+    Progress,
+    Row,
+    compared,
+    contradiction,
+    difference,
+    refuse_contradiction,
 )
-_OTHERS = rf"{_HEX}/(tickets/{_NUMBER}/.+|{re.escape(STEPPING)})"
-"""Journals and answers, which `sealed.verify_season` replays, and the lock of a server."""
+from leaderboard.seasons.events import SealedRow, SeasonRow
+from leaderboard.seasons.master import Master
+from leaderboard.seasons.publication import check_published, follows, read_season
+from leaderboard.seasons.ranking import counting, scored_entries
+from leaderboard.seasons.scores import score_ticket
+from leaderboard.seasons.scoring import instances, sealed_result
+from leaderboard.seasons.season import SealedResult, Season
+from leaderboard.seasons.ticket import RunningTicket, deadline
+from leaderboard.store import Store
 
 
-def count_unlogged_of_seasons(index: Index) -> int:
-    """Check that no file passes for one of a season; count those about to be logged.
+def verify_seasons(
+    store: Store, progress: Progress, published: Sequence[str | Path] = ()
+) -> tuple[list[Row], list[Note]]:
+    """Verify all seasons of a board.
 
-    Raises:
-      TamperedError: a file is none of a board.
-    """
-    root, unlogged = index.folder.seasons, 0
-    for path in _files(root):
-        name = path.relative_to(root).as_posix()
-        matches = [re.fullmatch(pattern, name) for pattern in _FILES]
-        found = next((match for match in matches if match is not None), None)
-        if found is None and re.fullmatch(_OTHERS, name) is None:
-            raise TamperedError(f"{root.name}/{name}", "is not a file of a board")
-        if found is not None and not _is_logged(index, name, *found.groups()):
-            unlogged += 1
-    return unlogged
-
-
-def check_sealed_signatures(index: Index) -> tuple[int, int]:
-    """Check the signatures of entries and requests, which the board's own key cannot forge.
-
-    Returns:
-      The number of seasons, and of their entries and tickets.
+    Args:
+      store: the board, whose log was followed.
+      progress: called with what was just checked.
+      published: folders as `season new` wrote them, of seasons whose board has no copy.
 
     Raises:
-      TamperedError: names the first file whose signature does not match.
+      TamperedError: names the first entry, ticket or value that does not follow.
+      BoardError: a published file differs from its digest.
     """
-    seasons = index.seasons.rows()
-    count = 0
-    for season in seasons:
-        for row in index.seasons.entrants(season.digest):
-            path, signed = _signed(index, season, row)
-            if not signed.is_valid(index.document.signatures_for):
-                where = path.relative_to(index.folder.path).as_posix()
-                raise TamperedError(where, "its signature does not match the entrant's key")
-            count += 1
-    return len(seasons), count
+    folders = {read_season(folder).digest: Path(folder) for folder in published}
+    rows, notes = [], []
+    for row in store.seasons():
+        verifier = _Verifier(store, row, progress, folders)
+        verifier.check()
+        rows += verifier.rows
+        notes += verifier.notes
+    return rows, notes
 
 
-def _signed(index: Index, season: SeasonRow, row: SealedRow) -> tuple[Path, Signed[SealedManifest]]:
-    folder = SeasonFolder(index.folder, season.digest)
-    if season.track == "sealed-online":
-        path = folder.request(row.number)
-        return path, read_document(index.folder, path, Signed[TicketRequest], row.document)
-    path = folder.entry(row.entrant.id)
-    return path, read_document(index.folder, path, Signed[Entry], row.document)
+@dataclass
+class _Verifier:
+    """The checks of one season, and what they have found."""
 
+    store: Store
+    of: SeasonRow
+    progress: Progress
+    folders: Mapping[str, Path]
+    rows: list[Row] = field(default_factory=list)
+    notes: list[Note] = field(default_factory=list)
 
-def _is_logged(index: Index, name: str, season: str, part: str = "") -> bool:
-    """Whether the log names a file; `part` is the id's digits, or the number, in its path."""
-    row = index.seasons.row(f"sha256:{season}")
-    if row is None:
-        return False
-    if name.endswith("/season.json"):
-        return True
-    if name.endswith("/reveal.json"):
-        return row.reveal is not None
-    if name.endswith("/ticket.json"):
-        return index.seasons.ticket(row.digest, int(part)) is not None
-    entrant = index.seasons.entrant(f"sha256:{part}")
-    if entrant is None or entrant.season != row.digest:
-        return False
-    return "/entries/" in name or entrant.result is not None
+    def __post_init__(self) -> None:
+        self.season: Season = self.store.season(self.of.digest)
+        self.entrants = self.store.entrants(self.of.digest)
 
+    def check(self) -> None:
+        """Check all that can be checked now."""
+        self.check_terms()
+        for row in self.entrants:
+            self.check_signature(row)
+        self.report("signatures of entrants", len(self.entrants))
+        for result in self.results():
+            refuse_contradiction(self.contradiction(result), self.name(result.subject))
+        if self.of.reveal is None:
+            self.check_published()
+            count = len(self.entrants)
+            self.report("results, scored again", 0, count, "not yet revealed" * bool(count))
+            return
+        master = self.store.revealed_master(self.of.digest)
+        self.generate_again(master)
+        self.score_again(master)
 
-def _files(root: Path) -> Iterator[Path]:
-    """All files below a folder, in order, without half-written ones."""
-    if root.is_dir():
-        yield from (
-            path
-            for path in sorted(root.rglob("*"))
-            if not path.is_dir() and not path.match(TEMPORARY)
+    def report(self, what: str, checked: int, unchecked: int = 0, why: str = "") -> None:
+        """Add a row of the table."""
+        self.rows.append(Row(f"{self.of.id}: {what}", checked, unchecked, why))
+
+    def name(self, subject: str) -> str:
+        """What to call an entry or ticket, by its id."""
+        return f"{self.of.id}, {subject}"
+
+    def results(self) -> Iterator[SealedResult]:
+        """The results, in the order of the entries."""
+        for row in self.entrants:
+            result = self.store.sealed_result(row)
+            if result is not None:
+                yield result
+
+    def check_signature(self, row: SealedRow) -> None:
+        """Check an entrant's signature, which the board's own key cannot forge."""
+        online = self.season.track == "sealed-online"
+        signed = self.store.request_of(row) if online else self.store.entry_of(row)
+        if not signed.is_valid(self.store.document.key):
+            self.refuse(row, "its signature does not match the entrant's key")
+
+    def check_terms(self) -> None:
+        """Check what the terms forbid, and a board of the organiser's own making could log."""
+        season, online = self.season, self.season.track == "sealed-online"
+        own: Counter[str] = Counter()
+        for row in self.entrants:
+            if not season.opens <= row.entrant.received < season.closes:
+                message = f"was logged at {row.entrant.received}: the season is open from "
+                self.refuse(row, f"{message}{season.opens} to {season.closes}")
+            own[row.entrant.key] += 1
+            if season.tickets_per_key is not None and own[row.entrant.key] > season.tickets_per_key:
+                self.refuse(row, f"exceeds the {season.tickets_per_key} tickets of a key")
+            if season.tickets is not None and row.number > season.tickets:
+                self.refuse(row, f"exceeds the {season.tickets} tickets of the season")
+            if online and row.entrant.policies < row.entrant.runs and row.result is not None:
+                end = deadline(season, row)
+                if row.finished < end:
+                    message = f"ended at {row.finished}, without all answers: must not be before "
+                    self.refuse(row, f"{message}{end}, its deadline")
+        if self.of.reveal is not None and self.of.revealed < season.closes:
+            message = f"was logged at {self.of.revealed}, before {season.closes}"
+            raise TamperedError(f"{self.of.id}: reveal", message)
+
+    def published(self) -> Path | None:
+        """A folder with the published files; None without one."""
+        copy = self.store.season_folder(self.of.digest).published
+        return copy if copy.is_dir() else self.folders.get(self.of.digest)
+
+    def check_published(self) -> None:
+        """Before the reveal: check the published files against their digests."""
+        count, folder = len(self.season.published), self.published()
+        if folder is None:
+            self.report("data sets", 0, count, "not in this folder" * bool(count))
+            return
+        self.report("data sets, by their digests", check_published(self.season, folder))
+
+    def generate_again(self, master: Master) -> None:
+        """Check that data sets and challenge states follow from the master."""
+        if not self.season.published:
+            return
+        outcomes: Counter[str] = Counter()
+        for instance, expected in zip(
+            instances(self.season, master), self.season.published, strict=True
+        ):
+            outcome = follows(instance, master, expected, self.published())
+            if outcome == "no":
+                where = f"{self.of.id}: published {expected.class_name} {expected.instance}"
+                message = "its data set or challenge states do not follow from the master"
+                raise TamperedError(where, message)
+            outcomes[outcome] += 1
+            self.progress(f"{expected.class_name} {expected.instance}")
+        why = "this processor rounds otherwise, and the published arrays are not here"
+        unknown, rounded = outcomes["unknown"], outcomes["within rounding"]
+        self.report("data sets", outcomes["exactly"], unknown, why * bool(unknown))
+        if rounded:
+            self.report("data sets, within 1e-6", rounded, 0, "this processor rounds otherwise")
+
+    def score_again(self, master: Master) -> None:
+        """Score entries and tickets again, and compare."""
+        counted = counting(self.store, self.season)
+        scored = [row for row in self.entrants if row.result is not None]
+        for row in scored:
+            if row not in counted:
+                self.refuse(row, "has a result, and does not count")
+        whole = [row for row in scored if self.has_answers(row)]
+        for row, again in zip(whole, self.scored(master, whole), strict=True):
+            recorded = self.store.sealed_result(row)
+            assert recorded is not None
+            found = difference(compared(recorded), compared(again), RESCORED)
+            if found is not None:
+                self.notes.append(Note(self.name(row.entrant.id), found))
+            self.progress(row.entrant.id)
+        left = sum(row.result is None for row in counted)
+        reasons = (
+            (left, "not scored yet: repeat `sme-leaderboard season reveal`"),
+            (len(scored) - len(whole), "their answers are not here"),
         )
+        why = "; ".join(f"{number} {reason}" for number, reason in reasons if number)
+        count = len(whole)
+        self.report("results, scored again", count, left + len(scored) - count, why)
+
+    def has_answers(self, row: SealedRow) -> bool:
+        """Whether the answers of an offline entry are here; those of a ticket lie beside it."""
+        if self.season.track == "sealed-online":
+            return True
+        answers = self.store.entry_of(row).content.answers
+        return all(each is None or self.store.objects.has(each.sha256) for each in answers)
+
+    def scored(self, master: Master, rows: Sequence[SealedRow]) -> Iterator[SealedResult]:
+        """The results, computed again."""
+        if self.season.track == "sealed-offline":
+            yield from scored_entries(self.store, self.season, master, rows)
+            return
+        for row in rows:
+            self.check_answers(master, row)
+            yield score_ticket(self.store, self.season, master, row.number)
+
+    def check_answers(self, master: Master, row: SealedRow) -> None:
+        """Check that the entrant has signed what was played on each answered instance."""
+        ticket = RunningTicket(self.store, self.season, master, row)
+        for number, instance in enumerate(ticket.instances):
+            if not instance.is_signed:
+                self.refuse(row, f"instance {number}: its answers are not what the entrant signed")
+
+    def contradiction(self, result: SealedResult) -> Difference | None:
+        """The first value of a result that does not follow from the regrets of its runs."""
+        board, season, runs = self.store.document, self.season, []
+        hidden = list(season.hidden)
+        if len(result.runs) != len(hidden):
+            return Difference("runs", str(len(result.runs)), str(len(hidden)))
+        for number, (run, place) in enumerate(zip(result.runs, hidden, strict=True)):
+            expected = _expected_run(season, place.member.name, run, board.rules)
+            if expected is None:
+                return Difference(f"runs.{number}", "other regions", "those of the protocol")
+            runs.append(expected)
+        again = sealed_result(
+            season,
+            result.subject,
+            runs,
+            result.versions,
+            board.draws,
+            result.stepping,
+            board.rules,
+        )
+        return contradiction(result, again)
+
+    def refuse(self, row: SealedRow, message: str) -> NoReturn:
+        """Raise `TamperedError` for an entry or ticket."""
+        kind = "ticket" if self.season.track == "sealed-online" else "entry"
+        raise TamperedError(f"{self.of.id}: {kind} {row.number} ({row.entrant.id})", message)
+
+
+def _expected_run(season: Season, class_name: str, run: RunScore, rules: int) -> RunScore | None:
+    """What follows from the regrets of a run; None if they are not those of the regions."""
+    protocol = season.protocol
+    if run.artefact is None:
+        return failed_run(protocol, class_name, None)
+    if {len(run.normalised_regret), len(run.similarity or ())} != {len(protocol.edges)}:
+        return None
+    metrics = run_metrics(run.normalised_regret, run.similarity, levels_of(protocol), rules)
+    return run.model_copy(update={"class_name": class_name, **metrics})

@@ -20,7 +20,7 @@ from leaderboard.documents.board import RULES, BoardDocument, Folder
 from leaderboard.documents.signed import SigningKey
 from leaderboard.documents.submission import now, shifted, utc
 from leaderboard.errors import BoardError, TamperedError
-from leaderboard.store.files import FolderLock, digest_of, unwritable, write_document
+from leaderboard.store.files import FolderLock, digest_of, unwritable
 from leaderboard.store.index import Index, IndexUnusable
 from leaderboard.store.log import EMPTY, Clock, Event, Head, Log, clock_offset, uptime
 from leaderboard.store.objects import Objects
@@ -43,7 +43,7 @@ class Database:
         self.folder = Folder(path)
         self.document: BoardDocument = self.folder.read()
         self.read_only = read_only
-        self.objects = Objects(self.folder)
+        self.objects = Objects(self.folder, by_kind=self.document.rules == 2)
         self.clock = Clock()
         self._log = Log(self.folder, self.document.key)
         self._thread_lock = threading.RLock()
@@ -153,10 +153,9 @@ class Database:
         event: Event,
         subject: str,
         document: StrictModel,
-        path: Path,
         time: str | None = None,
     ) -> None:
-        """Write a document's file, its log entry and its rows; call it in a transaction.
+        """Write a document, its log entry and its rows; call it in a transaction.
 
         `time` is the log entry's, if what is allowed depends on it; by default the board's.
 
@@ -166,7 +165,7 @@ class Database:
         key = self.signing_key()
         index, time = self._connected, time or self.clock.received()
         entry = self._log.entry(key, index.head, event, subject, digest_of(document), time)
-        write_document(path, document)
+        self.objects.write(document)
         self._log.write(entry)
         index.apply(entry)
         self.clock.last = entry.time

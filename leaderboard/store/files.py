@@ -7,14 +7,13 @@ file, so that a logged entry survives a loss of power, and makes files readable 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
-from leaderboard.documents.board import Folder, hex_of
+from leaderboard.documents.board import Folder
 from leaderboard.errors import BoardError, TamperedError
 from sme_registry import io
 from sme_registry.errors import SMEError
@@ -86,37 +85,32 @@ def read_document(
     folder: Folder,
     path: Path,
     kind: type[_Model],
-    digest: str | None = None,
     *,
     limit: int = MAX_DOCUMENT_BYTES,
 ) -> _Model:
-    """Read a document of a board.
-
-    Args:
-      folder: the board's folder, for error messages.
-      path: the file.
-      kind: the document's type.
-      digest: of the file, as logged; None if the log does not name the file.
-      limit: its size in bytes.
+    """Read board.json or a log entry, whose digest nothing names.
 
     Raises:
       TamperedError: the file is missing, is not a regular file, is too large, is not a document of
-        this type, differs from the logged one, or is not in the form in which the board writes it.
+        this type, or is not in the form in which the board writes it.
     """
     where = path.relative_to(folder.path).as_posix()
     try:
         data = read_regular(path, limit)
     except OSError as error:
         raise TamperedError(where, f"cannot be read: {error.strerror}") from None
-    if digest is not None and hashlib.sha256(data).hexdigest() != hex_of(digest):
-        raise TamperedError(where, f"differs from the document in the log, {digest[:19]}…")
-    try:
-        document = kind.from_dict(io.parse_json(data, where), where)
-    except SMEError as error:
-        raise TamperedError(where, f"is not a document that the board wrote: {error}") from None
-    if digest is None and to_bytes(document) != data:
+    document = parse_document(data, kind, where)
+    if to_bytes(document) != data:
         raise TamperedError(where, "is not in the form in which the board writes it")
     return document
+
+
+def parse_document(data: bytes, kind: type[_Model], where: str) -> _Model:
+    """A document from its bytes, which `where` names in errors."""
+    try:
+        return kind.from_dict(io.parse_json(data, where), where)
+    except SMEError as error:
+        raise TamperedError(where, f"is not a document that the board wrote: {error}") from None
 
 
 class FolderLock:

@@ -30,8 +30,9 @@ from leaderboard.errors import TamperedError
 from leaderboard.seasons import events as seasons
 from leaderboard.store import copies
 from leaderboard.store.copies import Copies
-from leaderboard.store.files import BUSY_SECONDS, digest_of, read_document
+from leaderboard.store.files import BUSY_SECONDS, digest_of
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
+from leaderboard.store.objects import Objects
 from leaderboard.store.rows import EntryRow, Status, name_object, scores_of, scores_text
 
 DERIVED = {  # tables and their keys
@@ -59,11 +60,10 @@ CREATE TABLE entry (
   submitter TEXT NOT NULL, key TEXT NOT NULL, code_link TEXT,
   runs INTEGER NOT NULL, policies INTEGER NOT NULL, steps INTEGER NOT NULL,
   enough_runs INTEGER NOT NULL DEFAULT 0, oracle_like INTEGER NOT NULL DEFAULT 0,
-  reference INTEGER NOT NULL, scores TEXT, bytes INTEGER NOT NULL
+  reference INTEGER NOT NULL, scores TEXT
 ) STRICT, WITHOUT ROWID;
 CREATE INDEX entry_waiting ON entry (sequence) WHERE status = 'waiting';
 CREATE INDEX entry_of_key ON entry (key, received);
-CREATE INDEX entry_bytes ON entry (bytes);
 CREATE UNIQUE INDEX entry_sequence ON entry (sequence);{copies.SCHEMA}{seasons.SCHEMA}
 CREATE TABLE object (
   digest TEXT PRIMARY KEY, size INTEGER NOT NULL, key TEXT NOT NULL, received TEXT NOT NULL
@@ -110,8 +110,9 @@ class Index:
         self.connection = connection
         self.folder = folder
         self.document = document
+        self.objects = Objects(folder, by_kind=document.rules == 2)
         self._board = document.digest
-        self.seasons = seasons.Seasons(connection, folder)
+        self.seasons = seasons.Seasons(connection, self.objects)
 
     @classmethod
     def open(
@@ -205,16 +206,27 @@ class Index:
                 self._clock(entry)
             case _:
                 self.seasons.apply(entry)
+        if entry.event not in ("opened", "clock"):
+            self._name_document(entry)
         self.connection.execute(
             "REPLACE INTO head VALUES (0, ?, ?, ?, ?)",
             (self._board, entry.sequence, entry.digest, entry.time),
         )
 
+    def _name_document(self, entry: LogEntry) -> None:
+        """Add the entry's document to the objects, as one of the entrant's or the board's."""
+        row = self.one(
+            "SELECT key FROM entry WHERE id = ?1 UNION SELECT key FROM sealed WHERE id = ?1",
+            entry.subject,
+        )
+        size = self.objects.path(entry.document).stat().st_size
+        key = self.document.key if row is None else row[0]
+        name_object(self.connection, entry.document, size, key, entry.time)
+
     def _received(self, entry: LogEntry) -> None:
         if self.one("SELECT 1 FROM entry WHERE id = ?", entry.subject) is not None:
             raise entry.contradiction("receives a submission twice")
-        path = self.folder.submission(entry.subject)
-        submission = read_document(self.folder, path, Signed[Submission], entry.document).content
+        submission = self.objects.document(Signed[Submission], entry.document).content
         entry.check_subject(submission.digest)
         method, submitter = submission.method, submission.submitter
         values = {
@@ -233,7 +245,6 @@ class Index:
             "policies": sum(run.artefact is not None for run in submission.runs),
             "steps": sum(run.steps for run in submission.runs),
             "reference": submitter.key == self.document.key and method.family == "reference",
-            "bytes": path.stat().st_size,
         }
         self.connection.execute(
             f"INSERT INTO entry ({', '.join(values)}) VALUES (:{', :'.join(values)})", values
@@ -250,17 +261,15 @@ class Index:
     def _result(self, entry: LogEntry) -> None:
         if self.status(entry.subject) != "waiting":
             raise entry.contradiction("the submission was not waiting for a result")
-        path = self.folder.result(entry.subject)
-        result = read_document(self.folder, path, Result, entry.document)
+        result = self.objects.document(Result, entry.document)
         entry.check_subject(result.submission)
         self.connection.execute(
             "UPDATE entry SET result = ?, status = ?, code = ?, enough_runs = ?, oracle_like = ?, "
-            "scores = ?, bytes = bytes + ? WHERE id = ?",
+            "scores = ? WHERE id = ?",
             (
                 *(entry.document, result.status, result.code),
                 *(result.enough_runs, result.oracle_like),
                 None if result.scores is None else scores_text(result.scores),
-                path.stat().st_size,
                 entry.subject,
             ),
         )
@@ -274,12 +283,11 @@ class Index:
     def _withdrawn(self, entry: LogEntry) -> None:
         if self.status(entry.subject) in (None, "withdrawn"):
             raise entry.contradiction("the submission is unknown or already withdrawn")
-        path = self.folder.withdrawal(entry.subject)
-        signed = read_document(self.folder, path, Signed[Withdrawal], entry.document)
+        signed = self.objects.document(Signed[Withdrawal], entry.document)
         entry.check_subject(signed.content.submission)
         self.connection.execute(
-            "UPDATE entry SET status = 'withdrawn', withdrawal = ?, bytes = bytes + ? WHERE id = ?",
-            (entry.document, path.stat().st_size, entry.subject),
+            "UPDATE entry SET status = 'withdrawn', withdrawal = ? WHERE id = ?",
+            (entry.document, entry.subject),
         )
         self.connection.execute("DELETE FROM lease WHERE submission = ?", (entry.subject,))
 

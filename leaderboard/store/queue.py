@@ -166,8 +166,7 @@ class Queue:
         with self._database.transaction() as index:
             if not _is_current(index, claim):
                 return False
-            path = self._database.folder.result(claim.id)
-            self._database.record("result", claim.id, result, path)
+            self._database.record("result", claim.id, result)
         return True
 
     def waiting(self) -> int:

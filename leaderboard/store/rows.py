@@ -30,7 +30,7 @@ class EntryRow:
       scores: None if it was not scored.
       policies: number of runs with a policy.
       alike: earlier submissions with policies like this one's, the board's own rows excluded; empty
-        before scoring and on boards of rules 1.
+        before scoring.
       faults: how often a fault has ended its scoring while it waits, for example a killed scorer
         or a full disk; 0 in a read-only store, which does not know.
       fault: the last of them; empty if there is none.

@@ -19,7 +19,7 @@ from leaderboard.documents.signed import Signed, SigningKey
 from leaderboard.documents.submission import Submission, Withdrawal, check_text, now, skeleton
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.seasons.store import SealedStore
-from leaderboard.store.files import digest_of, read_document, write_document
+from leaderboard.store.files import digest_of, write_document
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.queue import Queue
 from leaderboard.store.rows import EntryRow
@@ -118,22 +118,10 @@ class Store(SealedStore):
         store = cls(path, read_only=read_only)
         try:
             store.connect(reindex=reindex, progress=progress)
-            if not read_only:
-                store._remove_unlogged_results()
         except BaseException:
             store.close()
             raise
         return store
-
-    def _remove_unlogged_results(self) -> None:
-        """Remove results of scorers that died before they logged them."""
-        if not self.folder.results.is_dir():
-            return
-        with self.transaction() as index:
-            for path in self.folder.results.glob("[!.]*.json"):
-                id = f"sha256:{path.stem}"
-                if not index.one("SELECT 1 FROM entry WHERE id = ? AND result IS NOT NULL", id):
-                    path.unlink()
 
     def put_object(self, digest: str, chunks: Iterable[bytes], *, by: str) -> bool:
         """Store an artefact while its bytes arrive, up to the board's size limit.
@@ -216,7 +204,7 @@ class Store(SealedStore):
         with self.transaction() as index:
             if index.status(signed.id) is not None:
                 return False
-            self.record("received", signed.id, signed, self.folder.submission(signed.id))
+            self.record("received", signed.id, signed)
         return True
 
     def withdraw(self, signed: Signed[Withdrawal], address: str | None = None) -> bool:
@@ -249,8 +237,7 @@ class Store(SealedStore):
                 )
             if index.status(withdrawal.submission) == "withdrawn":
                 return False
-            path = self.folder.withdrawal(withdrawal.submission)
-            self.record("withdrawn", withdrawal.submission, signed, path)
+            self.record("withdrawn", withdrawal.submission, signed)
         return True
 
     def submission(self, id: str) -> Signed[Submission]:
@@ -260,7 +247,7 @@ class Store(SealedStore):
           Rejection: `unknown_submission`.
           TamperedError: its file differs from the logged one.
         """
-        signed = self._read("document", id, self.folder.submission, Signed[Submission])
+        signed = self._read("document", id, Signed[Submission])
         if signed is None:
             raise unknown_submission(id)
         return signed
@@ -271,7 +258,7 @@ class Store(SealedStore):
         Raises:
           TamperedError: its file differs from the logged one.
         """
-        return self._read("result", id, self.folder.result, Result)
+        return self._read("result", id, Result)
 
     def withdrawal(self, id: str) -> Signed[Withdrawal] | None:
         """A submission's withdrawal; None if there is none.
@@ -279,17 +266,15 @@ class Store(SealedStore):
         Raises:
           TamperedError: its file differs from the logged one.
         """
-        return self._read("withdrawal", id, self.folder.withdrawal, Signed[Withdrawal])
+        return self._read("withdrawal", id, Signed[Withdrawal])
 
-    def _read(
-        self, column: str, id: str, path_of: Callable[[str], Path], kind: type[_Model]
-    ) -> _Model | None:
+    def _read(self, column: str, id: str, kind: type[_Model]) -> _Model | None:
         """A document of a submission, whose digest in the log the index has in `column`."""
         with self.reading() as index:
             row = index.one(f"SELECT {column} FROM entry WHERE id = ?", id)
         if row is None or row[0] is None:
             return None
-        return read_document(self.folder, path_of(id), kind, row[0])
+        return self.objects.document(kind, row[0])
 
     def entries(self) -> list[EntryRow]:
         """All submissions, in the order in which they were received."""
@@ -300,6 +285,12 @@ class Store(SealedStore):
         """One submission; None if there is no such submission."""
         with self.reading() as index:
             return index.entry(id)
+
+    def named_objects(self) -> list[str]:
+        """The digests of all documents and policy files that logged documents name."""
+        with self.reading() as index:
+            rows = index.connection.execute("SELECT digest FROM object ORDER BY digest")
+            return [digest for (digest,) in rows]
 
     @property
     def head(self) -> Head:
@@ -317,11 +308,7 @@ class Store(SealedStore):
                 "SELECT (SELECT coalesce(sum(size), 0) FROM object "
                 "WHERE key = ?1 AND received > ?2) + "
                 "(SELECT coalesce(sum(size), 0) FROM upload "
-                "WHERE key = ?1 AND time > ?2) + "
-                "(SELECT coalesce(sum(bytes), 0) FROM entry "
-                "WHERE key = ?1 AND received > ?2) + "
-                "(SELECT coalesce(sum(bytes), 0) FROM sealed "
-                "WHERE key = ?1 AND received > ?2)",
+                "WHERE key = ?1 AND time > ?2)",
                 *(key, since),
             )
 
@@ -334,8 +321,7 @@ class Store(SealedStore):
             return index.number(
                 "SELECT (SELECT coalesce(sum(size), 0) FROM "
                 "(SELECT digest, size FROM object UNION SELECT digest, size FROM upload))"
-                " + (SELECT coalesce(sum(bytes), 0) FROM entry)"
-                " + (SELECT coalesce(sum(bytes + played_bytes), 0) FROM sealed)"
+                " + (SELECT coalesce(sum(played_bytes), 0) FROM sealed)"
             )
 
     def submission_times(self, key: str, since: str) -> list[str]:
@@ -350,7 +336,7 @@ class Store(SealedStore):
             return [received for (received,) in rows]
 
     def is_public(self, digest: str) -> bool:
-        """Whether an artefact belongs to a reference row, or to a submission that was scored.
+        """Whether a file is a document, or belongs to a reference row or a scored submission.
 
         Others are not published: who could download a policy that waits to be scored could submit
         it under another key, as if it were the first. Answers are public once they are scored, too.
@@ -360,7 +346,9 @@ class Store(SealedStore):
                 "SELECT 1 FROM artefact JOIN entry ON id = submission "
                 "WHERE digest = ?1 AND (reference OR scores IS NOT NULL) UNION "
                 "SELECT 1 FROM answer JOIN sealed ON id = entry "
-                "WHERE digest = ?1 AND scores IS NOT NULL LIMIT 1",
+                "WHERE digest = ?1 AND scores IS NOT NULL UNION "
+                "SELECT 1 FROM object WHERE digest = ?1 AND digest NOT IN "
+                "(SELECT digest FROM artefact UNION SELECT digest FROM answer) LIMIT 1",
                 digest,
             )
         return row is not None
@@ -385,8 +373,7 @@ def _refuse_unfit(document: BoardDocument) -> None:
 
 
 def _write_board(folder: Folder, document: BoardDocument, key: SigningKey) -> None:
-    parts = (folder.log, folder.submissions, folder.withdrawals, folder.results, folder.objects)
-    for part in parts:  # `build_folder` flushes them to disk
+    for part in (folder.log, folder.objects):  # `build_folder` flushes them to disk
         part.mkdir()
     key.write(folder.key)
     write_document(folder.board, document, new=True)

@@ -335,10 +335,9 @@ class Pages:
             return self._submission(id).encode()
         if kind != "json":
             return None
-        _, result = self._documents(id)
-        if folder == "submissions":
-            return self.store.folder.submission(id).read_bytes()  # verified by the store
-        return self.store.folder.result(id).read_bytes() if result is not None else None
+        signed, result = self._documents(id)
+        document = signed if folder == "submissions" else result
+        return None if document is None else to_json(document.to_dict()).encode()
 
     def _documents(self, id: str) -> tuple[Signed[Submission], Result | None]:
         """A submission and its result; the latest are kept, because three files need them."""

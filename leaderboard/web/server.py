@@ -203,11 +203,9 @@ def _refuse_board(out: Path) -> None:
         board = Folder(above)
         if not (board.key.exists() or (board.board.is_file() and board.log.is_dir())):
             continue
-        folders = (
-            *(board.log, board.objects, board.results, board.seasons),
-            *(board.submissions, board.withdrawals),
-        )
-        if target == above or any(target.is_relative_to(each.resolve()) for each in folders):
+        folders = ("log", "objects", "seasons", "submissions", "withdrawals", "results")
+        own = [(above / each).resolve() for each in folders]
+        if target == above or any(map(target.is_relative_to, own)):
             raise OptionError(
                 f"out={str(out)!r}: belongs to the board {above}, whose files the pages would "
                 f"replace. Give another folder, such as {above / 'site'}."

@@ -129,6 +129,13 @@ def signed_withdrawal(store, id, key, reason="a test", address=None):
     return withdrawal.signed(key, Receiver(store.document.key, address))
 
 
+def document_path(board, id, kind="document"):
+    """The file of a submission's document, `result` or `withdrawal` on a board of this folder."""
+    with Store.open(board, read_only=True) as store, store.reading() as index:
+        (digest,) = index.one(f"SELECT {kind} FROM entry WHERE id = ?", id)
+        return store.folder.object(digest)
+
+
 @pytest.fixture
 def key():
     return SigningKey.generate()

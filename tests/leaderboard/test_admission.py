@@ -14,6 +14,7 @@ from leaderboard.scoring.worker import run_scorer
 from sme_registry.io import sha256_of
 from tests.leaderboard.clocks import move_clock
 from tests.leaderboard.conftest import (
+    document_path,
     linear_onnx,
     put_submission,
     signed_withdrawal,
@@ -434,10 +435,10 @@ def test_documents_count_like_artefacts(store, key):
     used = artefact + len(signed.to_bytes())
     assert store.uploaded_bytes(key.public, ANY_TIME) == store.total_bytes() == used
     assert run_scorer(store.folder.path) == 1
-    used += store.folder.result(signed.id).stat().st_size
+    used += document_path(store.folder.path, signed.id, "result").stat().st_size
     assert store.uploaded_bytes(key.public, ANY_TIME) == used
     store.withdraw(signed_withdrawal(store, signed.id, key))
-    used += store.folder.withdrawal(signed.id).stat().st_size
+    used += document_path(store.folder.path, signed.id, "withdrawal").stat().st_size
     assert store.total_bytes() == used
     store.reindex()
     assert store.total_bytes() == used

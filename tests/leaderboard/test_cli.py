@@ -22,7 +22,7 @@ from sme_registry import EvaluationProtocol
 from sme_registry.io import sha256_of
 from sme_registry.spec import ProtocolFile, SuiteFile
 from sme_registry.training import train
-from tests.leaderboard.conftest import linear_onnx, tiny_suite
+from tests.leaderboard.conftest import document_path, linear_onnx, tiny_suite
 from tests.leaderboard.serving import serving
 
 COMMANDS = (
@@ -385,7 +385,7 @@ def test_score_lists_what_it_could_not_score_and_why_and_counts_its_own(scored):
 
 
 def test_an_altered_result_exits_with_3_and_is_named(scored):
-    path = sorted(Path("board/results").iterdir())[0]
+    path = document_path("board", scored, "result")
     path.chmod(0o644)
     path.write_text(path.read_text().replace('"wd_regret"', '"dw"', 1))
     assert path.name in fails(3, "verify", "board")

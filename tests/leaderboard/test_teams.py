@@ -15,14 +15,13 @@ from leaderboard.gate import sandbox
 from leaderboard.gate.isolation import available_isolation
 from leaderboard.gate.reference import optimal_onnx
 from leaderboard.scoring import ranking, score
-from leaderboard.scoring.rescore import rescore
 from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import run_scorer
 from leaderboard.store import Store
 from leaderboard.web.server import write_site
 from sme_registry import EvaluationProtocol
 from sme_registry.spec import Suite, SuiteFile
-from tests.leaderboard.conftest import linear_onnx
+from tests.leaderboard.conftest import document_path, linear_onnx
 
 AGENTS = [
     {"name": "scout_0", "action_dim": 1, "observes": [0]},
@@ -48,7 +47,7 @@ FIELDS = {
     "runs_to_rank": 1,
     "draws": 100,
 }
-DOCUMENT = BoardDocument(key="0" * 64, **FIELDS)
+DOCUMENT = BoardDocument(key="0" * 64, rules=3, **FIELDS)
 KEY = SigningKey.generate()
 WIDTHS = (6, 2)  # s, t/T, r_cum/k and two one-hot entries; the widest agent's channels
 
@@ -90,9 +89,9 @@ def test_a_board_of_teams_scores_a_shared_policy_and_each_agent(board, tmp_path)
     with Store.open(board, read_only=True) as store:
         ranking.refuse_unpublishable(store.entries())  # the references of teams score 0 and 1
         id = next(row.id for row in store.entries() if not row.reference)
-        assert rescore(store, id) == []
         result = store.result(id)
         write_site(store, tmp_path / "site")
+    assert verify(board, rescore="all").is_confirmed
     team, failed, alone = result.runs
     assert [agent.name for agent in team.agents] == ["scout_0", "driver_0"]
     # ρ of the team is the mean over channels, so its N lies between those of its agents.
@@ -104,10 +103,10 @@ def test_a_board_of_teams_scores_a_shared_policy_and_each_agent(board, tmp_path)
 
 
 def test_an_altered_agent_is_found(board, tmp_path):
-    assert verify(board).results == 3
     copy = shutil.copytree(board, tmp_path / "board")
-    results = sorted((copy / "results").iterdir())
-    path = next(path for path in results if "driver_0" in path.read_text())
+    with Store.open(copy, read_only=True) as store:
+        id = next(row.id for row in store.entries() if not row.reference)
+    path = document_path(copy, id, "result")
     path.write_text(path.read_text().replace("driver_0", "driver_9", 1))
     with pytest.raises(TamperedError, match=path.name):
         verify(copy)

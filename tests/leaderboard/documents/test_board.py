@@ -33,6 +33,7 @@ BOARD = BoardDocument(
     protocol_name="paper-v1",
     protocol=EvaluationProtocol(),
     key="ab" * 32,
+    rules=3,
     limits=Limits(artefact_bytes=1000, age_days=14),
 )
 A0, A1, B0 = (spec.digest for spec in SUITE.instances)
@@ -272,7 +273,7 @@ def test_boards_refuse_classes_with_safety_or_observation(setting):
     classes = [{"name": "Plain", "setting": {}, "seeds": [0]}]
     classes.append({"name": "Other", "setting": setting, "seeds": [0]})
     fields = {"title": "x", "suite_name": "x-v1", "protocol_name": "quick-v1", "protocol": {}}
-    fields["key"] = "ab" * 32
+    fields |= {"key": "ab" * 32, "rules": 3}
     BoardDocument.from_dict({**fields, "suite": Suite.from_dict({"classes": classes[:1]})})
     with pytest.raises(SpecError, match=r"suite: has classes .* \(Other\), and a leaderboard"):
         BoardDocument.from_dict({**fields, "suite": Suite.from_dict({"classes": classes})})

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 
 from leaderboard.documents.board import Folder
-from leaderboard.documents.result import Result
-from leaderboard.documents.signed import Signed, SigningKey
-from leaderboard.documents.submission import Submission
+from leaderboard.documents.signed import SigningKey
 from leaderboard.scoring.aggregation import never_listed, result_of
 from leaderboard.scoring.worker import run_scorer
-from leaderboard.store import LogEntry, Store, digest_of
+from leaderboard.store import LogEntry, Objects, Store
 from sme_registry.io import to_json
 from tests.leaderboard.conftest import (
     linear_onnx,
@@ -77,45 +75,38 @@ def ids(board):
 
 
 def result_on(board, number):
-    path = Folder(board).result(ids(board)[number])
-    return Result.from_dict(json.loads(path.read_text()))
+    with Store.open(board, read_only=True) as store:
+        return store.result(store.entries()[number].id)
 
 
 def with_runs(board, result, runs, **fields):
     """A result whose scores follow from these runs."""
+    with Store.open(board, read_only=True) as store:
+        submission = store.submission(result.submission).content
+        unlisted = fields.pop("unlisted", never_listed(store.document, submission))
+        return result_of(
+            *(store.document, result.submission, runs, result.versions),
+            unlisted=unlisted,
+            isolation=result.isolation,
+        )
+
+
+def forge(board, document, event="result", subject=None):
+    """Replace a document and sign the log again, as the board's owner can."""
     folder = Folder(board)
-    signed = json.loads(folder.submission(result.submission).read_text())
-    submission = Signed[Submission].from_dict(signed).content
-    unlisted = fields.pop("unlisted", never_listed(folder.read(), submission))
-    return result_of(
-        *(folder.read(), result.submission, runs, result.versions),
-        unlisted=unlisted,
-        isolation=result.isolation,
-    )
+    digest = Objects(folder).write(document)
+    subject = document.submission if subject is None else subject
+    resign(board, folder.signing_key(), replaced={(event, subject): digest})
 
 
-def forge(board, result):
-    """Replace a result and sign the log again, as the board's owner can; the result's file."""
-    path = Folder(board).result(result.submission)
-    path.write_text(to_json(result.to_dict()))
-    resign(board, Folder(board).signing_key())
-    return path
-
-
-def resign(board, key, start=1):
-    """Write the log again from an entry on, chain and signatures right, documents as they are."""
+def resign(board, key, start=1, replaced=()):
+    """Write the log again from an entry on, with other documents; chain and signatures right."""
     folder = Folder(board)
     previous = LogEntry.from_dict(json.loads(folder.log_entry(start - 1).read_text()))
     for path in sorted(folder.log.glob("*.json"))[start:]:
         entry = LogEntry.from_dict(json.loads(path.read_text()))
-        document = {}
-        if entry.event == "result":
-            result = Result.from_dict(json.loads(folder.result(entry.subject).read_text()))
-            document = {"document": digest_of(result)}
-        if entry.event == "received":
-            text = folder.submission(entry.subject).read_text()
-            document = {"document": digest_of(Signed[Submission].from_dict(json.loads(text)))}
-        entry = entry.model_copy(update={"previous": previous.digest, **document})
+        digest = dict(replaced).get((entry.event, entry.subject), entry.document)
+        entry = entry.model_copy(update={"previous": previous.digest, "document": digest})
         signature = key.sign("log", entry.signed_digest)
         previous = entry.model_copy(update={"signature": signature})
         path.write_text(to_json(previous.to_dict()))

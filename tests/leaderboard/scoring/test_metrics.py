@@ -25,12 +25,12 @@ LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 
 
 def test_metrics_of_a_run_match_a_calculation_by_hand():
-    actual = run_metrics(
-        (0.1, 0.2, 0.3, 0.4, 0.5, 0.6), (0.95, 0.9, 0.85, 0.8, 0.75, 0.7), levels=LEVELS
-    )
+    regret, similarity = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6), (0.95, 0.9, 0.85, 0.8, 0.75, 0.7)
+    actual = run_metrics(regret, similarity, LEVELS)
     assert actual["wd_regret"] == 0.1
     assert actual["ood_regret"] == pytest.approx((0.2 + 0.3 + 0.4 + 0.5 + 0.6) / 5)
-    assert actual["ood_decay"] == pytest.approx(0.4 - 0.1)
+    assert actual["ood_decay"] == pytest.approx((0.05 + 0.1 + 0.15 + 0.2 + 0.25) / 0.95 / 5)
+    assert run_metrics(regret, similarity, LEVELS, 2)["ood_decay"] == pytest.approx(0.4 - 0.1)
     assert actual["regret_slope"] == pytest.approx(0.1 / 0.2)
     assert actual["similarity_loss"] == pytest.approx(100 * (0.95 - 0.8))
 

@@ -1,4 +1,4 @@
-"""Rescoring: what is drawn, what is tampering, and what is only a note."""
+"""Scoring again: what is drawn, what is not confirmed, and what proves nothing."""
 
 import pytest
 from typer.testing import CliRunner
@@ -7,10 +7,9 @@ from leaderboard.cli import app
 from leaderboard.documents.board import Folder
 from leaderboard.documents.result import Result
 from leaderboard.scoring.aggregation import levels_of, run_metrics
-from leaderboard.scoring.rescore import RescoreNote, draw, rescore
 from leaderboard.scoring.score import evaluation_seed
-from leaderboard.scoring.verify import verify
-from leaderboard.store import Store
+from leaderboard.scoring.verify import Difference, Note, Row, draw, verify
+from leaderboard.store import Objects, Store
 from tests.leaderboard.scoring.conftest import (
     REFUSED,
     SENSITIVE,
@@ -33,18 +32,16 @@ def moved(board, number, by):
 
 
 def again(board, result):
-    """The notes on a result that the board's owner has forged."""
+    """What `verify` reports of a result that the board's owner has forged."""
     forge(board, result)
-    with Store.open(board, read_only=True) as store:
-        return rescore(store, result.submission)
+    return verify(board, rescore="all")
 
 
 def test_the_draw_is_unpredictable_and_its_seed_repeats_it(board, monkeypatch):
-    monkeypatch.setattr("leaderboard.scoring.verify.rescore", lambda store, id: [])
-    reports = [verify(board, rescore=1) for _ in range(3)]
-    assert len({report.rescore_seed for report in reports}) == 3
-    assert {report.rescored for report in reports} == {1}
-    assert verify(board, rescore="all").rescored == 4
+    monkeypatch.setattr("leaderboard.scoring.verify.score_submission", lambda *_: 1 / 0)
+    monkeypatch.setattr(Objects, "has", lambda *_: False)  # nothing to score
+    seeds = {verify(board, rescore=1).rescore_seed for _ in range(3)}
+    assert len(seeds) == 3
     assert verify(board).rescore_seed is None
     names = [str(number) for number in range(100)]
     assert draw(names, 5, 1) == draw(names, 5, 1) != draw(names, 5, 2)
@@ -53,17 +50,18 @@ def test_the_draw_is_unpredictable_and_its_seed_repeats_it(board, monkeypatch):
     assert draw(names, "all", 1) == draw(names, 1000, 1) == names
 
 
-def kinds(notes):
-    return [(note.kind, note.where) for note in notes if note.kind != "versions"]
-
-
 def test_other_numbers_are_not_confirmed_and_name_the_entry(board):
-    assert again(board, moved(board, STEADY, 1e-6)) == []
+    assert again(board, moved(board, STEADY, 1e-6)).is_confirmed
     for number in (STEADY, SENSITIVE):
-        (note,) = again(board, moved(board, number, 1e-4))
-        assert (note.submission, note.kind, note.where) == (ids(board)[number], "numbers", "runs.0")
-        assert "e-0" in note.recorded
-    assert verify(board).rescored == 0
+        honest = result_on(board, number)
+        (note,) = again(board, moved(board, number, 1e-4)).notes
+        assert (note.entry, note.difference.path) == (
+            ids(board)[number],
+            "runs.0.normalised_regret.0",
+        )
+        forge(board, honest)
+    forge(board, moved(board, STEADY, 1e-4))
+    assert verify(board).is_confirmed
     answer = CliRunner().invoke(app, ["verify", str(board), "--rescore", "all"])
     assert (answer.exit_code, "Not confirmed here" in answer.stdout) == (1, True)
     assert ids(board)[STEADY] in answer.stdout.replace("\n", "")
@@ -84,19 +82,18 @@ def rejected(result, code, versions=None):
 def test_other_versions_are_noted_and_prove_nothing(board):
     honest = result_on(board, STEADY)
     other = honest.model_copy(update={"versions": {**honest.versions, "onnxruntime": "1.0.0"}})
-    (note,) = again(board, other)
-    assert note == RescoreNote(
-        honest.submission, "versions", "onnxruntime", "1.0.0", honest.versions["onnxruntime"]
-    )
-    answer = CliRunner().invoke(app, ["verify", str(board), "--rescore", "all"])
-    assert answer.exit_code == 0
+    report = again(board, other)
+    assert report.is_confirmed
+    here = honest.versions["onnxruntime"]
+    row = Row("results of other versions", 1, 0, f"onnxruntime 1.0.0, here {here}")
+    assert row in report.rows
 
 
 @pytest.mark.parametrize("code", ["run_rounding", "onnx_op"])
 def test_a_rejected_policy_that_is_scored_here_is_not_confirmed(board, code):
-    notes = again(board, rejected(result_on(board, STEADY), code, {"sme_registry": "0.0.9"}))
-    assert kinds(notes) == [("verdict", "code")]
-    assert (notes[-1].recorded, notes[-1].here) == (code, "scored")
+    result = rejected(result_on(board, STEADY), code, {"sme_registry": "0.0.9"})
+    (note,) = again(board, result).notes
+    assert note == Note(result.submission, Difference("verdict", code, "scored"))
 
 
 def test_scores_of_a_policy_that_is_rejected_are_found(board):
@@ -107,5 +104,5 @@ def test_scores_of_a_policy_that_is_rejected_are_found(board):
     seed = evaluation_seed(Folder(board).read().protocol.digest, run.spec, artefact)
     copy = scored.runs[0].model_copy(update={"artefact": artefact, "evaluation_seed": seed})
     forged = scored.model_copy(update={"submission": refused.submission})
-    notes = again(board, with_runs(board, forged, [copy]))
-    assert [(note.recorded, note.here) for note in notes] == [("scored", "onnx_interface")]
+    (note,) = again(board, with_runs(board, forged, [copy])).notes
+    assert note.difference == Difference("verdict", "scored", "onnx_interface")

@@ -1,8 +1,7 @@
-"""`verify` names the first altered row, whatever was altered."""
+"""`verify` names what was altered, scores again and says what it could not check."""
 
-import contextlib
 import json
-import sqlite3
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,13 +10,14 @@ from leaderboard.documents.board import Folder, hex_of
 from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.ranking import ranking, refuse_unpublishable
-from leaderboard.scoring.verify import VerifyReport, close, verify
+from leaderboard.scoring.verify import difference, verify
 from leaderboard.store import LogEntry, Store
 from sme_registry.errors import OptionError
 from sme_registry.io import to_json
-from tests.leaderboard.conftest import tiny_submission
+from tests.leaderboard.conftest import document_path
 from tests.leaderboard.scoring.conftest import (
     FAILED,
+    REFUSED,
     STEADY,
     WAITING,
     forge,
@@ -75,37 +75,30 @@ def assert_swap_named(board, one, other):
     other.write_bytes(second)
 
 
+def table(report):
+    return {row.what: (row.checked, row.unchecked) for row in report.rows}
+
+
 def test_an_unaltered_board_is_verified_and_counted(board):
     before = {path: path.read_bytes() for path in board.rglob("*") if path.is_file()}
     seen = []
-    report = verify(
-        board, rescore=9, seed=7, progress=lambda done, total: seen.append((done, total))
-    )
-    with Store.open(board, read_only=True) as store:
-        head = store.head
-    assert report == VerifyReport(
-        entries=11,
-        log_sequence=LAST,
-        log_digest=head.digest,
-        submissions=5,
-        withdrawals=1,
-        results=4,
-        objects=7,
-        unlogged=0,
-        rows=19,
-        rescored=4,
-        rescore_seed=7,
-        tolerance=1e-5,
-        notes=(),
-    )
-    assert [done for done, _ in seen] == list(range(1, len(seen) + 1))
-    assert all(done <= total for done, total in seen)
+    report = verify(board, rescore=9, seed=7, progress=seen.append)
+    assert report.is_confirmed
+    assert (report.log_sequence, report.rescore_seed) == (LAST, 7)
+    assert table(report) == {
+        "log entries, and their documents": (11, 0),
+        "signatures of submitters": (6, 0),
+        "files by their digests": (17, 0),
+        "results, from their runs": (4, 0),
+        "marks of runs": (0, 3),
+        "results, scored again": (4, 0),
+    }
+    assert set(ids(board)[:4]) <= set(seen)
     after = {path: path.read_bytes() for path in board.rglob("*") if path.is_file()}
     assert {path: data for path, data in after.items() if "-" not in path.name} == before
-
     Folder(board).key.unlink()
     Folder(board).index.unlink()
-    assert verify(board).rows == 0
+    assert table(verify(board))["results, scored again"] == (0, 4)
     assert not Folder(board).index.exists()
 
 
@@ -114,14 +107,11 @@ def test_a_kept_digest_reveals_a_log_cut_at_its_end(board):
     kept = verify(board).log_digest
     folder = Folder(board)
     first = LogEntry.from_dict(json.loads(folder.log_entry(0).read_text()))
-    last = LogEntry.from_dict(json.loads(folder.log_entry(LAST).read_text()))
     for digest in (kept, hex_of(kept), first.digest):
-        assert verify(board, contains=digest).entries == 11
+        assert verify(board, contains=digest).log_sequence == LAST
     folder.log_entry(LAST).unlink()
-    folder.submission(last.subject).unlink()
-    folder.index.unlink()
     cut = verify(board)
-    assert (cut.log_sequence, cut.results) == (LAST - 1, 4)  # the rest is a valid log
+    assert cut.log_sequence == LAST - 1  # the rest is a valid log
     assert first_altered(board, contains=kept) == "log"
     assert verify(board, contains=first.digest) == cut
 
@@ -131,7 +121,7 @@ def test_a_kept_digest_reveals_a_rewritten_log(board):
     folder = Folder(board)
     alter(folder.log_entry(LAST), lambda plain: plain.update({"time": "2126-11-21T09:30:00Z"}))
     resign(board, folder.signing_key())
-    assert verify(board).entries == 11
+    assert verify(board).log_sequence == LAST
     assert first_altered(board, contains=kept) == "log"
 
 
@@ -178,16 +168,11 @@ def test_an_altered_log_entry_is_named(board, sequence):
     }
     for field, value in fields.items():
         assert_named(board, path, to_json({**plain, field: value}).encode())
-    assert_named(board, path, None, b"", data[:-9], b"\xff\x00", data + b" ")
+    cut = (None,) if sequence < LAST else ()  # the end of a log leaves no trace
+    assert_named(board, path, *cut, b"", data[:-9], b"\xff\x00", data + b" ")
 
     path.write_bytes(to_json({**plain, "document": digest}).encode())
     assert first_altered(board) == ("board.json" if sequence == 0 else where(board, path))
-    path.unlink()
-    Folder(board).index.unlink()
-    if sequence < LAST:
-        assert first_altered(board) == where(board, path)
-    else:  # a submission whose entry is cut off looks like one that was being received
-        assert verify(board).unlogged == 1
 
 
 def test_swapped_and_inserted_log_entries_are_named(board):
@@ -203,83 +188,62 @@ def test_swapped_and_inserted_log_entries_are_named(board):
     assert first_altered(board) == "log/00000003.json"
 
 
-def test_an_altered_submission_is_named(board):
-    paths = [Folder(board).submission(id) for id in ids(board)]
-    for path in (paths[STEADY], paths[FAILED], paths[WAITING]):
-        assert_named(
-            board,
-            path,
-            None,
-            path.read_bytes().replace(b"  ", b"   "),
-            changed(path, lambda plain: plain.update(signature="0" * 128)),
-            changed(path, lambda plain: plain["submission"]["method"].update(name="Better")),
-        )
-    assert_swap_named(board, *paths[:2])
-    # What the board's own key cannot do: sign for a submitter.
-    alter(paths[WAITING], lambda plain: plain.update(signature="0" * 128))
-    resign(board, Folder(board).signing_key(), LAST)
-    assert first_altered(board) == where(board, paths[WAITING])
-
-
-def test_an_altered_withdrawal_or_result_is_named(board):
-    folder, known = Folder(board), ids(board)
-    path = folder.withdrawal(known[FAILED])
-    assert_named(
-        board, path, None, changed(path, lambda plain: plain["withdrawal"].update(reason="another"))
-    )
-    rejection = {"status": "rejected", "code": "onnx_op", "scores": None}
-    for path in (folder.result(known[STEADY]), folder.result(known[FAILED])):
-        assert_named(
-            board,
-            path,
-            None,
-            changed(path, lambda plain: plain["scores"]["wd_regret"].update(value=0.0)),
-            changed(path, lambda plain: plain["runs"][0].update(wd_regret=0.0)),
-            changed(path, lambda plain: plain.update(rejection)),
-        )
-    assert_swap_named(board, *(folder.result(id) for id in known[:2]))
-
-
-def test_a_file_that_the_log_does_not_name_is_named_or_counted(board):
-    folder, known = Folder(board), ids(board)
-    with Store.open(board, read_only=True) as store:
-        signed, _ = tiny_submission(store, SigningKey.generate(), 5)
-    path = folder.submission(signed.id)
-    path.write_bytes(signed.to_bytes())
-    assert verify(board).unlogged == 1  # it was about to be logged
-    alter(path, lambda plain: plain["submission"]["method"].update(name="Better"))
-    assert first_altered(board) == where(board, path)
-    path.unlink()
-    result = folder.result(known[STEADY]).read_bytes()
-    for path in (folder.result(known[WAITING]), board / "results" / "note.json"):
-        path.write_bytes(result)
-        assert first_altered(board) == where(board, path)
-        path.unlink()
-
-
-def test_an_altered_artefact_is_named(board):
-    path = sorted(board.glob("objects/*/*"))[1]
-    assert_named(board, path, None, path.read_bytes()[:-1] + b"!")
-    path = path.with_name("0" * 62)
-    path.write_bytes(b"no such hash")
-    assert first_altered(board) == where(board, path)
-
-
 @pytest.mark.parametrize(
-    ("change", "row"),
-    [
-        ("UPDATE entry SET scores = replace(scores, '.', '.0') WHERE id = '{id}'", "entry {id}"),
-        ("DELETE FROM entry WHERE id = '{id}'", "entry {id}"),
-        ("INSERT INTO object VALUES ('sha256:0', 1, '', '')", "object sha256:0"),
-        ("UPDATE head SET sequence = 4", "head 0"),
-    ],
+    ("number", "kind"),
+    [(STEADY, "document"), (WAITING, "document"), (FAILED, "withdrawal"), (REFUSED, "result")],
 )
-def test_an_edited_index_is_named_with_its_first_altered_row(board, change, row):
-    id = ids(board)[FAILED]
-    with contextlib.closing(sqlite3.connect(Folder(board).index)) as connection:
-        connection.execute(change.format(id=id))
-        connection.commit()
-    assert first_altered(board) == f"index.sqlite: {row.format(id=id)}"
+def test_an_altered_document_is_named(board, number, kind):
+    path = document_path(board, ids(board)[number], kind)
+    data = path.read_bytes()
+    assert_named(board, path, None, b"", data.replace(b"  ", b"   "), data[:-9] + b"!" + data[-8:])
+
+
+def test_swapped_documents_are_named(board):
+    assert_swap_named(board, *(document_path(board, id) for id in ids(board)[:2]))
+    assert_swap_named(board, *(document_path(board, id, "result") for id in ids(board)[:2]))
+
+
+def test_a_signature_that_the_board_has_made_up_is_named(board):
+    """What the board's own key cannot do: sign for a submitter."""
+    waiting, withdrawn = ids(board)[WAITING], ids(board)[FAILED]
+    whole = shutil.copytree(board, board.with_name("whole"))
+    with Store.open(board, read_only=True) as store:
+        signed, withdrawal = store.submission(waiting), store.withdrawal(withdrawn)
+    forge(board, signed.model_copy(update={"signature": "0" * 128}), "received", waiting)
+    assert first_altered(board) == waiting
+    forge(whole, withdrawal.model_copy(update={"signature": "0" * 128}), "withdrawn", withdrawn)
+    assert first_altered(whole) == withdrawn
+
+
+def test_an_altered_policy_file_is_named_and_a_missing_one_is_reported(board):
+    with Store.open(board, read_only=True) as store:
+        runs = {id: store.submission(id).content.runs[0] for id in ids(board)}
+    path = Folder(board).object(runs[ids(board)[STEADY]].artefact.sha256)
+    assert_named(board, path, b"", path.read_bytes()[:-1] + b"!")
+    path.unlink()
+    report = verify(board, rescore="all")
+    assert report.missing == (runs[ids(board)[STEADY]].artefact.sha256,)
+    assert not report.is_confirmed
+    assert table(report)["results, scored again"] == (3, 1)
+    Folder(board).object(runs[ids(board)[WAITING]].artefact.sha256).unlink()  # not public yet
+    assert table(verify(board))["files by their digests"] == (15, 1)
+    path.with_name("0" * 62).write_bytes(b"no such hash")
+    assert first_altered(board) == where(board, path.with_name("0" * 62))
+
+
+PATHS = {
+    "another policy": ["runs.0.artefact"],
+    "other states": ["runs.0.evaluation_seed"],
+    "a run's metric": ["runs.0.wd_regret"],
+    "another order": ["runs.0"],
+    "the failed run left out": ["runs"],
+    "the failed run scored 0": ["runs.1.normalised_regret.0"],
+    "the failed run with the constant's decay": ["runs.1.ood_decay"],
+    "a score": ["scores.wd_regret.value"],
+    "the unlisted run left out": ["scores.wd_regret.value"],
+    "the unlisted run scored 0": ["scores.wd_regret.value"],
+    "the unlisted run with the constant's decay": ["scores.ood_decay.value"],
+}
 
 
 def test_a_forged_and_signed_result_is_detected(board):
@@ -317,17 +281,19 @@ def test_a_forged_and_signed_result_is_detected(board):
     }.items():
         forged[name] = with_runs(board, honest, honest.runs, unlisted=spared)
     for name, result in forged.items():
-        path = forge(board, result)
-        assert first_altered(board) == where(board, path), name
+        forge(board, result)
+        named, _, path = first_altered(board).partition(": ")
+        assert named == f"result of {honest.submission}", name
+        assert path in PATHS[name], (name, path)
     forge(board, honest)
-    assert verify(board).results == 4
+    assert verify(board).is_confirmed
 
 
 def test_a_result_of_an_earlier_version_that_gives_single_runs_an_interval_is_accepted():
     single = {"value": 0.5, "low": None, "high": None}
-    assert close(single, {"value": 0.5, "low": 0.5, "high": 0.5}, 1e-12)
-    assert not close(single, {"value": 0.5, "low": 0.4, "high": 0.6}, 1e-12)
-    assert not close(single, {"value": 0.6, "low": 0.6, "high": 0.6}, 1e-12)
+    assert difference({"value": 0.5, "low": 0.5, "high": 0.5}, single, 1e-12) is None
+    assert difference({"value": 0.5, "low": 0.4, "high": 0.6}, single, 1e-12)
+    assert difference({"value": 0.6, "low": 0.6, "high": 0.6}, single, 1e-12)
 
 
 # The board of the examples
@@ -335,9 +301,11 @@ def test_a_result_of_an_earlier_version_that_gives_single_runs_an_interval_is_ac
 
 def test_the_example_board_is_small_and_verifies_down_to_its_policies():
     report = verify(EXAMPLE, rescore=1)
-    assert (report.submissions, report.results, report.unlogged) == (4, 4, 0)
+    assert report.is_confirmed
+    assert table(report)["results, scored again"] == (1, 3)
+    assert Folder(EXAMPLE).read().rules == 3
     assert not (EXAMPLE / "board.key").exists()
-    assert sum(path.stat().st_size for path in EXAMPLE.rglob("*") if path.is_file()) < 300_000
+    assert sum(path.stat().st_size for path in EXAMPLE.rglob("*") if path.is_file()) < 330_000
 
 
 def test_two_methods_are_ranked_with_ten_runs():

@@ -113,9 +113,9 @@ def test_a_request_that_others_read_is_no_password(url, board, key):
     assert started.status_code == 201
     path = url + wire.tickets_path(board.season.id)
     with Store.open(board.path, read_only=True) as store:
-        folder = store.season_folder(board.season.digest)
-    stored = folder.request(started.json()["ticket"])
-    without = httpx.post(path, content=stored.read_bytes())
+        row = store.ticket(board.season.digest, started.json()["ticket"])
+        stored = store.objects.read(row.document)
+    without = httpx.post(path, content=stored)
     request = request.content.signed(key, Receiver(request.board, url))
     stale = upload_header(key, request.id, request.receiver, moment(-0.1))
     late = httpx.post(path, content=request.to_bytes(), headers={"Authorization": stale})

@@ -11,6 +11,7 @@ import pytest
 
 from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.errors import BoardError, Rejection, TamperedError
+from leaderboard.scoring.aggregation import run_metrics
 from leaderboard.seasons import admission
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.publication import (
@@ -25,9 +26,9 @@ from leaderboard.seasons.publication import (
     refuse_unrankable,
 )
 from leaderboard.seasons.ranking import by_key, counting, score_entries, season_rankings
-from leaderboard.seasons.replay import verify_season
 from leaderboard.seasons.scoring import instances, score_run, sealed_result
 from leaderboard.seasons.season import Reveal, Season, Terms
+from leaderboard.seasons.verify import verify_seasons
 from leaderboard.store import Store
 from sme_registry import materialize
 from sme_registry.datasets import SealedDataset
@@ -41,6 +42,7 @@ from tests.leaderboard.seasons.sealing import (
     NOTHING,
     failed_result,
     moment,
+    replayed,
     signed_entry,
     signed_request,
     tiny_season,
@@ -108,9 +110,8 @@ def reveal(store, season):
 def false_season(store, terms):
     """A season of an organiser's own making, announced though it is over, and revealed."""
     season = terms.commit(MASTER)
-    path = store.season_folder(season.digest)
     with store.transaction():
-        store.record("season", season.digest, season, path.season)
+        store.record("season", season.digest, season)
     reveal(store, season)
     return season
 
@@ -231,9 +232,15 @@ def test_a_season_is_scored_ranked_and_replayed(store, key, season, published, l
     assert values == pytest.approx([0.5, 1.0, 1.0], abs=1e-5)
     assert fitted[0].value.value == pytest.approx(0.0, abs=1e-5)
     assert fitted[0].entry.oracle_like
-    report = verify_season(store, season.id)
-    assert (report.instances, report.rounded, report.entries, report.results) == (2, 0, 7, 4)
-    assert passes == 2 * [3, 3]  # scored and verified, on each of two instances
+    assert replayed(store) == (
+        {"signatures of entrants": (7, 0), "data sets": (2, 0), "results, scored again": (4, 0)},
+        [],
+    )
+    answer = store.folder.object(sha256_of(pack_table(middle[0])))
+    answer.rename(answer.with_name(".moved"))
+    assert replayed(store)[0]["results, scored again"] == (3, 1)
+    answer.with_name(".moved").rename(answer)
+    assert passes[:4] == 2 * [3, 3]  # scored and verified, on each of two instances
     assert by_key(store, season) == {key.public: (1, 3), friend.public: (3, 4)}
     alone, _ = score_run(next(instances(season, MASTER)), middle[0], None)
     row = store.entrant(near)
@@ -242,8 +249,8 @@ def test_a_season_is_scored_ranked_and_replayed(store, key, season, published, l
     assert together is not None
     assert together.runs[0].normalised_regret == alone.normalised_regret
     store.rank(failed_result(season, first))
-    with pytest.raises(TamperedError, match=rf"{first[7:]}\.json: is of an entry that does not"):
-        verify_season(store, season.id)
+    with pytest.raises(TamperedError, match=rf"entry 1 \({first}\): has a result, and does not"):
+        replayed(store)
 
 
 def test_a_replay_finds_scores_that_do_not_follow(store, key, season, published, later):
@@ -252,20 +259,22 @@ def test_a_replay_finds_scores_that_do_not_follow(store, key, season, published,
     enter(store, season, key, halves(published))
     later()
     reveal(store, season)
-    with pytest.raises(BoardError, match="1 of 1 entries that count have no result"):
-        verify_season(store, season.id)
+    assert replayed(store)[0]["results, scored again"] == (0, 1)
     rank = store.rank
 
     def better(result):
         run = result.runs[0]
         regrets = (0.5 * run.normalised_regret[0], *run.normalised_regret[1:])
-        lower = run.model_copy(update={"normalised_regret": regrets})
-        return rank(result.model_copy(update={"runs": (lower, *result.runs[1:])}))
+        levels = (0.0, *season.protocol.epsilons)
+        metrics = run_metrics(regrets, run.similarity, levels)
+        lower = run.model_copy(update={"normalised_regret": regrets, **metrics})
+        runs = lower, *result.runs[1:]
+        return rank(sealed_result(season, result.subject, runs, result.versions, 100))
 
     store.rank = better
     score_entries(store, season.id)
-    with pytest.raises(TamperedError, match=r"runs\.0: scored again, it differs"):
-        verify_season(store, season.id)
+    [note] = replayed(store)[1]
+    assert note.difference.path == "runs.0.normalised_regret.0"
 
 
 @pytest.mark.parametrize("part", ["data", "challenge"])
@@ -275,14 +284,14 @@ def test_a_replay_finds_a_false_publication(store, tmp_path, season, published, 
     shutil.copytree(published, copy)
     later()
     false = false_season(store, Terms.from_dict(fields))
+    (copy / "season.json").write_text(json.dumps(false.to_dict()))
     if part == "data":
-        with pytest.raises(BoardError, match="--published FOLDER"):
-            verify_season(store, false.id)
+        assert replayed(store)[0]["data sets"] == (1, 1)
         other = dataset_path(copy, false.id, list(false.hidden)[1])
         shutil.rmtree(other)
         shutil.copytree(other.with_name("deep-0-v0"), other)
-    with pytest.raises(TamperedError, match="published: deep 1"):
-        verify_season(store, false.id, published=copy)
+    with pytest.raises(TamperedError, match="published deep 1"):
+        replayed(store, [copy])
 
 
 def test_another_machines_rounding_is_told_from_other_data(tmp_path, season, published, later):
@@ -302,17 +311,19 @@ def test_another_machines_rounding_is_told_from_other_data(tmp_path, season, pub
         terms = {**fields, "published": fields["published"][:count]}
         terms["classes"][0]["instances"] = count
         with tiny_board(tmp_path / str(count)) as store:
-            false_season(store, Terms.from_dict(terms))
-            with pytest.raises(BoardError, match=r"deep-0: .* --published FOLDER"):
-                verify_season(store, season.id)
+            false = false_season(store, Terms.from_dict(terms))
+            assert replayed(store)[0]["data sets"] == (0, count)
+            copy = store.season_folder(false.digest).published
+            shutil.copytree(published, copy)
             with pytest.raises(BoardError, match="Download it again"):
-                verify_season(store, season.id, published=published)
+                replayed(store)
+            shutil.rmtree(copy)
+            shutil.copytree(folder, copy)
             if count == 1:
-                report = verify_season(store, season.id, published=folder)
-                assert (report.instances, report.rounded) == (1, 1)
+                assert replayed(store)[0]["data sets, within 1e-6"] == (1, 0)
             else:
-                with pytest.raises(TamperedError, match="published: deep 1"):
-                    verify_season(store, season.id, published=folder)
+                with pytest.raises(TamperedError, match="published deep 1"):
+                    replayed(store)
 
 
 @pytest.mark.parametrize(("needed", "reason"), [(1, ""), (2, "too_few_runs")])
@@ -368,9 +379,8 @@ def test_an_entry_after_the_close_counts_nowhere(store, key, later):
     first = enter(store, season, key, [None, None])
     later()
     late = signed_entry(store, season, key, [None, None], statement="late")
-    path = store.season_folder(season.digest).entry(late.id)
     with store.transaction():
-        store.record("entry", late.id, late, path)
+        store.record("entry", late.id, late)
     assert [row.entrant.id for row in store.entrants(season.digest)] == [first, late.id]
     assert [row.entrant.id for row in counting(store, season)] == [first]
 
@@ -388,7 +398,7 @@ def test_a_replay_finds_entries_that_their_key_has_not_signed(store, key, season
     reveal(store, season)
     score_entries(store, season.id)
     with pytest.raises(TamperedError, match="its signature does not match the entrant's key"):
-        verify_season(store, season.id)
+        replayed(store)
 
 
 BOARD = Path(__file__).resolve().parents[3] / "docs" / "results" / "season" / "board"
@@ -426,24 +436,17 @@ def test_both_seasons_are_ranked_as_the_page_says():
     assert sum(path.stat().st_size for path in BOARD.rglob("*") if path.is_file()) < 3_500_000
 
 
-def test_the_online_season_is_replayed_from_its_journals():
+def test_both_seasons_are_verified_on_every_processor():
+    """Autumn's data sets are not committed; another processor may round them otherwise."""
     with Store.open(BOARD, read_only=True) as store:
-        report = verify_season(store, "winter")
-        assert (report.entries, report.results) == (5, 5)
+        rows, notes = verify_seasons(store, lambda what: None)
+        assert notes == []
+        counts = {row.what: row.checked for row in rows if "scored again" in row.what}
+        assert counts == {"winter: results, scored again": 5, "autumn: results, scored again": 6}
+        [data] = [row for row in rows if "data sets" in row.what]
+        assert data.checked + data.unchecked == 6
         for result in results(store, "winter").values():
             assert {each.steps for each in result.stepping} <= {0, 10_000}
-
-
-def test_the_offline_season_is_replayed_from_its_master():
-    """Its data sets are not committed; another processor may round them otherwise."""
-    with Store.open(BOARD, read_only=True) as store:
-        try:
-            report = verify_season(store, "autumn")
-        except BoardError as error:
-            if "generated again on this machine" not in str(error):
-                raise
-            pytest.skip(str(error))
-        assert (report.instances, report.rounded, report.results) == (6, 0, 6)
 
 
 @pytest.mark.parametrize("kind", ["journal", "npy"])
@@ -456,6 +459,6 @@ def test_an_altered_byte_is_found(tmp_path, kind):
     file.write_bytes(data)
     with (
         Store.open(board, read_only=True) as store,
-        pytest.raises((TamperedError, BoardError), match=r"tickets/1/2\.(journal|npy|json)"),
+        pytest.raises(TamperedError, match=r"winter: ticket 1 .* instance 2|tickets/1/2\.journal"),
     ):
-        verify_season(store, "winter")
+        replayed(store)

@@ -43,7 +43,7 @@ def score(store, id, sample, policies, facts=digest_of):
     ]
     result = result.model_copy(update={"runs": tuple(runs)})
     with store.transaction():
-        store.record("result", id, result, store.folder.result(id))
+        store.record("result", id, result)
 
 
 POLICIES = [

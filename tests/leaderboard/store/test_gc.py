@@ -31,7 +31,7 @@ def litter(store, key, submit):
     named = submit().content.runs[0].artefact.sha256
     for digest in (old, named):
         age(store.folder.object(digest), DAY + 60)
-    for folder in (store.folder.log, store.folder.results, store.folder.object(old).parent):
+    for folder in (store.folder.log, store.folder.path, store.folder.object(old).parent):
         (folder / ".dead.12345678.tmp").write_bytes(b"half")
         age(folder / ".dead.12345678.tmp", HOUR + 60)
     (store.folder.log / ".alive.12345678.tmp").write_bytes(b"being written")

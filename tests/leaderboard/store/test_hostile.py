@@ -18,7 +18,7 @@ from leaderboard.scoring.verify import verify
 from leaderboard.store import Store
 from sme_registry.errors import SMEError
 from sme_registry.io import is_regular, open_regular, read_regular
-from tests.leaderboard.conftest import put_submission, tiny_board
+from tests.leaderboard.conftest import document_path, put_submission, tiny_board
 from tests.leaderboard.store.synthetic import synthetic_result
 
 SECONDS = 60  # far more than reading takes; a reader that hangs fails its test
@@ -138,8 +138,8 @@ def test_readers_refuse_what_is_no_plain_file(board, harm, file):
     path = {
         "board": folder.board,
         "log": folder.log_entry(1),
-        "submission": folder.submission(row.id),
-        "result": folder.result(row.id),
+        "submission": document_path(board, row.id),
+        "result": document_path(board, row.id, "result"),
         "object": folder.object(artefact.sha256),
         "next log": folder.log_entry(last + 1),
     }[file]
@@ -169,9 +169,7 @@ def test_no_reader_needs_the_index_and_a_writer_rebuilds_it(whole, tmp_path, row
     path = board / f"index.sqlite{suffix}"
     replace(path, harm)
     assert rows_of(board) == rows
-    with pytest.raises(TamperedError) as tampered:
-        verify(board)
-    assert tampered.value.where == "index.sqlite"
+    verify(board)
     if harm is Path.mkdir:  # never removed, as files may lie in it
         with pytest.raises(BoardError, match=r"index\.sqlite"):
             rows_of(board, read_only=False)
@@ -202,9 +200,7 @@ def test_a_changed_index_has_no_effect_and_is_repaired(whole, tmp_path, rows, ch
         connection.commit()
     lies, own = change.startswith("UPDATE"), shutil.copytree(board, tmp_path / "own")
     assert rows_of(board) == rows
-    with pytest.raises(TamperedError, match="reindex" if lies else None) as tampered:
-        verify(board)
-    assert lies or tampered.value.where == "index.sqlite"
+    verify(board)
     if lies:  # without its key, a board's index is somebody else's
         (board / "board.key").unlink()
     assert rows_of(board, read_only=False) == rows

@@ -9,7 +9,6 @@ import pytest
 
 from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError, Rejection
-from leaderboard.scoring.aggregation import result_of
 from leaderboard.store import Index, Store, collect_garbage
 from tests.leaderboard.conftest import (
     put_submission,
@@ -305,17 +304,3 @@ def test_a_board_is_created_only_in_a_new_or_empty_folder(tmp_path):
     with pytest.raises(BoardError, match="already exists"):
         tiny_board(tmp_path / "board")
     assert (tmp_path / "board" / "board.json").read_bytes() == before
-
-
-def test_a_result_of_a_killed_scorer_is_removed_on_opening(tmp_path, key):
-    with tiny_board(tmp_path / "board") as store:
-        signed = put_submission(store, key)
-        path = store.folder.result(signed.id)
-        runs = synthetic_result(store, signed.id).runs
-    path.write_text(str(result_of(store.document, signed.id, runs, {})))
-    with Store.open(tmp_path / "board", read_only=True) as store:
-        assert store.result(signed.id) is None
-    assert path.exists()
-    with Store.open(tmp_path / "board") as store:
-        assert store.result(signed.id) is None
-    assert not path.exists()

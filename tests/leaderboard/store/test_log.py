@@ -59,7 +59,7 @@ def test_entries_are_dated_by_the_clock_and_never_before_the_last(tmp_path, key,
             put_submission(store, key, 2)
         assert {entry.time for entry in store.log()} == {"2030-01-01T00:00:00Z"}
         assert {row.received for row in store.entries()} == {"2030-01-01T00:00:00Z"}
-    assert verify(tmp_path / "board").entries == 3
+    assert verify(tmp_path / "board").log_sequence == 2
 
 
 def test_a_board_without_its_own_key_can_be_read_but_not_written(tmp_path, key):
@@ -83,10 +83,9 @@ def test_opening_a_board_detects_a_truncated_log(tmp_path, key):
             put_submission(store, key, number)
         last = store.folder.log_entry(2)
     last.unlink()
-    for read in (Store.open, verify):
-        with pytest.raises(TamperedError) as tampered:
-            read(tmp_path / "board")
-        assert tampered.value.where == "log/00000002.json"
+    with pytest.raises(TamperedError) as tampered:
+        Store.open(tmp_path / "board")
+    assert tampered.value.where == "log/00000002.json"
     with Store.open(tmp_path / "board", reindex=True) as store:  # accepted as it is
         assert len(store.entries()) == 1
     Store.open(tmp_path / "board").close()

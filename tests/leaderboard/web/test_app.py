@@ -28,6 +28,7 @@ from leaderboard.web.tables import PublicView
 from sme_registry.errors import OptionError
 from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import (
+    document_path,
     linear_onnx,
     put_submission,
     signed_withdrawal,
@@ -726,7 +727,7 @@ def test_a_body_that_is_no_withdrawal_has_its_code(refusing):
 
 def test_an_internal_fault_is_logged_and_not_shown(url, store, key, caplog):
     signed = put_submission(store, key)
-    store.folder.submission(signed.id).write_bytes(b"rotten")
+    document_path(store.folder.path, signed.id).write_bytes(b"rotten")
     answer = HTTP.get(f"{url}/api/submissions/{hex_of(signed.id)}")
     assert refusal(answer) == (500, "internal")
     assert str(store.folder.path) not in answer.text

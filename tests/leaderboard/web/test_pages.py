@@ -26,7 +26,8 @@ from sme_registry.errors import OptionError
 from tests.leaderboard.conftest import signed_withdrawal
 from tests.leaderboard.web import boards
 
-EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "board"  # of rules 1
+EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "board"
+OLD = EXAMPLE.parents[1] / "docs" / "results" / "season" / "board"  # of rules 2
 VOID = {"meta", "link", "input", "br", "img"}
 ELEMENTS = """
 html head meta title link script body a header footer main nav div section p span strong em small
@@ -209,7 +210,7 @@ def test_a_board_says_how_to_submit_and_its_limits_unless_it_accepts_nothing(boa
         assert any(a["href"].endswith("index.html#submit") for a in page.all("a")), name
     page = Page(html(Pages(board[0], "https://x/<script>"), "index.html"))
     assert "submit ppo https://x/<script>" in page.words
-    with Store.open(EXAMPLE, read_only=True) as store:
+    with Store.open(OLD, read_only=True) as store:
         words = Page(html(Pages(store), "index.html")).words.split("How to submit")[1]
     assert "accepts no submissions" in words
     assert "sme-leaderboard new" not in words
