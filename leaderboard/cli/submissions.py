@@ -85,7 +85,7 @@ def export_sb3(
 
       sme-leaderboard export-sb3 runs/demo/model.zip
     """
-    from leaderboard.bundle.making import export_sb3 as export
+    from leaderboard.bundle import export_sb3 as export
 
     target = model.with_suffix(".onnx") if out_file is None else out_file
     check_new(target, force=force)

@@ -322,15 +322,16 @@ def check_runs(suite: Suite, submission: Submission, sources: Sequence[str] = ()
         started than are allowed.
     """
     class_of = {spec.digest: member.name for member in suite.classes for spec in member.instances}
+    names = sources or [f"runs.{index}" for index in range(len(submission.runs))]
     for index, run in enumerate(submission.runs):
         if run.spec not in class_of:
             raise Rejection(
                 "unknown_spec",
-                f"runs.{index}.spec={run.spec}: must be the digest of one of the suite's "
+                f"{names[index]}: spec={run.spec}: must be the digest of one of the suite's "
                 f"{len(class_of)} instances (`sme show {submission.suite.name}`). Train on those, "
                 "or submit to a board of its suite.",
             )
-    _check_duplicates(submission, sources or [f"runs.{i}" for i in range(len(submission.runs))])
+    _check_duplicates(submission, names)
     ran = {run.spec for run in submission.runs}
     for digest, name in class_of.items():
         if digest not in ran:

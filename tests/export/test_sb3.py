@@ -12,7 +12,7 @@ import torch
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import VecNormalize
 
-from leaderboard.bundle.making import export_sb3
+from leaderboard.bundle import export_sb3
 from leaderboard.errors import Rejection
 from leaderboard.gate.sandbox import inspect_own, widths
 from sme_registry import SMESpec, evaluate

@@ -242,7 +242,7 @@ FAULTS = [
     ("unsafe_name", {"method__name": "<b>"}, "method.name"),
     ("unknown_suite", {"suite": {"name": "x", "digest": "sha256:" + "0" * 64}}, "suite=x"),
     ("stale_time", {"created": "2020-01-01T00:00:00Z"}, "14 days"),
-    ("unknown_spec", [run("sha256:" + "1" * 64)], r"runs.3.spec=.*3 instances \(`sme show two"),
+    ("unknown_spec", [run("sha256:" + "1" * 64)], r"runs.3: spec=.*3 instances \(`sme show two"),
     ("duplicate_run", [run(A0, 5), run(A0, 5)], "seed=5"),
     ("missing_run", {"runs_started": {"A": 100}}, "runs_started.B=None"),
     ("too_large", [run(A0, 6, policy(8, size=1001))], "size=1,001"),
