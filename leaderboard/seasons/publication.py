@@ -252,11 +252,10 @@ def follows(
       BoardError: the copy's data set has another digest.
     """
     data, states = _generate(instance, master)
-    again = _digests(instance.hidden, data, states)
-    if again == expected:
-        return "exactly"
-    if again.challenge != expected.challenge:
+    if sha256_of(states) != expected.challenge:
         return "no"
+    if expected.data in (data.digest, data.rounded().digest):  # in seasons before float32 the first
+        return "exactly"
     if folder is None:
         return "unknown"
     path = dataset_path(folder, instance.place.season, instance.hidden)
@@ -286,6 +285,7 @@ def recipe(instance: Instance, master: Master) -> DatasetRecipe:
 
 def _publish(instance: Instance, season: str, master: Master, folder: Path) -> Digests:
     data, states = _generate(instance, master)
+    data = data.rounded()
     data.write(_dataset_id(season, instance.hidden), folder / "datasets")
     path = challenge_path(folder, instance.hidden)
     path.parent.mkdir(exist_ok=True)

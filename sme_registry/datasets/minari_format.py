@@ -27,13 +27,13 @@ from sme_registry.io import require_packages
 from sme_registry.registration import env_spec
 
 DATA, METADATA = "main_data.hdf5", "metadata.json"
-VISIBLE = {  # what an agent sees: type and number of dimensions
-    "observations": (np.float32, 2),
-    "actions": (np.float32, 2),
-    "rewards": (np.float64, 1),
-    "next_observations": (np.float32, 2),
-    "terminations": (np.bool_, 1),
-    "truncations": (np.bool_, 1),
+VISIBLE = {  # what an agent sees: types and number of dimensions
+    "observations": ((np.float32,), 2),
+    "actions": ((np.float32,), 2),
+    "rewards": ((np.float64, np.float32), 1),
+    "next_observations": ((np.float32,), 2),
+    "terminations": ((np.bool_,), 1),
+    "truncations": ((np.bool_,), 1),
 }
 _INFOS = {  # the column of an info's rows, and that of the row after the last step
     "state": ("states", "next_states"),
@@ -182,12 +182,12 @@ def _visible_columns(source: _Source, group: Any) -> Arrays:
     columns = {"observations": observations[:-1], "next_observations": observations[1:]}
     columns |= {name: source.array(group, name) for name in VISIBLE if name not in columns}
     steps = len(columns["rewards"])
-    for name, (dtype, ndim) in VISIBLE.items():
+    for name, (dtypes, ndim) in VISIBLE.items():
         column = columns[name]
-        if column.dtype != dtype or column.ndim != ndim or len(column) != steps:
+        if column.dtype not in dtypes or column.ndim != ndim or len(column) != steps:
             raise ValueError(
                 f"{group.name}: its {name} are {column.dtype} of shape {column.shape}: must be "
-                f"{np.dtype(dtype)} in {ndim} dimensions, of {steps} steps"
+                f"{np.dtype(dtypes[0])} in {ndim} dimensions, of {steps} steps"
             )
     return columns
 

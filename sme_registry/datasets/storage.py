@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -108,13 +108,14 @@ class Dataset:
 class SealedDataset(AlignedArrays):
     """What entrants of a season get of a data set: aligned arrays, and nothing that tells its task.
 
-    The columns are those of `Transitions`. `truncations` `[N]` are true where an episode ended at
-    the horizon, or the data set does: bootstrap, unless the same row terminates.
+    The columns are those of `Transitions`, but that `rewards` may be float32. `truncations` `[N]`
+    are true where an episode ended at the horizon, or the data set does: bootstrap, unless the same
+    row terminates.
     """
 
     observations: Observation
     actions: npt.NDArray[np.float32]
-    rewards: Array
+    rewards: Array | npt.NDArray[np.float32]
     next_observations: Observation
     terminations: Mask
     truncations: Mask
@@ -130,11 +131,15 @@ class SealedDataset(AlignedArrays):
         """Read a data set's folder, which contains `data/`."""
         return cls(**read_columns(Path(path), visible=True))
 
+    def rounded(self) -> Self:
+        """The same with float32 rewards: their bits hardly ever depend on the processor."""
+        return replace(self, rewards=self.rewards.astype(np.float32))
+
     def agrees_with(self, other: Self) -> bool:
         """Whether the other has the same transitions, up to 1e-6: machines round differently."""
         columns = other.columns()
         return all(
-            mine.shape == columns[name].shape and np.allclose(mine, columns[name], 0, 1e-6)
+            mine.shape == columns[name].shape and np.allclose(mine, columns[name], 1e-6, 1e-6)
             for name, mine in self.columns().items()
         )
 

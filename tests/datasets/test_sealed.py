@@ -55,6 +55,10 @@ def test_an_episode_that_ends_at_the_horizon_is_truncated_also_where_it_terminat
 def test_it_is_read_back_bit_for_bit_by_us_and_by_minari(dataset, tmp_path):
     path = dataset.write(ID, tmp_path)
     assert SealedDataset.read(path).digest == dataset.digest
+    single = SealedDataset.read(dataset.rounded().write("sealed/autumn/deep-1-v0", tmp_path))
+    assert single.rewards.dtype == np.float32
+    assert single.digest == dataset.rounded().digest
+    assert dataset.agrees_with(single)
     assert SealedDataset.collect(RECIPE).digest == dataset.digest
     other = SealedDataset.collect(RECIPE.model_copy(update={"seed": 1}))
     assert other.digest != dataset.digest
