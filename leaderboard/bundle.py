@@ -373,9 +373,7 @@ def runs_of(path: Path, suite: SuiteFile, algorithm: str | None = None) -> list[
             return [
                 _trained(folder, record)
                 for folder, record in records
-                if record is None
-                or algorithm is None
-                or record.algorithm.casefold() == algorithm.casefold()
+                if record is None or algorithm is None or _same(record.algorithm, algorithm)
             ]
     elif path.suffix == ".json" and path.is_file():
         return _table(path, suite)

@@ -233,18 +233,8 @@ class Folder:
         return document
 
     def signing_key(self) -> SigningKey:
-        """The board's private key.
-
-        Raises:
-          BoardError: it is missing, is not a regular file, or contains no key.
-        """
-        try:
-            data = read_regular(self.key, 4096)
-        except OSError as error:
-            raise BoardError(
-                f"{self.key}: cannot be read: {error.strerror}. Restore the board's key."
-            ) from None
-        return SigningKey.parse(data, self.key)
+        """The board's private key; `BoardError` if it is missing, or a link."""
+        return SigningKey.read(self.key, links=False)
 
     def object(self, digest: str) -> Path:
         """The path of a document or policy file, by its digest."""
@@ -303,13 +293,7 @@ def check_receiver(board: BoardDocument, receiver: Receiver, address: str | None
 
 
 def refuse_unsubmittable(board: BoardDocument) -> None:
-    """Refuse a board whose suite needs more runs than a submission can list.
-
-    An entry needs `runs_to_rank` runs in each class, the same number on each instance.
-
-    Raises:
-      BoardError: they exceed the size limit of a submission.
-    """
+    """Raise `BoardError` if a rank needs more runs than a submission can list in its bytes."""
     needed, most = board.runs_needed, most_runs(board)
     if needed > most:
         raise BoardError(
@@ -337,8 +321,9 @@ def most_runs(board: BoardDocument) -> int:
         runs=(run,),
         runs_started={member.name: 100 for member in board.suite.classes},
     )
+    receiver = Receiver(board.key, f"https://{'x' * 30}")
     one, two = (
-        len(Signed[Submission](content=each, signature="0" * 128).to_bytes())
+        len(Signed[Submission](content=each, signature="0" * 128, **receiver._asdict()).to_bytes())
         for each in (submission, submission.model_copy(update={"runs": (run, run)}))
     )
     return 1 + (MAX_SIGNED_BYTES - one) // (two - one)

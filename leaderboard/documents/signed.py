@@ -54,15 +54,10 @@ Address = Annotated[
 
 
 class Receiver(NamedTuple):
-    """Who may take a signature: a board, by its public key, at an address.
+    """Who may take a signature."""
 
-    Attributes:
-      board: None for no board yet.
-      address: at which the signer has reached the board; None for the board's folder.
-    """
-
-    board: str | None = None
-    address: str | None = None
+    board: str | None = None  # by its public key; None for no board yet
+    address: str | None = None  # where the signer has reached it; None for the board's folder
 
 
 NOBODY = Receiver()
@@ -83,40 +78,24 @@ class SigningKey:
         return cls(signing.SigningKey.generate())
 
     @classmethod
-    def read(cls, path: str | os.PathLike[str]) -> SigningKey:
-        """Read a key from a file.
-
-        Raises:
-          BoardError: the file is missing or contains no key.
-        """
-        _require_nacl()
-        try:
-            data = read_regular(path, 4096, links=True)
-        except OSError as error:
-            raise _no_key(path, str(error.strerror)) from None
-        return cls.parse(data, path)
-
-    @classmethod
-    def parse(cls, data: bytes, path: str | os.PathLike[str]) -> SigningKey:
-        """The key in the bytes of a file; an error names its path.
-
-        Raises:
-          BoardError: they are no key.
-        """
+    def read(cls, path: str | os.PathLike[str], *, links: bool = True) -> SigningKey:
+        """Read a key from a file; `BoardError` if it has none, or is a link without `links`."""
         _require_nacl()
         from nacl import signing
 
         try:
-            return cls(signing.SigningKey(parse_secret(data)))
+            return cls(signing.SigningKey(parse_secret(read_regular(path, 4096, links=links))))
+        except OSError as error:
+            reason = error.strerror
         except ValueError:
-            raise _no_key(path, "not 64 hex digits") from None
+            reason = "not 64 hex digits"
+        raise BoardError(
+            f"{path}: no signing key: {reason}. Restore it, or create one with `sme-leaderboard "
+            "keygen`."
+        )
 
     def write(self, path: str | os.PathLike[str]) -> Path:
-        """Write the key into a new file that only its owner can read.
-
-        Raises:
-          BoardError: the file exists (an overwritten key is lost) or cannot be written.
-        """
+        """Write the key into a new file that only its owner can read."""
         return write_secret(path, self._private.encode())
 
     @property
@@ -172,12 +151,6 @@ def verifies(
     return True
 
 
-def _no_key(path: str | os.PathLike[str], reason: str) -> BoardError:
-    return BoardError(
-        f"{path}: no signing key: {reason}. Create one with `sme-leaderboard keygen`."
-    )
-
-
 def _require_nacl() -> None:
     """Imported where it is used, so that commands can show their help without it."""
     require_packages("signatures", {"nacl": "PyNaCl"}, "leaderboard")
@@ -189,11 +162,7 @@ def _message(purpose: Purpose, digest: str, receiver: Receiver) -> bytes:
 
 
 def write_secret(path: str | os.PathLike[str], secret: bytes) -> Path:
-    """Write a secret into a new file that only its owner can read.
-
-    Raises:
-      BoardError: the file exists (an overwritten secret is lost) or cannot be written.
-    """
+    """Write a secret into a new file that only its owner can read; one that exists is kept."""
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -210,11 +179,7 @@ def write_secret(path: str | os.PathLike[str], secret: bytes) -> Path:
 
 
 def parse_secret(data: bytes) -> bytes:
-    """The bytes in the contents of such a file.
-
-    Raises:
-      ValueError: they are not hex digits.
-    """
+    """The bytes in the contents of such a file; `ValueError` if they are not hex digits."""
     return bytes.fromhex(data.decode("ascii").strip())
 
 
@@ -335,10 +300,7 @@ class Signed(Seal, Generic[Kind]):
         """Read a document, whose content names its key, from the bytes of a file.
 
         Anyone can send one, so what costs time, and answers at length, follows the verification of
-        its signature.
-
-        Raises:
-          Rejection: `too_large`, `not_json`, `schema` or `bad_signature`.
+        its signature. A `Rejection` is `too_large`, `not_json`, `schema` or `bad_signature`.
         """
         kind = cls._kind()
         plain = _parse(text, kind)
@@ -354,11 +316,7 @@ class Signed(Seal, Generic[Kind]):
 
     @classmethod
     def read_unverified(cls, text: bytes) -> Self:
-        """Read a document whose content names no key; the caller verifies its signature.
-
-        Raises:
-          Rejection: `too_large`, `not_json` or `schema`.
-        """
+        """Read a document whose content names no key; the caller verifies its signature."""
         return cls._validated(_parse(text, cls._kind()))
 
     @classmethod
@@ -369,11 +327,7 @@ class Signed(Seal, Generic[Kind]):
             raise Rejection("schema", str(error)) from None
 
     def for_receiver(self, receiver: Receiver, key: SigningKey) -> Self:
-        """The same content, signed for a receiver if it is not yet; another board is not replaced.
-
-        Raises:
-          Rejection: `bad_signature` if `key` is not the one that must sign it.
-        """
+        """The same content, signed for a receiver, unless it is signed for another board."""
         if self.receiver == receiver or self.board not in (None, receiver.board):
             return self
         own = self.content.signer or ""

@@ -238,14 +238,9 @@ def now() -> str:
 
 
 def check_names(manifest: Manifest, board_key: str | None = None) -> None:
-    """Reject what is unsafe to show: markup, formulas, control characters, the board's own names.
+    """Reject what is unsafe to show (`unsafe_name`): markup, formulas, control characters.
 
-    Args:
-      manifest: a submission, an entry or a request for a ticket.
-      board_key: the key that may use the board's names; None if the board is not known yet.
-
-    Raises:
-      Rejection: `unsafe_name`.
+    So are the board's own names, but for its key; None if the board is not known yet.
     """
     method, training = manifest.method, manifest.training
     for field, name in (
@@ -312,14 +307,8 @@ def skeleton(name: str) -> str:
 def check_runs(suite: Suite, submission: Submission, sources: Sequence[str] = ()) -> None:
     """Reject runs that are not on the suite's instances, listed twice, missing or not counted.
 
-    Args:
-      suite: the board's suite.
-      submission: the submission.
-      sources: what to call each run in an error, such as its folder; empty for `runs.0`, ….
-
-    Raises:
-      Rejection: `unknown_spec`, `duplicate_run`, `missing_run`, or `schema` if more runs were
-        started than are allowed.
+    That is `unknown_spec`, `duplicate_run`, `missing_run`, or `schema` if more runs were started
+    than are allowed. `sources` are what to call each run, such as its folder; else `runs.0`, ….
     """
     class_of = {spec.digest: member.name for member in suite.classes for spec in member.instances}
     names = sources or [f"runs.{index}" for index in range(len(submission.runs))]
@@ -345,7 +334,7 @@ def check_runs(suite: Suite, submission: Submission, sources: Sequence[str] = ()
             "missing_run", "runs: none has a policy: at least one must. Submit a trained policy."
         )
     listed = Counter(class_of[run.spec] for run in submission.runs)
-    _check_started(submission, listed, MAX_RUNS)
+    _check_started(submission, listed)
 
 
 def _check_duplicates(submission: Submission, sources: Sequence[str]) -> None:
@@ -364,7 +353,7 @@ def _check_duplicates(submission: Submission, sources: Sequence[str]) -> None:
                 )
 
 
-def _check_started(submission: Submission, listed: Counter[str], most: int) -> None:
+def _check_started(submission: Submission, listed: Counter[str]) -> None:
     started = submission.runs_started
     for name in started:
         if name not in listed:
@@ -381,9 +370,9 @@ def _check_started(submission: Submission, listed: Counter[str], most: int) -> N
                 "listed runs. Count every run that was ever started with this method (option "
                 "--started).",
             )
-    if sum(started.values()) > most:
+    if sum(started.values()) > MAX_RUNS:
         raise Rejection(
             "schema",
-            f"runs_started={sum(started.values())}: must be at most {most:,} in total. "
+            f"runs_started={sum(started.values())}: must be at most {MAX_RUNS:,} in total. "
             "Count the runs of this version of the method only.",
         )
