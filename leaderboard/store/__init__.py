@@ -9,7 +9,7 @@ from leaderboard.seasons.events import SealedRow, SeasonRow, played_bytes
 from leaderboard.store.copies import Copies
 from leaderboard.store.files import digest_of, read_document
 from leaderboard.store.garbage import Garbage, collect_garbage, make_room
-from leaderboard.store.index import Index, IndexUnusable
+from leaderboard.store.index import Index
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.objects import Objects
 from leaderboard.store.queue import LEASE_SECONDS, Claim, Queue
@@ -25,7 +25,6 @@ __all__ = [
     "Garbage",
     "Head",
     "Index",
-    "IndexUnusable",
     "Log",
     "LogEntry",
     "Objects",

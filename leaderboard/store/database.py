@@ -8,7 +8,6 @@ process adds the entry to the index.
 from __future__ import annotations
 
 import contextlib
-import datetime
 import os
 import sqlite3
 import threading
@@ -18,16 +17,13 @@ from typing import Self
 
 from leaderboard.documents.board import RULES, BoardDocument, Folder
 from leaderboard.documents.signed import SigningKey
-from leaderboard.documents.submission import now, shifted, utc
+from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.store.files import FolderLock, digest_of, unwritable
-from leaderboard.store.index import Index, IndexUnusable
+from leaderboard.store.index import Index, files_of
 from leaderboard.store.log import EMPTY, Clock, Event, Head, Log, clock_offset, uptime
 from leaderboard.store.objects import Objects
-from sme_registry.io import sync_folder, temporary_beside
 from sme_registry.spec.document import StrictModel
-
-_EPOCH = datetime.datetime.fromtimestamp(0, datetime.UTC)
 
 
 class Database:
@@ -51,7 +47,6 @@ class Database:
         self._progress: Callable[[int], None] | None = None
         self._key: SigningKey | None = None
         self._index: Index | None = None
-        self._inode = (0, 0)
         if not self._log.has(0):
             raise TamperedError("log/00000000.json", "is missing; every log starts with it")
         self._lock = FolderLock(self.folder.log)
@@ -127,8 +122,6 @@ class Database:
                 yield self._connected
                 return
             with self._lock.hold(exclusive=True), self._explained():
-                if self._replaced():
-                    self._connect()
                 index = self._connected
                 with index.transaction():
                     self._catch_up(index)
@@ -261,7 +254,7 @@ class Database:
         """
         self.refuse_read_only()
         with self.locked():
-            self._rebuild()
+            self._connect(rebuild=True)
 
     @property
     def _connected(self) -> Index:
@@ -270,13 +263,13 @@ class Database:
         return self._index
 
     def _refresh(self) -> None:
-        """Apply what other processes have logged; two file-system calls show whether they have."""
+        """Apply what other processes have logged; a look at one file shows whether they have."""
         index = self._connected
         if self.read_only:
             if self._log.has(index.head.sequence + 1):
                 with index.transaction():
                     self._catch_up(index)
-        elif self._replaced() or self._log.has(index.head.sequence + 1):
+        elif self._log.has(index.head.sequence + 1):
             with self.transaction():
                 pass
 
@@ -289,26 +282,35 @@ class Database:
             if self._progress is not None:
                 self._progress(head.sequence)
 
-    def _connect(self, *, rebuild: bool = False) -> None:
-        """Connect to the index, rebuilt if necessary, while the board is locked.
-
-        Locked, because a connection to a database that is being replaced could read the other
-        database's write-ahead log.
-        """
-        previous, self._index = self._index, None
-        if previous is not None:
-            previous.close()
+    def _connect(self, *, rebuild: bool) -> None:
+        """Connect to the index, rebuilt in place if necessary, while the board is locked."""
         if self.read_only:
             self._index = Index.empty(self.folder, self.document)
             return
-        if not rebuild:
-            with contextlib.suppress(IndexUnusable):
-                self._index = Index.open(self.folder, self.document, in_memory=False)
-        if self._index is not None:
-            self._inode = _inode(self.folder.index)
-            self._refuse_lost_log(self._index.head)
-        else:
-            self._rebuild()
+        if self._index is None:
+            self._index = self._opened()
+        with self._explained():
+            if not rebuild and self._index.is_current:
+                self._refuse_lost_log(self._index.head)
+                return
+            with self._index.transaction():
+                uploads = self._index.uploads() if self._index.is_current else []
+                self._index.clear()
+                self._catch_up(self._index)
+                self._index.add_uploads(uploads)
+
+    def _opened(self) -> Index:
+        """The index, in a new file if the old one is unusable."""
+        path = self.folder.index
+        with contextlib.suppress(sqlite3.Error, OSError):
+            return Index.open(self.folder, self.document)
+        try:
+            for each in files_of(path):
+                each.unlink(missing_ok=True)
+            with self._explained():
+                return Index.open(self.folder, self.document)
+        except OSError as error:
+            raise unwritable(path, error) from error
 
     def _refuse_lost_log(self, head: Head) -> None:
         """Check that the log still has the index's last entry; an index is never ahead of it."""
@@ -321,62 +323,6 @@ class Database:
         if self._log.read(head.sequence).digest != head.digest:
             raise TamperedError(where, f"differs from the entry that the index recorded. {remedy}")
 
-    def _rebuild(self) -> None:
-        """Build a new index and put it in the old one's place, while the board is locked."""
-        path = self.folder.index
-        with self._explained():
-            self._build(path)
-        try:
-            self._index = Index.open(self.folder, self.document, in_memory=False)
-        except IndexUnusable as error:
-            raise BoardError(
-                f"{path}: {error}, although it was just built. Find the process that removes it, "
-                "then try again."
-            ) from None
-        self._inode = _inode(path)
-
-    def _build(self, path: Path) -> None:
-        temporary = temporary_beside(path)
-        try:
-            index = Index.empty(self.folder, self.document, temporary)
-            try:
-                with index.transaction():
-                    self._catch_up(index)
-                    self._add_uploads(index)
-                index.connection.execute("PRAGMA journal_mode = WAL")
-            finally:
-                index.close()
-            os.chmod(temporary, 0o644)
-            if self._index is not None:
-                self._index.close()
-                self._index = None
-            # In this order: no database may ever lie next to another one's write-ahead log.
-            for suffix in ("", "-wal", "-shm", "-journal"):
-                path.with_name(path.name + suffix).unlink(missing_ok=True)
-            os.replace(temporary, path)
-            sync_folder(path.parent)
-        except OSError as error:
-            raise unwritable(path, error) from error
-        finally:
-            for suffix in ("", "-journal", "-wal", "-shm"):
-                with contextlib.suppress(OSError):  # does not exist, or the disk is read-only
-                    temporary.with_name(temporary.name + suffix).unlink()
-
-    def _add_uploads(self, index: Index) -> None:
-        """Count the artefacts that no submission names; who uploaded them is no longer known."""
-        for digest, path in self.objects.paths():
-            if index.one("SELECT 1 FROM object WHERE digest = ?", digest) is None:
-                stat = path.stat()
-                seconds = min(max(stat.st_mtime, 0.0), 1e12)  # of another machine's clock
-                uploaded = utc(shifted(_EPOCH, datetime.timedelta(seconds=seconds)))
-                index.connection.execute(
-                    "INSERT INTO upload VALUES (?, ?, '', ?)", (digest, stat.st_size, uploaded)
-                )
-
-    def _replaced(self) -> bool:
-        """Whether the index's file was deleted, or replaced by another process."""
-        return _inode(self.folder.index) != self._inode
-
     @contextlib.contextmanager
     def _explained(self) -> Iterator[None]:
         try:
@@ -384,13 +330,5 @@ class Database:
         except sqlite3.Error as error:
             raise BoardError(
                 f"{self.folder.index}: {error}. Free disk space or get write permission; "
-                "otherwise delete this file, which is then rebuilt from the log."
+                "otherwise stop what uses the board, and delete this file, which is then rebuilt."
             ) from error
-
-
-def _inode(path: Path) -> tuple[int, int]:
-    try:
-        stat = path.stat()
-    except OSError:
-        return (0, 0)
-    return stat.st_dev, stat.st_ino

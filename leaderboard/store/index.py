@@ -11,11 +11,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
-import shutil
 import sqlite3
-import stat
-import tempfile
-import time
 import zlib
 from collections.abc import Iterator
 from dataclasses import fields
@@ -34,15 +30,7 @@ from leaderboard.store.files import BUSY_SECONDS, digest_of
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.objects import Objects
 from leaderboard.store.rows import EntryRow, Status, name_object, scores_of, scores_text
-
-DERIVED = {  # tables and their keys
-    "head": "zero",
-    "entry": "id",
-    "run": "position",
-    "object": "digest",
-    "artefact": "digest || submission",
-    **seasons.DERIVED,
-}
+from sme_registry.io import is_regular
 
 TIMES = (("entry", "received"), ("object", "received"), ("upload", "time"), *seasons.TIMES)
 """Tables and their columns with times of entries, which an entry of the event "clock" corrects."""
@@ -85,16 +73,6 @@ CREATE TABLE clock (boot TEXT PRIMARY KEY, offset REAL NOT NULL) STRICT, WITHOUT
 """
 VERSION = zlib.crc32(SCHEMA.encode()) & 0x7FFFFFFF  # changes with the schema's text
 
-
-MAX_BYTES = 2**32
-CHECK_SECONDS = 60.0
-"""Of an index that is opened, and for the checks of it."""
-
-
-class IndexUnusable(Exception):
-    """The index is missing, broken, or of another schema or log: rebuild it."""
-
-
 _COLUMNS = tuple(field.name for field in fields(EntryRow) if field.name != "alike")
 _OF_LEASE = {"faults": "coalesce(faults, 0)", "fault": "coalesce(fault, '')"}
 _ROW = ", ".join(_OF_LEASE.get(name, f"entry.{name}") for name in _COLUMNS)
@@ -115,53 +93,65 @@ class Index:
         self.seasons = seasons.Seasons(connection, self.objects)
 
     @classmethod
-    def open(
-        cls,
-        folder: Folder,
-        document: BoardDocument,
-        *,
-        in_memory: bool,
-        limit: int = MAX_BYTES,
-    ) -> Index:
-        """Open a board's index, or a copy in memory, which writes nothing into the folder.
-
-        A stranger may have prepared the file: only regular files with exactly this schema are
-        accepted, and no view, trigger or hot journal has any effect. Its rows may still be wrong.
-
-        Args:
-          folder, document: the board's.
-          in_memory: whether to open a copy.
-          limit: size of the file and its write-ahead log, in bytes.
+    def open(cls, folder: Folder, document: BoardDocument) -> Index:
+        """Connect to a board's index, whose file is created if it does not exist.
 
         Raises:
-          IndexUnusable: it must be rebuilt.
+          sqlite3.Error: the file is no database, or is broken.
+          OSError: it, or one of those beside it, is no regular file.
         """
-        _refuse_unusable_files(folder.index, limit)
+        *files, journal = files_of(folder.index)
+        if os.path.lexists(journal):  # from which SQLite would restore, and delete, what it names
+            raise OSError(f"{journal.name} exists, which a board never writes")
+        for path in files:
+            if os.path.lexists(path) and not is_regular(path):
+                raise OSError(f"{path.name} is not a regular file")
+        connection = _connect(str(folder.index))
         try:
-            connection = _connect(":memory:" if in_memory else _uri(folder.index, "rw"))
-            try:
-                if in_memory:
-                    _copy_index(folder.index, connection)
-                _refuse_unusable(connection, document)
-                if not in_memory:
-                    connection.execute("PRAGMA journal_mode = WAL")
-                    connection.execute("PRAGMA synchronous = FULL")
-            except BaseException:
-                connection.close()
-                raise
-        except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
-            raise IndexUnusable(str(error)) from None
+            connection.execute("PRAGMA trusted_schema = OFF")
+            connection.execute("PRAGMA journal_mode = WAL")
+            connection.execute("PRAGMA synchronous = FULL")
+            (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+            if verdict != "ok":
+                raise sqlite3.DatabaseError(verdict)
+        except BaseException:
+            connection.close()
+            raise
         return cls(connection, folder, document)
 
     @classmethod
-    def empty(cls, folder: Folder, document: BoardDocument, path: str | Path = "") -> Index:
-        """Create an empty index in a new file, or in memory; `apply` fills it.
+    def empty(cls, folder: Folder, document: BoardDocument) -> Index:
+        """An empty index in memory, or if it grows in a file that no other process sees."""
+        index = cls(_connect(""), folder, document)
+        with index.transaction():
+            index.clear()
+        return index
 
-        A large one in memory moves to a temporary file, which no other process sees.
-        """
-        connection = _connect(str(path))
-        connection.executescript(f"PRAGMA user_version = {VERSION}; BEGIN; {SCHEMA} COMMIT;")
-        return cls(connection, folder, document)
+    @property
+    def is_current(self) -> bool:
+        """Whether it has exactly the tables of this version, and is of this board."""
+        (version,) = self.connection.execute("PRAGMA user_version").fetchone()
+        if version != VERSION or _definitions(self.connection) != _expected():
+            return False
+        row = self.one("SELECT board FROM head")
+        return row is not None and row[0] == self._board
+
+    def clear(self) -> None:
+        """Replace all tables by empty ones of this version, in a transaction."""
+        for kind, name in self.connection.execute(
+            "SELECT type, name FROM sqlite_master WHERE type IN ('table', 'view')"
+        ).fetchall():
+            self.connection.execute(f'DROP {kind} "{name}"')
+        for statement in SCHEMA.split(";"):
+            self.connection.execute(statement)
+        self.connection.execute(f"PRAGMA user_version = {VERSION}")
+
+    def uploads(self) -> list[tuple[Any, ...]]:
+        """Of files that no submission names yet, which are not in the log."""
+        return self.connection.execute("SELECT * FROM upload").fetchall()
+
+    def add_uploads(self, rows: list[tuple[Any, ...]]) -> None:
+        self.connection.executemany("INSERT INTO upload VALUES (?, ?, ?, ?)", rows)
 
     def close(self) -> None:
         """Close the connection."""
@@ -326,15 +316,10 @@ class Index:
         row = self.one(f"{_ROWS} WHERE id = ?", id)
         return None if row is None else _entry_row(row, copies.copies_of(self.connection, id))
 
-    def derived_rows(self) -> Iterator[tuple[str, str, tuple[Any, ...]]]:
-        """Table, key and values of each row that the log determines, in a fixed order."""
-        for table, key in DERIVED.items():
-            for row in self.connection.execute(f"SELECT {key}, * FROM {table} ORDER BY {key}"):
-                yield table, str(row[0]), row[1:]
 
-
-def _uri(path: Path, mode: str) -> str:
-    return f"{path.absolute().as_uri()}?mode={mode}"
+def files_of(index: Path) -> list[Path]:
+    """The paths of a database and of what SQLite writes beside it."""
+    return [index.with_name(index.name + end) for end in ("", "-wal", "-shm", "-journal")]
 
 
 def _connect(target: str) -> sqlite3.Connection:
@@ -344,78 +329,21 @@ def _connect(target: str) -> sqlite3.Connection:
         timeout=BUSY_SECONDS,
         isolation_level=None,
         check_same_thread=False,
-        uri=target.startswith("file:"),
     )
 
 
-def _copy_index(path: Path, memory: sqlite3.Connection) -> None:
-    try:
-        _backup(path, memory)
-    except sqlite3.OperationalError:
-        # SQLite reads a write-ahead log only in a folder that is writable.
-        with tempfile.TemporaryDirectory() as folder:
-            copy = Path(folder) / path.name
-            for suffix in ("", "-wal"):
-                part = path.with_name(path.name + suffix)
-                if part.exists():
-                    shutil.copyfile(part, copy.with_name(part.name))
-            _backup(copy, memory)
-
-
-def _backup(path: Path, memory: sqlite3.Connection) -> None:
-    with contextlib.closing(_connect(_uri(path, "ro"))) as source:
-        source.backup(memory)
-
-
-def _refuse_unusable_files(path: Path, limit: int) -> None:
-    size = 0
-    for end in ("", "-wal", "-shm", "-journal"):
-        part = path.with_name(path.name + end)
-        try:
-            status = os.lstat(part)
-        except FileNotFoundError:
-            if part == path:
-                raise IndexUnusable("is missing") from None
-            continue
-        if end == "-journal":  # from which SQLite would restore, and delete, what it names
-            raise IndexUnusable(f"{part.name} exists, which a board never writes")
-        if not stat.S_ISREG(status.st_mode):
-            raise IndexUnusable(f"{part.name} is not a regular file")
-        size += status.st_size
-    if size > limit:
-        raise IndexUnusable(f"has more than {limit:,} bytes")
-
-
-def _refuse_unusable(connection: sqlite3.Connection, document: BoardDocument) -> None:
-    deadline = time.monotonic() + CHECK_SECONDS
-    connection.set_progress_handler(lambda: time.monotonic() > deadline, 10_000)
-    connection.execute("PRAGMA trusted_schema = OFF")
-    connection.execute("PRAGMA cell_size_check = ON")
-    (version,) = connection.execute("PRAGMA user_version").fetchone()
-    if version != VERSION or _schema_of(connection) != _schema():
-        raise IndexUnusable("has another schema")
-    (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-    if verdict != "ok":
-        raise IndexUnusable(f"is broken: {verdict}")
-    head = connection.execute("SELECT board FROM head").fetchone()
-    if head is None or head[0] != document.digest:
-        raise IndexUnusable("belongs to another board")
-    connection.set_progress_handler(None, 0)
-
-
-def _schema_of(connection: sqlite3.Connection) -> list[tuple[Any, ...]]:
-    """The definitions of all tables, indices, views and triggers, or the first hundred of them."""
+def _definitions(connection: sqlite3.Connection) -> list[tuple[Any, ...]]:
+    """Of all tables, indices, views and triggers."""
     return connection.execute(
         "SELECT type, name, tbl_name, sql FROM sqlite_master ORDER BY type, name"
-    ).fetchmany(100)
+    ).fetchall()
 
 
 @functools.cache
-def _schema() -> list[tuple[Any, ...]]:
-    """`_schema_of` an index of this version."""
+def _expected() -> list[tuple[Any, ...]]:
     with contextlib.closing(_connect(":memory:")) as connection:
         connection.executescript(SCHEMA)
-        return _schema_of(connection)
+        return _definitions(connection)
 
 
 def _entry_row(row: tuple[Any, ...], alike: dict[str, tuple[Copies, ...]]) -> EntryRow:

@@ -136,6 +136,17 @@ def document_path(board, id, kind="document"):
         return store.folder.object(digest)
 
 
+def derived(store):
+    """The rows of the index that follow from the log, by their table."""
+    with store.reading() as index:
+        tables = index.connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
+        names = sorted({name for (name,) in tables} - {"lease", "upload", "clock"})
+        return {
+            name: sorted(index.connection.execute(f"SELECT * FROM {name}"), key=str)
+            for name in names
+        }
+
+
 @pytest.fixture
 def key():
     return SigningKey.generate()
