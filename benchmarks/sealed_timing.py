@@ -17,26 +17,25 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
 import sys
-import tempfile
 import time
-from pathlib import Path
 
 import numpy as np
 from scipy.stats import spearmanr
 
-from leaderboard.seasons.instance import SteppedInstance
-from leaderboard.seasons.season import SeasonClass
-from leaderboard.seasons.stepping import Lanes, Start
-from sme_registry import EvaluationProtocol, SMESpec, materialize
+from leaderboard.seasons.stepping import Play, Start
+from sme_registry import SMESpec, materialize
+from sme_registry.envs import SMEVectorEnv
+from sme_registry.seasons.transcript import Place
 from sme_registry.seasons.wire import StepFormat
 
 SPEC = SMESpec(complexity=5, seed=20)
-START = Start(SPEC, 1)
+START = Start(SPEC, 1, Place(request="sha256:" + "0" * 64, ticket=1, instance=0))
 
 
 def main(steps: int = 100_000) -> None:
     random = np.random.default_rng(2)
-    lanes, task = Lanes(START, 1), materialize(SPEC)
+    env, task = SMEVectorEnv(SPEC, 1, autoreset_mode="SameStep"), materialize(SPEC)
+    observation = env.reset(seed=START.seed)[0]
     shape = steps, SPEC.action_dim
     # From the optimum to any action, so that the regret takes all values.
     noise = random.random((steps, 1)) * random.uniform(-1.0, 1.0, shape)
@@ -44,11 +43,11 @@ def main(steps: int = 100_000) -> None:
     regret, ended = np.empty(steps), np.empty(steps, bool)
     actions = np.empty(shape, np.float32)
     for i in range(steps):
-        states[i] = lanes.observation[0, : SPEC.state_dim]
+        states[i] = observation[0, : SPEC.state_dim]
         optimal[i] = task.optimal_action(states[i])
         actions[i] = np.clip(optimal[i] + noise[i], 0.0, 1.0)
-        done, measured = lanes.step_with_regret(actions[i : i + 1])
-        regret[i], ended[i] = measured.taken, done.terminated[0] or done.truncated[0]
+        observation, _, terminated, truncated, info = env.step(actions[i : i + 1])
+        regret[i], ended[i] = info["regret"][0], terminated[0] or truncated[0]
     seconds = timed(actions)[~ended]
     low, middle, high = np.quantile(seconds, [0.05, 0.5, 0.95]) * 1e6
     print(f"{len(seconds):,} steps: {middle:.1f} µs, 5 to 95 %: {low:.1f} to {high:.1f}")
@@ -70,18 +69,13 @@ def main(steps: int = 100_000) -> None:
 
 def timed(actions: np.ndarray) -> np.ndarray:
     """Seconds of each step, as the server takes it, of actions `[n, A]`."""
-    plain = {name: value for name, value in SPEC.to_dict().items() if name != "seed"}
-    member = SeasonClass(name="deep", setting=plain, instances=1, budget=10**8)
-    wire = StepFormat(1, SPEC.state_dim, SPEC.action_dim)
-    bodies = [wire.pack(i + 1, each[None]) for i, each in enumerate(actions)]
-    seconds = np.empty(len(actions))
-    with tempfile.TemporaryDirectory() as folder:
-        instance = SteppedInstance(Path(folder), 0, member, EvaluationProtocol(), lambda: START)
-        instance.start(1)
-        for i, body in enumerate(bodies):
-            begun = time.perf_counter()
-            instance.step(body)
-            seconds[i] = time.perf_counter() - begun
+    form = StepFormat(1, SPEC.state_dim, SPEC.action_dim)
+    play, seconds = Play(START, 1, 10**8), np.empty(len(actions))
+    for i, each in enumerate(actions):
+        body = form.pack(i + 1, each[None])
+        begun = time.perf_counter()
+        play.take(body)
+        seconds[i] = time.perf_counter() - begun
     return seconds
 
 

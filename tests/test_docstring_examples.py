@@ -19,6 +19,7 @@ import sme_registry
 from sme_registry.datasets import make_dataset
 from sme_registry.evaluation.evaluate import resolve_protocol
 from sme_registry.seasons import Ticket
+from sme_registry.seasons.transcript import Signer
 from sme_registry.seasons.wire import TicketClass
 from sme_registry.spec import Setting, StreamSpec, StudyAlgorithm, StudyFile, StudyPlan, SuiteClass
 from sme_registry.studies import run_study
@@ -100,6 +101,7 @@ def prepared(tmp_path_factory):
         deadline="2099-12-31T00:00:00Z",
         lanes=8,
         classes=(deep,),
+        signer=Signer(board="0" * 64, request="sha256:" + "0" * 64, key="1" * 64),
     )
     ticket.write(folder / "ticket.json")
     return folder

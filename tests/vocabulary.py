@@ -207,6 +207,8 @@ QUANTITIES = {
     "budget": "steps that a ticket allows on an instance, over all lanes",
     "used": "how many of them were taken",
     "requests": "number of requests for steps",
+    "hashes": "of a transcript after the first: a request each, and two once it is answered",
+    "transcript": "version of the transcripts that an entrant signs",
     "ticket": "number of a ticket in its season",
     "ticket_hours": "time from the start of a ticket to its deadline",
     "tickets": "most tickets of a season",

@@ -182,11 +182,11 @@ def start_ticket(
             f"season={request.season}: the request was sent to the season {season}. Send it to "
             "its own.",
         )
-    if request.answers_key is None:
+    if request.answers_key is None or request.transcript is None:
         raise Rejection(
             "schema",
-            "ticket.answers_key: missing: must be the public key that will sign the answers. "
-            "Create the request with `sme-leaderboard ticket`.",
+            "ticket.answers_key, ticket.transcript: missing: must be the public key that signs the "
+            "transcripts, and 1. Create the request with `sme-leaderboard ticket`.",
         )
     check_names(request, store.document.key)
     moment = datetime.datetime.fromisoformat(store.time)

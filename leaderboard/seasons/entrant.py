@@ -122,6 +122,7 @@ def ticket(
                 "season": season_digest,
                 "nonce": nonce,
                 "answers_key": signing_key.of_answers(nonce).public,
+                "transcript": 1,
             }
         )
         signed = request.signed(signing_key, receiver)
@@ -247,7 +248,16 @@ def answer(
             phases[number] = "answered"
             progress.update(done)
     left = sum(phase != "answered" for phase in phases)
-    out().print(f"{left} instances without answers" if left else "The ticket has ended.")
+    if left:
+        out().print(f"{left} instances without answers")
+        return
+    with Instance(url, held) as first:
+        has_ended = first.end_ticket()
+    out().print(
+        "The ticket has ended."
+        if has_ended
+        else f"The ticket ends at {escape(held.deadline)}: some instances were answered elsewhere."
+    )
 
 
 def _prepared(

@@ -24,6 +24,7 @@ from leaderboard.seasons.season import (
 from leaderboard.store.log import LogEntry
 from leaderboard.store.objects import Objects
 from leaderboard.store.rows import EntryRow, name_object, scores_of, scores_text
+from sme_registry.seasons.transcript import EVERY
 from sme_registry.seasons.wire import table_bytes
 
 DERIVED = {"season": "digest", "sealed": "id", "answer": "digest || entry"}
@@ -51,7 +52,8 @@ CREATE TABLE sealed (
   method TEXT NOT NULL, version TEXT NOT NULL, family TEXT NOT NULL, knowledge TEXT NOT NULL,
   submitter TEXT NOT NULL, key TEXT NOT NULL, code_link TEXT,
   runs INTEGER NOT NULL, policies INTEGER NOT NULL, steps INTEGER NOT NULL DEFAULT 0,
-  oracle_like INTEGER NOT NULL DEFAULT 0, scores TEXT, played_bytes INTEGER NOT NULL
+  oracle_like INTEGER NOT NULL DEFAULT 0, scores TEXT,
+  played_bytes INTEGER NOT NULL -- at most
 ) STRICT, WITHOUT ROWID;
 CREATE UNIQUE INDEX sealed_number ON sealed (season, number);
 CREATE INDEX sealed_of_key ON sealed (key, received);
@@ -62,10 +64,11 @@ CREATE TABLE answer (
 
 _Signed = TypeVar("_Signed", bound=Signed[SealedManifest])
 _RECORD_BYTES, _HEAD_BYTES = 12, 4096  # of a journal; heads with the signature's file
+_SNAPSHOT_BYTES, _NUMBERS_OF_A_LANE = 2**14, 40  # of a snapshot; bytes of a lane, for each channel
 
 
 def played_bytes(season: Season, result: SealedResult | None = None) -> int:
-    """The most bytes that the journals and answers of a ticket take.
+    """The most bytes that the journals, challenges, answers and snapshots of a ticket take.
 
     A journal is longest where a single lane is stepped: then each step has a record of its own.
 
@@ -76,12 +79,16 @@ def played_bytes(season: Season, result: SealedResult | None = None) -> int:
     total = 0
     rows = rows_of(season.protocol)
     for number, (member, _) in enumerate(season.hidden):
-        A = member.setting.action_dim
-        steps = (member.budget or 0) if result is None else result.stepping[number].steps
-        answered = result is None or result.runs[number].artefact is not None
-        answers = table_bytes(rows, A) if answered else 0
-        last = 4 * MAX_LANES * A  # the record that ends a journal
-        total += steps * (_RECORD_BYTES + 4 * A) + last + answers + _HEAD_BYTES
+        S, A = member.setting.state_dim, member.setting.action_dim
+        steps, answered = member.budget or 0, True
+        if result is not None:  # what was not signed may be in the journal, too
+            steps = min(steps, result.stepping[number].steps + EVERY * MAX_LANES)
+            answered = result.runs[number].artefact is not None
+        total += steps * (_RECORD_BYTES + 4 * A) + table_bytes(rows, S + 2) + _HEAD_BYTES
+        total += 4 * MAX_LANES * A  # the record that ends a journal
+        total += table_bytes(rows, A) * answered
+        if result is None:
+            total += _SNAPSHOT_BYTES + MAX_LANES * _NUMBERS_OF_A_LANE * (S + A + 4)
     return total
 
 

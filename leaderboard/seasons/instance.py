@@ -1,88 +1,95 @@
-"""`SteppedInstance`: one hidden instance of a ticket, from its first step to its answers.
+"""`Instance`: one hidden instance of a ticket, from its first step to its answers.
 
     waiting ── start ──▶ stepping ── finish, or no step fits the budget ──▶ answering ──▶ answered
 
-Its files are `<number>.journal`, `<number>.npy` with the answers, and `<number>.json` with the
-entrant's signature of both, in the ticket's folder. Its state follows from them. Each method may be
-called again after a lost answer, without a further effect.
+In the ticket's folder, `<number>.journal` has the actions, `<number>.json` the head of the
+transcript that the entrant has signed last, `<number>.challenge` the challenge states,
+`<number>.npy` the answers, and `<number>.npz` a snapshot of its `Play`. A snapshot is written when
+the entrant signs, and when the instance leaves memory; so a journal is read only from there on, and
+as a whole only where the snapshot is lost. Each method may be called again after a lost answer,
+without a further effect.
 """
 
 from __future__ import annotations
 
 import contextlib
+import io as streams
 import threading
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
 
 from leaderboard.documents.signed import Signed
 from leaderboard.errors import Rejection, TamperedError
-from leaderboard.seasons.entry import Answers
+from leaderboard.seasons.entry import Answers, InstanceHead, TicketRequest, has_signed
 from leaderboard.seasons.journal import Journal
-from leaderboard.seasons.season import MAX_LANES, Float32, SeasonClass, read_answers, rows_of
-from leaderboard.seasons.signatory import Signatory
-from leaderboard.seasons.stepping import Lanes, Start
+from leaderboard.seasons.season import (
+    MAX_LANES,
+    Float32,
+    SeasonClass,
+    Stepping,
+    read_answers,
+    rows_of,
+)
+from leaderboard.seasons.stepping import Play, Start, no_steps
 from sme_registry import EvaluationProtocol, io
 from sme_registry.errors import ActionError, SMEError, WireError
 from sme_registry.io import read_regular
-from sme_registry.seasons.wire import InstanceStatus, StepFormat, table_bytes
+from sme_registry.seasons.transcript import EVERY, Place, answers_head, challenge_head
+from sme_registry.seasons.wire import InstanceStatus, table_bytes
 
+SignedHead = Signed[InstanceHead]
 Phase = Literal["waiting", "stepping", "answering", "answered"]
-_MAX_SIGNED = 4096
+_MAX_SIGNED, _MAX_SNAPSHOT = 4096, 2**24
 _QUICK_PRODUCTS = 2**23
 """Of weights and lanes, in steps short enough for the event loop: a few milliseconds."""
 
 
-class SteppedInstance:
-    """One hidden instance, for any number of threads.
+class Instance:
+    """One hidden instance, for any number of threads; `start` and `states` derive what is hidden.
 
-    Args:
-      folder: the ticket's.
-      number: of the instance in the ticket, from 0.
-      member: its class.
-      protocol: the season's.
-      start: derives what is hidden; called when it is needed.
-      signatory: signs the answers; None in tickets that are older than signed answers.
-
-    Attributes:
-      budget: steps over all lanes.
+    `budget` is in steps over all lanes; `signed_path` is the file of the last signature.
     """
 
     def __init__(
         self,
         folder: Path,
-        number: int,
+        place: Place,
+        request: Signed[TicketRequest],
         member: SeasonClass,
         protocol: EvaluationProtocol,
         start: Callable[[], Start],
-        signatory: Signatory | None = None,
+        states: Callable[[], bytes],
     ) -> None:
-        self._number, self._signatory = number, signatory
-        self._journal_path = folder / f"{number}.journal"
-        self._answers_path = folder / f"{number}.npy"
-        self._signed_path = folder / f"{number}.json"
-        self._member = member
+        self._place, self._request = place, request
+        self._member, self._protocol = member, protocol
         assert member.budget is not None  # the track is online
         self.budget = member.budget
-        self._protocol = protocol
-        self._start = start
+        self._start, self._states = start, states
+        name = str(place.instance)
+        self._journal_path, self._answers_path, self.signed_path, self._snapshot_path = (
+            folder / f"{name}{end}" for end in (".journal", ".npy", ".json", ".npz")
+        )
+        self._challenge_path = folder / f"{name}.challenge"
         self._lock = threading.RLock()
         self._journal: Journal | None = None
-        self._journal_digest = ""  # once no more steps can be taken
-        self._lanes: Lanes | None = None
-        self._format: StepFormat | None = None
-        self._last = b"", b""  # actions and answer of the last request
-        self._answered, self._closed = self._answers_path.exists(), False
+        self._play: Play | None = None
+        self._answered: bool | None = None  # unknown
+        self._closed = False
 
     @property
     def phase(self) -> Phase:
         """How far the entrant is."""
         with self._lock:
-            journal = self._opened()
-            if self._answered:
-                return "answered"
+            journal = self.journal
             if journal is None:
                 return "waiting"
+            if self.answered:
+                return "answered"
             spent = journal.steps + journal.lanes > self.budget
             return "answering" if journal.ended or spent else "stepping"
 
@@ -90,7 +97,7 @@ class SteppedInstance:
     def status(self) -> InstanceStatus:
         """What the entrant may know."""
         with self._lock:
-            journal = self._opened()
+            journal = self.journal
             return InstanceStatus(
                 phase=self.phase,
                 lanes=None if journal is None else journal.lanes,
@@ -100,73 +107,69 @@ class SteppedInstance:
 
     @property
     def is_played(self) -> bool:
-        """Whether it has steps, answers, or a journal that is none."""
-        with self._lock:
-            try:
-                journal = self._opened()
-            except TamperedError:
-                return True
-            return self._answered or (journal is not None and journal.requests > 0)
-
-    @property
-    def lanes(self) -> int:
-        """L; 0 before the start."""
-        journal = self._opened()
-        return 0 if journal is None else journal.lanes
+        """Whether the entrant has signed or answered anything."""
+        return self.signed_path.exists() or self._answers_path.exists()
 
     @property
     def journal(self) -> Journal | None:
         """The steps; None before the start."""
         with self._lock:
-            return self._opened()
+            if self._journal is None and self._journal_path.exists():
+                snapshot = self._snapshot()
+                known = 0 if snapshot is None else int(snapshot["counts"][0])
+                with storage():
+                    self._journal = Journal.open(self._journal_path, known)
+            return self._journal
 
     @property
-    def stored_answers(self) -> tuple[Float32, str] | tuple[None, None]:
-        """The answers `[regions · n, A]` and the digest of their file; nothing without any.
+    def answered(self) -> bool:
+        """Whether its answers are stored, with the entrant's signature where that is required."""
+        with self._lock:
+            if self._answered is None:
+                self._answered = self._answers_path.exists() and self._is_ended
+            return self._answered
 
-        Raises:
-          Rejection: `answer_shape` if the file was altered, `storage_full` if it cannot be read.
-        """
-        if not self._answered:
-            return None, None
-        with _storage():
-            data = read_regular(self._answers_path, self.answer_bytes)
-        return read_answers(data, self._member.setting, self._protocol), io.sha256_of(data)
+    @property
+    def _is_ended(self) -> bool:
+        """Whether the entrant has signed its answers; those of older tickets were stored last."""
+        if self._request.content.transcript is None:
+            return True
+        signed, journal = self.signed, self.journal
+        if signed is None or journal is None:
+            return False
+        return signed.content.hashes == journal.requests + 2
+
+    @property
+    def signed(self) -> SignedHead | None:
+        """What the entrant has signed last; None where there is nothing to read."""
+        try:
+            data = read_regular(self.signed_path, _MAX_SIGNED)
+            return SignedHead.from_dict(io.parse_json(data, self.signed_path.name))
+        except (OSError, SMEError):
+            return None
 
     @property
     def signed_digest(self) -> str | None:
-        """The digest of the file with the entrant's signature; None where there is none to read."""
+        """The digest of the file with the entrant's signature; None where there is none."""
+        if self._request.content.transcript is None and not self.answered:
+            return None
         with contextlib.suppress(OSError):
-            if self._answered and self._signatory is not None:
-                return io.sha256_of(read_regular(self._signed_path, _MAX_SIGNED))
+            return io.sha256_of(read_regular(self.signed_path, _MAX_SIGNED))
         return None
 
     @property
-    def is_signed(self) -> bool:
-        """Whether the entrant has signed these answers and this journal, where that is required.
-
-        Raises:
-          Rejection, TamperedError: a file cannot be read.
-        """
-        if not self._answered or self._signatory is None:
-            return True
-        _, answers = self.stored_answers
-        try:
-            data = read_regular(self._signed_path, _MAX_SIGNED)
-            stored = Signed[Answers].from_dict(io.parse_json(data, "signature"))
-            return stored == self._signed(str(answers), stored.signature)
-        except (OSError, SMEError):
-            return False
+    def answers(self) -> tuple[Float32, str] | tuple[None, None]:
+        """The answers `[regions · n, A]` and the digest of their file; nothing without any."""
+        if not self.answered:
+            return None, None
+        with storage():
+            data = read_regular(self._answers_path, self.answer_bytes)
+        return read_answers(data, self._member.setting, self._protocol), io.sha256_of(data)
 
     @property
     def answer_bytes(self) -> int:
         """The most bytes of the answers' file."""
         return table_bytes(rows_of(self._protocol), self._member.setting.action_dim)
-
-    @property
-    def answered(self) -> bool:
-        """Whether its answers are stored."""
-        return self._answered
 
     @property
     def weights(self) -> int:
@@ -177,153 +180,190 @@ class SteppedInstance:
 
     @property
     def is_ready(self) -> bool:
-        """Whether the next step is small, needs no replay, and has no other request before it."""
-        if self._lanes is None or self.lanes * self.weights > _QUICK_PRODUCTS:
+        """Whether the next step is small, waits for no disk, and has no other request before it."""
+        play, journal = self._play, self._journal
+        if play is None or journal is None or journal.lanes * self.weights > _QUICK_PRODUCTS:
             return False
-        if not self._lock.acquire(blocking=False):
+        if _is_due(play) or not self._lock.acquire(blocking=False):
             return False
         self._lock.release()
         return True
 
     def start(self, lanes: int) -> bytes:
-        """Begin, or go on after a lost connection; the present observations.
-
-        Raises:
-          Rejection: `start_conflict`, `lanes_invalid`, `instance_phase` or `storage_full`.
-        """
+        """Begin, or go on after a lost connection; the present observations."""
         with self._lock:
-            self._refuse_closed()
-            journal = self._opened()
+            self._check_open()
+            journal = self.journal
             if journal is None:
                 most = min(MAX_LANES, self.budget)
                 if not 1 <= lanes <= most:
                     raise Rejection(
                         "lanes_invalid", f"lanes={lanes}: must be in [1, {most}]. Correct it."
                     )
-                journal = self._create(lanes)
+                with storage():
+                    action_dim = self._member.setting.action_dim
+                    journal = Journal.create(self._journal_path, lanes, action_dim)
+                self._journal = journal
             if lanes != journal.lanes:
                 raise Rejection(
                     "start_conflict",
                     f"lanes={lanes}: the instance was started with {journal.lanes}. Go on with "
                     "these.",
                 )
-            self._refuse_answered()
-            observation = self._present(journal).observation
-            assert self._format is not None  # with the lanes
-            return self._format.pack(journal.requests, observation)
+            return self._playing().started
 
-    def step(self, body: bytes) -> bytes:
+    def step(self, body: bytes, signature: str = "") -> bytes:
         """Take the steps of a request, or answer the last one again.
 
-        Raises:
-          Rejection: `instance_phase`, `step_invalid`, `step_conflict`, `step_ahead`,
-            `budget_spent` or `storage_full`. No step was taken.
+        `signature` is that of the transcript before it, where one is due. A rejected request has
+        taken no step.
         """
         with self._lock:
-            self._refuse_closed()
-            journal = self._started()
-            self._refuse_answered()
-            lanes = self._present(journal)
-            assert self._format is not None  # with the lanes
+            self._check_open()
+            play = self._playing()
             try:
-                number, actions = self._format.unpack_request(body)
+                number = play.unpack(body)
             except (WireError, ActionError) as error:
                 raise Rejection("step_invalid", str(error)) from None
-            raw = body[-actions.nbytes :]
-            if number == journal.requests and raw == self._last[0]:
-                return self._last[1]
-            self._refuse_step(journal, number)
-            with _storage():
-                journal.append(raw)
+            if number == play.requests and body == play.last[0]:
+                return play.last[1]
+            journal = self._started()
+            self._check_next(journal, number)
+            if _is_due(play):
+                self._sign(play, signature)
+            with storage():
+                journal.append(body[8:])
             # Whatever raises between here and the end, such as a lack of memory: the step is taken.
-            self._lanes, form = None, self._format
-            self._last = raw, form.pack_steps(lanes.step(actions))
-            self._lanes = lanes
-            return self._last[1]
+            self._play = None
+            answer = play.take(body)
+            self._play = play
+            return answer
 
-    def finish(self) -> None:
-        """Take no more steps.
-
-        Raises:
-          Rejection: `ticket_ended` or `storage_full`.
-        """
+    def finish(self, signature: str) -> None:
+        """Take no more steps."""
         with self._lock:
-            self._refuse_closed()
-            journal = self._opened() or self._create(1)
-            if self.phase == "stepping":
-                with _storage():
-                    journal.end()
+            self._check_open()
+            journal, play = self._started(), self._playing()
+            self._sign(play, signature)
+            with storage():
+                journal.end()
+            self.release()
 
-    def refuse_challenge(self) -> None:
-        """Raise `Rejection` (`instance_phase`) as long as steps may follow."""
-        phase = self.phase
-        if phase in ("waiting", "stepping"):
-            raise _wrong_phase(phase, "Take all steps, or finish it, before the challenge.")
-
-    def journal_digest(self) -> str:
-        """`Journal.digest` of the steps.
-
-        Raises:
-          Rejection: `instance_phase` as long as steps may follow, or `storage_full`.
-        """
-        self.refuse_challenge()
+    def challenge(self) -> bytes:
+        """The challenge states, an .npy file."""
         with self._lock:
-            if not self._journal_digest:
-                with _storage():
-                    self._journal_digest = self._started().digest()
-            return self._journal_digest
+            if not self._started().ended:
+                raise _wrong_phase(self.phase, "Finish it before the challenge.")
+            with storage():
+                if not self._challenge_path.exists():
+                    with io.atomic_file(self._challenge_path) as stream:
+                        stream.write(self._states())
+                return read_regular(self._challenge_path, 2**28)
 
     def has_stored(self, data: bytes) -> bool:
-        """Whether these are its answers, which a client sends again if the reply was lost.
-
-        Raises:
-          Rejection: `storage_full` if they are, and might not survive a loss of power.
-        """
-        with _storage():
-            if not self._answered or read_regular(self._answers_path, len(data) + 1) != data:
+        """Whether these are its answers, which a client sends again if the reply was lost."""
+        with self._lock, storage():
+            if not self.answered or read_regular(self._answers_path, len(data) + 1) != data:
                 return False
             io.sync_folder(self._answers_path.parent)  # which may have failed the first time
-        return True
+            return True
 
     def answer(self, data: bytes, signature: str) -> bool:
-        """Store the answers to the challenge.
+        """Store the answers to the challenge, an .npy file; False if the same ones are stored.
 
-        Args:
-          data: an .npy file of float32 actions `[rows, A]`, one for each challenge state.
-          signature: of the `Statement` of them and the journal.
-
-        Returns:
-          False if the same ones are stored.
-
-        Raises:
-          Rejection: `instance_phase`, `answer_shape`, `answer_not_finite`, `answer_conflict`,
-            `bad_signature` or `storage_full`.
+        `signature` is that of the transcript with them.
         """
-        with self._lock:
-            self._refuse_closed()
-            self.refuse_challenge()
-            read_answers(data, self._member.setting, self._protocol)
+        with self._lock, storage():
             if self.has_stored(data):
                 return False
-            if self._answered:
+            self._check_open()
+            states = self.challenge()
+            read_answers(data, self._member.setting, self._protocol)
+            if self.answered:
                 raise Rejection(
                     "answer_conflict",
                     "answers: others were stored for this instance, and count. Go on with the "
                     "next instance.",
                 )
-            if self._signatory is not None:
-                signed = self._signed(io.sha256_of(data), signature)
-                with _storage(), io.atomic_file(self._signed_path) as stream:
-                    stream.write(io.to_json(signed.to_dict()).encode())
-            try:  # the answers come last: with them, the instance is answered
-                with _storage(), io.atomic_file(self._answers_path, new=True) as stream:
-                    stream.write(data)
-                with _storage():
-                    io.sync_folder(self._answers_path.parent)
+            play = self._playing()
+            head = answers_head(challenge_head(play.head, states), data)
+            signed = self._signed(play.requests + 2, head, signature)
+            with io.atomic_file(self._answers_path) as stream:
+                stream.write(data)
+            try:
+                self._write(signed)
+                io.sync_folder(self._answers_path.parent)
             finally:  # the file may be there even if the folder could not be synced
-                self._answered = self._answers_path.exists()
+                self._answered = None
             self.release()
             return True
+
+    def final_head(self) -> str | None:
+        """The head of the transcript once it is answered; None before."""
+        signed = self.signed
+        return signed.content.head if signed is not None and self.answered else None
+
+    def stepping(self) -> Stepping:
+        """The regret of the steps that the entrant has signed, as it was summed when they came."""
+        with self._lock:
+            signed = self.signed
+            if signed is None or self.journal is None:
+                return self.replayed()
+            play = self._playing()
+            self.release()
+        if play.signed != min(signed.content.hashes, play.requests):
+            return self.replayed()
+        return play.stepping.model_copy(update={"signed": self.signed_digest})
+
+    def replayed(self) -> Stepping:
+        """`stepping`, from the journal alone."""
+        signed, digest = self.signed, self.signed_digest
+        if not self._journal_path.exists():
+            return no_steps(self.budget)
+        journal = Journal.open(self._journal_path)
+        play = Play(self._start(), journal.lanes, self.budget)
+        last = journal.requests
+        if self._request.content.transcript is not None:
+            last = 0 if signed is None else min(last, signed.content.hashes)
+        for body in journal.bodies(0, last):
+            play.take(body)
+        play.sign()
+        self._check_signed(journal, play, signed)
+        return play.stepping.model_copy(update={"signed": digest})
+
+    def _check_signed(self, journal: Journal, play: Play, signed: SignedHead | None) -> None:
+        """Raise TamperedError unless the entrant has signed the transcript and the answers."""
+        answers = read_regular(self._answers_path, self.answer_bytes) if self.answered else b""
+        if self._request.content.transcript is None:
+            is_right = not answers or self._has_stated(journal, answers)
+        elif signed is None:
+            is_right = not self.signed_path.exists()
+        else:
+            head, number = play.head, signed.content.hashes
+            if number > journal.requests:
+                head = answers_head(challenge_head(head, self._states()), answers)
+            is_right = signed.id == self._place.at(number, head).digest and has_signed(
+                self._request, signed.signature, signed.content
+            )
+        if not is_right:
+            where = "/".join(self.signed_path.parts[-5:])
+            raise TamperedError(where, "is not the entrant's signature of this transcript")
+
+    def _has_stated(self, journal: Journal, answers: bytes) -> bool:
+        """Whether the entrant has signed answers and journal, before there were transcripts."""
+        if self._request.content.answers_key is None:
+            return True
+        try:
+            data = read_regular(self.signed_path, _MAX_SIGNED)
+            stored = Signed[Answers].from_dict(io.parse_json(data, self.signed_path.name))
+        except (OSError, SMEError):
+            return False
+        statement = Answers(
+            **dict(self._place), answers=io.sha256_of(answers), journal=journal.digest()
+        )
+        return stored.content == statement and has_signed(
+            self._request, stored.signature, statement
+        )
 
     def sync(self) -> None:
         """Make the steps taken survive a loss of power; raises OSError if the disk fails."""
@@ -337,51 +377,83 @@ class SteppedInstance:
             self._closed = True
             self.release()
 
+    def forget(self) -> None:
+        """Remove the snapshot."""
+        with contextlib.suppress(OSError):
+            self._snapshot_path.unlink(missing_ok=True)
+
     def release(self) -> None:
-        """Free memory; the next steps replay the journal."""
+        """Free memory; the next steps go on from the snapshot."""
         with self._lock:
             with contextlib.suppress(OSError):  # the steps survive all but a loss of power
                 self.sync()
-            self._lanes = self._format = None
+                if self._play is not None:
+                    self._save(self._play)
+            self._play = None
 
-    def _signed(self, answers: str, signature: str) -> Signed[Answers]:
-        assert self._signatory is not None
-        return self._signatory.signed(self._number, answers, self.journal_digest(), signature)
+    def _playing(self) -> Play:
+        """What is in memory; from the snapshot and the steps after it where it was not."""
+        if self._play is None:
+            journal, snapshot = self._started(), self._snapshot()
+            play = Play(self._start(), journal.lanes, self.budget)
+            if snapshot is not None and snapshot["counts"][0] <= journal.requests:
+                play.restore(snapshot)
+            for body in journal.bodies(play.requests):
+                play.take(body)
+            self._play = play
+        return self._play
 
-    def _opened(self) -> Journal | None:
-        """The journal; None before the start."""
-        if self._journal is None and self._journal_path.exists():
-            with _storage():
-                self._journal = Journal.open(self._journal_path)
-        return self._journal
+    def _snapshot(self) -> dict[str, npt.NDArray[Any]] | None:
+        """The last one; None where there is none to read."""
+        try:
+            data = read_regular(self._snapshot_path, _MAX_SNAPSHOT)
+            with np.load(streams.BytesIO(data), allow_pickle=False) as arrays:
+                return dict(arrays)
+        except (OSError, EOFError, ValueError, zipfile.BadZipFile):
+            return None
 
-    def _create(self, lanes: int) -> Journal:
-        with _storage():
-            A = self._member.setting.action_dim
-            self._journal = Journal.create(self._journal_path, lanes, A)
-        return self._journal
+    def _save(self, play: Play) -> None:
+        with io.atomic_file(self._snapshot_path) as stream:
+            stream.write(play.snapshot())
+
+    def _sign(self, play: Play, signature: str) -> None:
+        """Store the entrant's signature of all steps so far, once."""
+        if play.signed == play.requests:
+            return
+        signed = self._signed(play.requests, play.head, signature)
+        with storage():
+            self.sync()
+            self._write(signed)
+            play.sign()
+            self._save(play)
+
+    def _signed(self, number: int, head: bytes, signature: str) -> SignedHead:
+        document = self._place.at(number, head)
+        if not has_signed(self._request, signature, document):
+            raise Rejection(
+                "bad_signature",
+                f"signature={signature[:16]!a}: must be of the transcript after {number} requests, "
+                f"whose hash is {document.head[:19]}… here, by the key that the request for the "
+                "ticket names. Use the ticket's file, and the transcripts beside it.",
+            )
+        return SignedHead(
+            content=InstanceHead(**dict(document)),
+            signature=signature,
+            **self._request.receiver._asdict(),
+        )
+
+    def _write(self, signed: SignedHead) -> None:
+        with io.atomic_file(self.signed_path) as stream:
+            stream.write(io.to_json(signed.to_dict()).encode())
 
     def _started(self) -> Journal:
         """The journal, or a rejection before the start."""
-        journal = self._opened()
+        journal = self.journal
         if journal is None:
             raise _wrong_phase("waiting", "Start it first.")
         return journal
 
-    def _present(self, journal: Journal) -> Lanes:
-        """The lanes after the journal's steps, which are replayed where they are not in memory."""
-        if self._lanes is None:
-            setting = self._member.setting
-            lanes = Lanes(self._start(), journal.lanes)
-            wire = StepFormat(journal.lanes, setting.state_dim, setting.action_dim)
-            for actions in journal.actions():
-                steps = lanes.step(actions)
-            if journal.requests:
-                self._last = actions.tobytes(), wire.pack_steps(steps)
-            self._lanes, self._format = lanes, wire
-        return self._lanes
-
-    def _refuse_step(self, journal: Journal, number: int) -> None:
+    def _check_next(self, journal: Journal, number: int) -> None:
         """Refuse steps that are not the next ones, or not in the budget."""
         following = journal.requests + 1
         if number < following:
@@ -404,13 +476,14 @@ class SteppedInstance:
                 "not fit. Answer the challenge.",
             )
 
-    def _refuse_closed(self) -> None:
+    def _check_open(self) -> None:
         if self._closed:
             raise Rejection("ticket_ended", "ticket: has ended. What it had counts.")
 
-    def _refuse_answered(self) -> None:
-        if self._answered:
-            raise _wrong_phase("answered", "Go on with the next instance.")
+
+def _is_due(play: Play) -> bool:
+    """Whether the entrant signs the transcript with its next request."""
+    return play.requests > 0 and play.requests % EVERY == 0
 
 
 def _wrong_phase(phase: Phase, advice: str) -> Rejection:
@@ -418,7 +491,7 @@ def _wrong_phase(phase: Phase, advice: str) -> Rejection:
 
 
 @contextlib.contextmanager
-def _storage() -> Iterator[None]:
+def storage() -> Iterator[None]:
     """Reject what the disk does not take."""
     try:
         yield

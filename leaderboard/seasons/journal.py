@@ -20,9 +20,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-import numpy as np
-import numpy.typing as npt
-
 from leaderboard.errors import BoardError, TamperedError
 from sme_registry import io
 from sme_registry.io import open_regular
@@ -54,11 +51,7 @@ class Journal:
 
     @classmethod
     def create(cls, path: Path, lanes: int, action_dim: int) -> Journal:
-        """A new, empty journal.
-
-        Raises:
-          OSError: it exists, or cannot be written.
-        """
+        """A new, empty journal."""
         header = _HEADER.pack(_MAGIC, lanes, action_dim)
         if not path.parent.is_dir():
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -70,13 +63,10 @@ class Journal:
         return cls(path, lanes, action_dim)
 
     @classmethod
-    def open(cls, path: Path) -> Journal:
+    def open(cls, path: Path, known: int = 0) -> Journal:
         """The journal of a file, up to its last whole record; writes nothing.
 
-        Raises:
-          TamperedError: the file is no journal.
-          OSError: it does not exist, or cannot be read.
-        """
+        The first `known` records, which were whole before, are not read again."""
         with open_regular(path) as stream:
             header = stream.read(_START)
             if len(header) < _START or header[_HEADER.size :] != _crc(header[: _HEADER.size]):
@@ -85,7 +75,7 @@ class Journal:
             if magic != _MAGIC:
                 raise TamperedError(path.name, "is not a journal of this version")
             journal = cls(path, lanes, action_dim)
-            journal._count(stream)
+            journal._count(stream, known)
         return journal
 
     @property
@@ -101,31 +91,19 @@ class Journal:
         """Add the next request; it survives a kill of this process when this returns.
 
         Args:
-          actions: `[L, A]` float32, little-endian.
-
-        Raises:
-          OSError: it cannot be written, for example since the disk is full. Nothing was added.
-        """
+          actions: `[L, A]` float32, little-endian."""
         self._append(self.requests + 1, actions)
         self.requests += 1
 
     def end(self) -> None:
-        """End the stepping, durably; ending it twice does nothing.
-
-        Raises:
-          OSError: it cannot be written. Nothing was added.
-        """
+        """End the stepping, durably; ending it twice does nothing."""
         if not self.ended:
             self._append(_END, bytes(self._actions_size))
             self.ended = True
         self.sync()
 
     def sync(self) -> None:
-        """Make what was added survive a loss of power.
-
-        Raises:
-          OSError: the disk fails.
-        """
+        """Make what was added survive a loss of power."""
         if self._unsynced:
             self._unsynced = False  # before, since steps may follow meanwhile
             try:
@@ -135,22 +113,19 @@ class Journal:
                 self._unsynced = True
                 raise
 
-    def actions(self) -> Iterator[npt.NDArray[np.float32]]:
-        """The actions of each request in order, `[L, A]` as they arrived."""
+    def bodies(self, first: int = 0, last: int | None = None) -> Iterator[bytes]:
+        """The bodies of the requests after the first so many, in order."""
         with open_regular(self.path) as stream:
-            stream.seek(_START)
-            for _ in range(self.requests):
-                _, actions = self._record(stream)
-                yield np.frombuffer(actions, "<f4").reshape(self.lanes, self.action_dim)
+            stream.seek(_START + first * self._record_size)
+            for _ in range(first, self.requests if last is None else last):
+                number, actions = self._record(stream)
+                yield _NUMBER.pack(number) + actions
 
     def digest(self) -> str:
         """SHA-256 of the bodies of all requests for steps, in order, as their senders know it."""
         hashed = hashlib.sha256()
-        with open_regular(self.path) as stream:
-            stream.seek(_START)
-            for _ in range(self.requests):
-                number, actions = self._record(stream)
-                hashed.update(_NUMBER.pack(number) + actions)
+        for body in self.bodies():
+            hashed.update(body)
         return f"sha256:{hashed.hexdigest()}"
 
     def _append(self, number: int, actions: bytes) -> None:
@@ -185,8 +160,14 @@ class Journal:
             os.ftruncate(handle, self._size)
             self._torn = False
 
-    def _count(self, stream: BinaryIO) -> None:
+    def _count(self, stream: BinaryIO, known: int) -> None:
         """Count the records, up to the last whole one."""
+        if known:
+            stream.seek(_START + (known - 1) * self._record_size)
+            if self._record(stream)[0] == known:
+                self.requests, self._size = known, _START + known * self._record_size
+            else:  # a loss of power took it
+                stream.seek(_START)
         while not self.ended:
             number, _ = self._record(stream)
             if number not in (self.requests + 1, _END):

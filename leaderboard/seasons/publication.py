@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 from leaderboard.errors import BoardError
 from leaderboard.seasons.master import Master
-from leaderboard.seasons.scoring import Instance, challenge, instances
+from leaderboard.seasons.scoring import HiddenTask, challenge, instances
 from leaderboard.seasons.season import MAX_INSTANCES, Digests, Hidden, Season, Terms, rows_of
 from sme_registry.compiled import chosen_backend
 from sme_registry.datasets import DatasetRecipe, SealedDataset
@@ -234,7 +234,7 @@ def _refuse_other_sizes(path: Path, data: SealedDataset, hidden: Hidden) -> None
 
 
 def follows(
-    instance: Instance, master: Master, expected: Digests, folder: Path | None = None
+    instance: HiddenTask, master: Master, expected: Digests, folder: Path | None = None
 ) -> Literal["exactly", "within rounding", "unknown", "no"]:
     """Whether what was published of an instance is what the master gives when generated again.
 
@@ -264,12 +264,12 @@ def follows(
     return "within rounding" if data.agrees_with(published) else "no"
 
 
-def _generate(instance: Instance, master: Master) -> tuple[SealedDataset, bytes]:
+def _generate(instance: HiddenTask, master: Master) -> tuple[SealedDataset, bytes]:
     data = SealedDataset.collect(recipe(instance, master))
     return data, pack_table(challenge(instance.spec, instance.protocol))
 
 
-def recipe(instance: Instance, master: Master) -> DatasetRecipe:
+def recipe(instance: HiddenTask, master: Master) -> DatasetRecipe:
     """What the data set of an instance is generated from; secret until the reveal."""
     data = instance.hidden.member.data
     assert data is not None  # the track is offline
@@ -283,7 +283,7 @@ def recipe(instance: Instance, master: Master) -> DatasetRecipe:
     )
 
 
-def _publish(instance: Instance, season: str, master: Master, folder: Path) -> Digests:
+def _publish(instance: HiddenTask, season: str, master: Master, folder: Path) -> Digests:
     data, states = _generate(instance, master)
     data = data.rounded()
     data.write(_dataset_id(season, instance.hidden), folder / "datasets")

@@ -23,7 +23,7 @@ from leaderboard.scoring.aggregation import is_oracle_like, method_scores
 from leaderboard.scoring.ranking import RankedRow, ranking
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.scoring import (
-    Instance,
+    HiddenTask,
     groups_of_season,
     instances,
     score_runs,
@@ -170,7 +170,7 @@ def _scored_at_once(
 
 
 def _read(
-    store: Store, instance: Instance, answer: Artefact | None
+    store: Store, instance: HiddenTask, answer: Artefact | None
 ) -> tuple[Float32 | None, str | None]:
     if answer is None:
         return None, None

@@ -48,7 +48,7 @@ _UNUSED = ("stable_baselines3", "torch", "onnxruntime")
 
 
 @dataclass(frozen=True)
-class Instance:
+class HiddenTask:
     """One hidden instance, as far as the master determines it.
 
     Attributes:
@@ -64,7 +64,7 @@ class Instance:
     protocol: EvaluationProtocol
 
     def __repr__(self) -> str:
-        return f"Instance({self.hidden.member.name}, {self.hidden.instance})"
+        return f"HiddenTask({self.hidden.member.name}, {self.hidden.instance})"
 
     @property
     def rows(self) -> int:
@@ -74,7 +74,7 @@ class Instance:
 
 def instances(
     terms: Terms, master: Master, ticket: str = "", nonce: str = ""
-) -> Iterator[Instance]:
+) -> Iterator[HiddenTask]:
     """Every hidden instance of a season, or of one of its tickets, in order.
 
     Args:
@@ -87,7 +87,7 @@ def instances(
         place = Place(terms.id, member.name, hidden.instance, ticket, nonce)
         spec = SMESpec.from_dict({**member.setting.to_dict(), "seed": master.seed(place)})
         seed = master.states_seed(place)
-        yield Instance(hidden, place, spec, terms.protocol.model_copy(update={"seed": seed}))
+        yield HiddenTask(hidden, place, spec, terms.protocol.model_copy(update={"seed": seed}))
 
 
 def challenge(spec: SMESpec, protocol: EvaluationProtocol) -> Float32:
@@ -104,7 +104,7 @@ def challenge(spec: SMESpec, protocol: EvaluationProtocol) -> Float32:
 
 
 def score_run(
-    instance: Instance, answers: Float32 | None, digest: str | None, rules: int = RULES
+    instance: HiddenTask, answers: Float32 | None, digest: str | None, rules: int = RULES
 ) -> tuple[RunScore, dict[str, str]]:
     """The score of the answers on an instance, and the versions of packages behind it.
 
@@ -120,7 +120,7 @@ def score_run(
 
 
 def score_runs(
-    instance: Instance, answered: Sequence[tuple[Float32 | None, str | None]], rules: int
+    instance: HiddenTask, answered: Sequence[tuple[Float32 | None, str | None]], rules: int
 ) -> list[tuple[RunScore, dict[str, str]]]:
     """`score_run` of several answers on an instance, whose optimum takes most of the time."""
     replies = [None if answers is None else _Replies(answers) for answers, _ in answered]
@@ -145,7 +145,7 @@ def score_runs(
 
 
 def _run_score(
-    instance: Instance, report: EvaluationReport, digest: str | None, rules: int
+    instance: HiddenTask, report: EvaluationReport, digest: str | None, rules: int
 ) -> RunScore:
     regrets = tuple(region.normalised_regret for region in report.regions)
     similarity = tuple(region.similarity for region in report.regions)

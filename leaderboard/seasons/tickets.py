@@ -1,369 +1,250 @@
-"""`Tickets`: those of one sealed-online season, whose master this server has.
+"""`Ticket`: hidden tasks for one entrant, stepped by the board; and its result, once it is over.
 
-Beside requests, every second the journals are synced, and tickets that are over are closed and
-scored, one after the other in a process of their own, so that steps go on. A ticket that cannot be
-scored is tried again after all others, after growing pauses of up to five minutes.
+An instance without answers, or whose answers the entrant has not signed, scores 1 in every metric,
+whatever its steps.
 """
 
 from __future__ import annotations
 
 import contextlib
-import logging
-import multiprocessing
-import os
-import signal
-import threading
-import time
-from collections import OrderedDict
-from collections.abc import Collection, Iterator, Sequence
-from multiprocessing.process import BaseProcess
-from pathlib import Path
+import datetime
+import hmac
+from functools import partial
+from itertools import islice
 
-from leaderboard.errors import BoardError, TamperedError
-from leaderboard.seasons.instance import SteppedInstance
-from leaderboard.seasons.master import Master
-from leaderboard.seasons.scores import score_ticket, unplayed_result
-from leaderboard.seasons.season import MAX_LANES, Season
-from leaderboard.seasons.ticket import RunningTicket, deadline
-from leaderboard.store import Store
-from sme_registry.io import file_lock
-from sme_registry.seasons.wire import StepFormat, TicketStatus
-
-MOST_HELD_LANES, _FIXED_LANES, _WEIGHTS_OF_A_LANE = 2**17, 128, 100
-"""In memory, of all instances together; what each takes besides its lanes, and its network.
-
-Those used longest ago are replayed when they go on.
-"""
+from leaderboard.documents.signed import MAX_BYTES, Signed
+from leaderboard.documents.submission import shifted, utc
+from leaderboard.errors import Rejection, TamperedError
+from leaderboard.scoring.aggregation import failed_run
+from leaderboard.seasons.entry import AllHeads, has_signed
+from leaderboard.seasons.instance import Instance, storage
+from leaderboard.seasons.master import Master, Place
+from leaderboard.seasons.scoring import HiddenTask, challenge, instances, score_run, sealed_result
+from leaderboard.seasons.season import MAX_LANES, SealedResult, Season
+from leaderboard.seasons.stepping import Start, no_steps
+from leaderboard.store import SealedRow, Store
+from sme_registry import seasons
+from sme_registry.errors import SMEError
+from sme_registry.io import parse_json, read_regular, to_json, write_atomically
+from sme_registry.seasons import wire
+from sme_registry.seasons.transcript import Place as InstancePlace
 
 
-class Tickets:
-    """The tickets of one season, for any number of threads; `close` frees the season.
+def deadline(season: Season, row: SealedRow) -> str:
+    """When a ticket of an online season ends at the latest."""
+    assert season.ticket_hours is not None  # the track is online
+    started = datetime.datetime.fromisoformat(row.entrant.received)
+    return utc(shifted(started, datetime.timedelta(hours=season.ticket_hours)))
+
+
+class Ticket:
+    """One ticket: it runs until all instances are answered, or its deadline has passed.
 
     Args:
       store: the board.
-      secret: the path of the season's master.
-      season: digest of the season; by default the first that is committed to the master.
-
-    Raises:
-      BoardError: no online season of the board is committed to the master, or another server steps
-        the season.
+      season, master: the season.
+      row: the ticket's.
 
     Attributes:
-      season, digest: the season, and the digest of its document.
-      board, secret: paths of the board's folder and of the master.
+      number: in the season, from 1.
+      id: of the request that started it.
+      deadline: its end.
+      instances: in the season's order.
     """
 
-    def __init__(
-        self, store: Store, secret: str | os.PathLike[str], season: str | None = None
-    ) -> None:
-        self.master = Master.read(secret)
-        seasons = _seasons_of(store, self.master, secret)
-        self.season = seasons[0] if season is None else store.season(season)
-        self.digest = self.season.digest
-        folder = store.season_folder(self.digest)
-        folder.path.mkdir(parents=True, exist_ok=True)
-        lock = file_lock(folder.stepping)
-        if lock is None:
-            raise BoardError(
-                f"season={self.season.id}: another server steps it. Stop that one first."
+    def __init__(self, store: Store, season: Season, master: Master, row: SealedRow) -> None:
+        self.number, self.id = row.number, row.entrant.id
+        self._season, self._master = season, master
+        self._request = request = store.request_of(row)
+        self._nonce = request.content.nonce
+        place = Place(season.id, "", 0, str(row.number), self._nonce)
+        self._token = master.secret("token", place).hex()
+        self.deadline = deadline(season, row)
+        self._closed = row.result is not None
+        folder = store.season_folder(row.season).ticket(row.number)
+        self._end_path = folder / "end.json"
+        self.instances = tuple(
+            Instance(
+                *(folder, self._place(number), request, hidden.member, season.protocol),
+                *(partial(self.start, number), partial(self._states, number)),
             )
-        self._process_lock = lock
-        self._store = store
-        self.board, self.secret = store.folder.path, Path(secret)
-        self._lock = threading.Lock()
-        self._running: dict[int, RunningTicket] = {}
-        self._held: OrderedDict[SteppedInstance, int] = OrderedDict()
-        self._held_lanes = 0
-
-    @classmethod
-    def of_master(cls, store: Store, secret: str | os.PathLike[str]) -> list[Tickets]:
-        """Those of each online season that is committed to a master; errors as of the class."""
-        seasons = _seasons_of(store, Master.read(secret), secret)
-        return [cls(store, secret, season.digest) for season in seasons]
-
-    def ticket(self, number: int) -> RunningTicket:
-        """A ticket by its number.
-
-        Raises:
-          Rejection: `ticket_unknown`.
-        """
-        found = self._running.get(number)
-        if found is None:
-            row = self._store.ticket(self.digest, number)
-            found = RunningTicket(self._store, self.season, self.master, row)
-            with self._lock:
-                found = self._running.setdefault(number, found)
-        return found
+            for number, hidden in enumerate(season.hidden)
+        )
 
     @property
-    def step_bytes(self) -> int:
-        """The most bytes of a request for steps, of any instance."""
-        dims = (member.setting.action_dim for member in self.season.classes)
-        return StepFormat(MAX_LANES, 1, max(dims)).request_bytes
+    def document(self) -> seasons.Ticket:
+        """What the entrant gets; it holds the password."""
+        return seasons.Ticket.from_dict(
+            {
+                "season": self._season.id,
+                "ticket": self.number,
+                "token": self._token,
+                "deadline": self.deadline,
+                "lanes": MAX_LANES,
+                "classes": [member.model_dump(exclude={"data"}) for member in self._season.classes],
+            }
+        )
 
-    def status(self, number: int, token: str) -> TicketStatus:
-        """How far an entrant is, with the password of the ticket."""
-        ticket = self.ticket(number)
-        ticket.refuse_token(token)
-        return ticket.status(self._store.clock.time)
+    def check_token(self, token: str) -> None:
+        """Raise `Rejection` (`token_wrong`) unless this is the ticket's password."""
+        if not hmac.compare_digest(token.encode(), self._token.encode()):
+            raise Rejection(
+                "token_wrong",
+                f"ticket={self.number}: the token in the header Authorization is not its own. "
+                "Send `Bearer` and the token that the board answered when the ticket started.",
+            )
 
-    def answer_bytes(self, number: int, token: str, instance: int) -> int:
-        """The most bytes of an instance's answers, with the password of the ticket."""
-        ticket = self.ticket(number)
-        ticket.refuse_token(token)
-        return ticket.instance(instance).answer_bytes
+    def is_over(self, now: str) -> bool:
+        """Whether nothing can change any more, at a time of the board."""
+        return self._closed or now >= self.deadline or self._end_path.exists()
 
-    def start(self, number: int, token: str, instance: int, lanes: int) -> bytes:
-        """`SteppedInstance.start`, with the password of the ticket."""
-        chosen = self._chosen(number, token, instance)
-        answer = chosen.start(lanes)
-        self._hold(chosen)
-        return answer
+    @property
+    def is_unplayed(self) -> bool:
+        """Whether the entrant has neither signed nor answered anything."""
+        return not any(each.is_played for each in self.instances)
 
-    def step(self, number: int, token: str, instance: int, body: bytes) -> bytes:
-        """`SteppedInstance.step`, with the password of the ticket."""
-        chosen = self._chosen(number, token, instance)
-        answer = chosen.step(body)
-        self._hold(chosen)
-        return answer
+    def check_running(self, now: str) -> None:
+        """Raise `Rejection` (`ticket_ended`) if the ticket is over, or older than transcripts."""
+        if self._closed or now >= self.deadline or self._request.content.transcript is None:
+            raise Rejection(
+                "ticket_ended",
+                f"ticket={self.number}: has ended, at the latest at {self.deadline}. What it "
+                "had counts.",
+            )
 
-    def quick_step(self, number: int, token: str, instance: int, body: bytes) -> bytes | None:
-        """`step`, which does not block; None where it would."""
-        ticket = self._running.get(number)
-        instances = () if ticket is None else ticket.instances
-        if instance >= len(instances) or not instances[instance].is_ready:
-            return None
-        return self.step(number, token, instance, body)
-
-    def finish(self, number: int, token: str, instance: int) -> None:
-        """`SteppedInstance.finish`, with the password of the ticket."""
-        self._chosen(number, token, instance).finish()
-
-    def refuse_challenge(self, number: int, token: str, instance: int) -> None:
-        """`SteppedInstance.refuse_challenge`, with the password of the ticket."""
-        self._chosen(number, token, instance).refuse_challenge()
-
-    def challenge(self, number: int, token: str, instance: int) -> bytes:
-        """`RunningTicket.challenge`, with the password of the ticket."""
-        self._chosen(number, token, instance)
-        return self.ticket(number).challenge(instance)
-
-    def journal_digest(self, number: int, token: str, instance: int) -> str:
-        """`SteppedInstance.journal_digest`, with the password of the ticket; also after its end."""
-        ticket = self.ticket(number)
-        ticket.refuse_token(token)
-        return ticket.instance(instance).journal_digest()
-
-    def answer(
-        self, number: int, token: str, instance: int, data: bytes, signature: str = ""
-    ) -> bool:
-        """`SteppedInstance.answer`, with the password of the ticket.
-
-        The same answers are confirmed after the ticket's end, too: the last ones are what ends it.
-        """
-        ticket = self.ticket(number)
-        ticket.refuse_token(token)
-        chosen = ticket.instance(instance)
-        if chosen.has_stored(data):
-            return False
-        ticket.refuse_over(self._store.clock.received())
-        return chosen.answer(data, signature)
-
-    def over(self) -> list[int]:
-        """The numbers of tickets that are over and have no result, in order."""
-        waiting, now = [], self._store.time
-        for row in self._store.entrants(self.digest):
-            if row.result is None:
-                waiting.append(row)
-            else:
-                self._running.pop(row.number, None)  # closed, and so its files are final
-        over = []
-        for row in waiting:
-            # An altered request holds up no other ticket; `verify` names its file.
-            with contextlib.suppress(TamperedError):
-                ticket = self.ticket(row.number)
-                ticket.deadline = deadline(self.season, row)  # a wrong clock's date is corrected
-                if ticket.is_over(now):
-                    over.append(row.number)
-        return over
-
-    def close_ticket(self, number: int) -> None:
-        """Refuse all further requests for a ticket, after those in progress."""
-        self.ticket(number).close()
-
-    def end_unplayed(self, numbers: Sequence[int], most: int) -> list[int]:
-        """Log the results of tickets that are over and that nobody has played.
+    def end(self, signature: str) -> None:
+        """End the ticket, all of which is answered.
 
         Args:
-          numbers: of tickets that are over.
-          most: results to log at a time.
+          signature: of the heads of all transcripts.
 
-        Returns:
-          The numbers of the others.
+        Raises:
+          Rejection: `instance_phase`, `bad_signature`, or `storage_full`.
         """
-        unplayed = {number for number in numbers if self.ticket(number).is_unplayed}
-        for number in sorted(unplayed)[:most]:
-            ticket = self.ticket(number)
-            ticket.close()
-            if ticket.is_unplayed:  # still: requests were in progress
-                result = unplayed_result(self._store, self.season, ticket)
-                self._store.end_ticket(self.digest, number, result)
-        return [number for number in numbers if number not in unplayed]
+        heads = self._heads
+        if not has_signed(self._request, signature, heads):
+            raise Rejection(
+                "bad_signature",
+                f"signature={signature[:16]!a}: must be of the transcripts of all instances. Use "
+                "the ticket's file, and the transcripts beside it.",
+            )
+        if not self._end_path.exists():
+            receiver = self._request.receiver._asdict()
+            signed = Signed[AllHeads](content=heads, signature=signature, **receiver)
+            with storage():
+                write_atomically(self._end_path, to_json(signed.to_dict()))
 
-    def sync(self) -> None:
-        """Make all steps taken survive a loss of power."""
-        with self._lock:
-            held = list(self._held)
-        for each in held:
-            with contextlib.suppress(OSError):  # the next steps fail, too, and say so
-                each.sync()
+    @property
+    def _heads(self) -> AllHeads:
+        heads = []
+        for number, instance in enumerate(self.instances):
+            head = instance.final_head()
+            if head is None:
+                raise Rejection(
+                    "instance_phase",
+                    f"instance={number}: has no answers. Answer it before the ticket's end.",
+                )
+            heads.append(head)
+        return AllHeads(request=self.id, ticket=self.number, heads=tuple(heads))
+
+    @property
+    def is_ended(self) -> bool:
+        """Whether the entrant has signed its end; or answered all of it, before transcripts.
+
+        Raises:
+          TamperedError: what is stored as the end is not signed by the entrant.
+        """
+        if self._request.content.transcript is None:
+            return all(each.answered for each in self.instances)
+        if not self._end_path.exists():
+            return False
+        with contextlib.suppress(SMEError):
+            data = read_regular(self._end_path, MAX_BYTES)
+            signed = Signed[AllHeads].from_dict(parse_json(data, self._end_path.name))
+            if signed.content == self._heads and has_signed(
+                self._request, signed.signature, signed.content
+            ):
+                return True
+        where = "/".join(self._end_path.parts[-5:])
+        raise TamperedError(where, "is not the entrant's signature of all transcripts")
+
+    def status(self, now: str) -> wire.TicketStatus:
+        """How far the entrant is."""
+        return wire.TicketStatus(
+            ticket=self.number,
+            phase="ended" if self.is_over(now) else "running",
+            deadline=self.deadline,
+            instances=tuple(each.status for each in self.instances),
+        )
+
+    def instance(self, number: int) -> Instance:
+        """Instance i of the ticket.
+
+        Raises:
+          Rejection: `instance_unknown`.
+        """
+        if number >= len(self.instances):
+            raise Rejection(
+                "instance_unknown",
+                f"instance={number}: must be in [0, {len(self.instances) - 1}]. Correct it.",
+            )
+        return self.instances[number]
+
+    def hidden(self, number: int) -> HiddenTask:
+        """What is hidden of instance i."""
+        every = instances(self._season, self._master, str(self.number), self._nonce)
+        return next(islice(every, number, None))
+
+    def start(self, number: int) -> Start:
+        """What the steps of instance i follow from."""
+        hidden = self.hidden(number)
+        seed = int.from_bytes(self._master.secret("starts", hidden.place))
+        return Start(hidden.spec, seed, self._place(number))
+
+    def _place(self, number: int) -> InstancePlace:
+        return InstancePlace(request=self.id, ticket=self.number, instance=number)
+
+    def _states(self, number: int) -> bytes:
+        hidden = self.hidden(number)
+        return wire.pack_table(challenge(hidden.spec, hidden.protocol))
+
+    def forget(self) -> None:
+        """Remove what only playing and scoring needed."""
+        for each in self.instances:
+            each.forget()
 
     def close(self) -> None:
-        """End what this server does for the season; another one can go on."""
-        for ticket in list(self._running.values()):
-            for each in ticket.instances:
-                each.release()
-        self._process_lock.release()
-
-    def _chosen(self, number: int, token: str, instance: int) -> SteppedInstance:
-        ticket = self.ticket(number)
-        ticket.refuse_token(token)
-        ticket.refuse_over(self._store.clock.received())
-        return ticket.instance(instance)
-
-    def _hold(self, instance: SteppedInstance) -> None:
-        """Note that an instance was used, and free others if too many are held."""
-        freed = []
-        with self._lock:
-            if instance not in self._held:
-                network = instance.weights // _WEIGHTS_OF_A_LANE
-                self._held[instance] = instance.lanes + _FIXED_LANES + network
-                self._held_lanes += self._held[instance]
-            self._held.move_to_end(instance)
-            while self._held_lanes > MOST_HELD_LANES:
-                oldest, lanes = self._held.popitem(last=False)
-                self._held_lanes -= lanes
-                freed.append(oldest)
-        for each in freed:
-            each.release()
+        """End the ticket: wait for the requests in progress, and refuse all others."""
+        self._closed = True
+        for each in self.instances:
+            each.close()
 
 
-def _seasons_of(store: Store, master: Master, secret: str | os.PathLike[str]) -> list[Season]:
-    online = [store.season(row.id) for row in store.seasons() if row.track == "sealed-online"]
-    found = [season for season in online if season.is_committed_to(master)]
-    if not found:
-        raise BoardError(
-            f"{secret}: is the master of no sealed-online season of this board. Give the file that "
-            "`sme-leaderboard season new` wrote."
-        )
-    return found
+def score_ticket(
+    store: Store, season: Season, ticket: Ticket, *, replay: bool = False
+) -> SealedResult:
+    """Score a ticket from its snapshots and answers; or `replay` its journals, too.
+
+    Nothing of the ticket may change any more.
+
+    Raises:
+      Rejection: `storage_full` if a file cannot be read.
+      TamperedError: a journal, answers or a signature are not those of the instance.
+    """
+    runs, stepping = [], []
+    versions: dict[str, str] = {}
+    for index, instance in enumerate(ticket.instances):
+        answers, digest = instance.answers
+        run, used = score_run(ticket.hidden(index), answers, digest, store.document.rules)
+        runs.append(run)
+        versions |= used
+        stepping.append(instance.replayed() if replay else instance.stepping())
+    draws, rules = store.document.draws, store.document.rules
+    return sealed_result(season, ticket.id, runs, versions, draws, stepping, rules)
 
 
-_SECONDS = 1.0
-_AT_ONCE = 100  # tickets: of a process, or unplayed ones of a second
-_FIRST_PAUSE, _LONGEST_PAUSE = 1.0, 300.0
-_STOP_SECONDS = 10.0
-_log = logging.getLogger(__name__)
-
-
-@contextlib.contextmanager
-def attending(tickets: Collection[Tickets]) -> Iterator[None]:
-    """Sync, end and score in a thread while the block runs."""
-    if not tickets:
-        yield
-        return
-    stop = threading.Event()
-    attendants = [Attendant(each) for each in tickets]
-
-    def attend() -> None:
-        while not stop.wait(_SECONDS):
-            for each in attendants:
-                each.attend()
-
-    thread = threading.Thread(target=attend, name="seasons", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
-        for each in attendants:
-            each.stop()
-
-
-class Attendant:
-    """What a server does for one season beside requests."""
-
-    def __init__(self, tickets: Tickets) -> None:
-        self._tickets = tickets
-        self._process: BaseProcess | None = None
-        self._numbers: list[int] = []  # of the tickets that the process scores
-        self._at_once = _AT_ONCE
-        self._failed: set[int] = set()
-        self._pause, self._retry_at = _FIRST_PAUSE, 0.0
-
-    def attend(self) -> None:
-        """Sync the journals, and score the next tickets that are over."""
-        try:
-            self._tickets.sync()
-            is_scoring = self._is_scoring()
-            played = self._tickets.end_unplayed(self._tickets.over(), _AT_ONCE)
-            if is_scoring:
-                return
-            waiting = [number for number in played if number not in self._failed]
-            if waiting:
-                self._numbers = waiting[: self._at_once]
-                for number in self._numbers:
-                    self._tickets.close_ticket(number)
-                self._process = self._start()
-            elif time.monotonic() >= self._retry_at:
-                self._failed.clear()
-        except Exception as error:  # the board is locked, or has no memory or files left
-            # Nothing but the kind of an error is logged: its text may name what is hidden.
-            _log.error("season: cannot be attended to: %s", type(error).__name__)
-
-    def stop(self) -> None:
-        """End the scoring; the next server does it."""
-        if self._process is not None:
-            self._process.terminate()
-            self._process.join(_STOP_SECONDS)
-
-    def _start(self) -> BaseProcess:
-        # Not forked: this process has threads, connections and locks.
-        process = multiprocessing.get_context("spawn").Process(
-            target=_score,
-            args=(self._tickets.board, self._tickets.digest, self._tickets.secret, self._numbers),
-            name="tickets",
-        )
-        process.start()
-        return process
-
-    def _is_scoring(self) -> bool:
-        if self._process is None or self._process.is_alive():
-            return self._process is not None
-        failed = self._process.exitcode != 0
-        self._process.close()
-        self._process = None
-        if failed:  # others first
-            _log.error("season: a ticket could not be scored; it is tried again")
-            self._failed.update(self._numbers)  # those with a result are not over any more
-            self._retry_at = time.monotonic() + self._pause
-        self._pause = min(2.0 * self._pause, _LONGEST_PAUSE) if failed else _FIRST_PAUSE
-        # The process may have died before it came to the others.
-        self._at_once = 1 if failed else _AT_ONCE
-        return False
-
-
-def _score(board: Path, season: str, secret: Path, numbers: Sequence[int]) -> None:
-    """Score tickets and log their results, in a process of its own."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server ends it
-    failed = False
-    for number in numbers:
-        try:
-            with Store.open(board) as store:
-                result = score_ticket(store, store.season(season), Master.read(secret), number)
-                store.end_ticket(season, number, result)
-        except Exception as error:
-            _log.error("season: scoring ticket %d failed: %s", number, type(error).__name__)
-            failed = True
-    raise SystemExit(failed)
+def unplayed_result(store: Store, season: Season, ticket: Ticket) -> SealedResult:
+    """What `score_ticket` computes for a ticket of which nothing is signed, and at no cost."""
+    runs = [failed_run(season.protocol, hidden.member.name, None) for hidden in season.hidden]
+    stepping = [no_steps(each.budget, each.status.lanes or 1) for each in ticket.instances]
+    return sealed_result(season, ticket.id, runs, {}, store.document.draws, stepping)

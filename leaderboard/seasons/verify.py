@@ -32,10 +32,9 @@ from leaderboard.seasons.events import SealedRow, SeasonRow
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.publication import check_published, follows, read_season
 from leaderboard.seasons.ranking import counting, scored_entries
-from leaderboard.seasons.scores import score_ticket
 from leaderboard.seasons.scoring import instances, sealed_result
 from leaderboard.seasons.season import SealedResult, Season
-from leaderboard.seasons.ticket import RunningTicket, deadline
+from leaderboard.seasons.tickets import Ticket, deadline, score_ticket
 from leaderboard.store import Store
 
 
@@ -210,15 +209,11 @@ class _Verifier:
             yield from scored_entries(self.store, self.season, master, rows)
             return
         for row in rows:
-            self.check_answers(master, row)
-            yield score_ticket(self.store, self.season, master, row.number)
-
-    def check_answers(self, master: Master, row: SealedRow) -> None:
-        """Check that the entrant has signed what was played on each answered instance."""
-        ticket = RunningTicket(self.store, self.season, master, row)
-        for number, instance in enumerate(ticket.instances):
-            if not instance.is_signed:
-                self.refuse(row, f"instance {number}: its answers are not what the entrant signed")
+            ticket = Ticket(self.store, self.season, master, row)
+            if row.finished < ticket.deadline and not ticket.is_ended:
+                message = f"ended at {row.finished}, without the entrant's end: must not be before "
+                self.refuse(row, f"{message}{ticket.deadline}, its deadline")
+            yield score_ticket(self.store, self.season, ticket, replay=True)
 
     def contradiction(self, result: SealedResult) -> Difference | None:
         """The first value of a result that does not follow from the regrets of its runs."""

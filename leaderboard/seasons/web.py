@@ -11,11 +11,11 @@
     POST /api/seasons/{id}/tickets/{n}/instances/{i}/steps      one step of all lanes
     POST /api/seasons/{id}/tickets/{n}/instances/{i}/finish     take no more steps
     GET  /api/seasons/{id}/tickets/{n}/instances/{i}/challenge  challenge states
-    GET  /api/seasons/{id}/tickets/{n}/instances/{i}/journal    digest of the steps
     PUT  /api/seasons/{id}/tickets/{n}/instances/{i}/answers    201 stored, 200 the same again
+    POST /api/seasons/{id}/tickets/{n}/end                      the ticket's end
 
-Steps of an instance that is ready are taken in the event loop; what replays a journal or waits for
-the disk runs in threads.
+Steps of an instance that is ready are taken in the event loop; what goes on from a snapshot or
+waits for the disk runs in threads.
 """
 
 from __future__ import annotations
@@ -37,21 +37,21 @@ from leaderboard.documents.signed import MAX_BYTES, Signed
 from leaderboard.errors import Rejection
 from leaderboard.seasons.admission import receive_entry, refuse_other_sender, start_ticket
 from leaderboard.seasons.entry import Entry, TicketRequest
+from leaderboard.seasons.instance import Instance
 from leaderboard.seasons.pages import SECTION
 from leaderboard.seasons.ranking import (
     ranking_facts,
 )
-from leaderboard.seasons.tickets import Tickets, attending
+from leaderboard.seasons.sessions import Sessions, attending
 from leaderboard.store import SeasonRow, Store
 from leaderboard.web.http import HTTP_CODES, RequestError, read_body
 from sme_registry import seasons
 from sme_registry.io import to_json
-from sme_registry.seasons import wire
 
 _SEASON = "/api/seasons/{season}"
 _TICKET = _SEASON + "/tickets/{ticket}"
 _INSTANCE = _TICKET + "/instances/{instance}"
-_WORKERS = 4  # threads that replay journals and write answers
+_WORKERS = 4  # threads that go on from snapshots and write answers
 _LARGEST = 2**31
 _CURVE_POINTS = 40
 _RANKINGS_KEPT = 16
@@ -70,11 +70,10 @@ class SeasonRoutes:
         self, store: Store, secrets: Iterable[str | os.PathLike[str]], address: str
     ) -> None:
         self._store, self._address = store, address
-        self._tickets = {
-            each.season.id: each for path in secrets for each in Tickets.of_master(store, path)
+        self._sessions = {
+            each.season.id: each for path in secrets for each in Sessions.of_master(store, path)
         }
         self._threads = CapacityLimiter(_WORKERS)
-        self._challenges = CapacityLimiter(1)
         self._requests = CapacityLimiter(1)
         self._entries = CapacityLimiter(1)
         self._rankings = CapacityLimiter(1)
@@ -84,10 +83,10 @@ class SeasonRoutes:
     def open(self) -> Iterator[None]:
         """End and score tickets while the block runs; afterwards another server may step them."""
         try:
-            with attending(self._tickets.values()):
+            with attending(self._sessions.values()):
                 yield
         finally:
-            for each in self._tickets.values():
+            for each in self._sessions.values():
                 each.close()
 
     @property
@@ -98,7 +97,6 @@ class SeasonRoutes:
             Route(f"{_INSTANCE}/start", self.start, methods=["POST"]),
             Route(f"{_INSTANCE}/finish", self.finish, methods=["POST"]),
             Route(f"{_INSTANCE}/challenge", self.challenge, methods=["GET"]),
-            Route(f"{_INSTANCE}/journal", self.journal, methods=["GET"]),
             Route(f"{_INSTANCE}/answers", self.answer, methods=["PUT"]),
             Route("/api/seasons", self.get_seasons, methods=["GET"]),
             Route(_SEASON, self.get_season, methods=["GET"]),
@@ -106,6 +104,7 @@ class SeasonRoutes:
             Route(f"{_SEASON}/entries", self.post_entry, methods=["POST"]),
             Route(f"{_SEASON}/tickets", self.post_ticket, methods=["POST"]),
             Route(_TICKET, self.get_ticket, methods=["GET"]),
+            Route(f"{_TICKET}/end", self.end, methods=["POST"]),
         ]
 
     async def get_seasons(self, request: Request) -> Response:
@@ -155,19 +154,19 @@ class SeasonRoutes:
             "opens": row.opens,
             "closes": row.closes,
             "revealed": row.revealed or None,
-            "served": row.id in self._tickets,
+            "served": row.id in self._sessions,
         }
 
     async def post_ticket(self, request: Request) -> Response:
-        tickets = self.tickets_of(request.path_params["season"])
+        sessions = self.sessions_of(request.path_params["season"])
         text = await read_body(request, MAX_BYTES, "ticket")
         header = request.headers.get("Authorization")
 
         def start() -> tuple[seasons.Ticket, bool]:
             signed = Signed[TicketRequest].read(text)
             refuse_other_sender(self._store, signed, header, self._address)
-            number, new = start_ticket(self._store, signed, tickets.digest, address=self._address)
-            return tickets.ticket(number).document, new
+            number, new = start_ticket(self._store, signed, sessions.digest, address=self._address)
+            return sessions.ticket(number).document, new
 
         ticket, new = await _run(start, self._requests)
         return JSONResponse(ticket.to_dict(), 201 if new else 200)
@@ -187,52 +186,64 @@ class SeasonRoutes:
         return JSONResponse({"id": signed.id}, 201 if new else 200)
 
     async def get_ticket(self, request: Request) -> Response:
-        tickets = self.tickets_of(request.path_params["season"])
+        sessions = self.sessions_of(request.path_params["season"])
         number, token = _small(request.scope, "ticket"), _token(request.scope)
-        status = await self._in_thread(lambda: tickets.status(number, token))
+        status = await self._in_thread(lambda: sessions.status(number, token))
         return JSONResponse(status.to_dict())
 
     async def start(self, request: Request) -> Response:
         text = request.query_params.get("lanes", "")
         if not (text.isascii() and text.isdigit() and len(text) < 10):
             raise RequestError("bad_request", f"lanes={text!r:.80}: must be a number. Correct it.")
-        tickets, where = self.place(request.scope)
         lanes = int(text)
-        return _octets(await self._in_thread(lambda: tickets.start(*where, lanes)))
+
+        def start(instance: Instance) -> bytes:
+            return instance.start(lanes)
+
+        return _octets(await self._used(request, start))
 
     async def finish(self, request: Request) -> Response:
-        tickets, where = self.place(request.scope)
-        await self._in_thread(lambda: tickets.finish(*where))
+        await self._used(request, lambda instance: instance.finish(_signature(request)))
         return Response()
 
     async def challenge(self, request: Request) -> Response:
-        tickets, where = self.place(request.scope)
-        await self._in_thread(lambda: tickets.refuse_challenge(*where))
-        return _octets(await _run(lambda: tickets.challenge(*where), self._challenges))
-
-    async def journal(self, request: Request) -> Response:
-        tickets, where = self.place(request.scope)
-        digest = await _run(lambda: tickets.journal_digest(*where), self._challenges)
-        return JSONResponse(wire.JournalDigest(journal=digest).to_dict())
+        return _octets(await self._used(request, Instance.challenge))
 
     async def answer(self, request: Request) -> Response:
-        tickets, where = self.place(request.scope)
-        limit = await self._in_thread(lambda: tickets.answer_bytes(*where))
-        data = await read_body(request, limit, "answers")
-        signature = request.query_params.get("signature", "")
-        new = await self._in_thread(lambda: tickets.answer(*where, data, signature))
+        sessions, where = self.place(request.scope)
+        instance = await self._in_thread(lambda: sessions.open(*where, ended=True))
+        data = await read_body(request, instance.answer_bytes, "answers")
+
+        def answer() -> bool:
+            if not instance.has_stored(data):
+                sessions.open(*where)
+            return instance.answer(data, _signature(request))
+
+        new = await self._in_thread(answer)
         return Response(status_code=201 if new else 200)
 
     async def step(self, request: Request) -> Response:
-        tickets, where = self.place(request.scope)
-        body = await read_body(request, tickets.step_bytes, "steps")
-        steps = tickets.quick_step(*where, body)
-        if steps is None:
-            steps = await self._in_thread(lambda: tickets.step(*where, body))
-        return _octets(steps)
+        sessions, where = self.place(request.scope)
+        body = await read_body(request, sessions.step_bytes, "steps")
+        signature = _signature(request)
 
-    def tickets_of(self, season: str) -> Tickets:
-        found = self._tickets.get(season)
+        def step() -> bytes:
+            instance = sessions.open(*where)
+            answer = instance.step(body, signature)
+            sessions.hold(instance)
+            return answer
+
+        is_ready = sessions.is_ready(where.ticket, where.instance)
+        return _octets(step() if is_ready else await self._in_thread(step))
+
+    async def end(self, request: Request) -> Response:
+        sessions = self.sessions_of(request.path_params["season"])
+        number, token = _small(request.scope, "ticket"), _token(request.scope)
+        await self._in_thread(lambda: sessions.end(number, token, _signature(request)))
+        return Response()
+
+    def sessions_of(self, season: str) -> Sessions:
+        found = self._sessions.get(season)
         if found is not None:
             return found
         row = self._store.season_row(season)
@@ -245,11 +256,23 @@ class SeasonRoutes:
             "season_not_served", f"season={season}: {HTTP_CODES['season_not_served']}."
         )
 
-    def place(self, scope: Scope) -> tuple[Tickets, _Where]:
+    def place(self, scope: Scope) -> tuple[Sessions, _Where]:
         """The tickets and the instance that a request is for."""
         parameters = scope["path_params"]
         where = _Where(_small(scope, "ticket"), _token(scope), _small(scope, "instance"))
-        return self.tickets_of(parameters["season"]), where
+        return self.sessions_of(parameters["season"]), where
+
+    async def _used(self, request: Request, use: Callable[[Instance], _T]) -> _T:
+        """What a thread does with the instance that a request is for, whose ticket runs."""
+        sessions, where = self.place(request.scope)
+
+        def work() -> _T:
+            instance = sessions.open(*where)
+            result = use(instance)
+            sessions.hold(instance)
+            return result
+
+        return await self._in_thread(work)
 
     async def _in_thread(self, work: Callable[[], _T]) -> _T:
         return await _run(work, self._threads)
@@ -278,6 +301,10 @@ def _small(scope: Scope, name: str) -> int:
 def _token(scope: Scope) -> str:
     """The password in the header `Authorization`; empty without one."""
     return Headers(scope=scope).get("Authorization", "").removeprefix("Bearer ")
+
+
+def _signature(request: Request) -> str:
+    return request.query_params.get("signature", "")
 
 
 def _octets(data: bytes) -> Response:

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import itertools
 import sys
-from typing import Any, NamedTuple, TypeAlias
+from collections.abc import Mapping
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
+import numpy.typing as npt
 from gymnasium.utils import seeding
 
 from sme_registry.compiled import Engine, engine
@@ -104,22 +106,33 @@ class InitialStates:
         self._generators: list[np.random.Generator | None] = [None] * num_envs
         self._ahead = max(1, min(_AHEAD, _MAX_NUMBERS // (num_envs * state_dim)))
         self._drawn = np.empty((num_envs, self._ahead, state_dim))
-        self._used = np.full(num_envs, self._ahead)
+        self.count = np.zeros(num_envs, np.int64)  # of states drawn since the seed
 
     def seed(self, env: int, seed: int) -> None:
         self._generators[env] = seeding.np_random(seed)[0]
-        self._used[env] = self._ahead
+        self.count[env] = 0
+
+    def skip(self, env: int, count: int) -> None:
+        """Go on, after `seed`, where so many states have been drawn."""
+        generator = self._generators[env]
+        assert generator is not None
+        self.count[env] = count
+        blocks, in_block = divmod(count, self._ahead)
+        drawn = self._drawn[env]
+        cast("np.random.PCG64", generator.bit_generator).advance(blocks * drawn.size)
+        if in_block:
+            generator.random(out=drawn)
 
     def draw(self, envs: Indices) -> Array:
         """The next state of each of these environments, `[len(envs), state_dim]`."""
-        for env in envs[self._used[envs] == self._ahead].tolist():
+        position = self.count[envs] % self._ahead
+        for env in envs[position == 0].tolist():
             generator = self._generators[env]
             if generator is None:
                 generator = self._generators[env] = seeding.np_random(None)[0]
             generator.random(out=self._drawn[env])
-            self._used[env] = 0
-        states: Array = self._drawn[envs, self._used[envs]]
-        self._used[envs] += 1
+        states: Array = self._drawn[envs, position]
+        self.count[envs] += 1
         return states
 
 
@@ -306,6 +319,25 @@ class Batch:
         self._write_seen(states.T, envs, observation)
         observation[envs, self._of_t : self._of_phase] = 0.0
         observation[envs, self._of_phase :] = self._one_hot[envs]
+
+    def snapshot(self) -> dict[str, npt.NDArray[Any]]:
+        """What the next steps of a task follow from, besides its spec and the seeds: copies."""
+        return {
+            "states": self._s.copy(),
+            "t": self._t.copy(),
+            "accumulated": self._accumulated.copy(),
+            "distractors": self._distractors.own[OWN_DRAWN:].copy(),
+            "begun": self.initial_states.count.copy(),
+        }
+
+    def restore(self, snapshot: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Go on from a snapshot of this task, after `seed` of every environment."""
+        self._s[:] = snapshot["states"]
+        self._t[:] = snapshot["t"]
+        self._accumulated[:] = snapshot["accumulated"]
+        self._distractors.own[OWN_DRAWN:] = snapshot["distractors"]
+        for env, count in enumerate(snapshot["begun"].tolist()):
+            self.initial_states.skip(env, count)
 
     def place(self, states: Array, t: Indices, accumulated: Array) -> None:
         """Put every environment at any point of an episode; `observe` gives what is seen there.

@@ -225,6 +225,20 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
             self._renderer.record(began.tolist(), unit_actions, result)
         return observation, reward, terminated, truncated, returned
 
+    def snapshot(self) -> dict[str, npt.NDArray[Any]]:
+        """What the next steps of a task follow from, besides its spec and the seed: arrays.
+
+        In mode "SameStep", and where `reset` had a seed.
+        """
+        return self._batch.snapshot()
+
+    def restore(self, snapshot: Mapping[str, npt.NDArray[Any]], seed: int) -> None:
+        """Go on from a snapshot of an environment that was reset with this seed."""
+        self.reset(seed=seed)
+        for env in range(self.num_envs):
+            self._batch.seed(env, seed + env)
+        self._batch.restore(snapshot)
+
     def render(self) -> tuple[Frame, ...] | None:
         """A frame of each environment, `[H, W, 3]` uint8; white for those not in `render_lanes`.
 

@@ -1,12 +1,12 @@
 """A hidden task of a ticket, stepped and answered over the network; as Gymnasium's environments.
 
 No request of this protocol has a further effect when it is repeated (`wire`), so a lost connection
-or a server that is being restarted costs time and nothing else.
+or a server that is being restarted costs time and nothing else. What was sent and answered is kept
+beside the ticket's file, and signed (`transcript`).
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
 from typing import Any, TypeVar, cast
 
@@ -29,20 +29,27 @@ from sme_registry.evaluation import Policy
 from sme_registry.evaluation.policies import as_policy
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.evaluation.regions import batch_rows
-from sme_registry.io import integer_in, parse_json, server_address, sha256_of
+from sme_registry.io import integer_in, parse_json, server_address
+from sme_registry.seasons.transcript import (
+    EVERY,
+    Ending,
+    Place,
+    TicketHeads,
+    Transcript,
+    answers_head,
+    challenge_head,
+    next_head,
+)
 from sme_registry.seasons.wire import (
     PATIENCE,
     Connection,
     Float32,
-    JournalDigest,
-    Statement,
     StepFormat,
     StepsAnswer,
     Ticket,
     TicketStatus,
     instance_path,
     pack_table,
-    require_signatures,
     ticket_path,
     unpack_table,
 )
@@ -61,8 +68,8 @@ WITHOUT_TASK = ("constant", "constant_half", "random", "uniform_random")
 class Instance:
     """A hidden task of a ticket, as its server shows it: observations, rewards and ends.
 
-    Whoever holds the ticket may stop at any time and go on elsewhere, but only one process at a
-    time can step an instance.
+    Only one process at a time can step an instance. Another one can go on, where it has the
+    transcript that is kept beside the ticket's file.
 
     Attributes:
       setting: all of the task's spec but its seed.
@@ -92,10 +99,16 @@ class Instance:
         self.setting: Setting = member.setting
         self.budget = member.budget
         self.number = 0
-        self.lanes = integer_in("lanes", lanes, 1, ticket.lanes)
-        self._format = StepFormat(self.lanes, self.setting.state_dim, self.setting.action_dim)
-        self._ticket, self._instance = ticket, instance
-        self._taken: hashlib._Hash | None = None  # of all steps, if this process knows them
+        self._set_lanes(integer_in("lanes", lanes, 1, ticket.lanes))
+        if ticket.signer is None:
+            raise OptionError(
+                "ticket: has no key to sign what is sent. Give the file that `sme-leaderboard "
+                "ticket` wrote."
+            )
+        self._ticket, self._instance, self._signer = ticket, instance, ticket.signer
+        self._place = Place(request=ticket.signer.request, ticket=ticket.ticket, instance=instance)
+        self._transcript = self._transcript_of(instance)
+        self._has_begun = False
         self._connection = Connection(url, ticket.token, insecure=insecure, patience=patience)
 
     @property
@@ -106,53 +119,116 @@ class Instance:
         """Begin, or go on after the last steps of any process: observations `[L, S + 2]`."""
         data = self._request("POST", f"start?lanes={self.lanes}", most=self._format.answer_bytes)
         number, observation = self._format.unpack_start(data)
+        kept = self._transcript
+        if not (kept.signed <= number <= kept.sent):
+            raise SealedError(
+                "transcript",
+                f"{kept.path}: has {kept.sent} requests for steps, and {kept.signed} of them are "
+                f"signed; the server has {number}. What was not sent here is not signed: go on "
+                "with the ticket's folder in which these steps were taken.",
+            )
         if number == 0:
-            self._taken = hashlib.sha256()
-        elif number != self.number:
-            self._taken = None
-        self.number = number
+            kept.begin(self.lanes, self._place.first_head(self.lanes, data))
+        else:
+            observation = self._sent_again(number).observation
+        self.number, self._has_begun = number, True
         return observation
+
+    def _sent_again(self, number: int) -> StepsAnswer:
+        """The answer to the last request, which the chain needs, and a killed process has lost."""
+        kept = self._transcript
+        body = number.to_bytes(8, "little") + kept.actions(number)
+        data = self._request("POST", "steps", body, most=self._format.answer_bytes)
+        head = next_head(kept.head(number - 1), body, data)
+        if kept.head(number) not in (b"", head):
+            raise SealedError(
+                "transcript",
+                f"{kept.path}: the server's answer to request {number} is not the one that it gave "
+                "before, so nothing is signed. Ask the board's owner.",
+            )
+        kept.receive(number, head)
+        return self._format.unpack_steps(data)
 
     def step(self, actions: npt.NDArray[np.floating]) -> StepsAnswer:
         """One step of every lane by finite actions `[L, A]` in [0, 1]; call `begin` first."""
-        body = self._format.pack(self.number + 1, actions)
+        number, kept = self.number + 1, self._transcript
+        body = self._format.pack(number, actions)
+        due = self.number > 0 and self.number % EVERY == 0
+        action = f"steps?signature={self._signature()}" if due else "steps"
         try:
-            data = self._request("POST", "steps", body, most=self._format.answer_bytes)
+            kept.send(number, body[8:])
+            data = self._request("POST", action, body, most=self._format.answer_bytes)
         except SealedError as error:
-            if error.code not in ("step_conflict", "step_ahead"):
-                raise
-            raise SealedError(
-                error.code,
-                f"{error.message} Call `begin` (of an environment, `reset`) to go on from the "
-                "present observation; no other process may step the instance.",
-            ) from None
-        self.number += 1
-        if self._taken is not None:
-            self._taken.update(body)
-        return self._format.unpack_steps(data)
+            if error.code in ("step_conflict", "step_ahead"):
+                raise SealedError(
+                    error.code,
+                    f"{error.message} Call `begin` (of an environment, `reset`) to go on from the "
+                    "present observation; no other process may step the instance.",
+                ) from None
+            if error.code not in ("unreachable", "wire"):  # these steps were not taken
+                kept.receive(self.number, kept.head(self.number))
+            raise
+        steps = self._format.unpack_steps(data)
+        kept.receive(number, next_head(kept.head(self.number), body, data))
+        self.number = number
+        return steps
 
     def challenge(self) -> Float32:
         """End the stepping, and return the challenge states: observations `[rows, S + 2]`."""
-        if self._ticket.signer is not None:
-            require_signatures()  # before the stepping ends for good
-        self._request("POST", "finish")
+        kept = self._transcript
+        ending = kept.ending
+        if ending is None and not self._has_begun:
+            started = self.status().instances[self._instance].lanes
+            self._set_lanes(kept.lanes or started or self.lanes)
+            self.begin()
+        if ending is None:
+            self._request("POST", f"finish?signature={self._signature()}")
+        number = self.number if ending is None else ending.requests
         data = self._request("GET", "challenge", most=2**28)
+        head = challenge_head(kept.head(number), data).hex()
+        if ending is None:
+            kept.end(Ending(request=self._place.request, requests=number, challenge=head))
+        elif ending.challenge != head:
+            raise SealedError(
+                "transcript",
+                f"{kept.path}: the server has shown other challenge states before, so nothing is "
+                "signed. Ask the board's owner.",
+            )
         return unpack_table(data, self.setting.state_dim + 2)
 
     def send_answers(self, actions: npt.NDArray[np.floating]) -> None:
-        """Sign and send the actions `[rows, A]`; the last instance's end the ticket."""
-        data, signer = pack_table(actions), self._ticket.signer
-        if signer is None:
-            self._request("PUT", "answers", data)
-            return
-        statement = Statement(
-            request=signer.request,
-            ticket=self._ticket.ticket,
-            instance=self._instance,
-            answers=sha256_of(data),
-            journal=self._journal_digest(),
-        )
-        self._request("PUT", f"answers?signature={signer.sign(statement)}", data)
+        """Sign and send the actions `[rows, A]` in the challenge states; the last end the ticket.
+
+        The challenge states must have been asked for here.
+        """
+        data, ending = pack_table(actions), self._transcript.ending
+        if ending is None:
+            raise SealedError(
+                "instance_phase",
+                f"{self._transcript.path}: has no challenge states. Ask for them first.",
+            )
+        head = answers_head(bytes.fromhex(ending.challenge), data)
+        signature = self._signer.sign(self._place.at(ending.requests + 2, head))
+        self._request("PUT", f"answers?signature={signature}", data)
+        self._transcript.end(ending.model_copy(update={"answers": head.hex()}))
+        self.end_ticket()
+
+    def end_ticket(self) -> bool:
+        """Sign all transcripts, and end the ticket; False if not all of it was answered here.
+
+        It then ends at its deadline.
+        """
+        endings = [
+            self._transcript_of(instance).ending for instance, _ in enumerate(self._ticket.places)
+        ]
+        heads = [f"sha256:{each.answers}" for each in endings if each and each.answers]
+        if len(heads) < len(endings):
+            return False
+        place = self._place
+        document = TicketHeads(request=place.request, ticket=place.ticket, heads=tuple(heads))
+        path = ticket_path(self._ticket.season, self._ticket.ticket)
+        self._connection.request("POST", f"{path}/end?signature={self._signer.sign(document)}")
+        return True
 
     def status(self) -> TicketStatus:
         path = ticket_path(self._ticket.season, self._ticket.ticket)
@@ -167,17 +243,21 @@ class Instance:
 
     def close(self) -> None:
         self._connection.close()
+        self._transcript.close()
 
-    def _journal_digest(self) -> str:
-        digest = _parse_answer(JournalDigest, self._request("GET", "journal")).journal
-        if self._taken is not None and digest != f"sha256:{self._taken.hexdigest()}":
-            raise SealedError(
-                "journal",
-                f"journal: the server's, {digest[:19]}…, is not of the steps that were taken here, "
-                "so it is not signed. If another process has stepped the instance, call `begin` "
-                "to accept its steps; otherwise ask the board's owner.",
-            )
-        return digest
+    def _set_lanes(self, lanes: int) -> None:
+        self.lanes = lanes
+        self._format = StepFormat(lanes, self.setting.state_dim, self.setting.action_dim)
+
+    def _transcript_of(self, instance: int) -> Transcript:
+        place = self._place.model_copy(update={"instance": instance})
+        action_dim = self._ticket.place(instance).member.setting.action_dim
+        return Transcript(self._ticket.path, place, action_dim)
+
+    def _signature(self) -> str:
+        """Of the transcript up to here."""
+        head = self._transcript.head(self.number)
+        return self._signer.sign(self._place.at(self.number, head))
 
     def _request(self, method: str, action: str, body: bytes = b"", *, most: int = 0) -> bytes:
         ticket = self._ticket

@@ -3,11 +3,11 @@
     POST /api/seasons/{id}/tickets                                       a ticket
     GET  /api/seasons/{id}/tickets/{n}                                   its status
     POST /api/seasons/{id}/tickets/{n}/instances/{i}/start?lanes=L       begin, or go on
-    POST /api/seasons/{id}/tickets/{n}/instances/{i}/steps               one step of all lanes
-    POST /api/seasons/{id}/tickets/{n}/instances/{i}/finish              take no more steps
+    POST /api/seasons/{id}/tickets/{n}/instances/{i}/steps?signature=    one step of all lanes
+    POST /api/seasons/{id}/tickets/{n}/instances/{i}/finish?signature=   take no more steps
     GET  /api/seasons/{id}/tickets/{n}/instances/{i}/challenge           challenge states, .npy
-    GET  /api/seasons/{id}/tickets/{n}/instances/{i}/journal             digest of all steps, JSON
     PUT  /api/seasons/{id}/tickets/{n}/instances/{i}/answers?signature=  an action for each, .npy
+    POST /api/seasons/{id}/tickets/{n}/end?signature=                    the ticket's end
 
 Each but the first has the ticket's token as `Authorization: Bearer`. Every request may be repeated
 after a lost answer: none has a further effect. Numbers are little-endian; L are the lanes, S and A
@@ -27,11 +27,12 @@ actions with that number, and numbers further ahead, are refused.
 
 Arrays travel as .npy files of version 1.0, type `<f4`, C order and two axes; nothing else is read.
 
-Answers are signed, so that no board can replace them, or the steps, unnoticed:
+Entrant and server each compute the `transcript` of an instance, and the entrant signs it:
 
-    signature = Ed25519(key, "sme-leaderboard/answers/" board "/" address "/" digest)
+    signature = Ed25519(key, "sme-leaderboard/answers/" board "/" address "/" digest of the `Head`)
 
-of the `Statement`; `address "/"` is left out for tickets that were started by earlier versions.
+`steps` needs that of the requests before where their number is a multiple of 256, `finish` that of
+all, `answers` that of the answers, too, and `end` one of the `TicketHeads`.
 
 The request for the ticket names the key's public half, and is signed by the entrant's own key. The
 ticket's file has the private half, so that a machine can step and answer without the entrant's.
@@ -56,7 +57,7 @@ from urllib.request import getproxies, proxy_bypass
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
 from sme_registry.errors import (
     ActionError,
@@ -71,21 +72,13 @@ from sme_registry.io import (
     number_in,
     parse_json,
     read_json,
-    require_packages,
     server_address,
     to_json,
 )
 from sme_registry.io.files import atomic_file, unwritable
+from sme_registry.seasons.transcript import Count, Hex, Signer
 from sme_registry.spec import Setting
-from sme_registry.spec.document import (
-    Digest,
-    Document,
-    Integer,
-    Name,
-    StrictModel,
-    TupleOf,
-    matching,
-)
+from sme_registry.spec.document import Integer, Name, StrictModel, TupleOf
 from sme_registry.task.task import Mask, Observation
 
 Float32 = npt.NDArray[np.float32]
@@ -97,41 +90,7 @@ _MAX_HEADER = 1024
 _HEADER = re.compile(
     rb"\{'descr': '<f4', 'fortran_order': False, 'shape': \((\d{1,9}), (\d{1,9})\), \} *\n"
 )
-_Hex = Annotated[str, matching(r"^[0-9a-f]{64}$", "64 hex digits")]
-_Secret = Annotated[_Hex, Field(repr=False)]
-_Count = Annotated[Integer, Field(ge=0)]
-
-
-class Statement(Document):
-    """What an entrant signs of one instance."""
-
-    request: Digest  # id of the request for the ticket, which names the season and the key
-    ticket: _Count
-    instance: _Count
-    answers: Digest  # SHA-256 of the answers' .npy file
-    journal: Digest  # SHA-256 of the bodies of all requests for steps, in order
-
-
-class Signer(Document):
-    """The key of a ticket's answers; `repr` does not show it."""
-
-    board: _Hex  # its public key
-    address: Annotated[str, Field(max_length=300)] | None = None  # at which it gave the ticket
-    request: Digest  # id of the request for the ticket
-    key: _Secret  # Ed25519's 32 private bytes
-
-    def sign(self, statement: Statement) -> str:
-        """The signature of a statement, 128 hex digits; requires PyNaCl."""
-        require_signatures()
-        from nacl.signing import SigningKey
-
-        parts = ["sme-leaderboard", "answers", self.board, self.address, statement.digest]
-        message = "/".join(filter(None, parts)).encode()
-        return SigningKey(bytes.fromhex(self.key)).sign(message).signature.hex()
-
-
-def require_signatures() -> None:
-    require_packages("signatures", {"nacl": "PyNaCl"}, "leaderboard")
+_Secret = Annotated[Hex, Field(repr=False)]
 
 
 class TicketClass(StrictModel):
@@ -174,12 +133,23 @@ class Ticket(StrictModel):
     """
 
     season: Name
-    ticket: _Count
+    ticket: Count
     token: _Secret
     deadline: Annotated[str, Field(max_length=40)]
     lanes: Annotated[Integer, Field(ge=1)]
     classes: Annotated[TupleOf[TicketClass], Field(min_length=1, max_length=1000)]
     signer: Signer | None = None
+    _path: Path | None = PrivateAttr(None)  # of its file
+
+    @property
+    def path(self) -> Path:
+        """Its file, beside which transcripts are kept."""
+        if self._path is None:
+            raise OptionError(
+                "ticket: is in no file, beside which transcripts are kept. Write it first, or give "
+                "the path of its file."
+            )
+        return self._path
 
     @property
     def places(self) -> Iterator[TicketPlace]:
@@ -193,7 +163,9 @@ class Ticket(StrictModel):
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Ticket:
-        return cls.from_dict(read_json(path), os.fspath(path))
+        ticket = cls.from_dict(read_json(path), os.fspath(path))
+        ticket._path = Path(path)
+        return ticket
 
     def write(self, path: str | os.PathLike[str]) -> Path:
         """Write the ticket into a new file that only its owner can read."""
@@ -211,26 +183,21 @@ class Ticket(StrictModel):
             ) from None
         except OSError as error:
             raise unwritable(path, error) from None
+        self._path = path
         return path
 
 
 class InstanceStatus(StrictModel):
     phase: Literal["waiting", "stepping", "answering", "answered"]
     lanes: Annotated[Integer, Field(ge=1)] | None  # null before `start`
-    requests: _Count  # number of the last steps that were taken
-    used: _Count  # steps of the budget that were taken, over all lanes
-
-
-class JournalDigest(StrictModel):
-    """The answer to a request for the digest of an instance's steps, once no more can follow."""
-
-    journal: Digest  # SHA-256 of the bodies of all requests for steps, in order
+    requests: Count  # number of the last steps that were taken
+    used: Count  # steps of the budget that were taken, over all lanes
 
 
 class TicketStatus(StrictModel):
     """The answer to a request for a ticket's status."""
 
-    ticket: _Count  # its number in the season
+    ticket: Count  # its number in the season
     phase: Literal["running", "ended"]  # ended: every instance is answered, or the deadline over
     deadline: Annotated[str, Field(max_length=40)]  # until when answers count, in UTC
     instances: TupleOf[InstanceStatus]  # in the ticket's order

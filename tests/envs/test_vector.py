@@ -227,3 +227,20 @@ def test_attributes_of_lanes_are_asked_for_as_of_gymnasiums_vectors(mode):
         env.set_attr("label", ["a", "b"])
     with pytest.raises(AttributeError, match="nothing"):
         env.get_attr("nothing")
+
+
+@pytest.mark.parametrize("fields", [{}, {"observation": {"distractors": 2}}])
+@pytest.mark.parametrize(("lanes", "steps"), [(1, 0), (1, 47), (1, 48), (3, 100)])
+def test_a_restored_batch_goes_on_as_the_one_of_the_snapshot(fields, lanes, steps):
+    there, here = (
+        SMEVectorEnv("Plane1", lanes, autoreset_mode="SameStep", horizon=3, **fields)
+        for _ in range(2)
+    )
+    there.reset(seed=5)
+    actions = np.random.default_rng(1).random((steps + 60, lanes, 2))
+    for each in actions[:steps]:
+        there.step(each)
+    here.restore(there.snapshot(), 5)
+    for each in actions[steps:]:
+        for one, other in zip(there.step(each)[:4], here.step(each)[:4], strict=True):
+            assert np.array_equal(one, other)

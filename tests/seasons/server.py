@@ -14,7 +14,7 @@ import pytest
 
 from leaderboard.documents.signed import SigningKey
 from leaderboard.seasons.scoring import instances
-from leaderboard.seasons.tickets import Attendant
+from leaderboard.seasons.sessions import Attendant
 from leaderboard.store import Store
 from sme_registry.envs import SMEVectorEnv
 from sme_registry.seasons import Ticket
@@ -42,8 +42,8 @@ class Server:
     requests: list[str] = field(default_factory=list)
     """Methods and last parts of the paths, as they arrived at the relay."""
     faults: list[str] = field(default_factory=list)
-    """What happens to the next requests, one each: "lose request", "lose answer", "cut answer", or
-    a status such as "503"; then all is well."""
+    """What happens to the next requests, one each: "lose request", "lose answer", "cut answer",
+    "alter answer", or a status such as "503"; then all is well."""
 
     def start(self):
         """Get a new ticket, as another entrant."""
@@ -114,6 +114,8 @@ def _relay(server):
             self.send_response(status)
             self.send_header("Content-Length", str(len(answer)))
             self.end_headers()
+            if fault == "alter answer":
+                answer = answer[:-4] + bytes([answer[-4] ^ 1]) + answer[-3:]
             if fault == "cut answer":
                 answer, self.close_connection = answer[: len(answer) // 2], True
             self.wfile.write(answer)

@@ -1,6 +1,7 @@
 """Learning in hidden tasks over the network: the numbers of local tasks, and no step is lost."""
 
 import http.client
+import json
 import pickle
 import ssl
 import time
@@ -11,6 +12,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from leaderboard.seasons.scoring import challenge
+from leaderboard.store import Store
 from sme_registry import seasons
 from sme_registry.errors import (
     ActionError,
@@ -23,6 +25,7 @@ from sme_registry.errors import (
 from sme_registry.evaluation.references import NAMES, SHORT_NAMES
 from sme_registry.seasons import Instance, Ticket, wire
 from sme_registry.seasons.client import actions_in
+from sme_registry.seasons.wire import StepFormat
 from sme_registry.spec import Setting
 from tests.leaderboard.seasons.playing import ROWS
 from tests.seasons.server import BUDGET, serving_season
@@ -151,7 +154,8 @@ def test_a_ticket_is_shown_only_to_the_server_that_gave_it(server):
 
 
 def test_after_an_interrupted_step_a_reset_goes_on(server, monkeypatch):
-    ticket = server.ticket.model_copy(update={"signer": None})
+    signer = server.ticket.signer.model_copy(update={"address": None})
+    ticket = server.ticket.model_copy(update={"signer": signer})
     hidden = seasons.make_vec(server.behind, ticket, 0, 2)  # the relay is a client, too
     hidden.reset()
     first, second, third = random_actions(2, 3)
@@ -171,7 +175,7 @@ def test_after_an_interrupted_step_a_reset_goes_on(server, monkeypatch):
     assert np.array_equal(hidden.step(third)[0], here.step(third)[0])
 
 
-def test_refusals_have_the_server_s_codes(server):
+def test_refusals_have_the_server_s_codes(server, tmp_path):
     Instance(server.url, server.ticket, 0, 2).begin()
     with pytest.raises(SealedError, match="start_conflict") as caught:  # its lanes stay the same
         Instance(server.url, server.ticket, 0, 3).begin()
@@ -179,6 +183,9 @@ def test_refusals_have_the_server_s_codes(server):
     with pytest.raises(OptionError, match=r"lanes=257: must be an integer in \[1, 256\]"):
         Instance(server.url, server.ticket, 0, 257)
     another_s = Ticket.from_dict({**server.ticket.to_dict(), "token": "cd" * 32})
+    with pytest.raises(OptionError, match="is in no file"):
+        seasons.make(server.url, another_s)
+    another_s.write(tmp_path / "ticket.json")
     with pytest.raises(SealedError, match="token_wrong"):
         seasons.make(server.url, another_s).reset()
     hidden = seasons.make_vec(server.url, server.ticket, 2, 2)
@@ -264,14 +271,13 @@ def test_an_answer_that_is_too_long_is_not_read_to_its_end(server, monkeypatch):
         wire.Connection(server.url, server.ticket.token).request("GET", path, most=20)
 
 
-def test_answers_are_the_policy_s_actions_in_the_challenge_states(server, tmp_path):
+def test_answers_are_the_policy_s_actions_in_the_challenge_states(server):
     def policy(observations):
         actions = 2.0 * observations[:, :2] - 1.0
         observations[:] = 0.0  # a policy may write into what it is given
         return actions
 
-    path = server.ticket.write(tmp_path / "ticket.json")
-    for ticket in (path, server.ticket):  # answers may be repeated
+    for ticket in (server.ticket.path, server.ticket):  # answers may be repeated
         seasons.answer(server.url, ticket, policy, 1, action_range="symmetric")
     assert server.answers(1).shape == (ROWS, 2)
     with Instance(server.url, server.ticket) as first:
@@ -282,20 +288,96 @@ def test_answers_are_the_policy_s_actions_in_the_challenge_states(server, tmp_pa
     assert [each.phase for each in status.instances] == ["waiting", "answered", "waiting"]
 
 
-def test_a_journal_with_other_steps_than_were_taken_is_not_signed(server):
-    answers = np.zeros((ROWS, 2))
-    with (
-        Instance(server.url, server.ticket, lanes=2) as hidden,
-        Instance(server.url, server.ticket, lanes=2) as other,
+def played(server, steps=2):
+    """An instance after some steps in two lanes."""
+    hidden = Instance(server.url, server.ticket, lanes=2)
+    hidden.begin()
+    for actions in random_actions(2, steps):
+        hidden.step(actions)
+    return hidden
+
+
+def signed_head(server):
+    """What the board has of the entrant's last signature; None without any."""
+    with Store.open(server.board.path, read_only=True) as store:
+        folder = store.season_folder(server.board.season.digest)
+    path = folder.ticket(server.ticket.ticket) / "0.json"
+    return json.loads(path.read_bytes())["head"] if path.exists() else None
+
+
+def test_steps_that_a_server_has_made_up_are_signed_by_nobody(server):
+    """It has the ticket's token; a program that goes on has never seen what was answered."""
+    played(server).close()
+    path = wire.instance_path(server.ticket.season, server.ticket.ticket, 0, "steps")
+    body = StepFormat(2, 3, 2).pack(3, np.ones((2, 2)))
+    wire.Connection(server.behind, server.ticket.token).request("POST", path, body)
+    for goes_on in (
+        lambda: Instance(server.url, server.ticket, lanes=2).begin(),
+        lambda: seasons.answer(server.url, server.ticket, "constant"),
     ):
-        for each in (hidden, other):
-            each.begin()
-            each.step(np.zeros((2, 2)))
+        with pytest.raises(SealedError, match=r"transcript: .* has 2 requests .* the server has 3"):
+            goes_on()
+    assert "POST finish" not in server.requests
+    assert signed_head(server) is None
+
+
+def test_a_ticket_without_its_transcripts_signs_nothing(server, tmp_path):
+    played(server).close()
+    copy = server.ticket.model_copy()
+    copy.write(tmp_path / "ticket.json")
+    with pytest.raises(SealedError, match="has 0 requests"):
+        seasons.answer(server.url, copy, "constant")
+    seasons.answer(server.url, server.ticket, "constant")
+    assert signed_head(server)["hashes"] == 4
+
+
+def test_answers_that_were_altered_on_their_way_get_no_signature_that_fits(server):
+    hidden = played(server)
+    server.faults = ["alter answer"]
+    hidden.step(np.zeros((2, 2)))
+    with pytest.raises(SealedError, match="bad_signature"):
         hidden.challenge()
-        with pytest.raises(SealedError, match="journal: the server's, sha256"):
-            hidden.send_answers(answers)
-        hidden.begin()
-        hidden.send_answers(answers)
+    with pytest.raises(SealedError, match="is not the one that it gave before"):
+        Instance(server.url, server.ticket, lanes=2).begin()
+    assert signed_head(server) is None
+
+
+def test_challenge_states_are_shown_once(server):
+    hidden = played(server)
+    server.faults = ["", "alter answer"]
+    hidden.challenge()
+    with pytest.raises(SealedError, match="has shown other challenge states before"):
+        hidden.challenge()
+    with pytest.raises(SealedError, match="bad_signature"):
+        hidden.send_answers(np.zeros((ROWS, 2)))
+    with pytest.raises(SealedError, match="Ask for them first"):
+        Instance(server.url, server.ticket, 1).send_answers(np.zeros((ROWS, 2)))
+
+
+def test_transcripts_are_signed_as_they_grow(server, monkeypatch):
+    for module in ("sme_registry.seasons.client", "leaderboard.seasons.instance"):
+        monkeypatch.setattr(f"{module}.EVERY", 4)
+    monkeypatch.setattr("sme_registry.seasons.transcript.EVERY", 4)
+    numbers = []
+    hidden = played(server, 0)
+    for actions in random_actions(2, 10):
+        hidden.step(actions)
+        head = signed_head(server)
+        numbers.append(0 if head is None else head["hashes"])
+    assert numbers == [0, 0, 0, 0, 4, 4, 4, 4, 8, 8]
+
+
+def test_requests_that_a_server_has_lost_are_taken_again(server):
+    """As after a loss of power, but for those that were signed."""
+    hidden = played(server, 5)
+    hidden._transcript.receive(5, hidden._transcript.head(5))
+    hidden._transcript.send(6, bytes(16))  # which never arrived
+    hidden.close()
+    again = Instance(server.url, server.ticket, lanes=2)
+    again.begin()
+    assert again.number == 5
+    again.step(np.ones((2, 2)))
+    again.challenge()
 
 
 def test_the_last_answers_may_be_repeated_after_they_have_ended_the_ticket(server):

@@ -116,7 +116,7 @@ def test_a_loop_of_one_file_learns(server, monkeypatch):
 
 def test_the_page_on_seasons_leads_from_a_ticket_to_its_end(server, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    server.ticket.write("ticket.json")
+    server.ticket.model_copy().write("ticket.json")
     page = (ROOT / "docs" / "guides" / "seasons.md").read_text()
     page = page.split("## Taking part online")[1]
     [block] = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)

@@ -18,11 +18,13 @@ import numpy as np
 from leaderboard.documents.signed import SigningKey
 from leaderboard.seasons.journal import Journal
 from leaderboard.seasons.master import Master
-from leaderboard.seasons.stepping import Lanes
-from leaderboard.seasons.ticket import RunningTicket
+from leaderboard.seasons.stepping import Play
+from leaderboard.seasons.tickets import Ticket
 from leaderboard.store import Store
 from leaderboard.web.server import listen, url_of
 from sme_registry import seasons
+from sme_registry.seasons.transcript import Transcript
+from sme_registry.seasons.wire import StepFormat
 from tests.leaderboard.seasons.playing import LANES
 
 _SERVE = """
@@ -147,15 +149,17 @@ def check(board, entrant, requests):
     number = entrant.ticket.ticket
     with Store.open(board.path, read_only=True) as store:
         row = store.ticket(board.season.digest, number)
-        ticket = RunningTicket(store, board.season, Master.read(board.secret), row)
+        ticket = Ticket(store, board.season, Master.read(board.secret), row)
         folder = store.season_folder(board.season.digest).ticket(number)
-    lanes, expected = Lanes(ticket.start(0), LANES), hashlib.sha256()
-    expected.update(lanes.observation.tobytes())
+    start, form, expected = ticket.start(0), StepFormat(LANES, 2, 1), hashlib.sha256()
+    play = Play(start, LANES, 10**9)
+    expected.update(play.started[8:])
     journal = Journal.open(folder / "0.journal")
     assert journal.requests == requests
     sent = actions_of(number, requests)
-    for actions, journalled in zip(sent, journal.actions(), strict=True):
-        np.testing.assert_array_equal(actions, journalled)
-        for part in lanes.step(actions):
+    for count, (actions, body) in enumerate(zip(sent, journal.bodies(), strict=True), start=1):
+        assert body == form.pack(count, actions)
+        for part in form.unpack_steps(play.take(body)):
             expected.update(part.tobytes())
     assert entrant.seen.digest() == expected.digest()
+    assert Transcript(entrant.ticket.path, start.place, 1).head(requests) == play.head

@@ -15,14 +15,20 @@ from leaderboard.errors import Rejection
 from leaderboard.seasons.admission import start_ticket
 from leaderboard.seasons.entrant import request_ticket
 from leaderboard.seasons.entry import TicketRequest, signer_of
-from leaderboard.seasons.scores import score_ticket
 from leaderboard.seasons.season import Season
-from leaderboard.seasons.tickets import Tickets
+from leaderboard.seasons.sessions import Sessions
+from leaderboard.seasons.tickets import Ticket, score_ticket
 from leaderboard.store import Store
-from sme_registry.io import sha256_of
 from sme_registry.seasons import wire
+from sme_registry.seasons.transcript import (
+    Place,
+    TicketHeads,
+    answers_head,
+    challenge_head,
+    next_head,
+)
 from tests.leaderboard.conftest import tiny_board
-from tests.leaderboard.seasons.sealing import MASTER, NOTHING, signed_request, tiny_season
+from tests.leaderboard.seasons.sealing import MASTER, signed_request, tiny_season
 from tests.leaderboard.serving import receiver
 
 LANES = 4
@@ -53,7 +59,9 @@ class Board(NamedTuple):
     def ticket(self, url, key, nonce=0, address=None):
         """A new ticket of a served board, whose address may not be where it is reached."""
         request = self.request(key, nonce).for_receiver(receiver(url, address), key)
-        return request_ticket(url, self.season.id, request, key)
+        ticket = request_ticket(url, self.season.id, request, key)
+        ticket.write(self.path.parent / f"{self.season.id}-{ticket.ticket}.json")
+        return ticket
 
 
 def online_board(folder, limits=None, **fields):
@@ -73,7 +81,7 @@ def playing(board):
         try:
             yield played
         finally:
-            played.tickets.close()
+            played.sessions.close()
 
 
 class Played:
@@ -82,7 +90,7 @@ class Played:
     def __init__(self, board, store):
         self.board, self.store = board, store
         self.key = SigningKey.generate()
-        self.tickets = Tickets(store, board.secret)
+        self.sessions = Sessions(store, board.secret)
         self.take_ticket()
 
     def take_ticket(self, nonce=0):
@@ -90,59 +98,102 @@ class Played:
         self.request = self.board.request(self.key, nonce)
         envelope = Signed[TicketRequest].read(self.request.to_bytes())
         self.number, _ = start_ticket(self.store, envelope, self.board.season.digest)
-        self.token = self.tickets.ticket(self.number).document.token
+        self.token = self.ticket.document.token
+        self.heads = {}  # of each instance, from h_0 on
 
     def restart(self):
-        """As after a kill: nothing but the files is left."""
-        self.tickets.close()
-        self.tickets = Tickets(self.store, self.board.secret)
+        """Let another server go on, after this one has stopped."""
+        self.sessions.close()
+        self.sessions = Sessions(self.store, self.board.secret)
+
+    def kill(self):
+        """Let another server go on, without a chance for this one to put anything aside."""
+        self.sessions._process_lock.release()
+        self.sessions = Sessions(self.store, self.board.secret)
+
+    @property
+    def ticket(self):
+        return self.sessions.ticket(self.number)
 
     @property
     def folder(self):
         """Of the ticket."""
         return self.store.season_folder(self.board.season.digest).ticket(self.number)
 
+    def place(self, instance):
+        return Place(request=self.request.id, ticket=self.number, instance=instance)
+
+    def open(self, instance=0):
+        return self.sessions.open(self.number, self.token, instance)
+
     def status(self, instance=0):
-        return self.tickets.status(self.number, self.token).instances[instance]
+        return self.sessions.status(self.number, self.token).instances[instance]
 
     def start(self, lanes=LANES, instance=0):
-        return self.tickets.start(self.number, self.token, instance, lanes)
+        opened = self.open(instance)
+        data = opened.start(lanes)
+        self.sessions.hold(opened)
+        if instance not in self.heads:
+            self.heads[instance] = [self.place(instance).first_head(lanes, data)]
+        return data
 
     def send(self, body, instance=0):
-        return self.tickets.step(self.number, self.token, instance, body)
+        opened, heads = self.open(instance), self.heads.get(instance, [b""])
+        answer = opened.step(body, self.signature(instance))
+        self.sessions.hold(opened)
+        if int.from_bytes(body[:8], "little") == len(heads):
+            heads.append(next_head(heads[-1], body, answer))
+        return answer
 
     def step(self, number, value=0.3, instance=0, lanes=LANES):
         return self.send(request(number, value, lanes), instance)
 
     def finish(self, instance=0):
-        self.tickets.finish(self.number, self.token, instance)
+        if instance not in self.heads:
+            self.start(instance=instance)
+        self.open(instance).finish(self.signature(instance))
 
     def answer(self, table, instance=0):
         data = table if isinstance(table, bytes) else wire.pack_table(table)
-        journal = NOTHING
+        heads, states = self.heads.get(instance, [b""]), b""
         with contextlib.suppress(Rejection):  # as long as steps may follow
-            journal = self.tickets.journal_digest(self.number, self.token, instance)
-        signature = self.signature(data, journal, instance)
-        return self.tickets.answer(self.number, self.token, instance, data, signature)
+            states = self.open(instance).challenge()
+        head = answers_head(challenge_head(heads[-1], states), data)
+        ticket = self.sessions.ticket(self.number)
+        opened = ticket.instance(instance)
+        if not opened.has_stored(data):
+            opened = self.open(instance)
+        return opened.answer(data, self.sign(self.place(instance).at(len(heads) + 1, head)))
 
-    def signature(self, data, journal, instance=0):
-        """The entrant's, of these answers and this digest of the steps."""
+    def end(self):
+        """Sign the heads of all instances, as the board has them."""
+        heads = [each.final_head() for each in self.ticket.instances]
+        document = TicketHeads(request=self.request.id, ticket=self.number, heads=tuple(heads))
+        self.sessions.end(self.number, self.token, self.sign(document))
+
+    def signature(self, instance=0):
+        """The entrant's, of the transcript of an instance so far."""
+        heads = self.heads.get(instance, [b""])
+        return self.sign(self.place(instance).at(len(heads) - 1, heads[-1].ljust(32, b"\0")))
+
+    def sign(self, document):
         signer = signer_of(self.request, self.key)
         assert signer is not None
-        statement = wire.Statement(
-            request=self.request.id,
-            ticket=self.number,
-            instance=instance,
-            answers=sha256_of(data),
-            journal=journal,
-        )
-        return signer.sign(statement)
+        return signer.sign(document)
 
     def score(self):
         """Score the ticket, and log its result; False if it has one."""
         season = self.board.season
-        result = score_ticket(self.store, season, MASTER, self.number)
-        return self.store.end_ticket(season.digest, self.number, result)
+        result = scored(self.store, season, self.number)
+        is_new = self.store.end_ticket(season.digest, self.number, result)
+        self.ticket.forget()
+        return is_new
+
+
+def scored(store, season, number, **options):
+    """The result of a ticket."""
+    ticket = Ticket(store, season, MASTER, store.ticket(season.digest, number))
+    return score_ticket(store, season, ticket, **options)
 
 
 def request(number, value=0.3, lanes=LANES):

@@ -92,6 +92,7 @@ def signed_entry(store, season, key, answers, **fields):
 def signed_request(store, season, key, nonce=0, **fields):
     """A request for a ticket of a board."""
     names = {"nonce": f"{nonce:064x}", "answers_key": key.of_answers(f"{nonce:064x}").public}
+    names["transcript"] = 1
     plain = manifest(season, key, **{**names, **fields})
     return TicketRequest.from_dict(plain).signed(key, Receiver(store.document.key))
 

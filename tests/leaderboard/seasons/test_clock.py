@@ -7,7 +7,7 @@ import httpx
 import pytest
 
 from leaderboard.cli.options import KEY_VARIABLE
-from leaderboard.seasons.tickets import Attendant
+from leaderboard.seasons.sessions import Attendant
 from leaderboard.store import Store
 from leaderboard.store.files import to_bytes
 from tests.leaderboard.clocks import set_clocks

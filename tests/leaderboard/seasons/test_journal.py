@@ -1,6 +1,7 @@
 """The journal: whole records, whatever ends its writer."""
 
 import errno
+import io
 import os
 
 import numpy as np
@@ -8,10 +9,11 @@ import pytest
 
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.seasons.journal import Journal
-from leaderboard.seasons.scores import measured_steps
-from leaderboard.seasons.stepping import Start
+from leaderboard.seasons.stepping import Play, Start, no_steps
 from sme_registry import SMESpec
 from sme_registry.envs import SMEEnv
+from sme_registry.seasons.transcript import Place
+from sme_registry.seasons.wire import StepFormat
 
 LANES, A = 3, 2
 HEADER, RECORD = 28, 8 + 4 * LANES * A + 4
@@ -22,9 +24,11 @@ def actions(number):
 
 
 def contents(journal):
-    for each in journal.actions():
-        assert each.shape == (LANES, A)
-    return [each.tobytes() for each in journal.actions()]
+    bodies = list(journal.bodies())
+    assert [int.from_bytes(each[:8], "little") for each in bodies] == [
+        *range(1, journal.requests + 1)
+    ]
+    return [each[8:] for each in bodies]
 
 
 def written(path, count):
@@ -70,6 +74,16 @@ def test_a_journal_ends_before_a_record_that_is_not_whole_or_out_of_order(tmp_pa
     journal.append(actions(9))
     assert contents(Journal.open(path)) == [actions(1), actions(9)]
     assert path.stat().st_size == HEADER + 2 * RECORD
+
+
+@pytest.mark.parametrize("known", [1, 2, 3, 4])
+def test_what_is_known_to_be_whole_is_not_read_again_unless_it_was_lost(tmp_path, known):
+    written(tmp_path / "0", 3)
+    journal = Journal.open(tmp_path / "0", known)
+    assert contents(journal) == [actions(1), actions(2), actions(3)]
+    journal.append(actions(4))
+    assert list(journal.bodies(2, 3)) == [(3).to_bytes(8, "little") + actions(3)]
+    assert contents(Journal.open(tmp_path / "0")) == [actions(n) for n in range(1, 5)]
 
 
 def test_an_ended_journal_stays_ended_and_accepts_nothing(tmp_path):
@@ -161,15 +175,22 @@ def test_another_file_is_no_journal_and_a_journal_is_never_replaced(tmp_path):
 
 
 SPEC = SMESpec(state_dim=3, action_dim=2, complexity=5, horizon=4, seed=12)
-START = Start(SPEC, 5)
+START = Start(SPEC, 5, Place(request="sha256:" + "0" * 64, ticket=1, instance=0))
 
 
-def journal(folder, actions):
-    """A journal of actions `[requests, L, A]`."""
-    made = Journal.create(folder / "0.journal", actions.shape[1], 2)
-    for each in actions:
-        made.append(each.astype("<f4").tobytes())
-    return made
+def measured(actions, budget):
+    """The regret of actions `[requests, L, A]`, of which a snapshot is taken on the way."""
+    lanes = actions.shape[1]
+    form = StepFormat(lanes, SPEC.state_dim, SPEC.action_dim)
+    play = Play(START, lanes, budget)
+    for number, each in enumerate(actions, start=1):
+        play.take(form.pack(number, each))
+        if number == len(actions) // 2:
+            arrays = np.load(io.BytesIO(play.snapshot()), allow_pickle=False)
+            play = Play(START, lanes, budget)
+            play.restore(arrays)
+    play.sign()
+    return play.stepping
 
 
 def regrets(actions):
@@ -186,10 +207,10 @@ def regrets(actions):
 
 
 @pytest.mark.parametrize(("taken", "budget"), [(250, 250), (130, 250), (5, 8)])
-def test_the_curve_has_the_regret_of_each_part_relative_to_the_constant(tmp_path, taken, budget):
+def test_the_curve_has_the_regret_of_each_part_relative_to_the_constant(taken, budget):
     """Steps that were not taken count like the constant's."""
     actions = np.random.default_rng(1).random((taken, 1, 2), dtype=np.float32)
-    measured = measured_steps(START, journal(tmp_path, actions), budget)
+    result = measured(actions, budget)
     rows, parts = regrets(actions), min(budget, 100)
     part = np.arange(budget) * parts // budget
     curve = np.ones(parts)
@@ -198,18 +219,18 @@ def test_the_curve_has_the_regret_of_each_part_relative_to_the_constant(tmp_path
         if len(own):
             share = len(own) / (part == number).sum()
             curve[number] = share * own[:, 0].sum() / own[:, 1].sum() + 1.0 - share
-    np.testing.assert_allclose(measured.learning_curve, curve, rtol=1e-12)
+    np.testing.assert_allclose(result.learning_curve, curve, rtol=1e-12)
     ratio = rows[:, 0].sum() / rows[:, 1].sum()
     expected = (taken * ratio + budget - taken) / budget
-    assert measured.normalised_online_regret == pytest.approx(expected, rel=1e-12)
-    assert measured.steps == taken
+    assert result.normalised_online_regret == pytest.approx(expected, rel=1e-12)
+    assert result.steps == taken
 
 
-def test_the_constant_has_a_regret_of_one_with_any_lanes_and_without_a_start(tmp_path):
+def test_the_constant_has_a_regret_of_one_with_any_lanes_and_without_a_start():
     half = np.full((6, 3, 2), 0.5, np.float32)
-    measured = measured_steps(START, journal(tmp_path, half), 20)  # 18 of them can be taken
-    np.testing.assert_allclose(measured.learning_curve, [1.0] * 6, rtol=1e-12)
-    assert measured.steps == 18
-    never = measured_steps(START, None, 1000)
+    result = measured(half, 20)  # 18 of them can be taken
+    np.testing.assert_allclose(result.learning_curve, [1.0] * 6, rtol=1e-12)
+    assert result.steps == 18
+    never = no_steps(1000)
     assert (never.steps, never.normalised_online_regret) == (0, 1.0)
     assert never.learning_curve == (1.0,) * 100

@@ -11,13 +11,12 @@ from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.errors import Rejection
 from leaderboard.seasons.admission import start_ticket
 from leaderboard.seasons.entry import TicketRequest
-from leaderboard.seasons.scores import score_ticket
 from leaderboard.store import Store
 from sme_registry import seasons
 from sme_registry.seasons import wire
 from tests.leaderboard.seasons.killing import step_through_kills
-from tests.leaderboard.seasons.playing import LANES, online_board, request
-from tests.leaderboard.seasons.sealing import MASTER, SETTING, manifest, moment, tiny_season
+from tests.leaderboard.seasons.playing import LANES, online_board, request, scored
+from tests.leaderboard.seasons.sealing import SETTING, manifest, moment, tiny_season
 from tests.leaderboard.serving import serving
 
 OTHER = SigningKey.generate()
@@ -155,7 +154,7 @@ def test_the_ranking_grows_as_tickets_end(url, board, key):
         store.announce(season)
         store.start_ticket(ranked.request(key))
         empty = httpx.get(address).json()
-        store.end_ticket(season.digest, 1, score_ticket(store, season, MASTER, 1))
+        store.end_ticket(season.digest, 1, scored(store, season, 1))
     grown = httpx.get(address, params={"metric": "ood_regret"}).json()
     assert (empty["metric"], empty["ranking"]) == ("wd_regret", {"generic": [], "family": []})
     [row] = grown["ranking"]["generic"]
@@ -172,6 +171,7 @@ def test_the_ranking_grows_as_tickets_end(url, board, key):
         ({"nonce": "0" * 63}, True, 422, "schema"),
         ({"nonce": "0" * 63 + "G"}, True, 422, "schema"),
         ({"answers_key": None}, True, 422, "schema"),
+        ({"transcript": None}, True, 422, "schema"),
         ({"season": "sha256:" + "0" * 64}, True, 404, "season_unknown"),
         ({"created": moment(-30)}, True, 403, "stale_time"),
         ({"created": moment(1)}, True, 403, "stale_time"),
@@ -185,6 +185,7 @@ def test_requests_for_tickets_are_checked(url, board, key, changes, board_key, s
         before = len(store.entrants(board.season.digest))
         board_name = store.document.key if board_key else None
     plain = {**manifest(board.season, key), "nonce": "0" * 64, "answers_key": OTHER.public}
+    plain["transcript"] = 1
     plain["submitter"] |= changes.get("submitter", {})
     plain |= {name: value for name, value in changes.items() if name != "submitter"}
     signed = TicketRequest.from_dict({**plain, "nonce": "0" * 64}).signed(key, Receiver(board_name))

@@ -8,16 +8,16 @@ import pytest
 from leaderboard.errors import TamperedError
 from leaderboard.seasons.journal import Journal
 from leaderboard.seasons.ranking import season_rankings
-from leaderboard.seasons.scores import score_ticket
 from leaderboard.seasons.season import Reveal
-from leaderboard.seasons.stepping import Lanes, Start
+from leaderboard.seasons.stepping import Play, Start
 from leaderboard.store import Store
 from leaderboard.store.log import Clock
 from sme_registry import SMESpec
 from sme_registry.envs import SMEEnv
 from sme_registry.seasons import wire
+from sme_registry.seasons.transcript import Place
 from tests.leaderboard.clocks import AFTERWARDS, move_clock
-from tests.leaderboard.seasons.playing import LANES, ROWS, online_board, playing
+from tests.leaderboard.seasons.playing import LANES, ROWS, online_board, playing, request, scored
 from tests.leaderboard.seasons.sealing import MASTER, moment, replayed, signed_request
 
 
@@ -35,6 +35,7 @@ def revealed(tmp_path_factory):
                     played.step(count, level, instance)
                 played.finish(instance)
                 played.answer(np.full((ROWS, 1), level), instance)
+            played.end()
             played.score()
         with pytest.MonkeyPatch.context() as patch:
             move_clock(patch)
@@ -61,8 +62,11 @@ def test_altered_journals_and_answers_are_found(revealed, tmp_path):
     with Store.open(tmp_path / "board", read_only=True) as store:
         folder = store.season_folder(revealed.season.digest).ticket(1)
         files = sorted(folder.iterdir())
-        assert len(files) == 6  # a journal, answers and their signature of each instance
+        # A journal, challenge states, answers and their signature of each instance; and the end.
+        assert len(files) == 9
         for path in files:
+            if path.suffix == ".challenge":  # which follow from the master
+                continue
             whole = path.read_bytes()
             middle = len(whole) // 2
             altered = whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :]
@@ -85,11 +89,12 @@ def replace_journal(folder):
     journal.end()
 
 
-def remove_signature(folder):
-    (folder / "0.json").unlink()
+def replace_signature(folder):
+    text = (folder / "0.json").read_text()
+    (folder / "0.json").write_text(text.replace('"hashes": 3', '"hashes": 1'))
 
 
-@pytest.mark.parametrize("replace", [replace_answers, replace_journal, remove_signature])
+@pytest.mark.parametrize("replace", [replace_answers, replace_journal, replace_signature])
 def test_what_an_organiser_replaces_before_the_result_is_found(tmp_path, monkeypatch, replace):
     with playing(online_board(tmp_path)) as played:
         played.start()
@@ -101,8 +106,35 @@ def test_what_an_organiser_replaces_before_the_result_is_found(tmp_path, monkeyp
         played.score()
         season = played.board.season
         played.store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
-        with pytest.raises(TamperedError, match=r"instance 0: its answers are not what"):
+        with pytest.raises(TamperedError, match=r"tickets/1/0\.json: is not the entrant's"):
             replayed(played.store)
+
+
+def test_what_the_entrant_has_not_signed_counts_for_nothing(tmp_path, monkeypatch):
+    """An organiser adds steps and answers to instances that were never answered."""
+    with playing(online_board(tmp_path)) as played:
+        store, season = played.store, played.board.season
+        for instance in (0, 1):
+            played.start(instance=instance)
+            played.step(1, 0.5, instance)
+        played.finish(1)
+        before = scored(store, season, 1)
+        assert [each.steps for each in before.stepping] == [0, LANES]
+        for instance in (0, 1):
+            journal = Journal.open(played.folder / f"{instance}.journal")
+            journal.ended = False  # as the organiser's own program may do
+            for number in range(2, 12):
+                journal.append(request(number, 0.9)[8:])
+            (played.folder / f"{instance}.npz").unlink(missing_ok=True)
+            answers = wire.pack_table(np.full((ROWS, 1), 0.5))
+            (played.folder / f"{instance}.npy").write_bytes(answers)
+        played.restart()
+        assert scored(store, season, 1) == before
+        move_clock(monkeypatch)
+        assert played.score()
+        store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
+        assert replayed(store)[1] == []
+        assert store.sealed_result(store.ticket(season.digest, 1)) == before
 
 
 @pytest.mark.parametrize(
@@ -178,10 +210,21 @@ def test_a_ticket_that_ended_early_without_all_answers_is_found(tmp_path, monkey
     board = online_board(tmp_path)
     with Store.open(board.path) as store:
         store.start_ticket(signed_request(store, board.season, key))
-        store.end_ticket(board.season.digest, 1, score_ticket(store, board.season, MASTER, 1))
+        store.end_ticket(board.season.digest, 1, scored(store, board.season, 1))
         logged(monkeypatch, AFTERWARDS, store, *reveal(board))
         with pytest.raises(TamperedError, match="without all answers: must not be before"):
             replayed(store)
+
+
+def test_a_ticket_that_ended_early_without_the_entrant_s_end_is_found(tmp_path, monkeypatch):
+    with playing(online_board(tmp_path)) as played:
+        for instance in (0, 1):
+            played.finish(instance)
+            played.answer(np.full((ROWS, 1), 0.5), instance)
+        played.score()
+        logged(monkeypatch, AFTERWARDS, played.store, *reveal(played.board))
+        with pytest.raises(TamperedError, match="without the entrant's end: must not be before"):
+            replayed(played.store)
 
 
 def test_a_reveal_before_the_close_is_found(tmp_path, monkeypatch):
@@ -194,16 +237,18 @@ def test_a_reveal_before_the_close_is_found(tmp_path, monkeypatch):
 
 SPEC = SMESpec(state_dim=3, action_dim=2, complexity=5, horizon=3, k=2, D=0.1, seed=11)
 SEED = 2**255 + 3
+START = Start(SPEC, SEED, Place(request="sha256:" + "0" * 64, ticket=1, instance=0))
 
 
 def test_steps_and_regret_are_those_of_single_environments():
-    lanes, unmeasured = Lanes(Start(SPEC, SEED), 3), Lanes(Start(SPEC, SEED), 3)
+    form, play = wire.StepFormat(3, 3, 2), Play(START, 3, 180)
     singles = [SMEEnv(SPEC) for _ in range(3)]
-    first = [env.reset(seed=SEED + lane)[0] for lane, env in enumerate(singles)]
-    np.testing.assert_array_equal(lanes.observation, first)
+    first = np.stack([env.reset(seed=SEED + lane)[0] for lane, env in enumerate(singles)])
+    assert play.started == form.pack(0, first)
     random = np.random.default_rng(1)
     seen = set()
-    for _ in range(60):
+    ratios = []
+    for number in range(1, 61):
         actions = random.random((3, 2), dtype=np.float32) * 1.2 - 0.1
         regret = half = 0.0
         expected = []
@@ -216,11 +261,10 @@ def test_steps_and_regret_are_those_of_single_environments():
                 last, observation = observation, env.reset()[0]
             expected.append((observation, np.float32(reward), terminated, truncated, last))
             seen.add((terminated, truncated))
-        steps, measured = lanes.step_with_regret(actions)
-        plain = unmeasured.step(actions)
-        for got, same, wanted in zip(steps, plain, zip(*expected, strict=True), strict=True):
+        steps = form.unpack_steps(play.take(form.pack(number, actions)))
+        for got, wanted in zip(steps, zip(*expected, strict=True), strict=True):
             np.testing.assert_array_equal(got, wanted)
-            np.testing.assert_array_equal(same, wanted)
-        np.testing.assert_array_equal(lanes.observation, steps.observation)
-        np.testing.assert_allclose(measured, (regret, half), rtol=1e-12)
+        ratios.append(regret / half)
+    play.sign()
+    np.testing.assert_allclose(play.stepping.learning_curve, ratios, rtol=1e-12)
     assert {(False, False), (True, False), (False, True)} <= seen

@@ -10,7 +10,7 @@ from leaderboard.cli.options import KEY_VARIABLE
 from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError
 from leaderboard.seasons import entrant
-from leaderboard.seasons.tickets import Attendant
+from leaderboard.seasons.sessions import Attendant
 from leaderboard.store import Store
 from sme_registry.seasons import Instance, Ticket
 from tests.leaderboard.seasons.playing import online_board

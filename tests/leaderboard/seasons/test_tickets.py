@@ -1,4 +1,4 @@
-"""Tickets without a server: what is refused, what survives, and what a restart changes."""
+"""Sessions without a server: what is refused, what survives, and what a restart changes."""
 
 import errno
 import os
@@ -12,26 +12,24 @@ from hypothesis import strategies as st
 
 from leaderboard.documents.signed import Signed
 from leaderboard.errors import BoardError, Rejection
-from leaderboard.seasons import tickets as tickets_module
+from leaderboard.seasons import sessions as sessions_module
 from leaderboard.seasons.admission import start_ticket
 from leaderboard.seasons.entry import TicketRequest
-from leaderboard.seasons.instance import SteppedInstance
+from leaderboard.seasons.instance import Instance
+from leaderboard.seasons.journal import Journal
 from leaderboard.seasons.master import Master
-from leaderboard.seasons.scores import score_ticket
-from leaderboard.seasons.stepping import Lanes
-from leaderboard.seasons.ticket import RunningTicket
-from leaderboard.seasons.tickets import Attendant, Tickets, _score
+from leaderboard.seasons.sessions import Attendant, Sessions, _score
+from leaderboard.seasons.stepping import Play
+from leaderboard.seasons.tickets import Ticket
 from leaderboard.store import played_bytes
 from leaderboard.store.files import to_bytes
 from sme_registry import materialize
-from sme_registry.io import sha256_of
-from sme_registry.seasons.wire import StepFormat, pack_table, unpack_table
+from sme_registry.seasons.wire import pack_table, unpack_table
 from tests.leaderboard.clocks import set_clocks
 from tests.leaderboard.conftest import tiny_board
-from tests.leaderboard.seasons.playing import LANES, ROWS, online_board, playing, request
-from tests.leaderboard.seasons.sealing import MASTER, NOTHING, SETTING, tiny_season
+from tests.leaderboard.seasons.playing import LANES, ROWS, online_board, playing, request, scored
+from tests.leaderboard.seasons.sealing import SETTING, tiny_season
 
-WIRE = StepFormat(LANES, 2, 1)
 HALF = np.full((ROWS, 1), 0.5, np.float32)
 
 
@@ -63,11 +61,15 @@ def refused(code, *arguments, **others):
 def many(tmp_path_factory):
     """A board on which one key may take many tickets."""
     folder, fields = tmp_path_factory.mktemp("many"), {"tickets": 1000, "tickets_per_key": 1000}
-    with playing(online_board(folder, {"submissions_per_day": 1000}, **fields)) as ready:
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        playing(online_board(folder, {"submissions_per_day": 1000}, **fields)) as ready,
+    ):
+        patch.setattr("leaderboard.seasons.instance.EVERY", 3)
         yield ready
 
 
-EVENTS = ("step", "again", "other", "ahead", "start", "restart", "release")
+EVENTS = ("step", "again", "other", "ahead", "start", "restart", "kill", "release")
 FAULTS = ("full disk", "no memory")
 
 
@@ -76,23 +78,24 @@ FAULTS = ("full disk", "no memory")
     events=st.lists(st.sampled_from(("step", *EVENTS, *FAULTS)), min_size=5, max_size=30),
     lanes=st.sampled_from([4, 20, 48]),
 )
+@example(events=["step", "step", "kill", "again", "step", "step", "kill", "step"], lanes=4)
 @example(events=["step", "restart", "again", "full disk", "no memory", "again"], lanes=4)
 @example(events=[*["step"] * 17, "again", "restart", "again", "step"], lanes=4)
 def test_each_step_is_taken_once_whatever_happens(many, events, lanes):
     many.take_ticket(many.number)
-    here, form = Lanes(many.tickets.ticket(many.number).start(0), lanes), StepFormat(lanes, 2, 1)
+    here = Play(many.ticket.start(0), lanes, 64)
     taken, last, most = 0, b"", 64 // lanes
     many.start(lanes)
     for event in events:
         level = 0.03 * (taken + 1)
         if event == "restart":
             many.restart()
+        elif event == "kill":
+            many.kill()
         elif event == "release":
-            many.tickets.ticket(many.number).instance(0).release()
+            many.ticket.instance(0).release()
         elif event == "start":
-            number, observation = form.unpack_start(many.start(lanes))
-            assert number == taken
-            np.testing.assert_array_equal(observation, here.observation)
+            assert many.start(lanes) == here.started
         elif event == "again":
             if taken:
                 assert many.step(taken, 0.03 * taken, lanes=lanes) == last
@@ -108,11 +111,11 @@ def test_each_step_is_taken_once_whatever_happens(many, events, lanes):
                 message = refused("storage_full", many.step, taken + 1, level, lanes=lanes)
             assert "No space left on device" in message
         else:
-            taken, last = taken + 1, form.pack_steps(here.step(np.full((lanes, 1), level, "f4")))
+            taken, last = taken + 1, here.take(request(taken + 1, level, lanes))
             if event == "no memory":  # after the step was recorded
                 many.start(lanes)
                 with pytest.MonkeyPatch.context() as patch:
-                    patch.setattr(Lanes, "step", runs_out)
+                    patch.setattr(Play, "take", runs_out)
                     with pytest.raises(MemoryError):
                         many.step(taken, level, lanes=lanes)
             assert many.step(taken, level, lanes=lanes) == last
@@ -154,26 +157,24 @@ def test_a_step_has_one_size_and_finite_actions_which_are_clipped(played):
 
 def test_phases_follow_each_other(played):
     refused("instance_phase", played.step, 1)
-    refused("instance_phase", played.tickets.challenge, played.number, played.token, 0)
+    refused("instance_phase", played.open().challenge)
     refused("instance_phase", played.answer, HALF)
+    refused("instance_phase", played.open().finish, "")
     played.start()
     played.step(1)
-    refused("instance_phase", played.tickets.challenge, played.number, played.token, 0)
+    refused("instance_phase", played.open().challenge)
     refused("instance_phase", played.answer, HALF)
     played.finish()
     played.finish()
     refused("instance_phase", played.step, 2)
     played.restart()
     refused("instance_phase", played.step, 2)
-    states = unpack_table(played.tickets.challenge(played.number, played.token, 0), 4)
-    assert len(states) == ROWS
+    assert len(unpack_table(played.open().challenge(), 4)) == ROWS
     assert played.answer(HALF)
     assert not played.answer(HALF)
     refused("answer_conflict", played.answer, HALF * 0.5)
     played.restart()
     assert not played.answer(HALF)
-    refused("instance_phase", played.start)
-    refused("instance_phase", played.step, 1)
     refused("instance_phase", played.step, 2)
     played.finish()
 
@@ -187,65 +188,128 @@ def test_answers_have_one_form(played):
     assert played.answer(HALF)
 
 
-def test_answers_need_a_signature_of_them_and_the_journal(played):
+def test_each_signature_is_of_the_transcript_so_far(played, monkeypatch):
+    monkeypatch.setattr("leaderboard.seasons.instance.EVERY", 2)
     played.start()
     played.step(1)
-    played.finish()
-    data = pack_table(HALF)
-    instance = played.tickets.ticket(played.number).instance(0)
-    journal = instance.journal_digest()
-    assert journal == sha256_of(request(1))
+    played.step(2)
+    instance, body = played.open(), request(3)
+    first, second = played.heads[0][1:]
     others = [
         "",
         "0" * 128,
-        played.signature(data + b"x", journal),
-        played.signature(data, NOTHING),
-        played.signature(data, journal, instance=1),
-        played.key.sign("answers", played.request.id, played.request.board),
+        played.sign(played.place(0).at(1, first)),
+        played.sign(played.place(0).at(1, second)),
+        played.sign(played.place(0).at(2, first)),
+        played.sign(played.place(1).at(2, second)),
+        played.key.sign("answers", played.place(0).at(2, second).digest, played.request.board),
     ]
     for other in others:
+        refused("bad_signature", instance.step, body, other)
+        refused("bad_signature", instance.finish, other)
+    assert not instance.is_played
+    played.step(3)
+    assert instance.signed.content.hashes == 2
+    played.step(4)
+    played.finish()
+    assert instance.signed.content.hashes == 4
+    data = pack_table(HALF)
+    for other in (*others, played.signature()):
         refused("bad_signature", instance.answer, data, other)
     assert not instance.answered
-    assert instance.answer(data, played.signature(data, journal))
-    assert instance.is_signed
+    assert played.answer(HALF)
+    assert instance.signed.content.hashes == 6
 
 
-def test_requests_older_than_signed_answers_need_no_signature(played):
-    old = played.board.request(played.key, 1, answers_key=None)
-    assert "answers_key" not in old.to_dict()["ticket"]
+def test_a_ticket_ends_with_a_signature_of_all_its_transcripts(played):
+    refused("instance_phase", played.sessions.end, played.number, played.token, "")
+    for instance in (0, 1):
+        played.finish(instance)
+        played.answer(HALF, instance)
+    for other in ("", played.signature(), played.sign(played.place(0).at(2, bytes(32)))):
+        refused("bad_signature", played.sessions.end, played.number, played.token, other)
+    assert played.sessions.over() == []
+    played.end()
+    played.end()
+    assert played.sessions.over() == [played.number]
+    assert played.sessions.status(played.number, played.token).phase == "ended"
+    played.restart()
+    assert played.sessions.over() == [played.number]
+
+
+def test_asking_for_a_ticket_reads_no_journal_and_replays_nothing(played, monkeypatch):
+    """Whether it was put aside by a server that stopped, or by one that was killed."""
+    monkeypatch.setattr("leaderboard.seasons.instance.EVERY", 4)
+    played.start()
+    for number in range(1, 11):
+        played.step(number)
+    records = []
+    read = Journal._record
+    monkeypatch.setattr(Journal, "_record", lambda *_: records.append(1) or read(*_))
+    for begin_again, most in ((played.restart, 2), (played.kill, 4)):
+        begin_again()
+        assert played.status().requests == 10
+        assert len(records) <= most
+        records.clear()
+        assert played.status().used == 10 * LANES
+        assert records == []
+    taken = []
+    take = Play.take
+    monkeypatch.setattr(Play, "take", lambda *_: taken.append(1) or take(*_))
+    played.step(11)
+    assert len(taken) == 1
+
+
+@pytest.mark.parametrize("fault", [b"", b"PK\x03\x04 no arrays", None])
+def test_a_lost_snapshot_is_replaced_by_a_replay(played, fault):
+    played.start()
+    played.step(1)
+    played.step(2)
+    played.restart()
+    snapshot = played.folder / "0.npz"
+    if fault is None:
+        snapshot.unlink()
+    else:
+        snapshot.write_bytes(fault)
+    last = played.step(2)
+    played.kill()
+    (played.folder / "0.npz").unlink(missing_ok=True)
+    assert played.step(2) == last
+    played.step(3)
+    played.finish()
+    assert scored(played.store, played.board.season, played.number, replay=True) == scored(
+        played.store, played.board.season, played.number
+    )
+
+
+def test_tickets_of_earlier_versions_are_scored_but_not_played_on(played):
+    old = played.board.request(played.key, 1, answers_key=None, transcript=None)
+    assert not {"answers_key", "transcript"} & old.to_dict()["ticket"].keys()
     number = played.store.start_ticket(old)
-    instance = played.tickets.ticket(number).instance(0)
-    instance.finish()
-    assert instance.answer(pack_table(HALF), "")
-    assert instance.is_signed
-    result = score_ticket(played.store, played.board.season, MASTER, number)
+    token = played.sessions.ticket(number).document.token
+    refused("ticket_ended", played.sessions.open, number, token, 0)
+    result = scored(played.store, played.board.season, number)
     assert "signed" not in result.to_dict()["stepping"][0]
 
 
 def test_a_token_opens_one_ticket(played):
-    number, token, tickets = played.number, played.token, played.tickets
+    number, token, sessions = played.number, played.token, played.sessions
     played.take_ticket(1)
     for ticket, password in ((played.number, token), (number, ""), (number, "é")):
         for call, *rest in (
-            (tickets.start, 0, 1),
-            (tickets.step, 0, request(1)),
-            (tickets.finish, 0),
-            (tickets.status,),
-            (tickets.refuse_challenge, 0),
-            (tickets.challenge, 0),
-            (tickets.journal_digest, 0),
-            (tickets.answer_bytes, 0),
-            (tickets.answer, 0, pack_table(HALF), ""),
+            (sessions.open, 0),
+            (sessions.status,),
+            (sessions.end, ""),
         ):
             refused("token_wrong", call, ticket, password, *rest)
-    refused("ticket_unknown", tickets.start, 99, token, 0, 1)
-    refused("instance_unknown", tickets.start, number, token, 2, 1)
+    refused("ticket_unknown", sessions.open, 99, token, 0)
+    refused("instance_unknown", sessions.open, number, token, 2)
 
 
 def test_a_deadline_ends_everything(played, monkeypatch):
     played.start()
     played.step(1)
-    assert played.tickets.over() == []
+    assert played.sessions.over() == []
     set_clocks(monkeypatch, 23.9)
     played.step(2)
     set_clocks(monkeypatch, 24.1)
@@ -253,19 +317,10 @@ def test_a_deadline_ends_everything(played, monkeypatch):
     refused("ticket_ended", played.start)
     refused("ticket_ended", played.finish)
     refused("ticket_ended", played.answer, HALF)
-    assert played.tickets.status(played.number, played.token).phase == "ended"
+    assert played.sessions.status(played.number, played.token).phase == "ended"
     set_clocks(monkeypatch, forward=-26, passed=25)  # set back, it extends no deadline
     with pytest.raises(BoardError, match="is behind"):
         played.step(3)
-
-
-def test_a_ticket_is_over_when_its_last_instance_is_answered(played):
-    for instance, over in ((0, []), (1, [played.number])):
-        played.finish(instance)
-        played.answer(HALF, instance)
-        assert played.tickets.over() == over
-        phase = played.tickets.status(played.number, played.token).phase
-        assert phase == ("ended" if over else "running")
 
 
 def test_an_altered_request_holds_up_no_other_ticket(played, monkeypatch):
@@ -275,30 +330,29 @@ def test_an_altered_request_holds_up_no_other_ticket(played, monkeypatch):
     played.store.folder.object(document).write_bytes(second.to_bytes())
     played.restart()
     set_clocks(monkeypatch, 0, passed=25)
-    assert played.tickets.over() == [2]
+    assert played.sessions.over() == [2]
 
 
 def test_a_closed_ticket_takes_nothing_from_requests_in_progress(played):
     played.start(instance=1)
-    instance, other = played.tickets.ticket(played.number).instances
+    instance, other = played.ticket.instances
     played.finish()
-    played.tickets.close_ticket(played.number)
+    played.sessions.close_ticket(played.number)
     refused("ticket_ended", instance.answer, pack_table(HALF), "")
     assert not instance.answered
     refused("ticket_ended", other.start, LANES)
     refused("ticket_ended", other.step, request(1))
-    refused("ticket_ended", other.finish)
+    refused("ticket_ended", other.finish, "")
 
 
 def test_steps_that_arrive_while_an_unplayed_ticket_is_closed_are_scored(played, monkeypatch):
     def late(ticket):
-        ticket.instance(0).start(LANES)
-        ticket.instance(0).step(request(1))
+        played.finish()
         close(ticket)
 
-    close = RunningTicket.close
-    monkeypatch.setattr(RunningTicket, "close", late)
-    assert played.tickets.end_unplayed([played.number], 100) == []
+    close = Ticket.close
+    monkeypatch.setattr(Ticket, "close", late)
+    assert played.sessions.end_unplayed([played.number], 100) == []
     assert played.store.ticket(played.board.season.digest, played.number).result is None
 
 
@@ -308,29 +362,30 @@ def test_tickets_that_nobody_played_score_one_without_a_process(played, monkeypa
     store, season = played.store, played.board.season
     set_clocks(monkeypatch, 0, passed=25)
     monkeypatch.delattr(Attendant, "_start")
-    evaluated = [score_ticket(store, season, MASTER, number) for number in (1, 2)]
-    Attendant(played.tickets).attend()
-    assert played.tickets.over() == []
+    evaluated = [scored(store, season, number) for number in (1, 2)]
+    Attendant(played.sessions).attend()
+    assert played.sessions.over() == []
     assert [store.sealed_result(row) for row in store.entrants(season.digest)] == evaluated
     # Nor does such a ticket keep its name from others.
     assert store.holder_of_name(f"Tester {played.key.public[:8]}") is None
 
 
 def test_a_ticket_takes_nothing_while_it_is_scored_and_what_it_took_is_flushed(played, monkeypatch):
+    played.finish(instance=1)
     played.start()
     played.step(1)
     flushed = []
     monkeypatch.setattr(os, "fdatasync", fails(errno.EIO))
-    played.tickets.sync()  # a disk that fails for a moment ends no server
+    played.sessions.sync()  # a disk that fails for a moment ends no server
     monkeypatch.setattr(os, "fdatasync", flushed.append)
-    Attendant(played.tickets).attend()
+    Attendant(played.sessions).attend()
     assert len(flushed) == 1
     set_clocks(monkeypatch, 0, passed=25)
     process = Mock()
     monkeypatch.setattr(Attendant, "_start", lambda _: process)
-    attendant = Attendant(played.tickets)
+    attendant = Attendant(played.sessions)
     attendant.attend()
-    instance = played.tickets.ticket(played.number).instance(0)
+    instance = played.ticket.instance(0)
     refused("ticket_ended", instance.step, request(2))
     attendant.stop()
     process.terminate.assert_called_once()
@@ -350,6 +405,7 @@ def test_tickets_that_could_not_be_scored_are_tried_again_one_by_one(played, mon
             played.take_ticket(number)
         played.start()
         played.step(1)
+        played.finish()
     started = []
     codes = []
 
@@ -369,19 +425,19 @@ def test_tickets_that_could_not_be_scored_are_tried_again_one_by_one(played, mon
         attendant.attend()
         return started
 
-    monkeypatch.setattr("leaderboard.seasons.tickets.signal.signal", lambda *_: None)
+    monkeypatch.setattr("leaderboard.seasons.sessions.signal.signal", lambda *_: None)
     monkeypatch.setattr(Attendant, "_start", start)
     whole = broken.read_bytes()
     broken.write_bytes(b"no journal")
     played.restart()
-    attendant = Attendant(played.tickets)
+    attendant = Attendant(played.sessions)
     assert attend(seconds=0) == [[1, 2]]
     assert attend(seconds=2) == [[1, 2], [1]]
     assert attend(seconds=2) == [[1, 2], [1], [2]]
-    assert played.tickets.over() == [1]
+    assert played.sessions.over() == [1]
     broken.write_bytes(whole)
     assert attend(seconds=60) == [[1, 2], [1], [2], [1]]
-    assert played.tickets.over() == []
+    assert played.sessions.over() == []
     assert codes == [True, False, False]
 
 
@@ -433,7 +489,7 @@ def test_answers_that_do_not_reach_the_disk_are_sent_again(played, monkeypatch, 
     if confirmed:
         monkeypatch.setattr("leaderboard.seasons.instance.io.sync_folder", fails(errno.EIO))
     else:
-        monkeypatch.setattr(os, "link", fails(errno.ENOSPC))
+        monkeypatch.setattr(os, "replace", fails(errno.ENOSPC))
     for _ in range(2):
         refused("storage_full", played.answer, HALF)
     monkeypatch.undo()
@@ -441,49 +497,49 @@ def test_answers_that_do_not_reach_the_disk_are_sent_again(played, monkeypatch, 
         played.restart()
         assert played.status().phase == "answering"
     assert played.answer(HALF) is not confirmed
-    assert played.tickets.ticket(played.number).instance(0).answered
+    assert played.ticket.instance(0).answered
 
 
 def test_instances_used_long_ago_leave_memory_and_large_ones_take_more(played, monkeypatch):
     def ready():
-        instances = played.tickets.ticket(played.number).instances
+        instances = played.ticket.instances
         return [each.is_ready for each in instances]
 
-    monkeypatch.setattr(tickets_module, "MOST_HELD_LANES", 150)
+    monkeypatch.setattr(sessions_module, "MOST_HELD_LANES", 150)
     played.start()
     played.start(instance=1)
     assert ready() == [False, True]
     played.step(1)
     assert ready() == [True, False]
     played.restart()
-    monkeypatch.setattr(SteppedInstance, "weights", 2**20)
-    monkeypatch.setattr(tickets_module, "MOST_HELD_LANES", 2**21 // 100)
+    monkeypatch.setattr(Instance, "weights", 2**20)
+    monkeypatch.setattr(sessions_module, "MOST_HELD_LANES", 2**21 // 100)
     played.start()
     assert ready() == [True, False]
     played.start(instance=1)
     assert ready() == [False, True]
-    monkeypatch.setattr(SteppedInstance, "weights", 2**22)  # no steps in the event loop
+    monkeypatch.setattr(Instance, "weights", 2**22)  # no steps in the event loop
     assert ready() == [False, False]
 
 
 def test_one_server_that_has_the_master_steps_a_season(played, tmp_path):
     with pytest.raises(BoardError, match="another server steps it"):
-        Tickets(played.store, played.board.secret)
+        Sessions(played.store, played.board.secret)
     other = Master.generate().write(tmp_path / "other.master")
     with pytest.raises(BoardError, match="the master of no sealed-online season"):
-        Tickets(played.store, other)
+        Sessions(played.store, other)
     with tiny_board(tmp_path / "offline") as store:
         store.announce(tiny_season("sealed-offline"))
         with pytest.raises(BoardError, match="the master of no sealed-online season"):
-            Tickets(store, played.board.secret)
+            Sessions(store, played.board.secret)
 
 
 def test_what_was_not_answered_scores_one(played):
     played.start()
     played.step(1)
     played.finish()
-    hidden = played.tickets.ticket(played.number).hidden(0)
-    states = unpack_table(played.tickets.challenge(played.number, played.token, 0), 4)
+    hidden = played.ticket.hidden(0)
+    states = unpack_table(played.open().challenge(), 4)
     played.answer(materialize(hidden.spec).optimal_action(states[:, :2]))
     assert played.score()
     assert not played.score()
