@@ -45,7 +45,7 @@ from leaderboard.errors import Rejection
 from leaderboard.gate.isolation import Isolation, isolation_for_own
 from leaderboard.gate.reference import constant_onnx, optimal_onnx
 from leaderboard.gate.sandbox import Confined, widths
-from leaderboard.store import Store, make_room
+from leaderboard.store import Store, expire_uploads
 from sme_registry.io import sha256_of
 from sme_registry.spec import SMESpec
 
@@ -156,12 +156,13 @@ def check_upload(store: Store, key: str, size: int) -> None:
 
 
 def check_room(store: Store, size: int) -> None:
-    """Reject (`quota`) so many bytes that do not fit onto a board, even without old uploads."""
-    if not make_room(store, size):
+    """Reject (`quota`) so many bytes that do not fit onto a board, without expired uploads."""
+    expire_uploads(store)
+    if store.total_bytes() + size > store.document.limits.total_bytes:
         raise Rejection(
             "quota",
             f"board: its {store.document.limits.total_bytes:,} bytes are full. "
-            "Send it again in a few minutes, or ask the board's owner to raise the limit.",
+            "Send it again in an hour, or ask the board's owner to raise the limit.",
         )
 
 

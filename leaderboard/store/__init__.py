@@ -8,7 +8,7 @@ next one continues from the state it leaves.
 from leaderboard.seasons.events import SealedRow, SeasonRow, played_bytes
 from leaderboard.store.copies import Copies
 from leaderboard.store.files import digest_of, read_document
-from leaderboard.store.garbage import Garbage, collect_garbage, make_room
+from leaderboard.store.garbage import Garbage, collect_garbage, expire_uploads
 from leaderboard.store.index import Index
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.objects import Objects
@@ -34,7 +34,7 @@ __all__ = [
     "Store",
     "collect_garbage",
     "digest_of",
-    "make_room",
+    "expire_uploads",
     "played_bytes",
     "read_document",
     "unknown_submission",

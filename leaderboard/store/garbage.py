@@ -1,6 +1,6 @@
 """What dead processes and missing submissions leave behind, and how it is removed.
 
-`collect_garbage` does so on request, `make_room` where a board is full.
+`collect_garbage` does so on request; uploads without a submission expire by themselves.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from pathlib import Path
 
 from leaderboard.documents.submission import shifted, utc
 from leaderboard.store.files import unwritable
-from leaderboard.store.index import Index
 from leaderboard.store.store import Store
 from sme_registry.io import TEMPORARY
 
@@ -80,50 +79,28 @@ def collect_garbage(
                 _remove(path)
             for digest in objects:
                 index.connection.execute("DELETE FROM upload WHERE digest = ?", (digest,))
-            _forget_uploads_of_named_artefacts(index, objects_older_than)
     return Garbage(len(temporary), len(objects), size)
 
 
-def make_room(store: Store, size: int) -> bool:
-    """Whether `size` more bytes fit onto a board.
-
-    A full one first removes uploads of more than ten minutes ago that no submission names.
+def expire_uploads(store: Store) -> None:
+    """Remove uploads of more than an hour ago that no submission of their key has named.
 
     Raises:
       BoardError: a file cannot be removed.
     """
-    limit = store.document.limits.total_bytes
-    if store.total_bytes() + size <= limit:
-        return True
+    moment = datetime.datetime.fromisoformat(store.time)
+    until = utc(shifted(moment, -datetime.timedelta(seconds=_UNNAMED_SECONDS)))
     with store.transaction() as index:
-        expired = f"FROM upload WHERE {_OLD}"
-        age = _outside(_UNNAMED_SECONDS)
-        digests = index.connection.execute(f"SELECT DISTINCT digest {expired}", age).fetchall()
-        index.connection.execute(f"DELETE {expired}", age)
-        for (digest,) in digests:
+        old = index.connection.execute(
+            "DELETE FROM upload WHERE time <= ? RETURNING digest", (until,)
+        ).fetchall()
+        for (digest,) in old:
             if index.one(_IS_HELD, digest) is None:
                 _remove(store.folder.object(digest))
-        return store.total_bytes() + size <= limit
 
 
-_UNNAMED_SECONDS = 600.0
-_OLD = "NOT (time > ? AND time <= ?)"  # also if its time is in the future, by a wrong clock
+_UNNAMED_SECONDS = 3600.0
 _IS_HELD = "SELECT 1 FROM object WHERE digest = ?1 UNION ALL SELECT 1 FROM upload WHERE digest = ?1"
-
-
-def _outside(seconds: float) -> tuple[str, str]:
-    """Ends of the time in which an upload is young; it is not if its time is in the future."""
-    moment = datetime.datetime.now(datetime.UTC)
-    age = datetime.timedelta(seconds=seconds)
-    return utc(shifted(moment, -age)), utc(shifted(moment, age))
-
-
-def _forget_uploads_of_named_artefacts(index: Index, older_than: float) -> None:
-    """Forget who else has the bytes of a submission's artefact, and has not submitted it."""
-    index.connection.execute(
-        f"DELETE FROM upload WHERE digest IN (SELECT digest FROM object) AND {_OLD}",
-        _outside(older_than),
-    )
 
 
 def _remove(path: Path) -> None:

@@ -234,6 +234,7 @@ def test_the_daily_quota_frees_up_at_the_stated_time(tmp_path, key, monkeypatch)
             receive(store, signed)
         assert caught.value.code == "quota"
         move_clock(monkeypatch, utc(free + datetime.timedelta(seconds=2)))
+        put(store, key, tiny_submission(store, key, 3)[1])  # its upload has expired
         assert receive(store, signed) == signed.id
 
 
@@ -455,35 +456,18 @@ def test_a_full_board_accepts_no_submission(tmp_path, key):
         assert store.entries() == []
 
 
-def test_old_uploads_without_a_submission_make_room(tmp_path):
+def test_uploads_without_a_submission_expire_after_an_hour(tmp_path, key, monkeypatch):
     limits = {"total_bytes": 1000, "artefact_bytes": 900}
+    one, two = sha256_of(b"1" * 300), sha256_of(b"2" * 300)
     with tiny_board(tmp_path / "full", limits=limits) as store:
-        for number in (b"1", b"2", b"3"):
-            put(store, SigningKey.generate(), {sha256_of(number * 300): number * 300})
-
-        def date(number, minutes):
-            time = utc(after(minutes=-minutes))
-            digest = sha256_of(number * 300)
-            with store.transaction() as index:
-                index.connection.execute(
-                    "UPDATE upload SET time = ? WHERE digest = ?", (time, digest)
-                )
-
-        def left():
-            return {store.objects.read(digest)[:1] for digest, _ in store.objects.paths()}
-
-        other = SigningKey.generate().public
-        assert (
-            code_of(lambda: admission.check_upload(store, other, 150)) == "quota"
-        )  # they are young
-        date(b"1", 30)
-        date(b"2", 40)
-        admission.check_upload(store, other, 100)
-        assert left() == {b"1", b"2", b"3"}  # it fits without
-        put(store, SigningKey.generate(), {sha256_of(b"1" * 300): b"1" * 300})  # by another key
-        admission.check_upload(store, other, 150)
-        assert left() == {b"1", b"3"}
-        date(b"1", 30)
-        date(b"3", -60 * 24 * 365)  # in the future, by a clock that was wrong
-        admission.check_upload(store, other, 900)
-        assert (left(), store.total_bytes()) == (set(), 0)
+        put(store, key, {one: b"1" * 300, two: b"2" * 300})
+        move_clock(monkeypatch, utc(after(minutes=40)))
+        other = SigningKey.generate()
+        assert code_of(lambda: admission.check_upload(store, other.public, 500)) == "quota"
+        put(store, other, {one: b"1" * 300})
+        move_clock(monkeypatch, utc(after(minutes=61)))
+        admission.check_upload(store, other.public, 500)
+        assert [digest for digest, _ in store.objects.paths()] == [one]
+        assert store.possesses(other.public, one)
+        assert not store.possesses(key.public, one)
+        assert store.total_bytes() == 300
