@@ -149,11 +149,11 @@ class Store(SealedStore):
         with self.transaction() as index:
             if not self.objects.touch(digest):
                 raise BoardError(f"artefact={digest}: was removed meanwhile. Upload it again.")
-            if self.possesses(by, digest):
+            time, execute = self.clock.received(), index.connection.execute
+            renewed = "UPDATE upload SET time = ? WHERE digest = ? AND key = ?"
+            if execute(renewed, (time, digest, by)).rowcount or self.possesses(by, digest):
                 return False
-            index.connection.execute(
-                "INSERT INTO upload VALUES (?, ?, ?, ?)", (digest, size, by, self.clock.received())
-            )
+            execute("INSERT INTO upload VALUES (?, ?, ?, ?)", (digest, size, by, time))
         return True
 
     def possesses(self, key: str, digest: str) -> bool:
