@@ -34,7 +34,8 @@ _PANELS = {
     "Results": {
         "rank": (_RESULTS, "Rank the entries by a metric."),
         "show": (_RESULTS, "Show one submission: its method, runs and scores."),
-        "verify": (_RESULTS, "Check every signature, hash, log entry and score."),
+        "fetch": (_RESULTS, "Copy the public part of a served board."),
+        "verify": (_RESULTS, "Check every signature, digest, log entry and score."),
     },
     "Administration": {
         "init": (_ADMIN, "Create a board."),

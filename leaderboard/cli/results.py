@@ -1,9 +1,11 @@
-"""`sme-leaderboard rank · show · verify`: read a board."""
+"""`sme-leaderboard rank · show · fetch · verify`: read a board."""
 
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -19,13 +21,19 @@ from leaderboard.scoring import ranking
 from leaderboard.scoring.ranking import REASONS, RankedRow
 from leaderboard.scoring.verify import VerifyReport
 from leaderboard.scoring.verify import verify as verify_board
-from leaderboard.seasons.verify import verify_seasons
 from leaderboard.store import EntryRow, Store
 from leaderboard.web import client
+from leaderboard.web.fetch import MOST_BYTES
+from leaderboard.web.fetch import fetch as fetch_board
 from leaderboard.web.tables import PublicView, RankingFile, public_view, steps_text
 from sme_registry.errors import OptionError
 from sme_registry.io.markup import Table
 from sme_registry.io.terminal import err, fixed, out, print_json, print_pairs
+
+WITH_SEASONS = find_spec("leaderboard.seasons") is not None
+if WITH_SEASONS:
+    from leaderboard.seasons.publication import files_of_seasons
+    from leaderboard.seasons.verify import verify_seasons
 
 app = typer.Typer()
 
@@ -262,6 +270,46 @@ def find_entry(store: Store, id: str) -> EntryRow:
 
 
 @app.command()
+def fetch(
+    url: Annotated[str, typer.Argument(metavar="URL", help="Of a served board.")],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="A new one, or a copy.")],
+    without_data: Annotated[
+        bool, typer.Option("--without-data", help="Leave out the data sets of seasons.")
+    ] = False,
+    most: Annotated[
+        int, typer.Option(min=1, metavar="BYTES", help="Stop after so many.")
+    ] = MOST_BYTES,
+    json: Json = False,
+) -> None:
+    """Copy the public part of a served board, for `verify`.
+
+    That is its log, documents, results, public policies and answers, and its seasons. Each part is
+    checked as it comes. If it is interrupted, or the board has grown, repeat it.
+
+    Examples:
+
+      sme-leaderboard fetch https://board.example copy
+
+      sme-leaderboard verify copy
+    """
+    with err().status("fetching") as status:
+        fetched = fetch_board(
+            url,
+            folder,
+            without_data=without_data,
+            most=most,
+            parts=[files_of_seasons] if WITH_SEASONS else [],
+            progress=lambda what: status.update(f"fetching {escape(what)}"),
+        )
+    if json:
+        print_json(asdict(fetched))
+        return
+    size = f"{fetched.files:,} files, {fetched.bytes:,} bytes"
+    out().print(f"{escape(str(folder))}: {fetched.entries:,} log entries; {size} new.")
+    out().print(f"Next: sme-leaderboard verify {escape(str(folder))}", soft_wrap=True)
+
+
+@app.command()
 def verify(
     board: BoardFolder = Path("board"),
     rescore: Annotated[
@@ -301,14 +349,14 @@ def verify(
 
       sme-leaderboard verify board --contains sha256:3f2a…
     """
-    seasons = partial(verify_seasons, published=published or ())
+    parts = [partial(verify_seasons, published=published or ())] if WITH_SEASONS else []
     with err().status("verifying") as status:
         report = verify_board(
             board,
             rescore=_rescore_count(rescore),
             seed=seed,
             contains=contains,
-            parts=[seasons],
+            parts=parts,
             progress=lambda what: status.update(f"verifying {escape(what)}"),
         )
     if json:

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,6 +20,8 @@ from leaderboard.errors import BoardError
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.scoring import HiddenTask, challenge, instances
 from leaderboard.seasons.season import MAX_INSTANCES, Digests, Hidden, Season, Terms, rows_of
+from leaderboard.store import Store
+from leaderboard.web.fetch import Files
 from sme_registry.compiled import chosen_backend
 from sme_registry.datasets import DatasetRecipe, SealedDataset
 from sme_registry.evaluation import resolve_protocol
@@ -184,6 +187,19 @@ def copy_published(season: Season, source: Path, target: Path) -> None:
                 dataset_path(source, season.id, hidden),
                 dataset_path(Path(building), season.id, hidden),
             )
+
+
+def _check_copy(season: Season, folder: Path) -> None:
+    if season.published and folder.is_dir():
+        check_published(season, folder)
+
+
+def files_of_seasons(store: Store) -> Iterator[Files]:
+    """The public files of a board's seasons, for `fetch`."""
+    for row in store.seasons():
+        season, folder = store.season(row.digest), store.season_folder(row.digest)
+        check = partial(_check_copy, season, folder.published)
+        yield Files(f"/api/seasons/{row.id}/files", folder.path, check)
 
 
 def check_published(

@@ -3,6 +3,8 @@
     GET  /api/seasons                                           the board's seasons
     GET  /api/seasons/{id}                                      one season, its state and its reveal
     GET  /api/seasons/{id}/ranking?metric=wd_regret             its methods with results
+    GET  /api/seasons/{id}/files?start=0                        a thousand of its public files
+    GET  /api/seasons/{id}/files/{path}?start=0                 8 MiB of one
     POST /api/seasons/{id}/entries                              201 an offline entry, 200 known
     POST /api/seasons/{id}/tickets                              201 a ticket, 200 the same again;
                                                                 signed, see `admission`
@@ -23,6 +25,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from anyio import CapacityLimiter, to_thread
@@ -46,13 +49,15 @@ from leaderboard.seasons.sessions import Sessions, attending
 from leaderboard.store import SeasonRow, Store
 from leaderboard.web.http import HTTP_CODES, RequestError, read_body
 from sme_registry import seasons
-from sme_registry.io import to_json
+from sme_registry.io import open_regular, to_json
 
 _SEASON = "/api/seasons/{season}"
 _TICKET = _SEASON + "/tickets/{ticket}"
 _INSTANCE = _TICKET + "/instances/{instance}"
 _WORKERS = 4  # threads that go on from snapshots and write answers
 _LARGEST = 2**31
+_FILES = 1000  # in a list
+_CHUNK = 2**23  # of a file
 _CURVE_POINTS = 40
 _RANKINGS_KEPT = 16
 _T = TypeVar("_T")
@@ -101,6 +106,8 @@ class SeasonRoutes:
             Route("/api/seasons", self.get_seasons, methods=["GET"]),
             Route(_SEASON, self.get_season, methods=["GET"]),
             Route(f"{_SEASON}/ranking", self.get_ranking, methods=["GET"]),
+            Route(f"{_SEASON}/files", self.get_files, methods=["GET"]),
+            Route(f"{_SEASON}/files/{{path:path}}", self.get_file, methods=["GET"]),
             Route(f"{_SEASON}/entries", self.post_entry, methods=["POST"]),
             Route(f"{_SEASON}/tickets", self.post_ticket, methods=["POST"]),
             Route(_TICKET, self.get_ticket, methods=["GET"]),
@@ -144,6 +151,45 @@ class SeasonRoutes:
             return self._ranked[key]
 
         return Response(await _run(ranked, self._rankings), media_type="application/json")
+
+    async def get_files(self, request: Request) -> Response:
+        start = _start(request)
+
+        def files() -> list[dict[str, Any]]:
+            folder, parts = self._public_parts(request)
+            paths = [path for part in parts for path in sorted((folder / part).rglob("[!.]*"))]
+            return [
+                {"path": path.relative_to(folder).as_posix(), "size": path.stat().st_size}
+                for path in paths
+                if path.is_file()
+            ]
+
+        listed = await self._in_thread(files)
+        end = start + _FILES
+        more = end if end < len(listed) else None
+        return JSONResponse({"files": listed[start:end], "next": more})
+
+    async def get_file(self, request: Request) -> Response:
+        start, path = _start(request), request.path_params["path"]
+
+        def read() -> bytes:
+            folder, parts = self._public_parts(request)
+            if path.split("/")[0] not in parts or "/." in path:
+                raise RequestError("not_found", f"{HTTP_CODES['not_found']}.")
+            try:
+                with open_regular(folder / path) as stream:
+                    stream.seek(start)
+                    return stream.read(_CHUNK)
+            except OSError:
+                raise RequestError("not_found", f"{HTTP_CODES['not_found']}.") from None
+
+        return _octets(await self._in_thread(read))
+
+    def _public_parts(self, request: Request) -> tuple[Path, list[str]]:
+        """The folder of a season, and those in it that are public."""
+        row = self._store.season_row(request.path_params["season"])
+        revealed = ["tickets"] if row.reveal else []
+        return self._store.season_folder(row.digest).path, ["published", *revealed]
 
     def _view(self, row: SeasonRow) -> dict[str, Any]:
         return {
@@ -280,6 +326,13 @@ class SeasonRoutes:
 
 async def _run(work: Callable[[], _T], limiter: CapacityLimiter) -> _T:
     return await to_thread.run_sync(work, limiter=limiter)
+
+
+def _start(request: Request) -> int:
+    text = request.query_params.get("start", "0")
+    if not (text.isascii() and text.isdigit() and len(text) < 16):
+        raise RequestError("bad_request", f"start={text!r:.80}: must be a number.")
+    return int(text)
 
 
 class _Where(NamedTuple):

@@ -91,13 +91,18 @@ class LogEntry(PlainDocument):
         return _digest(fields)
 
     @property
+    def file(self) -> str:
+        """Its file in the board's folder."""
+        return f"log/{self.sequence:08d}.json"
+
+    @property
     def head(self) -> Head:
         """This entry as the one that the next entry must follow."""
         return Head(self.sequence, self.digest, self.time)
 
     def contradiction(self, message: str) -> TamperedError:
         """The error to raise where this entry contradicts those before it."""
-        return TamperedError(f"log/{self.sequence:08d}.json", f"event={self.event}: {message}")
+        return TamperedError(self.file, f"event={self.event}: {message}")
 
     def check_subject(self, id: str) -> None:
         """Raise `TamperedError` if its document is of another subject."""
@@ -127,8 +132,7 @@ class Log:
         where = path.relative_to(self.folder.path).as_posix()
         if entry.sequence != sequence:
             raise TamperedError(where, f"holds entry {entry.sequence}")
-        if not verifies(self.key, entry.signature, "log", entry.signed_digest):
-            raise TamperedError(where, "its signature does not match the board's key")
+        self._check_signature(entry)
         return entry
 
     def read_after(self, head: Head) -> LogEntry:
@@ -138,12 +142,23 @@ class Log:
           TamperedError: it is missing, altered, not signed by the board, or does not follow `head`.
         """
         entry = self.read(head.sequence + 1)
-        where = f"log/{entry.sequence:08d}.json"
-        if entry.previous != head.digest:
-            raise TamperedError(where, "does not follow the entry before it: one was replaced")
-        if (entry.event == "opened") != (entry.sequence == 0):
-            raise TamperedError(where, "only the first entry may open a board")
+        self._check_order(entry, head)
         return entry
+
+    def check(self, entry: LogEntry, head: Head) -> None:
+        """Raise `TamperedError` unless the board has signed an entry, and it follows `head`."""
+        self._check_signature(entry)
+        self._check_order(entry, head)
+
+    def _check_signature(self, entry: LogEntry) -> None:
+        if not verifies(self.key, entry.signature, "log", entry.signed_digest):
+            raise TamperedError(entry.file, "its signature does not match the board's key")
+
+    def _check_order(self, entry: LogEntry, head: Head) -> None:
+        if (entry.sequence, entry.previous) != (head.sequence + 1, head.digest):
+            raise TamperedError(entry.file, "does not follow the entry before it: one was replaced")
+        if (entry.event == "opened") != (entry.sequence == 0):
+            raise TamperedError(entry.file, "only the first entry may open a board")
 
     def entry(
         self, key: SigningKey, head: Head, event: Event, subject: str, document: str, time: str

@@ -105,7 +105,7 @@ class ServedBoard:
     """
 
     def __init__(self, url: str, *, insecure: bool) -> None:
-        self._url = url
+        self.url = url
         self._address = server_address(url, insecure=insecure).url
         self._connection = Connection(url, insecure=insecure, patience=_PATIENCE)
 
@@ -121,7 +121,7 @@ class ServedBoard:
         try:
             return BoardDocument.from_dict(answer)
         except SpecError as error:
-            raise BoardError(f"{self._url}: its definition is invalid: {error}") from None
+            raise BoardError(f"{self.url}: its definition is invalid: {error}") from None
 
     def receiver(self) -> Receiver:
         """Who takes signatures: the address is where this client has reached the board."""
@@ -133,19 +133,35 @@ class ServedBoard:
         self.request("PUT", f"/api/objects/{hex_of(digest)}", data, sign)
 
     def request(
-        self, method: str, path: str, content: bytes = b"", sign: Callable[[], str] | None = None
+        self,
+        method: str,
+        path: str,
+        content: bytes = b"",
+        sign: Callable[[], str] | None = None,
+        most: int = _MOST,
     ) -> Any:
         """The JSON of an answer; None if it is none."""
+        data = self.read(method, path, content, sign, most)
+        with contextlib.suppress(MalformedDocumentError):
+            return parse_json(data, self.url)
+        return None
+
+    def read(
+        self,
+        method: str,
+        path: str,
+        content: bytes = b"",
+        sign: Callable[[], str] | None = None,
+        most: int = _MOST,
+    ) -> bytes:
+        """The bytes of an answer, of at most `most`."""
         try:
-            data = self._connection.request(method, path, content, most=_MOST, sign=sign)
+            return self._connection.request(method, path, content, most=most, sign=sign)
         except SealedError as error:
             if error.code in CODES:
                 raise Rejection(error.code, error.message) from None
             named = error.code in ("unreachable", "http", "wire")  # the client's own, with the URL
-            raise BoardError(error.message if named else f"{self._url}: {error.message}") from None
-        with contextlib.suppress(MalformedDocumentError):
-            return parse_json(data, self._url)
-        return None
+            raise BoardError(error.message if named else f"{self.url}: {error.message}") from None
 
 
 def answer_for(id: str, answer: Any, url: str) -> dict[str, Any]:

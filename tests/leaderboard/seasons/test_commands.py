@@ -153,5 +153,10 @@ def test_an_entry_is_sent_to_a_served_board(season):
         id = good("enter", url, season, "{name}.npy", *ENTER).strip()
         bad = ("enter", url, season, "bad-{name}.npy", "--failed", "deep-1", *ENTER)
         assert "answer_shape" in fails(1, *bad)
+        good("fetch", url, "copy")
+        good("fetch", url, "small", "--without-data")
+    assert counts("verify", "copy")["autumn: data sets, by their digests"] == (2, 0)
+    assert counts("verify", "small")["autumn: data sets"] == (0, 2)
+    assert counts("verify", "copy")["files by their digests"] == (2, 1)  # answers are secret
     with Store.open("board", read_only=True) as store:
         assert [row.entrant.id for row in store.entrants(read_season(season).digest)] == [id]

@@ -70,6 +70,10 @@ def test_a_ticket_of_any_season_is_played_and_then_scored_and_logged(url, board,
     played(url, ticket, 0, 16)
     with seasons.Instance(url, ticket, 1) as instance:
         assert instance.status().phase == "running"
+        files = f"{url}/api/seasons/second/files"
+        assert httpx.get(files, trust_env=False).json() == {"files": [], "next": None}
+        for path in ("tickets/1/0.journal", ".stepping"):  # secret until the reveal
+            assert httpx.get(f"{files}/{path}", trust_env=False).status_code == 404
         played(url, ticket, 1, 5)
         assert instance.status().phase == "ended"
     with Store.open(board.path, read_only=True) as store:

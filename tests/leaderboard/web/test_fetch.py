@@ -1,0 +1,137 @@
+"""`fetch`: what a copy has, how it goes on, and what a server cannot make it write."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from leaderboard.documents.board import hex_of
+from leaderboard.errors import BoardError, TamperedError
+from leaderboard.scoring.verify import verify
+from leaderboard.seasons.publication import files_of_seasons
+from leaderboard.seasons.verify import verify_seasons
+from leaderboard.store import Store
+from leaderboard.web.client import ServedBoard
+from leaderboard.web.fetch import fetch
+from tests.leaderboard.serving import serving
+
+ROOT = Path(__file__).resolve().parents[3]
+EXAMPLE = ROOT / "examples" / "board"
+SEASONS = ROOT / "docs" / "results" / "season" / "board"  # of rules 2, with two revealed seasons
+
+
+@pytest.fixture
+def url(tmp_path):
+    board = shutil.copytree(EXAMPLE, tmp_path / "served")
+    with serving(board) as url:
+        yield url
+
+
+def files(folder):
+    return {
+        path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()
+    }
+
+
+def test_a_copy_has_all_that_is_public_and_is_verified(url, tmp_path):
+    fetched = fetch(url, tmp_path / "copy")
+    assert fetched.entries == 9
+    assert files(tmp_path / "copy") == files(EXAMPLE)
+    assert verify(tmp_path / "copy", rescore=1).is_confirmed
+    again = fetch(url, tmp_path / "copy")
+    assert (again.entries, again.files) == (9, 0)
+
+
+def test_it_goes_on_after_every_interruption(url, tmp_path, monkeypatch):
+    real, copy = ServedBoard.read, tmp_path / "copy"
+    for count in range(40):
+        left = [count]
+
+        def read(self, *arguments, left=left, **named):
+            left[0] -= 1
+            if left[0] < 0:
+                raise KeyboardInterrupt
+            return real(self, *arguments, **named)
+
+        monkeypatch.setattr(ServedBoard, "read", read)
+        try:
+            fetch(url, copy)
+            break
+        except KeyboardInterrupt:
+            if count > 3:  # what is there is a board
+                Store.open(copy, read_only=True).close()
+    assert count > 5
+    assert files(copy) == files(EXAMPLE)
+
+
+def answering(monkeypatch, change):
+    """The server's answers to requests for bytes, changed."""
+    real = ServedBoard.read
+
+    def read(self, method, path, *arguments, **named):
+        return change(path, real(self, method, path, *arguments, **named))
+
+    monkeypatch.setattr(ServedBoard, "read", read)
+
+
+def test_what_a_server_alters_is_refused_and_not_written(url, tmp_path, monkeypatch):
+    board = Store.open(EXAMPLE, read_only=True)
+    with board, monkeypatch.context() as patch:
+        document = board.log(1, 1)[0].document
+        name = f"/api/objects/{hex_of(document)}"
+        answering(patch, lambda path, data: data + b" " if path == name else data)
+        with pytest.raises(BoardError, match="has another digest"):
+            fetch(url, tmp_path / "one")
+        with Store.open(tmp_path / "one", read_only=True) as copy:
+            assert copy.head.sequence == 0
+    for old, new in ((b"received", b"withdrawn"), (b'"sequence":3', b'"sequence":4')):
+        with monkeypatch.context() as patch:
+            answering(patch, lambda path, data, a=old, b=new: data.replace(a, b))
+            with pytest.raises(TamperedError, match=r"signature|does not follow"):
+                fetch(url, tmp_path / new.decode()[-3:].strip(":"))
+
+
+def test_a_limit_and_another_boards_folder_stop_it(url, tmp_path):
+    with pytest.raises(BoardError, match=r"more than 10,000 bytes"):
+        fetch(url, tmp_path / "copy", most=10_000)
+    fetch(url, tmp_path / "copy")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").write_text("")
+    other = shutil.copytree(SEASONS, tmp_path / "other")
+    for folder, match in ((tmp_path / "full", "not empty"), (other, "no copy of this board")):
+        before = files(folder)
+        with pytest.raises(BoardError, match=match):
+            fetch(url, folder)
+        assert files(folder) == before
+
+
+@pytest.fixture
+def seasons(tmp_path):
+    board = shutil.copytree(SEASONS, tmp_path / "served")
+    with serving(board) as url:
+        yield url
+
+
+def test_seasons_are_copied_with_what_was_played_and_verified(seasons, tmp_path):
+    copy = tmp_path / "copy"
+    fetch(seasons, copy, parts=[files_of_seasons])
+    played = {path for path in files(copy) if path.suffix in (".journal", ".npy")}
+    assert played == {path for path in files(SEASONS) if path.suffix in (".journal", ".npy")}
+    with Store.open(copy, read_only=True) as store:
+        rows, notes = verify_seasons(store, lambda what: None)
+        assert notes == []
+        assert sum(row.checked for row in rows if row.what.endswith("scored again")) == 11
+    assert len(verify(copy).missing) == 6  # which the board itself lacks
+
+
+@pytest.mark.parametrize(
+    "path", ["../up", "/absolute", "tickets/../../up", ".stepping", "published/.a", "a//b", "a\\b"]
+)
+def test_a_server_names_no_file_outside_the_copy(seasons, tmp_path, monkeypatch, path):
+    def lie(address, data):
+        listed = b'{"files": [{"path": "%s", "size": 3}], "next": null}'
+        return listed % path.replace("\\", "\\\\").encode() if "/files?" in address else data
+
+    answering(monkeypatch, lie)
+    with pytest.raises(BoardError, match="unsafe name"):
+        fetch(seasons, tmp_path / "copy", parts=[files_of_seasons])
