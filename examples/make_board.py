@@ -33,7 +33,7 @@ from onnx import TensorProto, helper, numpy_helper
 import sme_registry
 from leaderboard.admission import submit_bundle, submit_references
 from leaderboard.bundle import make_bundle
-from leaderboard.documents.signed import SigningKey
+from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.documents.submission import Training
 from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import run_scorers
@@ -151,7 +151,7 @@ def make_board(
                 Path(temporary, f"bundle-{index}"),
                 suite=suite,
                 key=key,
-                board=store.document.key,
+                receiver=Receiver(store.document.key),
                 runs=[source],
                 method=method,
                 submitter=submitter,

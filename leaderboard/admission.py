@@ -281,14 +281,14 @@ def check_time(created: str, at: datetime.datetime, age_days: int) -> None:
 
 
 def check_name(store: Store, submitter: Submitter) -> None:
-    """Reject (`name_taken`) a name that another key has used, or one that looks like it."""
+    """Reject (`name_taken`) a name that another key has used, in whatever case."""
     holder = store.holder_of_name(submitter.name)
     if holder not in (None, submitter.key):
         raise Rejection(
             "name_taken",
             f"submitter.name={submitter.name!a}: on this board it belongs to the key "
-            f"{holder[:16]}…, which was the first to use it, or a name that looks like it. Choose "
-            "another name, or sign with that key.",
+            f"{holder[:16]}…, which was the first to use it. Choose another name, or sign with "
+            "that key.",
         )
 
 

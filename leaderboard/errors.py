@@ -28,7 +28,7 @@ CODES = {
     "duplicate_run": "a run, or an artefact within one spec, is listed twice",
     "missing_run": "an instance has no run, no run has a policy, or runs_started is too small",
     "unsafe_name": "a name or path has forbidden characters, or is reserved for the board",
-    "name_taken": "another key has used this name, or one that looks like it, on this board",
+    "name_taken": "another key has used this name on this board",
     "unknown_submission": "no submission on the board has this id",
     "withdrawn": "the submission was withdrawn by its submitter",
     "quota": "the key's, or the board's, quota is used up",

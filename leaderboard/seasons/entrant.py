@@ -104,11 +104,12 @@ def ticket(
     # Kept until the ticket is: a request that was sent and not answered may have started one.
     request_file = out_file.with_name(f"{out_file.name}.request")
     repeated = request_file.exists()
+    season_digest, receiver = served_season(url, season)
     if repeated:
         signed = Signed[TicketRequest].read(read_file(request_file))
+        signed = signed.for_receiver(receiver, signing_key)
         err().print(f"Repeating {escape(str(request_file))}.", soft_wrap=True)
     else:
-        season_digest, receiver = served_season(url, season)
         nonce = secrets.token_hex(32)
         request = TicketRequest.from_dict(
             {

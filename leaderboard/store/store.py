@@ -16,7 +16,7 @@ from leaderboard.documents.board import (
 )
 from leaderboard.documents.result import Result
 from leaderboard.documents.signed import Signed, SigningKey
-from leaderboard.documents.submission import Submission, Withdrawal, check_text, now, skeleton
+from leaderboard.documents.submission import Submission, Withdrawal, check_text, now
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.seasons.store import SealedStore
 from leaderboard.store.files import digest_of, write_document
@@ -175,22 +175,22 @@ class Store(SealedStore):
             )
 
     def holder_of_name(self, name: str) -> str | None:
-        """The key that was first to use a submitter's name, or one that looks like it.
+        """The key that was first to use a submitter's name, in whatever case.
 
         A name is used by an entry or ticket that waits for its scores, or has had scores of at
         least one policy or answer: otherwise, policies that are rejected, or tickets that nobody
         plays, would be enough to occupy names.
         """
         with self.reading() as index:
-            rows = index.connection.execute(
-                "SELECT submitter, key FROM (SELECT submitter, key, sequence FROM entry "
+            row = index.one(
+                "SELECT key FROM (SELECT submitter, key, sequence FROM entry "
                 "WHERE status = 'waiting' OR scores IS NOT NULL "
                 "UNION ALL SELECT submitter, key, sequence FROM sealed "
                 "WHERE result IS NULL OR policies > 0) "
-                "GROUP BY submitter, key ORDER BY min(sequence)"
+                "WHERE lower(submitter) = lower(?) ORDER BY sequence LIMIT 1",
+                name,
             )
-            alike = skeleton(name)
-            return next((key for submitter, key in rows if skeleton(submitter) == alike), None)
+        return None if row is None else row[0]
 
     def receive(self, signed: Signed[Submission]) -> bool:
         """Add a submission, which was admitted, to the queue.
