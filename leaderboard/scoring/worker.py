@@ -42,6 +42,18 @@ _UNWRITTEN_SECONDS, _UNWRITTEN_SECONDS_SERVED = 30.0, 3600.0
 _log = logging.getLogger(__name__)
 
 
+Job = Callable[[Store, str], None]
+"""Does a job of the queue, by its id; may do it twice."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a scorer does: submissions, and jobs if it knows how; it can be pickled."""
+
+    submissions: bool = True
+    job: Job | None = None
+
+
 def worker_name() -> str:
     """A unique name for a scorer."""
     return f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
@@ -57,6 +69,7 @@ def run_scorer(
     lease_seconds: float = LEASE_SECONDS,
     retry: bool = True,
     isolation: Isolation | None = None,
+    work: Work = Work(),  # frozen
 ) -> int:
     """Score in this process, one submission after another.
 
@@ -72,6 +85,7 @@ def run_scorer(
       lease_seconds: how long a claim outlives its scorer.
       retry: whether submissions that earlier faults have postponed are tried at once.
       isolation: of the sandboxes; None for the one that this machine has.
+      work: what to do.
 
     Returns:
       The number of results written.
@@ -89,8 +103,16 @@ def run_scorer(
         if retry:
             store.queue.retry()
         while not stop():
-            claim = store.queue.claim(worker, seconds=lease_seconds)
-            if claim is not None:
+            claim = store.queue.claim(
+                worker,
+                seconds=lease_seconds,
+                submissions=work.submissions,
+                jobs=work.job is not None,
+            )
+            if claim is not None and claim.is_job and work.job is not None:
+                with _heartbeats(store, claim):
+                    _do(store, claim, work.job)
+            elif claim is not None:
                 with _heartbeats(store, claim):
                     result = _score(store, claim, progress, isolation)
                     written += result is not None and _finish(store, claim, result, patience, stop)
@@ -99,6 +121,19 @@ def run_scorer(
             else:
                 time.sleep(_POLL_SECONDS)
     return written
+
+
+def _do(store: Store, claim: Claim, job: Job) -> None:
+    """Do a job; after a fault it is postponed."""
+    try:
+        job(store, claim.id)
+        store.queue.end_job(claim)
+    except KeyboardInterrupt:
+        store.queue.release(claim)
+        raise
+    except Exception as error:  # whose text may name what is hidden
+        _log.warning("%s: attempt %d: %s", claim.id, claim.attempt, type(error).__name__)
+        store.queue.fault(claim, type(error).__name__)
 
 
 def _score(
@@ -167,16 +202,19 @@ def _heartbeats(store: Store, claim: Claim) -> Iterator[None]:
 
 @contextlib.contextmanager
 def background_scorers(
-    path: str | Path, workers: int, isolation: Isolation | None = None
+    path: str | Path, workers: int, isolation: Isolation | None = None, job: Job | None = None
 ) -> Iterator[None]:
-    """Run scorer processes while the block runs, watched by a thread; 0 workers run none.
+    """Run scorer processes while the block runs, watched by a thread.
+
+    With 0 workers, one does jobs, if it knows how, and none scores submissions.
 
     Nothing but the end of the block ends the scoring: after an error it starts again, first after
     a second, then after growing pauses of up to five minutes.
     """
-    if not workers:
+    if not workers and job is None:
         yield
         return
+    work = Work(submissions=workers > 0, job=job)
     stop = threading.Event()
 
     def score() -> None:
@@ -184,7 +222,14 @@ def background_scorers(
         while not stop.is_set():
             begun = time.monotonic()
             try:
-                run_scorers(path, workers, until_empty=False, stop=stop.is_set, isolation=isolation)
+                run_scorers(
+                    path,
+                    max(workers, 1),
+                    until_empty=False,
+                    stop=stop.is_set,
+                    isolation=isolation,
+                    work=work,
+                )
             except Exception as error:
                 if time.monotonic() - begun > _LONGEST_PAUSE:
                     pause = _FIRST_PAUSE
@@ -211,6 +256,7 @@ def run_scorers(
     started: Callable[[int], None] | None = None,
     lease_seconds: float = LEASE_SECONDS,
     isolation: Isolation | None = None,
+    work: Work = Work(),  # frozen
 ) -> int:
     """Score in several processes at once; one that dies is replaced and its submission rescored.
 
@@ -228,6 +274,7 @@ def run_scorers(
       started: called with the process id of each new process.
       lease_seconds: how long a claim outlives its scorer if its death goes unnoticed.
       isolation: of the sandboxes; None for the one that this machine has.
+      work: what to do.
 
     Returns:
       The number of submissions done since the start.
@@ -241,7 +288,7 @@ def run_scorers(
     """
     integer_in("workers", workers, 1, advice="Leave it out for one.")
     with Store.open(path) as store:
-        scorers = _Scorers(path, store, workers, (until_empty, lease_seconds, isolation))
+        scorers = _Scorers(path, store, workers, (until_empty, lease_seconds, isolation, work))
         before = store.queue.done()
         store.queue.retry()
 
@@ -281,7 +328,7 @@ class _Scorers:
         path: str | Path,
         store: Store,
         workers: int,
-        options: tuple[bool, float, Isolation | None],
+        options: tuple[bool, float, Isolation | None, Work],
     ) -> None:
         self._path, self._store, self._workers = path, store, workers
         self._options, self._until_empty = options, options[0]
@@ -401,6 +448,7 @@ def _scorer_process(
     until_empty: bool,
     lease_seconds: float,
     isolation: Isolation | None,
+    work: Work,
 ) -> None:
     # A terminal sends Ctrl-C to parent and children, and the parent passes it on: the second one
     # must not disturb the clean-up.
@@ -421,6 +469,7 @@ def _scorer_process(
             lease_seconds=lease_seconds,
             retry=False,
             isolation=isolation,
+            work=work,
         )
     except KeyboardInterrupt:
         pass

@@ -1,22 +1,18 @@
 """`Sessions`: the tickets of an online season whose master this server has, as they are played.
 
-Beside requests, every second the journals are synced, and tickets that are over are closed and
-scored, one after the other in a process of their own, so that steps go on. A ticket that cannot be
-scored is tried again after all others, after growing pauses of up to five minutes.
+Beside requests, every second the journals are synced, and tickets that are over are closed, and put
+into the board's queue of what is scored.
 """
 
 from __future__ import annotations
 
 import contextlib
 import logging
-import multiprocessing
 import os
-import signal
 import threading
-import time
 from collections import OrderedDict
-from collections.abc import Collection, Iterator, Sequence
-from multiprocessing.process import BaseProcess
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from leaderboard.errors import BoardError, TamperedError
@@ -150,29 +146,21 @@ class Sessions:
                     over.append(row.number)
         return over
 
-    def close_ticket(self, number: int) -> None:
-        """Refuse all further requests for a ticket, after those in progress."""
-        self.ticket(number).close()
-
-    def end_unplayed(self, numbers: Sequence[int], most: int) -> list[int]:
-        """Log the results of tickets that are over and that nobody has played.
-
-        Args:
-          numbers: of tickets that are over.
-          most: results to log at a time.
-
-        Returns:
-          The numbers of the others.
-        """
-        unplayed = {number for number in numbers if self.ticket(number).is_unplayed}
-        for number in sorted(unplayed)[:most]:
-            ticket = self.ticket(number)
-            ticket.close()
-            if ticket.is_unplayed:  # still: requests were in progress
+    def attend(self) -> None:
+        """Sync the journals; end the tickets that nobody has played, and let others be scored."""
+        try:
+            self.sync()
+            over = [self.ticket(number) for number in self.over()]
+            for ticket in over:
+                ticket.close()
+            self._store.queue.add_jobs(each.id for each in over if not each.is_unplayed)
+            for ticket in [each for each in over if each.is_unplayed][:_AT_ONCE]:
                 result = unplayed_result(self._store, self.season, ticket)
-                self._store.end_ticket(self.digest, number, result)
+                self._store.end_ticket(self.digest, ticket.number, result)
                 ticket.forget()
-        return [number for number in numbers if number not in unplayed]
+        except Exception as error:  # the board is locked, or has no memory or files left
+            # Nothing but the kind of an error is logged: its text may name what is hidden.
+            _log.error("season: cannot be attended to: %s", type(error).__name__)
 
     def sync(self) -> None:
         """Make all steps taken survive a loss of power."""
@@ -218,24 +206,21 @@ def _seasons_of(store: Store, master: Master, secret: str | os.PathLike[str]) ->
 
 
 _SECONDS = 1.0
-_AT_ONCE = 100  # tickets: of a process, or unplayed ones of a second
-_FIRST_PAUSE, _LONGEST_PAUSE = 1.0, 300.0
-_STOP_SECONDS = 10.0
+_AT_ONCE = 100  # results of unplayed tickets, of a second
 _log = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
-def attending(tickets: Collection[Sessions]) -> Iterator[None]:
-    """Sync, end and score in a thread while the block runs."""
-    if not tickets:
+def attending(sessions: Collection[Sessions]) -> Iterator[None]:
+    """Sync, and end tickets, in a thread while the block runs."""
+    if not sessions:
         yield
         return
     stop = threading.Event()
-    attendants = [Attendant(each) for each in tickets]
 
     def attend() -> None:
         while not stop.wait(_SECONDS):
-            for each in attendants:
+            for each in sessions:
                 each.attend()
 
     thread = threading.Thread(target=attend, name="seasons", daemon=True)
@@ -245,90 +230,26 @@ def attending(tickets: Collection[Sessions]) -> Iterator[None]:
     finally:
         stop.set()
         thread.join()
-        for each in attendants:
-            each.stop()
 
 
-class Attendant:
-    """What a server does for one season beside requests."""
+@dataclass(frozen=True)
+class ScoreTicket:
+    """The job of a scorer, in its own process: score a ticket that is over, and log its result.
 
-    def __init__(self, tickets: Sessions) -> None:
-        self._sessions = tickets
-        self._process: BaseProcess | None = None
-        self._numbers: list[int] = []  # of the tickets that the process scores
-        self._at_once = _AT_ONCE
-        self._failed: set[int] = set()
-        self._pause, self._retry_at = _FIRST_PAUSE, 0.0
+    Attributes:
+      secrets: files of the masters of the seasons that a server steps.
+    """
 
-    def attend(self) -> None:
-        """Sync the journals, and score the next tickets that are over."""
-        try:
-            self._sessions.sync()
-            is_scoring = self._is_scoring()
-            played = self._sessions.end_unplayed(self._sessions.over(), _AT_ONCE)
-            if is_scoring:
-                return
-            waiting = [number for number in played if number not in self._failed]
-            if waiting:
-                self._numbers = waiting[: self._at_once]
-                for number in self._numbers:
-                    self._sessions.close_ticket(number)
-                self._process = self._start()
-            elif time.monotonic() >= self._retry_at:
-                self._failed.clear()
-        except Exception as error:  # the board is locked, or has no memory or files left
-            # Nothing but the kind of an error is logged: its text may name what is hidden.
-            _log.error("season: cannot be attended to: %s", type(error).__name__)
+    secrets: tuple[Path, ...]
 
-    def stop(self) -> None:
-        """End the scoring; the next server does it."""
-        if self._process is not None:
-            self._process.terminate()
-            self._process.join(_STOP_SECONDS)
-
-    def _start(self) -> BaseProcess:
-        # Not forked: this process has threads, connections and locks.
-        process = multiprocessing.get_context("spawn").Process(
-            target=_score,
-            args=(
-                self._sessions.board,
-                self._sessions.digest,
-                self._sessions.secret,
-                self._numbers,
-            ),
-            name="tickets",
-        )
-        process.start()
-        return process
-
-    def _is_scoring(self) -> bool:
-        if self._process is None or self._process.is_alive():
-            return self._process is not None
-        failed = self._process.exitcode != 0
-        self._process.close()
-        self._process = None
-        if failed:  # others first
-            _log.error("season: a ticket could not be scored; it is tried again")
-            self._failed.update(self._numbers)  # those with a result are not over any more
-            self._retry_at = time.monotonic() + self._pause
-        self._pause = min(2.0 * self._pause, _LONGEST_PAUSE) if failed else _FIRST_PAUSE
-        # The process may have died before it came to the others.
-        self._at_once = 1 if failed else _AT_ONCE
-        return False
-
-
-def _score(board: Path, season: str, secret: Path, numbers: Sequence[int]) -> None:
-    """Score tickets and log their results, in a process of its own."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server ends it
-    failed = False
-    for number in numbers:
-        try:
-            with Store.open(board) as store:
-                of, row = store.season(season), store.ticket(season, number)
-                ticket = Ticket(store, of, Master.read(secret), row)
-                store.end_ticket(season, number, score_ticket(store, of, ticket))
-                ticket.forget()
-        except Exception as error:
-            _log.error("season: scoring ticket %d failed: %s", number, type(error).__name__)
-            failed = True
-    raise SystemExit(failed)
+    def __call__(self, store: Store, id: str) -> None:
+        """Score the ticket that was started by the request of this id."""
+        row = store.entrant(id)
+        if row is None or row.result is not None:
+            return
+        season = store.season(row.season)
+        masters = map(Master.read, self.secrets)
+        master = next(each for each in masters if season.is_committed_to(each))
+        ticket = Ticket(store, season, master, row)
+        store.end_ticket(row.season, row.number, score_ticket(store, season, ticket))
+        ticket.forget()

@@ -38,6 +38,7 @@ from starlette.types import Scope
 from leaderboard.documents.result import RANKED_METRICS
 from leaderboard.documents.signed import MAX_BYTES, Signed
 from leaderboard.errors import Rejection
+from leaderboard.scoring.worker import Job
 from leaderboard.seasons.admission import receive_entry, refuse_other_sender, start_ticket
 from leaderboard.seasons.entry import Entry, TicketRequest
 from leaderboard.seasons.instance import Instance
@@ -45,7 +46,7 @@ from leaderboard.seasons.pages import SECTION
 from leaderboard.seasons.ranking import (
     ranking_facts,
 )
-from leaderboard.seasons.sessions import Sessions, attending
+from leaderboard.seasons.sessions import ScoreTicket, Sessions, attending
 from leaderboard.store import SeasonRow, Store
 from leaderboard.web.http import HTTP_CODES, RequestError, read_body
 from sme_registry import seasons
@@ -78,6 +79,7 @@ class SeasonRoutes:
         self._sessions = {
             each.season.id: each for path in secrets for each in Sessions.of_master(store, path)
         }
+        self._secrets = tuple(each.secret for each in self._sessions.values())
         self._threads = CapacityLimiter(_WORKERS)
         self._requests = CapacityLimiter(1)
         self._entries = CapacityLimiter(1)
@@ -93,6 +95,11 @@ class SeasonRoutes:
         finally:
             for each in self._sessions.values():
                 each.close()
+
+    @property
+    def job(self) -> Job | None:
+        """What scores tickets that are over; None if no season is stepped."""
+        return ScoreTicket(self._secrets) if self._secrets else None
 
     @property
     def routes(self) -> list[Route]:

@@ -1,4 +1,6 @@
-"""`Queue`: the submissions that wait to be scored, and the scorers that have claimed them.
+"""`Queue`: what waits to be scored, and the scorers that have claimed it.
+
+Submissions, and before them jobs: tickets of seasons that are over.
 
 First come, first served, the reference rows before all others. A key has a second submission in
 progress only while nobody else's waits, so that many scorers do not all work for one.
@@ -11,6 +13,7 @@ scored.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,14 +42,19 @@ SELECT id, coalesce(attempt, 0), coalesce(faults, 0), coalesce(fault, '') {_CLAI
 ORDER BY reference DESC,
   key IN (SELECT key FROM lease JOIN entry ON id = submission WHERE held), sequence LIMIT 1
 """
+_NEXT_JOB = """
+SELECT id, coalesce(attempt, 0), coalesce(faults, 0), coalesce(fault, '')
+FROM job LEFT JOIN lease ON submission = id
+WHERE submission IS NULL OR boot <> ? OR expires <= ? ORDER BY job.rowid LIMIT 1
+"""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """The right to write one submission's result until another scorer claims it.
+    """The right to write one submission's result, or to do a job, until another scorer claims it.
 
     Attributes:
-      id: the submission's.
+      id: the submission's, or the job's.
       worker: the scorer's name.
       attempt: number of claims of this submission, this one included.
       seconds: how long the claim holds without a heartbeat.
@@ -56,6 +64,7 @@ class Claim:
     worker: str
     attempt: int
     seconds: float
+    is_job: bool = False
 
 
 class Queue:
@@ -64,8 +73,26 @@ class Queue:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def claim(self, worker: str, *, seconds: float = LEASE_SECONDS) -> Claim | None:
-        """Claim the next submission that waits, is not claimed, and is not postponed.
+    def add_jobs(self, ids: Iterable[str]) -> None:
+        """Let scorers do jobs that the log does not know of, before submissions."""
+        with self._database.transaction() as index:
+            index.connection.executemany("INSERT OR IGNORE INTO job VALUES (?)", zip(ids))
+
+    def end_job(self, claim: Claim) -> None:
+        """Remove a job that is done."""
+        with self._database.transaction() as index:
+            index.connection.execute("DELETE FROM job WHERE id = ?", (claim.id,))
+            index.connection.execute("DELETE FROM lease WHERE submission = ?", (claim.id,))
+
+    def claim(
+        self,
+        worker: str,
+        *,
+        seconds: float = LEASE_SECONDS,
+        submissions: bool = True,
+        jobs: bool = False,
+    ) -> Claim | None:
+        """Claim the next job or submission that waits, is not claimed, and is not postponed.
 
         A claim holds for `seconds` of the machine's uptime, whatever its clock is set to;
         `heartbeat` renews it.
@@ -73,6 +100,7 @@ class Queue:
         Args:
           worker: the scorer's name, unique among those running.
           seconds: how long the claim holds without a heartbeat.
+          submissions, jobs: what to claim.
 
         Returns:
           The claim; None if there is nothing to claim now.
@@ -83,7 +111,8 @@ class Queue:
         with self._database.transaction() as index:
             _end_lost(index)
             boot, at = uptime()
-            row = index.one(_NEXT, boot, at)
+            job = index.one(_NEXT_JOB, boot, at) if jobs else None
+            row = index.one(_NEXT, boot, at) if submissions and job is None else job
             if row is None:
                 return None
             self._database.signing_key()  # without it no result could follow
@@ -92,7 +121,7 @@ class Queue:
                 "REPLACE INTO lease VALUES (?, ?, ?, 1, ?, ?, ?, ?)",
                 (id, worker, attempts + 1, faults, fault, boot, at + seconds),
             )
-            return Claim(id, worker, attempts + 1, seconds)
+            return Claim(id, worker, attempts + 1, seconds, is_job=job is not None)
 
     def heartbeat(self, claim: Claim) -> bool:
         """Renew a claim.

@@ -87,7 +87,10 @@ def create_app(
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         with store, contextlib.ExitStack() as stack:
             store.note_clock()
-            stack.enter_context(background_scorers(os.fspath(path), score_workers, isolation))
+            job = next((track.job for track in tracks), None)
+            stack.enter_context(
+                background_scorers(store.folder.path, score_workers, isolation, job)
+            )
             for track in tracks:
                 stack.enter_context(track.open())
             yield

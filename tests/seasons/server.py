@@ -14,7 +14,7 @@ import pytest
 
 from leaderboard.documents.signed import SigningKey
 from leaderboard.seasons.scoring import instances
-from leaderboard.seasons.sessions import Attendant
+from leaderboard.seasons.web import SeasonRoutes
 from leaderboard.store import Store
 from sme_registry.envs import SMEVectorEnv
 from sme_registry.seasons import Ticket
@@ -79,7 +79,7 @@ def serving_season(folder):
     """A board in a folder, served with a relay by threads of this process; it scores nothing."""
     board = online_board(folder, classes=CLASSES)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Attendant, "_start", lambda _: None)
+        patch.setattr(SeasonRoutes, "job", None)
         server = Server(board)
         with (
             _relay(server),

@@ -7,7 +7,7 @@ import httpx
 import pytest
 
 from leaderboard.cli.options import KEY_VARIABLE
-from leaderboard.seasons.sessions import Attendant
+from leaderboard.seasons.web import SeasonRoutes
 from leaderboard.store import Store
 from leaderboard.store.files import to_bytes
 from tests.leaderboard.clocks import set_clocks
@@ -23,7 +23,7 @@ MONTH = 24.0 * 30
 def board(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(KEY_VARIABLE, str(tmp_path / "my.key"))
-    monkeypatch.setattr(Attendant, "_start", lambda _: None)
+    monkeypatch.setattr(SeasonRoutes, "job", None)
     return online_board(tmp_path)
 
 

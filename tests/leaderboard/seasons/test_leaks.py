@@ -2,16 +2,16 @@
 
 import logging
 import pickle
-from unittest.mock import Mock
 
 import httpx
 import numpy as np
 import pytest
 
 from leaderboard.documents.signed import SigningKey
+from leaderboard.scoring.worker import Work, run_scorer
 from leaderboard.seasons.entry import signer_of
 from leaderboard.seasons.scoring import instances
-from leaderboard.seasons.sessions import Attendant
+from leaderboard.seasons.sessions import Sessions
 from leaderboard.seasons.tickets import Ticket
 from leaderboard.store import Store
 from sme_registry import SMEError, materialize, seasons
@@ -137,11 +137,19 @@ def test_answers_to_steps_have_one_form(tmp_path):
     assert len(heads) == 1
 
 
-def test_a_fault_is_logged_without_its_text(caplog):
-    tickets = Mock()
-    tickets.sync.side_effect = SMEError("the seed is 0x5eed")
-    Attendant(tickets).attend()
-    assert "SMEError" in caplog.text
+def test_a_fault_is_logged_without_its_text(tmp_path, caplog, monkeypatch):
+    def fails(*_):
+        raise SMEError("the seed is 0x5eed")
+
+    monkeypatch.setattr("leaderboard.scoring.worker.log_to_terminal", lambda: None)
+    with playing(online_board(tmp_path)) as played:
+        monkeypatch.setattr(Sessions, "sync", fails)
+        played.sessions.attend()
+        played.store.queue.add_jobs([played.request.id])
+        stop = iter((False, True))
+        run_scorer(played.board.path, work=Work(job=fails), until_empty=False, stop=stop.__next__)
+        assert played.store.queue.faults() == 1
+    assert caplog.text.count("SMEError") == 2
     assert "5eed" not in caplog.text
 
 

@@ -10,7 +10,7 @@ from leaderboard.cli.options import KEY_VARIABLE
 from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError
 from leaderboard.seasons import entrant
-from leaderboard.seasons.sessions import Attendant
+from leaderboard.seasons.web import SeasonRoutes
 from leaderboard.store import Store
 from sme_registry.seasons import Instance, Ticket
 from tests.leaderboard.seasons.playing import online_board
@@ -29,7 +29,7 @@ def board(tmp_path, monkeypatch):
 
 @pytest.fixture
 def url(board, monkeypatch):
-    monkeypatch.setattr(Attendant, "_start", lambda _: None)  # nothing is scored
+    monkeypatch.setattr(SeasonRoutes, "job", None)  # nothing is scored
     with serving(board.path, season_secrets=[board.secret]) as url:
         yield url
 

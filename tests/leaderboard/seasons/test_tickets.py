@@ -3,7 +3,6 @@
 import errno
 import os
 import pickle
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -12,13 +11,14 @@ from hypothesis import strategies as st
 
 from leaderboard.documents.signed import Signed
 from leaderboard.errors import BoardError, Rejection
+from leaderboard.scoring.worker import Work, run_scorer
 from leaderboard.seasons import sessions as sessions_module
 from leaderboard.seasons.admission import start_ticket
 from leaderboard.seasons.entry import TicketRequest
 from leaderboard.seasons.instance import Instance
 from leaderboard.seasons.journal import Journal
 from leaderboard.seasons.master import Master
-from leaderboard.seasons.sessions import Attendant, Sessions, _score
+from leaderboard.seasons.sessions import ScoreTicket, Sessions
 from leaderboard.seasons.stepping import Play
 from leaderboard.seasons.tickets import Ticket
 from leaderboard.store import played_bytes
@@ -337,7 +337,7 @@ def test_a_closed_ticket_takes_nothing_from_requests_in_progress(played):
     played.start(instance=1)
     instance, other = played.ticket.instances
     played.finish()
-    played.sessions.close_ticket(played.number)
+    played.ticket.close()
     refused("ticket_ended", instance.answer, pack_table(HALF), "")
     assert not instance.answered
     refused("ticket_ended", other.start, LANES)
@@ -348,23 +348,39 @@ def test_a_closed_ticket_takes_nothing_from_requests_in_progress(played):
 def test_steps_that_arrive_while_an_unplayed_ticket_is_closed_are_scored(played, monkeypatch):
     def late(ticket):
         played.finish()
+        set_clocks(monkeypatch, passed=25)
         close(ticket)
 
     close = Ticket.close
+    monkeypatch.setattr(Sessions, "over", lambda _: [played.number])
     monkeypatch.setattr(Ticket, "close", late)
-    assert played.sessions.end_unplayed([played.number], 100) == []
-    assert played.store.ticket(played.board.season.digest, played.number).result is None
+    played.sessions.attend()
+    assert result(played, played.number) is None
+    assert claimed(played) == [played.request.id]
 
 
-def test_tickets_that_nobody_played_score_one_without_a_process(played, monkeypatch):
+def result(played, number):
+    row = played.store.ticket(played.board.season.digest, number)
+    return played.store.sealed_result(row)
+
+
+def claimed(played):
+    """The jobs that the queue has now."""
+    ids = []
+    while (claim := played.store.queue.claim("tests", submissions=False, jobs=True)) is not None:
+        ids.append(claim.id)
+    return ids
+
+
+def test_tickets_that_nobody_played_score_one_without_a_scorer(played, monkeypatch):
     played.take_ticket(1)
     played.start(lanes=48)
     store, season = played.store, played.board.season
     set_clocks(monkeypatch, 0, passed=25)
-    monkeypatch.delattr(Attendant, "_start")
     evaluated = [scored(store, season, number) for number in (1, 2)]
-    Attendant(played.sessions).attend()
+    played.sessions.attend()
     assert played.sessions.over() == []
+    assert claimed(played) == []
     assert [store.sealed_result(row) for row in store.entrants(season.digest)] == evaluated
     # Nor does such a ticket keep its name from others.
     assert store.holder_of_name(f"Tester {played.key.public[:8]}") is None
@@ -378,27 +394,17 @@ def test_a_ticket_takes_nothing_while_it_is_scored_and_what_it_took_is_flushed(p
     monkeypatch.setattr(os, "fdatasync", fails(errno.EIO))
     played.sessions.sync()  # a disk that fails for a moment ends no server
     monkeypatch.setattr(os, "fdatasync", flushed.append)
-    Attendant(played.sessions).attend()
+    played.sessions.attend()
     assert len(flushed) == 1
     set_clocks(monkeypatch, 0, passed=25)
-    process = Mock()
-    monkeypatch.setattr(Attendant, "_start", lambda _: process)
-    attendant = Attendant(played.sessions)
-    attendant.attend()
-    instance = played.ticket.instance(0)
-    refused("ticket_ended", instance.step, request(2))
-    attendant.stop()
-    process.terminate.assert_called_once()
-    process.join.assert_called_once()
+    for _ in range(2):
+        played.sessions.attend()
+    refused("ticket_ended", played.ticket.instance(0).step, request(2))
+    assert claimed(played) == [played.request.id]
 
 
-def ended(code):
-    """A process that has ended."""
-    return Mock(exitcode=code, is_alive=lambda: False)
-
-
-def test_tickets_that_could_not_be_scored_are_tried_again_one_by_one(played, monkeypatch):
-    """The first process dies; then the journal of ticket 1 cannot be read for a while."""
+def test_tickets_that_cannot_be_scored_are_tried_again_after_others(played, monkeypatch):
+    """The journal of ticket 1 cannot be read for a while."""
     broken = played.folder / "0.journal"
     for number in (1, 2):
         if played.number < number:
@@ -406,39 +412,25 @@ def test_tickets_that_could_not_be_scored_are_tried_again_one_by_one(played, mon
         played.start()
         played.step(1)
         played.finish()
-    started = []
-    codes = []
-
-    def start(attendant):
-        board = played.board
-        started.append(attendant._numbers)
-        if len(started) == 1:
-            return ended(1)
-        with pytest.raises(SystemExit) as end:
-            _score(board.path, board.season.digest, board.secret, attendant._numbers)
-        codes.append(bool(end.value.code))
-        return ended(int(codes[-1]))
-
-    def attend(seconds):
-        set_clocks(monkeypatch, 0, passed=25 + seconds / 3600)
-        attendant.attend()
-        attendant.attend()
-        return started
-
-    monkeypatch.setattr("leaderboard.seasons.sessions.signal.signal", lambda *_: None)
-    monkeypatch.setattr(Attendant, "_start", start)
     whole = broken.read_bytes()
     broken.write_bytes(b"no journal")
     played.restart()
-    attendant = Attendant(played.sessions)
-    assert attend(seconds=0) == [[1, 2]]
-    assert attend(seconds=2) == [[1, 2], [1]]
-    assert attend(seconds=2) == [[1, 2], [1], [2]]
+    set_clocks(monkeypatch, 0, passed=25)
+    work = Work(submissions=False, job=ScoreTicket((played.board.secret,)))
+
+    def attend():
+        played.sessions.attend()
+        run_scorer(played.board.path, work=work)
+        return [number for number in (1, 2) if result(played, number) is not None]
+
+    assert attend() == [2]
     assert played.sessions.over() == [1]
+    assert played.store.queue.faults() > 0
     broken.write_bytes(whole)
-    assert attend(seconds=60) == [[1, 2], [1], [2], [1]]
+    assert attend() == [1, 2]
     assert played.sessions.over() == []
-    assert codes == [True, False, False]
+    assert claimed(played) == []
+    assert not list(played.folder.parent.glob("*/*.npz"))
 
 
 @pytest.mark.parametrize("lanes", [1, LANES])
