@@ -144,7 +144,7 @@ class OfflinePolicy(Perceptron):
     on and how, in plain JSON data; "algorithm" names it in reports.
 
     Examples:
-      >>> from sme_registry.evaluation import OfflinePolicy
+      >>> from sme_registry.datasets import OfflinePolicy
       >>> policy = OfflinePolicy([(np.zeros((4, 10), np.float32), np.zeros(4, np.float32))])
       >>> policy(np.ones((1, 10), np.float32)).tolist()
       [[0.5, 0.5, 0.5, 0.5]]

@@ -279,12 +279,6 @@ class SealedVectorEnv(VectorEnv[Observation, Array, Array]):
 
     Spaces, rewards and ends of episodes are those of `SMEVectorEnv` in the autoreset mode
     "SameStep"; seeds and resets are as in `SealedEnv`. `instance` has the budget and the answers.
-
-    Examples:
-      >>> from sme_registry.seasons import Instance, SealedVectorEnv
-      >>> envs = SealedVectorEnv(Instance("https://board.example", "ticket.json", lanes=4))
-      >>> envs.num_envs
-      4
     """
 
     def __init__(self, instance: Instance, action_range: ActionRange = "unit") -> None:
@@ -342,12 +336,6 @@ class SealedEnv(gymnasium.Env[Observation, Action]):
     Spaces, rewards and ends of episodes are those of `SMEEnv`; infos are empty. The server draws
     the initial states: `seed` seeds `np_random` only. `reset` within an episode does not end it: it
     returns the present observation, also in a new process that goes on where another one stopped.
-
-    Examples:
-      >>> from sme_registry.seasons import Instance, SealedEnv
-      >>> env = SealedEnv(Instance("https://board.example", "ticket.json"), "symmetric")
-      >>> float(env.action_space.low[0])
-      -1.0
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012

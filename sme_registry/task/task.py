@@ -368,8 +368,9 @@ def step(
     order that depends on B, and then a batch would not equal its singles bit for bit.
 
     Examples:
-      >>> from sme_registry.task import load_task, step
-      >>> task, states, begin = load_task("Default"), np.full((2, 8), 0.5), np.zeros(2, np.int64)
+      >>> from sme_registry.task import step
+      >>> task = sme_registry.materialize(sme_registry.load("Default"))
+      >>> states, begin = np.full((2, 8), 0.5), np.zeros(2, np.int64)
       >>> result = step(task, states, begin, np.zeros((2, 1)), task.optimal_action(states))
       >>> result.reward.ravel().tolist()
       [1.0, 1.0]
