@@ -43,6 +43,7 @@ from leaderboard.store.files import MAX_LOG_ENTRY_BYTES
 from sme_registry import SMESpec
 from sme_registry.errors import OptionError
 from sme_registry.io import TEMPORARY, integer_in
+from sme_registry.spec import EvaluationProtocol
 
 EXACT = 1e-9
 """Tolerance for numbers recomputed from the same runs: another machine may sum in another order."""
@@ -230,6 +231,16 @@ def contradiction(recorded: Any, again: Any) -> Difference | None:
     return difference({"runs": one["runs"], **one}, {"runs": other["runs"], **other}, EXACT)
 
 
+def with_metrics(run: RunScore, protocol: EvaluationProtocol, rules: int) -> RunScore | None:
+    """A run with the metrics that follow from its regions; None if these are not the protocol's."""
+    of_agents = [agent.normalised_regret for agent in run.agents]
+    lists = (run.normalised_regret, run.similarity or (), *of_agents)
+    if {len(each) for each in lists} != {len(protocol.edges)}:
+        return None
+    metrics = run_metrics(run.normalised_regret, run.similarity, levels_of(protocol), rules)
+    return run.model_copy(update=metrics)
+
+
 def refuse_contradiction(found: Difference | None, entry: str) -> None:
     """Raise `TamperedError` if an entry's result contradicts itself."""
     if found is not None:
@@ -409,23 +420,16 @@ def _expected_run(
     """What follows from the regrets of a submitted run; None if these do not fit its instance."""
     if run.artefact is None:
         return failed_run(board.protocol, class_name, run.spec)
-    if [agent.name for agent in score.agents] != agent_names(spec):
-        return None
-    of_agents = [agent.normalised_regret for agent in score.agents]
-    lists = (score.normalised_regret, score.similarity or (), *of_agents)
-    if any(len(each) != len(board.protocol.edges) for each in lists):
+    expected = with_metrics(score, board.protocol, board.rules)
+    if expected is None or [agent.name for agent in score.agents] != agent_names(spec):
         return None
     digest = run.artefact.sha256
-    metrics = run_metrics(
-        score.normalised_regret, score.similarity, levels_of(board.protocol), board.rules
-    )
-    return score.model_copy(
+    return expected.model_copy(
         update={
             "spec": run.spec,
             "class_name": class_name,
             "artefact": digest,
             "evaluation_seed": evaluation_seed(board.protocol.digest, run.spec, digest),
-            **metrics,
         }
     )
 

@@ -16,7 +16,7 @@ from typing import NoReturn
 
 from leaderboard.documents.result import RunScore
 from leaderboard.errors import TamperedError
-from leaderboard.scoring.aggregation import failed_run, levels_of, run_metrics
+from leaderboard.scoring.aggregation import failed_run
 from leaderboard.scoring.verify import (
     RESCORED,
     Difference,
@@ -27,6 +27,7 @@ from leaderboard.scoring.verify import (
     contradiction,
     difference,
     refuse_contradiction,
+    with_metrics,
 )
 from leaderboard.seasons.events import SealedRow, SeasonRow
 from leaderboard.seasons.master import Master
@@ -222,10 +223,13 @@ class _Verifier:
         if len(result.runs) != len(hidden):
             return Difference("runs", str(len(result.runs)), str(len(hidden)))
         for number, (run, place) in enumerate(zip(result.runs, hidden, strict=True)):
-            expected = _expected_run(season, place.member.name, run, board.rules)
+            name = place.member.name
+            expected: RunScore | None = failed_run(season.protocol, name, None)
+            if run.artefact is not None:
+                expected = with_metrics(run, season.protocol, board.rules)
             if expected is None:
                 return Difference(f"runs.{number}", "other regions", "those of the protocol")
-            runs.append(expected)
+            runs.append(expected.model_copy(update={"class_name": name}))
         again = sealed_result(
             season,
             result.subject,
@@ -241,14 +245,3 @@ class _Verifier:
         """Raise `TamperedError` for an entry or ticket."""
         kind = "ticket" if self.season.track == "sealed-online" else "entry"
         raise TamperedError(f"{self.of.id}: {kind} {row.number} ({row.entrant.id})", message)
-
-
-def _expected_run(season: Season, class_name: str, run: RunScore, rules: int) -> RunScore | None:
-    """What follows from the regrets of a run; None if they are not those of the regions."""
-    protocol = season.protocol
-    if run.artefact is None:
-        return failed_run(protocol, class_name, None)
-    if {len(run.normalised_regret), len(run.similarity or ())} != {len(protocol.edges)}:
-        return None
-    metrics = run_metrics(run.normalised_regret, run.similarity, levels_of(protocol), rules)
-    return run.model_copy(update={"class_name": class_name, **metrics})

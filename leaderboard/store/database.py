@@ -222,7 +222,8 @@ class Database:
         if self.document.rules != RULES:
             raise BoardError(
                 f"{self.folder.path}: follows rules {self.document.rules}, and boards that accept "
-                f"submissions follow rules {RULES}. Create a new board with `sme-leaderboard init`."
+                f"submissions follow rules {RULES}. Go on with the version that made it, or create "
+                "a new board with `sme-leaderboard init`."
             )
         if self._key is None:
             if not self.folder.key.exists():

@@ -114,7 +114,8 @@ class Objects:
         try:
             data = self.read(digest)
         except BoardError:
-            raise TamperedError(self._where(digest), "is missing, or no regular file") from None
+            where = self._where(digest)
+            raise TamperedError(where, "is missing, altered, or no regular file") from None
         return parse_document(data, kind, self._where(digest))
 
     def paths(self) -> Iterator[tuple[str, Path]]:
@@ -129,6 +130,8 @@ class Objects:
                     yield f"sha256:{shelf.name}{path.name}", path
 
     def _where(self, digest: str) -> str:
+        if self._is_by_kind and not self.has(digest):  # its file, which was altered, has another
+            return f"document {digest}"
         return self.path(digest).relative_to(self.folder.path).as_posix()
 
     @functools.cached_property

@@ -296,6 +296,25 @@ def test_a_result_of_an_earlier_version_that_gives_single_runs_an_interval_is_ac
     assert difference({"value": 0.6, "low": 0.6, "high": 0.6}, single, 1e-12)
 
 
+OLD = EXAMPLE.parents[1] / "docs" / "results" / "season" / "board"
+
+
+def test_a_board_of_rules_2_is_read_where_its_documents_lie_and_accepts_nothing(tmp_path):
+    board = shutil.copytree(OLD, tmp_path / "board")
+    report = verify(board)
+    assert (report.log_sequence, len(report.missing), report.notes) == (30, 6, ())
+    with Store.open(board) as store:
+        decays = [store.result(row.id).scores.ood_decay.value for row in store.entries()]
+        assert decays == pytest.approx([0.0, 0.0], abs=1e-6)  # N̄ − N₀ of π* and of ½
+        with pytest.raises(BoardError, match="follows rules 2"):
+            store.signing_key()
+    for path in (*board.glob("results/*.json"), *board.glob("seasons/*/entries/*.json")):
+        data = path.read_bytes()
+        path.write_bytes(data.replace(b": ", b":  ", 1))
+        assert first_altered(board).startswith("document sha256:")
+        path.write_bytes(data)
+
+
 # The board of the examples
 
 

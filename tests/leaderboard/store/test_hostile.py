@@ -212,13 +212,14 @@ def test_a_changed_index_has_no_effect_and_is_repaired(whole, tmp_path, rows, ch
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
+        ({"rules": 1}, "is of rules 1, which commit"),
         ({"draws": 10**7}, "draws"),
         ({"seeds": list(range(1001))}, "1,001 instances"),
         ({"title": "x" * 2**21}, "bytes"),
     ],
     ids=lambda each: "" if isinstance(each, str) else next(iter(each)),
 )
-def test_a_board_of_excessive_numbers_is_refused_at_once(board, change, reason):
+def test_a_board_of_excessive_numbers_or_of_rules_1_is_refused_at_once(board, change, reason):
     path = Folder(board).board
     plain = json.loads(path.read_text())
     for name, value in change.items():
