@@ -31,6 +31,7 @@ from leaderboard.documents.submission import (
     THE_BOARD,
     Artefact,
     Knowledge,
+    Manifest,
     Method,
     Run,
     Submission,
@@ -207,10 +208,9 @@ def admit(
     check_submission(store.document, submission, datetime.datetime.fromisoformat(time))
     _check_files(store, submission, policy_file, isolation)
     with store.transaction():  # no other submission can use the quota or the name in between
-        check_name(store, submission.submitter)
-        _check_quotas(store, key)
+        check_entrant(store, submission.submitter, len(signed.to_bytes()))
         if key != store.document.key:
-            check_room(store, len(signed.to_bytes()))
+            _check_queue(store)
         for digest, declared in _policies(submission).items():  # nor can `gc` take a file
             if policy_file is not None:
                 store.put_object(digest, [policy_file(digest)], by=key)
@@ -237,10 +237,10 @@ def submit_bundle(
 def check_submission(board: BoardDocument, submission: Submission, at: datetime.datetime) -> None:
     """Reject what a board does not accept at its time `at`, whatever else is on it.
 
-    The first failure is reported: `unsafe_name`, `unknown_suite`, `schema` (a time that does not
-    exist), `stale_time`, those of `check_runs`, `too_large`.
+    The first failure is reported: those of `check_manifest`, `unknown_suite`, those of
+    `check_runs`, `too_large`.
     """
-    check_names(submission, board.key)
+    check_manifest(board, submission, at)
     expected = board.suite_reference
     if submission.suite != expected:
         raise Rejection(
@@ -248,7 +248,6 @@ def check_submission(board: BoardDocument, submission: Submission, at: datetime.
             f"suite={submission.suite.name}, {submission.suite.digest}: must be "
             f"{expected.name}, {expected.digest}. Create a bundle for this board's suite.",
         )
-    check_time(submission.created, at, board.limits.age_days)
     check_runs(board.suite, submission)
     for index, run in enumerate(submission.runs):
         if run.artefact is not None and run.artefact.size > board.limits.artefact_bytes:
@@ -259,8 +258,13 @@ def check_submission(board: BoardDocument, submission: Submission, at: datetime.
             )
 
 
-def check_time(created: str, at: datetime.datetime, age_days: int) -> None:
-    """Reject a time that does not exist (`schema`), or is not near the board's (`stale_time`)."""
+def check_manifest(board: BoardDocument, manifest: Manifest, at: datetime.datetime) -> None:
+    """Reject unsafe names and texts, and a time that is not near the board's.
+
+    That is `unsafe_name`, `schema` if the time does not exist, or `stale_time`.
+    """
+    check_names(manifest, board.key)
+    created, age_days = manifest.created, board.limits.age_days
     try:
         moment = datetime.datetime.fromisoformat(created)
     except ValueError:
@@ -280,8 +284,12 @@ def check_time(created: str, at: datetime.datetime, age_days: int) -> None:
         )
 
 
-def check_name(store: Store, submitter: Submitter) -> None:
-    """Reject (`name_taken`) a name that another key has used, in whatever case."""
+def check_entrant(store: Store, submitter: Submitter, size: int) -> None:
+    """Decide, in the transaction that stores so many bytes, whether a key may send them.
+
+    That is `name_taken`, or `quota`, of a day and of the board. The board's own key has no quota,
+    because nothing is shown without the reference rows.
+    """
     holder = store.holder_of_name(submitter.name)
     if holder not in (None, submitter.key):
         raise Rejection(
@@ -290,37 +298,28 @@ def check_name(store: Store, submitter: Submitter) -> None:
             f"{holder[:16]}…, which was the first to use it. Choose another name, or sign with "
             "that key.",
         )
-
-
-def _check_quotas(store: Store, key: str) -> None:
-    """Reject one more submission of a key if its quota, or the queue, is full.
-
-    The board's own key has no quota, because nothing is shown without the reference rows.
-    """
-    limits = store.document.limits
+    key, most = submitter.key, store.document.limits.submissions_per_day
     if key == store.document.key:
         return
-    check_daily_quota(store, key)
-    waiting = store.queue.queued()  # those that faults have stopped take nobody's place
-    if waiting >= limits.waiting_submissions:
-        raise Rejection(
-            "quota",
-            f"board: the queue is full, with {waiting} of {limits.waiting_submissions} waiting "
-            "submissions. Send it again when some of them are scored.",
-        )
-
-
-def check_daily_quota(store: Store, key: str) -> None:
-    """Reject (`quota`) one more submission or entry of a key that has sent a day's number."""
-    limits = store.document.limits
     times = store.submission_times(key, a_day_ago(store))
-    if len(times) >= limits.submissions_per_day:
-        first = datetime.datetime.fromisoformat(times[-limits.submissions_per_day])
-        free = shifted(first, _DAY)
+    if len(times) >= most:
+        free = shifted(datetime.datetime.fromisoformat(times[-most]), _DAY)
         raise Rejection(
             "quota",
-            f"key={key[:16]}…: has sent {len(times)} of {limits.submissions_per_day} submissions "
-            f"within 24 hours. Send the next one after {utc(free)}.",
+            f"key={key[:16]}…: has sent {len(times)} of {most} submissions within 24 hours. Send "
+            f"the next one after {utc(free)}.",
+        )
+    check_room(store, size)
+
+
+def _check_queue(store: Store) -> None:
+    waiting = store.queue.queued()  # those that faults have stopped take nobody's place
+    most = store.document.limits.waiting_submissions
+    if waiting >= most:
+        raise Rejection(
+            "quota",
+            f"board: the queue is full, with {waiting} of {most} waiting submissions. Send it "
+            "again when some of them are scored.",
         )
 
 

@@ -13,16 +13,14 @@ import datetime
 
 from leaderboard.admission import (
     ReadFile,
-    check_daily_quota,
-    check_name,
-    check_room,
+    check_entrant,
+    check_manifest,
     check_stored,
-    check_time,
     uploader,
 )
 from leaderboard.documents.board import check_receiver
 from leaderboard.documents.signed import Signed
-from leaderboard.documents.submission import Artefact, check_names, skeleton
+from leaderboard.documents.submission import Artefact, skeleton
 from leaderboard.errors import Rejection
 from leaderboard.seasons.entry import Entry, TicketRequest
 from leaderboard.seasons.season import Season, read_answers
@@ -46,36 +44,25 @@ def enter(
     answers: ReadFile | None = None,
     address: str | None = None,
 ) -> bool:
-    """Check an entry and store it.
+    """Check an entry, its signature verified, and store it; False if the board has it.
 
     Args:
-      store: the board.
-      signed: the entry, its signature verified.
+      store, signed: the board and the entry.
       answers: returns the bytes of an answer by digest; they are stored with the entry. By default
         the entrant's key has uploaded them.
       address: of the server that it was sent to; None if it was given to the board's folder.
-
-    Returns:
-      True if it is new, False if the board already has it.
-
-    Raises:
-      Rejection: with the code of the first fault.
     """
     check_receiver(store.document, signed.receiver, address)
     if store.entrant(signed.id) is not None:
         return False
     entry, key = signed.content, signed.content.submitter.key
-    check_names(entry, store.document.key)
-    moment = datetime.datetime.fromisoformat(store.time)
-    check_time(entry.created, moment, store.document.limits.age_days)
+    check_manifest(store.document, entry, datetime.datetime.fromisoformat(store.time))
     store.open_season(entry.season, "sealed-offline")
     season = store.season(entry.season)
     given = _check_answers(store, season, signed, answers)
     with store.transaction():  # no other entrant can take the name, nor `gc` an answer in between
-        check_name(store, entry.submitter)
-        check_daily_quota(store, key)
+        check_entrant(store, entry.submitter, len(signed.to_bytes()))
         _check_newest(store, season, entry)
-        check_room(store, len(signed.to_bytes()))
         for answer in given:
             if answers is not None:
                 store.put_object(answer.sha256, [answers(answer.sha256)], by=key)
@@ -130,17 +117,7 @@ def _check_answers(
 def refuse_other_sender(
     store: Store, signed: Signed[TicketRequest], header: str | None, address: str
 ) -> None:
-    """Reject a request that its own key has not just sent, to this board at this address.
-
-    Args:
-      store: the board.
-      signed: the request.
-      header: the value of `Authorization`; None if there is none.
-      address: of the server that it was sent to.
-
-    Raises:
-      Rejection: `bad_signature`, `wrong_board` or `stale_time`.
-    """
+    """Reject a request whose header does not show that its own key has just sent it, here."""
     sender = uploader(store.document, header, signed.id, address)
     key = signed.content.submitter.key
     if sender != key:
@@ -157,19 +134,9 @@ def start_ticket(
     season: str,
     address: str | None = None,
 ) -> tuple[int, bool]:
-    """Start a ticket; the same request starts no second one, and has its number again.
+    """Start a ticket of the season to which a request was sent: its number, and whether it is new.
 
-    Args:
-      store: the board.
-      signed: the request, its signature verified.
-      season: digest of the season that it was sent to.
-      address: of the server that it was sent to; None if it was given to the board's folder.
-
-    Returns:
-      The ticket's number, and whether it is new.
-
-    Raises:
-      Rejection: with the code of the first fault.
+    The same request starts no second one. `address` is as in `enter`.
     """
     check_receiver(store.document, signed.receiver, address)
     known = store.entrant(signed.id)
@@ -188,12 +155,8 @@ def start_ticket(
             "ticket.answers_key, ticket.transcript: missing: must be the public key that signs the "
             "transcripts, and 1. Create the request with `sme-leaderboard ticket`.",
         )
-    check_names(request, store.document.key)
-    moment = datetime.datetime.fromisoformat(store.time)
-    check_time(request.created, moment, store.document.limits.age_days)
+    check_manifest(store.document, request, datetime.datetime.fromisoformat(store.time))
     size = len(signed.to_bytes()) + played_bytes(store.season(season))
     with store.transaction():  # no other entrant can take the name, or the room, in between
-        check_name(store, request.submitter)
-        check_daily_quota(store, request.submitter.key)
-        check_room(store, size)
+        check_entrant(store, request.submitter, size)
         return store.start_ticket(signed), True

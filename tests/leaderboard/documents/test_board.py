@@ -240,8 +240,8 @@ def test_a_board_whose_suite_exceeds_a_submission_is_refused(tmp_path):
 
 FAULTS = [
     ("unsafe_name", {"method__name": "<b>"}, "method.name"),
-    ("unknown_suite", {"suite": {"name": "x", "digest": "sha256:" + "0" * 64}}, "suite=x"),
     ("stale_time", {"created": "2020-01-01T00:00:00Z"}, "14 days"),
+    ("unknown_suite", {"suite": {"name": "x", "digest": "sha256:" + "0" * 64}}, "suite=x"),
     ("unknown_spec", [run("sha256:" + "1" * 64)], r"runs.3: spec=.*3 instances \(`sme show two"),
     ("duplicate_run", [run(A0, 5), run(A0, 5)], "seed=5"),
     ("missing_run", {"runs_started": {"A": 100}}, "runs_started.B=None"),

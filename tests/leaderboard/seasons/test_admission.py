@@ -107,7 +107,7 @@ def test_the_same_answers_must_fit_each_class(store, key):
 
 def test_what_changes_between_the_check_and_the_record_is_checked_again(store, key, monkeypatch):
     signed, path = entry(store, key, GOOD, None), store.folder.object(sha256_of(GOOD))
-    room = "leaderboard.seasons.admission.check_room"
+    room = "leaderboard.seasons.admission.check_entrant"
     with monkeypatch.context() as patch:  # as `gc` of another process
         patch.setattr(room, lambda *_: path.unlink())
         store.put_object(sha256_of(GOOD), [GOOD], by=key.public)
