@@ -32,6 +32,7 @@ import numpy as np
 from leaderboard.documents.board import RULES, BoardDocument
 from leaderboard.documents.result import (
     METRICS,
+    AgentScore,
     ClassScore,
     Estimate,
     Isolation,
@@ -40,6 +41,7 @@ from leaderboard.documents.result import (
     Scores,
 )
 from leaderboard.documents.submission import Submission, check_runs
+from sme_registry.evaluation import EvaluationReport
 from sme_registry.spec import EvaluationProtocol
 from sme_registry.statistics import Array, Statistic, aggregate, iqm, mean, stratified_bootstrap
 
@@ -272,4 +274,30 @@ def failed_run(protocol: EvaluationProtocol, class_name: str, spec: str | None) 
         normalised_regret=regrets,
         similarity=None,
         **metrics,
+    )
+
+
+def scored_run(
+    report: EvaluationReport, class_name: str, artefact: str | None, rules: int, **fields: Any
+) -> RunScore:
+    """A run with the scores of an evaluation; `fields` are the others of `RunScore`."""
+    regrets, similarity = (
+        tuple(getattr(region, name) for region in report.regions)
+        for name in ("normalised_regret", "similarity")
+    )
+    agents = tuple(
+        AgentScore(name=name, normalised_regret=tuple(r.normalised_regret for r in each.regions))
+        for name, each in report.agents.items()
+    )
+    metrics: dict[str, Any] = {
+        **run_metrics(regrets, similarity, levels_of(report.protocol), rules)
+    }
+    return RunScore(
+        class_name=class_name,
+        artefact=artefact,
+        normalised_regret=regrets,
+        similarity=similarity,
+        agents=agents,
+        **metrics,
+        **fields,
     )

@@ -62,17 +62,16 @@ import numpy as np
 import numpy.typing as npt
 
 from leaderboard.documents.board import BoardDocument
-from leaderboard.documents.result import AgentScore, Result, RunScore
+from leaderboard.documents.result import Result, RunScore
 from leaderboard.documents.submission import Submission
 from leaderboard.errors import Rejection
 from leaderboard.gate.isolation import Isolation, available_isolation
 from leaderboard.gate.sandbox import Actions, Observations, Sandbox, SandboxLimits, widths
 from leaderboard.scoring.aggregation import (
     failed_run,
-    levels_of,
     never_listed,
     result_of,
-    run_metrics,
+    scored_run,
 )
 from sme_registry import SMESpec, evaluate, materialize
 from sme_registry.compiled import engine
@@ -133,10 +132,8 @@ def score_submission(
       isolation: of the sandbox; None for the one that this machine has.
 
     Returns:
-      The result, a function of board, submission and files up to floating-point rounding,
-      except for the last bits in
-      `RunScore.actions`. It is a rejection if an
-      policy file, or its behaviour, is rejected.
+      The result, a function of board, submission and files up to floating-point rounding, but for
+      `RunScore.actions`. It is a rejection if a policy file, or its behaviour, is rejected.
 
     Raises:
       ScoringFault: a sandbox does not start, was ended from outside, or lacks memory or processor
@@ -206,7 +203,18 @@ def _score_runs(
                 f"{error.message}",
             ) from None
         evaluated += 1
-        runs.append(_run_score(board, class_name, digest, *evaluation))
+        report, actions = evaluation
+        runs.append(
+            scored_run(
+                report,
+                class_name,
+                digest,
+                board.rules,
+                spec=run.spec,
+                evaluation_seed=report.protocol.seed,
+                actions=actions,
+            )
+        )
     return runs
 
 
@@ -232,26 +240,16 @@ def _evaluate(
     with Sandbox(data, *widths(spec), limits, isolation=machine.isolation) as sandbox:
         machine.versions["onnxruntime"] = sandbox.runtime
         policy = _CheckedPolicy(sandbox, states, agents)
-        report = _report(board, spec, policy, digest, progress)
+        seed = evaluation_seed(board.protocol.digest, spec.digest, digest)
+        protocol = board.protocol.model_copy(update={"seed": seed})
         with _sandbox_errors():
+            report = evaluate(
+                policy, spec, protocol, action_range="unit", name=digest, progress=progress
+            )
             actions = observe(sandbox)
     used = {name: version for name, version in report.versions.items() if name not in _UNUSED}
     machine.versions |= {**used, "onnxruntime": sandbox.runtime}
     return report, actions
-
-
-def _report(
-    board: BoardDocument,
-    spec: SMESpec,
-    policy: Callable[[Observations], Actions],
-    digest: str,
-    progress: Progress | None = None,
-) -> EvaluationReport:
-    """The evaluation of a sandboxed policy, whose errors it passes on as they are."""
-    seed = evaluation_seed(board.protocol.digest, spec.digest, digest)
-    protocol = board.protocol.model_copy(update={"seed": seed})
-    with _sandbox_errors():
-        return evaluate(policy, spec, protocol, action_range="unit", name=digest, progress=progress)
 
 
 @contextlib.contextmanager
@@ -295,35 +293,6 @@ class _CheckedPolicy:
             if end == self._states:
                 self._begin_region()
         return a
-
-
-def _run_score(
-    board: BoardDocument,
-    class_name: str,
-    digest: str,
-    report: EvaluationReport,
-    actions: str | None,
-) -> RunScore:
-    regrets = tuple(region.normalised_regret for region in report.regions)
-    similarity = tuple(region.similarity for region in report.regions)
-    levels = levels_of(board.protocol)
-    metrics: dict[str, Any] = {**run_metrics(regrets, similarity, levels, board.rules)}
-    return RunScore(
-        spec=report.spec_digest,
-        class_name=class_name,
-        artefact=digest,
-        evaluation_seed=report.protocol.seed,
-        normalised_regret=regrets,
-        similarity=similarity,
-        agents=tuple(
-            AgentScore(
-                name=name, normalised_regret=tuple(r.normalised_regret for r in each.regions)
-            )
-            for name, each in report.agents.items()
-        ),
-        actions=actions,
-        **metrics,
-    )
 
 
 @dataclass(frozen=True, eq=False)

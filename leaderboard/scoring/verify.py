@@ -377,15 +377,14 @@ class _Verifier:
                 found = difference(compared(recorded), compared(again), RESCORED)
             if found is not None:
                 self.notes.append(Note(id, found))
-            others.update(_other_versions(recorded.versions, again.versions))
+            others.update(other_versions(recorded.versions, again.versions))
             count += 1
             self.progress(id)
         left = (scored - len(drawn), "not drawn: --rescore")
         absent = (len(drawn) - count, "their policy files are not here")
         why = "; ".join(f"{number} {reason}" for number, reason in (left, absent) if number)
         self.rows.append(Row("results, scored again", count, scored - count, why))
-        for other, number in others.items():
-            self.rows.append(Row("results of other versions", number, 0, other))
+        self.rows += [Row("results of other versions", n, 0, other) for other, n in others.items()]
 
     def _contradiction(self, result: Result) -> Difference | None:
         """The first value of a result that does not follow from the regrets of its runs."""
@@ -434,7 +433,8 @@ def _expected_run(
     )
 
 
-def _other_versions(recorded: dict[str, str], here: dict[str, str]) -> list[str]:
+def other_versions(recorded: dict[str, str], here: dict[str, str]) -> list[str]:
+    """The packages that had another version when a result was recorded."""
     return [
         f"{name} {version}, here {here[name]}"
         for name, version in recorded.items()

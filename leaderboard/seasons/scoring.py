@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from leaderboard.documents.board import RULES
 from leaderboard.documents.result import RunScore
@@ -20,9 +19,8 @@ from leaderboard.scoring.aggregation import (
     class_score,
     failed_run,
     is_oracle_like,
-    levels_of,
     method_scores,
-    run_metrics,
+    scored_run,
 )
 from leaderboard.seasons.master import Master, Place
 from leaderboard.seasons.season import (
@@ -140,26 +138,10 @@ def score_runs(
         if isinstance(report, PolicyError):
             raise report
         each.refuse_unused()
-        scores.append((_run_score(instance, report, digest, rules), _versions(report)))
+        name = instance.hidden.member.name
+        run = scored_run(report, name, digest, rules, spec=None, evaluation_seed=None)
+        scores.append((run, _versions(report)))
     return scores
-
-
-def _run_score(
-    instance: HiddenTask, report: EvaluationReport, digest: str | None, rules: int
-) -> RunScore:
-    regrets = tuple(region.normalised_regret for region in report.regions)
-    similarity = tuple(region.similarity for region in report.regions)
-    levels = levels_of(instance.protocol)
-    metrics: dict[str, Any] = {**run_metrics(regrets, similarity, levels, rules)}
-    return RunScore(
-        spec=None,
-        class_name=instance.hidden.member.name,
-        artefact=digest,
-        evaluation_seed=None,
-        normalised_regret=regrets,
-        similarity=similarity,
-        **metrics,
-    )
 
 
 def _versions(report: EvaluationReport) -> dict[str, str]:

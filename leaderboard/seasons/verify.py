@@ -26,6 +26,7 @@ from leaderboard.scoring.verify import (
     compared,
     contradiction,
     difference,
+    other_versions,
     refuse_contradiction,
     with_metrics,
 )
@@ -180,13 +181,14 @@ class _Verifier:
         for row in scored:
             if row not in counted:
                 self.refuse(row, "has a result, and does not count")
-        whole = [row for row in scored if self.has_answers(row)]
+        whole, others = [row for row in scored if self.has_answers(row)], Counter[str]()
         for row, again in zip(whole, self.scored(master, whole), strict=True):
             recorded = self.store.sealed_result(row)
             assert recorded is not None
             found = difference(compared(recorded), compared(again), RESCORED)
             if found is not None:
                 self.notes.append(Note(self.name(row.entrant.id), found))
+            others.update(other_versions(recorded.versions, again.versions))
             self.progress(row.entrant.id)
         left = sum(row.result is None for row in counted)
         reasons = (
@@ -196,6 +198,8 @@ class _Verifier:
         why = "; ".join(f"{number} {reason}" for number, reason in reasons if number)
         count = len(whole)
         self.report("results, scored again", count, left + len(scored) - count, why)
+        for other, number in others.items():
+            self.report("results of other versions", number, 0, other)
 
     def has_answers(self, row: SealedRow) -> bool:
         """Whether the answers of an offline entry are here; those of a ticket lie beside it."""
