@@ -89,17 +89,9 @@ def uploader(
     address: str,
     at: datetime.datetime | None = None,
 ) -> str:
-    """The public key that signed an upload of the object of this digest.
+    """The public key whose header permits an upload to a server's address at a time, or now.
 
-    Args:
-      board: the board.
-      header: the value of `Authorization`; None if there is none.
-      digest: of the object.
-      address: of the server that it was sent to.
-      at: time of arrival; now by default.
-
-    Raises:
-      Rejection: `bad_signature`, `wrong_board` or `stale_time`.
+    A `Rejection` is `bad_signature`, `wrong_board` or `stale_time`.
     """
     match = _HEADER.fullmatch(header or "")
     if match is None:
@@ -174,18 +166,14 @@ def admit(
     isolation: Isolation | None = None,
     address: str | None = None,
 ) -> bool:
-    """Check a submission and store it.
+    """Check a submission, its signature verified, and store it; False if the board has it.
 
     Args:
-      store: the board.
-      signed: the submission, its signature verified.
+      store, signed: the board and the submission.
       policy_file: returns a file's bytes by digest, of the size in the submission; they are
         stored with the submission. By default the submitter's key has uploaded them.
       isolation: of the process that reads its policies; None for the one that this machine has.
       address: of the server that it was sent to; None if it was given to the board's folder.
-
-    Returns:
-      True if it is new, False if the board already has it.
 
     Raises:
       Rejection: with the code of the first fault.
@@ -410,52 +398,27 @@ REFERENCES: tuple[Reference, ...] = (
 
 
 def submit_references(store: Store) -> list[str]:
-    """Submit π* and the constant ½ through the pipeline that every policy takes.
+    """Submit π* and the constant ½ as every policy is; returns the ids of `optimal` and `constant`.
 
     The board's own key signs them at the time when the board was opened. A row that exists is
-    kept, so a board has one of each, however often this is called.
-
-    Returns:
-      The ids of `optimal` and `constant`.
-
-    Raises:
-      BoardError: the board's key is missing.
+    kept, so a board has one of each, however often this is called: another version of `onnx` would
+    write other bytes.
     """
-    opened = store.log(0, 1)[0].time
-    key = store.folder.signing_key()
     existing = {row.method: row.id for row in store.entries() if row.reference}
-    ids = []
-    for reference in REFERENCES:
-        if reference.name in existing:  # another version of `onnx` would write other bytes
-            ids.append(existing[reference.name])
-            continue
-        signed, artefacts = _submission(store, key, opened, reference)
-        admit(
-            store,
-            signed,
-            artefacts.__getitem__,
-            isolation_for_own(),
-        )
-        ids.append(signed.id)
-    return ids
+    return [existing.get(each.name) or _submit_reference(store, each) for each in REFERENCES]
 
 
-def _submission(
-    store: Store, key: SigningKey, opened: str, reference: Reference
-) -> tuple[Signed[Submission], dict[str, bytes]]:
-    """A reference row with one run on each instance, and its artefacts by digest."""
-    artefacts: dict[str, bytes] = {}
+def _submit_reference(store: Store, reference: Reference) -> str:
+    """Submit one run of a reference policy on each instance."""
+    key, instances = store.folder.signing_key(), store.document.instances
+    files: dict[str, bytes] = {}
     runs = []
-    instances = store.document.instances
-    for digest, (_, spec) in instances.items():
+    for spec_digest, (_, spec) in instances.items():
         data = reference.onnx(spec)
-        sha256 = sha256_of(data)
-        artefacts[sha256] = data
-        runs.append(
-            Run(spec=digest, seed=0, steps=0, artefact=Artefact(sha256=sha256, size=len(data)))
-        )
+        policy = Artefact(sha256=sha256_of(data), size=len(data))
+        files[policy.sha256] = data
+        runs.append(Run(spec=spec_digest, seed=0, steps=0, artefact=policy))
     submission = Submission(
-        track=store.document.track,
         suite=store.document.suite_reference,
         method=Method(
             name=reference.name,
@@ -464,9 +427,11 @@ def _submission(
             knowledge=reference.knowledge,
         ),
         submitter=Submitter(name=THE_BOARD, key=key.public),
-        created=opened,
+        created=store.log(0, 1)[0].time,
         runs=tuple(runs),
         runs_started=dict(Counter(class_name for class_name, _ in instances.values())),
         statement=reference.statement,
     )
-    return submission.signed(key, Receiver(key.public)), artefacts
+    signed = submission.signed(key, Receiver(key.public))
+    admit(store, signed, files.__getitem__, isolation_for_own())
+    return signed.id
