@@ -17,6 +17,7 @@ from leaderboard import admission
 from leaderboard.bundle import make_bundle
 from leaderboard.cli import results
 from leaderboard.cli.options import (
+    Board,
     BoardFolder,
     Json,
     NewBoardFolder,
@@ -29,8 +30,8 @@ from leaderboard.documents.board import RUNS_TO_RANK, Folder
 from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.errors import BoardError
 from leaderboard.gate.isolation import Isolation, available_isolation, isolation_for_own
-from leaderboard.scoring.worker import run_scorers
-from leaderboard.store import Store, collect_garbage
+from leaderboard.scoring.worker import Work, run_scorers
+from leaderboard.store import collect_garbage
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.io.markup import plural
@@ -96,7 +97,7 @@ def init(
         instances = min(len(member.seeds) for member in file.suite.classes)
         runs_to_rank = min(instances, RUNS_TO_RANK - 1) if practice else RUNS_TO_RANK
     name, protocol_name = file.versioned_name, Path(protocol).stem
-    with Store.create(
+    with Board.create(
         board,
         title=title or f"SME leaderboard: {name}",
         suite_name=name,
@@ -166,7 +167,7 @@ def score_waiting(board: Path, workers: int, isolation: Isolation) -> None:
       typer.Exit: with code 1, if some could not be scored because of a fault of the machine.
     """
 
-    with Store.open(board) as store:
+    with Board.open(board) as store:
         entries = store.entries()
     before = {entry.id for entry in entries if entry.status != "waiting"}
     waiting = len(entries) - len(before)
@@ -174,8 +175,10 @@ def score_waiting(board: Path, workers: int, isolation: Isolation) -> None:
         out().print("No submission is waiting.")
         return
     with Progress("scoring", waiting, console=err(), unit="submissions") as progress:
-        run_scorers(board, workers, progress=progress.update_of, isolation=isolation)
-    with Store.open(board) as store:
+        run_scorers(
+            board, workers, progress=progress.update_of, isolation=isolation, work=Work(board=Board)
+        )
+    with Board.open(board) as store:
         entries = store.entries()
     counts = Counter(entry.status for entry in entries if entry.id not in before)
     parts = [
@@ -306,7 +309,7 @@ def reindex(board: BoardFolder = Path("board")) -> None:
       sme-leaderboard reindex board
     """
 
-    with Store.open(board, reindex=True) as store:
+    with Board.open(board, reindex=True) as store:
         out().print(f"Indexed {len(store.entries()):,} entries.")
 
 
@@ -332,7 +335,7 @@ def clock(
       sme-leaderboard clock board --correct
     """
 
-    with Store.open(board) as store:
+    with Board.open(board) as store:
         store.note_clock(anew=True)
         if correct:
             first = store.correct_clock()
@@ -359,7 +362,7 @@ def gc(
 
     if math.isnan(older_than_hours):
         raise BoardError("older_than_hours=nan: must be a number of hours, at least 0.")
-    with Store.open(board) as store:
+    with Board.open(board) as store:
         garbage = collect_garbage(
             store, objects_older_than=older_than_hours * 3600.0, dry_run=dry_run
         )
@@ -420,7 +423,7 @@ def _create_board(folder: Path, run: Path, record: RunRecord) -> None:
     seed = setting.pop("seed")
     suite = Suite.from_dict({"classes": [{"name": _SUITE, "setting": setting, "seeds": [seed]}]})
     file = SuiteFile(name=_SUITE, version=1, digest=suite.digest, suite=suite)
-    with Store.create(
+    with Board.create(
         folder / "board",
         title=_TITLE,
         suite_name=file.versioned_name,

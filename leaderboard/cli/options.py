@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +17,14 @@ from leaderboard.web import client
 from sme_registry.errors import OptionError
 from sme_registry.io.terminal import Progress, err
 from sme_registry.spec import ProtocolFile, SuiteFile, catalogue
+
+Board: type[Store] = Store
+"""How boards are opened: with seasons, if this package has them."""
+
+if find_spec("leaderboard.seasons") is not None:
+    from leaderboard.seasons.store import SeasonStore
+
+    Board = SeasonStore
 
 _LONG_LOG = 2000  # entries, read in two seconds or so
 _HOST = re.compile(r"[A-Za-z0-9.-]+:\d+(/.*)?|localhost(/.*)?|[A-Za-z0-9-]+(\.[A-Za-z0-9-]+)+/.*")
@@ -69,7 +78,7 @@ def open_board(board: Path) -> Store:
     with Progress(
         "reading", entries, console=err(), unit="log entries", enabled=entries > _LONG_LOG
     ) as progress:
-        return Store.open(board, read_only=True, progress=progress.update)
+        return Board.open(board, read_only=True, progress=progress.update)
 
 
 def new_board_folder(board: str | Path) -> Path:

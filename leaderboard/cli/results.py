@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import typer
 from rich.markup import escape
 
-from leaderboard.cli.options import BoardFolder, BoardOrUrl, Json, is_url, open_board
+from leaderboard.cli.options import Board, BoardFolder, BoardOrUrl, Json, is_url, open_board
 from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.result import LABELS, SYMBOLS, Estimate, Metric, Result
 from leaderboard.documents.submission import now
@@ -298,6 +298,7 @@ def fetch(
             folder,
             without_data=without_data,
             most=most,
+            board=Board,
             parts=[files_of_seasons] if WITH_SEASONS else [],
             progress=lambda what: status.update(f"fetching {escape(what)}"),
         )
@@ -356,6 +357,7 @@ def verify(
             rescore=_rescore_count(rescore),
             seed=seed,
             contains=contains,
+            board=Board,
             parts=parts,
             progress=lambda what: status.update(f"verifying {escape(what)}"),
         )

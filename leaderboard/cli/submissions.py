@@ -14,6 +14,7 @@ from leaderboard.admission import check_submission
 from leaderboard.bundle import Bundle, make_bundle
 from leaderboard.cli.options import (
     DEFAULT_KEY,
+    Board,
     BoardOrUrl,
     BundleFolder,
     CodeLink,
@@ -39,7 +40,6 @@ from leaderboard.documents.submission import Knowledge, Withdrawal, now
 from leaderboard.errors import Rejection
 from leaderboard.gate.isolation import isolation_for_own
 from leaderboard.scoring.score import score_submission
-from leaderboard.store import Store
 from leaderboard.web import client
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import resolve_protocol
@@ -342,7 +342,7 @@ def submit(
         err().print(client.page_of(board, id), soft_wrap=True)
         err().print(f"Next: sme-leaderboard show {escape(board)} {id}", soft_wrap=True)
     else:
-        with Store.open(Path(board)) as store:
+        with Board.open(Path(board)) as store:
             signing_key = SigningKey.read(key) if signed.board is None else None
             out().print(admission.submit_bundle(store, bundle, signing_key), soft_wrap=True)
 
@@ -375,7 +375,7 @@ def withdraw(
     if is_url(board):
         client.withdraw(board, id, signing_key, reason)
     else:
-        with Store.open(Path(board)) as store:
+        with Board.open(Path(board)) as store:
             id = find_entry(store, id).id
             withdrawal = Withdrawal(submission=id, created=now(), reason=reason)
             store.withdraw(withdrawal.signed(signing_key, Receiver(store.document.key)))

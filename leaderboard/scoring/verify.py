@@ -128,6 +128,7 @@ def verify(
     rescore: int | Literal["all"] = 0,
     seed: int | None = None,
     contains: str | None = None,
+    board: type[Store] = Store,
     parts: Sequence[Part] = (),
     progress: Progress | None = None,
 ) -> VerifyReport:
@@ -138,7 +139,8 @@ def verify(
       rescore: number of results, rejections too, whose submissions to score again; or "all".
       seed: of their draw, to repeat one; None for the system's randomness, which nobody predicts.
       contains: digest of an entry that the log once had; None to skip this check.
-      parts: what else to verify, such as its seasons.
+      board: how to open it: one with further tracks needs their class.
+      parts: what else to verify, of further tracks.
       progress: called with what was just checked.
 
     Raises:
@@ -152,7 +154,7 @@ def verify(
     seed = secrets.randbits(53) if seed is None else integer_in("seed", seed, 0)
     digest = None if contains is None else _entry_digest(contains)
     _check_opening(Folder(path))
-    with Store.open(path, read_only=True) as store:
+    with board.open(path, read_only=True) as store:
         with store.locked():
             head = store.head
             _check_numbering(store, head.sequence + 1)

@@ -16,7 +16,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import connection
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -48,10 +48,15 @@ Job = Callable[[Store, str], None]
 
 @dataclass(frozen=True)
 class Work:
-    """What a scorer does: submissions, and jobs if it knows how; it can be pickled."""
+    """What a scorer does: submissions, and jobs if it knows how; it can be pickled.
+
+    Attributes:
+      board: how to open it: one with further tracks needs their class.
+    """
 
     submissions: bool = True
     job: Job | None = None
+    board: type[Store] = Store
 
 
 def worker_name() -> str:
@@ -99,7 +104,7 @@ def run_scorer(
     patience = _UNWRITTEN_SECONDS if until_empty else _UNWRITTEN_SECONDS_SERVED
     stop = stop or (lambda: False)
     written = 0
-    with Store.open(path) as store:
+    with work.board.open(path) as store:
         if retry:
             store.queue.retry()
         while not stop():
@@ -202,7 +207,10 @@ def _heartbeats(store: Store, claim: Claim) -> Iterator[None]:
 
 @contextlib.contextmanager
 def background_scorers(
-    path: str | Path, workers: int, isolation: Isolation | None = None, job: Job | None = None
+    path: str | Path,
+    workers: int,
+    isolation: Isolation | None = None,
+    work: Work = Work(),  # frozen
 ) -> Iterator[None]:
     """Run scorer processes while the block runs, watched by a thread.
 
@@ -211,10 +219,10 @@ def background_scorers(
     Nothing but the end of the block ends the scoring: after an error it starts again, first after
     a second, then after growing pauses of up to five minutes.
     """
-    if not workers and job is None:
+    if not workers and work.job is None:
         yield
         return
-    work = Work(submissions=workers > 0, job=job)
+    work = replace(work, submissions=workers > 0)
     stop = threading.Event()
 
     def score() -> None:
@@ -287,7 +295,7 @@ def run_scorers(
       TamperedError: the log was altered.
     """
     integer_in("workers", workers, 1, advice="Leave it out for one.")
-    with Store.open(path) as store:
+    with work.board.open(path) as store:
         scorers = _Scorers(path, store, workers, (until_empty, lease_seconds, isolation, work))
         before = store.queue.done()
         store.queue.retry()

@@ -23,11 +23,12 @@ from leaderboard.documents.signed import Signed
 from leaderboard.documents.submission import Artefact, skeleton
 from leaderboard.errors import Rejection
 from leaderboard.seasons.entry import Entry, TicketRequest
+from leaderboard.seasons.events import played_bytes
 from leaderboard.seasons.season import Season, read_answers
-from leaderboard.store import Store, played_bytes
+from leaderboard.seasons.store import SeasonStore
 
 
-def receive_entry(store: Store, signed: Signed[Entry], season: str, address: str) -> bool:
+def receive_entry(store: SeasonStore, signed: Signed[Entry], season: str, address: str) -> bool:
     """Admit an entry that a server at an address received for the season of this digest."""
     if signed.content.season != season:
         raise Rejection(
@@ -39,7 +40,7 @@ def receive_entry(store: Store, signed: Signed[Entry], season: str, address: str
 
 
 def enter(
-    store: Store,
+    store: SeasonStore,
     signed: Signed[Entry],
     answers: ReadFile | None = None,
     address: str | None = None,
@@ -70,7 +71,7 @@ def enter(
         return store.enter(signed)
 
 
-def _check_newest(store: Store, season: Season, entry: Entry) -> None:
+def _check_newest(store: SeasonStore, season: Season, entry: Entry) -> None:
     """Refuse an entry that would not count, as its key has signed a later one of its method."""
     own = entry.submitter.key, skeleton(entry.method.name)
     for row in store.entrants(season.digest):
@@ -84,7 +85,7 @@ def _check_newest(store: Store, season: Season, entry: Entry) -> None:
 
 
 def _check_answers(
-    store: Store, season: Season, signed: Signed[Entry], read: ReadFile | None
+    store: SeasonStore, season: Season, signed: Signed[Entry], read: ReadFile | None
 ) -> list[Artefact]:
     """The answers that are not null, each in the shape of its instance's challenge."""
     entry, hidden = signed.content, list(season.hidden)
@@ -115,7 +116,7 @@ def _check_answers(
 
 
 def refuse_other_sender(
-    store: Store, signed: Signed[TicketRequest], header: str | None, address: str
+    store: SeasonStore, signed: Signed[TicketRequest], header: str | None, address: str
 ) -> None:
     """Reject a request whose header does not show that its own key has just sent it, here."""
     sender = uploader(store.document, header, signed.id, address)
@@ -129,7 +130,7 @@ def refuse_other_sender(
 
 
 def start_ticket(
-    store: Store,
+    store: SeasonStore,
     signed: Signed[TicketRequest],
     season: str,
     address: str | None = None,

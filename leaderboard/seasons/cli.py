@@ -8,10 +8,12 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
-from leaderboard.cli.options import BoardFolder, Json, open_board
+from leaderboard.cli import options
+from leaderboard.cli.options import BoardFolder, Json
 from leaderboard.documents.result import LABELS, Metric
 from leaderboard.errors import Rejection
 from leaderboard.scoring.ranking import REASONS
+from leaderboard.seasons.events import SeasonRow
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.publication import (
     check_published,
@@ -24,7 +26,7 @@ from leaderboard.seasons.publication import (
 )
 from leaderboard.seasons.ranking import EASY, counting, ranking_facts, score_entries, table_regret
 from leaderboard.seasons.season import Reveal, Terms
-from leaderboard.store import SeasonRow, Store
+from leaderboard.seasons.store import SeasonStore
 from sme_registry.errors import OptionError
 from sme_registry.io import check_new, read_json
 from sme_registry.io.markup import Table, plural
@@ -82,7 +84,7 @@ def new(
     """
 
     fields = read_plan(read_json(plan), str(plan))
-    with Store.open(board, read_only=True) as store:
+    with SeasonStore.open(board, read_only=True) as store:
         refuse_large_answers(fields, store.document.limits.artefact_bytes)
         refuse_unrankable(fields, store.document.runs_to_rank)
     folder = Path(fields.id) if out_folder is None else out_folder
@@ -123,7 +125,7 @@ def publish(
     season = read_season(folder)
     with Progress("checking", len(season.published), console=err(), unit="instances") as progress:
         check_published(season, folder, progress.update_of)
-    with Store.open(board) as store:
+    with SeasonStore.open(board) as store:
         store.announce(season)
         if season.published:
             copy_published(season, folder, store.season_folder(season.digest).published)
@@ -142,7 +144,7 @@ def close(board: BoardFolder, season: SeasonId) -> None:
       sme-leaderboard season close board autumn
     """
 
-    with open_board(board) as store:
+    with _open(board) as store:
         row = store.season_row(season)
         if store.clock.time < row.closes:
             raise Rejection(
@@ -173,7 +175,7 @@ def reveal(board: BoardFolder, season: SeasonId, secret: SecretFile = None) -> N
       sme-leaderboard season reveal board autumn
     """
 
-    with Store.open(board) as store:
+    with SeasonStore.open(board) as store:
         row = store.season_row(season)
         master = Master.read(_secret(board, row.id, secret))
         store.reveal(Reveal(season=row.digest, master=master.raw.hex()))
@@ -206,7 +208,7 @@ def show(
       sme-leaderboard season show board autumn --metric ood_regret
     """
 
-    with open_board(board) as store:
+    with _open(board) as store:
         if season is None:
             rows = [_facts(store, row) for row in store.seasons()]
             if json:
@@ -244,6 +246,12 @@ def show(
         out().print("methods, entrants: of the same key in this season.")
 
 
+def _open(board: Path) -> SeasonStore:
+    store = options.open_board(board)
+    assert isinstance(store, SeasonStore)
+    return store
+
+
 def _warn_of_easy_classes(terms: Terms) -> None:
 
     for member in terms.classes:
@@ -259,7 +267,7 @@ def _warn_of_easy_classes(terms: Terms) -> None:
             )
 
 
-def _facts(store: Store, row: SeasonRow) -> dict[str, Any]:
+def _facts(store: SeasonStore, row: SeasonRow) -> dict[str, Any]:
     """A season in short."""
     time = store.clock.time
     state = "revealed" if row.reveal else "closed" if time >= row.closes else "open"

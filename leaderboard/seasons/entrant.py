@@ -33,7 +33,7 @@ from leaderboard.seasons.admission import enter as enter_folder
 from leaderboard.seasons.entry import Entry, TicketRequest, signer_of
 from leaderboard.seasons.publication import name_of, read_season
 from leaderboard.seasons.season import Season
-from leaderboard.store import Store
+from leaderboard.seasons.store import SeasonStore
 from leaderboard.web.client import Progress as Sent
 from leaderboard.web.client import ServedBoard, answer_for
 from sme_registry.errors import OptionError, SpecError
@@ -359,7 +359,7 @@ def enter(
         with Progress("uploading", len(data), console=err(), unit="answers") as progress:
             send_entry(board, season.id, signed, data, signing_key, progress=progress.update_of)
     else:
-        with Store.open(Path(board)) as store:
+        with SeasonStore.open(Path(board)) as store:
             enter_folder(store, signed, answers=data.__getitem__)
     out().print(signed.id, soft_wrap=True)
     err().print(

@@ -1,11 +1,10 @@
-"""Sealed seasons in the index: the tables `season`, `sealed` (entries and tickets) and `answer`.
+"""What log entries of seasons do to the index: its tracks are seasons, with entries and tickets.
 
-They are a function of the log and of public documents, and hold nothing of a hidden instance.
+Its rows are a function of the log and of public documents, and hold nothing of a hidden instance.
 """
 
 from __future__ import annotations
 
-import sqlite3
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -21,46 +20,11 @@ from leaderboard.seasons.season import (
     Season,
     rows_of,
 )
+from leaderboard.store.index import KINDS, Index, Kinds
 from leaderboard.store.log import LogEntry
-from leaderboard.store.objects import Objects
-from leaderboard.store.rows import EntryRow, name_object, scores_of, scores_text
+from leaderboard.store.rows import EntryRow, scores_of, scores_text
 from sme_registry.seasons.transcript import EVERY
 from sme_registry.seasons.wire import table_bytes
-
-DERIVED = {"season": "digest", "sealed": "id", "answer": "digest || entry"}
-"""Tables and their keys."""
-
-TIMES = (
-    ("season", "announced"),
-    ("season", "revealed"),
-    ("sealed", "received"),
-    ("sealed", "finished"),
-)
-"""Tables and their columns with times of log entries."""
-
-SCHEMA = """
-CREATE TABLE season (
-  digest TEXT PRIMARY KEY, sequence INTEGER NOT NULL, announced TEXT NOT NULL,
-  document TEXT NOT NULL, id TEXT NOT NULL UNIQUE, title TEXT NOT NULL, track TEXT NOT NULL,
-  opens TEXT NOT NULL, closes TEXT NOT NULL, instances INTEGER NOT NULL,
-  reveal TEXT, revealed TEXT NOT NULL DEFAULT ''
-) STRICT, WITHOUT ROWID;
-CREATE TABLE sealed (
-  id TEXT PRIMARY KEY, season TEXT NOT NULL, number INTEGER NOT NULL,
-  sequence INTEGER NOT NULL, received TEXT NOT NULL, created TEXT NOT NULL, document TEXT NOT NULL,
-  result TEXT, finished TEXT NOT NULL DEFAULT '',
-  method TEXT NOT NULL, version TEXT NOT NULL, family TEXT NOT NULL, knowledge TEXT NOT NULL,
-  submitter TEXT NOT NULL, key TEXT NOT NULL, code_link TEXT,
-  runs INTEGER NOT NULL, policies INTEGER NOT NULL, steps INTEGER NOT NULL DEFAULT 0,
-  oracle_like INTEGER NOT NULL DEFAULT 0, scores TEXT,
-  played_bytes INTEGER NOT NULL -- at most
-) STRICT, WITHOUT ROWID;
-CREATE UNIQUE INDEX sealed_number ON sealed (season, number);
-CREATE INDEX sealed_of_key ON sealed (key, received);
-CREATE TABLE answer (
-  digest TEXT NOT NULL, entry TEXT NOT NULL, PRIMARY KEY (digest, entry)
-) STRICT, WITHOUT ROWID;
-"""
 
 _Signed = TypeVar("_Signed", bound=Signed[SealedManifest])
 _RECORD_BYTES, _HEAD_BYTES = 12, 4096  # of a journal; heads with the signature's file
@@ -150,16 +114,11 @@ class SealedRow:
 
 
 class Seasons:
-    """The tables, in a database with `SCHEMA` and the index's other tables.
+    """The seasons of a board's index."""
 
-    Args:
-      connection: to it.
-      objects: the board's documents.
-    """
-
-    def __init__(self, connection: sqlite3.Connection, objects: Objects) -> None:
-        self._connection = connection
-        self._objects = objects
+    def __init__(self, index: Index) -> None:
+        self._index = index
+        self._objects = index.objects
 
     def apply(self, entry: LogEntry) -> None:
         """Apply a log entry of a season.
@@ -192,22 +151,22 @@ class Seasons:
     def entrants(self, season: str) -> list[SealedRow]:
         """The entries or tickets of a season, by its digest, in the log's order."""
         return [
-            _sealed(row) for row in self._all(f"{_SEALED} WHERE season = ? ORDER BY number", season)
+            _sealed(row) for row in self._all(f"{_SEALED} WHERE track = ? ORDER BY number", season)
         ]
 
     def entrant(self, id: str) -> SealedRow | None:
         """The entry or ticket of this id; None if there is none."""
-        rows = self._all(f"{_SEALED} WHERE id = ?", id)
+        rows = self._all(f"{_SEALED} WHERE id = ? AND track <> ''", id)
         return _sealed(rows[0]) if rows else None
 
     def ticket(self, season: str, number: int) -> SealedRow | None:
         """The entry or ticket of this number; None if there is none."""
-        rows = self._all(f"{_SEALED} WHERE season = ? AND number = ?", season, number)
+        rows = self._all(f"{_SEALED} WHERE track = ? AND number = ?", season, number)
         return _sealed(rows[0]) if rows else None
 
     def next_number(self, season: str) -> int:
         """The number of a season's next entry or ticket."""
-        [(number,)] = self._all("SELECT count(*) + 1 FROM sealed WHERE season = ?", season)
+        [(number,)] = self._all("SELECT count(*) + 1 FROM entry WHERE track = ?", season)
         return int(number)
 
     def read(self, row: SeasonRow) -> Season:
@@ -230,12 +189,12 @@ class Seasons:
             "document": entry.document,
             "id": season.id,
             "title": season.title,
-            "track": season.track,
+            "kind": season.track,
             "opens": season.opens,
             "closes": season.closes,
             "instances": sum(1 for _ in season.hidden),
         }
-        self._insert("season", values)
+        self._index.insert("track", values)
 
     def _entry(self, entry: LogEntry) -> None:
         season, signed = self._signed(entry, "sealed-offline", Signed[Entry])
@@ -245,11 +204,7 @@ class Seasons:
         given = [answer for answer in answers if answer is not None]
         self._add(entry, season, signed, policies=len(given), played=0)
         for answer in given:
-            key = signed.content.submitter.key
-            name_object(self._connection, answer.sha256, answer.size, key, entry.time)
-            self._connection.execute(
-                "INSERT OR IGNORE INTO answer VALUES (?, ?)", (answer.sha256, entry.subject)
-            )
+            self._index.name_artefact(answer, signed.content.submitter.key, entry)
 
     def _ticket(self, entry: LogEntry) -> None:
         season, signed = self._signed(entry, "sealed-online", Signed[TicketRequest])
@@ -276,12 +231,13 @@ class Seasons:
         policies: int,
         played: int,
     ) -> None:
-        if self.entrant(entry.subject) is not None:
+        if self._index.one("SELECT 1 FROM entry WHERE id = ?", entry.subject) is not None:
             raise entry.contradiction("receives an entry or ticket twice")
         method, submitter = signed.content.method, signed.content.submitter
         values = {
             "id": entry.subject,
-            "season": season.digest,
+            "status": "entered",
+            "track": season.digest,
             "number": self.next_number(season.digest),
             "sequence": entry.sequence,
             "received": entry.time,
@@ -296,9 +252,9 @@ class Seasons:
             "code_link": signed.content.code,
             "runs": season.instances,
             "policies": policies,
-            "played_bytes": played,
+            "reserved": played,
         }
-        self._insert("sealed", values)
+        self._index.insert("entry", values)
 
     def _result(self, entry: LogEntry) -> None:
         row = self.entrant(entry.subject)
@@ -313,9 +269,9 @@ class Seasons:
         sizes = len(result.runs), len(result.stepping)
         if result.season != row.season or sizes != (season.instances, season.instances * online):
             raise entry.contradiction("names a result of another season")
-        self._connection.execute(
-            "UPDATE sealed SET result = ?, finished = ?, policies = ?, steps = ?, oracle_like = ?, "
-            "scores = ?, played_bytes = ? WHERE id = ?",
+        self._index.connection.execute(
+            "UPDATE entry SET status = 'scored', result = ?, finished = ?, policies = ?, "
+            "steps = ?, oracle_like = ?, scores = ?, reserved = ? WHERE id = ?",
             (
                 *(entry.document, entry.time),
                 sum(run.artefact is not None for run in result.runs),
@@ -334,31 +290,37 @@ class Seasons:
         entry.check_subject(reveal.season)
         if not self.read(row).is_committed_to(Master(bytes.fromhex(reveal.master))):
             raise entry.contradiction("the master does not match the season's commitment")
-        self._connection.execute(
-            "UPDATE season SET reveal = ?, revealed = ? WHERE digest = ?",
+        self._index.connection.execute(
+            "UPDATE track SET reveal = ?, revealed = ? WHERE digest = ?",
             (entry.document, entry.time, entry.subject),
         )
 
     def _all(self, statement: str, *values: Any) -> list[tuple[Any, ...]]:
-        return self._connection.execute(statement, values).fetchall()
+        return self._index.connection.execute(statement, values).fetchall()
 
-    def _insert(self, table: str, values: dict[str, Any]) -> None:
-        self._connection.execute(
-            f"INSERT INTO {table} ({', '.join(values)}) VALUES (:{', :'.join(values)})", values
-        )
 
+def _apply(index: Index, entry: LogEntry) -> None:
+    Seasons(index).apply(entry)
+
+
+SEASON_KINDS: Kinds = {
+    **KINDS,
+    **dict.fromkeys(("season", "entry", "ticket", "ended", "ranked", "revealed"), _apply),
+}
+"""Of log entries, also of seasons: announced, an entry, a ticket started, their results, the master
+published."""
 
 _SEASONS = (
-    "SELECT digest, sequence, announced, document, id, title, track, opens, closes, instances, "
-    "reveal, revealed FROM season"
+    "SELECT digest, sequence, announced, document, id, title, kind, opens, closes, instances, "
+    "reveal, revealed FROM track"
 )
 _OF_ENTRANT = (
     *("id", "sequence", "received", "method", "version", "family", "knowledge", "submitter", "key"),
     *("code_link", "runs", "steps", "policies", "oracle_like", "scores"),
 )
 _SEALED = (
-    f"SELECT season, number, created, document, result, finished, {', '.join(_OF_ENTRANT)} "
-    "FROM sealed"
+    f"SELECT track, number, created, document, result, finished, {', '.join(_OF_ENTRANT)} "
+    "FROM entry"
 )
 
 

@@ -13,9 +13,10 @@ from markupsafe import Markup
 
 from leaderboard.documents.submission import Knowledge
 from leaderboard.scoring.ranking import REASONS, RankedRow
+from leaderboard.seasons.events import SealedRow, SeasonRow
 from leaderboard.seasons.ranking import OfKey, by_key, counting, season_rankings
 from leaderboard.seasons.season import SealedResult, Season
-from leaderboard.store import SealedRow, SeasonRow, Store
+from leaderboard.seasons.store import SeasonStore
 from leaderboard.web import charts
 from leaderboard.web.pages import Pages, Section
 from leaderboard.web.tables import setting_text
@@ -24,10 +25,12 @@ _CURVE_POINTS = 40
 
 
 def _files(pages: Pages) -> dict[str, Callable[[], str]]:
-    rows = pages.store.seasons()
+    store = pages.store
+    assert isinstance(store, SeasonStore)
+    rows = store.seasons()
     if not rows:
         return {}
-    files = {f"seasons/{row.id}.html": functools.partial(_page, pages, row) for row in rows}
+    files = {f"seasons/{row.id}.html": functools.partial(_page, pages, store, row) for row in rows}
     return {**files, "seasons.html": functools.partial(_list, pages, rows)}
 
 
@@ -38,8 +41,8 @@ def _list(pages: Pages, rows: list[SeasonRow]) -> str:
     return pages.render("seasons.html", here="seasons.html", title="Sealed seasons", rows=rows)
 
 
-def _page(pages: Pages, row: SeasonRow) -> str:
-    page = season_page(pages.store, row)
+def _page(pages: Pages, store: SeasonStore, row: SeasonRow) -> str:
+    page = season_page(store, row)
     # The scorer of the reference rows has scored the entries, too.
     if pages.preparing and any(page.rankings.values()):
         return pages.preparation("../")
@@ -74,7 +77,7 @@ class SeasonPage:
         return self.row.track == "sealed-online"
 
 
-def season_page(store: Store, row: SeasonRow) -> SeasonPage:
+def season_page(store: SeasonStore, row: SeasonRow) -> SeasonPage:
     """What is public of a season now."""
     season = store.season(row.digest)
     counted = {each.entrant.id for each in counting(store, season)}
@@ -110,7 +113,7 @@ class _Stepped(NamedTuple):
 
 
 @functools.lru_cache(4096)  # results may have megabytes, and never change
-def _stepped(store: Store, row: SealedRow) -> _Stepped:
+def _stepped(store: SeasonStore, row: SealedRow) -> _Stepped:
     result = store.sealed_result(row)
     return _Stepped(_online_regret(result), _mean_curve(result))
 

@@ -20,6 +20,7 @@ from leaderboard.errors import BoardError
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.scoring import HiddenTask, challenge, instances
 from leaderboard.seasons.season import MAX_INSTANCES, Digests, Hidden, Season, Terms, rows_of
+from leaderboard.seasons.store import SeasonStore
 from leaderboard.store import Store
 from leaderboard.web.fetch import Files
 from sme_registry.compiled import chosen_backend
@@ -196,6 +197,7 @@ def _check_copy(season: Season, folder: Path) -> None:
 
 def files_of_seasons(store: Store) -> Iterator[Files]:
     """The public files of a board's seasons, for `fetch`."""
+    assert isinstance(store, SeasonStore)
     for row in store.seasons():
         season, folder = store.season(row.digest), store.season_folder(row.digest)
         check = partial(_check_copy, season, folder.published)

@@ -21,6 +21,7 @@ from leaderboard.documents.result import Metric, RunScore, Scores
 from leaderboard.documents.submission import Artefact, Knowledge
 from leaderboard.scoring.aggregation import is_oracle_like, method_scores
 from leaderboard.scoring.ranking import RankedRow, ranking
+from leaderboard.seasons.events import SealedRow
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.scoring import (
     HiddenTask,
@@ -30,7 +31,8 @@ from leaderboard.seasons.scoring import (
     sealed_result,
 )
 from leaderboard.seasons.season import Float32, SealedResult, Season, read_answers
-from leaderboard.store import EntryRow, SealedRow, Store
+from leaderboard.seasons.store import SeasonStore
+from leaderboard.store import EntryRow
 from sme_registry import SMESpec, materialize
 from sme_registry.spec import Setting
 
@@ -42,7 +44,7 @@ KNOWLEDGE: tuple[Knowledge, ...] = ("generic", "family")
 _AT_A_TIME = 32  # entries; what an interrupted reveal repeats, and holds in memory
 
 
-def counting(store: Store, season: Season) -> list[SealedRow]:
+def counting(store: SeasonStore, season: Season) -> list[SealedRow]:
     """The entries or tickets that count, in the log's order."""
     rows = store.entrants(season.digest)
     if season.track == "sealed-online":
@@ -63,7 +65,7 @@ class OfKey(NamedTuple):
     entrants: int
 
 
-def by_key(store: Store, season: Season) -> dict[str, OfKey]:
+def by_key(store: SeasonStore, season: Season) -> dict[str, OfKey]:
     """The numbers of methods, and of entries or tickets, of each key in a season."""
     rows = store.entrants(season.digest)
     methods = Counter(key for key, _ in {row.method for row in rows})
@@ -71,7 +73,7 @@ def by_key(store: Store, season: Season) -> dict[str, OfKey]:
     return {key: OfKey(methods[key], count) for key, count in entrants.items()}
 
 
-def score_entries(store: Store, name: str, progress: Progress | None = None) -> int:
+def score_entries(store: SeasonStore, name: str, progress: Progress | None = None) -> int:
     """Score the counting entries of a revealed offline season that have no result yet.
 
     Args:
@@ -99,7 +101,7 @@ def score_entries(store: Store, name: str, progress: Progress | None = None) -> 
 
 
 def season_rankings(
-    store: Store, season: Season, metric: Metric
+    store: SeasonStore, season: Season, metric: Metric
 ) -> dict[Knowledge, list[RankedRow]]:
     """The rankings of a season's methods with results, one for each declared knowledge."""
     rows = [row for row in counting(store, season) if row.result is not None]
@@ -117,7 +119,9 @@ def season_rankings(
     }
 
 
-def ranking_facts(store: Store, season: Season, metric: Metric) -> dict[str, list[dict[str, Any]]]:
+def ranking_facts(
+    store: SeasonStore, season: Season, metric: Metric
+) -> dict[str, list[dict[str, Any]]]:
     """The rankings as plain data, one list for each declared knowledge, best first."""
     keys = by_key(store, season)
     return {
@@ -143,7 +147,7 @@ def ranking_facts(store: Store, season: Season, metric: Metric) -> dict[str, lis
 
 
 def scored_entries(
-    store: Store, season: Season, master: Master, rows: Sequence[SealedRow]
+    store: SeasonStore, season: Season, master: Master, rows: Sequence[SealedRow]
 ) -> Iterator[SealedResult]:
     """The results of offline entries, from their answers, in order.
 
@@ -154,7 +158,7 @@ def scored_entries(
 
 
 def _scored_at_once(
-    store: Store, season: Season, master: Master, rows: Sequence[SealedRow]
+    store: SeasonStore, season: Season, master: Master, rows: Sequence[SealedRow]
 ) -> Iterator[SealedResult]:
     answers = [store.entry_of(row).content.answers for row in rows]
     runs: list[list[RunScore]] = [[] for _ in rows]
@@ -170,7 +174,7 @@ def _scored_at_once(
 
 
 def _read(
-    store: Store, instance: HiddenTask, answer: Artefact | None
+    store: SeasonStore, instance: HiddenTask, answer: Artefact | None
 ) -> tuple[Float32 | None, str | None]:
     if answer is None:
         return None, None
@@ -179,7 +183,7 @@ def _read(
 
 
 def _methods(
-    store: Store, season: Season, rows: Iterable[SealedRow]
+    store: SeasonStore, season: Season, rows: Iterable[SealedRow]
 ) -> dict[tuple[str, str], EntryRow]:
     """A row for each key and method; those of several tickets are scored over all their runs."""
     groups: dict[tuple[str, str], list[SealedRow]] = {}
@@ -206,7 +210,9 @@ def _methods(
 
 
 @functools.lru_cache(1024)  # a bootstrap, which every page of the season shows
-def _score_together(store: Store, digest: str, rows: tuple[SealedRow, ...]) -> tuple[Scores, bool]:
+def _score_together(
+    store: SeasonStore, digest: str, rows: tuple[SealedRow, ...]
+) -> tuple[Scores, bool]:
     """The scores of all runs of some tickets of a season, and whether they are oracle-like."""
     season = store.season(digest)
     runs = [result.runs for result in _results(store, rows)]
@@ -215,7 +221,7 @@ def _score_together(store: Store, digest: str, rows: tuple[SealedRow, ...]) -> t
     return scores, is_oracle_like(scores, store.document.rules, _all(runs))
 
 
-def _results(store: Store, rows: Iterable[SealedRow]) -> Iterator[SealedResult]:
+def _results(store: SeasonStore, rows: Iterable[SealedRow]) -> Iterator[SealedResult]:
     for row in rows:
         result = store.sealed_result(row)
         if result is not None:

@@ -19,6 +19,7 @@ from leaderboard.errors import BoardError, TamperedError
 from leaderboard.seasons.instance import Instance
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.season import MAX_LANES, Season
+from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import Ticket, deadline, score_ticket, unplayed_result
 from leaderboard.store import Store
 from sme_registry.io import file_lock
@@ -49,7 +50,7 @@ class Sessions:
     """
 
     def __init__(
-        self, store: Store, secret: str | os.PathLike[str], season: str | None = None
+        self, store: SeasonStore, secret: str | os.PathLike[str], season: str | None = None
     ) -> None:
         self.master = Master.read(secret)
         seasons = _seasons_of(store, self.master, secret)
@@ -71,7 +72,7 @@ class Sessions:
         self._held_lanes = 0
 
     @classmethod
-    def of_master(cls, store: Store, secret: str | os.PathLike[str]) -> list[Sessions]:
+    def of_master(cls, store: SeasonStore, secret: str | os.PathLike[str]) -> list[Sessions]:
         """Those of each online season that is committed to a master; errors as of the class."""
         seasons = _seasons_of(store, Master.read(secret), secret)
         return [cls(store, secret, season.digest) for season in seasons]
@@ -194,7 +195,7 @@ class Sessions:
             each.release()
 
 
-def _seasons_of(store: Store, master: Master, secret: str | os.PathLike[str]) -> list[Season]:
+def _seasons_of(store: SeasonStore, master: Master, secret: str | os.PathLike[str]) -> list[Season]:
     online = [store.season(row.id) for row in store.seasons() if row.track == "sealed-online"]
     found = [season for season in online if season.is_committed_to(master)]
     if not found:
@@ -244,6 +245,7 @@ class ScoreTicket:
 
     def __call__(self, store: Store, id: str) -> None:
         """Score the ticket that was started by the request of this id."""
+        assert isinstance(store, SeasonStore)
         row = store.entrant(id)
         if row is None or row.result is not None:
             return

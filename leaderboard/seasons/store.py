@@ -1,4 +1,4 @@
-"""`SealedStore`: the seasons of a board's folder, each change under the board's transaction.
+"""`SeasonStore`: a board with seasons, each change under the board's transaction.
 
 What may change when follows from the time at which the log receives it.
 """
@@ -10,14 +10,16 @@ from typing import Literal
 from leaderboard.documents.signed import Signed
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.seasons.entry import Entry, TicketRequest
-from leaderboard.seasons.events import SealedRow, SeasonRow
+from leaderboard.seasons.events import SEASON_KINDS, SealedRow, SeasonRow, Seasons
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.season import Reveal, SealedResult, SealedTrack, Season, SeasonFolder
-from leaderboard.store.database import Database
+from leaderboard.store import Store
 
 
-class SealedStore(Database):
-    """The seasons of a board."""
+class SeasonStore(Store):
+    """A board with seasons."""
+
+    kinds = SEASON_KINDS
 
     def announce(self, season: Season) -> bool:
         """Publish a season and its commitment.
@@ -29,7 +31,7 @@ class SealedStore(Database):
           BoardError: its id is taken, it is over, or it cannot be written.
         """
         with self.transaction() as index:
-            row = index.seasons.row(season.id)
+            row = Seasons(index).row(season.id)
             if row is not None and row.digest == season.digest:
                 return False
             if row is not None:
@@ -47,7 +49,7 @@ class SealedStore(Database):
     def seasons(self) -> list[SeasonRow]:
         """All seasons, in the order in which they were announced."""
         with self.reading() as index:
-            return index.seasons.rows()
+            return Seasons(index).rows()
 
     def season_row(self, name: str) -> SeasonRow:
         """The season of this id or digest.
@@ -56,7 +58,7 @@ class SealedStore(Database):
           Rejection: `season_unknown`.
         """
         with self.reading() as index:
-            row = index.seasons.row(name)
+            row = Seasons(index).row(name)
         if row is None:
             raise Rejection(
                 "season_unknown",
@@ -74,7 +76,7 @@ class SealedStore(Database):
         """
         row = self.season_row(name)
         with self.reading() as index:
-            return index.seasons.read(row)
+            return Seasons(index).read(row)
 
     def season_folder(self, digest: str) -> SeasonFolder:
         """The folder of a season, by its digest."""
@@ -92,7 +94,7 @@ class SealedStore(Database):
           BoardError: it cannot be written.
         """
         with self.transaction() as index:
-            if index.seasons.entrant(signed.id) is not None:
+            if Seasons(index).entrant(signed.id) is not None:
                 return False
             time = self.clock.received()
             self.open_season(signed.content.season, "sealed-offline", time)
@@ -111,13 +113,13 @@ class SealedStore(Database):
           BoardError: it cannot be written.
         """
         with self.transaction() as index:
-            known = index.seasons.entrant(signed.id)
+            known = Seasons(index).entrant(signed.id)
             if known is not None:
                 return known.number
             time = self.clock.received()
             row = self.open_season(signed.content.season, "sealed-online", time)
-            season, key = index.seasons.read(row), signed.content.submitter.key
-            own = sum(each.entrant.key == key for each in index.seasons.entrants(row.digest))
+            season, key = Seasons(index).read(row), signed.content.submitter.key
+            own = sum(each.entrant.key == key for each in Seasons(index).entrants(row.digest))
             assert season.tickets is not None  # the track is online
             assert season.tickets_per_key is not None
             if own >= season.tickets_per_key:
@@ -126,7 +128,7 @@ class SealedStore(Database):
                     f"key={key[:16]}…: has started {own} of {season.tickets_per_key} tickets of "
                     f"the season {row.id}. Every one of them counts.",
                 )
-            number = index.seasons.next_number(row.digest)
+            number = Seasons(index).next_number(row.digest)
             if number > season.tickets:
                 raise Rejection(
                     "ticket_limit",
@@ -163,7 +165,7 @@ class SealedStore(Database):
           BoardError: no such entry exists, or the result cannot be written.
         """
         with self.transaction() as index:
-            row = index.seasons.entrant(result.subject)
+            row = Seasons(index).entrant(result.subject)
             if row is None:
                 raise BoardError(f"entry={result.subject}: is not on this board.")
             self.revealed_master(row.season)
@@ -183,7 +185,7 @@ class SealedStore(Database):
         with self.transaction() as index:
             time, row = self.clock.received(), self.season_row(reveal.season)
             master = Master(bytes.fromhex(reveal.master))
-            if not index.seasons.read(row).is_committed_to(master):
+            if not Seasons(index).read(row).is_committed_to(master):
                 raise Rejection(
                     "reveal_mismatch",
                     f"master: does not match the commitment of the season {row.id}. Give the file "
@@ -192,8 +194,8 @@ class SealedStore(Database):
             if row.reveal is not None:
                 return False
             self._refuse_not_over(row, time)
-            for other in index.seasons.rows():  # their tasks follow from the same secret
-                if other.reveal is None and index.seasons.read(other).is_committed_to(master):
+            for other in Seasons(index).rows():  # their tasks follow from the same secret
+                if other.reveal is None and Seasons(index).read(other).is_committed_to(master):
                     self._refuse_not_over(other, time)
             self.record("revealed", row.digest, reveal, time)
         return True
@@ -233,12 +235,12 @@ class SealedStore(Database):
     def entrants(self, season: str) -> list[SealedRow]:
         """The entries or tickets of a season, by its digest, in the log's order."""
         with self.reading() as index:
-            return index.seasons.entrants(season)
+            return Seasons(index).entrants(season)
 
     def entrant(self, id: str) -> SealedRow | None:
         """The entry or ticket of this id; None if there is none."""
         with self.reading() as index:
-            return index.seasons.entrant(id)
+            return Seasons(index).entrant(id)
 
     def ticket(self, season: str, number: int) -> SealedRow:
         """A ticket by its season's digest and its number.
@@ -247,7 +249,7 @@ class SealedStore(Database):
           Rejection: `ticket_unknown`.
         """
         with self.reading() as index:
-            row = index.seasons.ticket(season, number)
+            row = Seasons(index).ticket(season, number)
         if row is None:
             raise Rejection(
                 "ticket_unknown",

@@ -17,12 +17,13 @@ from leaderboard.documents.submission import shifted, utc
 from leaderboard.errors import Rejection, TamperedError
 from leaderboard.scoring.aggregation import failed_run
 from leaderboard.seasons.entry import AllHeads, has_signed
+from leaderboard.seasons.events import SealedRow
 from leaderboard.seasons.instance import Instance, storage
 from leaderboard.seasons.master import Master, Place
 from leaderboard.seasons.scoring import HiddenTask, challenge, instances, score_run, sealed_result
 from leaderboard.seasons.season import MAX_LANES, SealedResult, Season
 from leaderboard.seasons.stepping import Start, no_steps
-from leaderboard.store import SealedRow, Store
+from leaderboard.seasons.store import SeasonStore
 from sme_registry import seasons
 from sme_registry.errors import SMEError
 from sme_registry.io import parse_json, read_regular, to_json, write_atomically
@@ -52,7 +53,7 @@ class Ticket:
       instances: in the season's order.
     """
 
-    def __init__(self, store: Store, season: Season, master: Master, row: SealedRow) -> None:
+    def __init__(self, store: SeasonStore, season: Season, master: Master, row: SealedRow) -> None:
         self.number, self.id = row.number, row.entrant.id
         self._season, self._master = season, master
         self._request = request = store.request_of(row)
@@ -221,7 +222,7 @@ class Ticket:
 
 
 def score_ticket(
-    store: Store, season: Season, ticket: Ticket, *, replay: bool = False
+    store: SeasonStore, season: Season, ticket: Ticket, *, replay: bool = False
 ) -> SealedResult:
     """Score a ticket from its snapshots and answers; or `replay` its journals, too.
 
@@ -243,7 +244,7 @@ def score_ticket(
     return sealed_result(season, ticket.id, runs, versions, draws, stepping, rules)
 
 
-def unplayed_result(store: Store, season: Season, ticket: Ticket) -> SealedResult:
+def unplayed_result(store: SeasonStore, season: Season, ticket: Ticket) -> SealedResult:
     """What `score_ticket` computes for a ticket of which nothing is signed, and at no cost."""
     runs = [failed_run(season.protocol, hidden.member.name, None) for hidden in season.hidden]
     stepping = [no_steps(each.budget, each.status.lanes or 1) for each in ticket.instances]

@@ -36,12 +36,12 @@ from leaderboard.seasons.publication import check_published, follows, read_seaso
 from leaderboard.seasons.ranking import counting, scored_entries
 from leaderboard.seasons.scoring import instances, sealed_result
 from leaderboard.seasons.season import SealedResult, Season
+from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import Ticket, deadline, score_ticket
-from leaderboard.store import Store
 
 
 def verify_seasons(
-    store: Store, progress: Progress, published: Sequence[str | Path] = ()
+    store: SeasonStore, progress: Progress, published: Sequence[str | Path] = ()
 ) -> tuple[list[Row], list[Note]]:
     """Verify all seasons of a board.
 
@@ -68,7 +68,7 @@ def verify_seasons(
 class _Verifier:
     """The checks of one season, and what they have found."""
 
-    store: Store
+    store: SeasonStore
     of: SeasonRow
     progress: Progress
     folders: Mapping[str, Path]

@@ -41,13 +41,15 @@ from leaderboard.errors import Rejection
 from leaderboard.scoring.worker import Job
 from leaderboard.seasons.admission import receive_entry, refuse_other_sender, start_ticket
 from leaderboard.seasons.entry import Entry, TicketRequest
+from leaderboard.seasons.events import SeasonRow
 from leaderboard.seasons.instance import Instance
 from leaderboard.seasons.pages import SECTION
 from leaderboard.seasons.ranking import (
     ranking_facts,
 )
 from leaderboard.seasons.sessions import ScoreTicket, Sessions, attending
-from leaderboard.store import SeasonRow, Store
+from leaderboard.seasons.store import SeasonStore
+from leaderboard.store import Store
 from leaderboard.web.http import HTTP_CODES, RequestError, read_body
 from sme_registry import seasons
 from sme_registry.io import open_regular, to_json
@@ -75,6 +77,7 @@ class SeasonRoutes:
     def __init__(
         self, store: Store, secrets: Iterable[str | os.PathLike[str]], address: str
     ) -> None:
+        assert isinstance(store, SeasonStore)
         self._store, self._address = store, address
         self._sessions = {
             each.season.id: each for path in secrets for each in Sessions.of_master(store, path)

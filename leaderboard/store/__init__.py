@@ -5,7 +5,6 @@ The signed log is authoritative, the other files hold the documents that it name
 next one continues from the state it leaves.
 """
 
-from leaderboard.seasons.events import SealedRow, SeasonRow, played_bytes
 from leaderboard.store.copies import Copies
 from leaderboard.store.files import digest_of, read_document
 from leaderboard.store.garbage import Garbage, collect_garbage, expire_uploads
@@ -29,13 +28,10 @@ __all__ = [
     "LogEntry",
     "Objects",
     "Queue",
-    "SealedRow",
-    "SeasonRow",
     "Store",
     "collect_garbage",
     "digest_of",
     "expire_uploads",
-    "played_bytes",
     "read_document",
     "unknown_submission",
 ]

@@ -13,15 +13,15 @@ import sqlite3
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
 
 from leaderboard.documents.board import RULES, BoardDocument, Folder
 from leaderboard.documents.signed import SigningKey
 from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.store.files import FolderLock, digest_of, unwritable
-from leaderboard.store.index import Index, files_of
-from leaderboard.store.log import EMPTY, Clock, Event, Head, Log, clock_offset, uptime
+from leaderboard.store.index import KINDS, Index, Kinds, files_of
+from leaderboard.store.log import EMPTY, Clock, Head, Log, clock_offset, uptime
 from leaderboard.store.objects import Objects
 from sme_registry.spec.document import StrictModel
 
@@ -33,7 +33,12 @@ class Database:
       path: the board's folder.
       read_only: write nothing, and read nothing but log and documents: the index, which is then
         held in memory, is built from them.
+
+    Attributes:
+      kinds: of the log's entries, which those of further tracks extend.
     """
+
+    kinds: ClassVar[Kinds] = KINDS
 
     def __init__(self, path: str | Path, *, read_only: bool) -> None:
         self.folder = Folder(path)
@@ -143,7 +148,7 @@ class Database:
 
     def record(
         self,
-        event: Event,
+        event: str,
         subject: str,
         document: StrictModel,
         time: str | None = None,
@@ -286,7 +291,7 @@ class Database:
     def _connect(self, *, rebuild: bool) -> None:
         """Connect to the index, rebuilt in place if necessary, while the board is locked."""
         if self.read_only:
-            self._index = Index.empty(self.folder, self.document)
+            self._index = Index.empty(self.folder, self.document, self.kinds)
             return
         if self._index is None:
             self._index = self._opened()
@@ -304,12 +309,12 @@ class Database:
         """The index, in a new file if the old one is unusable."""
         path = self.folder.index
         with contextlib.suppress(sqlite3.Error, OSError):
-            return Index.open(self.folder, self.document)
+            return Index.open(self.folder, self.document, self.kinds)
         try:
             for each in files_of(path):
                 each.unlink(missing_ok=True)
             with self._explained():
-                return Index.open(self.folder, self.document)
+                return Index.open(self.folder, self.document, self.kinds)
         except OSError as error:
             raise unwritable(path, error) from error
 

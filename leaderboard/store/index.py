@@ -1,8 +1,10 @@
 """`index.sqlite`: the tables behind pages, ranking and queue, derived from log and documents.
 
-The tables `head`, `entry`, `run`, `object` and `artefact`, and those of `seasons`, are a function
-of the log alone, so a rebuilt index equals one that grew. `lease` and `upload` are temporary state:
-the claims of scorers and the faults that ended them, and artefacts that no submission names yet.
+The tables `head`, `track`, `entry`, `run`, `object` and `artefact` are a function of the log alone,
+so a rebuilt index equals one that grew. `entry` has the entrants of all tracks, and `track` the
+tracks besides the open one; `KINDS` says what each kind of log entry does to them. `lease` and
+`upload` are temporary state: the claims of scorers and the faults that ended them, and artefacts
+that no submission names yet.
 `clock` is how the machine's clock stood when the board was first served since the machine started.
 """
 
@@ -13,7 +15,7 @@ import functools
 import os
 import sqlite3
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -21,18 +23,21 @@ from typing import Any
 from leaderboard.documents.board import BoardDocument, Folder
 from leaderboard.documents.result import Result
 from leaderboard.documents.signed import Signed
-from leaderboard.documents.submission import Submission, Withdrawal
-from leaderboard.errors import TamperedError
-from leaderboard.seasons import events as seasons
+from leaderboard.documents.submission import Artefact, Submission, Withdrawal
+from leaderboard.errors import BoardError, TamperedError
 from leaderboard.store import copies
 from leaderboard.store.copies import Copies
 from leaderboard.store.files import BUSY_SECONDS, digest_of
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.objects import Objects
-from leaderboard.store.rows import EntryRow, Status, name_object, scores_of, scores_text
+from leaderboard.store.rows import EntryRow, Status, scores_of, scores_text
 from sme_registry.io import is_regular
 
-TIMES = (("entry", "received"), ("object", "received"), ("upload", "time"), *seasons.TIMES)
+TIMES = (
+    *(("track", column) for column in ("announced", "revealed")),
+    *(("entry", column) for column in ("received", "finished")),
+    *(("object", "received"), ("upload", "time")),
+)
 """Tables and their columns with times of entries, which an entry of the event "clock" corrects."""
 
 SCHEMA = f"""
@@ -40,19 +45,28 @@ CREATE TABLE head (
   zero INTEGER PRIMARY KEY CHECK (zero = 0),
   board TEXT NOT NULL, sequence INTEGER NOT NULL, digest TEXT NOT NULL, time TEXT NOT NULL
 ) STRICT, WITHOUT ROWID;
+CREATE TABLE track (
+  digest TEXT PRIMARY KEY, sequence INTEGER NOT NULL, announced TEXT NOT NULL,
+  document TEXT NOT NULL, id TEXT NOT NULL UNIQUE, title TEXT NOT NULL, kind TEXT NOT NULL,
+  opens TEXT NOT NULL, closes TEXT NOT NULL, instances INTEGER NOT NULL,
+  reveal TEXT, revealed TEXT NOT NULL DEFAULT ''
+) STRICT, WITHOUT ROWID;
 CREATE TABLE entry (
   id TEXT PRIMARY KEY, sequence INTEGER NOT NULL, received TEXT NOT NULL,
   document TEXT NOT NULL, result TEXT, withdrawal TEXT,
   status TEXT NOT NULL DEFAULT 'waiting', code TEXT NOT NULL DEFAULT '',
   method TEXT NOT NULL, version TEXT NOT NULL, family TEXT NOT NULL, knowledge TEXT NOT NULL,
   submitter TEXT NOT NULL, key TEXT NOT NULL, code_link TEXT,
-  runs INTEGER NOT NULL, policies INTEGER NOT NULL, steps INTEGER NOT NULL,
+  runs INTEGER NOT NULL, policies INTEGER NOT NULL, steps INTEGER NOT NULL DEFAULT 0,
   enough_runs INTEGER NOT NULL DEFAULT 0, oracle_like INTEGER NOT NULL DEFAULT 0,
-  reference INTEGER NOT NULL, scores TEXT
+  reference INTEGER NOT NULL DEFAULT 0, scores TEXT,
+  track TEXT NOT NULL DEFAULT '', number INTEGER, created TEXT NOT NULL DEFAULT '',
+  finished TEXT NOT NULL DEFAULT '', reserved INTEGER NOT NULL DEFAULT 0 -- bytes at most
 ) STRICT, WITHOUT ROWID;
+CREATE UNIQUE INDEX entry_number ON entry (track, number);
 CREATE INDEX entry_waiting ON entry (sequence) WHERE status = 'waiting';
 CREATE INDEX entry_of_key ON entry (key, received);
-CREATE UNIQUE INDEX entry_sequence ON entry (sequence);{copies.SCHEMA}{seasons.SCHEMA}
+CREATE UNIQUE INDEX entry_sequence ON entry (sequence);{copies.SCHEMA}
 CREATE TABLE object (
   digest TEXT PRIMARY KEY, size INTEGER NOT NULL, key TEXT NOT NULL, received TEXT NOT NULL
 ) STRICT, WITHOUT ROWID;
@@ -77,24 +91,31 @@ VERSION = zlib.crc32(SCHEMA.encode()) & 0x7FFFFFFF  # changes with the schema's 
 _COLUMNS = tuple(field.name for field in fields(EntryRow) if field.name != "alike")
 _OF_LEASE = {"faults": "coalesce(faults, 0)", "fault": "coalesce(fault, '')"}
 _ROW = ", ".join(_OF_LEASE.get(name, f"entry.{name}") for name in _COLUMNS)
-_ROWS = f"SELECT {_ROW} FROM entry LEFT JOIN lease ON submission = id"
+_ROWS = f"SELECT {_ROW} FROM entry LEFT JOIN lease ON submission = id WHERE track = ''"
+
+
+Kinds = Mapping[str, "Callable[[Index, LogEntry], None]"]
 
 
 class Index:
     """A connection to a database with the schema's tables, of a board's folder and document."""
 
     def __init__(
-        self, connection: sqlite3.Connection, folder: Folder, document: BoardDocument
+        self,
+        connection: sqlite3.Connection,
+        folder: Folder,
+        document: BoardDocument,
+        kinds: Kinds,
     ) -> None:
         self.connection = connection
         self.folder = folder
         self.document = document
         self.objects = Objects(folder, by_kind=document.rules == 2)
         self._board = document.digest
-        self.seasons = seasons.Seasons(connection, self.objects)
+        self._kinds = kinds
 
     @classmethod
-    def open(cls, folder: Folder, document: BoardDocument) -> Index:
+    def open(cls, folder: Folder, document: BoardDocument, kinds: Kinds) -> Index:
         """Connect to a board's index, whose file is created if it does not exist.
 
         Raises:
@@ -118,12 +139,12 @@ class Index:
         except BaseException:
             connection.close()
             raise
-        return cls(connection, folder, document)
+        return cls(connection, folder, document, kinds)
 
     @classmethod
-    def empty(cls, folder: Folder, document: BoardDocument) -> Index:
+    def empty(cls, folder: Folder, document: BoardDocument, kinds: Kinds) -> Index:
         """An empty index in memory, or if it grows in a file that no other process sees."""
-        index = cls(_connect(""), folder, document)
+        index = cls(_connect(""), folder, document, kinds)
         with index.transaction():
             index.clear()
         return index
@@ -181,22 +202,14 @@ class Index:
         Raises:
           TamperedError: the document that it names is missing or altered, or the entry contradicts
             those before it.
+          BoardError: it is of a kind that this program does not know.
         """
-        match entry.event:
-            case "opened":
-                document = self.document
-                if (entry.subject, entry.document) != (document.digest, digest_of(document)):
-                    raise TamperedError("board.json", "differs from the board that the log opened")
-            case "received":
-                self._received(entry)
-            case "result":
-                self._result(entry)
-            case "withdrawn":
-                self._withdrawn(entry)
-            case "clock":
-                self._clock(entry)
-            case _:
-                self.seasons.apply(entry)
+        if entry.event not in self._kinds:
+            raise BoardError(
+                f"log/{entry.sequence:08d}.json: event={entry.event}: must be one of "
+                f"{', '.join(self._kinds)}. Open the board with the version that wrote it."
+            )
+        self._kinds[entry.event](self, entry)
         if entry.event not in ("opened", "clock"):
             self._name_document(entry)
         self.connection.execute(
@@ -206,13 +219,34 @@ class Index:
 
     def _name_document(self, entry: LogEntry) -> None:
         """Add the entry's document to the objects, as one of the entrant's or the board's."""
-        row = self.one(
-            "SELECT key FROM entry WHERE id = ?1 UNION SELECT key FROM sealed WHERE id = ?1",
-            entry.subject,
-        )
+        row = self.one("SELECT key FROM entry WHERE id = ?", entry.subject)
         size = self.objects.path(entry.document).stat().st_size
         key = self.document.key if row is None else row[0]
-        name_object(self.connection, entry.document, size, key, entry.time)
+        self._name_object(entry.document, size, key, entry)
+
+    def _name_object(self, digest: str, size: int, key: str, entry: LogEntry) -> None:
+        row = digest, size, key, entry.time
+        self.connection.execute("INSERT OR IGNORE INTO object VALUES (?, ?, ?, ?)", row)
+        self.connection.execute(
+            "DELETE FROM upload WHERE digest = ? AND key IN (?, '')", (digest, key)
+        )
+
+    def name_artefact(self, artefact: Artefact, key: str, entry: LogEntry) -> None:
+        """Add a file that an entrant's document names, which is no mere upload from then on."""
+        self._name_object(artefact.sha256, artefact.size, key, entry)
+        row = artefact.sha256, entry.subject
+        self.connection.execute("INSERT OR IGNORE INTO artefact VALUES (?, ?)", row)
+
+    def insert(self, table: str, values: dict[str, Any]) -> None:
+        """Insert a row, by its columns."""
+        self.connection.execute(
+            f"INSERT INTO {table} ({', '.join(values)}) VALUES (:{', :'.join(values)})", values
+        )
+
+    def _opened(self, entry: LogEntry) -> None:
+        document = self.document
+        if (entry.subject, entry.document) != (document.digest, digest_of(document)):
+            raise TamperedError("board.json", "differs from the board that the log opened")
 
     def _received(self, entry: LogEntry) -> None:
         if self.one("SELECT 1 FROM entry WHERE id = ?", entry.subject) is not None:
@@ -237,17 +271,10 @@ class Index:
             "steps": sum(run.steps for run in submission.runs),
             "reference": submitter.key == self.document.key and method.family == "reference",
         }
-        self.connection.execute(
-            f"INSERT INTO entry ({', '.join(values)}) VALUES (:{', :'.join(values)})", values
-        )
+        self.insert("entry", values)
         for run in submission.runs:
             if run.artefact is not None:
-                digest, size = run.artefact.sha256, run.artefact.size
-                name_object(self.connection, digest, size, submitter.key, entry.time)
-                self.connection.execute(
-                    "INSERT OR IGNORE INTO artefact VALUES (?, ?)",
-                    (digest, entry.subject),
-                )
+                self.name_artefact(run.artefact, submitter.key, entry)
 
     def _result(self, entry: LogEntry) -> None:
         if self.status(entry.subject) != "waiting":
@@ -302,7 +329,7 @@ class Index:
 
     def status(self, id: str) -> Status | None:
         """A submission's status; None if there is no such submission."""
-        row = self.one("SELECT status FROM entry WHERE id = ?", id)
+        row = self.one("SELECT status FROM entry WHERE id = ? AND track = ''", id)
         return None if row is None else row[0]
 
     def entries(self) -> list[EntryRow]:
@@ -314,8 +341,18 @@ class Index:
 
     def entry(self, id: str) -> EntryRow | None:
         """One submission; None if there is no such submission."""
-        row = self.one(f"{_ROWS} WHERE id = ?", id)
+        row = self.one(f"{_ROWS} AND id = ?", id)
         return None if row is None else _entry_row(row, copies.copies_of(self.connection, id))
+
+
+KINDS: Kinds = {
+    "opened": Index._opened,
+    "received": Index._received,
+    "result": Index._result,
+    "withdrawn": Index._withdrawn,
+    "clock": Index._clock,
+}
+"""Of log entries, on every board: what each does to the index."""
 
 
 def files_of(index: Path) -> list[Path]:

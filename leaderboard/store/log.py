@@ -15,7 +15,7 @@ import functools
 import hashlib
 import time
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field, field_validator
 
@@ -26,10 +26,6 @@ from leaderboard.errors import BoardError, TamperedError
 from leaderboard.store.files import MAX_LOG_ENTRY_BYTES, read_document, write_document
 from sme_registry.spec.document import Digest, Integer, SchemaVersion
 
-SealedEvent = Literal["season", "entry", "ticket", "ended", "ranked", "revealed"]
-"""Of a season: announced, an entry, a ticket started, their results, the master published."""
-
-Event = Literal["opened", "received", "result", "withdrawn", "clock"] | SealedEvent
 NOTHING = "sha256:" + "0" * 64
 MOST_BEHIND, LONGEST_JUMP = 60.0, 300.0
 """Seconds of the machine's clock: behind the log's last entry, and against the uptime."""
@@ -58,13 +54,11 @@ class LogEntry(PlainDocument):
       previous: digest of the entry before; 64 zeros for the first.
       time: when it was received.
       event: "opened" (once, the first), "received", "result" or "withdrawn"; "clock", which dates
-        all entries with a later time as its own; or of a season, see `SealedEvent`.
-      subject: the submission's id, or that of a sealed entry or ticket; for "opened" the board
-        document's digest, for "season" and "revealed" the season's, for "clock" that of the first
-        entry that it dates.
-      document: SHA-256 of the file written: the signed submission, entry or request for a ticket,
-        a result, the signed withdrawal, board.json, season.json or reveal.json; for "clock" the
-        entry that is its subject.
+        all entries with a later time as its own; or of another track.
+      subject: the entrant's id; for "opened" the board document's digest, for "clock" that of the
+        first entry that it dates, or of another track its digest.
+      document: SHA-256 of the document written: the signed submission, a result, the signed
+        withdrawal or board.json, or of another track; for "clock" the entry that is its subject.
       signature: by the board's key.
     """
 
@@ -72,7 +66,7 @@ class LogEntry(PlainDocument):
     sequence: Annotated[Integer, Field(ge=0)]
     previous: Digest
     time: UtcTime
-    event: Event
+    event: Annotated[str, Field(pattern=r"^[a-z]{1,16}$")]
     subject: Digest
     document: Digest
     signature: Signature
@@ -161,7 +155,7 @@ class Log:
             raise TamperedError(entry.file, "only the first entry may open a board")
 
     def entry(
-        self, key: SigningKey, head: Head, event: Event, subject: str, document: str, time: str
+        self, key: SigningKey, head: Head, event: str, subject: str, document: str, time: str
     ) -> LogEntry:
         """The entry after `head`, which is not written yet."""
         fields = {

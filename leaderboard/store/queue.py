@@ -211,7 +211,7 @@ class Queue:
 
     def done(self) -> int:
         """Number of submissions with a result or a withdrawal."""
-        return self._count("FROM entry WHERE status <> 'waiting'")
+        return self._count("FROM entry WHERE status NOT IN ('waiting', 'entered') AND track = ''")
 
     def claimable(self) -> int:
         """Number of waiting submissions that are neither claimed nor postponed."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import sqlite3
 from dataclasses import dataclass
 from typing import Literal
 
@@ -103,13 +102,3 @@ def scores_of(text: str) -> Scores:
     count = len(METRICS)
     named = dict(zip(METRICS, estimates[:count], strict=True))
     return Scores.model_construct(None, **named, normalised_regret=tuple(estimates[count:]))
-
-
-def name_object(
-    connection: sqlite3.Connection, digest: str, size: int, key: str, received: str
-) -> None:
-    """Add an artefact that a logged document names, which is no mere upload from then on."""
-    connection.execute(
-        "INSERT OR IGNORE INTO object VALUES (?, ?, ?, ?)", (digest, size, key, received)
-    )
-    connection.execute("DELETE FROM upload WHERE digest = ? AND key IN (?, '')", (digest, key))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 from leaderboard.documents.board import (
     RULES,
@@ -18,7 +18,7 @@ from leaderboard.documents.result import Result
 from leaderboard.documents.signed import Signed, SigningKey
 from leaderboard.documents.submission import Submission, Withdrawal, check_text, now
 from leaderboard.errors import BoardError, Rejection
-from leaderboard.seasons.store import SealedStore
+from leaderboard.store.database import Database
 from leaderboard.store.files import digest_of, write_document
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.queue import Queue
@@ -30,7 +30,7 @@ from sme_registry.spec.document import StrictModel
 _Model = TypeVar("_Model", bound=StrictModel)
 
 
-class Store(SealedStore):
+class Store(Database):
     """A board's folder, opened by `create` or `open`; a context manager.
 
     Attributes:
@@ -56,7 +56,7 @@ class Store(SealedStore):
         protocol_name: str,
         protocol: EvaluationProtocol,
         **fields: Any,
-    ) -> Store:
+    ) -> Self:
         """Create a board with its own key in a new folder.
 
         Args:
@@ -101,7 +101,7 @@ class Store(SealedStore):
         read_only: bool = False,
         reindex: bool = False,
         progress: Callable[[int], None] | None = None,
-    ) -> Store:
+    ) -> Self:
         """Open a board and bring its index up to date; an unusable index is rebuilt.
 
         Args:
@@ -166,8 +166,6 @@ class Store(SealedStore):
                 index.one(
                     "SELECT 1 FROM upload WHERE digest = ?1 AND key = ?2 UNION "
                     "SELECT 1 FROM artefact JOIN entry ON id = submission "
-                    "WHERE digest = ?1 AND key = ?2 UNION "
-                    "SELECT 1 FROM answer JOIN sealed ON id = entry "
                     "WHERE digest = ?1 AND key = ?2",
                     *(digest, key),
                 )
@@ -177,17 +175,14 @@ class Store(SealedStore):
     def holder_of_name(self, name: str) -> str | None:
         """The key that was first to use a submitter's name, in whatever case.
 
-        A name is used by an entry or ticket that waits for its scores, or has had scores of at
-        least one policy or answer: otherwise, policies that are rejected, or tickets that nobody
-        plays, would be enough to occupy names.
+        A name is used by an entrant of any track that waits for its scores, or has had scores of
+        at least one policy: otherwise, policies that are rejected would be enough to occupy names.
         """
         with self.reading() as index:
             row = index.one(
-                "SELECT key FROM (SELECT submitter, key, sequence FROM entry "
-                "WHERE status = 'waiting' OR scores IS NOT NULL "
-                "UNION ALL SELECT submitter, key, sequence FROM sealed "
-                "WHERE result IS NULL OR policies > 0) "
-                "WHERE lower(submitter) = lower(?) ORDER BY sequence LIMIT 1",
+                "SELECT key FROM entry WHERE lower(submitter) = lower(?) AND "
+                "(status IN ('entered', 'waiting') OR (scores IS NOT NULL AND policies > 0)) "
+                "ORDER BY sequence LIMIT 1",
                 name,
             )
         return None if row is None else row[0]
@@ -224,7 +219,9 @@ class Store(SealedStore):
         """
         withdrawal = signed.content
         with self.transaction() as index:
-            row = index.one("SELECT key FROM entry WHERE id = ?", withdrawal.submission)
+            row = index.one(
+                "SELECT key FROM entry WHERE id = ? AND track = ''", withdrawal.submission
+            )
             if row is None:
                 raise unknown_submission(withdrawal.submission)
             check_text("reason", withdrawal.reason)
@@ -271,7 +268,7 @@ class Store(SealedStore):
     def _read(self, column: str, id: str, kind: type[_Model]) -> _Model | None:
         """A document of a submission, whose digest in the log the index has in `column`."""
         with self.reading() as index:
-            row = index.one(f"SELECT {column} FROM entry WHERE id = ?", id)
+            row = index.one(f"SELECT {column} FROM entry WHERE id = ? AND track = ''", id)
         if row is None or row[0] is None:
             return None
         return self.objects.document(kind, row[0])
@@ -321,16 +318,14 @@ class Store(SealedStore):
             return index.number(
                 "SELECT (SELECT coalesce(sum(size), 0) FROM "
                 "(SELECT digest, size FROM object UNION SELECT digest, size FROM upload))"
-                " + (SELECT coalesce(sum(played_bytes), 0) FROM sealed)"
+                " + (SELECT coalesce(sum(reserved), 0) FROM entry)"
             )
 
     def submission_times(self, key: str, since: str) -> list[str]:
-        """When each submission, or sealed entry, of a key was received after a time, in order."""
+        """When each entrant of a key, of any track, was received after a time, in order."""
         with self.reading() as index:
             rows = index.connection.execute(
-                "SELECT received FROM (SELECT key, received FROM entry "
-                "UNION ALL SELECT key, received FROM sealed) "
-                "WHERE key = ? AND received > ? ORDER BY received",
+                "SELECT received FROM entry WHERE key = ? AND received > ? ORDER BY received",
                 (key, since),
             )
             return [received for (received,) in rows]
@@ -339,16 +334,14 @@ class Store(SealedStore):
         """Whether a file is a document, or belongs to a reference row or a scored submission.
 
         Others are not published: who could download a policy that waits to be scored could submit
-        it under another key, as if it were the first. Answers are public once they are scored, too.
+        it under another key, as if it were the first.
         """
         with self.reading() as index:
             row = index.one(
                 "SELECT 1 FROM artefact JOIN entry ON id = submission "
                 "WHERE digest = ?1 AND (reference OR scores IS NOT NULL) UNION "
-                "SELECT 1 FROM answer JOIN sealed ON id = entry "
-                "WHERE digest = ?1 AND scores IS NOT NULL UNION "
                 "SELECT 1 FROM object WHERE digest = ?1 AND digest NOT IN "
-                "(SELECT digest FROM artefact UNION SELECT digest FROM answer) LIMIT 1",
+                "(SELECT digest FROM artefact) LIMIT 1",
                 digest,
             )
         return row is not None

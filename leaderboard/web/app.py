@@ -38,7 +38,7 @@ from leaderboard.documents.signed import MAX_BYTES, Signed
 from leaderboard.documents.submission import Submission, Withdrawal
 from leaderboard.errors import BoardError, Rejection, ScoringFault
 from leaderboard.gate.isolation import Isolation, available_isolation
-from leaderboard.scoring.worker import background_scorers
+from leaderboard.scoring.worker import Work, background_scorers
 from leaderboard.store import Head, Store, unknown_submission
 from leaderboard.web import http
 from leaderboard.web.http import HTTP_CODES, RequestError
@@ -47,8 +47,12 @@ from leaderboard.web.tables import TABS, public_view
 from sme_registry.errors import SMEError
 from sme_registry.io import server_address
 
+_Board: type[Store] = Store
 if find_spec("leaderboard.seasons") is not None:  # without them, a board has the open track only
+    from leaderboard.seasons.store import SeasonStore
     from leaderboard.seasons.web import SeasonRoutes
+
+    _Board = SeasonStore
 
 _Render = Callable[[Pages, str], bytes]
 _PAGES_KEPT, _BYTES_KEPT = 256, 2**26
@@ -76,10 +80,9 @@ def create_app(
       season_secrets: the masters of the sealed-online seasons that this server steps.
     """
     _refuse_missing(isolation)
-    store = Store.open(os.fspath(path))
+    store = _Board.open(os.fspath(path))
     address = server_address(url, insecure=True).url
-    with_seasons = find_spec("leaderboard.seasons") is not None
-    tracks = [SeasonRoutes(store, season_secrets, address)] if with_seasons else []
+    tracks = [SeasonRoutes(store, season_secrets, address)] if _Board is not Store else []
     pages = _PageCache(store, address, [track.section for track in tracks])
     routes = _Routes(store, pages, isolation, address)
 
@@ -87,9 +90,9 @@ def create_app(
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         with store, contextlib.ExitStack() as stack:
             store.note_clock()
-            job = next((track.job for track in tracks), None)
+            work = Work(job=next((track.job for track in tracks), None), board=_Board)
             stack.enter_context(
-                background_scorers(store.folder.path, score_workers, isolation, job)
+                background_scorers(store.folder.path, score_workers, isolation, work)
             )
             for track in tracks:
                 stack.enter_context(track.open())

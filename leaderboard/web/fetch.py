@@ -76,6 +76,7 @@ def fetch(
     without_data: bool = False,
     most: int = MOST_BYTES,
     insecure: bool = False,
+    board: type[Store] = Store,
     parts: Sequence[Part] = (),
     progress: Progress | None = None,
 ) -> Fetched:
@@ -99,7 +100,7 @@ def fetch(
         copy = _Copy(served, Path(folder), most, progress or (lambda _: None))
         copy.open()
         entries = copy.fetch_log()
-        with Store.open(copy.folder.path, read_only=True) as store:
+        with board.open(copy.folder.path, read_only=True) as store:
             for digest in store.named_objects():
                 if store.is_public(digest):
                     copy.fetch_object(digest, optional=True)

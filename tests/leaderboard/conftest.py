@@ -7,7 +7,7 @@ import pytest
 
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import Submission, Withdrawal, now
-from leaderboard.store import Store
+from leaderboard.seasons.store import SeasonStore
 from sme_registry import EvaluationProtocol
 from sme_registry.io import sha256_of
 from sme_registry.spec import Suite
@@ -27,7 +27,7 @@ def tiny_suite(instances=1):
 def tiny_board(path, *, instances=1, **fields):
     """A new board of 200 states in each region; the caller closes it."""
     settings = {"runs_to_rank": 1, "draws": 100, **fields}
-    return Store.create(
+    return SeasonStore.create(
         path,
         title="Tiny",
         suite_name="tiny-v1",
@@ -131,7 +131,7 @@ def signed_withdrawal(store, id, key, reason="a test", address=None):
 
 def document_path(board, id, kind="document"):
     """The file of a submission's document, `result` or `withdrawal` on a board of this folder."""
-    with Store.open(board, read_only=True) as store, store.reading() as index:
+    with SeasonStore.open(board, read_only=True) as store, store.reading() as index:
         (digest,) = index.one(f"SELECT {kind} FROM entry WHERE id = ?", id)
         return store.folder.object(digest)
 

@@ -14,8 +14,8 @@ import pytest
 
 from leaderboard.documents.signed import SigningKey
 from leaderboard.seasons.scoring import instances
+from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.web import SeasonRoutes
-from leaderboard.store import Store
 from sme_registry.envs import SMEVectorEnv
 from sme_registry.seasons import Ticket
 from tests.leaderboard.seasons.playing import Board, online_board
@@ -69,7 +69,7 @@ class Server:
 
     def answers(self, instance):
         """The answers that the board has."""
-        with Store.open(self.board.path, read_only=True) as store:
+        with SeasonStore.open(self.board.path, read_only=True) as store:
             folder = store.season_folder(self.board.season.digest)
         return np.load(folder.ticket(self.ticket.ticket) / f"{instance}.npy", allow_pickle=False)
 

@@ -12,7 +12,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from leaderboard.seasons.scoring import challenge
-from leaderboard.store import Store
+from leaderboard.seasons.store import SeasonStore
 from sme_registry import seasons
 from sme_registry.errors import (
     ActionError,
@@ -299,7 +299,7 @@ def played(server, steps=2):
 
 def signed_head(server):
     """What the board has of the entrant's last signature; None without any."""
-    with Store.open(server.board.path, read_only=True) as store:
+    with SeasonStore.open(server.board.path, read_only=True) as store:
         folder = store.season_folder(server.board.season.digest)
     path = folder.ticket(server.ticket.ticket) / "0.json"
     return json.loads(path.read_bytes())["head"] if path.exists() else None

@@ -15,7 +15,7 @@ import numpy as np
 
 from leaderboard.seasons.ranking import MOST_ROWS, counting, table_regret
 from leaderboard.seasons.season import SealedResult
-from leaderboard.store import Store
+from leaderboard.seasons.store import SeasonStore
 
 PARTS = 25  # of a curve in the figure, of the 100 in a result
 
@@ -45,7 +45,7 @@ def played(result: SealedResult, name: str) -> Played:
     )
 
 
-def results(store: Store, season: str) -> Iterator[tuple[str, SealedResult]]:
+def results(store: SeasonStore, season: str) -> Iterator[tuple[str, SealedResult]]:
     """The counting results of a season, the best first."""
     found = []
     for row in counting(store, store.season(season)):
@@ -61,7 +61,7 @@ def spread(values: np.ndarray) -> str:
     return f"{values.mean():.2f} ({', '.join(f'{each:.2f}' for each in sorted(values))})"
 
 
-def print_tables(store: Store, season: str) -> None:
+def print_tables(store: SeasonStore, season: str) -> None:
     """Print a season's tables in Markdown; a star marks knowledge of the family."""
     document = store.season(season)
     print(f"\n{document.title}, {document.track}, {document.digest}\n")
@@ -88,7 +88,7 @@ def print_tables(store: Store, season: str) -> None:
             print(f"| {method} | {spread(own.regrets[:, 0])} | {shells} | {online} |")
 
 
-def draw(store: Store, season: str, path: Path) -> None:
+def draw(store: SeasonStore, season: str, path: Path) -> None:
     """Draw the learning curves of an online season, a panel for each class."""
     import matplotlib.pyplot as plt
 
@@ -122,7 +122,7 @@ def main() -> None:
     parser.add_argument("board", type=Path)
     parser.add_argument("--figure", type=Path, help="a PNG file to write")
     arguments = parser.parse_args()
-    with Store.open(arguments.board, read_only=True) as store:
+    with SeasonStore.open(arguments.board, read_only=True) as store:
         for row in store.seasons():
             print_tables(store, row.id)
             if row.track == "sealed-online" and arguments.figure:

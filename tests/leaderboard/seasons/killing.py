@@ -19,8 +19,8 @@ from leaderboard.documents.signed import SigningKey
 from leaderboard.seasons.journal import Journal
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.stepping import Play
+from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import Ticket
-from leaderboard.store import Store
 from leaderboard.web.server import listen, url_of
 from sme_registry import seasons
 from sme_registry.seasons.transcript import Transcript
@@ -147,7 +147,7 @@ def check(board, entrant, requests):
         raise entrant.error
     assert entrant.requests == requests
     number = entrant.ticket.ticket
-    with Store.open(board.path, read_only=True) as store:
+    with SeasonStore.open(board.path, read_only=True) as store:
         row = store.ticket(board.season.digest, number)
         ticket = Ticket(store, board.season, Master.read(board.secret), row)
         folder = store.season_folder(board.season.digest).ticket(number)

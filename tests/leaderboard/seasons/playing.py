@@ -17,8 +17,8 @@ from leaderboard.seasons.entrant import request_ticket
 from leaderboard.seasons.entry import TicketRequest, signer_of
 from leaderboard.seasons.season import Season
 from leaderboard.seasons.sessions import Sessions
+from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import Ticket, score_ticket
-from leaderboard.store import Store
 from sme_registry.seasons import wire
 from sme_registry.seasons.transcript import (
     Place,
@@ -45,7 +45,7 @@ class Board(NamedTuple):
 
     def request(self, key, nonce=0, **fields):
         """A signed request for a ticket."""
-        with Store.open(self.path) as store:
+        with SeasonStore.open(self.path) as store:
             return signed_request(store, self.season, key, nonce, **fields)
 
     def send(self, url, request, key):
@@ -76,7 +76,7 @@ def online_board(folder, limits=None, **fields):
 @contextlib.contextmanager
 def playing(board):
     """A ticket of a board, whose season is stepped in this process."""
-    with Store.open(board.path) as store:
+    with SeasonStore.open(board.path) as store:
         played = Played(board, store)
         try:
             yield played

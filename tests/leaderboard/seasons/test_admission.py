@@ -11,6 +11,7 @@ from leaderboard.scoring.verify import verify
 from leaderboard.seasons import admission as entries
 from leaderboard.seasons.entry import Entry
 from leaderboard.seasons.season import MAX_OFFLINE_INSTANCES
+from leaderboard.seasons.store import SeasonStore
 from sme_registry.errors import SpecError
 from sme_registry.io import sha256_of
 from sme_registry.seasons.wire import pack_table
@@ -241,4 +242,4 @@ def test_a_full_disk_loses_nothing_and_the_entry_can_be_sent_again(tmp_path, key
             assert store.head == before
             (disk / "filler").unlink()
             assert send(store, signed, GOOD)
-            verify(disk / "board")
+            verify(disk / "board", board=SeasonStore)

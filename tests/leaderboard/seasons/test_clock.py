@@ -7,8 +7,8 @@ import httpx
 import pytest
 
 from leaderboard.cli.options import KEY_VARIABLE
+from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.web import SeasonRoutes
-from leaderboard.store import Store
 from leaderboard.store.files import to_bytes
 from tests.leaderboard.clocks import set_clocks
 from tests.leaderboard.conftest import put_submission, signed_withdrawal
@@ -38,7 +38,7 @@ def events(board, seconds=0.0, until=""):
     """The events of the log after so many seconds, or when one of them has come."""
     deadline = time.perf_counter() + seconds
     while True:
-        with Store.open(board.path, read_only=True) as store:
+        with SeasonStore.open(board.path, read_only=True) as store:
             found = [entry.event for entry in store.log()]
         if until in found or time.perf_counter() > deadline:
             return found
@@ -65,7 +65,7 @@ def test_a_clock_set_back_before_a_deadline_dates_nothing(board, key, monkeypatc
 
 
 def test_a_clock_set_a_month_ahead_closes_no_season(board, key, monkeypatch):
-    with Store.open(board.path) as store:
+    with SeasonStore.open(board.path) as store:
         signed = put_submission(store, key)
         with served(board) as url:
             set_clocks(monkeypatch, forward=MONTH)
@@ -78,7 +78,7 @@ def test_a_clock_set_a_month_ahead_closes_no_season(board, key, monkeypatch):
 def test_entries_of_a_machine_that_started_with_a_wrong_clock_are_corrected(
     board, key, monkeypatch
 ):
-    with Store.open(board.path) as store:
+    with SeasonStore.open(board.path) as store:
         signed = put_submission(store, key)
         set_clocks(monkeypatch, forward=MONTH)
         with served(board) as url:
@@ -92,7 +92,7 @@ def test_entries_of_a_machine_that_started_with_a_wrong_clock_are_corrected(
         assert board.ticket(url, key).ticket == 1
     assert events(board)[2:] == ["received", "withdrawn", "clock", "ticket"]
     good("verify", "board")
-    with Store.open(board.path, read_only=True) as store:
+    with SeasonStore.open(board.path, read_only=True) as store:
         assert max(entry.time for entry in store.log(4)) < store.log(3, 1)[0].time
 
 

@@ -11,7 +11,7 @@ from leaderboard.cli.options import KEY_VARIABLE
 from leaderboard.documents.signed import SigningKey
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.publication import read_season
-from leaderboard.store import Store
+from leaderboard.seasons.store import SeasonStore
 from sme_registry.seasons.wire import pack_table, unpack_table
 from tests.leaderboard.conftest import linear_onnx, tiny_board
 from tests.leaderboard.seasons.sealing import tiny_terms
@@ -112,7 +112,7 @@ def test_a_class_that_a_table_solves_is_warned_of_and_a_false_plan_is_refused(tm
 def entered(*arguments):
     """The answers of an entry that is sent."""
     id = good("enter", "board", "autumn", *arguments, *ENTER).strip()
-    with Store.open("board", read_only=True) as store:
+    with SeasonStore.open("board", read_only=True) as store:
         row = store.entrant(id)
         assert row is not None
         answers = store.entry_of(row).content.answers
@@ -158,5 +158,5 @@ def test_an_entry_is_sent_to_a_served_board(season):
     assert counts("verify", "copy")["autumn: data sets, by their digests"] == (2, 0)
     assert counts("verify", "small")["autumn: data sets"] == (0, 2)
     assert counts("verify", "copy")["files by their digests"] == (2, 1)  # answers are secret
-    with Store.open("board", read_only=True) as store:
+    with SeasonStore.open("board", read_only=True) as store:
         assert [row.entrant.id for row in store.entrants(read_season(season).digest)] == [id]

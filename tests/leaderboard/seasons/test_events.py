@@ -7,7 +7,7 @@ from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.scoring.verify import verify
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.season import Reveal
-from leaderboard.store import Store
+from leaderboard.seasons.store import SeasonStore
 from leaderboard.store.log import Clock
 from tests.leaderboard.clocks import AFTERWARDS, move_clock
 from tests.leaderboard.conftest import derived, put_submission, tiny_board
@@ -70,9 +70,11 @@ def test_a_season_is_played_from_its_announcement_to_its_results_and_reindexed(s
     grown = derived(store)
     store.reindex()
     assert derived(store) == grown
-    with Store.open(store.folder.path, read_only=True) as reader:
+    with SeasonStore.open(store.folder.path, read_only=True) as reader:
         assert derived(reader) == grown
-    [missing] = verify(store.folder.path).missing  # an answer that the board lost
+    [missing] = verify(
+        store.folder.path, board=SeasonStore
+    ).missing  # an answer that the board lost
     assert missing.startswith("sha256:aa")
 
 
@@ -213,10 +215,10 @@ def test_an_altered_document_of_a_season_is_named(store, key, later):
         text = path.read_text()
         path.write_text(text.replace(": ", ":  ", 1))
         with pytest.raises(TamperedError) as error:
-            Store.open(store.folder.path, read_only=True)
+            SeasonStore.open(store.folder.path, read_only=True)
         assert error.value.where == path.relative_to(store.folder.path).as_posix()
         path.write_text(text)
-    Store.open(store.folder.path, read_only=True).close()
+    SeasonStore.open(store.folder.path, read_only=True).close()
 
 
 def test_an_entrants_name_is_nobody_elses_and_no_entry_is_ranked_before_the_reveal(store, key):
@@ -238,26 +240,26 @@ def test_what_processes_that_die_write_of_seasons_is_logged_or_not(tmp_path, key
         entry = signed_entry(store, season, key, [None, None])
 
     online = tiny_season(ONLINE)
-    with Store.open(tmp_path / "board") as store:
+    with SeasonStore.open(tmp_path / "board") as store:
         store.announce(online)
         request, other = (signed_request(store, online, key, nonce) for nonce in (0, 1))
 
     def after_every_death(work):
         def run():
-            with Store.open(tmp_path / "board") as opened:
+            with SeasonStore.open(tmp_path / "board") as opened:
                 work(opened)
 
         call = 0
         while crashes_before(call, run):
             call += 1
         assert call > 3
-        return Store.open(tmp_path / "board", read_only=True)
+        return SeasonStore.open(tmp_path / "board", read_only=True)
 
     with after_every_death(lambda store: store.enter(entry)) as store:
         assert [row.entrant.id for row in store.entrants(season.digest)] == [entry.id]
     with after_every_death(lambda store: store.start_ticket(request)) as store:
         assert [row.number for row in store.entrants(online.digest)] == [1]
-    with Store.open(tmp_path / "board") as store:
+    with SeasonStore.open(tmp_path / "board") as store:
         assert store.start_ticket(other) == 2
         assert store.start_ticket(request) == 1
         for number, each in ((1, request), (2, other)):
@@ -267,4 +269,4 @@ def test_what_processes_that_die_write_of_seasons_is_logged_or_not(tmp_path, key
         assert store.revealed_master(season.id) == MASTER
     with after_every_death(lambda store: store.rank(failed_result(season, entry.id))) as store:
         assert [row.entrant.status for row in store.entrants(season.digest)] == ["scored"]
-    verify(tmp_path / "board")
+    verify(tmp_path / "board", board=SeasonStore)

@@ -12,8 +12,8 @@ from leaderboard.scoring.worker import Work, run_scorer
 from leaderboard.seasons.entry import signer_of
 from leaderboard.seasons.scoring import instances
 from leaderboard.seasons.sessions import Sessions
+from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import Ticket
-from leaderboard.store import Store
 from sme_registry import SMEError, materialize, seasons
 from sme_registry.seasons import wire
 from sme_registry.seasons.transcript import Place, answers_head, challenge_head, next_head
@@ -105,7 +105,7 @@ def test_no_answer_file_or_log_holds_a_secret(tmp_path, caplog):
     ):
         statuses = [each.status_code for each in everything(url, board, client)]
     assert set(statuses) == {200, 201, 400, 403, 409, 422}
-    with Store.open(board.path) as store:
+    with SeasonStore.open(board.path) as store:
         result = scored(store, board.season, 1)
         store.end_ticket(board.season.digest, 1, result)
         searched = secrets_of(board, store)
@@ -147,7 +147,12 @@ def test_a_fault_is_logged_without_its_text(tmp_path, caplog, monkeypatch):
         played.sessions.attend()
         played.store.queue.add_jobs([played.request.id])
         stop = iter((False, True))
-        run_scorer(played.board.path, work=Work(job=fails), until_empty=False, stop=stop.__next__)
+        run_scorer(
+            played.board.path,
+            work=Work(job=fails, board=SeasonStore),
+            until_empty=False,
+            stop=stop.__next__,
+        )
         assert played.store.queue.faults() == 1
     assert caplog.text.count("SMEError") == 2
     assert "5eed" not in caplog.text

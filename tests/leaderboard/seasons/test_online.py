@@ -11,7 +11,7 @@ from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.errors import Rejection
 from leaderboard.seasons.admission import start_ticket
 from leaderboard.seasons.entry import TicketRequest
-from leaderboard.store import Store
+from leaderboard.seasons.store import SeasonStore
 from sme_registry import seasons
 from sme_registry.seasons import wire
 from tests.leaderboard.seasons.killing import step_through_kills
@@ -27,7 +27,7 @@ MORE_SEASONS = {"second": {}, "few": {"tickets": 1}, "coming": {"opens": moment(
 def board(tmp_path_factory):
     """Several seasons of one master, in which each test plays with a key of its own."""
     board = online_board(tmp_path_factory.mktemp("online"))
-    with Store.open(board.path) as store:
+    with SeasonStore.open(board.path) as store:
         for name, fields in MORE_SEASONS.items():
             store.announce(tiny_season("sealed-online", id=name, **fields))
         store.announce(tiny_season("sealed-offline"))
@@ -44,7 +44,7 @@ def url(board):
 
 def another(board, name):
     """The same board, and another of its seasons."""
-    with Store.open(board.path, read_only=True) as store:
+    with SeasonStore.open(board.path, read_only=True) as store:
         return board._replace(season=store.season(name))
 
 
@@ -76,7 +76,7 @@ def test_a_ticket_of_any_season_is_played_and_then_scored_and_logged(url, board,
             assert httpx.get(f"{files}/{path}", trust_env=False).status_code == 404
         played(url, ticket, 1, 5)
         assert instance.status().phase == "ended"
-    with Store.open(board.path, read_only=True) as store:
+    with SeasonStore.open(board.path, read_only=True) as store:
         deadline = time.monotonic() + 300
         while (result := store.sealed_result(store.ticket(second.season.digest, 1))) is None:
             assert time.monotonic() < deadline, "the server has scored no ticket"
@@ -103,7 +103,7 @@ def test_a_season_that_is_open_and_a_key_have_only_so_many_tickets(url, board, k
 
 def test_tickets_count_towards_the_quota_of_a_day(tmp_path, key):
     board = online_board(tmp_path, limits={"submissions_per_day": 1})
-    with Store.open(board.path) as store:
+    with SeasonStore.open(board.path) as store:
         store.start_ticket(board.request(key))
         envelope = Signed[TicketRequest].read(board.request(key, 1).to_bytes())
         with pytest.raises(Rejection, match="quota"):
@@ -115,7 +115,7 @@ def test_a_request_that_others_read_is_no_password(url, board, key):
     started = board.send(url, request, key)
     assert started.status_code == 201
     path = url + wire.tickets_path(board.season.id)
-    with Store.open(board.path, read_only=True) as store:
+    with SeasonStore.open(board.path, read_only=True) as store:
         row = store.ticket(board.season.digest, started.json()["ticket"])
         stored = store.objects.read(row.document)
     without = httpx.post(path, content=stored)
@@ -146,7 +146,7 @@ def test_a_request_that_a_server_in_the_middle_passes_on_starts_no_ticket(url, b
         header = {"Authorization": upload_header(key, signed.id, of_header)}
         answer = httpx.post(path, content=signed.to_bytes(), headers=header)
         assert outcome(answer) == (403, "wrong_board")
-    with Store.open(board.path, read_only=True) as store:
+    with SeasonStore.open(board.path, read_only=True) as store:
         assert store.entrant(honest.id) is None
 
 
@@ -154,7 +154,7 @@ def test_the_ranking_grows_as_tickets_end(url, board, key):
     season = tiny_season("sealed-online", id="ranked")
     ranked = board._replace(season=season)
     address = f"{url}/api/seasons/ranked/ranking"
-    with Store.open(board.path) as store:
+    with SeasonStore.open(board.path) as store:
         store.announce(season)
         store.start_ticket(ranked.request(key))
         empty = httpx.get(address).json()
@@ -185,7 +185,7 @@ def test_the_ranking_grows_as_tickets_end(url, board, key):
     ],
 )
 def test_requests_for_tickets_are_checked(url, board, key, changes, board_key, status, code):
-    with Store.open(board.path, read_only=True) as store:
+    with SeasonStore.open(board.path, read_only=True) as store:
         before = len(store.entrants(board.season.digest))
         board_name = store.document.key if board_key else None
     plain = {**manifest(board.season, key), "nonce": "0" * 64, "answers_key": OTHER.public}
@@ -197,13 +197,13 @@ def test_requests_for_tickets_are_checked(url, board, key, changes, board_key, s
         ticket = TicketRequest.model_construct(**{**dict(signed.content), **changes})
         signed = signed.model_copy(update={"content": ticket})
     assert outcome(board.send(url, signed, key)) == (status, code)
-    with Store.open(board.path, read_only=True) as store:
+    with SeasonStore.open(board.path, read_only=True) as store:
         assert len(store.entrants(board.season.digest)) == before
 
 
 def test_a_request_opens_no_ticket_of_another_season_or_board(board, key):
     digest, other = board.season.digest, another(board, "second").season.digest
-    with Store.open(board.path) as store:
+    with SeasonStore.open(board.path) as store:
         known, new = board.request(key), board.request(key, 1)
         known, new = (Signed[TicketRequest].read(each.to_bytes()) for each in (known, new))
         number, is_new = start_ticket(store, known, digest)

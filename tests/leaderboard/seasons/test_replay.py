@@ -10,7 +10,7 @@ from leaderboard.seasons.journal import Journal
 from leaderboard.seasons.ranking import season_rankings
 from leaderboard.seasons.season import Reveal
 from leaderboard.seasons.stepping import Play, Start
-from leaderboard.store import Store
+from leaderboard.seasons.store import SeasonStore
 from leaderboard.store.log import Clock
 from sme_registry import SMESpec
 from sme_registry.envs import SMEEnv
@@ -44,7 +44,7 @@ def revealed(tmp_path_factory):
 
 
 def test_a_season_of_tickets_is_replayed_and_every_one_of_them_counts(revealed):
-    with Store.open(revealed.path, read_only=True) as store:
+    with SeasonStore.open(revealed.path, read_only=True) as store:
         counts = {"signatures of entrants": (2, 0), "results, scored again": (2, 0)}
         assert replayed(store) == (counts, [])
         [row] = season_rankings(store, revealed.season, "wd_regret")["generic"]
@@ -59,7 +59,7 @@ def test_a_season_of_tickets_is_replayed_and_every_one_of_them_counts(revealed):
 
 def test_altered_journals_and_answers_are_found(revealed, tmp_path):
     shutil.copytree(revealed.path, tmp_path / "board")
-    with Store.open(tmp_path / "board", read_only=True) as store:
+    with SeasonStore.open(tmp_path / "board", read_only=True) as store:
         folder = store.season_folder(revealed.season.digest).ticket(1)
         files = sorted(folder.iterdir())
         # A journal, challenge states, answers and their signature of each instance; and the end.
@@ -152,7 +152,7 @@ def test_what_the_entrant_has_not_signed_counts_for_nothing(tmp_path, monkeypatc
 )
 def test_a_result_that_does_not_follow_is_found(revealed, monkeypatch, part, changes, path):
     """One that contradicts itself was altered; other numbers are not confirmed."""
-    with Store.open(revealed.path, read_only=True) as store:
+    with SeasonStore.open(revealed.path, read_only=True) as store:
         stored = store.sealed_result
 
         def lie(row):
@@ -197,7 +197,7 @@ def reveal(board):
 )
 def test_forbidden_tickets_are_found(tmp_path, monkeypatch, key, fields, days, number, message):
     board = online_board(tmp_path, **fields)
-    with Store.open(board.path) as store:
+    with SeasonStore.open(board.path) as store:
         for count in range(1, number + 1):
             request = signed_request(store, board.season, key, count)
             logged(monkeypatch, moment(days), store, "ticket", request.id, request)
@@ -208,7 +208,7 @@ def test_forbidden_tickets_are_found(tmp_path, monkeypatch, key, fields, days, n
 
 def test_a_ticket_that_ended_early_without_all_answers_is_found(tmp_path, monkeypatch, key):
     board = online_board(tmp_path)
-    with Store.open(board.path) as store:
+    with SeasonStore.open(board.path) as store:
         store.start_ticket(signed_request(store, board.season, key))
         store.end_ticket(board.season.digest, 1, scored(store, board.season, 1))
         logged(monkeypatch, AFTERWARDS, store, *reveal(board))
@@ -229,7 +229,7 @@ def test_a_ticket_that_ended_early_without_the_entrant_s_end_is_found(tmp_path, 
 
 def test_a_reveal_before_the_close_is_found(tmp_path, monkeypatch):
     board = online_board(tmp_path)
-    with Store.open(board.path) as store:
+    with SeasonStore.open(board.path) as store:
         logged(monkeypatch, moment(0), store, *reveal(board))
         with pytest.raises(TamperedError, match="reveal: was logged at"):
             replayed(store)

@@ -31,8 +31,8 @@ from leaderboard.seasons.publication import (
 from leaderboard.seasons.ranking import by_key, counting, score_entries, season_rankings
 from leaderboard.seasons.scoring import instances, score_run, sealed_result
 from leaderboard.seasons.season import Reveal, Season, Terms
+from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.verify import verify_seasons
-from leaderboard.store import Store
 from sme_registry import materialize
 from sme_registry.datasets import SealedDataset
 from sme_registry.errors import SMEError
@@ -459,7 +459,7 @@ def tops(ranked):
 
 
 def test_both_seasons_are_ranked_as_the_page_says():
-    with Store.open(BOARD, read_only=True) as store:
+    with SeasonStore.open(BOARD, read_only=True) as store:
         for season, best in (("winter", ["SAC", "PPO"]), ("autumn", ["IQL", "BC"])):
             document = store.season(season)
             assert document.is_committed_to(store.revealed_master(season))
@@ -475,7 +475,7 @@ def test_both_seasons_are_ranked_as_the_page_says():
 
 def test_both_seasons_are_verified_on_every_processor():
     """Autumn's data sets are not committed; another processor may round them otherwise."""
-    with Store.open(BOARD, read_only=True) as store:
+    with SeasonStore.open(BOARD, read_only=True) as store:
         rows, notes = verify_seasons(store, lambda what: None)
         assert notes == []
         counts = {row.what: row.checked for row in rows if "scored again" in row.what}
@@ -495,7 +495,7 @@ def test_an_altered_byte_is_found(tmp_path, kind):
     data[len(data) // 2] ^= 1
     file.write_bytes(data)
     with (
-        Store.open(board, read_only=True) as store,
+        SeasonStore.open(board, read_only=True) as store,
         pytest.raises(TamperedError, match=r"tickets/1/2\.json"),
     ):
         replayed(store)

@@ -10,8 +10,8 @@ from leaderboard.cli.options import KEY_VARIABLE
 from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError
 from leaderboard.seasons import entrant
+from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.web import SeasonRoutes
-from leaderboard.store import Store
 from sme_registry.seasons import Instance, Ticket
 from tests.leaderboard.seasons.playing import online_board
 from tests.leaderboard.serving import serving
@@ -61,7 +61,7 @@ def test_a_ticket_is_started_stepped_and_answered(url, board):
     assert ticket.token not in shown
     assert os.stat("ticket.json").st_mode & 0o777 == 0o600
     assert not Path("ticket.json.request").exists()
-    with Store.open(board.path) as store:
+    with SeasonStore.open(board.path) as store:
         row = store.ticket(board.season.digest, ticket.ticket)
         assert store.request_of(row).content.method.knowledge == "family"
     with Instance(url, ticket, 0, 4) as hidden:
@@ -105,7 +105,7 @@ def test_files_of_actions_answer_challenges_that_were_fetched(url, board):
     assert "cannot be read" in command(2, *answer, "none.npy", "-i", "deep-0")
     np.save("deep-0.npy", states[:, :1])
     command(0, *answer, "{name}.npy", "-i", "deep-0")
-    with Store.open(board.path, read_only=True) as store:
+    with SeasonStore.open(board.path, read_only=True) as store:
         folder = store.season_folder(board.season.digest).ticket(ticket.ticket)
     np.testing.assert_array_equal(np.load(folder / "0.npy", allow_pickle=False), states[:, :1])
 

@@ -15,13 +15,14 @@ from leaderboard.scoring.worker import Work, run_scorer
 from leaderboard.seasons import sessions as sessions_module
 from leaderboard.seasons.admission import start_ticket
 from leaderboard.seasons.entry import TicketRequest
+from leaderboard.seasons.events import played_bytes
 from leaderboard.seasons.instance import Instance
 from leaderboard.seasons.journal import Journal
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.sessions import ScoreTicket, Sessions
 from leaderboard.seasons.stepping import Play
+from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import Ticket
-from leaderboard.store import played_bytes
 from leaderboard.store.files import to_bytes
 from sme_registry import materialize
 from sme_registry.seasons.wire import pack_table, unpack_table
@@ -416,7 +417,7 @@ def test_tickets_that_cannot_be_scored_are_tried_again_after_others(played, monk
     broken.write_bytes(b"no journal")
     played.restart()
     set_clocks(monkeypatch, 0, passed=25)
-    work = Work(submissions=False, job=ScoreTicket((played.board.secret,)))
+    work = Work(False, ScoreTicket((played.board.secret,)), SeasonStore)
 
     def attend():
         played.sessions.attend()

@@ -6,7 +6,7 @@ from leaderboard.documents.result import ClassScore, Estimate, Result, RunScore,
 from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.documents.submission import Submission
 from leaderboard.scoring.aggregation import failed_run, levels_of, run_metrics
-from leaderboard.store import Store
+from leaderboard.seasons.store import SeasonStore
 from sme_registry.io import sha256_of
 from sme_registry.spec import EvaluationProtocol, Suite
 
@@ -31,7 +31,7 @@ def suite(classes=3, instances=2):
 
 def create(path, *, classes=3, references=True):
     """A board with its two reference rows."""
-    store = Store.create(
+    store = SeasonStore.create(
         path,
         title="Smoke board",
         suite_name="smoke-v1",

@@ -9,6 +9,7 @@ from leaderboard.documents.board import hex_of
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.verify import verify
 from leaderboard.seasons.publication import files_of_seasons
+from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.verify import verify_seasons
 from leaderboard.store import Store
 from leaderboard.web.client import ServedBoard
@@ -114,14 +115,14 @@ def seasons(tmp_path):
 
 def test_seasons_are_copied_with_what_was_played_and_verified(seasons, tmp_path):
     copy = tmp_path / "copy"
-    fetch(seasons, copy, parts=[files_of_seasons])
+    fetch(seasons, copy, board=SeasonStore, parts=[files_of_seasons])
     played = {path for path in files(copy) if path.suffix in (".journal", ".npy")}
     assert played == {path for path in files(SEASONS) if path.suffix in (".journal", ".npy")}
-    with Store.open(copy, read_only=True) as store:
+    with SeasonStore.open(copy, read_only=True) as store:
         rows, notes = verify_seasons(store, lambda what: None)
         assert notes == []
         assert sum(row.checked for row in rows if row.what.endswith("scored again")) == 11
-    assert len(verify(copy).missing) == 6  # which the board itself lacks
+    assert len(verify(copy, board=SeasonStore).missing) == 6  # which the board itself lacks
 
 
 @pytest.mark.parametrize(
@@ -134,4 +135,4 @@ def test_a_server_names_no_file_outside_the_copy(seasons, tmp_path, monkeypatch,
 
     answering(monkeypatch, lie)
     with pytest.raises(BoardError, match="unsafe name"):
-        fetch(seasons, tmp_path / "copy", parts=[files_of_seasons])
+        fetch(seasons, tmp_path / "copy", board=SeasonStore, parts=[files_of_seasons])
