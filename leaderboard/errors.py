@@ -136,7 +136,7 @@ class TamperedError(SMEError):
     """A board's files contradict its signed log.
 
     Args:
-      where: the first altered row, such as `log/00000007.json`.
+      where: the first altered file or value, such as `log/00000007.json`.
       message: what is wrong with it.
     """
 

@@ -272,6 +272,7 @@ class Pages:
             "log.html",
             here="log.html",
             title="Log and verification",
+            address=self._address,
             head=self.store.head,
             entries=list(self.store.log(page * LOG_ROWS, LOG_ROWS)),
             page=page,

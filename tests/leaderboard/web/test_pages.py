@@ -222,7 +222,7 @@ def test_the_pages_of_method_log_and_suite_explain_what_they_must(pages, board):
     assert "OOD decay and regret slope are 1, and the similarity loss is 100 points" in words
     assert "symmetric: θ ± the longer arm" in words
     words = pages["log.html"].words
-    assert "verify BOARD --contains DIGEST" in words
+    assert "verify copy --contains DIGEST" in words
     assert "Removing entries at the end leaves none" in words
     assert store.head[1] in words
     words = pages["suite.html"].words
