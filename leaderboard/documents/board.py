@@ -21,14 +21,9 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer
 
 from leaderboard.documents.signed import MAX_BYTES as MAX_SIGNED_BYTES
-from leaderboard.documents.signed import PublicKey, Receiver, Signed, SigningKey
+from leaderboard.documents.signed import PublicKey, Receiver, SigningKey
 from leaderboard.documents.submission import (
     MAX_ARTEFACT_BYTES,
-    Artefact,
-    Method,
-    Run,
-    Submission,
-    Submitter,
     SuiteReference,
     Track,
 )
@@ -48,6 +43,9 @@ MAX_BYTES = 2**20
 
 MAX_INSTANCES = 1000
 """Of a board's suite, each of which takes a run of every submission."""
+
+MOST_LISTED = 200
+"""Runs that fit into the bytes of a submission, with short texts."""
 
 RUNS_TO_RANK = 10
 """Runs in each class that a rank needs, unless the board is for practice."""
@@ -293,37 +291,11 @@ def check_receiver(board: BoardDocument, receiver: Receiver, address: str | None
 
 
 def refuse_unsubmittable(board: BoardDocument) -> None:
-    """Raise `BoardError` if a rank needs more runs than a submission can list in its bytes."""
-    needed, most = board.runs_needed, most_runs(board)
-    if needed > most:
+    """Raise `BoardError` if a rank needs more runs than fit into a submission."""
+    if board.runs_needed > MOST_LISTED:
         raise BoardError(
-            f"suite={board.suite_name}: a ranked entry needs {needed:,} runs, "
+            f"suite={board.suite_name}: a ranked entry needs {board.runs_needed:,} runs, "
             f"{board.runs_to_rank} in each class and as many on each instance: must be at most "
-            f"{most}, which fit into the {MAX_SIGNED_BYTES:,} bytes of a submission. Use fewer "
-            "classes or instances, or lower runs_to_rank."
+            f"{MOST_LISTED}, which fit into the {MAX_SIGNED_BYTES:,} bytes of a submission. Use "
+            "fewer classes or instances, or lower runs_to_rank."
         )
-
-
-def most_runs(board: BoardDocument) -> int:
-    """Number of runs that fit into a submission to a board, with short texts."""
-    digest = board.suite.digest
-    run = Run(
-        spec=digest,
-        seed=10**6,
-        steps=10**7,
-        artefact=Artefact(sha256=digest, size=MAX_ARTEFACT_BYTES),
-    )
-    submission = Submission(
-        suite=board.suite_reference,
-        method=Method(name="x" * 20, version="1.0", family="x" * 20, knowledge="generic"),
-        submitter=Submitter(name="x" * 20, key=board.key),
-        created="2026-01-01T00:00:00Z",
-        runs=(run,),
-        runs_started={member.name: 100 for member in board.suite.classes},
-    )
-    receiver = Receiver(board.key, f"https://{'x' * 30}")
-    one, two = (
-        len(Signed[Submission](content=each, signature="0" * 128, **receiver._asdict()).to_bytes())
-        for each in (submission, submission.model_copy(update={"runs": (run, run)}))
-    )
-    return 1 + (MAX_SIGNED_BYTES - one) // (two - one)
