@@ -50,9 +50,10 @@ _QUICK_PRODUCTS = 2**23
 
 
 class Instance:
-    """One hidden instance, for any number of threads; `start` and `states` derive what is hidden.
+    """One hidden instance, for any number of threads.
 
-    `budget` is in steps over all lanes; `signed_path` is the file of the last signature.
+    `start` and `states` derive what is hidden; `check_running` rejects what comes after the
+    ticket's end. `budget` is in steps over all lanes.
     """
 
     def __init__(
@@ -64,14 +65,15 @@ class Instance:
         protocol: EvaluationProtocol,
         start: Callable[[], Start],
         states: Callable[[], bytes],
+        check_running: Callable[[], None],
     ) -> None:
         self._place, self._request = place, request
         self._member, self._protocol = member, protocol
         assert member.budget is not None  # the track is online
         self.budget = member.budget
-        self._start, self._states = start, states
+        self._start, self._states, self._check_running = start, states, check_running
         name = str(place.instance)
-        self._journal_path, self._answers_path, self.signed_path, self._snapshot_path = (
+        self._journal_path, self._answers_path, self._signed_path, self._snapshot_path = (
             folder / f"{name}{end}" for end in (".journal", ".npy", ".json", ".npz")
         )
         self._challenge_path = folder / f"{name}.challenge"
@@ -79,7 +81,6 @@ class Instance:
         self._journal: Journal | None = None
         self._play: Play | None = None
         self._answered: bool | None = None  # unknown
-        self._closed = False
 
     @property
     def phase(self) -> Phase:
@@ -108,7 +109,10 @@ class Instance:
     @property
     def is_played(self) -> bool:
         """Whether the entrant has signed or answered anything."""
-        return self.signed_path.exists() or self._answers_path.exists()
+        paths = [self._signed_path, self._answers_path]
+        if self._request.content.transcript is None:
+            paths.append(self._journal_path)
+        return any(path.exists() for path in paths)
 
     @property
     def journal(self) -> Journal | None:
@@ -143,8 +147,8 @@ class Instance:
     def signed(self) -> SignedHead | None:
         """What the entrant has signed last; None where there is nothing to read."""
         try:
-            data = read_regular(self.signed_path, _MAX_SIGNED)
-            return SignedHead.from_dict(io.parse_json(data, self.signed_path.name))
+            data = read_regular(self._signed_path, _MAX_SIGNED)
+            return SignedHead.from_dict(io.parse_json(data, self._signed_path.name))
         except (OSError, SMEError):
             return None
 
@@ -154,7 +158,7 @@ class Instance:
         if self._request.content.transcript is None and not self.answered:
             return None
         with contextlib.suppress(OSError):
-            return io.sha256_of(read_regular(self.signed_path, _MAX_SIGNED))
+            return io.sha256_of(read_regular(self._signed_path, _MAX_SIGNED))
         return None
 
     @property
@@ -192,7 +196,7 @@ class Instance:
     def start(self, lanes: int) -> bytes:
         """Begin, or go on after a lost connection; the present observations."""
         with self._lock:
-            self._check_open()
+            self._check_running()
             journal = self.journal
             if journal is None:
                 most = min(MAX_LANES, self.budget)
@@ -219,7 +223,7 @@ class Instance:
         taken no step.
         """
         with self._lock:
-            self._check_open()
+            self._check_running()
             play = self._playing()
             try:
                 number = play.unpack(body)
@@ -242,7 +246,7 @@ class Instance:
     def finish(self, signature: str) -> None:
         """Take no more steps."""
         with self._lock:
-            self._check_open()
+            self._check_running()
             journal, play = self._started(), self._playing()
             self._sign(play, signature)
             with storage():
@@ -260,23 +264,16 @@ class Instance:
                         stream.write(self._states())
                 return read_regular(self._challenge_path, 2**28)
 
-    def has_stored(self, data: bytes) -> bool:
-        """Whether these are its answers, which a client sends again if the reply was lost."""
-        with self._lock, storage():
-            if not self.answered or read_regular(self._answers_path, len(data) + 1) != data:
-                return False
-            io.sync_folder(self._answers_path.parent)  # which may have failed the first time
-            return True
-
     def answer(self, data: bytes, signature: str) -> bool:
         """Store the answers to the challenge, an .npy file; False if the same ones are stored.
 
         `signature` is that of the transcript with them.
         """
         with self._lock, storage():
-            if self.has_stored(data):
+            if self.answered and read_regular(self._answers_path, len(data) + 1) == data:
+                io.sync_folder(self._answers_path.parent)  # which may have failed the first time
                 return False
-            self._check_open()
+            self._check_running()
             states = self.challenge()
             read_answers(data, self._member.setting, self._protocol)
             if self.answered:
@@ -337,7 +334,7 @@ class Instance:
         if self._request.content.transcript is None:
             is_right = not answers or self._has_stated(journal, answers)
         elif signed is None:
-            is_right = not self.signed_path.exists()
+            is_right = not self._signed_path.exists()
         else:
             head, number = play.head, signed.content.hashes
             if number > journal.requests:
@@ -346,7 +343,7 @@ class Instance:
                 self._request, signed.signature, signed.content
             )
         if not is_right:
-            where = "/".join(self.signed_path.parts[-5:])
+            where = "/".join(self._signed_path.parts[-5:])
             raise TamperedError(where, "is not the entrant's signature of this transcript")
 
     def _has_stated(self, journal: Journal, answers: bytes) -> bool:
@@ -354,13 +351,13 @@ class Instance:
         if self._request.content.answers_key is None:
             return True
         try:
-            data = read_regular(self.signed_path, _MAX_SIGNED)
-            stored = Signed[Answers].from_dict(io.parse_json(data, self.signed_path.name))
+            data = read_regular(self._signed_path, _MAX_SIGNED)
+            stored = Signed[Answers].from_dict(io.parse_json(data, self._signed_path.name))
         except (OSError, SMEError):
             return False
-        statement = Answers(
-            **dict(self._place), answers=io.sha256_of(answers), journal=journal.digest()
-        )
+        bodies = b"".join(journal.bodies())
+        digests = io.sha256_of(answers), io.sha256_of(bodies)
+        statement = Answers(**dict(self._place), answers=digests[0], journal=digests[1])
         return stored.content == statement and has_signed(
             self._request, stored.signature, statement
         )
@@ -371,19 +368,13 @@ class Instance:
         if journal is not None:
             journal.sync()
 
-    def close(self) -> None:
-        """Refuse all further requests, after those in progress."""
-        with self._lock:
-            self._closed = True
-            self.release()
-
     def forget(self) -> None:
         """Remove the snapshot."""
         with contextlib.suppress(OSError):
             self._snapshot_path.unlink(missing_ok=True)
 
     def release(self) -> None:
-        """Free memory; the next steps go on from the snapshot."""
+        """Free memory, after the request in progress; the next steps go on from the snapshot."""
         with self._lock:
             with contextlib.suppress(OSError):  # the steps survive all but a loss of power
                 self.sync()
@@ -443,7 +434,7 @@ class Instance:
         )
 
     def _write(self, signed: SignedHead) -> None:
-        with io.atomic_file(self.signed_path) as stream:
+        with io.atomic_file(self._signed_path) as stream:
             stream.write(io.to_json(signed.to_dict()).encode())
 
     def _started(self) -> Journal:
@@ -475,10 +466,6 @@ class Instance:
                 f"steps: {journal.steps} of {self.budget} are taken, and {journal.lanes} more do "
                 "not fit. Answer the challenge.",
             )
-
-    def _check_open(self) -> None:
-        if self._closed:
-            raise Rejection("ticket_ended", "ticket: has ended. What it had counts.")
 
 
 def _is_due(play: Play) -> bool:

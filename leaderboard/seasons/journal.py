@@ -12,7 +12,6 @@ kill in the middle of a write, leaves of the last record is ignored, and cut off
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import struct
 import zlib
@@ -120,13 +119,6 @@ class Journal:
             for _ in range(first, self.requests if last is None else last):
                 number, actions = self._record(stream)
                 yield _NUMBER.pack(number) + actions
-
-    def digest(self) -> str:
-        """SHA-256 of the bodies of all requests for steps, in order, as their senders know it."""
-        hashed = hashlib.sha256()
-        for body in self.bodies():
-            hashed.update(body)
-        return f"sha256:{hashed.hexdigest()}"
 
     def _append(self, number: int, actions: bytes) -> None:
         if self.ended or len(actions) != self._actions_size:

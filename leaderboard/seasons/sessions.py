@@ -35,18 +35,8 @@ Those used longest ago go on from their snapshots.
 class Sessions:
     """The tickets of one season, for any number of threads; `close` frees the season.
 
-    Args:
-      store: the board.
-      secret: the path of the season's master.
-      season: digest of the season; by default the first that is committed to the master.
-
-    Raises:
-      BoardError: no online season of the board is committed to the master, or another server steps
-        the season.
-
-    Attributes:
-      season, digest: the season, and the digest of its document.
-      board, secret: paths of the board's folder and of the master.
+    `secret` is the path of its master, and `season` its digest; by default it is the first that is
+    committed to the master.
     """
 
     def __init__(
@@ -65,7 +55,7 @@ class Sessions:
             )
         self._process_lock = lock
         self._store = store
-        self.board, self.secret = store.folder.path, Path(secret)
+        self.secret = Path(secret)
         self._lock = threading.Lock()
         self._running: dict[int, Ticket] = {}
         self._held: OrderedDict[Instance, int] = OrderedDict()
@@ -78,11 +68,7 @@ class Sessions:
         return [cls(store, secret, season.digest) for season in seasons]
 
     def ticket(self, number: int) -> Ticket:
-        """A ticket by its number.
-
-        Raises:
-          Rejection: `ticket_unknown`.
-        """
+        """A ticket by its number."""
         found = self._running.get(number)
         if found is None:
             row = self._store.ticket(self.digest, number)
@@ -103,16 +89,10 @@ class Sessions:
         ticket.check_token(token)
         return ticket.status(self._store.clock.time)
 
-    def open(self, number: int, token: str, instance: int, *, ended: bool = False) -> Instance:
-        """An instance, with the password of its ticket, which runs, or may have `ended`.
-
-        Raises:
-          Rejection: `ticket_unknown`, `token_wrong`, `instance_unknown` or `ticket_ended`.
-        """
+    def open(self, number: int, token: str, instance: int) -> Instance:
+        """An instance, with the password of its ticket."""
         ticket = self.ticket(number)
         ticket.check_token(token)
-        if not ended:
-            ticket.check_running(self._store.clock.received())
         return ticket.instance(instance)
 
     def is_ready(self, number: int, instance: int) -> bool:
@@ -122,11 +102,9 @@ class Sessions:
         return instance < len(instances) and instances[instance].is_ready
 
     def end(self, number: int, token: str, signature: str) -> None:
-        """`Ticket.end`, with the password of the ticket; again after its end, too."""
+        """`Ticket.end`, with the password of the ticket."""
         ticket = self.ticket(number)
         ticket.check_token(token)
-        if not ticket.is_over(""):
-            ticket.check_running(self._store.clock.received())
         ticket.end(signature)
 
     def over(self) -> list[int]:
@@ -235,13 +213,9 @@ def attending(sessions: Collection[Sessions]) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class ScoreTicket:
-    """The job of a scorer, in its own process: score a ticket that is over, and log its result.
+    """The job of a scorer, in its own process: score a ticket that is over, and log its result."""
 
-    Attributes:
-      secrets: files of the masters of the seasons that a server steps.
-    """
-
-    secrets: tuple[Path, ...]
+    secrets: tuple[Path, ...]  # files of the masters of the seasons that a server steps
 
     def __call__(self, store: Store, id: str) -> None:
         """Score the ticket that was started by the request of this id."""

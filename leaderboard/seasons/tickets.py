@@ -55,7 +55,7 @@ class Ticket:
 
     def __init__(self, store: SeasonStore, season: Season, master: Master, row: SealedRow) -> None:
         self.number, self.id = row.number, row.entrant.id
-        self._season, self._master = season, master
+        self._season, self._master, self._clock = season, master, store.clock
         self._request = request = store.request_of(row)
         self._nonce = request.content.nonce
         place = Place(season.id, "", 0, str(row.number), self._nonce)
@@ -67,7 +67,7 @@ class Ticket:
         self.instances = tuple(
             Instance(
                 *(folder, self._place(number), request, hidden.member, season.protocol),
-                *(partial(self.start, number), partial(self._states, number)),
+                *(partial(self.start, number), partial(self._states, number), self.check_running),
             )
             for number, hidden in enumerate(season.hidden)
         )
@@ -104,9 +104,10 @@ class Ticket:
         """Whether the entrant has neither signed nor answered anything."""
         return not any(each.is_played for each in self.instances)
 
-    def check_running(self, now: str) -> None:
+    def check_running(self) -> None:
         """Raise `Rejection` (`ticket_ended`) if the ticket is over, or older than transcripts."""
-        if self._closed or now >= self.deadline or self._request.content.transcript is None:
+        is_over = self._closed or self._clock.received() >= self.deadline
+        if is_over or self._request.content.transcript is None:
             raise Rejection(
                 "ticket_ended",
                 f"ticket={self.number}: has ended, at the latest at {self.deadline}. What it "
@@ -114,14 +115,7 @@ class Ticket:
             )
 
     def end(self, signature: str) -> None:
-        """End the ticket, all of which is answered.
-
-        Args:
-          signature: of the heads of all transcripts.
-
-        Raises:
-          Rejection: `instance_phase`, `bad_signature`, or `storage_full`.
-        """
+        """End the ticket, all of which is answered, with a signature of all transcripts."""
         heads = self._heads
         if not has_signed(self._request, signature, heads):
             raise Rejection(
@@ -130,6 +124,7 @@ class Ticket:
                 "the ticket's file, and the transcripts beside it.",
             )
         if not self._end_path.exists():
+            self.check_running()
             receiver = self._request.receiver._asdict()
             signed = Signed[AllHeads](content=heads, signature=signature, **receiver)
             with storage():
@@ -179,11 +174,7 @@ class Ticket:
         )
 
     def instance(self, number: int) -> Instance:
-        """Instance i of the ticket.
-
-        Raises:
-          Rejection: `instance_unknown`.
-        """
+        """Instance i of the ticket."""
         if number >= len(self.instances):
             raise Rejection(
                 "instance_unknown",
@@ -218,7 +209,7 @@ class Ticket:
         """End the ticket: wait for the requests in progress, and refuse all others."""
         self._closed = True
         for each in self.instances:
-            each.close()
+            each.release()
 
 
 def score_ticket(

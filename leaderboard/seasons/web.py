@@ -267,15 +267,9 @@ class SeasonRoutes:
 
     async def answer(self, request: Request) -> Response:
         sessions, where = self.place(request.scope)
-        instance = await self._in_thread(lambda: sessions.open(*where, ended=True))
+        instance = await self._in_thread(lambda: sessions.open(*where))
         data = await read_body(request, instance.answer_bytes, "answers")
-
-        def answer() -> bool:
-            if not instance.has_stored(data):
-                sessions.open(*where)
-            return instance.answer(data, _signature(request))
-
-        new = await self._in_thread(answer)
+        new = await self._in_thread(lambda: instance.answer(data, _signature(request)))
         return Response(status_code=201 if new else 200)
 
     async def step(self, request: Request) -> Response:

@@ -141,11 +141,7 @@ class Instance:
         data = self._request("POST", "steps", body, most=self._format.answer_bytes)
         head = next_head(kept.head(number - 1), body, data)
         if kept.head(number) not in (b"", head):
-            raise SealedError(
-                "transcript",
-                f"{kept.path}: the server's answer to request {number} is not the one that it gave "
-                "before, so nothing is signed. Ask the board's owner.",
-            )
+            raise self._shown_otherwise(f"another answer to request {number}")
         kept.receive(number, head)
         return self._format.unpack_steps(data)
 
@@ -189,11 +185,7 @@ class Instance:
         if ending is None:
             kept.end(Ending(request=self._place.request, requests=number, challenge=head))
         elif ending.challenge != head:
-            raise SealedError(
-                "transcript",
-                f"{kept.path}: the server has shown other challenge states before, so nothing is "
-                "signed. Ask the board's owner.",
-            )
+            raise self._shown_otherwise("other challenge states")
         return unpack_table(data, self.setting.state_dim + 2)
 
     def send_answers(self, actions: npt.NDArray[np.floating]) -> None:
@@ -244,6 +236,13 @@ class Instance:
     def close(self) -> None:
         self._connection.close()
         self._transcript.close()
+
+    def _shown_otherwise(self, what: str) -> SealedError:
+        return SealedError(
+            "transcript",
+            f"{self._transcript.path}: the server has shown {what} before, so nothing is signed. "
+            "Ask the board's owner.",
+        )
 
     def _set_lanes(self, lanes: int) -> None:
         self.lanes = lanes

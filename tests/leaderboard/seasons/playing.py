@@ -159,11 +159,9 @@ class Played:
         with contextlib.suppress(Rejection):  # as long as steps may follow
             states = self.open(instance).challenge()
         head = answers_head(challenge_head(heads[-1], states), data)
-        ticket = self.sessions.ticket(self.number)
-        opened = ticket.instance(instance)
-        if not opened.has_stored(data):
-            opened = self.open(instance)
-        return opened.answer(data, self.sign(self.place(instance).at(len(heads) + 1, head)))
+        return self.open(instance).answer(
+            data, self.sign(self.place(instance).at(len(heads) + 1, head))
+        )
 
     def end(self):
         """Sign the heads of all instances, as the board has them."""

@@ -288,7 +288,7 @@ def test_tickets_of_earlier_versions_are_scored_but_not_played_on(played):
     assert not {"answers_key", "transcript"} & old.to_dict()["ticket"].keys()
     number = played.store.start_ticket(old)
     token = played.sessions.ticket(number).document.token
-    refused("ticket_ended", played.sessions.open, number, token, 0)
+    refused("ticket_ended", played.sessions.open(number, token, 0).start, 1)
     result = scored(played.store, played.board.season, number)
     assert "signed" not in result.to_dict()["stepping"][0]
 
