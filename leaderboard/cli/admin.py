@@ -6,7 +6,6 @@ import math
 import os
 import shutil
 from collections import Counter
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +16,7 @@ from leaderboard import admission
 from leaderboard.bundle import make_bundle
 from leaderboard.cli import results
 from leaderboard.cli.options import (
+    WITH_SEASONS,
     Board,
     BoardFolder,
     Json,
@@ -228,7 +228,7 @@ def site(
     from leaderboard.web.server import write_site
 
     sections: list[Section] = []
-    if find_spec("leaderboard.seasons") is not None:
+    if WITH_SEASONS:
         from leaderboard.seasons.pages import SECTION
 
         sections.append(SECTION)

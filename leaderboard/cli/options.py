@@ -18,10 +18,11 @@ from sme_registry.errors import OptionError
 from sme_registry.io.terminal import Progress, err
 from sme_registry.spec import ProtocolFile, SuiteFile, catalogue
 
+WITH_SEASONS = find_spec("leaderboard.seasons") is not None
 Board: type[Store] = Store
 """How boards are opened: with seasons, if this package has them."""
 
-if find_spec("leaderboard.seasons") is not None:
+if WITH_SEASONS:
     from leaderboard.seasons.store import SeasonStore
 
     Board = SeasonStore

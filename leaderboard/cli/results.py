@@ -5,14 +5,21 @@ from __future__ import annotations
 import sys
 from dataclasses import asdict
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 from rich.markup import escape
 
-from leaderboard.cli.options import Board, BoardFolder, BoardOrUrl, Json, is_url, open_board
+from leaderboard.cli.options import (
+    WITH_SEASONS,
+    Board,
+    BoardFolder,
+    BoardOrUrl,
+    Json,
+    is_url,
+    open_board,
+)
 from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.result import LABELS, SYMBOLS, Estimate, Metric, Result
 from leaderboard.documents.submission import now
@@ -30,7 +37,6 @@ from sme_registry.errors import OptionError
 from sme_registry.io.markup import Table
 from sme_registry.io.terminal import err, fixed, out, print_json, print_pairs
 
-WITH_SEASONS = find_spec("leaderboard.seasons") is not None
 if WITH_SEASONS:
     from leaderboard.seasons.publication import files_of_seasons
     from leaderboard.seasons.verify import verify_seasons

@@ -207,7 +207,7 @@ class Index:
         if entry.event not in self._kinds:
             raise BoardError(
                 f"log/{entry.sequence:08d}.json: event={entry.event}: must be one of "
-                f"{', '.join(self._kinds)}. Open the board with the version that wrote it."
+                f"{', '.join(self._kinds)}. Open the board with all its tracks."
             )
         self._kinds[entry.event](self, entry)
         if entry.event not in ("opened", "clock"):

@@ -17,6 +17,7 @@ from leaderboard.documents.board import hex_of
 from leaderboard.documents.result import Estimate
 from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError, NotPublishable
+from leaderboard.seasons.store import SeasonStore
 from leaderboard.store import Copies, Store
 from leaderboard.web import charts, tables
 from leaderboard.web import pages as site_pages
@@ -210,7 +211,7 @@ def test_a_board_says_how_to_submit_and_its_limits_unless_it_accepts_nothing(boa
         assert any(a["href"].endswith("index.html#submit") for a in page.all("a")), name
     page = Page(html(Pages(board[0], "https://x/<script>"), "index.html"))
     assert "submit ppo https://x/<script>" in page.words
-    with Store.open(OLD, read_only=True) as store:
+    with SeasonStore.open(OLD, read_only=True) as store:
         words = Page(html(Pages(store), "index.html")).words.split("How to submit")[1]
     assert "accepts no submissions" in words
     assert "sme-leaderboard new" not in words

@@ -1,0 +1,62 @@
+"""Seasons are one folder: without it, the open board works as before."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import httpx
+import pytest
+
+from leaderboard.cli.options import KEY_VARIABLE
+from tests.leaderboard.test_cli import furnish
+
+ROOT = Path(__file__).resolve().parents[2]
+COMMAND = (sys.executable, "-c", "from leaderboard.cli import main; main()")
+TINY = ("--suite", "tiny-v1.json")
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Runs a command of a copy of the package in which the folder was deleted."""
+    package = tmp_path / "copy" / "leaderboard"
+    shutil.copytree(ROOT / "leaderboard", package, ignore=shutil.ignore_patterns("seasons"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(map(str, (package.parent, ROOT))))
+    monkeypatch.setenv(KEY_VARIABLE, str(tmp_path / "my.key"))
+    furnish(tmp_path)
+
+    def run(*arguments):
+        done = subprocess.run((*COMMAND, *arguments), capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run
+
+
+def test_the_open_board_works_without_the_folder_of_seasons(run):
+    assert "ticket" not in run("--help")
+    run("keygen")
+    run("init", "board", *TINY, "--protocol", "small-v1.json", "--runs-to-rank", "2")
+    run("new", "bundle", "--runs", "runs.json", *TINY, "--submitter", "A Lab", "--method", "Linear")
+    serve = (*COMMAND, "serve", "board", "--port", "0", "--workers", "0")
+    with subprocess.Popen(serve, stdout=subprocess.PIPE, text=True) as served:
+        try:
+            url = next(word for word in served.stdout.readline().split() if "://" in word)
+            id = run("submit", "bundle", url).split()[0]
+            assert httpx.get(f"{url}/api/seasons").status_code == 404
+            entries = httpx.get(f"{url}/api/log").json()["entries"]
+            assert [each["event"] for each in entries] == ["opened", *["received"] * 3]
+        finally:
+            served.send_signal(signal.SIGINT)
+    assert served.returncode == 0
+    assert "3 scored" in run("score", "board")
+    rows = json.loads(run("rank", "board", "--json"))["rows"]
+    assert {row["id"]: row["method"] for row in rows}[id] == "Linear"
+    assert "Verified" in run("verify", "board", "--rescore", "1")
+    run("site", "board", "--out", "site")
+    assert "Linear" in Path("site/index.html").read_text()
+    assert not Path("site/seasons.html").exists()
