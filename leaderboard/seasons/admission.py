@@ -20,7 +20,7 @@ from leaderboard.admission import (
 )
 from leaderboard.documents.board import check_receiver
 from leaderboard.documents.signed import Signed
-from leaderboard.documents.submission import Artefact, skeleton
+from leaderboard.documents.submission import Artefact
 from leaderboard.errors import Rejection
 from leaderboard.seasons.entry import Entry, TicketRequest
 from leaderboard.seasons.events import played_bytes
@@ -73,7 +73,7 @@ def enter(
 
 def _check_newest(store: SeasonStore, season: Season, entry: Entry) -> None:
     """Refuse an entry that would not count, as its key has signed a later one of its method."""
-    own = entry.submitter.key, skeleton(entry.method.name)
+    own = entry.submitter.key, entry.method.name.casefold()
     for row in store.entrants(season.digest):
         if row.method == own and row.created > entry.created:
             raise Rejection(

@@ -199,7 +199,7 @@ def show(
 ) -> None:
     """Show a board's seasons, or one with its ranking.
 
-    Methods that know the family are ranked apart from those that know nothing of the tasks.
+    Methods that declare to know the family of tasks are ranked apart from the others.
 
     Examples:
 

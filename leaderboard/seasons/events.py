@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from leaderboard.documents.signed import Signed
-from leaderboard.documents.submission import skeleton
+from leaderboard.errors import Rejection
 from leaderboard.seasons.entry import Entry, SealedManifest, TicketRequest
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.season import (
@@ -109,8 +109,8 @@ class SealedRow:
 
     @property
     def method(self) -> tuple[str, str]:
-        """What it is of: a key, and a method up to look-alike spelling."""
-        return self.entrant.key, skeleton(self.entrant.method)
+        """What it is of: a key, and the method's name in lower case."""
+        return self.entrant.key, self.entrant.method.casefold()
 
 
 class Seasons:
@@ -178,7 +178,7 @@ class Seasons:
         return self._objects.document(Season, row.document)
 
     def _season(self, entry: LogEntry) -> None:
-        season = self._objects.document(Season, entry.document)
+        season = self._index.read(Season, entry)
         entry.check_subject(season.digest)
         if self.row(season.digest) is not None or self.row(season.id) is not None:
             raise entry.contradiction("announces a season twice")
@@ -207,20 +207,65 @@ class Seasons:
             self._index.name_artefact(answer, signed.content.submitter.key, entry)
 
     def _ticket(self, entry: LogEntry) -> None:
-        season, signed = self._signed(entry, "sealed-online", Signed[TicketRequest])
-        played = played_bytes(self.read(season))
-        self._add(entry, season, signed, policies=season.instances, played=played)
+        row, signed = self._signed(entry, "sealed-online", Signed[TicketRequest])
+        season = self.read(row)
+        self._check_limits(season, signed.content.submitter.key)
+        self._add(entry, row, signed, policies=row.instances, played=played_bytes(season))
 
     def _signed(
         self, entry: LogEntry, track: SealedTrack, kind: type[_Signed]
     ) -> tuple[SeasonRow, _Signed]:
-        """The document that an entry names, and its season."""
-        signed = self._objects.document(kind, entry.document)
+        """The document that an entry names, and its season, which is open."""
+        signed = self._index.read(kind, entry)
         entry.check_subject(signed.id)
-        row = self.row(signed.content.season)
-        if row is None or row.track != track or row.reveal is not None:
-            raise entry.contradiction("names no season of its track, or a revealed one")
-        return row, signed
+        return self.open(signed.content.season, track, entry.time), signed
+
+    def open(self, name: str, track: SealedTrack, time: str) -> SeasonRow:
+        """The season of this id or digest, which must be of a track, and open at a time.
+
+        Raises:
+          Rejection: `season_unknown`, `season_track`, `season_not_open`, `season_closed` or
+            `season_revealed`.
+        """
+        row = self.row(name)
+        if row is None:
+            raise unknown_season(name)
+        if row.track != track:
+            raise Rejection(
+                "season_track",
+                f"season={row.id}: its track is {row.track}: must be {track}. Offline seasons take "
+                "entries, online ones start tickets.",
+            )
+        if row.reveal is not None:
+            raise Rejection("season_revealed", f"season={row.id}: its tasks are public now.")
+        if time < row.opens:
+            raise Rejection(
+                "season_not_open",
+                f"season={row.id}: opens at {row.opens}, and it is {time}. Come back then.",
+            )
+        if time >= row.closes:
+            raise Rejection("season_closed", f"season={row.id}: closed at {row.closes}.")
+        return row
+
+    def _check_limits(self, season: Season, key: str) -> None:
+        """Reject (`ticket_limit`) one more ticket than a key, or all keys, may start."""
+        assert season.tickets is not None  # the track is online
+        assert season.tickets_per_key is not None
+        own = self._index.number(
+            "SELECT count(*) FROM entry WHERE track = ? AND key = ?", season.digest, key
+        )
+        if own >= season.tickets_per_key:
+            raise Rejection(
+                "ticket_limit",
+                f"key={key[:16]}…: has started {own} of {season.tickets_per_key} tickets of "
+                f"the season {season.id}. Every one of them counts.",
+            )
+        if self.next_number(season.digest) > season.tickets:
+            raise Rejection(
+                "ticket_limit",
+                f"season={season.id}: all of its {season.tickets} tickets were started. Ask the "
+                "board's owner for another season.",
+            )
 
     def _add(
         self,
@@ -264,7 +309,7 @@ class Seasons:
         online = season.track == "sealed-online"
         if online != (entry.event == "ended") or not (online or season.reveal):
             raise entry.contradiction("of another track, or before the reveal")
-        result = self._objects.document(SealedResult, entry.document)
+        result = self._index.read(SealedResult, entry)
         entry.check_subject(result.subject)
         sizes = len(result.runs), len(result.stepping)
         if result.season != row.season or sizes != (season.instances, season.instances * online):
@@ -284,19 +329,54 @@ class Seasons:
 
     def _revealed(self, entry: LogEntry) -> None:
         row = self.row(entry.subject)
-        if row is None or row.digest != entry.subject or row.reveal is not None:
-            raise entry.contradiction("the season is unknown or already revealed")
-        reveal = self._objects.document(Reveal, entry.document)
+        if row is None or row.digest != entry.subject:
+            raise entry.contradiction("the season is unknown")
+        reveal = self._index.read(Reveal, entry)
         entry.check_subject(reveal.season)
-        if not self.read(row).is_committed_to(Master(bytes.fromhex(reveal.master))):
-            raise entry.contradiction("the master does not match the season's commitment")
+        master = Master(bytes.fromhex(reveal.master))
+        if not self.read(row).is_committed_to(master):
+            raise Rejection(
+                "reveal_mismatch",
+                f"master: does not match the commitment of the season {row.id}. Give the file "
+                "that `sme-leaderboard season new` wrote.",
+            )
+        if row.reveal is not None:
+            raise entry.contradiction("the season is already revealed")
+        for other in self.rows():  # whose tasks may follow from the same secret
+            if other.reveal is None and self.read(other).is_committed_to(master):
+                self._check_over(other, entry.time)
         self._index.connection.execute(
             "UPDATE track SET reveal = ?, revealed = ? WHERE digest = ?",
             (entry.document, entry.time, entry.subject),
         )
 
+    def _check_over(self, row: SeasonRow, time: str) -> None:
+        """Reject (`season_not_closed`) a reveal while entrants can still play."""
+        if time < row.closes:
+            raise Rejection(
+                "season_not_closed",
+                f"season={row.id}: closes at {row.closes}, and it is {time}. Its tasks stay secret "
+                "until then.",
+            )
+        running = [each.number for each in self.entrants(row.digest) if each.result is None]
+        if row.track == "sealed-online" and running:
+            raise Rejection(
+                "season_not_closed",
+                f"season={row.id}: {len(running)} tickets run, the first of them number "
+                f"{running[0]}. Serve the board until their deadlines have passed.",
+            )
+
     def _all(self, statement: str, *values: Any) -> list[tuple[Any, ...]]:
         return self._index.connection.execute(statement, values).fetchall()
+
+
+def unknown_season(name: str) -> Rejection:
+    """The rejection of an id or digest that no season of the board has."""
+    return Rejection(
+        "season_unknown",
+        f"season={name[:80]}: is not on this board. `sme-leaderboard season show` lists its "
+        "seasons.",
+    )
 
 
 def _apply(index: Index, entry: LogEntry) -> None:

@@ -3,7 +3,7 @@
     offline   of each key and method the entry before the close that was signed last counts
     online    every ticket of a key and method counts: its runs are those of all of them
 
-Methods that have ever declared knowledge of the family are ranked apart from those that have not.
+Methods whose last entry or ticket declares knowledge of the family are ranked apart.
 A rank needs the board's `runs_to_rank` runs in each class, over all tickets.
 """
 
@@ -53,7 +53,7 @@ def counting(store: SeasonStore, season: Season) -> list[SealedRow]:
     for row in rows:
         other = last.get(row.method, row)
         # One that was signed before and delivered later is nobody's last word.
-        if row.entrant.received < season.closes and row.created >= other.created:
+        if row.created >= other.created:
             last[row.method] = row
     return sorted(last.values(), key=lambda row: row.number)
 
@@ -105,14 +105,7 @@ def season_rankings(
 ) -> dict[Knowledge, list[RankedRow]]:
     """The rankings of a season's methods with results, one for each declared knowledge."""
     rows = [row for row in counting(store, season) if row.result is not None]
-    known: dict[tuple[str, str], Knowledge] = {}
-    for row in store.entrants(season.digest):  # whoever has known the family once, knows it
-        if row.entrant.knowledge == "family":
-            known[row.method] = "family"
-    entries = [
-        replace(entry, knowledge=known.get(method, "generic"))
-        for method, entry in _methods(store, season, rows).items()
-    ]
+    entries = list(_methods(store, season, rows).values())
     return {
         knowledge: ranking([each for each in entries if each.knowledge == knowledge], metric)
         for knowledge in KNOWLEDGE

@@ -135,7 +135,7 @@ class Sessions:
             self._store.queue.add_jobs(each.id for each in over if not each.is_unplayed)
             for ticket in [each for each in over if each.is_unplayed][:_AT_ONCE]:
                 result = unplayed_result(self._store, self.season, ticket)
-                self._store.end_ticket(self.digest, ticket.number, result)
+                self._store.end_ticket(self.digest, ticket.number, result, ticket.deadline)
                 ticket.forget()
         except Exception as error:  # the board is locked, or has no memory or files left
             # Nothing but the kind of an error is logged: its text may name what is hidden.
@@ -227,5 +227,7 @@ class ScoreTicket:
         masters = map(Master.read, self.secrets)
         master = next(each for each in masters if season.is_committed_to(each))
         ticket = Ticket(store, season, master, row)
-        store.end_ticket(row.season, row.number, score_ticket(store, season, ticket))
+        not_before = "" if ticket.is_ended else ticket.deadline
+        result = score_ticket(store, season, ticket)
+        store.end_ticket(row.season, row.number, result, not_before)
         ticket.forget()

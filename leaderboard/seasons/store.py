@@ -10,7 +10,7 @@ from typing import Literal
 from leaderboard.documents.signed import Signed
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.seasons.entry import Entry, TicketRequest
-from leaderboard.seasons.events import SEASON_KINDS, SealedRow, SeasonRow, Seasons
+from leaderboard.seasons.events import SEASON_KINDS, SealedRow, SeasonRow, Seasons, unknown_season
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.season import Reveal, SealedResult, SealedTrack, Season, SeasonFolder
 from leaderboard.store import Store
@@ -60,11 +60,7 @@ class SeasonStore(Store):
         with self.reading() as index:
             row = Seasons(index).row(name)
         if row is None:
-            raise Rejection(
-                "season_unknown",
-                f"season={name[:80]}: is not on this board. `sme-leaderboard season show` lists "
-                "its seasons.",
-            )
+            raise unknown_season(name)
         return row
 
     def season(self, name: str) -> Season:
@@ -96,9 +92,7 @@ class SeasonStore(Store):
         with self.transaction() as index:
             if Seasons(index).entrant(signed.id) is not None:
                 return False
-            time = self.clock.received()
-            self.open_season(signed.content.season, "sealed-offline", time)
-            self.record("entry", signed.id, signed, time)
+            self.record("entry", signed.id, signed)
         return True
 
     def start_ticket(self, signed: Signed[TicketRequest]) -> int:
@@ -116,46 +110,35 @@ class SeasonStore(Store):
             known = Seasons(index).entrant(signed.id)
             if known is not None:
                 return known.number
-            time = self.clock.received()
-            row = self.open_season(signed.content.season, "sealed-online", time)
-            season, key = Seasons(index).read(row), signed.content.submitter.key
-            own = sum(each.entrant.key == key for each in Seasons(index).entrants(row.digest))
-            assert season.tickets is not None  # the track is online
-            assert season.tickets_per_key is not None
-            if own >= season.tickets_per_key:
-                raise Rejection(
-                    "ticket_limit",
-                    f"key={key[:16]}…: has started {own} of {season.tickets_per_key} tickets of "
-                    f"the season {row.id}. Every one of them counts.",
-                )
-            number = Seasons(index).next_number(row.digest)
-            if number > season.tickets:
-                raise Rejection(
-                    "ticket_limit",
-                    f"season={row.id}: all of its {season.tickets} tickets were started. Ask the "
-                    "board's owner for another season.",
-                )
-            self.record("ticket", signed.id, signed, time)
+            number = Seasons(index).next_number(signed.content.season)
+            self.record("ticket", signed.id, signed)
         return number
 
-    def end_ticket(self, season: str, number: int, result: SealedResult) -> bool:
+    def end_ticket(
+        self, season: str, number: int, result: SealedResult, not_before: str = ""
+    ) -> bool:
         """Log the result of a ticket.
 
         Args:
           season: digest of the season.
           number: the ticket's.
           result: of this season and ticket.
+          not_before: the ticket's deadline, unless its entrant has ended it.
 
         Returns:
           False if it has one.
 
         Raises:
           Rejection: `ticket_unknown`.
-          BoardError: it cannot be written.
+          BoardError: it cannot be written, or the clock has gone back to before the deadline.
         """
         with self.transaction():
-            row = self.ticket(season, number)
-            return self._finish("ended", row, result)
+            if self.clock.received() < not_before:
+                raise BoardError(
+                    f"ticket={number}: it is {self.clock.time}, and the ticket ends at "
+                    f"{not_before}. Try again then."
+                )
+            return self._finish("ended", self.ticket(season, number), result)
 
     def rank(self, result: SealedResult) -> bool:
         """Log the result of an offline entry, after the reveal; False if it has one.
@@ -182,38 +165,12 @@ class SeasonStore(Store):
             a ticket runs, also of another season with this master, or `reveal_mismatch`.
           BoardError: it cannot be written.
         """
-        with self.transaction() as index:
-            time, row = self.clock.received(), self.season_row(reveal.season)
-            master = Master(bytes.fromhex(reveal.master))
-            if not Seasons(index).read(row).is_committed_to(master):
-                raise Rejection(
-                    "reveal_mismatch",
-                    f"master: does not match the commitment of the season {row.id}. Give the file "
-                    "that `sme-leaderboard season new` wrote.",
-                )
-            if row.reveal is not None:
+        with self.transaction():
+            row = self.season_row(reveal.season)
+            if row.reveal is not None and self.objects.document(Reveal, row.reveal) == reveal:
                 return False
-            self._refuse_not_over(row, time)
-            for other in Seasons(index).rows():  # their tasks follow from the same secret
-                if other.reveal is None and Seasons(index).read(other).is_committed_to(master):
-                    self._refuse_not_over(other, time)
-            self.record("revealed", row.digest, reveal, time)
+            self.record("revealed", row.digest, reveal)
         return True
-
-    def _refuse_not_over(self, row: SeasonRow, time: str) -> None:
-        if time < row.closes:
-            raise Rejection(
-                "season_not_closed",
-                f"season={row.id}: closes at {row.closes}, and it is {time}. Its tasks stay secret "
-                "until then.",
-            )
-        running = [each.number for each in self.entrants(row.digest) if each.result is None]
-        if row.track == "sealed-online" and running:
-            raise Rejection(
-                "season_not_closed",
-                f"season={row.id}: {len(running)} tickets run, the first of them number "
-                f"{running[0]}. Serve the board until their deadlines have passed.",
-            )
 
     def revealed_master(self, name: str) -> Master:
         """The published master of the season of this id or digest.
@@ -274,30 +231,15 @@ class SeasonStore(Store):
         """
         return None if row.result is None else self.objects.document(SealedResult, row.result)
 
-    def open_season(self, name: str, track: SealedTrack, time: str | None = None) -> SeasonRow:
-        """The season of this id or digest, which must be of a track, and open at a time, or now.
+    def open_season(self, name: str, track: SealedTrack) -> SeasonRow:
+        """The season of this id or digest, which must be of a track, and open now.
 
         Raises:
           Rejection: `season_unknown`, `season_track`, `season_not_open`, `season_closed` or
             `season_revealed`.
         """
-        row, time = self.season_row(name), time or self.clock.time
-        if row.track != track:
-            raise Rejection(
-                "season_track",
-                f"season={row.id}: its track is {row.track}: must be {track}. Offline seasons take "
-                "entries, online ones start tickets.",
-            )
-        if row.reveal is not None:
-            raise Rejection("season_revealed", f"season={row.id}: its tasks are public now.")
-        if time < row.opens:
-            raise Rejection(
-                "season_not_open",
-                f"season={row.id}: opens at {row.opens}, and it is {time}. Come back then.",
-            )
-        if time >= row.closes:
-            raise Rejection("season_closed", f"season={row.id}: closed at {row.closes}.")
-        return row
+        with self.reading() as index:
+            return Seasons(index).open(name, track, self.clock.time)
 
     def _finish(
         self, event: Literal["ended", "ranked"], row: SealedRow, result: SealedResult

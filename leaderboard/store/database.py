@@ -146,26 +146,19 @@ class Database:
                 self._follow_clock(self._connected)
             yield self._connected
 
-    def record(
-        self,
-        event: str,
-        subject: str,
-        document: StrictModel,
-        time: str | None = None,
-    ) -> None:
-        """Write a document, its log entry and its rows; call it in a transaction.
-
-        `time` is the log entry's, if what is allowed depends on it; by default the board's.
+    def record(self, event: str, subject: str, document: StrictModel) -> None:
+        """Log a document, which must be allowed now; call it in a transaction.
 
         Raises:
-          BoardError: they cannot be written, or the machine's clock is wrong.
+          Rejection: it is not allowed, and nothing was written.
+          BoardError: it cannot be written, or the machine's clock is wrong.
         """
         key = self.signing_key()
-        index, time = self._connected, time or self.clock.received()
+        index, time = self._connected, self.clock.received()
         entry = self._log.entry(key, index.head, event, subject, digest_of(document), time)
+        index.apply(entry, document)
         self.objects.write(document)
         self._log.write(entry)
-        index.apply(entry)
         self.clock.last = entry.time
 
     @property

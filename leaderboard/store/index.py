@@ -18,20 +18,21 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from leaderboard.documents.board import BoardDocument, Folder
 from leaderboard.documents.result import Result
 from leaderboard.documents.signed import Signed
 from leaderboard.documents.submission import Artefact, Submission, Withdrawal
-from leaderboard.errors import BoardError, TamperedError
+from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.store import copies
 from leaderboard.store.copies import Copies
-from leaderboard.store.files import BUSY_SECONDS, digest_of
+from leaderboard.store.files import BUSY_SECONDS, digest_of, to_bytes
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.objects import Objects
 from leaderboard.store.rows import EntryRow, Status, scores_of, scores_text
 from sme_registry.io import is_regular
+from sme_registry.spec.document import StrictModel
 
 TIMES = (
     *(("track", column) for column in ("announced", "revealed")),
@@ -94,6 +95,7 @@ _ROW = ", ".join(_OF_LEASE.get(name, f"entry.{name}") for name in _COLUMNS)
 _ROWS = f"SELECT {_ROW} FROM entry LEFT JOIN lease ON submission = id WHERE track = ''"
 
 
+_Model = TypeVar("_Model", bound=StrictModel)
 Kinds = Mapping[str, "Callable[[Index, LogEntry], None]"]
 
 
@@ -112,6 +114,7 @@ class Index:
         self.document = document
         self.objects = Objects(folder, by_kind=document.rules == 2)
         self._board = document.digest
+        self._written: StrictModel | None = None
         self._kinds = kinds
 
     @classmethod
@@ -196,10 +199,15 @@ class Index:
         row = self.connection.execute("SELECT sequence, digest, time FROM head").fetchone()
         return EMPTY if row is None else Head(*row)
 
-    def apply(self, entry: LogEntry) -> None:
-        """Apply the log entry after `head`.
+    def apply(self, entry: LogEntry, document: StrictModel | None = None) -> None:
+        """Apply the log entry after `head`, which may be one that is not written yet.
+
+        Args:
+          entry: the entry.
+          document: that it names, where it is not written yet.
 
         Raises:
+          Rejection: the document is not allowed at the entry's time, and is not written yet.
           TamperedError: the document that it names is missing or altered, or the entry contradicts
             those before it.
           BoardError: it is of a kind that this program does not know.
@@ -209,7 +217,15 @@ class Index:
                 f"log/{entry.sequence:08d}.json: event={entry.event}: must be one of "
                 f"{', '.join(self._kinds)}. Open the board with all its tracks."
             )
-        self._kinds[entry.event](self, entry)
+        if entry.time < self.head.time and self.document.rules > 2 and entry.event != "clock":
+            raise entry.contradiction("is dated before the entry before it")
+        self._written = document
+        try:
+            self._kinds[entry.event](self, entry)
+        except Rejection as error:
+            if document is not None:
+                raise
+            raise entry.contradiction(error.message) from None
         if entry.event not in ("opened", "clock"):
             self._name_document(entry)
         self.connection.execute(
@@ -217,10 +233,23 @@ class Index:
             (self._board, entry.sequence, entry.digest, entry.time),
         )
 
+    def read(self, kind: type[_Model], entry: LogEntry) -> _Model:
+        """The document of an entry that is applied.
+
+        Raises:
+          TamperedError: it is missing, altered, or not of this kind.
+        """
+        if self._written is not None:
+            return cast(_Model, self._written)
+        return self.objects.document(kind, entry.document)
+
     def _name_document(self, entry: LogEntry) -> None:
         """Add the entry's document to the objects, as one of the entrant's or the board's."""
         row = self.one("SELECT key FROM entry WHERE id = ?", entry.subject)
-        size = self.objects.path(entry.document).stat().st_size
+        if self._written is None:
+            size = self.objects.path(entry.document).stat().st_size
+        else:
+            size = len(to_bytes(self._written))
         key = self.document.key if row is None else row[0]
         self._name_object(entry.document, size, key, entry)
 
@@ -251,7 +280,7 @@ class Index:
     def _received(self, entry: LogEntry) -> None:
         if self.one("SELECT 1 FROM entry WHERE id = ?", entry.subject) is not None:
             raise entry.contradiction("receives a submission twice")
-        submission = self.objects.document(Signed[Submission], entry.document).content
+        submission = self.read(Signed[Submission], entry).content
         entry.check_subject(submission.digest)
         method, submitter = submission.method, submission.submitter
         values = {
@@ -279,7 +308,7 @@ class Index:
     def _result(self, entry: LogEntry) -> None:
         if self.status(entry.subject) != "waiting":
             raise entry.contradiction("the submission was not waiting for a result")
-        result = self.objects.document(Result, entry.document)
+        result = self.read(Result, entry)
         entry.check_subject(result.submission)
         self.connection.execute(
             "UPDATE entry SET result = ?, status = ?, code = ?, enough_runs = ?, oracle_like = ?, "
@@ -301,7 +330,7 @@ class Index:
     def _withdrawn(self, entry: LogEntry) -> None:
         if self.status(entry.subject) in (None, "withdrawn"):
             raise entry.contradiction("the submission is unknown or already withdrawn")
-        signed = self.objects.document(Signed[Withdrawal], entry.document)
+        signed = self.read(Signed[Withdrawal], entry)
         entry.check_subject(signed.content.submission)
         self.connection.execute(
             "UPDATE entry SET status = 'withdrawn', withdrawal = ? WHERE id = ?",

@@ -77,7 +77,7 @@ def test_the_page_of_a_season_before_and_after_its_reveal(board, key, monkeypatc
         board.rank(result(OFFLINE, id))
     after = page(board, "seasons/autumn.html")
     assert MASTER.raw.hex() in after.words
-    generic, family = (after.words.index(f"Methods {text}") for text in ("without", "that know"))
+    generic, family = (after.words.index(f"Methods {text}") for text in ("without", "that declare"))
     assert generic < after.words.index("Mine generic") < family < after.words.index("Mine family")
     assert after.words.count("Methods of its key") == 2
     assert after.words.count("too few runs") == 2  # of the ten that this board needs

@@ -208,8 +208,8 @@ def test_a_season_is_scored_ranked_and_replayed(store, key, season, published, l
     # Kept back, and logged by an organiser's own board when a later one had arrived.
     old = {"method": method("Best"), "created": moment(-2)}
     store.enter(signed_entry(store, season, key, [None, None], **old))
-    enter(store, season, friend, halves(published), method=method("Fit", "family"))
-    family = enter(store, season, friend, best, method=method("Fit"))
+    enter(store, season, friend, halves(published), method=method("Fit"))
+    family = enter(store, season, friend, best, method=method("Fit", "family"))
     failed = enter(store, season, friend, [None, None], method=method("Failed"))
     middle = [0.25 + 0.5 * each for each in best]  # half way from ½ to the optimum
     near = enter(store, season, friend, middle, method=method("Middle"))
@@ -407,19 +407,6 @@ def test_the_tickets_of_each_method_have_their_own_scores_and_rank(
         rows = season_rankings(store, season, "wd_regret")["generic"]
     shown = [(row.entry.method, row.value.value, row.entry.runs, row.reason) for row in rows]
     assert shown == [("Good", 0.5, 4, reason), ("Bad", 1.0, 4, reason)]
-
-
-def test_an_entry_after_the_close_counts_nowhere(store, key, later):
-    """As an organiser's own board may log it."""
-    season = tiny_season()
-    store.announce(season)
-    first = enter(store, season, key, [None, None])
-    later()
-    late = signed_entry(store, season, key, [None, None], statement="late")
-    with store.transaction():
-        store.record("entry", late.id, late)
-    assert [row.entrant.id for row in store.entrants(season.digest)] == [first, late.id]
-    assert [row.entrant.id for row in counting(store, season)] == [first]
 
 
 @pytest.mark.parametrize("fault", ["signature", "board"])
