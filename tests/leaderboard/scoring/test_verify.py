@@ -36,9 +36,9 @@ def where(board, path):
     return path.relative_to(board).as_posix()
 
 
-def first_altered(board, **arguments):
+def first_altered(path, **arguments):
     with pytest.raises(TamperedError) as tampered:
-        verify(board, **arguments)
+        verify(path, **arguments)
     assert tampered.value.where in str(tampered.value)
     return tampered.value.where
 
