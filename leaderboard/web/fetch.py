@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 from leaderboard.documents.board import BoardDocument, Folder, hex_of
 from leaderboard.errors import BoardError
 from leaderboard.store import EMPTY, Head, Log, LogEntry, Objects, Store, digest_of
-from leaderboard.store.files import write_document, write_file
+from leaderboard.store.files import unwritable, write_document, write_file
 from leaderboard.web.client import ServedBoard
 from sme_registry.errors import SpecError
 from sme_registry.io import sha256_of
@@ -29,8 +29,9 @@ from sme_registry.io import sha256_of
 MOST_BYTES = 2**34
 _MOST_LOG = 2**22  # of an answer: a hundred entries of at most 4,096 bytes, as JSON
 _MOST_OBJECT = 2**24
-_CHUNK = 2**23  # of a file of a season
-_NAME = re.compile(r"([A-Za-z0-9_-][A-Za-z0-9_.-]*/)*[A-Za-z0-9_-][A-Za-z0-9_.-]*")
+_CHUNK, _INODE = 2**23, 2**12  # of a file of a season; what an empty one counts as
+_PART = "[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}"
+_NAME = re.compile(f"({_PART}/){{0,9}}{_PART}")
 
 Progress = Callable[[str], None]
 """Called with what is fetched next."""
@@ -116,7 +117,8 @@ class _Copy:
     def __init__(self, served: ServedBoard, folder: Path, most: int, progress: Progress) -> None:
         self.folder = Folder(folder)
         self.files = self.bytes = 0
-        self._served, self._most, self._progress = served, most, progress
+        self._served, self._progress = served, progress
+        self._most = self._left = most
         self._objects = Objects(self.folder)
 
     def open(self) -> None:
@@ -200,34 +202,39 @@ class _Copy:
         path = files.folder / name
         if path.exists():
             return
-        path.parent.mkdir(parents=True, exist_ok=True)
+        self._spend(_INODE)
         growing = path.with_name(f".{path.name}.tmp")
-        with open(growing, "ab") as stream:
-            while (start := stream.tell()) < size:
-                data = self._read(f"{files.address}/{name}?start={start}", _CHUNK, name)
-                if not 0 < len(data) <= size - start:
-                    raise self._refusal(f"{name}: has another size than its list says")
-                stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(growing, path)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with open(growing, "ab") as stream:
+                while (start := stream.tell()) < size:
+                    data = self._read(f"{files.address}/{name}?start={start}", _CHUNK, name)
+                    if not 0 < len(data) <= size - start:
+                        raise self._refusal(f"{name}: has another size than its list says")
+                    stream.write(data)
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.replace(growing, path)
+        except OSError as error:
+            raise unwritable(path, error) from None
         self.files += 1
 
     def _json(self, address: str, what: str) -> Any:
         self._progress(what)
         answer = self._served.request("GET", address, most=_MOST_LOG)
-        self._count(_MOST_LOG if answer is None else len(str(answer)))
+        self._spend(_MOST_LOG if answer is None else len(str(answer)))
         return answer
 
     def _read(self, address: str, most: int, what: str) -> bytes:
         self._progress(what)
         data = self._served.read("GET", address, most=most)
-        self._count(len(data))
+        self.bytes += len(data)
+        self._spend(len(data))
         return data
 
-    def _count(self, size: int) -> None:
-        self.bytes += size
-        if self.bytes > self._most:
+    def _spend(self, size: int) -> None:
+        self._left -= size
+        if self._left < 0:
             raise BoardError(
                 f"{self._served.url}: has sent more than {self._most:,} bytes. What is here is "
                 "whole; repeat the command to go on, with a larger limit: --most."

@@ -126,7 +126,17 @@ def test_seasons_are_copied_with_what_was_played_and_verified(seasons, tmp_path)
 
 
 @pytest.mark.parametrize(
-    "path", ["../up", "/absolute", "tickets/../../up", ".stepping", "published/.a", "a//b", "a\\b"]
+    "path",
+    [
+        "../up",
+        "x" * 200,
+        "/absolute",
+        "tickets/../../up",
+        ".stepping",
+        "published/.a",
+        "a//b",
+        "a\\b",
+    ],
 )
 def test_a_server_names_no_file_outside_the_copy(seasons, tmp_path, monkeypatch, path):
     def lie(address, data):
