@@ -448,13 +448,7 @@ def _name(id: str) -> str:
 
 
 def policy_of_each(policy: str, names: Collection[str]) -> dict[str, str]:
-    """The policy of each instance, by its name, which replaces `{name}`.
-
-    Raises:
-      OptionError: there are several instances, and all would have the same policy, which is none
-        of the references that need no task.
-    """
-
+    """The policy of each instance, by its name, which replaces `{name}`."""
     if len(names) > 1 and "{name}" not in policy and policy not in WITHOUT_TASK:
         raise OptionError(
             f"policy={policy!r}: must contain {{name}}, the name of the instance, such as "
@@ -464,11 +458,7 @@ def policy_of_each(policy: str, names: Collection[str]) -> dict[str, str]:
 
 
 def answers_in(path: str) -> bytes | None:
-    """The bytes of a file of actions, if a policy is given by one; None for other policies.
-
-    Raises:
-      OptionError: the file cannot be read.
-    """
+    """The bytes of a file of actions, if a policy is given by one; None for other policies."""
     return read_file(Path(path)) if path.endswith(".npy") else None
 
 
@@ -488,13 +478,7 @@ def manifest_fields(
     code: str | None,
     statement: str,
 ) -> dict[str, Any]:
-    """The fields of a `Manifest`, signed now.
-
-    Args:
-      key: the submitter's public key.
-      method: name, version, family (None for the name) and knowledge.
-      submitter, code, statement: as given.
-    """
+    """The fields of a `Manifest`, signed now; the method is name, version, family, knowledge."""
     name, version, family, knowledge = method
     return {
         "method": {
