@@ -31,14 +31,9 @@ _END = 0
 
 
 class Journal:
-    """One journal; `create` and `open` make it. No file stays open between two steps.
+    """One journal, of `requests` so far; no more can follow where it has `ended`.
 
-    Attributes:
-      path: its file.
-      lanes: L, lanes that each request steps.
-      action_dim: A, action channels.
-      requests: number of records with actions.
-      ended: whether no more can follow.
+    No file stays open between two steps.
     """
 
     def __init__(self, path: Path, lanes: int, action_dim: int) -> None:
@@ -65,7 +60,8 @@ class Journal:
     def open(cls, path: Path, known: int = 0) -> Journal:
         """The journal of a file, up to its last whole record; writes nothing.
 
-        The first `known` records, which were whole before, are not read again."""
+        The first `known` records, which were whole before, are not read again.
+        """
         with open_regular(path) as stream:
             header = stream.read(_START)
             if len(header) < _START or header[_HEADER.size :] != _crc(header[: _HEADER.size]):
@@ -87,10 +83,7 @@ class Journal:
         return _NUMBER.size + self._actions_size + _CRC_SIZE
 
     def append(self, actions: bytes) -> None:
-        """Add the next request; it survives a kill of this process when this returns.
-
-        Args:
-          actions: `[L, A]` float32, little-endian."""
+        """Add the next request, `[L, A]` float32; then it survives a kill of this process."""
         self._append(self.requests + 1, actions)
         self.requests += 1
 

@@ -33,32 +33,18 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 
 @dataclass(frozen=True)
 class Start:
-    """What the steps of an instance follow from, besides the actions; `repr` does not show it.
+    """What the steps of an instance follow from, besides the actions; `repr` does not show it."""
 
-    Attributes:
-      spec: the hidden task.
-      seed: of the first lane's episodes; lane i has seed + i.
-      place: of the instance.
-    """
-
-    spec: SMESpec = field(repr=False)
-    seed: int = field(repr=False)
+    spec: SMESpec = field(repr=False)  # the hidden task
+    seed: int = field(repr=False)  # of the first lane's episodes; lane i has seed + i
     place: Place
 
 
 class Play:
-    """An instance that has begun.
+    """An instance that has begun, with a budget of steps over all its lanes.
 
-    Args:
-      start: of the instance.
-      lanes: L.
-      budget: steps over all lanes.
-
-    Attributes:
-      requests: number taken.
-      head: of the transcript after them.
-      last: the last request and its answer.
-      signed: number of requests that the entrant has signed; −1 before the first signature.
+    `head` is that of the transcript after all `requests`, `last` the last request and its answer,
+    and `signed` how many requests the entrant has signed: −1 before the first signature.
     """
 
     def __init__(self, start: Start, lanes: int, budget: int) -> None:
@@ -68,7 +54,7 @@ class Play:
         self._possible = budget // lanes
         # Regret, that of the constant ½, and requests, of each part of the budget.
         self._sums = np.zeros((min(MOST_PARTS, self._possible), 3))
-        self._signed_sums = self._sums
+        self._signed_sums = self._sums.copy()
         self.requests, self.signed, self.last = 0, -1, (b"", b"")
         self.head = start.place.first_head(lanes, self.started)
 

@@ -39,18 +39,9 @@ def deadline(season: Season, row: SealedRow) -> str:
 
 
 class Ticket:
-    """One ticket: it runs until all instances are answered, or its deadline has passed.
+    """One ticket: it runs until the entrant ends it, or its deadline has passed.
 
-    Args:
-      store: the board.
-      season, master: the season.
-      row: the ticket's.
-
-    Attributes:
-      number: in the season, from 1.
-      id: of the request that started it.
-      deadline: its end.
-      instances: in the season's order.
+    Its `id` is that of the request; its `instances` are in the season's order.
     """
 
     def __init__(self, store: SeasonStore, season: Season, master: Master, row: SealedRow) -> None:
@@ -145,11 +136,7 @@ class Ticket:
 
     @property
     def is_ended(self) -> bool:
-        """Whether the entrant has signed its end; or answered all of it, before transcripts.
-
-        Raises:
-          TamperedError: what is stored as the end is not signed by the entrant.
-        """
+        """Whether the entrant has signed its end; or answered all of it, before transcripts."""
         if self._request.content.transcript is None:
             return all(each.answered for each in self.instances)
         if not self._end_path.exists():
@@ -217,11 +204,7 @@ def score_ticket(
 ) -> SealedResult:
     """Score a ticket from its snapshots and answers; or `replay` its journals, too.
 
-    Nothing of the ticket may change any more.
-
-    Raises:
-      Rejection: `storage_full` if a file cannot be read.
-      TamperedError: a journal, answers or a signature are not those of the instance.
+    Nothing of the ticket may change any more. A TamperedError names what is not the entrant's.
     """
     runs, stepping = [], []
     versions: dict[str, str] = {}
