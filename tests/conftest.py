@@ -87,6 +87,17 @@ def _forgets_compiled_programs():
 
 
 @pytest.fixture(scope="module")
+def quickly_compiled():
+    """JAX in half the time: for programs not compared with another library's last bits."""
+    jax = pytest.importorskip("jax")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")  # of processes started here
+        jax.config.update("jax_disable_most_optimizations", True)
+        yield
+        jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture(scope="module")
 def chromium():
     """A headless browser."""
     sync_api = pytest.importorskip("playwright.sync_api")

@@ -21,6 +21,8 @@ MIXINGS = {
     "nonlinear": {"mixing": "nonlinear", "mixing_depth": 2},
 }
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
 
 def two_tasks(observation):
     base = {"state_dim": 3, "action_dim": 2, "horizon": 4, "k": 2, "safety": {"tightness": 0.3}}

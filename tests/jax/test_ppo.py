@@ -239,6 +239,7 @@ def program():
     return ppo.PPOProgram(SMALL, specs, [4, 5], steps=96)
 
 
+@pytest.mark.usefixtures("quickly_compiled")  # and all that follow
 def test_a_program_collects_whole_rollouts_and_learns_between_them():
     agents = program()
     before, keys = agents.weights(0), [agents.state.key]

@@ -2,7 +2,6 @@
 
 import pytest
 
-from tests.jax.conftest import quickly_compiled  # noqa: F401
 from tests.training.runs import short, without_figures
 
 

@@ -31,6 +31,8 @@ pytest.importorskip("stable_baselines3")
 
 from sme_registry.studies.engine import programs
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
 ROOT = Path(__file__).resolve().parents[3]
 STEPS = 96
 

@@ -329,8 +329,8 @@ def visits(monkeypatch):
     return ended, raised
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 def test_interrupted_lives_in_jax_go_on_with_the_weights_of_their_visits(tmp_path, visits):
-    pytest.importorskip("jax")
     whole, interrupted = tmp_path / "whole", tmp_path / "interrupted"
     ran(whole, jax_file(), device="cpu", keep_models=True)
     ended, raised = visits
@@ -355,10 +355,10 @@ def test_interrupted_lives_in_jax_go_on_with_the_weights_of_their_visits(tmp_pat
         assert result.curve.steps == (16, 32, 48, 64)
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 def test_models_that_are_asked_for_after_an_interruption_make_lives_in_jax_start_again(
     tmp_path, visits
 ):
-    pytest.importorskip("jax")
     ended, raised = visits
     raised.append(KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):
