@@ -29,14 +29,20 @@ os.environ.setdefault(
 # JAX keeps only what took a second to compile; here the workers share all of it.
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
-# The files that take longest, longest first: no worker is left with one at the end.
-LONG = (
+# First the files that compile most in JAX, as a worker is small then; then those that take longest,
+# so that no worker is left with one at the end.
+FIRST = (
+    "tests/studies/engine/test_lanes.py",
+    "tests/studies/engine/test_lives.py",
+    "tests/training/test_jax_runs.py",
+    "tests/jax/",
     "tests/test_documentation.py",
     "tests/docs/test_site.py",
     "tests/test_cli.py",
     "tests/studies/engine/test_runner.py",
     "tests/leaderboard/test_cli.py",
 )
+ENOUGH = 1_250_000_000  # bytes of a worker with programs of JAX, which it then forgets
 
 settings.register_profile(
     "deterministic", derandomize=True, deadline=None, database=None, max_examples=50
@@ -70,20 +76,31 @@ def pytest_unconfigure():
 
 
 def pytest_collection_modifyitems(items):
-    """Give the long files to workers first."""
-    rank = {name: place for place, name in enumerate(LONG)}
-    items.sort(key=lambda item: rank.get(item.nodeid.partition("::")[0], len(rank)))
+    """Give some files to workers first."""
+
+    def rank(item):
+        places = (place for place, name in enumerate(FIRST) if item.nodeid.startswith(name))
+        return next(places, len(FIRST))
+
+    items.sort(key=rank)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _forgets_compiled_programs():
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item, nextitem):
     """The programs that a file compiled in JAX go with it: hundreds of them take gigabytes."""
-    yield
-    if jax := sys.modules.get("jax"):
+    jax = sys.modules.get("jax")
+    if jax and (nextitem is None or nextitem.path != item.path or _memory() > ENOUGH):
         jax.clear_caches()
         gc.collect()
         if sys.platform == "linux":
             ctypes.CDLL(None).malloc_trim(0)  # glibc keeps a third of what was freed
+
+
+def _memory():
+    """Bytes in use, where the system says so."""
+    statm = Path("/proc/self/statm")
+    pages = int(statm.read_text().split()[1]) if statm.exists() else 0
+    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 @pytest.fixture(scope="module")
