@@ -14,9 +14,9 @@ import gymnasium
 import numpy as np
 
 import sme_registry
-from sme_registry.compiled.engine import chosen_backend
 from sme_registry.spec import EnvFile
 from sme_registry.spec.catalogue import entries, spec_folder
+from sme_registry.task.engine import chosen_backend
 
 
 def expect(holds, what):

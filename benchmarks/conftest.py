@@ -93,7 +93,7 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
     import gymnasium
     import numpy as np
 
-    from sme_registry.compiled import chosen_backend
+    from sme_registry.task.engine import chosen_backend
 
     table = Table(title="Medians of interleaved rounds, one core", title_justify="left")
     for heading in ("what", "per", "ours", "peer", "", "ratio", "target", ""):

@@ -29,7 +29,7 @@ from sme_registry.spec.stream import StreamLike
 if TYPE_CHECKING:
     from pettingzoo import AECEnv
 
-    from sme_registry.envs.team import SMETeamEnv
+    from sme_registry.teams import SMETeamEnv
 
 _ENTRY_POINTS: dict[str, Any] = {
     "entry_point": "sme_registry.envs:SMEEnv",

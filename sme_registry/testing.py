@@ -26,13 +26,13 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from sme_registry.envs import SMEEnv, SMEVectorEnv
 from sme_registry.envs.arguments import from_unit
 from sme_registry.envs.schedule import Schedule
-from sme_registry.envs.team import SMETeamEnv, observed_columns
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.sme_spec import ACTION_RANGES, SpecLike
 from sme_registry.spec.stream import StreamLike
 from sme_registry.task import Task, load, materialize, observe, step
 from sme_registry.task.loading import materialize_segments
 from sme_registry.task.task import NUMBERS, Array, Step
+from sme_registry.teams import SMETeamEnv, observed_columns
 
 __all__ = ["ConformanceError", "check_env", "check_stream", "check_team"]
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from sme_registry import load
 from sme_registry.spec import EnvFile, ObservationSpec, SafetySpec, SMESpec, SuiteFile
 from sme_registry.spec.catalogue import names
-from sme_registry.studies.engine.executors import InProcess, Processes
+from sme_registry.studies.executors import InProcess, Processes
 from sme_registry.task.certificate import certify
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -13,7 +13,7 @@ import leaderboard.cli
 import sme_registry.cli
 from leaderboard.cli.options import KEY_VARIABLE
 from leaderboard.documents.signed import SigningKey
-from sme_registry.io.checks import hidden_in
+from sme_registry.io.system import hidden_in
 from sme_registry.io.terminal import log_to_terminal
 from tests.leaderboard.seasons.sealing import tiny_season
 from tests.leaderboard.web import boards

@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from sme_registry.export import export_onnx
 from sme_registry.sb3 import PPOLagrangian, PPOProjection, SMEVecEnv
 from sme_registry.sb3.vec_env import episodes_of, finished_in
-from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.cell import run_cell
 from sme_registry.training.algorithms import find
 from sme_registry.training.models import load_checkpoint
 from sme_registry.training.numpy_policy import numpy_policy

@@ -74,11 +74,11 @@ from leaderboard.scoring.aggregation import (
     scored_run,
 )
 from sme_registry import SMESpec, evaluate, materialize
-from sme_registry.compiled import engine
 from sme_registry.errors import PolicyError, SMEError
 from sme_registry.evaluation import EvaluationReport, as_policy
 from sme_registry.io import versions
 from sme_registry.spec import EvaluationProtocol
+from sme_registry.task.engine import engine
 
 Progress = Callable[[int, int], None]
 

@@ -23,11 +23,11 @@ from leaderboard.seasons.season import MAX_INSTANCES, Digests, Hidden, Season, T
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.store import Store
 from leaderboard.web.fetch import Files
-from sme_registry.compiled import chosen_backend
 from sme_registry.datasets import DatasetRecipe, SealedDataset
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.io import build_folder, read_json, read_regular, sha256_of, to_json, versions
 from sme_registry.seasons.wire import instance_name, pack_table, table_bytes
+from sme_registry.task.engine import chosen_backend
 
 Progress = Callable[[int, int], None]
 

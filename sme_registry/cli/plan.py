@@ -41,7 +41,7 @@ from sme_registry.io.terminal import (
 from sme_registry.spec import StudyFile, StudyPlan, catalogue
 from sme_registry.spec.catalogue import is_path
 from sme_registry.spec.study import PlannedCell
-from sme_registry.studies.engine.budget import (
+from sme_registry.studies.budget import (
     Estimator,
     scaled,
     selected,
@@ -49,7 +49,7 @@ from sme_registry.studies.engine.budget import (
     with_agents,
     with_sources,
 )
-from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.ledger import Ledger
 from sme_registry.training.algorithms import (
     check_algorithm,
     code_notice,

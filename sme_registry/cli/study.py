@@ -27,8 +27,8 @@ from sme_registry.io.terminal import (
     print_note,
 )
 from sme_registry.spec import StudyFile
-from sme_registry.studies.engine.executors import EXECUTORS
-from sme_registry.studies.engine.ledger import (
+from sme_registry.studies.executors import EXECUTORS
+from sme_registry.studies.ledger import (
     PLAN,
     STATES,
     CellStatus,
@@ -38,7 +38,7 @@ from sme_registry.studies.engine.ledger import (
     label,
     study_status,
 )
-from sme_registry.studies.engine.runner import run_study
+from sme_registry.studies.runner import run_study
 
 _FAILURES_SHOWN = 20
 ExecutorName = enum.StrEnum("ExecutorName", list(EXECUTORS))  # type: ignore[misc]

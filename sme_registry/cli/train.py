@@ -42,7 +42,7 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
-from sme_registry.studies.engine.runner import run_study
+from sme_registry.studies.runner import run_study
 from sme_registry.task import load
 from sme_registry.training import algorithms
 from sme_registry.training.record import CHECKPOINT

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from sme_registry.compiled import engine
 from sme_registry.evaluation import Policy, references, regions
 from sme_registry.evaluation.regions import (
     TOLERANCE,
@@ -30,6 +29,7 @@ from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf
 from sme_registry.task import Task
 from sme_registry.task.draw import Array, gaussian, uniform
+from sme_registry.task.engine import engine
 from sme_registry.task.task import Observation
 
 POLICY = "policy"  # the key of the diagnosed policy among the names of the references

@@ -15,13 +15,12 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import seeding
 
-from sme_registry.compiled import Engine, engine
-from sme_registry.compiled.engine import StepMany, draw
 from sme_registry.envs.arguments import not_finite_error
 from sme_registry.envs.schedule import Schedule
 from sme_registry.errors import ActionError
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.task import Task
+from sme_registry.task.engine import Engine, StepMany, draw, engine
 from sme_registry.task.loading import check_memory
 from sme_registry.task.task import (
     OWN_DISTRACTORS,

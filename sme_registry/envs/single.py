@@ -10,7 +10,6 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled import engine
 from sme_registry.envs import arguments
 from sme_registry.envs.batch import Distractors
 from sme_registry.envs.rendering import RENDER_MODES, RenderMixin, html_card
@@ -20,6 +19,7 @@ from sme_registry.spec.catalogue import title
 from sme_registry.spec.sme_spec import ActionRange, SpecLike
 from sme_registry.spec.stream import StreamLike
 from sme_registry.task import Task
+from sme_registry.task.engine import engine
 from sme_registry.task.task import (
     ACCUMULATED_REWARD,
     BUFFER_STATE,

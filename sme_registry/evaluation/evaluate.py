@@ -19,8 +19,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled import Engine, engine
-from sme_registry.compiled.engine import network
 from sme_registry.envs import arguments
 from sme_registry.errors import PolicyError, SpecError
 from sme_registry.evaluation import references
@@ -49,6 +47,7 @@ from sme_registry.spec.sme_spec import SpecLike
 from sme_registry.spec.suite import ProtocolLike
 from sme_registry.task import Task, load, materialize
 from sme_registry.task.draw import Array
+from sme_registry.task.engine import Engine, engine, network
 
 WHOLE = ""
 """The scope of all action channels, among the agents' names."""

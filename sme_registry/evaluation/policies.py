@@ -2,7 +2,7 @@
 
 In a team, either each agent has its own policy of what it observes and owns,
 `[B, |O_i| + 2] → [B, a_i]`, or all share one, which is called for each agent in turn with its
-shared observation (`envs.team`), `[B, S + 2 + n] → [B, max a_i]`.
+shared observation (`sme_registry.teams`), `[B, S + 2 + n] → [B, max a_i]`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from typing import Any, ClassVar, Literal, NamedTuple, cast
 import numpy as np
 
 from sme_registry.envs import arguments
-from sme_registry.envs.team import shared_observation_of
 from sme_registry.errors import (
     ActionError,
     OptionError,
@@ -35,6 +34,7 @@ from sme_registry.io import choice, import_object
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.sme_spec import ACTION_RANGES, ActionRange
 from sme_registry.task.task import Array, Observation
+from sme_registry.teams import shared_observation_of
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sme_registry.compiled import engine
 from sme_registry.errors import SpecError
 from sme_registry.spec import SMESpec
 from sme_registry.task import Task, materialize
 from sme_registry.task.draw import Array
+from sme_registry.task.engine import engine
 from sme_registry.task.task import Observation
 
 Act = Callable[[Observation], Any]

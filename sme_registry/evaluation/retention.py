@@ -33,7 +33,6 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from sme_registry.compiled import Engine, engine
 from sme_registry.evaluation.evaluate import OnBatch, same_draw
 from sme_registry.evaluation.policies import Policy, prefixed_errors
 from sme_registry.evaluation.regions import (
@@ -46,6 +45,7 @@ from sme_registry.evaluation.regions import (
 from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
 from sme_registry.spec.document import Integer, Real, StrictModel, TupleOf
 from sme_registry.task.draw import Array
+from sme_registry.task.engine import Engine, engine
 from sme_registry.task.loading import materialize_together
 
 _Optional = TupleOf[Real | None]

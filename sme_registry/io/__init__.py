@@ -1,6 +1,5 @@
 """Files, checks of arguments, and the machine; terminal, tables and markup are imported by name."""
 
-from sme_registry.io.checks import choice, integer_in, number_in, server_address, visible
 from sme_registry.io.files import (
     TEMPORARY,
     Arrays,
@@ -27,12 +26,17 @@ from sme_registry.io.files import (
 )
 from sme_registry.io.system import (
     available_memory,
+    choice,
     import_object,
     install_command,
+    integer_in,
     is_installed,
     missing_dependency,
+    number_in,
     require_packages,
+    server_address,
     versions,
+    visible,
 )
 
 __all__ = [

@@ -30,9 +30,8 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
 from sme_registry.errors import SMEError
-from sme_registry.io.checks import hidden_in, visible
 from sme_registry.io.files import to_json
-from sme_registry.io.system import missing_dependency
+from sme_registry.io.system import hidden_in, missing_dependency, visible
 
 _SECONDS_PER_DAY = 86_400
 

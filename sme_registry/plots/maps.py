@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled import engine
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import StreamReport
 from sme_registry.evaluation.policies import as_policy
@@ -23,6 +22,7 @@ from sme_registry.spec.sme_spec import ActionRange, SpecLike
 from sme_registry.statistics import iqm
 from sme_registry.task import load, materialize
 from sme_registry.task.draw import Array
+from sme_registry.task.engine import engine
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

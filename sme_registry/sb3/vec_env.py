@@ -20,7 +20,6 @@ from sme_registry.envs.batch import Batch
 from sme_registry.envs.episodes import Episode, Episodes, info_of_envs
 from sme_registry.envs.rendering import METADATA, Frame, batch_renderer, html_card
 from sme_registry.envs.schedule import Schedule, renamed_by_content
-from sme_registry.envs.team import shared_action_dim, shared_observation, shared_observation_dim
 from sme_registry.envs.vector import EnvView
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.io import integer_in
@@ -30,6 +29,7 @@ from sme_registry.spec.catalogue import title
 from sme_registry.spec.sme_spec import ActionRange, SpecLike
 from sme_registry.spec.stream import StreamLike
 from sme_registry.task.task import REWARD, Array, Mask, Observation
+from sme_registry.teams import shared_action_dim, shared_observation, shared_observation_dim
 
 StepResult: TypeAlias = tuple[Observation, npt.NDArray[np.float32], Mask, list[dict[str, Any]]]
 """Observations, rewards, dones and infos."""

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sme_registry.spec.study import sweep
-    from sme_registry.studies.engine.cell import run_cell
-    from sme_registry.studies.engine.ledger import CellStatus as CellStatus
-    from sme_registry.studies.engine.ledger import study_status as study_status
-    from sme_registry.studies.engine.result import CellResult as CellResult
-    from sme_registry.studies.engine.runner import run_study
+    from sme_registry.studies.cell import run_cell
+    from sme_registry.studies.ledger import CellStatus as CellStatus
+    from sme_registry.studies.ledger import study_status as study_status
     from sme_registry.studies.report.frames import load, load_streams
     from sme_registry.studies.report.write import compare, write_report
+    from sme_registry.studies.result import CellResult as CellResult
+    from sme_registry.studies.runner import run_study
 
 __all__ = [
     "compare",
@@ -34,14 +34,14 @@ __all__ = [
 ]
 
 _LAZY = {
-    "CellResult": "studies.engine.result",
-    "CellStatus": "studies.engine.ledger",
+    "CellResult": "studies.result",
+    "CellStatus": "studies.ledger",
     "compare": "studies.report.write",
     "load": "studies.report.frames",
     "load_streams": "studies.report.frames",
-    "run_cell": "studies.engine.cell",
-    "run_study": "studies.engine.runner",
-    "study_status": "studies.engine.ledger",
+    "run_cell": "studies.cell",
+    "run_study": "studies.runner",
+    "study_status": "studies.ledger",
     "sweep": "spec.study",
     "write_report": "studies.report.write",
 }

@@ -27,10 +27,10 @@ def lint_imports(folder):
 AT_THE_TOP = {
     "spec/document.py": "sme_registry.task",
     "task/task.py": "torch",
-    "compiled/engine.py": "numba",
+    "task/engine.py": "numba",
     "envs/single.py": "pygame",
     "plots/style.py": "stable_baselines3",
-    "studies/engine/runner.py": "pandas",
+    "studies/runner.py": "pandas",
     "teams.py": "sme_registry.registration",
     "io/files.py": "sme_registry.spec",
 }

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from sme_registry.compiled import chosen_backend, engine
 from sme_registry.errors import MissingDependencyError, OptionError
 from sme_registry.spec import SMESpec
 from sme_registry.task import materialize, observe, step
+from sme_registry.task.engine import chosen_backend, engine
 from tests.compiled.stepping import Lane, step_batch
 from tests.strategies import specs
 

@@ -11,7 +11,7 @@ from sme_registry import SMESpec, materialize
 pytest.importorskip("numba")
 from numba import njit
 
-from sme_registry.compiled.kernels import CELLS_PER_UNIT, LIMIT, normal_cdf
+from sme_registry.task.kernels import CELLS_PER_UNIT, LIMIT, normal_cdf
 
 BOUND = 3e-15
 

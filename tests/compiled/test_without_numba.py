@@ -10,7 +10,7 @@ import threading
 
 import pytest
 
-from sme_registry.compiled.engine import compiling
+from sme_registry.task.engine import compiling
 
 EPISODE = """
     import gymnasium, numpy as np, sme_registry
@@ -73,7 +73,7 @@ def test_what_steps_is_compiled_when_it_does_and_a_second_process_loads_it():
     script = """
     import json
     from numba.core.dispatcher import Dispatcher
-    from sme_registry.compiled import kernels
+    from sme_registry.task import kernels
     kept = {name: f for name, f in vars(kernels).items() if isinstance(f, Dispatcher)}
     print(json.dumps({
         name: [sum(f.stats.cache_hits.values()), sum(f.stats.cache_misses.values())]

@@ -5,8 +5,8 @@ import pytest
 
 from sme_registry import SMESpec
 from sme_registry.envs import SMEEnv, SMEVectorEnv
-from sme_registry.envs.team import SMETeamEnv
 from sme_registry.task.task import ACCUMULATED_REWARD, BUFFER_VALUES
+from sme_registry.teams import SMETeamEnv
 from sme_registry.testing import ConformanceError, check_env, check_team
 
 TASK = SMESpec(horizon=12, k=5, D=0.2, complexity=2)

@@ -28,7 +28,7 @@ from sme_registry.io import write_atomically
 from sme_registry.spec import EvaluationProtocol, StudyFile, StudyPlan
 from sme_registry.spec.study import Cell
 from sme_registry.studies import run_study
-from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing
+from sme_registry.studies.result import CellResult, LearningCurve, Timing
 from sme_registry.training import train
 from sme_registry.training.record import Snapshots
 from tests.commands import good, refused

@@ -133,7 +133,7 @@ def test_a_policy_of_ones_own_loop_is_diagnosed_with_its_log(tmp_path):
 
 def test_a_cell_of_a_study_is_found_by_the_first_digits_of_its_key(tmp_path):
     from sme_registry.spec.study import Cell
-    from sme_registry.studies.engine.cell import run_cell
+    from sme_registry.studies.cell import run_cell
 
     cells = [
         Cell(

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from sme_registry.envs.batch import Batch, BatchStep
-from sme_registry.envs.team import SMETeamEnv, observed_columns
 from sme_registry.errors import ActionError
 from sme_registry.spec import SMESpec
 from sme_registry.task import materialize
+from sme_registry.teams import SMETeamEnv, observed_columns
 
 UNEQUAL = {
     "agents": [

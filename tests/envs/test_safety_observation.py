@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from sme_registry import SMESpec, StreamSpec, testing
 from sme_registry.envs import SMEEnv, SMEVectorEnv
-from sme_registry.envs.team import SMETeamEnv
 from sme_registry.errors import OptionError, SpecError, StateError
 from sme_registry.task.draw import counted
+from sme_registry.teams import SMETeamEnv
 from tests.strategies import specs
 
 SPECS = {

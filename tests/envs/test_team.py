@@ -10,7 +10,6 @@ import pytest
 import sme_registry
 from sme_registry import teams
 from sme_registry.envs import SMEEnv, SMEVectorEnv
-from sme_registry.envs.team import SMETeamEnv
 from sme_registry.errors import (
     ActionError,
     EpisodeError,
@@ -19,6 +18,7 @@ from sme_registry.errors import (
     StateError,
 )
 from sme_registry.spec import SMESpec
+from sme_registry.teams import SMETeamEnv
 
 START = np.linspace(0.1, 0.9, 8)
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from sme_registry import SMESpec, evaluate
-from sme_registry.compiled import engine
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation import evaluate_many
 from sme_registry.evaluation.policies import as_policy
 from sme_registry.spec import EvaluationProtocol
+from sme_registry.task.engine import engine
 
 SPEC = SMESpec(state_dim=3, action_dim=2, complexity=2, hidden_width=8)
 SIBLINGS = [SPEC, SPEC.derive(k=10), SPEC.derive(r_min=0.5, D=0.25), SPEC.derive(horizon=7)]

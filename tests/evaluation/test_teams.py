@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from sme_registry import SMESpec, evaluate, materialize
-from sme_registry.compiled import engine
-from sme_registry.envs.team import (
+from sme_registry.errors import PolicyError
+from sme_registry.evaluation import references, regions
+from sme_registry.evaluation.policies import as_policy
+from sme_registry.task.engine import engine
+from sme_registry.teams import (
     shared_action_dim,
     shared_observation,
     shared_observation_dim,
 )
-from sme_registry.errors import PolicyError
-from sme_registry.evaluation import references, regions
-from sme_registry.evaluation.policies import as_policy
 from tests.evaluation.kinds import (
     NAMES,
     PROTOCOL,

@@ -9,7 +9,7 @@ import json
 import numpy as np
 import pytest
 
-from sme_registry.compiled import engine
+from sme_registry.task.engine import engine
 from sme_registry.task.loading import load_task
 from tests.compiled.stepping import Lane
 from tests.golden import regenerate

@@ -17,7 +17,7 @@ from sme_registry import SMESpec, save
 from sme_registry.errors import OptionError, SMEError, SpecError
 from sme_registry.spec import StudyFile, StudyPlan, Suite, SuiteFile
 from sme_registry.studies import run_study
-from sme_registry.studies.engine.result import CellFailure, CellResult
+from sme_registry.studies.result import CellFailure, CellResult
 from sme_registry.training import train
 from sme_registry.training.record import RunRecord
 

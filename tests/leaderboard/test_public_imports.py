@@ -19,8 +19,12 @@ from tests.leaderboard.web import boards
 
 # Private to the two packages: their modules are imported by name.
 SHARED = ("sme_registry.io.", "sme_registry.spec.")
-PROTOCOL = ("sme_registry.seasons.wire", "sme_registry.seasons.transcript")
-"""What servers and clients send each other, and sign."""
+PROTOCOL = (
+    "sme_registry.seasons.wire",
+    "sme_registry.seasons.transcript",
+    "sme_registry.task.engine",
+)
+"""What servers and clients send each other, and sign; and what steps for both."""
 
 
 def submodules(module):

@@ -9,8 +9,8 @@ from collections import Counter
 from pathlib import Path
 
 from sme_registry.spec import StudyFile, StudyPlan
-from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.cell import run_cell
+from sme_registry.studies.ledger import Ledger
 
 PROTOCOL = {"states_per_region": 2, "epsilons": [1.0]}
 STARTED, GATE = "started", "gate"

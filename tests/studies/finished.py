@@ -3,10 +3,10 @@
 import dataclasses
 
 from sme_registry.spec import StudyFile, StudyPlan
-from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.engine.result import CellFailure
+from sme_registry.studies.cell import run_cell
+from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.report.tables import analyse
+from sme_registry.studies.result import CellFailure
 
 LEARNERS = {
     "Alpha": {"half_life": 10.0, "r_min": 0.7, "k": 0.02},

@@ -19,8 +19,8 @@ from sme_registry.evaluation import (
 )
 from sme_registry.evaluation.retention import final_specs
 from sme_registry.spec import StreamSpec, StudyFile, StudyPlan
-from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing
+from sme_registry.studies.ledger import Ledger
+from sme_registry.studies.result import CellResult, LearningCurve, Timing
 
 AGENTS = ("Forgetful", "Tired", "Stubborn")
 TASK = {"state_dim": 2, "action_dim": 2, "complexity": 2, "horizon": 10, "hidden_width": 8}

@@ -8,9 +8,9 @@ import pytest
 
 from sme_registry.errors import OptionError, SpecError, UnknownNameError
 from sme_registry.spec import SMESpec, StudyAlgorithm, StudyFile, StudyPlan, SuiteFile, catalogue
-from sme_registry.studies.engine.budget import Estimator, scaled, selected, with_agents
-from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.runner import run_study
+from sme_registry.studies.budget import Estimator, scaled, selected, with_agents
+from sme_registry.studies.cell import run_cell
+from sme_registry.studies.runner import run_study
 from tests import commands
 from tests.studies.cells import raising, small_file
 

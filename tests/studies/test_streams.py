@@ -11,7 +11,7 @@ from sme_registry import SMESpec, StreamSpec, load, save
 from sme_registry.errors import SpecError
 from sme_registry.spec import StreamFile, StudyFile, StudyPlan, Suite, SuiteFile, catalogue
 from sme_registry.spec.study import Cell
-from sme_registry.studies.engine.budget import uneven_rollouts
+from sme_registry.studies.budget import uneven_rollouts
 from tests import commands
 
 TASK = SMESpec(state_dim=2, action_dim=2, horizon=8)

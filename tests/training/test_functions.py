@@ -13,8 +13,8 @@ from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.spec.study import Cell
 from sme_registry.studies import load as load_frames
 from sme_registry.studies import run_study
-from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.ledger import Ledger, study_status
+from sme_registry.studies.cell import run_cell
+from sme_registry.studies.ledger import Ledger, study_status
 from sme_registry.training import train
 from sme_registry.training.record import RunRecord
 from tests import commands

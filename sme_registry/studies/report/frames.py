@@ -107,9 +107,9 @@ from sme_registry.evaluation.retention import BY_VISIT, StreamRegion
 from sme_registry.spec import Setting, StudyPlan
 from sme_registry.spec.cards import BLOCKS, fields_of_block, number_type
 from sme_registry.spec.study import PlannedCell
-from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.engine.result import CellResult
+from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.report.design import metrics_of
+from sme_registry.studies.result import CellResult
 
 RUN = ["class_name", "algorithm", "run"]
 RUN_COLUMNS = "class_name:str algorithm:str run:int64 "  # columns of `RUN`, for `frame`

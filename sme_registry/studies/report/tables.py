@@ -1,4 +1,4 @@
-"""`analyse`: the tables of a study's runs on single tasks; `streams` has those of streams alone.
+"""`analyse`: the tables of a study's runs on single tasks; `analysis` has those of streams alone.
 
 An unknown interval end is NaN.
 
@@ -55,7 +55,6 @@ import pandas as pd
 from sme_registry import statistics
 from sme_registry.spec import StudyAlgorithm, StudyFile
 from sme_registry.statistics import Array, Statistic
-from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.report.analysis import (
     CURVES,
     ENOUGH_RUNS,
@@ -68,6 +67,7 @@ from sme_registry.studies.report.analysis import (
     RunKind,
     by_place,
     change_verdict,
+    reference_costs,
     summary,
     table,
     training_data,
@@ -93,7 +93,7 @@ from sme_registry.studies.report.frames import (
     study_frames,
     window,
 )
-from sme_registry.studies.report.streams import reference_costs
+from sme_registry.studies.result import CellResult
 from sme_registry.training.algorithms import parse_uses
 
 THRESHOLDS = np.linspace(0.0, 1.0, 101)

@@ -31,7 +31,7 @@ from sme_registry.io.markup import environment, plural
 from sme_registry.io.terminal import duration
 from sme_registry.plots.style import WRITTEN
 from sme_registry.spec import StudyFile
-from sme_registry.studies.engine.ledger import REPORT, Ledger, label, requested
+from sme_registry.studies.ledger import REPORT, Ledger, label, requested
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.design import Metric, metrics_of
 from sme_registry.studies.report.figures import (

@@ -10,7 +10,7 @@ from leaderboard.gate.reference import constant_onnx, optimal_onnx
 from leaderboard.gate.sandbox import inspect_own, widths
 from leaderboard.web.charts import can_show, explorer
 from sme_registry import SMESpec, evaluate, materialize
-from sme_registry.export.export import onnx_bytes
+from sme_registry.export import onnx_bytes
 from tests.explorer.networks import offline, perceptron
 from tests.explorer.test_programs import module
 from tests.leaderboard.gate.models import doubling, looping, memory_bomb

@@ -18,8 +18,8 @@ from sme_registry.errors import (
 )
 from sme_registry.spec import EvaluationProtocol
 from sme_registry.spec.study import Cell
-from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.result import CellResult
+from sme_registry.studies.cell import run_cell
+from sme_registry.studies.result import CellResult
 from sme_registry.task import materialize
 from sme_registry.training.algorithms import find
 

@@ -8,14 +8,14 @@ from rich.console import Console
 
 from sme_registry.errors import OptionError
 from sme_registry.spec import StudyFile, StudyPlan
-from sme_registry.studies.engine.executors import InProcess
-from sme_registry.studies.engine.ledger import Ledger, write_state
-from sme_registry.studies.engine.result import failed
-from sme_registry.studies.engine.runner import run_study
+from sme_registry.studies.executors import InProcess
+from sme_registry.studies.ledger import Ledger, write_state
+from sme_registry.studies.result import failed
+from sme_registry.studies.runner import run_study
 
 pytest.importorskip("jax")
 
-from sme_registry.studies.engine.programs import Programs
+from sme_registry.studies.programs import Programs
 
 
 def plan_file(seeds=3, **fields):

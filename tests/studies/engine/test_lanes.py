@@ -15,21 +15,21 @@ from rich.console import Console
 
 from sme_registry.evaluation import evaluate
 from sme_registry.spec import StudyFile, StudyPlan
-from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.executors import InProcess
-from sme_registry.studies.engine.ledger import Ledger, read_header, read_state, write_state
-from sme_registry.studies.engine.result import CellResult
-from sme_registry.studies.engine.runner import run_study
+from sme_registry.studies.cell import run_cell
+from sme_registry.studies.executors import InProcess
+from sme_registry.studies.ledger import Ledger, read_header, read_state, write_state
 from sme_registry.studies.report.findings import findings
 from sme_registry.studies.report.tables import analyse
 from sme_registry.studies.report.texts import implementation_caveats
 from sme_registry.studies.report.write import page
+from sme_registry.studies.result import CellResult
+from sme_registry.studies.runner import run_study
 from tests.studies.cells import numbers
 
 pytest.importorskip("jax")
 pytest.importorskip("stable_baselines3")
 
-from sme_registry.studies.engine import programs
+from sme_registry.studies import programs
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
@@ -40,7 +40,7 @@ STEPS = 96
 KILLED = """
 import os, signal, sys
 from tests.studies.engine import test_lanes
-from sme_registry.studies.engine import programs
+from sme_registry.studies import programs
 
 programs.SECONDS_BETWEEN_STATES = 0.0
 test_lanes.ran(sys.argv[1], on_steps=lambda done: os.kill(os.getpid(), signal.SIGKILL))

@@ -8,9 +8,9 @@ import sys
 import pytest
 
 from sme_registry.errors import OptionError, SpecError
-from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.engine.result import CellFailure
+from sme_registry.studies.cell import run_cell
+from sme_registry.studies.ledger import Ledger
+from sme_registry.studies.result import CellFailure
 from tests.studies.cells import small_file, wait_for
 
 FILE = small_file()
@@ -18,7 +18,7 @@ CELL, OTHER = (planned.cell for planned in FILE.plan.cells)
 
 HOLDER = """
 import sys, time
-from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.ledger import Ledger
 lock = Ledger(sys.argv[1]).lock(sys.argv[2])
 print("holds" if lock else "not", flush=True)
 time.sleep(600)

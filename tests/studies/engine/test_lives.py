@@ -12,10 +12,10 @@ from sme_registry.errors import PolicyError, SMEError, SpecError
 from sme_registry.evaluation import evaluate_stream, expected_regret
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.spec.study import Cell
-from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.ledger import Ledger, label, study_status
-from sme_registry.studies.engine.result import CellResult
-from sme_registry.studies.engine.runner import run_study
+from sme_registry.studies.cell import run_cell
+from sme_registry.studies.ledger import Ledger, label, study_status
+from sme_registry.studies.result import CellResult
+from sme_registry.studies.runner import run_study
 from sme_registry.training.algorithms import find
 from sme_registry.training.record import Snapshots
 from tests.studies.cells import numbers
@@ -276,7 +276,7 @@ def test_a_stream_that_agents_in_jax_cannot_live_in_is_refused_before_anything_r
 
 def test_lives_that_switch_at_the_same_steps_are_runs_of_one_program():
     pytest.importorskip("jax")
-    from sme_registry.studies.engine.programs import Programs
+    from sme_registry.studies.programs import Programs
 
     deep = TASK.derive(complexity=3, hidden_width=8)
     base = life(stream_of(TASK, OTHER), "jax:PPO")
@@ -314,7 +314,7 @@ def visits(monkeypatch):
     ended = []
     raised = []
     pytest.importorskip("jax")
-    from sme_registry.studies.engine import programs
+    from sme_registry.studies import programs
 
     original = programs._ProgramRun._on_visit
 

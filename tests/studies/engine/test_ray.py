@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from sme_registry.errors import OptionError
-from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.engine.runner import run_study
+from sme_registry.studies.ledger import Ledger
+from sme_registry.studies.runner import run_study
 from tests.studies import cells
 from tests.studies.cells import small_file
 
@@ -24,7 +24,7 @@ LOST_NODE = """
 import sys, threading
 from functools import partial
 from pathlib import Path
-from sme_registry.studies.engine.runner import run_study
+from sme_registry.studies.runner import run_study
 from tests.studies import cells
 
 study, notes = map(Path, sys.argv[1:])

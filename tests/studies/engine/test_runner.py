@@ -17,9 +17,9 @@ import pytest
 from rich.console import Console
 
 from sme_registry.errors import OptionError, UnknownNameError
-from sme_registry.studies.engine.ledger import Ledger, study_status
-from sme_registry.studies.engine.result import CellFailure
-from sme_registry.studies.engine.runner import run_study
+from sme_registry.studies.ledger import Ledger, study_status
+from sme_registry.studies.result import CellFailure
+from sme_registry.studies.runner import run_study
 from tests.commands import sme
 from tests.studies import cells
 from tests.studies.cells import small_file
@@ -30,7 +30,7 @@ DRIVER = """
 import sys
 from functools import partial
 from pathlib import Path
-from sme_registry.studies.engine.runner import run_study
+from sme_registry.studies.runner import run_study
 from tests.studies import cells
 study, notes, seeds, open_for = sys.argv[1:]
 work = partial(cells.gated, Path(notes), open_for=int(open_for))

@@ -7,10 +7,10 @@ import pytest
 
 from sme_registry import load, studies
 from sme_registry.spec import StudyFile, StudyPlan
-from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.engine.result import CellResult
+from sme_registry.studies.cell import run_cell
+from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.report.texts import csv_tables, text_tables
+from sme_registry.studies.result import CellResult
 from tests.studies.finished import analysed
 
 pytest.importorskip("stable_baselines3")

@@ -8,7 +8,7 @@ import pytest
 
 from sme_registry import statistics
 from sme_registry.spec import StudyPlan
-from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.report import tables
 from sme_registry.studies.report.design import ALL, SEVERAL, class_infos
 from sme_registry.studies.report.frames import window

@@ -8,7 +8,7 @@ import pytest
 from sme_registry.errors import UnknownNameError
 from sme_registry.evaluation.regions import LayerProbe
 from sme_registry.spec import StudyPlan
-from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.cell import run_cell
 from sme_registry.studies.report import frames, texts
 from sme_registry.studies.report.design import metrics_of
 from sme_registry.studies.report.frames import study_frames

@@ -12,7 +12,7 @@ import pytest
 from sme_registry import studies
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.statistics import iqm
-from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.report import frames
 from sme_registry.studies.report.design import ALL, metrics_of
 from sme_registry.studies.report.frames import StudyFrames

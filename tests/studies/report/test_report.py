@@ -13,8 +13,8 @@ import pytest
 from sme_registry.errors import OptionError
 from sme_registry.io import read_json
 from sme_registry.spec import StudyFile, StudyPlan
-from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.cell import run_cell
+from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.report.findings import findings
 from sme_registry.studies.report.frames import records
 from sme_registry.studies.report.texts import TextTable

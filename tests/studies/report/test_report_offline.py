@@ -4,12 +4,12 @@ import pandas as pd
 import pytest
 
 from sme_registry.io.markup import fixed
-from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.engine.result import OfflineCell
+from sme_registry.studies.cell import run_cell
+from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.report.design import ALL
 from sme_registry.studies.report.tables import analyse
 from sme_registry.studies.report.texts import text_tables
+from sme_registry.studies.result import OfflineCell
 from tests.studies.finished import study_file
 
 pytest.importorskip("matplotlib")

@@ -12,12 +12,12 @@ from scipy.stats import trim_mean
 from sme_registry import studies
 from sme_registry.errors import OptionError
 from sme_registry.io import read_json
-from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.engine.result import CellFailure
+from sme_registry.studies.cell import run_cell
+from sme_registry.studies.ledger import Ledger
+from sme_registry.studies.report import analysis as tables
 from sme_registry.studies.report import frames
-from sme_registry.studies.report import streams as tables
 from sme_registry.studies.report.findings import findings
+from sme_registry.studies.result import CellFailure
 from tests.studies import finished
 from tests.studies.lives import AGENTS, STREAMS, TASK, live, stream_study
 

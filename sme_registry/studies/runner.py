@@ -17,16 +17,16 @@ from sme_registry.io import Lock, choice, integer_in
 from sme_registry.io.terminal import Progress, err
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.spec.study import Cell, PlannedCell
-from sme_registry.studies.engine.budget import selected, with_sources
-from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.executors import EXECUTORS, Executor, RunCell
-from sme_registry.studies.engine.ledger import Ledger, StudyStatus, label, plan_status
-from sme_registry.studies.engine.result import CPU, CellFailure, CellResult, Job, Outcome
+from sme_registry.studies.budget import selected, with_sources
+from sme_registry.studies.cell import run_cell
+from sme_registry.studies.executors import EXECUTORS, Executor, RunCell
+from sme_registry.studies.ledger import Ledger, StudyStatus, label, plan_status
+from sme_registry.studies.result import CPU, CellFailure, CellResult, Job, Outcome
 from sme_registry.training.algorithms import check_algorithm, code_notice, imported, in_jax
 from sme_registry.training.record import versions_for
 
 if TYPE_CHECKING:
-    from sme_registry.studies.engine.programs import Programs
+    from sme_registry.studies.programs import Programs
 
 
 def run_study(
@@ -136,7 +136,7 @@ def _programs(
             "--device, or leave out --ray on a machine that has such a device."
         )
     device = device if local else CPU
-    module = "sme_registry.studies.engine.programs"
+    module = "sme_registry.studies.programs"
     platform = imported(f"{module}:platform_of")(device)
     cells = (cell.cell for cell in plan.cells)
     programs: Programs = imported(f"{module}:Programs")(cells, platform, device, lanes)

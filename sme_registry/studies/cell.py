@@ -26,7 +26,7 @@ from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import write_atomically
 from sme_registry.spec.study import Cell
-from sme_registry.studies.engine.result import (
+from sme_registry.studies.result import (
     EVALUATION,
     TRAINING,
     CellFailure,
@@ -107,7 +107,7 @@ def _train(cell: Cell, entry: Entry, progress: ReportSteps, model_path: Path | N
 
 
 def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> CellResult:
-    run_program = imported("sme_registry.studies.engine.programs:run_program")
+    run_program = imported("sme_registry.studies.programs:run_program")
     outcome: Outcome
     (outcome,) = run_program((cell,), SharedProgram(1), progress, model_path is not None)
     entry, model, snapshots = outcome

@@ -38,8 +38,8 @@ from sme_registry.jax.run import hidden_of, new_program, policy_of
 from sme_registry.jax.run import run as run_to_end
 from sme_registry.jax.task import Form
 from sme_registry.spec.study import Cell
-from sme_registry.studies.engine.ledger import read_header, read_state, write_state
-from sme_registry.studies.engine.result import (
+from sme_registry.studies.ledger import read_header, read_state, write_state
+from sme_registry.studies.result import (
     CPU,
     EVALUATION,
     TRAINING,

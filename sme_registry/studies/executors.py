@@ -37,8 +37,8 @@ from sme_registry.io.system import (
     end_with_parent,
 )
 from sme_registry.spec.study import Cell
-from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.result import CPU, CellResult, Job, Outcome, Report, failed
+from sme_registry.studies.cell import run_cell
+from sme_registry.studies.result import CPU, CellResult, Job, Outcome, Report, failed
 from sme_registry.training.algorithms import imported
 
 RunCell = Callable[[Cell, Callable[[int, int], None] | None, Path | None], CellResult]
@@ -137,7 +137,7 @@ def run_job(run: RunCell, job: Job, keep_models: bool, progress: Report) -> Iter
 
 def _outcomes(run: RunCell, job: Job, keep_models: bool, progress: Report) -> Iterator[Outcome]:
     if job.program is not None:
-        run_program = imported("sme_registry.studies.engine.programs:run_program")
+        run_program = imported("sme_registry.studies.programs:run_program")
         yield from run_program(job.cells, job.program, progress, keep_models)
         return
     (cell,) = job.cells

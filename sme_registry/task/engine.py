@@ -105,7 +105,7 @@ def network(
     if (backend or chosen_backend()) == "numpy":
         return functools.partial(_network_with_numpy, tuple(layers), uniform)
     with compiling():
-        from sme_registry.compiled import kernels
+        from sme_registry.task import kernels
     packed = kernels.pack_layers(layers)
     run = machine_code(kernels.network, kernels.NETWORK)
 
@@ -164,7 +164,7 @@ _packed: weakref.WeakKeyDictionary[Task, Array] = weakref.WeakKeyDictionary()
 
 def _numba_engine(task: Task) -> Engine:
     with compiling():  # loads Numba: 0.3 s of CPU
-        from sme_registry.compiled import kernels
+        from sme_registry.task import kernels
 
     if task not in _packed:
         _packed[task] = kernels.pack(task)

@@ -16,7 +16,7 @@ from sme_registry.errors import OptionError, SMEError, UnknownNameError, did_you
 from sme_registry.io import choice
 from sme_registry.spec import StudyAlgorithm, StudyFile, StudyPlan
 from sme_registry.spec.study import Cell, PlannedCell
-from sme_registry.studies.engine.result import CellResult
+from sme_registry.studies.result import CellResult
 from sme_registry.training.algorithms import AGENTS, find, parse_uses
 from sme_registry.training.functions import source_of
 

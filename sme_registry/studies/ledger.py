@@ -40,8 +40,8 @@ from sme_registry.io import (
 )
 from sme_registry.spec import StudyFile
 from sme_registry.spec.study import PlannedCell
-from sme_registry.studies.engine.budget import Estimator, selected
-from sme_registry.studies.engine.result import CellFailure, CellResult
+from sme_registry.studies.budget import Estimator, selected
+from sme_registry.studies.result import CellFailure, CellResult
 from sme_registry.training.record import MODELS_OF_STUDY, folder_of_cell, model_of_cell
 
 PLAN = "plan.json"

@@ -1,1 +1,0 @@
-"""Running a study: cells, the ledger of their results, and executors."""
