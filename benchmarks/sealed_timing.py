@@ -22,7 +22,7 @@ import time
 import numpy as np
 from scipy.stats import spearmanr
 
-from leaderboard.seasons.stepping import Play, Start
+from leaderboard.seasons.journal import Play, Start
 from sme_registry import SMESpec, materialize
 from sme_registry.envs import SMEVectorEnv
 from sme_registry.seasons.transcript import Place

@@ -26,7 +26,7 @@ import numpy.typing as npt
 from leaderboard.documents.signed import Signed
 from leaderboard.errors import Rejection, TamperedError
 from leaderboard.seasons.entry import Answers, InstanceHead, TicketRequest, has_signed
-from leaderboard.seasons.journal import Journal
+from leaderboard.seasons.journal import Journal, Play, Start, no_steps
 from leaderboard.seasons.season import (
     MAX_LANES,
     Float32,
@@ -35,7 +35,6 @@ from leaderboard.seasons.season import (
     read_answers,
     rows_of,
 )
-from leaderboard.seasons.stepping import Play, Start, no_steps
 from sme_registry import EvaluationProtocol, io
 from sme_registry.errors import ActionError, SMEError, WireError
 from sme_registry.io import read_regular

@@ -47,8 +47,8 @@ from leaderboard.seasons.pages import SECTION
 from leaderboard.seasons.ranking import (
     ranking_facts,
 )
-from leaderboard.seasons.sessions import ScoreTicket, Sessions, attending
 from leaderboard.seasons.store import SeasonStore
+from leaderboard.seasons.tickets import ScoreTicket, Sessions, attending
 from leaderboard.store import Store
 from leaderboard.web.http import HTTP_CODES, RequestError, read_body
 from sme_registry import seasons

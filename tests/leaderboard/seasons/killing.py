@@ -16,9 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from leaderboard.documents.signed import SigningKey
-from leaderboard.seasons.journal import Journal
+from leaderboard.seasons.journal import Journal, Play
 from leaderboard.seasons.master import Master
-from leaderboard.seasons.stepping import Play
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import Ticket
 from leaderboard.web.server import listen, url_of

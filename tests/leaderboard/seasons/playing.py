@@ -16,9 +16,8 @@ from leaderboard.seasons.admission import start_ticket
 from leaderboard.seasons.entrant import request_ticket
 from leaderboard.seasons.entry import TicketRequest, signer_of
 from leaderboard.seasons.season import Season
-from leaderboard.seasons.sessions import Sessions
 from leaderboard.seasons.store import SeasonStore
-from leaderboard.seasons.tickets import Ticket, score_ticket
+from leaderboard.seasons.tickets import Sessions, Ticket, score_ticket
 from sme_registry.seasons import wire
 from sme_registry.seasons.transcript import (
     Place,

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from leaderboard.errors import BoardError, TamperedError
-from leaderboard.seasons.journal import Journal
-from leaderboard.seasons.stepping import Play, Start, no_steps
+from leaderboard.seasons.journal import Journal, Play, Start, no_steps
 from sme_registry import SMESpec
 from sme_registry.envs import SMEEnv
 from sme_registry.seasons.transcript import Place

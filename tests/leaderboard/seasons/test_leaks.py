@@ -11,9 +11,8 @@ from leaderboard.documents.signed import SigningKey
 from leaderboard.scoring.worker import Work, run_scorer
 from leaderboard.seasons.entry import signer_of
 from leaderboard.seasons.scoring import instances
-from leaderboard.seasons.sessions import Sessions
 from leaderboard.seasons.store import SeasonStore
-from leaderboard.seasons.tickets import Ticket
+from leaderboard.seasons.tickets import Sessions, Ticket
 from sme_registry import SMEError, materialize, seasons
 from sme_registry.seasons import wire
 from sme_registry.seasons.transcript import Place, answers_head, challenge_head, next_head

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from leaderboard.errors import TamperedError
-from leaderboard.seasons.journal import Journal
+from leaderboard.seasons.journal import Journal, Play, Start
 from leaderboard.seasons.ranking import season_rankings
 from leaderboard.seasons.season import Reveal
-from leaderboard.seasons.stepping import Play, Start
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.store.files import digest_of
 from leaderboard.store.log import Clock

@@ -12,17 +12,15 @@ from hypothesis import strategies as st
 from leaderboard.documents.signed import Signed
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.scoring.worker import Work, run_scorer
-from leaderboard.seasons import sessions as sessions_module
+from leaderboard.seasons import tickets as tickets_module
 from leaderboard.seasons.admission import start_ticket
 from leaderboard.seasons.entry import TicketRequest
 from leaderboard.seasons.events import played_bytes
 from leaderboard.seasons.instance import Instance
-from leaderboard.seasons.journal import Journal
+from leaderboard.seasons.journal import Journal, Play
 from leaderboard.seasons.master import Master
-from leaderboard.seasons.sessions import ScoreTicket, Sessions
-from leaderboard.seasons.stepping import Play
 from leaderboard.seasons.store import SeasonStore
-from leaderboard.seasons.tickets import Ticket
+from leaderboard.seasons.tickets import ScoreTicket, Sessions, Ticket
 from leaderboard.store.files import to_bytes
 from sme_registry import materialize
 from sme_registry.seasons.wire import pack_table, unpack_table
@@ -498,7 +496,7 @@ def test_instances_used_long_ago_leave_memory_and_large_ones_take_more(played, m
         instances = played.ticket.instances
         return [each.is_ready for each in instances]
 
-    monkeypatch.setattr(sessions_module, "MOST_HELD_LANES", 150)
+    monkeypatch.setattr(tickets_module, "MOST_HELD_LANES", 150)
     played.start()
     played.start(instance=1)
     assert ready() == [False, True]
@@ -506,7 +504,7 @@ def test_instances_used_long_ago_leave_memory_and_large_ones_take_more(played, m
     assert ready() == [True, False]
     played.restart()
     monkeypatch.setattr(Instance, "weights", 2**20)
-    monkeypatch.setattr(sessions_module, "MOST_HELD_LANES", 2**21 // 100)
+    monkeypatch.setattr(tickets_module, "MOST_HELD_LANES", 2**21 // 100)
     played.start()
     assert ready() == [True, False]
     played.start(instance=1)
