@@ -327,9 +327,15 @@ class Signed(Seal, Generic[Kind]):
             raise Rejection("schema", str(error)) from None
 
     def for_receiver(self, receiver: Receiver, key: SigningKey) -> Self:
-        """The same content, signed for a receiver, unless it is signed for another board."""
-        if self.receiver == receiver or self.board not in (None, receiver.board):
+        """The same content, signed for a receiver; what is for another board is not sent to it."""
+        if self.receiver == receiver:
             return self
+        if self.board not in (None, receiver.board):
+            raise Rejection(
+                "wrong_board",
+                f"board={receiver.board}: must be {self.board}, which it is signed for. Send it "
+                "there, or create it again for this board.",
+            )
         own = self.content.signer or ""
         if key.public != own:
             raise Rejection(

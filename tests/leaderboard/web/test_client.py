@@ -276,6 +276,19 @@ def test_a_server_in_the_middle_passes_on_no_submission(tmp_path, url, relay, st
     assert store.withdrawal(signed.id) is None
 
 
+def test_what_is_signed_for_one_board_is_not_sent_to_another(tmp_path, store, key):
+    """Which could pass it on, with its uploads."""
+    folder, _ = bundle_of(tmp_path / "bundle", store, key)
+    other = store.document.model_copy(update={"key": SigningKey.generate().public})
+    answer = 200, json.dumps(other.to_dict()).encode()
+    with (
+        scripted(lambda *_: answer) as (url, asked),
+        pytest.raises(Rejection, match=f"wrong_board: board={other.key}: must be "),
+    ):
+        client.submit(url, folder, key)
+    assert asked == ["GET /definition.json"]
+
+
 def test_a_name_for_this_machine_and_the_usual_port_are_the_same_address(tmp_path, store, key):
     folder, signed = bundle_of(tmp_path / "bundle", store, key)
     with serving(store.folder.path) as url:
