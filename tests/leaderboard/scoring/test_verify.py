@@ -246,6 +246,7 @@ PATHS = {
     "the failed run left out": ["runs"],
     "the failed run scored 0": ["runs.1.normalised_regret.0"],
     "the failed run with the constant's decay": ["runs.1.ood_decay"],
+    "a region left out": ["runs.0"],
     "a score": ["scores.wd_regret.value"],
     "the unlisted run left out": ["scores.wd_regret.value"],
     "the unlisted run scored 0": ["scores.wd_regret.value"],
@@ -277,6 +278,8 @@ def test_a_forged_and_signed_result_is_detected(board):
     forged["a score"] = honest.model_copy(
         update={"scores": honest.scores.model_copy(update={"wd_regret": honest.scores.ood_regret})}
     )
+    short = run.model_copy(update={"normalised_regret": run.normalised_regret[:-1]})
+    forged["a region left out"] = honest.model_copy(update={"runs": (short, failed)})
     for name, spared in {
         "the unlisted run left out": [],
         "the unlisted run scored 0": [

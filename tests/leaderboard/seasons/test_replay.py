@@ -7,11 +7,13 @@ import pytest
 
 from leaderboard.errors import TamperedError
 from leaderboard.seasons.journal import Journal, Play, Start
+from leaderboard.seasons.publication import files_of_seasons
 from leaderboard.seasons.ranking import season_rankings
 from leaderboard.seasons.season import Reveal
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.store.files import digest_of
 from leaderboard.store.log import Clock
+from leaderboard.web.fetch import fetch
 from sme_registry import SMESpec
 from sme_registry.envs import SMEEnv
 from sme_registry.seasons import wire
@@ -19,6 +21,7 @@ from sme_registry.seasons.transcript import Place
 from tests.leaderboard.clocks import AFTERWARDS, move_clock
 from tests.leaderboard.seasons.playing import LANES, ROWS, online_board, playing, request, scored
 from tests.leaderboard.seasons.sealing import MASTER, moment, replayed, signed_request
+from tests.leaderboard.serving import serving
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +58,16 @@ def test_a_season_of_tickets_is_replayed_and_every_one_of_them_counts(revealed):
     assert row.entry.runs == 4
     assert row.entry.steps == 4 * 32
     assert row.value.interval is not None
+
+
+def test_a_fetched_season_of_tickets_is_replayed_without_its_server(revealed, tmp_path):
+    board = shutil.copytree(revealed.path, tmp_path / "board")
+    with serving(board) as url:
+        fetch(url, tmp_path / "copy", board=SeasonStore, parts=[files_of_seasons])
+    shutil.rmtree(board)
+    with SeasonStore.open(tmp_path / "copy", read_only=True) as store:
+        counts, notes = replayed(store)
+    assert (counts["results, scored again"], notes) == ((2, 0), [])
 
 
 def test_altered_journals_and_answers_are_found(revealed, tmp_path):

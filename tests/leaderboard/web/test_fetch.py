@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from leaderboard.documents.board import hex_of
+from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.verify import verify
 from leaderboard.seasons.publication import files_of_seasons
@@ -99,7 +100,9 @@ def test_a_limit_and_another_boards_folder_stop_it(url, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").write_text("")
     other = shutil.copytree(SEASONS, tmp_path / "other")
-    for folder, match in ((tmp_path / "full", "not empty"), (other, "no copy of this board")):
+    own = shutil.copytree(EXAMPLE, tmp_path / "own")
+    SigningKey.generate().write(own / "board.key")
+    for folder, match in ((tmp_path / "full", "not empty"), (other, "no copy"), (own, "no copy")):
         before = files(folder)
         with pytest.raises(BoardError, match=match):
             fetch(url, folder)
@@ -126,22 +129,35 @@ def test_seasons_are_copied_with_what_was_played_and_verified(seasons, tmp_path)
 
 
 @pytest.mark.parametrize(
-    "path",
+    ("answer", "match"),
     [
-        "../up",
-        "x" * 200,
-        "/absolute",
-        "tickets/../../up",
-        ".stepping",
-        "published/.a",
-        "a//b",
-        "a\\b",
+        (lambda path, data: b"" if "/files/" in path else data, "another size"),
+        (lambda path, data: data + b"x" if "/files/" in path else data, "another size"),
+        (lambda path, data: b"[]" if "/files?" in path else data, "list of files is invalid"),
+        (lambda path, data: data.replace(b'"title"', b'"x"'), "definition is invalid"),
+        (lambda path, data: data.replace(b'"draws": 10000', b'"draws": 999'), "another board"),
     ],
 )
+def test_a_server_that_contradicts_itself_is_refused(seasons, tmp_path, monkeypatch, answer, match):
+    answering(monkeypatch, answer)
+    with pytest.raises(BoardError, match=match):
+        fetch(seasons, tmp_path / "copy", board=SeasonStore, parts=[files_of_seasons])
+
+
+def test_a_list_of_files_that_never_ends_ends(seasons, tmp_path, monkeypatch):
+    again = b'{"files": [], "next": 0}'
+    answering(monkeypatch, lambda path, data: again if "/files?" in path else data)
+    fetch(seasons, tmp_path / "copy", board=SeasonStore, parts=[files_of_seasons])
+
+
+ODD = ("../up", "x" * 200, "/absolute", "tickets/../../up", ".stepping", "published/.a", "a//b")
+
+
+@pytest.mark.parametrize("path", ODD)
 def test_a_server_names_no_file_outside_the_copy(seasons, tmp_path, monkeypatch, path):
     def lie(address, data):
         listed = b'{"files": [{"path": "%s", "size": 3}], "next": null}'
-        return listed % path.replace("\\", "\\\\").encode() if "/files?" in address else data
+        return listed % path.encode() if "/files?" in address else data
 
     answering(monkeypatch, lie)
     with pytest.raises(BoardError, match="unsafe name"):
