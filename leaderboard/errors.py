@@ -39,6 +39,7 @@ CODES = {
     "season_closed": "the season is closed",
     "season_not_closed": "the season is not over or not revealed, so its tasks are still secret",
     "season_revealed": "the season's tasks are public",
+    "not_admitted": "the season takes listed keys only, and the organiser has not listed this one",
     "reveal_mismatch": "the master does not match the season's commitment",
     "ticket_unknown": "the season has no ticket of this number",
     "ticket_ended": "the ticket's deadline has passed, or all of it is answered",

@@ -44,7 +44,7 @@ THE_BOARD, REFERENCE_FAMILY = "the board", "reference"
 """Submitter and family reserved for the board's own reference rows."""
 
 # ASCII only: a similar letter of another script would let one method imitate another.
-_NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._+()-]| (?=[A-Za-z0-9._+()-]))*")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+()-]*(?: [A-Za-z0-9._+()-]+)*")
 _LINK = re.compile(r"https://[A-Za-z0-9._~:/?#\[\]@!$&'()*+,;=%-]+")
 _LOOK_ALIKE = str.maketrans(
     {"0": "o", "1": "l", "i": "l", "2": "z", "3": "e", "4": "a", "5": "s", "8": "b"}
@@ -58,6 +58,16 @@ Track = Literal["open"]
 Knowledge = Literal["generic", "family", "oracle"]
 
 _Line = Annotated[str, Field(min_length=1, max_length=80)]
+SafeName = Annotated[
+    str,
+    matching(
+        rf"^(?:{_NAME.pattern})$",
+        "a name: a letter or digit first, then also single spaces and '._+-()'",
+        max_length=80,
+    ),
+]
+"""The names that `check_names` allows."""
+
 _Text = Annotated[str, Field(max_length=2000)]
 _Link = Annotated[
     str,

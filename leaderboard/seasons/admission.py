@@ -58,7 +58,7 @@ def enter(
         return False
     entry, key = signed.content, signed.content.submitter.key
     check_manifest(store.document, entry, datetime.datetime.fromisoformat(store.time))
-    store.open_season(entry.season, "sealed-offline")
+    store.open_season(entry.season, "sealed-offline", key)
     season = store.season(entry.season)
     given = _check_answers(store, season, signed, answers)
     with store.transaction():  # no other entrant can take the name, nor `gc` an answer in between

@@ -134,6 +134,31 @@ def publish(
 
 
 @season.command()
+def admit(
+    board: BoardFolder,
+    season: SeasonId,
+    key: Annotated[
+        str, typer.Argument(metavar="KEY", help="The entrant's public key, 64 hex digits.")
+    ],
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="Of the entrant, as the season's page shows it.")
+    ],
+) -> None:
+    """Admit a key to a season whose plan has "admission": "listed".
+
+    The list is part of the board's signed log.
+
+    Examples:
+
+      sme-leaderboard season admit board autumn 3f…a9 "A Lab"
+    """
+
+    with SeasonStore.open(board) as store:
+        new = store.admit(season, key, name)
+    out().print(f"{'Admitted' if new else 'Admitted before'}: {escape(name)}.")
+
+
+@season.command()
 def close(board: BoardFolder, season: SeasonId) -> None:
     """List what counts after the close, and the log's digest to keep elsewhere.
 
@@ -281,6 +306,8 @@ def _facts(store: SeasonStore, row: SeasonRow) -> dict[str, Any]:
         "closes": row.closes,
         "instances": row.instances,
         "entrants": len(store.entrants(row.digest)),
+        "admission": document.admission,
+        "admitted": len(store.admitted(row.digest)),
         "commitment": document.commitment,
         "revealed": row.revealed or None,
     }

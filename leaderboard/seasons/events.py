@@ -14,6 +14,7 @@ from leaderboard.seasons.entry import Entry, SealedManifest, TicketRequest
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.season import (
     MAX_LANES,
+    Admitted,
     Reveal,
     SealedResult,
     SealedTrack,
@@ -120,25 +121,6 @@ class Seasons:
         self._index = index
         self._objects = index.objects
 
-    def apply(self, entry: LogEntry) -> None:
-        """Apply a log entry of a season.
-
-        Raises:
-          TamperedError: the document that it names is missing or altered, or the entry contradicts
-            those before it.
-        """
-        match entry.event:
-            case "season":
-                self._season(entry)
-            case "entry":
-                self._entry(entry)
-            case "ticket":
-                self._ticket(entry)
-            case "ended" | "ranked":
-                self._result(entry)
-            case "revealed":
-                self._revealed(entry)
-
     def rows(self) -> list[SeasonRow]:
         """All seasons, in the order in which they were announced."""
         return [SeasonRow(*row) for row in self._all(f"{_SEASONS} ORDER BY sequence")]
@@ -196,6 +178,21 @@ class Seasons:
         }
         self._index.insert("track", values)
 
+    def _admitted(self, entry: LogEntry) -> None:
+        admitted = self._index.read(Admitted, entry)
+        row = self.row(admitted.season)
+        if row is None or row.reveal is not None or entry.subject != row.digest:
+            raise entry.contradiction("the season is unknown or revealed")
+        if admitted.key in self.admitted(row.digest):
+            raise entry.contradiction("admits a key twice")
+        self._index.insert(
+            "admitted", {"track": row.digest, "key": admitted.key, "name": admitted.name}
+        )
+
+    def admitted(self, season: str) -> dict[str, str]:
+        """The names of the keys that the organiser has admitted to a season, by its digest."""
+        return dict(self._all("SELECT key, name FROM admitted WHERE track = ?", season))
+
     def _entry(self, entry: LogEntry) -> None:
         season, signed = self._signed(entry, "sealed-offline", Signed[Entry])
         answers = signed.content.answers
@@ -218,14 +215,15 @@ class Seasons:
         """The document that an entry names, and its season, which is open."""
         signed = self._index.read(kind, entry)
         entry.check_subject(signed.id)
-        return self.open(signed.content.season, track, entry.time), signed
+        key = signed.content.submitter.key
+        return self.open(signed.content.season, track, key, entry.time), signed
 
-    def open(self, name: str, track: SealedTrack, time: str) -> SeasonRow:
-        """The season of this id or digest, which must be of a track, and open at a time.
+    def open(self, name: str, track: SealedTrack, key: str, time: str) -> SeasonRow:
+        """The season of this id or digest, which must be of a track, and open to a key at a time.
 
         Raises:
-          Rejection: `season_unknown`, `season_track`, `season_not_open`, `season_closed` or
-            `season_revealed`.
+          Rejection: `season_unknown`, `season_track`, `season_not_open`, `season_closed`,
+            `season_revealed` or `not_admitted`.
         """
         row = self.row(name)
         if row is None:
@@ -245,6 +243,12 @@ class Seasons:
             )
         if time >= row.closes:
             raise Rejection("season_closed", f"season={row.id}: closed at {row.closes}.")
+        if self.read(row).admission == "listed" and key not in self.admitted(row.digest):
+            raise Rejection(
+                "not_admitted",
+                f"key={key[:16]}…: the organiser of the season {row.id} has not admitted it. Send "
+                "the public key to the organiser, who adds it with `sme-leaderboard season admit`.",
+            )
         return row
 
     def _check_limits(self, season: Season, key: str) -> None:
@@ -292,7 +296,7 @@ class Seasons:
             "version": method.version,
             "family": method.family,
             "knowledge": method.knowledge,
-            "submitter": submitter.name,
+            "submitter": self.admitted(season.digest).get(submitter.key, submitter.name),
             "key": submitter.key,
             "code_link": signed.content.code,
             "runs": season.instances,
@@ -379,16 +383,23 @@ def unknown_season(name: str) -> Rejection:
     )
 
 
-def _apply(index: Index, entry: LogEntry) -> None:
-    Seasons(index).apply(entry)
-
-
-SEASON_KINDS: Kinds = {
-    **KINDS,
-    **dict.fromkeys(("season", "entry", "ticket", "ended", "ranked", "revealed"), _apply),
+_OF_SEASONS = {
+    "season": Seasons._season,
+    "admitted": Seasons._admitted,
+    "entry": Seasons._entry,
+    "ticket": Seasons._ticket,
+    "ended": Seasons._result,
+    "ranked": Seasons._result,
+    "revealed": Seasons._revealed,
 }
-"""Of log entries, also of seasons: announced, an entry, a ticket started, their results, the master
-published."""
+
+
+def _apply(index: Index, entry: LogEntry) -> None:
+    _OF_SEASONS[entry.event](Seasons(index), entry)
+
+
+SEASON_KINDS: Kinds = {**KINDS, **dict.fromkeys(_OF_SEASONS, _apply)}
+"""Of log entries, those of seasons, too."""
 
 _SEASONS = (
     "SELECT digest, sequence, announced, document, id, title, kind, opens, closes, instances, "

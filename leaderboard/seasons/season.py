@@ -23,7 +23,8 @@ from pydantic import Field, field_validator, model_validator
 
 from leaderboard.documents.board import Folder, hex_of
 from leaderboard.documents.result import ClassScore, RunScore, Scores
-from leaderboard.documents.submission import UtcTime
+from leaderboard.documents.signed import PublicKey
+from leaderboard.documents.submission import SafeName, UtcTime
 from leaderboard.errors import Rejection
 from leaderboard.seasons.master import Master
 from sme_registry.errors import ActionError, WireError
@@ -131,6 +132,7 @@ class Terms(Document):
     Attributes:
       id: the season's name, in paths and addresses.
       title: for its page.
+      admission: who may take part: "open", or "listed", those keys that the organiser admits.
       opens, closes: entries count, and tickets start, from the first moment up to the second.
       protocol_name, protocol: the regions and numbers of the challenge states; its seed is 0, as
         the seed of each instance's states is secret.
@@ -139,6 +141,8 @@ class Terms(Document):
       published: of each instance in order; empty online.
       versions: of the organiser's packages, by which data sets are rounded.
     """
+
+    fields_added_later: ClassVar[tuple[str, ...]] = ("admission",)
 
     schema_version: SchemaVersion = 1
     id: Name
@@ -154,6 +158,7 @@ class Terms(Document):
     tickets_per_key: Annotated[Integer | None, Field(ge=1, le=1000)] = None
     published: Annotated[tuple[Digests, ...], Field(strict=False, max_length=MAX_INSTANCES)] = ()
     versions: Annotated[dict[str, str], Field(default_factory=dict, max_length=16)]
+    admission: Literal["open", "listed"] = "open"
 
     @model_validator(mode="after")
     def _classes_fit(self) -> Self:
@@ -252,6 +257,21 @@ class Season(Terms):
     def is_committed_to(self, master: Master) -> bool:
         """Whether the commitment is to this master and these terms."""
         return hmac.compare_digest(self.commitment, self.terms.commit(master).commitment)
+
+
+class Admitted(Document):
+    """That the organiser admits a key to a season.
+
+    Attributes:
+      season: digest of the season.
+      key: the entrant's.
+      name: of the entrant, as the season shows it.
+    """
+
+    schema_version: SchemaVersion = 1
+    season: Digest
+    key: PublicKey
+    name: SafeName
 
 
 class Reveal(Document):

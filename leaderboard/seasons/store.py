@@ -12,7 +12,14 @@ from leaderboard.errors import BoardError, Rejection
 from leaderboard.seasons.entry import Entry, TicketRequest
 from leaderboard.seasons.events import SEASON_KINDS, SealedRow, SeasonRow, Seasons, unknown_season
 from leaderboard.seasons.master import Master
-from leaderboard.seasons.season import Reveal, SealedResult, SealedTrack, Season, SeasonFolder
+from leaderboard.seasons.season import (
+    Admitted,
+    Reveal,
+    SealedResult,
+    SealedTrack,
+    Season,
+    SeasonFolder,
+)
 from leaderboard.store import Store
 
 
@@ -78,6 +85,33 @@ class SeasonStore(Store):
         """The folder of a season, by its digest."""
         return SeasonFolder(self.folder, digest)
 
+    def admit(self, season: str, key: str, name: str) -> bool:
+        """Add a key to the list of a season, by its id, under the name that pages show.
+
+        Returns:
+          False if it is on the list.
+
+        Raises:
+          Rejection: `season_unknown` or `season_revealed`.
+          SpecError: the key or the name is none.
+          BoardError: it cannot be written.
+        """
+        with self.transaction() as index:
+            row = self.season_row(season)
+            if row.reveal is not None:
+                raise Rejection("season_revealed", f"season={row.id}: its tasks are public now.")
+            fields = {"season": row.digest, "key": key, "name": name}
+            admitted = Admitted.from_dict(fields)
+            if key in Seasons(index).admitted(row.digest):
+                return False
+            self.record("admitted", row.digest, admitted)
+        return True
+
+    def admitted(self, season: str) -> dict[str, str]:
+        """The names of the admitted keys of a season, by its digest."""
+        with self.reading() as index:
+            return Seasons(index).admitted(season)
+
     def enter(self, signed: Signed[Entry]) -> bool:
         """Add an entry, which was admitted, to an open season.
 
@@ -85,8 +119,8 @@ class SeasonStore(Store):
           False if the board already has it.
 
         Raises:
-          Rejection: `season_unknown`, `season_track`, `season_not_open`, `season_closed` or
-            `season_revealed`.
+          Rejection: `season_unknown`, `season_track`, `season_not_open`, `season_closed`,
+            `season_revealed` or `not_admitted`.
           BoardError: it cannot be written.
         """
         with self.transaction() as index:
@@ -103,7 +137,7 @@ class SeasonStore(Store):
 
         Raises:
           Rejection: `season_unknown`, `season_track`, `season_not_open`, `season_closed`,
-            `season_revealed`, or `ticket_limit` of the submitter's key.
+            `season_revealed`, `not_admitted`, or `ticket_limit` of the submitter's key.
           BoardError: it cannot be written.
         """
         with self.transaction() as index:
@@ -231,15 +265,15 @@ class SeasonStore(Store):
         """
         return None if row.result is None else self.objects.document(SealedResult, row.result)
 
-    def open_season(self, name: str, track: SealedTrack) -> SeasonRow:
-        """The season of this id or digest, which must be of a track, and open now.
+    def open_season(self, name: str, track: SealedTrack, key: str) -> SeasonRow:
+        """The season of this id or digest, which must be of a track, and open to a key now.
 
         Raises:
-          Rejection: `season_unknown`, `season_track`, `season_not_open`, `season_closed` or
-            `season_revealed`.
+          Rejection: `season_unknown`, `season_track`, `season_not_open`, `season_closed`,
+            `season_revealed` or `not_admitted`.
         """
         with self.reading() as index:
-            return Seasons(index).open(name, track, self.clock.time)
+            return Seasons(index).open(name, track, key, self.clock.time)
 
     def _finish(
         self, event: Literal["ended", "ranked"], row: SealedRow, result: SealedResult

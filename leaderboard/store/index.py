@@ -52,6 +52,9 @@ CREATE TABLE track (
   opens TEXT NOT NULL, closes TEXT NOT NULL, instances INTEGER NOT NULL,
   reveal TEXT, revealed TEXT NOT NULL DEFAULT ''
 ) STRICT, WITHOUT ROWID;
+CREATE TABLE admitted (
+  track TEXT NOT NULL, key TEXT NOT NULL, name TEXT NOT NULL, PRIMARY KEY (track, key)
+) STRICT, WITHOUT ROWID;
 CREATE TABLE entry (
   id TEXT PRIMARY KEY, sequence INTEGER NOT NULL, received TEXT NOT NULL,
   document TEXT NOT NULL, result TEXT, withdrawal TEXT,

@@ -31,6 +31,7 @@ STATUSES = {
     "wrong_board": 403,
     "stale_time": 403,
     "token_wrong": 403,
+    "not_admitted": 403,
     "unknown_submission": 404,
     "season_unknown": 404,
     "ticket_unknown": 404,

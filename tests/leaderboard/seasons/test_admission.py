@@ -16,7 +16,14 @@ from sme_registry.errors import SpecError
 from sme_registry.io import sha256_of
 from sme_registry.seasons.wire import pack_table
 from tests.leaderboard.conftest import tiny_board
-from tests.leaderboard.seasons.sealing import NOTHING, manifest, moment, signed_entry, tiny_season
+from tests.leaderboard.seasons.sealing import (
+    NOTHING,
+    manifest,
+    moment,
+    signed_entry,
+    signed_request,
+    tiny_season,
+)
 from tests.leaderboard.serving import authorization, serving
 from tests.leaderboard.store.crashing import fill, small_disk
 
@@ -208,6 +215,32 @@ def test_the_largest_season_has_entries_that_can_be_sent(store, key):
     tiny_season(instances=most)
     with pytest.raises(SpecError, match="must be at most 400 together"):
         tiny_season(instances=most + 1)
+
+
+def test_a_season_with_a_list_takes_listed_keys_under_their_listed_names(store, key):
+    offline = tiny_season(id="listed", admission="listed")
+    online = tiny_season("sealed-online", id="tickets", admission="listed")
+    for season in (offline, online):
+        store.announce(season)
+    entries = [signed_entry(store, offline, key, [None, None], statement=str(n)) for n in (0, 1)]
+    request = signed_request(store, online, key)
+    assert refused(store, entries[0]) == "not_admitted"
+    with pytest.raises(Rejection, match=r"not_admitted: .* the organiser of the season tickets"):
+        store.start_ticket(request)
+    store.admit("listed", SigningKey.generate().public, "Another")
+    assert refused(store, entries[0]) == "not_admitted"
+    assert store.admit("listed", key.public, "A Lab")
+    assert not store.admit("listed", key.public, "A Lab")
+    assert send(store, entries[0])
+    assert [row.entrant.submitter for row in store.entrants(offline.digest)] == ["A Lab"]
+    with pytest.raises(Rejection, match="not_admitted"):  # each season has its own list
+        store.start_ticket(request)
+    store.reindex()
+    assert store.admitted(offline.digest)[key.public] == "A Lab"
+    assert verify(store.folder.path, board=SeasonStore).log_sequence == store.head.sequence
+    for name in ("<b>", "", "x\n"):
+        with pytest.raises(SpecError, match="name"):
+            store.admit("tickets", key.public, name)
 
 
 def test_no_entry_knows_the_optimum(key):

@@ -160,3 +160,23 @@ def test_an_entry_is_sent_to_a_served_board(season):
     assert counts("verify", "copy")["files by their digests"] == (2, 1)  # answers are secret
     with SeasonStore.open("board", read_only=True) as store:
         assert [row.entrant.id for row in store.entrants(read_season(season).digest)] == [id]
+
+
+def test_a_served_season_with_a_list_takes_the_keys_on_it():
+    fields = {**json.loads(Path(PLAN).read_text()), "admission": "listed"}
+    Path(PLAN).write_text(json.dumps(fields))
+    good("season", "new", "board", PLAN)
+    good("season", "publish", "board", "autumn")
+    key = SigningKey.read("my.key").public
+    enter = ("constant_half", *ENTER)
+    with serving(Path("board")) as url:
+        assert "not_admitted" in fails(1, "enter", url, "autumn", *enter)
+        good("season", "admit", "board", "autumn", key, "Listed Lab")
+        assert "Admitted before" in good("season", "admit", "board", "autumn", key, "Listed Lab")
+        good("enter", url, "autumn", *enter)
+    with SeasonStore.open("board", read_only=True) as store:
+        [row] = store.entrants(read_season("autumn").digest)
+    assert row.entrant.submitter == "Listed Lab"
+    shown = facts("show", "board", "autumn")
+    assert (shown["admission"], shown["admitted"]) == ("listed", 1)
+    assert "key" in fails(2, "season", "admit", "board", "autumn", "abc", "A Lab")
