@@ -25,11 +25,11 @@ from scipy.stats import spearmanr
 from leaderboard.seasons.journal import Play, Start
 from sme_registry import SMESpec, materialize
 from sme_registry.envs import SMEVectorEnv
-from sme_registry.seasons.transcript import Place
+from sme_registry.seasons.transcript import Chain
 from sme_registry.seasons.wire import StepFormat
 
 SPEC = SMESpec(complexity=5, seed=20)
-START = Start(SPEC, 1, Place(request="sha256:" + "0" * 64, ticket=1, instance=0))
+START = Start(SPEC, 1, Chain(request="sha256:" + "0" * 64, ticket=1, instance=0))
 
 
 def main(steps: int = 100_000) -> None:

@@ -38,7 +38,7 @@ from leaderboard.seasons.season import (
 from sme_registry import EvaluationProtocol, io
 from sme_registry.errors import ActionError, SMEError, WireError
 from sme_registry.io import read_regular
-from sme_registry.seasons.transcript import EVERY, Place, answers_head, challenge_head
+from sme_registry.seasons.transcript import EVERY, Chain, answers_head, challenge_head
 from sme_registry.seasons.wire import InstanceStatus, table_bytes
 
 SignedHead = Signed[InstanceHead]
@@ -58,7 +58,7 @@ class Instance:
     def __init__(
         self,
         folder: Path,
-        place: Place,
+        chain: Chain,
         request: Signed[TicketRequest],
         member: SeasonClass,
         protocol: EvaluationProtocol,
@@ -66,12 +66,13 @@ class Instance:
         states: Callable[[], bytes],
         check_running: Callable[[], None],
     ) -> None:
-        self._place, self._request = place, request
+        self._chain, self._request = chain, request
+        self._is_old = request.content.transcript is None
         self._member, self._protocol = member, protocol
         assert member.budget is not None  # the track is online
         self.budget = member.budget
         self._start, self._states, self._check_running = start, states, check_running
-        name = str(place.instance)
+        name = str(chain.instance)
         self._journal_path, self._answers_path, self._signed_path, self._snapshot_path = (
             folder / f"{name}{end}" for end in (".journal", ".npy", ".json", ".npz")
         )
@@ -109,7 +110,7 @@ class Instance:
     def is_played(self) -> bool:
         """Whether the entrant has signed or answered anything."""
         paths = [self._signed_path, self._answers_path]
-        if self._request.content.transcript is None:
+        if self._is_old:
             paths.append(self._journal_path)
         return any(path.exists() for path in paths)
 
@@ -129,14 +130,11 @@ class Instance:
         """Whether its answers are stored, with the entrant's signature where that is required."""
         with self._lock:
             if self._answered is None:
-                self._answered = self._answers_path.exists() and self._is_ended
+                self._answered = self._answers_path.exists() and (self._is_old or self._has_ended())
             return self._answered
 
-    @property
-    def _is_ended(self) -> bool:
-        """Whether the entrant has signed its answers; those of older tickets were stored last."""
-        if self._request.content.transcript is None:
-            return True
+    def _has_ended(self) -> bool:
+        """Whether the entrant has signed its answers."""
         signed, journal = self.signed, self.journal
         if signed is None or journal is None:
             return False
@@ -154,7 +152,7 @@ class Instance:
     @property
     def signed_digest(self) -> str | None:
         """The digest of the file with the entrant's signature; None where there is none."""
-        if self._request.content.transcript is None and not self.answered:
+        if self._is_old and not self.answered:
             return None
         with contextlib.suppress(OSError):
             return io.sha256_of(read_regular(self._signed_path, _MAX_SIGNED))
@@ -319,7 +317,7 @@ class Instance:
         journal = Journal.open(self._journal_path)
         play = Play(self._start(), journal.lanes, self.budget)
         last = journal.requests
-        if self._request.content.transcript is not None:
+        if not self._is_old:
             last = 0 if signed is None else min(last, signed.content.hashes)
         for body in journal.bodies(0, last):
             play.take(body)
@@ -330,7 +328,7 @@ class Instance:
     def _check_signed(self, journal: Journal, play: Play, signed: SignedHead | None) -> None:
         """Raise TamperedError unless the entrant has signed the transcript and the answers."""
         answers = read_regular(self._answers_path, self.answer_bytes) if self.answered else b""
-        if self._request.content.transcript is None:
+        if self._is_old:
             is_right = not answers or self._has_stated(journal, answers)
         elif signed is None:
             is_right = not self._signed_path.exists()
@@ -338,7 +336,7 @@ class Instance:
             head, number = play.head, signed.content.hashes
             if number > journal.requests:
                 head = answers_head(challenge_head(head, self._states()), answers)
-            is_right = signed.id == self._place.at(number, head).digest and has_signed(
+            is_right = signed.id == self._chain.at(number, head).digest and has_signed(
                 self._request, signed.signature, signed.content
             )
         if not is_right:
@@ -356,7 +354,7 @@ class Instance:
             return False
         bodies = b"".join(journal.bodies())
         digests = io.sha256_of(answers), io.sha256_of(bodies)
-        statement = Answers(**dict(self._place), answers=digests[0], journal=digests[1])
+        statement = Answers(**dict(self._chain), answers=digests[0], journal=digests[1])
         return stored.content == statement and has_signed(
             self._request, stored.signature, statement
         )
@@ -418,7 +416,7 @@ class Instance:
             self._save(play)
 
     def _signed(self, number: int, head: bytes, signature: str) -> SignedHead:
-        document = self._place.at(number, head)
+        document = self._chain.at(number, head)
         if not has_signed(self._request, signature, document):
             raise Rejection(
                 "bad_signature",

@@ -43,7 +43,7 @@ from leaderboard.seasons.season import Stepping
 from sme_registry import io
 from sme_registry.envs import SMEVectorEnv
 from sme_registry.io import open_regular
-from sme_registry.seasons.transcript import Place, next_head
+from sme_registry.seasons.transcript import Chain, next_head
 from sme_registry.seasons.wire import StepFormat, StepsAnswer
 from sme_registry.spec import SMESpec
 
@@ -216,7 +216,7 @@ class Start:
 
     spec: SMESpec = field(repr=False)  # the hidden task
     seed: int = field(repr=False)  # of the first lane's episodes; lane i has seed + i
-    place: Place
+    chain: Chain
 
 
 class Play:
@@ -235,7 +235,7 @@ class Play:
         self._sums = np.zeros((min(MOST_PARTS, self._possible), 3))
         self._signed_sums = self._sums.copy()
         self.requests, self.signed, self.last = 0, -1, (b"", b"")
-        self.head = start.place.first_head(lanes, self.started)
+        self.head = start.chain.first_head(lanes, self.started)
 
     @property
     def started(self) -> bytes:

@@ -39,7 +39,7 @@ from sme_registry import seasons
 from sme_registry.errors import SMEError
 from sme_registry.io import file_lock, parse_json, read_regular, to_json, write_atomically
 from sme_registry.seasons import wire
-from sme_registry.seasons.transcript import Place as InstancePlace
+from sme_registry.seasons.transcript import Chain
 from sme_registry.seasons.wire import StepFormat, TicketStatus
 
 
@@ -69,7 +69,7 @@ class Ticket:
         self._end_path = folder / "end.json"
         self.instances = tuple(
             Instance(
-                *(folder, self._place(number), request, hidden.member, season.protocol),
+                *(folder, self._chain(number), request, hidden.member, season.protocol),
                 *(partial(self.start, number), partial(self._states, number), self.check_running),
             )
             for number, hidden in enumerate(season.hidden)
@@ -190,10 +190,10 @@ class Ticket:
         """What the steps of instance i follow from."""
         hidden = self.hidden(number)
         seed = int.from_bytes(self._master.secret("starts", hidden.place))
-        return Start(hidden.spec, seed, self._place(number))
+        return Start(hidden.spec, seed, self._chain(number))
 
-    def _place(self, number: int) -> InstancePlace:
-        return InstancePlace(request=self.id, ticket=self.number, instance=number)
+    def _chain(self, number: int) -> Chain:
+        return Chain(request=self.id, ticket=self.number, instance=number)
 
     def _states(self, number: int) -> bytes:
         hidden = self.hidden(number)

@@ -32,8 +32,8 @@ from sme_registry.evaluation.regions import batch_rows
 from sme_registry.io import integer_in, parse_json, server_address
 from sme_registry.seasons.transcript import (
     EVERY,
+    Chain,
     Ending,
-    Place,
     TicketHeads,
     Transcript,
     answers_head,
@@ -106,7 +106,7 @@ class Instance:
                 "ticket` wrote."
             )
         self._ticket, self._instance, self._signer = ticket, instance, ticket.signer
-        self._place = Place(request=ticket.signer.request, ticket=ticket.ticket, instance=instance)
+        self._chain = Chain(request=ticket.signer.request, ticket=ticket.ticket, instance=instance)
         self._transcript = self._transcript_of(instance)
         self._has_begun = False
         self._connection = Connection(url, ticket.token, insecure=insecure, patience=patience)
@@ -128,7 +128,7 @@ class Instance:
                 "with the ticket's folder in which these steps were taken.",
             )
         if number == 0:
-            kept.begin(self.lanes, self._place.first_head(self.lanes, data))
+            kept.begin(self.lanes, self._chain.first_head(self.lanes, data))
         else:
             observation = self._sent_again(number).observation
         self.number, self._has_begun = number, True
@@ -183,7 +183,7 @@ class Instance:
         data = self._request("GET", "challenge", most=2**28)
         head = challenge_head(kept.head(number), data).hex()
         if ending is None:
-            kept.end(Ending(request=self._place.request, requests=number, challenge=head))
+            kept.end(Ending(request=self._chain.request, requests=number, challenge=head))
         elif ending.challenge != head:
             raise self._shown_otherwise("other challenge states")
         return unpack_table(data, self.setting.state_dim + 2)
@@ -200,7 +200,7 @@ class Instance:
                 f"{self._transcript.path}: has no challenge states. Ask for them first.",
             )
         head = answers_head(bytes.fromhex(ending.challenge), data)
-        signature = self._signer.sign(self._place.at(ending.requests + 2, head))
+        signature = self._signer.sign(self._chain.at(ending.requests + 2, head))
         self._request("PUT", f"answers?signature={signature}", data)
         self._transcript.end(ending.model_copy(update={"answers": head.hex()}))
         self.end_ticket()
@@ -216,8 +216,8 @@ class Instance:
         heads = [f"sha256:{each.answers}" for each in endings if each and each.answers]
         if len(heads) < len(endings):
             return False
-        place = self._place
-        document = TicketHeads(request=place.request, ticket=place.ticket, heads=tuple(heads))
+        chain = self._chain
+        document = TicketHeads(request=chain.request, ticket=chain.ticket, heads=tuple(heads))
         path = ticket_path(self._ticket.season, self._ticket.ticket)
         self._connection.request("POST", f"{path}/end?signature={self._signer.sign(document)}")
         return True
@@ -249,14 +249,14 @@ class Instance:
         self._format = StepFormat(lanes, self.setting.state_dim, self.setting.action_dim)
 
     def _transcript_of(self, instance: int) -> Transcript:
-        place = self._place.model_copy(update={"instance": instance})
+        chain = self._chain.model_copy(update={"instance": instance})
         action_dim = self._ticket.place(instance).member.setting.action_dim
-        return Transcript(self._ticket.path, place, action_dim)
+        return Transcript(self._ticket.path, chain, action_dim)
 
     def _signature(self) -> str:
         """Of the transcript up to here."""
         head = self._transcript.head(self.number)
-        return self._signer.sign(self._place.at(self.number, head))
+        return self._signer.sign(self._chain.at(self.number, head))
 
     def _request(self, method: str, action: str, body: bytes = b"", *, most: int = 0) -> bytes:
         ticket = self._ticket

@@ -32,8 +32,8 @@ Hex = Annotated[str, matching(r"^[0-9a-f]{64}$", "64 hex digits")]
 Count = Annotated[Integer, Field(ge=0)]
 
 
-class Place(StrictModel):
-    """An instance of a ticket."""
+class Chain(StrictModel):
+    """Whose transcript it is: an instance's of a ticket."""
 
     request: Digest  # id of the request for the ticket, which names the season and the key
     ticket: Count
@@ -41,8 +41,8 @@ class Place(StrictModel):
 
     def first_head(self, lanes: int, started: bytes) -> bytes:
         """h_0, from the answer to `start`."""
-        place = f"sme-transcript/1/{self.request}/{self.ticket}/{self.instance}/{lanes}/"
-        return hashlib.sha256(place.encode() + started).digest()
+        prefix = f"sme-transcript/1/{self.request}/{self.ticket}/{self.instance}/{lanes}/"
+        return hashlib.sha256(prefix.encode() + started).digest()
 
     def at(self, hashes: int, head: bytes) -> Head:
         """What the entrant signs after so many requests."""
@@ -118,11 +118,11 @@ class Transcript:
     they are sent, so that a program that was killed can ask for their answer again.
     """
 
-    def __init__(self, ticket: Path, place: Place, action_dim: int) -> None:
+    def __init__(self, ticket: Path, chain: Chain, action_dim: int) -> None:
         self._file: IO[bytes] | None = None
-        self.path = ticket.with_name(f"{ticket.name}.{place.instance}.transcript")
+        self.path = ticket.with_name(f"{ticket.name}.{chain.instance}.transcript")
         self._end = self.path.with_suffix(".end")
-        self._place, self._action_dim = place, action_dim
+        self._chain, self._action_dim = chain, action_dim
         self._lanes = 0
 
     @property
@@ -167,7 +167,7 @@ class Transcript:
             ending = Ending.from_dict(parse_json(self._end.read_bytes(), self._end.name))
         except (OSError, MalformedDocumentError, SpecError):
             return None
-        return ending if ending.request == self._place.request else None
+        return ending if ending.request == self._chain.request else None
 
     def head(self, number: int) -> bytes:
         """h_n; empty where there is none."""
@@ -206,7 +206,7 @@ class Transcript:
 
     @property
     def _request(self) -> bytes:
-        return bytes.fromhex(self._place.request.removeprefix("sha256:"))
+        return bytes.fromhex(self._chain.request.removeprefix("sha256:"))
 
     @property
     def _actions(self) -> int:

@@ -161,4 +161,4 @@ def check(board, entrant, requests):
         for part in form.unpack_steps(play.take(body)):
             expected.update(part.tobytes())
     assert entrant.seen.digest() == expected.digest()
-    assert Transcript(entrant.ticket.path, start.place, 1).head(requests) == play.head
+    assert Transcript(entrant.ticket.path, start.chain, 1).head(requests) == play.head

@@ -20,7 +20,7 @@ from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import Sessions, Ticket, score_ticket
 from sme_registry.seasons import wire
 from sme_registry.seasons.transcript import (
-    Place,
+    Chain,
     TicketHeads,
     answers_head,
     challenge_head,
@@ -119,8 +119,8 @@ class Played:
         """Of the ticket."""
         return self.store.season_folder(self.board.season.digest).ticket(self.number)
 
-    def place(self, instance):
-        return Place(request=self.request.id, ticket=self.number, instance=instance)
+    def chain(self, instance):
+        return Chain(request=self.request.id, ticket=self.number, instance=instance)
 
     def open(self, instance=0):
         return self.sessions.open(self.number, self.token, instance)
@@ -133,7 +133,7 @@ class Played:
         data = opened.start(lanes)
         self.sessions.hold(opened)
         if instance not in self.heads:
-            self.heads[instance] = [self.place(instance).first_head(lanes, data)]
+            self.heads[instance] = [self.chain(instance).first_head(lanes, data)]
         return data
 
     def send(self, body, instance=0):
@@ -159,7 +159,7 @@ class Played:
             states = self.open(instance).challenge()
         head = answers_head(challenge_head(heads[-1], states), data)
         return self.open(instance).answer(
-            data, self.sign(self.place(instance).at(len(heads) + 1, head))
+            data, self.sign(self.chain(instance).at(len(heads) + 1, head))
         )
 
     def end(self):
@@ -171,7 +171,7 @@ class Played:
     def signature(self, instance=0):
         """The entrant's, of the transcript of an instance so far."""
         heads = self.heads.get(instance, [b""])
-        return self.sign(self.place(instance).at(len(heads) - 1, heads[-1].ljust(32, b"\0")))
+        return self.sign(self.chain(instance).at(len(heads) - 1, heads[-1].ljust(32, b"\0")))
 
     def sign(self, document):
         signer = signer_of(self.request, self.key)

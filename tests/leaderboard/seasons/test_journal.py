@@ -11,7 +11,7 @@ from leaderboard.errors import BoardError, TamperedError
 from leaderboard.seasons.journal import Journal, Play, Start, no_steps
 from sme_registry import SMESpec
 from sme_registry.envs import SMEEnv
-from sme_registry.seasons.transcript import Place
+from sme_registry.seasons.transcript import Chain
 from sme_registry.seasons.wire import StepFormat
 
 LANES, A = 3, 2
@@ -174,7 +174,7 @@ def test_another_file_is_no_journal_and_a_journal_is_never_replaced(tmp_path):
 
 
 SPEC = SMESpec(state_dim=3, action_dim=2, complexity=5, horizon=4, seed=12)
-START = Start(SPEC, 5, Place(request="sha256:" + "0" * 64, ticket=1, instance=0))
+START = Start(SPEC, 5, Chain(request="sha256:" + "0" * 64, ticket=1, instance=0))
 
 
 def measured(actions, budget):

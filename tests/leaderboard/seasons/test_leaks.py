@@ -15,7 +15,7 @@ from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import Sessions, Ticket
 from sme_registry import SMEError, materialize, seasons
 from sme_registry.seasons import wire
-from sme_registry.seasons.transcript import Place, answers_head, challenge_head, next_head
+from sme_registry.seasons.transcript import Chain, answers_head, challenge_head, next_head
 from tests.leaderboard.seasons.playing import LANES, online_board, playing, request, scored
 from tests.leaderboard.seasons.sealing import MASTER
 from tests.leaderboard.serving import receiver, serving
@@ -62,10 +62,10 @@ def everything(url, board, client):
     yield client.get(f"{url}/api/seasons/{board.season.id}")
     yield client.get(f"{url}/api/log")
     yield client.get(url + wire.ticket_path(board.season.id, 1))
-    place = Place(request=signed.id, ticket=1, instance=0)
+    chain = Chain(request=signed.id, ticket=1, instance=0)
     started = client.post(at("start?lanes=4"), headers=token)
     yield started
-    head = place.first_head(4, started.content)
+    head = chain.first_head(4, started.content)
     for number in range(1, 17):
         answer = step(number)
         yield answer
@@ -76,14 +76,14 @@ def everything(url, board, client):
     yield client.post(at("start?lanes=x"), headers=token)
     yield client.get(at("challenge"), headers=token)
     yield client.post(at("finish"), headers=token)
-    yield client.post(at(f"finish?signature={signer.sign(place.at(16, head))}"), headers=token)
+    yield client.post(at(f"finish?signature={signer.sign(chain.at(16, head))}"), headers=token)
     challenge = client.get(at("challenge"), headers=token)
     yield challenge
     yield client.put(at("answers"), content=b"x", headers=token)
     answers = wire.pack_table(np.full((300, 1), 0.5))
     yield client.put(at("answers"), content=answers, headers=token)
     head = answers_head(challenge_head(head, challenge.content), answers)
-    last = f"answers?signature={signer.sign(place.at(18, head))}"
+    last = f"answers?signature={signer.sign(chain.at(18, head))}"
     yield client.put(at(last), content=answers, headers=token)
     yield client.post(url + wire.ticket_path(board.season.id, 1) + "/end", headers=token)
     yield client.get(url + wire.ticket_path(board.season.id, 1), headers=token)

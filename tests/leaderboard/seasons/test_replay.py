@@ -17,7 +17,7 @@ from leaderboard.web.fetch import fetch
 from sme_registry import SMESpec
 from sme_registry.envs import SMEEnv
 from sme_registry.seasons import wire
-from sme_registry.seasons.transcript import Place
+from sme_registry.seasons.transcript import Chain
 from tests.leaderboard.clocks import AFTERWARDS, move_clock
 from tests.leaderboard.seasons.playing import LANES, ROWS, online_board, playing, request, scored
 from tests.leaderboard.seasons.sealing import MASTER, moment, replayed, signed_request
@@ -260,7 +260,7 @@ def test_a_ticket_that_ended_early_without_the_entrant_s_end_is_found(tmp_path, 
 
 SPEC = SMESpec(state_dim=3, action_dim=2, complexity=5, horizon=3, k=2, D=0.1, seed=11)
 SEED = 2**255 + 3
-START = Start(SPEC, SEED, Place(request="sha256:" + "0" * 64, ticket=1, instance=0))
+START = Start(SPEC, SEED, Chain(request="sha256:" + "0" * 64, ticket=1, instance=0))
 
 
 def test_steps_and_regret_are_those_of_single_environments():

@@ -197,11 +197,11 @@ def test_each_signature_is_of_the_transcript_so_far(played, monkeypatch):
     others = [
         "",
         "0" * 128,
-        played.sign(played.place(0).at(1, first)),
-        played.sign(played.place(0).at(1, second)),
-        played.sign(played.place(0).at(2, first)),
-        played.sign(played.place(1).at(2, second)),
-        played.key.sign("answers", played.place(0).at(2, second).digest, played.request.board),
+        played.sign(played.chain(0).at(1, first)),
+        played.sign(played.chain(0).at(1, second)),
+        played.sign(played.chain(0).at(2, first)),
+        played.sign(played.chain(1).at(2, second)),
+        played.key.sign("answers", played.chain(0).at(2, second).digest, played.request.receiver),
     ]
     for other in others:
         refused("bad_signature", instance.step, body, other)
@@ -225,7 +225,7 @@ def test_a_ticket_ends_with_a_signature_of_all_its_transcripts(played):
     for instance in (0, 1):
         played.finish(instance)
         played.answer(HALF, instance)
-    for other in ("", played.signature(), played.sign(played.place(0).at(2, bytes(32)))):
+    for other in ("", played.signature(), played.sign(played.chain(0).at(2, bytes(32)))):
         refused("bad_signature", played.sessions.end, played.number, played.token, other)
     assert played.sessions.over() == []
     played.end()
