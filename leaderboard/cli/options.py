@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
@@ -28,7 +27,6 @@ if WITH_SEASONS:
     Board = SeasonStore
 
 _LONG_LOG = 2000  # entries, read in two seconds or so
-_HOST = re.compile(r"[A-Za-z0-9.-]+:\d+(/.*)?|localhost(/.*)?|[A-Za-z0-9-]+(\.[A-Za-z0-9-]+)+/.*")
 
 
 def is_url(board: str) -> bool:
@@ -37,34 +35,19 @@ def is_url(board: str) -> bool:
 
 
 def board_folder(board: str | Path) -> Path:
-    """The folder of a board on this machine.
-
-    Raises:
-      OptionError: it is a URL, a file, or nothing that exists.
-    """
-    name = str(board)
-    if is_url(name):
+    """The folder of a board on this machine."""
+    path = Path(board)
+    if is_url(str(board)):
         raise OptionError(
-            f"{name!r}: must be a board's folder: this command reads its files. Open the URL "
+            f"{str(board)!r}: must be a board's folder: this command reads its files. Open the URL "
             "in a browser for the ranking. `submit`, `show`, `check` and `withdraw` accept a URL."
         )
-    path = Path(board)
-    if path.is_file():
-        raise OptionError(f"{name!r}: is a file. Give the folder that contains board.json.")
-    if path.exists():
-        return path
-    if _HOST.fullmatch(name):
+    if not path.is_dir():
         raise OptionError(
-            f"{name!r}: no such folder. For a served board, give the whole URL, such as "
-            f"http://{name}"
+            f"{str(board)!r}: no such folder. Give the folder that contains board.json, or for a "
+            "served board its whole URL. `sme-leaderboard init` creates a board."
         )
-    suite = _suite_named(name)
-    if suite is not None:
-        raise OptionError(f"{name!r}: no such folder. {_how_to_use(suite)}")
-    raise OptionError(
-        f"{name!r}: no such folder. Correct it, or create a board with "
-        f"`sme-leaderboard init {name}`."
-    )
+    return path
 
 
 def open_board(board: Path) -> Store:
@@ -83,49 +66,25 @@ def open_board(board: Path) -> Store:
 
 
 def new_board_folder(board: str | Path) -> Path:
-    """The folder of a board to create.
-
-    Raises:
-      OptionError: it is a URL, a file, or the name of a suite.
-    """
+    """The folder of a board to create, which is not the name of a suite."""
     name = str(board)
-    if is_url(name):
+    if is_url(name) or Path(board).is_file():
         raise OptionError(
-            f"{name!r}: must be a folder on this machine. To serve a board at a URL, create "
-            "it and run `sme-leaderboard serve`."
+            f"{name!r}: must be a folder on this machine. To serve a board at a URL, create it and "
+            "run `sme-leaderboard serve`; for a suite's file, `sme-leaderboard init board --suite "
+            "FILE`."
         )
-    if Path(board).is_file():
-        use = f" To use this suite: sme-leaderboard init board --suite {name}"
-        raise OptionError(f"{name!r}: is a file. Give a new folder.{use * name.endswith('.json')}")
-    suite = _suite_named(name)
-    if suite is not None:
+    if any(name in (file.name, file.versioned_name) for file in catalogue.entries(SuiteFile)):
         raise OptionError(
-            f"{name!r}: must be a folder. {_how_to_use(suite)}. For a folder of this "
-            f"name, give .{os.sep}{name}"
+            f"{name!r}: must be a folder, and is a suite. Give `board --suite {name}`; for a "
+            f"folder of this name, .{os.sep}{name}"
         )
     return Path(board)
 
 
 def board_or_url(board: str) -> str:
-    """A board's folder or the URL of a served board, as it is given.
-
-    Raises:
-      OptionError: see `board_folder`.
-    """
+    """A board's folder or the URL of a served board, as it is given."""
     return board if is_url(board) else str(board_folder(board))
-
-
-def _suite_named(name: str) -> SuiteFile | None:
-    """The suite of the catalogue with this name, with or without its version."""
-    suites = catalogue.entries(SuiteFile)
-    return next((file for file in suites if name in (file.name, file.versioned_name)), None)
-
-
-def _how_to_use(suite: SuiteFile) -> str:
-    return (
-        f"{suite.name} is a suite. To create a board for it: sme-leaderboard init board "
-        f"--suite {suite.name}"
-    )
 
 
 BoardFolder = Annotated[

@@ -266,18 +266,18 @@ def test_what_is_no_board_is_refused_with_advice():
         assert "Open the URL" in fails(2, command, "http://127.0.0.1:8000")
     for board, advice in {
         "board/board.json": "Give the folder",
-        "tiny-v1.json": "is a file",
-        "core": "init board --suite core",
+        "tiny-v1.json": "Give the folder",
+        "core": "no such folder",
         "empty": "contains no board",
     }.items():
         assert advice in fails(2, "rank", board)
     for board, advice in {
-        "core-v1": "init board --suite core",
+        "core-v1": "board --suite core",
         "http://127.0.0.1:8000": "serve",
     }.items():
         assert advice in fails(2, "init", board)
     for arguments in (("withdraw", "localhost:1", "abcd"), ("submit", "bundle", "localhost:1")):
-        assert "http://localhost:1" in fails(2, *arguments)
+        assert "its whole URL" in fails(2, *arguments)
     assert sorted(Path().rglob("*")) == before
 
 
