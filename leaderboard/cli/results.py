@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Literal
 
 import typer
@@ -20,8 +22,7 @@ from leaderboard.cli.options import (
     is_url,
     open_board,
 )
-from leaderboard.documents.board import BoardDocument
-from leaderboard.documents.result import LABELS, SYMBOLS, Estimate, Metric, Result
+from leaderboard.documents.result import METRICS, RANKED, Estimate, Metric, Result
 from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError
 from leaderboard.scoring import ranking
@@ -88,35 +89,44 @@ def rank(
     elif csv or latex:
         sys.stdout.write(file.to_csv() if csv else file.to_latex())
     else:
-        out().print(_ranking_table(rows, metric, document))
+        notes = []
+        if document.practice:
+            needed = document.runs_to_rank
+            runs = "one run" if needed == 1 else f"{needed} runs"
+            notes.append(f"A practice board: a rank needs {runs} in each class.")
+        out().print(ranking_table(rows, metric, f"on {document.suite_name}", notes))
 
 
-def _ranking_table(rows: list[RankedRow], metric: Metric, board: BoardDocument) -> Table:
-
+def ranking_table(
+    rows: list[RankedRow],
+    metric: Metric,
+    title: str,
+    notes: Sequence[str] = (),
+    more: Mapping[str, Callable[[RankedRow], str]] = MappingProxyType({}),
+) -> Table:
+    """The ranking of any track, with further notes below it, and further columns."""
     reasons: dict[str, None] = dict.fromkeys(row.reason for row in rows if row.reason)
-    notes = dict(zip(reasons, "*†‡§¶", strict=False))
+    signs = dict(zip(reasons, "*†‡§¶", strict=False))
     entries = [row.entry for row in rows]
-    caption = [f"{sign} not ranked: {REASONS[code]}" for code, sign in notes.items()]
+    caption = [f"{sign} not ranked: {REASONS[code]}" for code, sign in signs.items()]
     if any(entry.oracle_like and not entry.reference for entry in entries):
         caption.append("oracle-like: so close to π* that the method's code is requested")
-    if board.practice:
-        runs = "one run" if board.runs_to_rank == 1 else f"{board.runs_to_rank} runs"
-        caption.append(f"A practice board: a rank needs {runs} in each class.")
     columns = {"rank": "number", "method": "text", "submitter": "text", "marks": "text"}
     if not any(map(_marks, entries)):
         del columns["marks"]
-    after = {"runs": "number", "steps/run": "number", "received": "name"}
-    ranking = Table(
-        f"{LABELS[metric]} on {board.suite_name} (0 optimal, 1 the constant ½; 95 % intervals)",
-        {**columns, **dict.fromkeys(SYMBOLS.values(), "number"), **after},
-        caption="\n".join(caption),
+    columns |= {text.symbol: "number" for text in RANKED.values()}
+    columns |= {"runs": "number", "steps/run": "number", "received": "name"}
+    table = Table(
+        f"{RANKED[metric].label} {title} (0 optimal, 1 the constant ½; 95 % intervals)",
+        {**columns, **dict.fromkeys(more, "number")},
+        caption="\n".join((*caption, *notes)),
     )
     for row in rows:
         entry = row.entry
-        scores = {name: getattr(entry.scores, name) for name in SYMBOLS}
+        scores = {name: getattr(entry.scores, name) for name in RANKED}
         scores[metric] = row.shown(metric)
-        ranking.add_row(
-            row.ranks or notes.get(row.reason, ""),
+        table.add_row(
+            row.ranks or signs.get(row.reason, ""),
             escape(f"{entry.method} {entry.version}".strip()),
             escape(entry.submitter),
             *([_marks(entry)] if "marks" in columns else []),
@@ -127,9 +137,10 @@ def _ranking_table(rows: list[RankedRow], metric: Metric, board: BoardDocument) 
             str(entry.runs),
             steps_text(entry.steps_per_run),
             entry.received[:10],
+            *(cell(row) for cell in more.values()),
             style="dim" if row.first is None else None,
         )
-    return ranking
+    return table
 
 
 def _marks(entry: EntryRow) -> str:
@@ -239,7 +250,7 @@ def _scores_table(result: Result) -> Table:
         "normalised regret (0 optimal, 1 the constant ½)",
         {"": "text", "θ": "number", "low": "number", "high": "number"},
     )
-    rows = {label: getattr(result.scores, name) for name, label in LABELS.items()}
+    rows = {text.label: getattr(result.scores, name) for name, text in METRICS.items()}
     for m, value in enumerate(result.scores.normalised_regret):
         rows[f"N in OOD {m}" if m else "N in WD"] = value
     for label, value in rows.items():

@@ -34,7 +34,7 @@ from leaderboard.cli.options import (
 )
 from leaderboard.cli.results import find_entry
 from leaderboard.documents.board import RULES, BoardDocument
-from leaderboard.documents.result import LABELS, SYMBOLS, Result
+from leaderboard.documents.result import RANKED, Result
 from leaderboard.documents.signed import NOBODY, Receiver, SigningKey
 from leaderboard.documents.submission import Knowledge, Withdrawal, now
 from leaderboard.errors import Rejection
@@ -301,10 +301,10 @@ def _board_of(file: SuiteFile, protocol: str) -> BoardDocument:
 
 
 def _print_scores(result: Result) -> None:
-    for name in SYMBOLS:
+    for name, metric in RANKED.items():
         value = getattr(result.scores, name)
         ends = f"  ({value.low:.4f} to {value.high:.4f})" if value.interval else ""
-        out().print(f"{LABELS[name]:18s} {value.value:.4f}{ends}")
+        out().print(f"{metric.label:18s} {value.value:.4f}{ends}")
     fewest = min(member.runs for member in result.classes)
     known = result.scores is not None and result.scores.wd_regret.interval is not None
     kind = "95 % intervals over runs" if known else "no intervals: the spread of one run is unknown"

@@ -16,7 +16,9 @@ how runs become scores. Fields younger than version 1 are left out of the JSON a
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self, get_args
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, NamedTuple, Self, get_args
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
@@ -34,17 +36,40 @@ from sme_registry.spec.document import (
 Metric = Literal["wd_regret", "ood_regret", "ood_decay"]
 """The metrics that a board ranks by."""
 
-RANKED_METRICS: tuple[Metric, ...] = get_args(Metric)
 
-SYMBOLS = {"wd_regret": "N₀", "ood_regret": "N̄", "ood_decay": "decay"}
-LABELS = {
-    "wd_regret": "WD regret N₀",
-    "ood_regret": "OOD regret N̄",
-    "ood_decay": "OOD decay",
-    "regret_slope": "regret slope on ε",
-    "similarity_loss": "similarity loss, points",
-}
-METRICS = tuple(LABELS)
+class MetricText(NamedTuple):
+    """How pages, files and commands write a metric.
+
+    Attributes:
+      stem: of the names of a ranking's files; empty if nothing ranks by it.
+      references: the values of the reference rows that are known.
+    """
+
+    name: str
+    label: str
+    symbol: str = ""
+    latex: str = ""
+    stem: str = ""
+    references: Mapping[str, float] = MappingProxyType({})
+
+    @property
+    def page(self) -> str:
+        """Its page on a board's site."""
+        return "index.html" if self.stem == "board" else f"{self.stem}.html"
+
+
+_KNOWN = {"optimal": 0.0, "constant": 1.0}
+_TEXTS = (
+    MetricText("wd_regret", "WD regret N₀", "N₀", "WD regret $N_0$", "board", _KNOWN),
+    MetricText("ood_regret", "OOD regret N̄", "N̄", r"OOD regret $\bar{N}$", "ood_regret", _KNOWN),
+    MetricText("ood_decay", "OOD decay", "decay", "OOD decay", "ood_decay", {"optimal": 0.0}),
+    MetricText("regret_slope", "regret slope on ε"),
+    MetricText("similarity_loss", "similarity loss, points"),
+)
+METRICS = {each.name: each for each in _TEXTS}
+RANKED: dict[Metric, MetricText] = {name: METRICS[name] for name in get_args(Metric)}
+"""By which a board ranks."""
+
 Isolation = Literal["", "bwrap", "process"]
 _Regions = Annotated[tuple[Real, ...], Field(strict=False, min_length=2)]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,9 +11,10 @@ from rich.markup import escape
 
 from leaderboard.cli import options
 from leaderboard.cli.options import BoardFolder, Json
-from leaderboard.documents.result import LABELS, Metric
+from leaderboard.cli.results import ranking_table
+from leaderboard.documents.result import Metric
 from leaderboard.errors import Rejection
-from leaderboard.scoring.ranking import REASONS
+from leaderboard.scoring.ranking import RankedRow
 from leaderboard.seasons.events import SeasonRow
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.publication import (
@@ -24,7 +26,15 @@ from leaderboard.seasons.publication import (
     refuse_large_answers,
     refuse_unrankable,
 )
-from leaderboard.seasons.ranking import EASY, counting, ranking_facts, score_entries, table_regret
+from leaderboard.seasons.ranking import (
+    EASY,
+    by_key,
+    counting,
+    ranking_facts,
+    score_entries,
+    season_rankings,
+    table_regret,
+)
 from leaderboard.seasons.season import Reveal, Terms
 from leaderboard.seasons.store import SeasonStore
 from sme_registry.errors import OptionError
@@ -246,29 +256,22 @@ def show(
             out().print(table)
             return
         row, document = store.season_row(season), store.season(season)
-        facts, rankings = _facts(store, row), ranking_facts(store, document, metric)
+        facts, keys = _facts(store, row), by_key(store, document)
+        rankings = season_rankings(store, document, metric)
+        plain = ranking_facts(store, document, metric)
     if json:
-        print_json({**facts, "metric": metric, "ranking": rankings})
+        print_json({**facts, "metric": metric, "ranking": plain})
         return
     print_pairs(escape(row.title), facts)
-    for knowledge, entries in rankings.items():
-        if not entries:
-            continue
-        heads = ("rank", "method", "submitter", "value", "low", "high", "methods", "entrants")
-        table = Table(f"{LABELS[metric]}, knowledge: {knowledge}", dict.fromkeys(heads, "text"))
-        for entry in entries:
-            numbers = (entry[name] for name in ("value", "low", "high"))
-            table.add_row(
-                entry["ranks"] or REASONS[entry["reason"]],
-                escape(f"{entry['method']} {entry['version']}"),
-                escape(entry["submitter"]),
-                *("" if number is None else fixed(number) for number in numbers),
-                str(entry["methods_of_key"]),
-                str(entry["entrants_of_key"]),
-            )
-        out().print(table)
-    if any(rankings.values()):
-        out().print("methods, entrants: of the same key in this season.")
+    of_key: dict[str, Callable[[RankedRow], str]] = {
+        "methods": lambda row: str(keys[row.entry.key].methods),
+        "entrants": lambda row: str(keys[row.entry.key].entrants),
+    }
+    note = "methods, entrants: of the same key in this season."
+    for knowledge, ranked in rankings.items():
+        if ranked:
+            title = f"with knowledge {knowledge}"
+            out().print(ranking_table(ranked, metric, title, [note], of_key))
 
 
 def _open(board: Path) -> SeasonStore:

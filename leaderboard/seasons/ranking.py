@@ -33,6 +33,7 @@ from leaderboard.seasons.scoring import (
 from leaderboard.seasons.season import Float32, SealedResult, Season, read_answers
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.store import EntryRow
+from leaderboard.web.tables import row_facts
 from sme_registry import SMESpec, materialize
 from sme_registry.spec import Setting
 
@@ -120,18 +121,9 @@ def ranking_facts(
     return {
         knowledge: [
             {
-                "ranks": row.ranks,
-                "reason": row.reason,
-                "method": row.entry.method,
-                "version": row.entry.version,
-                "submitter": row.entry.submitter,
-                "value": row.value.value,
-                "low": row.value.low,
-                "high": row.value.high,
-                "oracle_like": row.entry.oracle_like,
+                **row_facts(row),
                 "methods_of_key": keys[row.entry.key].methods,
                 "entrants_of_key": keys[row.entry.key].entrants,
-                "id": row.entry.id,
             }
             for row in rows
         ]

@@ -35,7 +35,6 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import Scope
 
-from leaderboard.documents.result import RANKED_METRICS
 from leaderboard.documents.signed import MAX_BYTES, Signed
 from leaderboard.errors import Rejection
 from leaderboard.scoring.worker import Job
@@ -50,7 +49,7 @@ from leaderboard.seasons.ranking import (
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import ScoreTicket, Sessions, attending
 from leaderboard.store import Store
-from leaderboard.web.http import HTTP_CODES, RequestError, read_body
+from leaderboard.web.http import HTTP_CODES, RequestError, metric_of, read_body
 from sme_registry import seasons
 from sme_registry.io import open_regular, to_json
 
@@ -141,11 +140,7 @@ class SeasonRoutes:
 
     async def get_ranking(self, request: Request) -> Response:
         name = request.path_params["season"]
-        text = request.query_params.get("metric", RANKED_METRICS[0])
-        metric = next((each for each in RANKED_METRICS if each == text), None)
-        if metric is None:
-            names = ", ".join(RANKED_METRICS)
-            raise RequestError("bad_request", f"metric={text!r:.80}: must be one of {names}.")
+        metric = metric_of(request)
 
         def rank() -> bytes:
             row = self._store.season_row(name)

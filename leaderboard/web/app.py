@@ -34,6 +34,7 @@ from starlette.responses import JSONResponse, Response
 
 from leaderboard import admission
 from leaderboard.documents.board import hex_of
+from leaderboard.documents.result import RANKED
 from leaderboard.documents.signed import MAX_BYTES, Signed
 from leaderboard.documents.submission import Submission, Withdrawal
 from leaderboard.errors import BoardError, Rejection, ScoringFault
@@ -43,7 +44,7 @@ from leaderboard.store import Head, Store, unknown_submission
 from leaderboard.web import http
 from leaderboard.web.http import HTTP_CODES, RequestError
 from leaderboard.web.pages import Pages, Section, content_type
-from leaderboard.web.tables import TABS, public_view
+from leaderboard.web.tables import public_view
 from sme_registry.errors import SMEError
 from sme_registry.io import server_address
 
@@ -235,13 +236,8 @@ class _Routes:
         return JSONResponse({"id": id, "status": "withdrawn"})
 
     async def get_board(self, request: Request) -> Response:
-        metric = request.query_params.get("metric", TABS[0].key)
-        stems = {tab.key: tab.stem for tab in TABS}
-        if metric not in stems:
-            raise RequestError(
-                "bad_request", f"metric={metric!r:.80}: must be one of {', '.join(stems)}."
-            )
-        return await self._cached(request, _page, f"{stems[metric]}.json", "application/json")
+        name = f"{RANKED[http.metric_of(request)].stem}.json"
+        return await self._cached(request, _page, name, "application/json")
 
     async def get_log(self, request: Request) -> Response:
         text = request.query_params.get("start", "0")

@@ -13,6 +13,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from leaderboard.documents.result import RANKED, Metric
 from leaderboard.errors import NotPublishable, Rejection
 
 HTTP_CODES = {
@@ -198,3 +199,12 @@ _ERROR_PAGE = """<!DOCTYPE html>
 </body>
 </html>
 """
+
+
+def metric_of(request: Request) -> Metric:
+    """The metric that a request ranks by; WD regret by default."""
+    text = request.query_params.get("metric", "wd_regret")
+    for metric in RANKED:
+        if metric == text:
+            return metric
+    raise RequestError("bad_request", f"metric={text!r:.80}: must be one of {', '.join(RANKED)}.")

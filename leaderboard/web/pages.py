@@ -25,14 +25,14 @@ from typing import Any, NamedTuple
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.result import METRICS, Estimate, Metric, Result
+from leaderboard.documents.result import METRICS, RANKED, Estimate, Metric, Result
 from leaderboard.documents.signed import Signed
 from leaderboard.documents.submission import Submission
 from leaderboard.errors import CODES, NotPublishable
 from leaderboard.scoring import ranking
 from leaderboard.store import EntryRow, Store
 from leaderboard.web import charts, tables
-from leaderboard.web.tables import SHORT, TABS
+from leaderboard.web.tables import SHORT
 from sme_registry import SMESpec
 from sme_registry.io import to_json
 
@@ -48,7 +48,7 @@ _TYPES = {
     ".tex": "text/plain; charset=utf-8",
     ".svg": "image/svg+xml",
 }
-_NEED_SCORES = (*(tab.page for tab in TABS), "compare.html")
+_NEED_SCORES = (*(tab.page for tab in RANKED.values()), "compare.html")
 
 
 class Section(NamedTuple):
@@ -150,11 +150,11 @@ class Pages:
             "compare.html": self._compare,
             **{path: render for part in self._files for path, render in part.items()},
             **{
-                f"{tab.stem}.{kind}": partial(self._file, tab.key, kind)
-                for tab in TABS
+                f"{tab.stem}.{kind}": partial(self._file, name, kind)
+                for name, tab in RANKED.items()
                 for kind in ("json", "csv", "tex")
             },
-            **{tab.page: partial(self._board, tab) for tab in reversed(TABS)},
+            **{tab.page: partial(self._board, name) for name, tab in reversed(RANKED.items())},
         }
 
     def _prepared(self, folder: str, name: str) -> bytes | None:
@@ -166,8 +166,9 @@ class Pages:
             return None
         return (self.preparation() if path in _NEED_SCORES else self._top[path]()).encode()
 
-    def _board(self, tab: tables.MetricTab) -> str:
-        ranked = ranking.ranking(self.entries, tab.key)
+    def _board(self, metric: Metric) -> str:
+        tab = RANKED[metric]
+        ranked = ranking.ranking(self.entries, metric)
         scores = [row.entry.scores for row in ranked if row.entry.scores]
         regrets = [[each.value for each in one.normalised_regret] for one in scores]
         sparks = charts.sparklines(regrets)
@@ -186,7 +187,7 @@ class Pages:
             reasons=ranking.REASONS,
             names={id: f"{entry.method} {entry.version}" for id, entry in self._by_id.items()},
             **self._overview,
-            bars=charts.Bars([row.shown(tab.key) for row in ranked], tab.references),
+            bars=charts.Bars([row.shown(metric) for row in ranked], tab.references),
             sparks=dict(zip((row.entry.id for row in ranked), sparks, strict=True)),
         )
 
@@ -301,7 +302,7 @@ class Pages:
 
         data = {
             "regions": charts.region_labels(self.document.protocol.edges),
-            "metrics": [*(tab.label for tab in TABS), "Regret slope", "Similarity loss"],
+            "metrics": [text.label[0].upper() + text.label[1:] for text in METRICS.values()],
             "entries": [
                 {
                     "id": hex_of(entry.id),
@@ -436,7 +437,7 @@ class Pages:
             ),
             "marks": tables.MARKS,
             "address_digits": SHORT,
-            "metrics": TABS,
+            "metrics": list(RANKED.values()),
             "places": tables.places(self._listed),
         }
 

@@ -12,10 +12,8 @@ from typing import Any
 
 from leaderboard.documents.board import BoardDocument, hex_of
 from leaderboard.documents.result import (
-    LABELS,
     METRICS,
-    RANKED_METRICS,
-    SYMBOLS,
+    RANKED,
     Estimate,
     Metric,
     Result,
@@ -26,7 +24,7 @@ from leaderboard.documents.submission import Run, Submission, Withdrawal, skelet
 from leaderboard.errors import NotPublishable
 from leaderboard.scoring import ranking
 from leaderboard.scoring.aggregation import class_mean, groups_of, never_listed
-from leaderboard.scoring.ranking import REFERENCES, RankedRow
+from leaderboard.scoring.ranking import RankedRow
 from leaderboard.store import EntryRow, Store
 from sme_registry import SMESpec
 from sme_registry.errors import SpecError
@@ -38,30 +36,6 @@ from sme_registry.spec import Setting
 _INSTANCES = 100  # of a class, on the page of the suite
 SHORT = 16  # hex digits of an id in an address: too many for a deliberate collision
 
-
-@dataclass(frozen=True)
-class MetricTab:
-    """A metric by which a board ranks: its page, the stem of its files, and its reference rows."""
-
-    key: Metric
-    page: str
-    stem: str
-    references: Mapping[str, float]
-
-    @property
-    def symbol(self) -> str:
-        return SYMBOLS[self.key]
-
-    @property
-    def label(self) -> str:
-        return LABELS[self.key]
-
-
-TABS = (
-    MetricTab("wd_regret", "index.html", "board", REFERENCES),
-    MetricTab("ood_regret", "ood_regret.html", "ood_regret", REFERENCES),
-    MetricTab("ood_decay", "ood_decay.html", "ood_decay", {"optimal": 0.0}),
-)
 
 MARKS = {
     "reference": "reference row",
@@ -201,8 +175,9 @@ _FORMULA_STARTS = tuple("=+-@＝＋－＠|%")
 _LATEX_HEAD = (
     r"\begin{tabular}{rllrrlrrr}",
     r"\toprule",
-    r"Rank & Method & By & Runs & Steps per run & Received & WD regret $N_0$ "
-    r"& OOD regret $\bar{N}$ & OOD decay \\",
+    "Rank & Method & By & Runs & Steps per run & Received & "
+    + " & ".join(metric.latex for metric in RANKED.values())
+    + r" \\",
     r"\midrule",
 )
 
@@ -219,15 +194,11 @@ class RankingFile:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data, for JSON."""
-        rows = [
-            {**_facts(row), "scores": row.entry.scores and row.entry.scores.to_dict()}
-            for row in self.rows
-        ]
         return {
             "title": self.board.title,
             **self._provenance(),
             "metric": self.metric,
-            "rows": rows,
+            "rows": [row_facts(row) for row in self.rows],
         }
 
     def to_csv(self) -> str:
@@ -264,7 +235,7 @@ class RankingFile:
             rank = row.ranks.replace("–", "--") or "--"
             cells = [rank, _latex(f"{entry.method} {entry.version}"), _latex(entry.submitter)]
             cells += [str(entry.runs), f"{entry.steps_per_run:,}", entry.received[:10]]
-            shown = {name: getattr(scores, name) for name in RANKED_METRICS}
+            shown = {name: getattr(scores, name) for name in RANKED}
             cells += map(_interval, (shown | {self.metric: row.shown(self.metric)}).values())
             lines.append(" & ".join(cells) + r" \\")
         lines += [r"\bottomrule", r"\end{tabular}"]
@@ -282,6 +253,11 @@ class RankingFile:
             "log_digest": self.head[1],
             "date": self.date,
         }
+
+
+def row_facts(row: RankedRow) -> dict[str, Any]:
+    """A row of a ranking of any track as plain data, for JSON."""
+    return {**_facts(row), "scores": row.entry.scores and row.entry.scores.to_dict()}
 
 
 def _facts(row: RankedRow) -> dict[str, Any]:

@@ -86,7 +86,7 @@ def test_a_season_is_played_from_the_command_line(later):
     shown = facts("show", "board", "autumn")
     assert shown["state"] == "revealed"
     [row] = shown["ranking"]["generic"]
-    assert (row["id"], row["ranks"]) == (id, "1")
+    assert (row["id"], row["first"], row["last"]) == (id, 1, 1)
     assert (row["methods_of_key"], row["entrants_of_key"]) == (1, 1)
     assert shown["ranking"]["family"] == []
     assert "Test 1" in good("season", "show", "board", "autumn", "--metric", "ood_regret")

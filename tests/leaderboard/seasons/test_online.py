@@ -162,7 +162,7 @@ def test_the_ranking_grows_as_tickets_end(url, board, key):
     grown = httpx.get(address, params={"metric": "ood_regret"}).json()
     assert (empty["metric"], empty["ranking"]) == ("wd_regret", {"generic": [], "family": []})
     [row] = grown["ranking"]["generic"]
-    assert (row["method"], row["value"], row["entrants_of_key"]) == ("Test", 1.0, 1)
+    assert (row["method"], row["rank_value"], row["entrants_of_key"]) == ("Test", 1.0, 1)
     assert (grown["id"], grown["metric"]) == ("ranked", "ood_regret")
     assert outcome(httpx.get(address, params={"metric": "luck"})) == (400, "bad_request")
     unknown = httpx.get(f"{url}/api/seasons/none/ranking")
