@@ -39,7 +39,7 @@ from leaderboard.scoring.aggregation import (
 )
 from leaderboard.scoring.score import agent_names, evaluation_seed, score_submission
 from leaderboard.store import LogEntry, Store, digest_of, read_document
-from leaderboard.store.files import MAX_LOG_ENTRY_BYTES
+from leaderboard.store.blobs import MAX_LOG_ENTRY_BYTES
 from sme_registry import SMESpec
 from sme_registry.errors import OptionError
 from sme_registry.io import TEMPORARY, integer_in

@@ -5,15 +5,18 @@ The signed log is authoritative, the other files hold the documents that it name
 next one continues from the state it leaves.
 """
 
-from leaderboard.store.copies import Copies
-from leaderboard.store.files import digest_of, read_document
-from leaderboard.store.garbage import Garbage, collect_garbage, expire_uploads
+from leaderboard.store.blobs import Objects, digest_of, read_document
 from leaderboard.store.index import Index
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
-from leaderboard.store.objects import Objects
 from leaderboard.store.queue import LEASE_SECONDS, Claim, Queue
-from leaderboard.store.rows import EntryRow
-from leaderboard.store.store import Store, unknown_submission
+from leaderboard.store.rows import Copies, EntryRow
+from leaderboard.store.store import (
+    Garbage,
+    Store,
+    collect_garbage,
+    expire_uploads,
+    unknown_submission,
+)
 
 __all__ = [
     "EMPTY",

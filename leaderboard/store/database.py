@@ -19,10 +19,9 @@ from leaderboard.documents.board import RULES, BoardDocument, Folder
 from leaderboard.documents.signed import SigningKey
 from leaderboard.documents.submission import now
 from leaderboard.errors import BoardError, TamperedError
-from leaderboard.store.files import FolderLock, digest_of, unwritable
+from leaderboard.store.blobs import FolderLock, Objects, digest_of, unwritable
 from leaderboard.store.index import KINDS, Index, Kinds, files_of
 from leaderboard.store.log import EMPTY, Clock, Head, Log, clock_offset, uptime
-from leaderboard.store.objects import Objects
 from sme_registry.spec.document import StrictModel
 
 

@@ -25,12 +25,10 @@ from leaderboard.documents.result import Result
 from leaderboard.documents.signed import Signed
 from leaderboard.documents.submission import Artefact, Submission, Withdrawal
 from leaderboard.errors import BoardError, Rejection, TamperedError
-from leaderboard.store import copies
-from leaderboard.store.copies import Copies
-from leaderboard.store.files import BUSY_SECONDS, digest_of, to_bytes
+from leaderboard.store import rows
+from leaderboard.store.blobs import BUSY_SECONDS, Objects, digest_of, to_bytes
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
-from leaderboard.store.objects import Objects
-from leaderboard.store.rows import EntryRow, Status, scores_of, scores_text
+from leaderboard.store.rows import Copies, EntryRow, Status, scores_of, scores_text
 from sme_registry.io import is_regular
 from sme_registry.spec.document import StrictModel
 
@@ -70,7 +68,7 @@ CREATE TABLE entry (
 CREATE UNIQUE INDEX entry_number ON entry (track, number);
 CREATE INDEX entry_waiting ON entry (sequence) WHERE status = 'waiting';
 CREATE INDEX entry_of_key ON entry (key, received);
-CREATE UNIQUE INDEX entry_sequence ON entry (sequence);{copies.SCHEMA}
+CREATE UNIQUE INDEX entry_sequence ON entry (sequence);{rows.SCHEMA}
 CREATE TABLE object (
   digest TEXT PRIMARY KEY, size INTEGER NOT NULL, key TEXT NOT NULL, received TEXT NOT NULL
 ) STRICT, WITHOUT ROWID;
@@ -327,7 +325,7 @@ class Index:
             "SELECT sequence, reference FROM entry WHERE id = ?", entry.subject
         ) or (0, True)
         if not reference:
-            copies.add_runs(self.connection, entry.subject, sequence, result.runs)
+            rows.add_runs(self.connection, entry.subject, sequence, result.runs)
         self.connection.execute("DELETE FROM lease WHERE submission = ?", (entry.subject,))
 
     def _withdrawn(self, entry: LogEntry) -> None:
@@ -366,7 +364,7 @@ class Index:
 
     def entries(self) -> list[EntryRow]:
         """All submissions, in the order in which they were received."""
-        alike = copies.copies_of(self.connection)
+        alike = rows.copies_of(self.connection)
         return [
             _entry_row(row, alike) for row in self.connection.execute(f"{_ROWS} ORDER BY sequence")
         ]
@@ -374,7 +372,7 @@ class Index:
     def entry(self, id: str) -> EntryRow | None:
         """One submission; None if there is no such submission."""
         row = self.one(f"{_ROWS} AND id = ?", id)
-        return None if row is None else _entry_row(row, copies.copies_of(self.connection, id))
+        return None if row is None else _entry_row(row, rows.copies_of(self.connection, id))
 
 
 KINDS: Kinds = {

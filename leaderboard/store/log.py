@@ -23,7 +23,7 @@ from leaderboard.documents.board import Folder
 from leaderboard.documents.signed import PlainDocument, Signature, SigningKey, plain_json, verifies
 from leaderboard.documents.submission import UtcTime, now
 from leaderboard.errors import BoardError, TamperedError
-from leaderboard.store.files import MAX_LOG_ENTRY_BYTES, read_document, write_document
+from leaderboard.store.blobs import MAX_LOG_ENTRY_BYTES, read_document, write_document
 from sme_registry.spec.document import Digest, Integer, SchemaVersion
 
 NOTHING = "sha256:" + "0" * 64

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import datetime
 import os
+import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -16,14 +19,14 @@ from leaderboard.documents.board import (
 )
 from leaderboard.documents.result import Result
 from leaderboard.documents.signed import Signed, SigningKey
-from leaderboard.documents.submission import Submission, Withdrawal, check_text, now
+from leaderboard.documents.submission import Submission, Withdrawal, check_text, now, shifted, utc
 from leaderboard.errors import BoardError, Rejection
+from leaderboard.store.blobs import digest_of, unwritable, write_document
 from leaderboard.store.database import Database
-from leaderboard.store.files import digest_of, write_document
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.queue import Queue
 from leaderboard.store.rows import EntryRow
-from sme_registry.io import build_folder
+from sme_registry.io import TEMPORARY, build_folder
 from sme_registry.spec import EvaluationProtocol, Suite
 from sme_registry.spec.document import StrictModel
 
@@ -380,3 +383,97 @@ def unknown_submission(id: str) -> Rejection:
         "unknown_submission",
         f"submission={id[:80]}: is not on this board. Check the id: 'sha256:' and 64 hex digits.",
     )
+
+
+@dataclass(frozen=True)
+class Garbage:
+    """What `collect_garbage` removed, or would remove.
+
+    Attributes:
+      temporary: number of half-written files of dead processes.
+      objects: number of artefacts that no submission names.
+      bytes: of all of them.
+    """
+
+    temporary: int
+    objects: int
+    bytes: int
+
+    @property
+    def files(self) -> int:
+        """Number of files of both kinds."""
+        return self.temporary + self.objects
+
+
+def collect_garbage(
+    store: Store,
+    *,
+    temporary_older_than: float = 3600.0,
+    objects_older_than: float = 86400.0,
+    dry_run: bool = False,
+) -> Garbage:
+    """Remove half-written files of dead processes and artefacts that no submission names.
+
+    Args:
+      temporary_older_than: seconds since a temporary file was last written to; a younger one may
+        belong to an upload in progress.
+      objects_older_than: seconds since an artefact was uploaded; the submission of a younger one
+        may follow.
+      dry_run: only count.
+
+    Raises:
+      BoardError: a file cannot be removed.
+    """
+    now = time.time()
+
+    def is_older(path: Path, seconds: float) -> bool:
+        return path.lstat().st_mtime <= now - seconds
+
+    with store.transaction() as index:
+        temporary = [
+            path
+            for path in store.folder.path.rglob(TEMPORARY)
+            if path.is_file() and is_older(path, temporary_older_than)
+        ]
+        objects = {
+            digest: path
+            for digest, path in store.objects.paths()
+            if is_older(path, objects_older_than)
+            and index.one("SELECT 1 FROM object WHERE digest = ?", digest) is None
+        }
+        paths = [*temporary, *objects.values()]
+        size = sum(path.lstat().st_size for path in paths)
+        if not dry_run:
+            for path in paths:
+                _remove(path)
+            for digest in objects:
+                index.connection.execute("DELETE FROM upload WHERE digest = ?", (digest,))
+    return Garbage(len(temporary), len(objects), size)
+
+
+def expire_uploads(store: Store) -> None:
+    """Remove uploads of more than an hour ago that no submission of their key has named.
+
+    Raises:
+      BoardError: a file cannot be removed.
+    """
+    moment = datetime.datetime.fromisoformat(store.time)
+    until = utc(shifted(moment, -datetime.timedelta(seconds=_UNNAMED_SECONDS)))
+    with store.transaction() as index:
+        old = index.connection.execute(
+            "DELETE FROM upload WHERE time <= ? RETURNING digest", (until,)
+        ).fetchall()
+        for (digest,) in old:
+            if index.one(_IS_HELD, digest) is None:
+                _remove(store.folder.object(digest))
+
+
+_UNNAMED_SECONDS = 3600.0
+_IS_HELD = "SELECT 1 FROM object WHERE digest = ?1 UNION ALL SELECT 1 FROM upload WHERE digest = ?1"
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise unwritable(path, error) from error

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 from leaderboard.documents.board import BoardDocument, Folder, hex_of
 from leaderboard.errors import BoardError
 from leaderboard.store import EMPTY, Head, Log, LogEntry, Objects, Store, digest_of
-from leaderboard.store.files import unwritable, write_document, write_file
+from leaderboard.store.blobs import unwritable, write_document, write_file
 from leaderboard.web.client import ServedBoard
 from sme_registry.errors import SpecError
 from sme_registry.io import sha256_of

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from leaderboard.documents.board import Folder
 from leaderboard.errors import BoardError
 from leaderboard.store import Store
-from leaderboard.store.files import write_file
+from leaderboard.store.blobs import write_file
 from leaderboard.web.pages import Pages, Section
 from sme_registry.errors import OptionError
 from sme_registry.io import require_packages

@@ -9,7 +9,7 @@ import pytest
 from leaderboard.cli.options import KEY_VARIABLE
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.web import SeasonRoutes
-from leaderboard.store.files import to_bytes
+from leaderboard.store.blobs import to_bytes
 from tests.leaderboard.clocks import set_clocks
 from tests.leaderboard.conftest import put_submission, signed_withdrawal
 from tests.leaderboard.seasons.playing import online_board

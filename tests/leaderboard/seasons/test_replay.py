@@ -11,7 +11,7 @@ from leaderboard.seasons.publication import files_of_seasons
 from leaderboard.seasons.ranking import season_rankings
 from leaderboard.seasons.season import Reveal
 from leaderboard.seasons.store import SeasonStore
-from leaderboard.store.files import digest_of
+from leaderboard.store.blobs import digest_of
 from leaderboard.store.log import Clock
 from leaderboard.web.fetch import fetch
 from sme_registry import SMESpec

@@ -21,7 +21,7 @@ from leaderboard.seasons.journal import Journal, Play
 from leaderboard.seasons.master import Master
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import ScoreTicket, Sessions, Ticket
-from leaderboard.store.files import to_bytes
+from leaderboard.store.blobs import to_bytes
 from sme_registry import materialize
 from sme_registry.seasons.wire import pack_table, unpack_table
 from tests.leaderboard.clocks import set_clocks

@@ -6,7 +6,7 @@ import pytest
 from leaderboard import admission
 from leaderboard.errors import Rejection
 from leaderboard.store import Store, collect_garbage
-from leaderboard.store.objects import Objects
+from leaderboard.store.blobs import Objects
 from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import tiny_submission
 

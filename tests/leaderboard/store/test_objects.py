@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from leaderboard.errors import BoardError, Rejection, TamperedError
-from leaderboard.store import Store, files
-from leaderboard.store.files import FolderLock
+from leaderboard.store import Store, blobs
+from leaderboard.store.blobs import FolderLock
 from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import tiny_board
 
@@ -122,7 +122,7 @@ for command in ("rank", "verify"):
 
 
 def test_readers_share_the_lock_and_a_writer_excludes_them(tmp_path, monkeypatch):
-    monkeypatch.setattr(files, "BUSY_SECONDS", 0.05)
+    monkeypatch.setattr(blobs, "BUSY_SECONDS", 0.05)
     one, other = FolderLock(tmp_path), FolderLock(tmp_path)
     with one.hold(exclusive=False), other.hold(exclusive=False):
         pass
@@ -142,7 +142,7 @@ def test_readers_share_the_lock_and_a_writer_excludes_them(tmp_path, monkeypatch
 
 def test_a_board_is_read_but_not_written_without_flock(store, submit, monkeypatch):
     signed = submit()
-    monkeypatch.setattr(files, "fcntl", None)
+    monkeypatch.setattr(blobs, "fcntl", None)
     with Store.open(store.folder.path, read_only=True) as reader:
         assert [entry.id for entry in reader.entries()] == [signed.id]
     with pytest.raises(BoardError, match="only be written on Linux and macOS"):
