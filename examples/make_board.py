@@ -159,7 +159,7 @@ def make_board(
             )
             submit_bundle(store, Path(temporary, f"bundle-{index}"))
     run_scorers(out, 2)
-    verify(out)
+    assert verify(out).is_confirmed
 
 
 def main() -> None:
