@@ -101,7 +101,8 @@ class WireError(SMEError, ValueError):
 class SealedError(SMEError):
     """A board's server refused a request, or gives no answer.
 
-    Its `code` is the board's, or "unreachable", "http" or "wire" where it sent none.
+    Its `code` is the board's; "unreachable", "http" or "wire" where it sent none; "transcript"
+    where it has sent or taken something else than this program knows.
     """
 
     def __init__(self, code: str, message: str) -> None:

@@ -371,7 +371,11 @@ class SealedResult(Document):
       stepping: online of each run, in the same order; empty offline.
       oracle_like: as in `Result`.
       versions: of the packages on which the numbers depend.
+      signed: of a ticket that the entrant has ended, the digest of the file with the signature of
+        all its transcripts; null otherwise.
     """
+
+    fields_added_later: ClassVar[tuple[str, ...]] = ("signed",)
 
     schema_version: SchemaVersion = 1
     season: Digest
@@ -382,3 +386,4 @@ class SealedResult(Document):
     stepping: Annotated[tuple[Stepping, ...], Field(strict=False)] = ()
     oracle_like: bool = False
     versions: dict[str, str] = Field(default_factory=dict)
+    signed: Digest | None = None

@@ -37,7 +37,14 @@ from leaderboard.seasons.store import SeasonStore
 from leaderboard.store import Store
 from sme_registry import seasons
 from sme_registry.errors import SMEError
-from sme_registry.io import file_lock, parse_json, read_regular, to_json, write_atomically
+from sme_registry.io import (
+    file_lock,
+    parse_json,
+    read_regular,
+    sha256_of,
+    to_json,
+    write_atomically,
+)
 from sme_registry.seasons import wire
 from sme_registry.seasons.transcript import Chain
 from sme_registry.seasons.wire import StepFormat, TicketStatus
@@ -163,6 +170,13 @@ class Ticket:
         where = "/".join(self._end_path.parts[-5:])
         raise TamperedError(where, "is not the entrant's signature of all transcripts")
 
+    @property
+    def end_digest(self) -> str | None:
+        """The digest of the file in which the entrant has signed its end; None without one."""
+        if not self._end_path.exists():
+            return None
+        return sha256_of(read_regular(self._end_path, MAX_BYTES))
+
     def status(self, now: str) -> wire.TicketStatus:
         """How far the entrant is."""
         return wire.TicketStatus(
@@ -227,7 +241,8 @@ def score_ticket(
         versions |= used
         stepping.append(instance.replayed() if replay else instance.stepping())
     draws, rules = store.document.draws, store.document.rules
-    return sealed_result(season, ticket.id, runs, versions, draws, stepping, rules)
+    result = sealed_result(season, ticket.id, runs, versions, draws, stepping, rules)
+    return result.model_copy(update={"signed": ticket.end_digest})
 
 
 def unplayed_result(store: SeasonStore, season: Season, ticket: Ticket) -> SealedResult:

@@ -230,7 +230,7 @@ class _Verifier:
             result.stepping,
             board.rules,
         )
-        return contradiction(result, again)
+        return contradiction(result, again.model_copy(update={"signed": result.signed}))
 
     def refuse(self, row: SealedRow, message: str) -> NoReturn:
         """Raise `TamperedError` for an entry or ticket."""

@@ -52,6 +52,9 @@ def test_a_season_of_tickets_is_replayed_and_every_one_of_them_counts(revealed):
         assert replayed(store) == (counts, [])
         [row] = season_rankings(store, revealed.season, "wd_regret")["generic"]
         results = [store.sealed_result(each) for each in store.entrants(revealed.season.digest)]
+    ends = [result.signed for result in results]
+    assert len(set(ends)) == 2
+    assert None not in ends
     values = [result.scores.wd_regret.value for result in results if result is not None]
     assert len(set(values)) == 2
     assert row.value.value == pytest.approx(np.mean(values))
