@@ -32,12 +32,11 @@ from leaderboard.store.rows import Copies, EntryRow, Status, scores_of, scores_t
 from sme_registry.io import is_regular
 from sme_registry.spec.document import StrictModel
 
-TIMES = (
-    *(("track", column) for column in ("announced", "revealed")),
-    *(("entry", column) for column in ("received", "finished")),
-    *(("object", "received"), ("upload", "time")),
-)
-"""Tables and their columns with times of entries, which an entry of the event "clock" corrects."""
+TIMES = (("track", "announced"), ("entry", "received"), ("object", "received"), ("upload", "time"))
+"""Tables and their columns with times of receipt, which an entry of the event "clock" corrects.
+
+What an end or a reveal was decided by stays: it has happened.
+"""
 
 SCHEMA = f"""
 CREATE TABLE head (

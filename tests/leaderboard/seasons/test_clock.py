@@ -13,6 +13,7 @@ from leaderboard.store.blobs import to_bytes
 from tests.leaderboard.clocks import set_clocks
 from tests.leaderboard.conftest import put_submission, signed_withdrawal
 from tests.leaderboard.seasons.playing import online_board
+from tests.leaderboard.seasons.sealing import signed_request
 from tests.leaderboard.serving import serving
 from tests.leaderboard.test_cli import fails, good
 
@@ -119,3 +120,18 @@ def test_a_running_ticket_has_the_deadline_of_its_corrected_start(board, key, mo
         assert "entries 2 and later" in good("clock", "board", "--correct")
         set_clocks(monkeypatch, passed=25)
         assert "ended" in events(board, 20, "ended")
+
+
+def test_a_ticket_that_a_wrong_clock_has_ended_stays_ended_and_its_season_verifies(
+    board, key, monkeypatch
+):
+    with SeasonStore.open(board.path) as store:
+        store.start_ticket(signed_request(store, board.season, key))
+    set_clocks(monkeypatch, forward=MONTH)
+    with served(board):
+        assert "ended" in events(board, 20, "ended")
+    set_clocks(monkeypatch)
+    assert "entries 3 and later" in good("clock", "board", "--correct")
+    set_clocks(monkeypatch, passed=25)
+    good("season", "reveal", "board", board.season.id, "--secret", board.secret)
+    good("verify", "board")
