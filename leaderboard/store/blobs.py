@@ -38,11 +38,7 @@ _Model = TypeVar("_Model", bound=StrictModel)
 
 @contextlib.contextmanager
 def durable_file(path: Path, *, new: bool = False) -> Iterator[BinaryIO]:
-    """`sme_registry.io.atomic_file` in a folder that need not exist, durable on a loss of power.
-
-    Raises:
-      BoardError: the disk is full, the folder is not writable, or (`new`) the file exists.
-    """
+    """`sme_registry.io.atomic_file` in a folder that need not exist, durable on a loss of power."""
     try:
         if not path.parent.is_dir():
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -91,12 +87,7 @@ def read_document(
     *,
     limit: int = MAX_DOCUMENT_BYTES,
 ) -> _Model:
-    """Read board.json or a log entry, whose digest nothing names.
-
-    Raises:
-      TamperedError: the file is missing, is not a regular file, is too large, is not a document of
-        this type, or is not in the form in which the board writes it.
-    """
+    """Read board.json or a log entry, whose digest nothing names."""
     where = path.relative_to(folder.path).as_posix()
     try:
         data = read_regular(path, limit)
@@ -136,12 +127,7 @@ class FolderLock:
 
     @contextlib.contextmanager
     def hold(self, *, exclusive: bool) -> Iterator[None]:
-        """Hold the lock for the block; a shared one admits other shared holders.
-
-        Raises:
-          BoardError: the lock is closed, another process holds it for a minute, or (exclusive)
-            this system has no `flock`.
-        """
+        """Hold the lock for the block; a shared one admits other shared holders."""
         if not self._open:
             raise BoardError(f"{self._path.parent}: the store is closed. Open it again.")
         if self._handle is None:
@@ -218,11 +204,7 @@ class Objects:
         return is_regular(self.path(digest))
 
     def touch(self, digest: str) -> bool:
-        """Make a policy file young, so that `gc` keeps it; False if it does not exist.
-
-        Raises:
-          BoardError: the folder is not writable.
-        """
+        """Make a policy file young, so that `gc` keeps it; False if it does not exist."""
         path = self.folder.object(digest)
         try:
             os.utime(path)
@@ -233,12 +215,7 @@ class Objects:
         return True
 
     def read(self, digest: str) -> bytes:
-        """Read a document or policy file and verify its digest.
-
-        Raises:
-          BoardError: it does not exist.
-          TamperedError: its bytes have another digest.
-        """
+        """Read a document or policy file and verify its digest."""
         path = self.path(digest)
         try:
             data = read_regular(path, MAX_DOCUMENT_BYTES)
@@ -251,11 +228,7 @@ class Objects:
         return data
 
     def document(self, kind: type[_Model], digest: str) -> _Model:
-        """Read a document that the log names.
-
-        Raises:
-          TamperedError: it is missing, altered, or not of this kind.
-        """
+        """Read a document that the log names."""
         try:
             data = self.read(digest)
         except BoardError:

@@ -61,10 +61,6 @@ class Database:
         Args:
           reindex: rebuild the index and ignore what the old one recorded of the log.
           progress: called with the number of each log entry that is read.
-
-        Raises:
-          BoardError: the index cannot be written.
-          TamperedError: log, documents and index disagree; names the first altered row.
         """
         self._progress = progress
         if not self.read_only and not os.access(self.folder.path, os.W_OK):
@@ -115,10 +111,6 @@ class Database:
 
         Yields:
           The index, up to date.
-
-        Raises:
-          BoardError: the board is read-only, locked for a minute by another process, or SQLite
-            fails.
         """
         self.refuse_read_only()
         with self._thread_lock:
@@ -150,7 +142,6 @@ class Database:
 
         Raises:
           Rejection: it is not allowed, and nothing was written.
-          BoardError: it cannot be written, or the machine's clock is wrong.
         """
         key = self.signing_key()
         index, time = self._connected, self.clock.received()
@@ -162,11 +153,7 @@ class Database:
 
     @property
     def time(self) -> str:
-        """When the board receives what comes now.
-
-        Raises:
-          BoardError: the machine's clock is wrong.
-        """
+        """When the board receives what comes now."""
         with self.reading():
             return self.clock.received()
 
@@ -187,9 +174,6 @@ class Database:
 
         Returns:
           The number of the first of them; 0 if there is none.
-
-        Raises:
-          BoardError: it cannot be written.
         """
         key = self.signing_key()
         with self.transaction() as index:
@@ -210,12 +194,7 @@ class Database:
         self.clock.offset = None if row is None else row[0]
 
     def signing_key(self) -> SigningKey:
-        """The board's key.
-
-        Raises:
-          BoardError: the key's file is missing or holds another board's key, or the board follows
-            earlier rules.
-        """
+        """The board's key."""
         if self.document.rules != RULES:
             raise BoardError(
                 f"{self.folder.path}: follows rules {self.document.rules}, and boards that accept "
@@ -244,12 +223,7 @@ class Database:
             raise BoardError(f"{self.folder.path}: opened read-only. Open it for writing.")
 
     def reindex(self) -> None:
-        """Rebuild the index from the log and the documents, whatever its state.
-
-        Raises:
-          TamperedError: log and documents disagree.
-          BoardError: the index cannot be written.
-        """
+        """Rebuild the index from the log and the documents, whatever its state."""
         self.refuse_read_only()
         with self.locked():
             self._connect(rebuild=True)

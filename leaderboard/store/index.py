@@ -208,9 +208,6 @@ class Index:
 
         Raises:
           Rejection: the document is not allowed at the entry's time, and is not written yet.
-          TamperedError: the document that it names is missing or altered, or the entry contradicts
-            those before it.
-          BoardError: it is of a kind that this program does not know.
         """
         if entry.event not in self._kinds:
             raise BoardError(
@@ -234,11 +231,7 @@ class Index:
         )
 
     def read(self, kind: type[_Model], entry: LogEntry) -> _Model:
-        """The document of an entry that is applied.
-
-        Raises:
-          TamperedError: it is missing, altered, or not of this kind.
-        """
+        """The document of an entry that is applied."""
         if self._written is not None:
             return cast(_Model, self._written)
         return self.objects.document(kind, entry.document)

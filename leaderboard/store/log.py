@@ -116,11 +116,7 @@ class Log:
         return self.folder.log_entry(sequence).exists()
 
     def read(self, sequence: int) -> LogEntry:
-        """Read an entry and verify its signature, but not the entries before it.
-
-        Raises:
-          TamperedError: it is missing, altered, or not signed by the board.
-        """
+        """Read an entry and verify its signature, but not the entries before it."""
         path = self.folder.log_entry(sequence)
         entry = read_document(self.folder, path, LogEntry, limit=MAX_LOG_ENTRY_BYTES)
         where = path.relative_to(self.folder.path).as_posix()
@@ -130,11 +126,7 @@ class Log:
         return entry
 
     def read_after(self, head: Head) -> LogEntry:
-        """Read the entry after `head` and verify that it follows it.
-
-        Raises:
-          TamperedError: it is missing, altered, not signed by the board, or does not follow `head`.
-        """
+        """Read the entry after `head` and verify that it follows it."""
         entry = self.read(head.sequence + 1)
         self._check_order(entry, head)
         return entry
@@ -170,11 +162,7 @@ class Log:
         return LogEntry.from_dict({**fields, "signature": key.sign("log", _digest(fields))})
 
     def write(self, entry: LogEntry) -> None:
-        """Write an entry.
-
-        Raises:
-          BoardError: it cannot be written, or another process has used its number.
-        """
+        """Write an entry."""
         write_document(self.folder.log_entry(entry.sequence), entry, new=True)
 
     def first_after(self, head: Head, time: str) -> LogEntry | None:
@@ -207,12 +195,7 @@ class Clock:
         return max(now(), self.last)
 
     def received(self) -> str:
-        """The board's time, for what is written or expires.
-
-        Raises:
-          BoardError: the machine's clock is more than a minute behind the log's last entry, or has
-            jumped by more than five minutes.
-        """
+        """The board's time, for what is written or expires."""
         if _seconds(self.last) - time.time() > MOST_BEHIND:
             raise BoardError(
                 f"clock={now()}: is behind the log's last entry, of {self.last}. Nothing was "

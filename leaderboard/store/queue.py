@@ -104,9 +104,6 @@ class Queue:
 
         Returns:
           The claim; None if there is nothing to claim now.
-
-        Raises:
-          BoardError: the index cannot be written, or the board's key is missing.
         """
         with self._database.transaction() as index:
             _end_lost(index)
@@ -186,7 +183,6 @@ class Queue:
 
         Raises:
           ValueError: the result is of another submission, suite or protocol.
-          BoardError: it cannot be written.
         """
         document = self._database.document
         digests = (result.submission, result.suite, result.protocol)

@@ -70,8 +70,6 @@ class Store(Database):
           The board's store, opened for writing.
 
         Raises:
-          BoardError: the folder exists and is not empty, or the suite does not fit a board.
-          OptionError: the folder cannot be created.
           SpecError: a field is invalid.
         """
         key = SigningKey.generate()
@@ -113,10 +111,6 @@ class Store(Database):
             then held in memory, is built from them. For copies of boards, whose index may lie.
           reindex: rebuild the index and ignore what the old one recorded of the log.
           progress: called with the number of each log entry that is read.
-
-        Raises:
-          BoardError: the folder holds no board, or the index cannot be written.
-          TamperedError: log, documents and index disagree; names the first altered row.
         """
         store = cls(path, read_only=read_only)
         try:
@@ -142,7 +136,6 @@ class Store(Database):
 
         Raises:
           Rejection: `too_large` or `artefact_digest`.
-          BoardError: it cannot be written, or the board's key is missing.
         """
         self.refuse_read_only()
         self.signing_key()  # without it no submission could follow
@@ -195,9 +188,6 @@ class Store(Database):
 
         Returns:
           False if the board already has it.
-
-        Raises:
-          BoardError: it cannot be written.
         """
         with self.transaction() as index:
             if index.status(signed.id) is not None:
@@ -218,7 +208,6 @@ class Store(Database):
         Raises:
           Rejection: `unknown_submission`, `unsafe_name` (the reason), `wrong_board`, or
             `bad_signature`, if the submission's own key did not sign it.
-          BoardError: it cannot be written.
         """
         withdrawal = signed.content
         with self.transaction() as index:
@@ -245,7 +234,6 @@ class Store(Database):
 
         Raises:
           Rejection: `unknown_submission`.
-          TamperedError: its file differs from the logged one.
         """
         signed = self._read("document", id, Signed[Submission])
         if signed is None:
@@ -253,19 +241,11 @@ class Store(Database):
         return signed
 
     def result(self, id: str) -> Result | None:
-        """A submission's result; None if it has none, or does not exist.
-
-        Raises:
-          TamperedError: its file differs from the logged one.
-        """
+        """A submission's result; None if it has none, or does not exist."""
         return self._read("result", id, Result)
 
     def withdrawal(self, id: str) -> Signed[Withdrawal] | None:
-        """A submission's withdrawal; None if there is none.
-
-        Raises:
-          TamperedError: its file differs from the logged one.
-        """
+        """A submission's withdrawal; None if there is none."""
         return self._read("withdrawal", id, Signed[Withdrawal])
 
     def _read(self, column: str, id: str, kind: type[_Model]) -> _Model | None:
@@ -350,11 +330,7 @@ class Store(Database):
         return row is not None
 
     def log(self, start: int = 0, count: int = 100) -> list[LogEntry]:
-        """At most `count` log entries, from number `start` on.
-
-        Raises:
-          TamperedError: an entry was altered.
-        """
+        """At most `count` log entries, from number `start` on."""
         stop = min(start + count, self.head.sequence + 1)
         return [self._log.read(sequence) for sequence in range(max(start, 0), stop)]
 
@@ -420,9 +396,6 @@ def collect_garbage(
       objects_older_than: seconds since an artefact was uploaded; the submission of a younger one
         may follow.
       dry_run: only count.
-
-    Raises:
-      BoardError: a file cannot be removed.
     """
     now = time.time()
 
@@ -452,11 +425,7 @@ def collect_garbage(
 
 
 def expire_uploads(store: Store) -> None:
-    """Remove uploads of more than an hour ago that no submission of their key has named.
-
-    Raises:
-      BoardError: a file cannot be removed.
-    """
+    """Remove uploads of more than an hour ago that no submission of their key has named."""
     moment = datetime.datetime.fromisoformat(store.time)
     until = utc(shifted(moment, -datetime.timedelta(seconds=_UNNAMED_SECONDS)))
     with store.transaction() as index:
