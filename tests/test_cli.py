@@ -62,15 +62,15 @@ def test_suite_writes_a_file_of_tasks_files_sweeps_and_another_suite(tmp_path):
     good("suite", "new", "wider.json", "--suite", "mine.json", "-t", "Plane10")
     wider = SuiteFile.read(tmp_path / "wider.json").suite
     assert [member.name for member in wider.classes] == ["Default", "k2", "Plane10"]
-    good("suite", "axis.json", "-t", "Default", "--sweep", "k=1,5")
+    good("suite", "new", "axis.json", "-t", "Default", "--sweep", "k=1,5")
     axis = SuiteFile.read(tmp_path / "axis.json").suite
     assert [spec.k for spec in axis.instances] == [1, 5]
     good("study", "new", "plan.json", "--suite", "wider.json", "-a", "reference:linear")
     assert StudyFile.read(tmp_path / "plan.json").plan.classes == wider.classes
     before = (tmp_path / "mine.json").read_bytes()
-    assert "--force" in refused("suite", "mine.json", "-t", "Default")
-    assert "twice" in refused("suite", "other.json", "-t", "Default", "-t", "Default")
-    assert "--task" in refused("suite", "other.json")
+    assert "--force" in refused("suite", "new", "mine.json", "-t", "Default")
+    assert "twice" in refused("suite", "new", "other.json", "-t", "Default", "-t", "Default")
+    assert "--task" in refused("suite", "new", "other.json")
     assert (tmp_path / "mine.json").read_bytes() == before
     assert not (tmp_path / "other.json").exists()
     assert "is the file of a suite, not of a task" in refused("train", "mine.json")

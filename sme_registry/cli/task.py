@@ -30,7 +30,7 @@ from sme_registry.cli.arguments import (
 from sme_registry.errors import OptionError, SMEError, UnknownNameError
 from sme_registry.io import integer_in, parse_json
 from sme_registry.io.markup import plural
-from sme_registry.io.terminal import CommandGroup, out, print_json, print_line, print_note
+from sme_registry.io.terminal import out, print_json, print_line, print_note
 from sme_registry.spec import (
     EnvFile,
     ProtocolFile,
@@ -232,17 +232,7 @@ def _class_name(document: SMESpec | StreamSpec) -> str:
     return title.replace(" (", "-").removesuffix(")")
 
 
-class _NewByDefault(CommandGroup):
-    """A group whose command `new` may be left out."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        named = args and args[0] in (*self.commands, *self.get_help_option_names(ctx))
-        parsed: list[str] = super().parse_args(ctx, args if named or not args else ["new", *args])
-        return parsed
-
-
 suite = typer.Typer(
-    cls=_NewByDefault,
     no_args_is_help=True,
     help="""Suites of your own: classes of tasks, each with several instances.
 
@@ -268,7 +258,7 @@ def new_suite(
 
     A class is one setting under several seeds, so that a method is judged on a kind of task and not
     on one draw. Studies, leaderboards and --suite accept the file like the name of a suite;
-    leaderboards only if it has no streams. `sme suite FILE` is short for `sme suite new FILE`.
+    leaderboards only if it has no streams.
 
     Examples:
 

@@ -172,9 +172,8 @@ def program_of_graph(
     try:
         for node in nodes:
             operands = [values[name] if name else None for name in node.inputs]
-            result = _OPERATORS[node.operator](build, *operands, **_settings(node))
-            results = result if isinstance(result, list) else [result]
-            values.update(zip(filter(None, node.outputs), results, strict=True))
+            (name,) = node.outputs
+            values[name] = _OPERATORS[node.operator](build, *operands, **node.attributes)
         # The output must be the newest value.
         build.unary("clip", _number(build, values[output]), low=-1e300, high=1e300)
         return build.build()
@@ -190,12 +189,6 @@ _Value = int | npt.NDArray[Any]
 
 _FLOATS = (1, 11)  # TensorProto.FLOAT and DOUBLE
 _UNARY = ("Relu", "Tanh", "Sigmoid", "Softplus", "Erf", "Exp", "Sqrt", "Abs", "Neg")
-
-
-def _settings(node: GraphNode) -> dict[str, Any]:
-    """The attributes of a node; of a Split, how many parts it has as well."""
-    parts = {"parts": len(node.outputs)} if node.operator == "Split" else {}
-    return {**node.attributes, **parts}
 
 
 def _unary(op: str, build: ProgramBuilder, x: Any) -> _Value:
@@ -276,54 +269,9 @@ def _clip(
     return build.unary("clip", _data(x), low=ends[0], high=ends[1])
 
 
-def _pow(build: ProgramBuilder, x: Any, exponent: Any) -> _Value:
-    if _scalar(exponent) != 2.0:
-        raise _UnknownNetwork
-    return build.binary("mul", _data(x), x)
-
-
 def _concat(build: ProgramBuilder, *values: Any, axis: int) -> _Value:
     _check_last(axis)
     return build.concat(*(_number(build, value) for value in values))
-
-
-def _slice(
-    build: ProgramBuilder, x: Any, start: Any, end: Any, axis: Any, step: Any = None
-) -> _Value:
-    _check_last(int(_scalar(axis)))
-    taken = slice(int(_scalar(start)), int(_scalar(end)), 1 if step is None else int(_scalar(step)))
-    return build.columns(_data(x), tuple(range(build.width(x))[taken]))
-
-
-def _gather(build: ProgramBuilder, x: Any, indices: Any, axis: int = 0) -> _Value:
-    _check_last(axis)
-    if isinstance(indices, int) or np.ndim(indices) != 1:
-        raise _UnknownNetwork
-    every = range(build.width(_data(x)))
-    return build.columns(x, tuple(every[i] for i in np.asarray(indices).tolist()))
-
-
-def _split(
-    build: ProgramBuilder,
-    x: Any,
-    lengths: Any = None,
-    axis: int = 0,
-    parts: int = 1,
-    num_outputs: int = 0,
-) -> list[int]:
-    _check_last(axis)
-    width = build.width(_data(x))
-    size = -(-width // parts)
-    sizes = [size] * (parts - 1) + [width - size * (parts - 1)]
-    if lengths is not None:
-        sizes = np.asarray(lengths).tolist()
-    if sum(sizes) != width or min(sizes) < 1:
-        raise _UnknownNetwork
-    ends = np.cumsum(sizes).tolist()
-    return [
-        build.columns(x, tuple(range(end - size, end)))
-        for size, end in zip(sizes, ends, strict=True)
-    ]
 
 
 def _layer_normalization(
@@ -347,7 +295,7 @@ def _transpose(build: ProgramBuilder, x: Any, perm: Sequence[int] = (1, 0)) -> _
     return _matrix(x).T
 
 
-_OPERATORS: dict[str, Callable[..., _Value | list[int]]] = {
+_OPERATORS: dict[str, Callable[..., _Value]] = {
     **{name: partial(_unary, name.lower()) for name in _UNARY},
     **{name: partial(_binary, name.lower()) for name in ("Add", "Sub", "Mul", "Div")},
     "Elu": partial(_leaking, "elu", 1.0),
@@ -360,11 +308,7 @@ _OPERATORS: dict[str, Callable[..., _Value | list[int]]] = {
     "Gemm": _gemm,
     "MatMul": lambda build, x, W: _gemm(build, x, W),
     "Clip": _clip,
-    "Pow": _pow,
     "Concat": _concat,
-    "Slice": _slice,
-    "Gather": _gather,
-    "Split": _split,
     "LayerNormalization": _layer_normalization,
     "Transpose": _transpose,
 }

@@ -9,6 +9,7 @@ Importing this module imports neither PyTorch nor JAX.
 
 from sme_registry.training.record import RunRecord as RunRecord
 from sme_registry.training.record import model_of_cell as model_of_cell
+from sme_registry.training.record import read_episodes as read_episodes
 from sme_registry.training.run import TrainingResult, train
 
 __all__ = [
