@@ -138,9 +138,17 @@ def test_bad_axes_are_refused():
 
 
 WRITTEN = {  # into files that users read, by names that no package exports
-    "evaluation.regions": ("ChannelReport", "Invariance", "LayerProbe", "SafetyScore"),
+    "evaluation.regions": (
+        *("ChannelReport", "Invariance", "LayerProbe", "ObservationReport", "RegionReport"),
+        *("SafetyReport", "SafetyScore"),
+    ),
     "evaluation.report": ("AgentReport",),
-    "datasets.documents": ("Behaviour", "DatasetRecord", "OfflineRecord"),
+    "datasets.documents": (
+        *("BCHyperparameters", "Behaviour", "DatasetRecord", "IQLHyperparameters"),
+        "OfflineRecord",
+    ),
+    "studies.result": ("CellResult",),
+    "training.record": ("RunRecord",),
     "spec.document": ("Document", "StrictModel"),
     "spec.study": ("Cell", "PlannedCell"),
     "spec.catalogue": ("Fingerprint",),
