@@ -379,7 +379,7 @@ def verify(
             progress=lambda what: status.update(f"verifying {escape(what)}"),
         )
     if json:
-        print_json(report.to_dict())
+        print_json({**asdict(report), "is_confirmed": report.is_confirmed})
     else:
         _print_verification(report)
     if not report.is_confirmed:
@@ -393,8 +393,9 @@ def _print_verification(report: VerifyReport) -> None:
         table.add_row(escape(row.what), f"{row.checked:,}", f"{row.unchecked:,}", escape(row.why))
     out().print(table)
     for note in report.notes:
-        path, recorded, here = note.difference
-        line = f"not confirmed here: {note.entry}: {path}: recorded {recorded}, here {here}"
+        found = note.difference
+        line = f"not confirmed here: {note.entry}: {found.path}: recorded {found.recorded}"
+        line += f", here {found.here}"
         out().print(escape(line), soft_wrap=True)
     for digest in report.missing:
         out().print(f"missing: {digest}", soft_wrap=True)

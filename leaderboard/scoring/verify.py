@@ -22,9 +22,9 @@ import re
 import secrets
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from leaderboard.documents.board import BoardDocument, Folder, hex_of
 from leaderboard.documents.result import Result, RunScore
@@ -59,7 +59,8 @@ Progress = Callable[[str], None]
 """Called with what was just checked."""
 
 
-class Row(NamedTuple):
+@dataclass(frozen=True)
+class Row:
     """How much of a kind was checked, how much was not, and why."""
 
     what: str
@@ -68,7 +69,8 @@ class Row(NamedTuple):
     why: str = ""
 
 
-class Difference(NamedTuple):
+@dataclass(frozen=True)
+class Difference:
     """The first value that differs: its path, as in `runs.0.wd_regret`, and both values."""
 
     path: str
@@ -76,7 +78,8 @@ class Difference(NamedTuple):
     here: str
 
 
-class Note(NamedTuple):
+@dataclass(frozen=True)
+class Note:
     """An entry that this machine does not confirm, and the first value that differs."""
 
     entry: str
@@ -111,15 +114,6 @@ class VerifyReport:
     def is_confirmed(self) -> bool:
         """Whether nothing that was checked differs, and nothing that is public is missing."""
         return not self.notes and not self.missing
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data, for JSON."""
-        return {
-            **asdict(self),
-            "rows": [row._asdict() for row in self.rows],
-            "notes": [{"entry": note.entry, **note.difference._asdict()} for note in self.notes],
-            "is_confirmed": self.is_confirmed,
-        }
 
 
 def verify(

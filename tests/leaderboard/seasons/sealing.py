@@ -100,4 +100,4 @@ def signed_request(store, season, key, nonce=0, **fields):
 def replayed(store, published=()):
     """What `verify` finds of the seasons: counts by what was checked, and notes."""
     rows, notes = verify_seasons(store, lambda what: None, published)
-    return {row.what.partition(": ")[2]: row[1:3] for row in rows}, notes
+    return {row.what.partition(": ")[2]: (row.checked, row.unchecked) for row in rows}, notes
