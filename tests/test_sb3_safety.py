@@ -97,12 +97,12 @@ def test_the_multiplier_follows_the_mean_cost_of_the_rollout_down_to_0():
 def test_a_multiplier_lowers_the_cost_and_the_critic_of_costs_learns():
     model = PPOLagrangian(
         "MlpPolicy",
-        lanes(),
+        lanes(8),
         multiplier=20.0,
         multiplier_learning_rate=0.0,
         learning_rate=3e-3,
         gamma=0.5,
-        n_steps=256,
+        n_steps=32,
         n_epochs=5,
         seed=1,
     )
