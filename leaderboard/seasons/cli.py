@@ -16,7 +16,6 @@ from leaderboard.documents.result import Metric
 from leaderboard.errors import Rejection
 from leaderboard.scoring.ranking import RankedRow
 from leaderboard.seasons.events import SeasonRow
-from leaderboard.seasons.master import Master
 from leaderboard.seasons.publication import (
     check_published,
     copy_published,
@@ -26,7 +25,7 @@ from leaderboard.seasons.publication import (
     refuse_large_answers,
     refuse_unrankable,
 )
-from leaderboard.seasons.ranking import (
+from leaderboard.seasons.scoring import (
     EASY,
     by_key,
     counting,
@@ -35,7 +34,7 @@ from leaderboard.seasons.ranking import (
     season_rankings,
     table_regret,
 )
-from leaderboard.seasons.season import Reveal, Terms
+from leaderboard.seasons.season import Master, Reveal, Terms
 from leaderboard.seasons.store import SeasonStore
 from sme_registry.errors import OptionError
 from sme_registry.io import check_new, read_json

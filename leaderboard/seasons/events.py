@@ -11,10 +11,10 @@ from typing import Any, TypeVar
 from leaderboard.documents.signed import Signed
 from leaderboard.errors import Rejection
 from leaderboard.seasons.entry import Entry, SealedManifest, TicketRequest
-from leaderboard.seasons.master import Master
 from leaderboard.seasons.season import (
     MAX_LANES,
     Admitted,
+    Master,
     Reveal,
     SealedResult,
     SealedTrack,
@@ -97,7 +97,7 @@ class SealedRow:
       finished: when it got its result; empty likewise.
       entrant: what rankings need of it. Its `received` is when the ticket started, `runs` the
         number of hidden instances, and `policies` that of answers. `enough_runs` is false:
-        `scoring.season` counts them over all tickets of a method.
+        `scoring` counts them over all tickets of a method.
     """
 
     season: str

@@ -14,7 +14,7 @@ from markupsafe import Markup
 from leaderboard.documents.submission import Knowledge
 from leaderboard.scoring.ranking import REASONS, RankedRow
 from leaderboard.seasons.events import SealedRow, SeasonRow
-from leaderboard.seasons.ranking import OfKey, by_key, counting, season_rankings
+from leaderboard.seasons.scoring import OfKey, by_key, counting, season_rankings
 from leaderboard.seasons.season import SealedResult, Season
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.web import charts

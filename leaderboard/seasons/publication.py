@@ -17,9 +17,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 from leaderboard.errors import BoardError
-from leaderboard.seasons.master import Master
 from leaderboard.seasons.scoring import HiddenTask, challenge, instances
-from leaderboard.seasons.season import MAX_INSTANCES, Digests, Hidden, Season, Terms, rows_of
+from leaderboard.seasons.season import (
+    MAX_INSTANCES,
+    Digests,
+    Hidden,
+    Master,
+    Season,
+    Terms,
+    rows_of,
+)
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.store import Store
 from leaderboard.web.fetch import Files

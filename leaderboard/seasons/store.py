@@ -11,9 +11,9 @@ from leaderboard.documents.signed import Signed
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.seasons.entry import Entry, TicketRequest
 from leaderboard.seasons.events import SEASON_KINDS, SealedRow, SeasonRow, Seasons, unknown_season
-from leaderboard.seasons.master import Master
 from leaderboard.seasons.season import (
     Admitted,
+    Master,
     Reveal,
     SealedResult,
     SealedTrack,

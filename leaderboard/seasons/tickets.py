@@ -30,9 +30,8 @@ from leaderboard.seasons.entry import AllHeads, has_signed
 from leaderboard.seasons.events import SealedRow
 from leaderboard.seasons.instance import Instance, storage
 from leaderboard.seasons.journal import Start, no_steps
-from leaderboard.seasons.master import Master, Place
 from leaderboard.seasons.scoring import HiddenTask, challenge, instances, score_run, sealed_result
-from leaderboard.seasons.season import MAX_LANES, SealedResult, Season
+from leaderboard.seasons.season import MAX_LANES, Master, Place, SealedResult, Season
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.store import Store
 from sme_registry import seasons

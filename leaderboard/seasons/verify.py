@@ -31,11 +31,9 @@ from leaderboard.scoring.verify import (
     with_metrics,
 )
 from leaderboard.seasons.events import SealedRow, SeasonRow
-from leaderboard.seasons.master import Master
 from leaderboard.seasons.publication import check_published, follows, read_season
-from leaderboard.seasons.ranking import counting, scored_entries
-from leaderboard.seasons.scoring import instances, sealed_result
-from leaderboard.seasons.season import SealedResult, Season
+from leaderboard.seasons.scoring import counting, instances, scored_entries, sealed_result
+from leaderboard.seasons.season import Master, SealedResult, Season
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import Ticket, deadline, score_ticket
 

@@ -43,7 +43,7 @@ from leaderboard.seasons.entry import Entry, TicketRequest
 from leaderboard.seasons.events import SeasonRow
 from leaderboard.seasons.instance import Instance
 from leaderboard.seasons.pages import SECTION
-from leaderboard.seasons.ranking import (
+from leaderboard.seasons.scoring import (
     ranking_facts,
 )
 from leaderboard.seasons.store import SeasonStore

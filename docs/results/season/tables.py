@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from leaderboard.seasons.ranking import MOST_ROWS, counting, table_regret
+from leaderboard.seasons.scoring import MOST_ROWS, counting, table_regret
 from leaderboard.seasons.season import SealedResult
 from leaderboard.seasons.store import SeasonStore
 

@@ -9,10 +9,15 @@ from benchmarks.interval_coverage import DISTRIBUTIONS, simulate
 from leaderboard.errors import Rejection
 from leaderboard.scoring.aggregation import failed_run, run_metrics
 from leaderboard.scoring.ranking import rank_ranges
-from leaderboard.seasons.master import Place
-from leaderboard.seasons.ranking import EASY, table_regret
-from leaderboard.seasons.scoring import challenge, instances, score_run, sealed_result
-from leaderboard.seasons.season import read_answers
+from leaderboard.seasons.scoring import (
+    EASY,
+    challenge,
+    instances,
+    score_run,
+    sealed_result,
+    table_regret,
+)
+from leaderboard.seasons.season import Place, read_answers
 from sme_registry import evaluate
 from sme_registry.seasons.wire import pack_table
 from sme_registry.spec import Setting

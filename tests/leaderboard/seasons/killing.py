@@ -17,7 +17,7 @@ import numpy as np
 
 from leaderboard.documents.signed import SigningKey
 from leaderboard.seasons.journal import Journal, Play
-from leaderboard.seasons.master import Master
+from leaderboard.seasons.season import Master
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import Ticket
 from leaderboard.web.server import listen, url_of

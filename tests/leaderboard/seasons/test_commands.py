@@ -9,8 +9,8 @@ import pytest
 
 from leaderboard.cli.options import KEY_VARIABLE
 from leaderboard.documents.signed import SigningKey
-from leaderboard.seasons.master import Master
 from leaderboard.seasons.publication import read_season
+from leaderboard.seasons.season import Master
 from leaderboard.seasons.store import SeasonStore
 from sme_registry.seasons.wire import pack_table, unpack_table
 from tests.leaderboard.conftest import linear_onnx, tiny_board

@@ -9,8 +9,7 @@ import pytest
 import rfc8785
 
 from leaderboard.errors import BoardError
-from leaderboard.seasons.master import Master, Place, Purpose
-from leaderboard.seasons.season import Reveal, Season, Terms
+from leaderboard.seasons.season import Master, Place, Purpose, Reveal, Season, Terms
 from sme_registry import SMESpec
 from sme_registry.errors import SpecError
 

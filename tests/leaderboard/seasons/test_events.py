@@ -5,8 +5,7 @@ import pytest
 from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.scoring.verify import verify
-from leaderboard.seasons.master import Master
-from leaderboard.seasons.season import Reveal
+from leaderboard.seasons.season import Master, Reveal
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.store.log import Clock
 from tests.leaderboard.clocks import AFTERWARDS, move_clock

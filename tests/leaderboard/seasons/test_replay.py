@@ -8,7 +8,7 @@ import pytest
 from leaderboard.errors import TamperedError
 from leaderboard.seasons.journal import Journal, Play, Start
 from leaderboard.seasons.publication import files_of_seasons
-from leaderboard.seasons.ranking import season_rankings
+from leaderboard.seasons.scoring import season_rankings
 from leaderboard.seasons.season import Reveal
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.store.blobs import digest_of

@@ -16,7 +16,6 @@ from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.scoring.aggregation import run_metrics
 from leaderboard.seasons import admission
-from leaderboard.seasons.master import Master
 from leaderboard.seasons.publication import (
     challenge_path,
     check_published,
@@ -28,9 +27,16 @@ from leaderboard.seasons.publication import (
     refuse_large_answers,
     refuse_unrankable,
 )
-from leaderboard.seasons.ranking import by_key, counting, score_entries, season_rankings
-from leaderboard.seasons.scoring import instances, score_run, sealed_result
-from leaderboard.seasons.season import Reveal, Season, Terms
+from leaderboard.seasons.scoring import (
+    by_key,
+    counting,
+    instances,
+    score_entries,
+    score_run,
+    sealed_result,
+    season_rankings,
+)
+from leaderboard.seasons.season import Master, Reveal, Season, Terms
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.verify import verify_seasons
 from sme_registry import materialize

@@ -18,7 +18,7 @@ from leaderboard.seasons.entry import TicketRequest
 from leaderboard.seasons.events import played_bytes
 from leaderboard.seasons.instance import Instance
 from leaderboard.seasons.journal import Journal, Play
-from leaderboard.seasons.master import Master
+from leaderboard.seasons.season import Master
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.tickets import ScoreTicket, Sessions, Ticket
 from leaderboard.store.blobs import to_bytes
