@@ -3,6 +3,7 @@
     SMEError
     ├── Rejection            a submission or an artefact is rejected; has a stable `code`
     ├── BoardError           a folder holds no board, a key is missing, a file is not writable, …
+    │   ├── ClockError           the machine's clock is wrong, so nothing is written
     │   ├── ScoringFault     the machine could not score; says nothing about the submission
     │   └── NotPublishable   the reference rows do not score 0 and 1, so no score is shown
     └── TamperedError        a board's files contradict its signed log; names the first such row
@@ -111,6 +112,10 @@ class Rejection(SMEError):
 
 class BoardError(SMEError):
     """A folder holds no board, a key is missing, or the board cannot be read or written."""
+
+
+class ClockError(BoardError):
+    """The machine's clock is behind the log, or has jumped: nothing is written until it is set."""
 
 
 class ScoringFault(BoardError):

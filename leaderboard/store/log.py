@@ -22,7 +22,7 @@ from pydantic import Field, field_validator
 from leaderboard.documents.board import Folder
 from leaderboard.documents.signed import PlainDocument, Signature, SigningKey, plain_json, verifies
 from leaderboard.documents.submission import UtcTime, now
-from leaderboard.errors import BoardError, TamperedError
+from leaderboard.errors import ClockError, TamperedError
 from leaderboard.store.blobs import MAX_LOG_ENTRY_BYTES, read_document, write_document
 from sme_registry.spec.document import Digest, Integer, SchemaVersion
 
@@ -197,13 +197,13 @@ class Clock:
     def received(self) -> str:
         """The board's time, for what is written or expires."""
         if _seconds(self.last) - time.time() > MOST_BEHIND:
-            raise BoardError(
+            raise ClockError(
                 f"clock={now()}: is behind the log's last entry, of {self.last}. Nothing was "
                 "changed. Set the machine's clock; if it is right, that entry is dated wrongly: "
                 "correct it with `sme-leaderboard clock --correct`."
             )
         if self.offset is not None and abs(clock_offset()[1] - self.offset) > LONGEST_JUMP:
-            raise BoardError(
+            raise ClockError(
                 f"clock={now()}: has jumped since the board was first served. Nothing was changed. "
                 "Set the machine's clock; if it is right, go on with `sme-leaderboard clock`."
             )

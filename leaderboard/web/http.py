@@ -14,7 +14,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from leaderboard.documents.result import RANKED, Metric
-from leaderboard.errors import NotPublishable, Rejection
+from leaderboard.errors import ClockError, NotPublishable, Rejection
 
 HTTP_CODES = {
     "not_found": "nothing exists at this address",
@@ -22,6 +22,7 @@ HTTP_CODES = {
     "not_publishable": "a reference row is missing, waiting or off",
     "bad_request": "the request is invalid",
     "season_not_served": "this server does not have the season's secret, and cannot step its tasks",
+    "clock_wrong": "the server's clock is wrong, and nothing is written until it is set",
     "internal": "the server failed; its log has the details",
 }
 
@@ -52,6 +53,7 @@ STATUSES = {
     "ticket_limit": 429,
     "internal": 500,
     "season_not_served": 503,
+    "clock_wrong": 503,
     "not_publishable": 503,
     "storage_full": 507,
 }
@@ -160,6 +162,9 @@ async def on_http_error(request: Request, error: Exception) -> Response:
 
 async def on_board_error(request: Request, error: Exception) -> Response:
     """The answer where the board publishes nothing; every other fault is logged and hidden."""
+    if isinstance(error, ClockError):
+        _log.error("%s", error)
+        return error_answer(request, "clock_wrong", f"{HTTP_CODES['clock_wrong']}.")
     if not isinstance(error, NotPublishable):
         raise error
     waits = error.waiting and request.app.state.scores

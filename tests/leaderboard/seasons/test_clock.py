@@ -70,7 +70,7 @@ def test_a_clock_set_a_month_ahead_closes_no_season(board, key, monkeypatch):
         signed = put_submission(store, key)
         with served(board) as url:
             set_clocks(monkeypatch, forward=MONTH)
-            assert withdraw(url, store, key, signed) == 500
+            assert withdraw(url, store, key, signed) == 503
             set_clocks(monkeypatch)
             assert withdraw(url, store, key, signed) == 200
             assert board.ticket(url, key).ticket == 1
@@ -106,7 +106,7 @@ def test_a_clock_that_has_jumped_while_serving_is_right_when_the_organiser_says_
     set_clocks(monkeypatch, forward=0.1)
     for _ in range(2):  # a restart of the server alone makes it not right
         with served(board) as url:
-            assert board.send(url, board.request(key, 1), key).status_code == 500
+            assert board.send(url, board.request(key, 1), key).status_code == 503
     with served(board) as url:
         good("clock", "board")
         assert board.ticket(url, key, 1).ticket == 2
