@@ -130,6 +130,7 @@ def test_a_hostile_server_s_words_are_escapes_in_every_command_that_reaches_one(
         "deadline": HOSTILE,
         "lanes": 1,
         "classes": [{"name": "deep", "setting": {}, "instances": 1, "budget": 9}],
+        "signer": {"board": "0" * 64, "request": f"sha256:{'0' * 64}", "key": "1" * 64},
     }
     (folder / "ticket.json").write_text(json.dumps(ticket))
     words = {"code": "quota", "message": f"{HOSTILE}\nerror: forged"}
