@@ -1,4 +1,4 @@
-"""Trainers work in hidden tasks as they do in others: SB3's, this project's, a loop of one file."""
+"""Trainers work in hidden tasks as they do in others: SB3's, this project's, and the page's."""
 
 import re
 import shlex
@@ -6,12 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from stable_baselines3 import PPO
-from stable_baselines3.common.monitor import Monitor
 from typer.testing import CliRunner
 
-from examples import cleanrl_style_ppo as cleanrl
 from leaderboard.cli import app
 from sme_registry import seasons
 from sme_registry.errors import OptionError, SealedError
@@ -86,32 +82,6 @@ def test_this_project_s_trainers_learn_and_their_models_answer(server, algorithm
     assert server.answers(0).shape == (ROWS, 2)
     with pytest.raises(SealedError, match="instance_phase"):  # no more steps after the answers
         model.learn(64)
-
-
-def test_sb3_takes_the_single_environment(server):
-    env = Monitor(seasons.make(server.url, server.ticket, 1, action_range="symmetric"))
-    PPO("MlpPolicy", env, n_steps=16, batch_size=16, n_epochs=1, device="cpu").learn(16)
-    assert env.unwrapped.instance.number == 16
-
-
-def test_a_loop_of_one_file_learns(server, monkeypatch):
-    monkeypatch.setattr(cleanrl, "ENVS", 4)
-    monkeypatch.setattr(cleanrl, "ROLLOUT", 16)
-    torch.manual_seed(0)
-    env = seasons.make_vec(server.url, server.ticket, 0, cleanrl.ENVS, action_range="symmetric")
-    agent = cleanrl.Agent(env.single_observation_space.shape[0], env.single_action_space.shape[0])
-    optimiser = torch.optim.Adam(agent.parameters(), lr=1e-3)
-    before = agent.mean_actions(env.reset(seed=0)[0])
-    observations, rollout = env.reset()[0], []
-    for _ in range(cleanrl.ROLLOUT):
-        with torch.no_grad():
-            actions = agent.distribution(torch.as_tensor(observations)).sample().numpy()
-        following, rewards, terminated, truncated, _ = env.step(actions.clip(-1, 1))
-        rollout.append((observations, actions, rewards, terminated | truncated))
-        observations = following
-    cleanrl.learn(agent, optimiser, rollout, observations)
-    assert not np.array_equal(agent.mean_actions(env.reset()[0]), before)
-    seasons.answer(server.url, server.ticket, agent.mean_actions, 0, action_range="symmetric")
 
 
 def test_the_page_on_seasons_leads_from_a_ticket_to_its_end(server, tmp_path, monkeypatch):

@@ -6,20 +6,17 @@ import numpy as np
 import pytest
 
 from benchmarks.interval_coverage import DISTRIBUTIONS, simulate
-from leaderboard.errors import Rejection
 from leaderboard.scoring.aggregation import failed_run, run_metrics
 from leaderboard.scoring.ranking import rank_ranges
 from leaderboard.seasons.scoring import (
-    EASY,
     challenge,
     instances,
     score_run,
     sealed_result,
     table_regret,
 )
-from leaderboard.seasons.season import Place, read_answers
+from leaderboard.seasons.season import Place
 from sme_registry import evaluate
-from sme_registry.seasons.wire import pack_table
 from sme_registry.spec import Setting
 from tests.leaderboard.seasons.sealing import MASTER, tiny_season
 
@@ -58,9 +55,6 @@ def test_a_constant_policy_has_no_decay_and_a_run_without_a_policy_loses_all_poi
         "regret_slope": 1.0,
         "similarity_loss": 100.0,
     }
-
-
-# Over runs
 
 
 # Intervals
@@ -118,42 +112,16 @@ def test_answers_score_what_their_policy_scores():
     assert "numpy" in versions
 
 
-def test_the_order_of_answers_matters_and_each_is_used_once():
-    shown = challenge(FIRST.spec, FIRST.protocol)
-    right, _ = score_run(FIRST, policy(shown), None)
-    wrong, _ = score_run(FIRST, policy(shown)[::-1], None)
-    assert wrong.wd_regret != right.wd_regret
-    with pytest.raises(ValueError, match="301 answers to 300 challenge states"):
-        score_run(FIRST, np.zeros((301, 1), np.float32), None)
-
-
 def test_tasks_and_states_are_an_instances_own_and_a_tickets():
     others = instances(SEASON, MASTER, "2", "a" * 64)
     everyone = [FIRST, SECOND, *others, *instances(SEASON, MASTER, "1", "b" * 64)]
     assert len({each.spec.digest for each in everyone}) == 6
     assert len({each.protocol.seed for each in everyone}) == 6
-    text = repr([FIRST, SECOND])  # shows no secret
-    assert str(FIRST.spec.seed)[2:] not in text
-    assert str(FIRST.protocol.seed) not in text
     assert FIRST.place == Place(SEASON.id, "deep", 0, "1", "a" * 64)
     [again, _] = instances(SEASON, MASTER, "1", "a" * 64)
     np.testing.assert_array_equal(
         challenge(again.spec, again.protocol), challenge(FIRST.spec, FIRST.protocol)
     )
-
-
-def test_wrong_answers_are_refused():
-    tables = [
-        (pack_table(np.zeros((299, 1))), "answer_shape"),
-        (pack_table(np.zeros((300, 2))), "answer_shape"),
-        (b"\x93NUMPY garbage", "answer_shape"),
-        (pack_table(np.full((300, 1), np.nan)), "answer_not_finite"),
-        (pack_table(np.full((300, 1), np.inf)), "answer_not_finite"),
-    ]
-    for data, code in tables:
-        with pytest.raises(Rejection) as error:
-            read_answers(data, FIRST.spec, FIRST.protocol)
-        assert error.value.code == code
 
 
 def test_a_result_averages_instances_and_an_unanswered_one_scores_1():
@@ -172,11 +140,6 @@ def test_a_result_averages_instances_and_an_unanswered_one_scores_1():
 
 def setting(state_dim):
     return Setting(state_dim=state_dim, action_dim=1, complexity=5, hidden_width=16)
-
-
-def test_few_state_channels_are_filled_by_a_table_and_many_are_not():
-    one, eight = table_regret(setting(1), 1000), table_regret(setting(8), 1000)
-    assert one < 0.01 < EASY < 0.2 < eight < 0.6
 
 
 def test_more_rows_make_a_better_table_and_one_row_is_enough():

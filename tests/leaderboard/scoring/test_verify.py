@@ -136,8 +136,6 @@ def test_invalid_options_and_a_missing_board_are_not_tampering(tmp_path):
     for text in ("", "3f2a", "sha256:" + "x" * 64):
         with pytest.raises(OptionError, match="contains="):
             verify(tmp_path, contains=text)
-    with pytest.raises(BoardError, match="contains no board"):
-        verify(tmp_path)
     with pytest.raises(OptionError, match="rescore=-1"):
         verify(tmp_path, rescore=-1)
     with pytest.raises(OptionError, match="seed=-1"):

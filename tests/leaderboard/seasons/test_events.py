@@ -77,26 +77,12 @@ def test_a_season_is_played_from_its_announcement_to_its_results_and_reindexed(s
     assert missing.startswith("sha256:aa")
 
 
-def test_nothing_in_the_index_or_the_log_is_secret_before_the_reveal(store, key):
-    season = tiny_season(ONLINE)
-    store.announce(season)
-    store.start_ticket(signed_request(store, season, key))
-    secrets = {MASTER.raw.hex(), repr(MASTER.raw)}
-    with store.reading() as index:
-        text = "\n".join(index.connection.iterdump())
-    files = [path.read_text() for path in store.folder.path.rglob("*.json")]
-    for content in (text, *files):
-        assert not any(secret in content for secret in secrets)
-
-
 def test_the_same_request_is_the_same_ticket_and_another_the_next(store, key):
     season = tiny_season(ONLINE)
     store.announce(season)
     first = signed_request(store, season, key, 1)
     assert [store.start_ticket(first) for _ in range(2)] == [1, 1]
     assert store.start_ticket(signed_request(store, season, key, 2)) == 2
-    with pytest.raises(Rejection, match="ticket_limit"):
-        store.start_ticket(signed_request(store, season, key, 3))
     other = SigningKey.generate()
     assert store.start_ticket(signed_request(store, season, other, 3)) == 3
     result = failed_result(season, first.id)
@@ -218,18 +204,6 @@ def test_an_altered_document_of_a_season_is_named(store, key, later):
         assert error.value.where == path.relative_to(store.folder.path).as_posix()
         path.write_text(text)
     SeasonStore.open(store.folder.path, read_only=True).close()
-
-
-def test_an_entrants_name_is_nobody_elses_and_no_entry_is_ranked_before_the_reveal(store, key):
-    season, ada = tiny_season(), {"name": "Ada", "key": key.public}
-    store.announce(season)
-    entry = signed_entry(store, season, key, [None, None], submitter=ada)
-    store.enter(entry)
-    assert store.holder_of_name("ADA") == key.public
-    before = store.head
-    with pytest.raises(Rejection, match="season_not_closed"):  # nothing is ranked before the reveal
-        store.rank(failed_result(season, entry.id))
-    assert store.head == before
 
 
 def test_what_processes_that_die_write_of_seasons_is_logged_or_not(tmp_path, key, later):

@@ -36,14 +36,6 @@ def written(path, count):
         journal.append(actions(number))
 
 
-def test_a_journal_gives_back_what_was_added(tmp_path):
-    written(tmp_path / "0", 5)
-    journal = Journal.open(tmp_path / "0")
-    assert (journal.lanes, journal.action_dim) == (LANES, A)
-    assert (journal.requests, journal.steps, journal.ended) == (5, 15, False)
-    assert contents(journal) == [actions(number) for number in range(1, 6)]
-
-
 def test_a_torn_record_is_cut_off_and_the_next_one_takes_its_place(tmp_path):
     for extra in range(RECORD):
         path = tmp_path / str(extra)
@@ -173,7 +165,7 @@ def test_another_file_is_no_journal_and_a_journal_is_never_replaced(tmp_path):
     assert Journal.open(tmp_path / "1").requests == 1
 
 
-SPEC = SMESpec(state_dim=3, action_dim=2, complexity=5, horizon=4, seed=12)
+SPEC = SMESpec(state_dim=3, action_dim=2, complexity=5, horizon=3, k=2, D=0.1, seed=12)
 START = Start(SPEC, 5, Chain(request="sha256:" + "0" * 64, ticket=1, instance=0))
 
 
@@ -193,24 +185,30 @@ def measured(actions, budget):
 
 
 def regrets(actions):
-    """The regret of a single lane's actions, and of ½ in the same states, `[requests, 2]`."""
-    env, rows = SMEEnv(SPEC), []
-    env.reset(seed=START.seed)
-    for each in actions[:, 0]:
-        half = env.task.regret(env.state, np.full(2, 0.5))
-        *_, terminated, truncated, info = env.step(each)
-        rows.append((info["regret"], half))
-        if terminated or truncated:
-            env.reset()
-    return np.array(rows)
+    """The regret of the actions of all lanes, and of ½ in the same states, `[requests, 2]`."""
+    rows, ends = np.zeros((len(actions), 2)), set()
+    for lane in range(actions.shape[1]):
+        env = SMEEnv(SPEC)
+        env.reset(seed=START.seed + lane)
+        for row, each in zip(rows, actions[:, lane], strict=True):
+            half = env.task.regret(env.state, np.full(2, 0.5))
+            *_, terminated, truncated, info = env.step(each)
+            row += info["regret"], half
+            ends.add((terminated, truncated))
+            if terminated or truncated:
+                env.reset()
+    return rows, ends
 
 
-@pytest.mark.parametrize(("taken", "budget"), [(250, 250), (130, 250), (5, 8)])
-def test_the_curve_has_the_regret_of_each_part_relative_to_the_constant(taken, budget):
-    """Steps that were not taken count like the constant's."""
-    actions = np.random.default_rng(1).random((taken, 1, 2), dtype=np.float32)
-    result = measured(actions, budget)
-    rows, parts = regrets(actions), min(budget, 100)
+@pytest.mark.parametrize(
+    ("taken", "budget", "lanes"), [(250, 250, 1), (130, 250, 1), (5, 8, 1), (130, 250, 3)]
+)
+def test_the_curve_has_the_regret_of_each_part_relative_to_the_constant(taken, budget, lanes):
+    """As in single environments; steps that were not taken count like the constant's."""
+    actions = np.random.default_rng(1).random((taken, lanes, 2), dtype=np.float32) * 1.2 - 0.1
+    result = measured(actions, budget * lanes)
+    (rows, ends), parts = regrets(actions), min(budget, 100)
+    assert taken < 100 or {(False, False), (True, False), (False, True)} <= ends
     part = np.arange(budget) * parts // budget
     curve = np.ones(parts)
     for number in range(parts):
@@ -222,7 +220,7 @@ def test_the_curve_has_the_regret_of_each_part_relative_to_the_constant(taken, b
     ratio = rows[:, 0].sum() / rows[:, 1].sum()
     expected = (taken * ratio + budget - taken) / budget
     assert result.normalised_online_regret == pytest.approx(expected, rel=1e-12)
-    assert result.steps == taken
+    assert result.steps == taken * lanes
 
 
 def test_the_constant_has_a_regret_of_one_with_any_lanes_and_without_a_start():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from leaderboard.errors import TamperedError
-from leaderboard.seasons.journal import Journal, Play, Start
+from leaderboard.seasons.journal import Journal
 from leaderboard.seasons.publication import files_of_seasons
 from leaderboard.seasons.scoring import season_rankings
 from leaderboard.seasons.season import Reveal
@@ -14,10 +14,7 @@ from leaderboard.seasons.store import SeasonStore
 from leaderboard.store.blobs import digest_of
 from leaderboard.store.log import Clock
 from leaderboard.web.fetch import fetch
-from sme_registry import SMESpec
-from sme_registry.envs import SMEEnv
 from sme_registry.seasons import wire
-from sme_registry.seasons.transcript import Chain
 from tests.leaderboard.clocks import AFTERWARDS, move_clock
 from tests.leaderboard.seasons.playing import LANES, ROWS, online_board, playing, request, scored
 from tests.leaderboard.seasons.sealing import MASTER, moment, replayed, signed_request
@@ -259,38 +256,3 @@ def test_a_ticket_that_ended_early_without_the_entrant_s_end_is_found(tmp_path, 
         logged(monkeypatch, AFTERWARDS, played.store, *reveal(played.board))
         with pytest.raises(TamperedError, match="without the entrant's end: must not be before"):
             replayed(played.store)
-
-
-SPEC = SMESpec(state_dim=3, action_dim=2, complexity=5, horizon=3, k=2, D=0.1, seed=11)
-SEED = 2**255 + 3
-START = Start(SPEC, SEED, Chain(request="sha256:" + "0" * 64, ticket=1, instance=0))
-
-
-def test_steps_and_regret_are_those_of_single_environments():
-    form, play = wire.StepFormat(3, 3, 2), Play(START, 3, 180)
-    singles = [SMEEnv(SPEC) for _ in range(3)]
-    first = np.stack([env.reset(seed=SEED + lane)[0] for lane, env in enumerate(singles)])
-    assert play.started == form.pack(0, first)
-    random = np.random.default_rng(1)
-    seen = set()
-    ratios = []
-    for number in range(1, 61):
-        actions = random.random((3, 2), dtype=np.float32) * 1.2 - 0.1
-        regret = half = 0.0
-        expected = []
-        for lane, env in enumerate(singles):
-            half += float(env.task.regret(env.state, np.full(2, 0.5)))
-            observation, reward, terminated, truncated, info = env.step(actions[lane])
-            regret += info["regret"]
-            last = np.zeros(5, np.float32)
-            if terminated or truncated:
-                last, observation = observation, env.reset()[0]
-            expected.append((observation, np.float32(reward), terminated, truncated, last))
-            seen.add((terminated, truncated))
-        steps = form.unpack_steps(play.take(form.pack(number, actions)))
-        for got, wanted in zip(steps, zip(*expected, strict=True), strict=True):
-            np.testing.assert_array_equal(got, wanted)
-        ratios.append(regret / half)
-    play.sign()
-    np.testing.assert_allclose(play.stepping.learning_curve, ratios, rtol=1e-12)
-    assert {(False, False), (True, False), (False, True)} <= seen

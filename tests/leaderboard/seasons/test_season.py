@@ -187,13 +187,6 @@ def test_answers_must_fit_a_board_and_somebody_must_be_able_to_have_a_rank():
         refuse_unrankable(tiny_terms("sealed-online"), 5)
 
 
-def test_a_plan_with_a_fault_is_refused_and_leaves_no_folder(tmp_path):
-    for fields in ({"classes": None}, {"classes": [{"name": "deep"}]}, {"track": "open"}):
-        with pytest.raises(SMEError):
-            create_season(read_plan({**plan(), **fields}), MASTER, tmp_path / "new")
-    assert not any(tmp_path.iterdir())
-
-
 def test_the_plan_in_the_documentation_is_one():
     page = (Path(__file__).parents[3] / "docs" / "guides" / "seasons.md").read_text()
     [text] = re.findall(r"```json\n(.*?)```", page, re.S)

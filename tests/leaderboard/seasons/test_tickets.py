@@ -181,9 +181,13 @@ def test_phases_follow_each_other(played):
 def test_answers_have_one_form(played):
     played.finish()
     wide = np.full((ROWS, 2), 0.5)
-    for table in (HALF[1:], wide, b"", pickle.dumps(HALF), pack_table(HALF) + b"\0"):
+    whole = pack_table(HALF)
+    for table in (HALF[1:], wide, b"", pickle.dumps(HALF), whole[:-1], whole + b"\0"):
         refused("answer_shape", played.answer, table)
-    refused("answer_not_finite", played.answer, HALF * np.nan)
+    for last in (np.nan, np.inf, -np.inf):
+        table = HALF.copy()
+        table[-1] = last
+        refused("answer_not_finite", played.answer, table)
     assert played.answer(HALF)
 
 
