@@ -123,12 +123,6 @@ def test_unranked_entries_have_a_reason_and_take_no_rank():
     ]
 
 
-def test_entries_that_may_not_have_learned_have_no_rank_by_ood_decay():
-    unsure, sure = entry(3, scores(0.46, 0.46)), entry(4, scores(0.45, 0.6))
-    assert ranks("ood_decay", unsure, sure) == [(3, None, None, "not_learned"), (4, 1, 1, "")]
-    assert [row[1] for row in ranks("wd_regret", unsure, sure)] == [1, 1]
-
-
 # By decay, sabotage inside the cube wins nothing
 
 

@@ -1,6 +1,5 @@
 """`score_submission`: numbers, flags and rejections of real policies in the sandbox."""
 
-import glob
 import hashlib
 import os
 import signal
@@ -13,7 +12,7 @@ import pytest
 from onnx import numpy_helper
 
 from leaderboard.documents.board import BoardDocument
-from leaderboard.documents.result import METRICS, Result
+from leaderboard.documents.result import METRICS
 from leaderboard.documents.signed import SigningKey
 from leaderboard.documents.submission import Submission
 from leaderboard.errors import BoardError
@@ -25,6 +24,7 @@ from sme_registry import EvaluationProtocol, SMESpec, evaluate
 from sme_registry.io import sha256_of
 from sme_registry.spec import Suite
 from tests.leaderboard.gate import models
+from tests.leaderboard.gate.test_sandbox import children
 
 KEY = SigningKey.generate()
 SUITE = Suite.from_dict(
@@ -158,16 +158,6 @@ def test_a_result_is_the_same_each_time_whatever_else_is_loaded(monkeypatch):
     assert first == again
     assert {"sme_registry", "python", "numpy", "onnxruntime"} <= set(first.versions)
     assert first.versions["onnxruntime"] == metadata.version("onnxruntime")
-
-
-def test_a_result_records_the_isolation_and_reads_back(scored):
-    result = scored[0]
-    assert result.isolation == available_isolation()
-    plain = result.to_dict()
-    assert Result.from_dict(plain) == result
-    assert [("actions" in run) for run in plain["runs"]] == [True, False, True]
-    del plain["isolation"]  # fields younger than the first results are left out at their defaults
-    assert "isolation" not in Result.from_dict(plain).to_dict()
 
 
 def test_failed_and_unlisted_runs_score_one(scored):
@@ -328,20 +318,12 @@ def test_errors_of_the_scorer_do_not_reject_the_submission(error):
         score(LINEAR, board=ONE, progress=stop)
 
 
-def children():
-    children = []
-    for path in glob.glob(f"/proc/{os.getpid()}/task/*/children"):
-        with open(path) as stream:
-            children += [int(child) for child in stream.read().split()]
-    return children
-
-
 @pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="finds its children in /proc")
 def test_a_sandbox_ended_from_outside_does_not_reject_the_submission():
-    before = set(children())
+    before = children()
 
     def end_it(done, total):
-        for child in set(children()) - before:
+        for child in children() - before:
             os.kill(child, signal.SIGKILL)
 
     with pytest.raises(BoardError, match="not caused by the model"):

@@ -24,8 +24,6 @@ from leaderboard.store import Queue, Store
 from sme_registry.errors import MissingDependencyError, OptionError
 from tests.leaderboard.conftest import (
     document_path,
-    linear_onnx,
-    put_policy,
     put_submission,
     tiny_board,
 )
@@ -63,19 +61,6 @@ def raising(error):
         raise error
 
     return fails
-
-
-def test_a_scorer_empties_the_queue_and_returns(store, key, submit):
-    invalid = put_policy(store, key, linear_onnx(0, observation_dim=9))
-    valid = submit(1)
-    seen = []
-    path = store.folder.path
-    assert run_scorer(path, progress=lambda done, total: seen.append((done, total))) == 2
-    assert store.entry(valid.id).status == "scored"
-    assert store.entry(invalid.id).code == "onnx_interface"
-    assert run_scorer(path) == 0
-    states = 6 * store.document.protocol.states_per_region
-    assert seen[-1] == (states, states)
 
 
 FAULTS = [

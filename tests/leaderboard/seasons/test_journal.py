@@ -7,7 +7,7 @@ import os
 import numpy as np
 import pytest
 
-from leaderboard.errors import BoardError, TamperedError
+from leaderboard.errors import TamperedError
 from leaderboard.seasons.journal import Journal, Play, Start, no_steps
 from sme_registry import SMESpec
 from sme_registry.envs import SMEEnv
@@ -75,21 +75,6 @@ def test_what_is_known_to_be_whole_is_not_read_again_unless_it_was_lost(tmp_path
     journal.append(actions(4))
     assert list(journal.bodies(2, 3)) == [(3).to_bytes(8, "little") + actions(3)]
     assert contents(Journal.open(tmp_path / "0")) == [actions(n) for n in range(1, 5)]
-
-
-def test_an_ended_journal_stays_ended_and_accepts_nothing(tmp_path):
-    path = tmp_path / "0"
-    written(path, 2)
-    journal = Journal.open(path)
-    journal.end()
-    journal.end()
-    size = path.stat().st_size
-    with pytest.raises(BoardError, match="accepts no such record"):
-        journal.append(actions(3))
-    journal = Journal.open(path)
-    assert journal.ended
-    assert path.stat().st_size == size == HEADER + 3 * RECORD
-    assert contents(journal) == [actions(1), actions(2)]
 
 
 @pytest.mark.parametrize("written_before", [0, 1, RECORD - 1])

@@ -166,6 +166,8 @@ def test_phases_follow_each_other(played):
     played.finish()
     played.finish()
     refused("instance_phase", played.step, 2)
+    played.kill()
+    refused("instance_phase", played.step, 2)
     played.restart()
     refused("instance_phase", played.step, 2)
     assert len(unpack_table(played.open().challenge(), 4)) == ROWS
