@@ -57,17 +57,6 @@ def test_the_answer_to_start_arrives_and_has_one_size():
             FORMAT.unpack_start(other)
 
 
-def test_numbers_and_actions_arrive_from_double_precision_too():
-    body = FORMAT.pack(9, random(LANES, A).astype(np.float64))
-    number, actions = FORMAT.unpack_request(body)
-    assert (number, len(body)) == (9, FORMAT.request_bytes)
-    assert actions.dtype == np.float32
-    assert np.array_equal(actions, random(LANES, A))
-    for other in (b"", body + b"\0"):
-        with pytest.raises(WireError, match=f"must have {FORMAT.request_bytes}"):
-            FORMAT.unpack_request(other)
-
-
 def test_the_bytes_of_a_request_are_little_endian():
     body = StepFormat(1, S, 1).pack(1, np.array([[0.5]]))
     assert body == b"\1\0\0\0\0\0\0\0\0\0\0\x3f"

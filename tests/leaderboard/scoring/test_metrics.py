@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from benchmarks.interval_coverage import DISTRIBUTIONS, simulate
-from leaderboard.scoring.aggregation import failed_run, run_metrics
+from leaderboard.scoring.aggregation import run_metrics
 from leaderboard.scoring.ranking import rank_ranges
 from leaderboard.seasons.scoring import (
     challenge,
     instances,
     score_run,
-    sealed_result,
     table_regret,
 )
 from leaderboard.seasons.season import Place
@@ -115,17 +114,6 @@ def test_tasks_and_states_are_an_instances_own_and_a_tickets():
     np.testing.assert_array_equal(
         challenge(again.spec, again.protocol), challenge(FIRST.spec, FIRST.protocol)
     )
-
-
-def test_a_result_averages_instances_and_an_unanswered_one_scores_1():
-    run, versions = score_run(FIRST, policy(challenge(FIRST.spec, FIRST.protocol)), None)
-    failed, _ = score_run(SECOND, None, None)
-    assert failed == failed_run(SEASON.protocol, "deep", None)
-    result = sealed_result(SEASON, "sha256:" + "2" * 64, [run, failed], versions, 100)
-    assert result.scores.wd_regret.value == pytest.approx((run.wd_regret + 1) / 2)
-    low, high = result.scores.wd_regret.ends
-    assert low < result.scores.wd_regret.value < high
-    assert [member.runs for member in result.classes] == [2]
 
 
 # A table of the nearest states

@@ -545,6 +545,9 @@ def test_what_was_not_answered_scores_one(played):
     assert result is not None
     assert result.runs[0].wd_regret < 1e-6
     assert result.runs[1].wd_regret == result.runs[1].ood_decay == 1.0
+    assert result.scores.wd_regret.value == pytest.approx(0.5, abs=1e-6)
+    low, high = result.scores.wd_regret.ends
+    assert low < 0.5 < high
     assert [each.steps for each in result.stepping] == [LANES, 0]
     assert result.stepping[1].normalised_online_regret == 1.0
     assert all(run.spec is run.evaluation_seed is None for run in result.runs)
