@@ -149,13 +149,6 @@ def _renamed(file: StudyFile, plan: StudyPlan, suffix: str) -> StudyFile:
     return file.model_copy(update={"name": name, "plan": plan, "digest": plan.digest})
 
 
-def first_places(cells: Iterable[PlannedCell]) -> dict[str, PlannedCell]:
-    places: dict[str, PlannedCell] = {}
-    for planned in cells:
-        places.setdefault(planned.cell.digest, planned)
-    return places
-
-
 def selected(cells: Iterable[PlannedCell], only: Sequence[str] = ()) -> tuple[PlannedCell, ...]:
     """The cells that match."""
     cells = tuple(cells)
