@@ -27,8 +27,6 @@ from sme_registry.task.task import (
     ACTIONS,
     NUMBERS,
     REWARD,
-    ROWS,
-    ROWS_WITH_SAFETY,
     Array,
     Indices,
     Observation,
@@ -46,9 +44,13 @@ class StepColumns(NamedTuple):
 
     @classmethod
     def of(cls, spec: SMESpec) -> StepColumns:
-        rows, actions = (ROWS, 1) if spec.safety is None else (ROWS_WITH_SAFETY, len(ACTIONS))
-        numbers = {name: row for row, name in enumerate(NUMBERS[:rows]) if row != REWARD}
-        return cls(rows, numbers, ACTIONS[:actions])
+        def has(field: str) -> bool:
+            return not field or getattr(spec, field) is not None
+
+        rows = {name: row for row, (name, field) in enumerate(NUMBERS.items()) if has(field)}
+        actions = tuple(name for name, field in ACTIONS.items() if has(field))
+        numbers = {name: row for name, row in rows.items() if row != REWARD}  # infos have no reward
+        return cls(max(rows.values()) + 1, numbers, actions)
 
     def at_reset(self, width: int) -> dict[str, Any]:
         """The info of a reset: NaN for every key, those of actions as fresh arrays `[width]`."""

@@ -29,11 +29,11 @@ from sme_registry.task.task import (
     BUFFER_STATE,
     BUFFER_T,
     BUFFER_VALUES,
+    NUMBERS,
     OWN_DISTRACTORS,
     OWN_DRAWN,
     OWN_KEY,
     REWARD,
-    ROWS_WITH_SAFETY,
     Array,
     Indices,
     Mask,
@@ -220,7 +220,7 @@ def _numpy_engine(task: Task) -> Engine:
             return 0.0, -1.0
         s, own = buffer[BUFFER_STATE : BUFFER_STATE + S, None], buffer[BUFFER_STATE + S :, None]
         t = buffer[[BUFFER_T]].astype(np.int64)
-        values, ends = np.zeros((ROWS_WITH_SAFETY, 1, 1)), np.empty((2, 1), dtype=bool)
+        values, ends = np.zeros((len(NUMBERS), 1, 1)), np.empty((2, 1), dtype=bool)
         accumulated = buffer[[BUFFER_VALUES + ACCUMULATED_REWARD], None]
         if not step_many(
             s, t, accumulated, own, action.astype(np.float64)[None], s,

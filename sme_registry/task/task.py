@@ -61,21 +61,26 @@ Mask: TypeAlias = npt.NDArray[np.bool_]
 Indices: TypeAlias = npt.NDArray[np.int64]
 """Indices of environments, or a count for each of them."""
 
-NUMBERS = (
-    "similarity", "step_reward", "regret", "reward", "accumulated_reward",
-    "cost", "safe_regret",  # of tasks with safety
-)  # fmt: skip
-"""What one step computes for n agents in B environments: the rows of `values` `[5 or 7, n, B]`."""
+NUMBERS = {
+    "similarity": "",
+    "step_reward": "",
+    "regret": "",
+    "reward": "",
+    "accumulated_reward": "",
+    "cost": "safety",
+    "safe_regret": "safety",
+}
+"""What one step computes for n agents in B environments, the rows of `values` `[5 or 7, n, B]`; and
+the field of the spec without which a task has no such number."""
 SIMILARITY, STEP_REWARD, REGRET, REWARD, ACCUMULATED_REWARD, COST, SAFE_REGRET = range(len(NUMBERS))
-ROWS, ROWS_WITH_SAFETY = COST, len(NUMBERS)
 
-ACTIONS = ("optimal_action", "limit", "safe_action")
-"""The rows of `actions` `[1 or 3, B, A]`; only π* without safety."""
+ACTIONS = {"optimal_action": "", "limit": "safety", "safe_action": "safety"}
+"""The rows of `actions` `[1 or 3, B, A]`, likewise."""
 
 # A single environment is one buffer: t, the values of its last step, of which it keeps r_cum, the
 # state s `[S]`, and its own distractors: the key of their random numbers, how many it has drawn,
 # and d `[m]`.
-BUFFER_T, BUFFER_VALUES, BUFFER_STATE = 0, 1, 1 + ROWS_WITH_SAFETY
+BUFFER_T, BUFFER_VALUES, BUFFER_STATE = 0, 1, 1 + len(NUMBERS)
 OWN_KEY, OWN_DRAWN, OWN_DISTRACTORS = range(3)
 
 _LARGEST = 1e300  # beyond it W s could overflow, and π* be NaN

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sme_registry.task.task import BUFFER_STATE, BUFFER_VALUES, REWARD, ROWS
+from sme_registry.task.task import BUFFER_STATE, BUFFER_VALUES, COST, REWARD
 
 
 @dataclass
@@ -43,7 +43,7 @@ class Lane:
         if end < 0:
             return None
         state = self.numbers[BUFFER_STATE : BUFFER_STATE + S].copy()
-        values = self.numbers[BUFFER_VALUES : BUFFER_VALUES + ROWS].tolist()
+        values = self.numbers[BUFFER_VALUES : BUFFER_VALUES + COST].tolist()
         assert values[REWARD] == reward
         return Result(state, observation, optimal, *values, end in (1.0, 3.0), end >= 2.0)
 
