@@ -69,13 +69,10 @@ def test_an_episode_that_terminates_at_the_horizon_is_not_cut(server, monkeypatc
     assert [info["TimeLimit.truncated"] for info in infos] == [False, True, False]
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "settings"),
-    [("PPO", {"n_steps": 16, "batch_size": 64, "n_epochs": 1}), ("SAC", {"learning_starts": 48})],
-)
-def test_this_project_s_trainers_learn_and_their_models_answer(server, algorithm, settings):
+def test_this_project_s_trainers_learn_and_their_models_answer(server):
     env = SealedVecEnv(server.url, server.ticket, 0, 4)
-    model = new_model(algorithm, env, seed=0, steps=64, hyperparameters=settings)
+    settings = {"learning_starts": 48}
+    model = new_model("SAC", env, seed=0, steps=64, hyperparameters=settings)
     model.learn(64)
     assert env.instance.number == 16
     seasons.answer(server.url, server.ticket, model, 0)

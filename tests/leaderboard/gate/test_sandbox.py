@@ -87,19 +87,6 @@ def code_of(found, limits=LIMITS, rows=8):
     return caught.value.code
 
 
-def test_actions_are_those_of_the_network(isolation):
-    import onnxruntime
-
-    o = observations(100)
-    with opened(linear()) as policy:
-        assert policy.isolation == isolation
-        assert policy.runtime == onnxruntime.__version__
-        a = policy(o)
-    W = np.random.default_rng(0).normal(size=(OBSERVATION, ACTION)).astype(np.float32)
-    assert a.dtype == np.float32
-    np.testing.assert_allclose(a, o @ W, atol=1e-6)
-
-
 def test_batches_of_every_size_are_answered_in_order_and_others_refused():
     with opened(squashed([node("Identity", "y", "a")])) as policy:
         assert policy(observations(0)).shape == (0, ACTION)

@@ -110,12 +110,6 @@ def test_a_copy_that_differs_only_outside_the_cube_is_refused():
     assert refused(policy(ORIGINAL), other_outside)
 
 
-def test_the_same_policy_on_another_instance_is_no_repetition():
-    behaviours = Behaviours(PROTOCOL, "one")
-    for spec in (SPEC, plane(complexity=2)):
-        behaviours.observe("runs.0", spec, policy(ORIGINAL))
-
-
 def test_near_optimal_copies_are_refused_and_near_optimal_networks_are_not():
     assert refused(OPTIMUM, lambda o: OPTIMUM(o) + FLOOR / 2)
     wave = [lambda o, k=k: OPTIMUM(o) + 2e-3 * np.sin(9 * o[:, :2] + k) for k in range(3)]

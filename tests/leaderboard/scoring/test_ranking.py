@@ -16,14 +16,12 @@ from leaderboard.scoring.ranking import ranking, refuse_unpublishable, supersede
 from leaderboard.store import Copies, EntryRow
 from leaderboard.web.tables import RankingFile
 from sme_registry import EvaluationProtocol
-from sme_registry.spec import Suite
+from tests.leaderboard.conftest import tiny_suite
 
 BOARD = BoardDocument(
     title="Small",
     suite_name="small_suite-v1",
-    suite=Suite.from_dict(
-        {"classes": [{"name": "a", "setting": {"state_dim": 2, "action_dim": 1}, "seeds": [0]}]}
-    ),
+    suite=tiny_suite(),
     rules=3,
     protocol_name="few-v1",
     protocol=EvaluationProtocol(states_per_region=60),
@@ -141,12 +139,6 @@ def test_a_policy_made_worse_inside_the_cube_stays_below_the_original():
     honest = entry(4, scores(0.2, 0.29, 0.01))  # better in every outer region
     steep = entry(3, scores(0.1, 0.4, 0.01))
     assert by_decay(steep, honest) == [(4, 1, 1), (3, 2, 2)]
-
-
-def test_a_decay_below_zero_is_worth_no_more_than_none():
-    negative, flat = entry(3, scores(0.3, 0.2, 0.01)), entry(4, scores(0.15, 0.15, 0.01))
-    optimal = entry(5, scores(0.0, 0.0, 0.0))
-    assert by_decay(negative, flat, optimal) == [(5, 1, 3), (4, 1, 3), (3, 1, 3)]
 
 
 def test_an_entry_without_a_rank_holds_nobody_down():
