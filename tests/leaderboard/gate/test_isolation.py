@@ -77,16 +77,6 @@ def test_bubblewrap_that_fails_later_is_a_fault(bubblewrap, working):
             Sandbox(MODEL, OBSERVATION, ACTION)
 
 
-def test_only_a_machine_without_bubblewrap_runs_without_it(monkeypatch, tmp_path):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    isolation._bwrap.cache_clear()
-    assert available_isolation() == "process"
-    with Sandbox(MODEL, OBSERVATION, ACTION) as policy:
-        assert policy.isolation == "process"
-    with pytest.raises(ScoringFault, match="bubblewrap is not installed"):
-        Sandbox(MODEL, OBSERVATION, ACTION, isolation="bwrap")
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize(("available", "spare"), [(RESERVED_BYTES + 7, 7), (7, 0), (None, 0)])
 def test_a_child_may_use_the_available_memory_without_a_reserve(monkeypatch, available, spare):
