@@ -5,7 +5,6 @@ import pytest
 
 from leaderboard import admission
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.result import Result
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import Submission, utc
 from leaderboard.errors import Rejection, ScoringFault
@@ -21,6 +20,7 @@ from tests.leaderboard.conftest import (
     tiny_board,
     tiny_submission,
 )
+from tests.leaderboard.store.synthetic import synthetic_result
 
 ANY_TIME = "2000-01-01T00:00:00Z"
 
@@ -150,15 +150,7 @@ def test_a_name_belongs_to_the_first_key_that_uses_it(store, key):
 def test_policies_that_are_rejected_occupy_no_name(store, key):
     put_submission(store, key, 1, submitter={"name": "A Lab", "key": key.public})
     claim = store.queue.claim("worker")
-    board = store.document
-    rejected = Result(
-        submission=claim.id,
-        suite=board.suite.digest,
-        protocol=board.protocol.digest,
-        status="rejected",
-        code="run_failed",
-    )
-    assert store.queue.finish(claim, rejected)
+    assert store.queue.finish(claim, synthetic_result(store, claim.id, code="run_failed"))
     assert store.holder_of_name("a lab") is None
 
 
@@ -267,16 +259,6 @@ def test_a_submission_is_for_one_board(tmp_path, store, key):
 # Bundles.
 
 
-def test_a_bundle_is_stored_with_its_artefacts(tmp_path, store, key):
-    signed, artefacts = tiny_submission(store, key)
-    folder = bundle(tmp_path / "bundle", signed, artefacts)
-    for _ in range(2):
-        assert admission.submit_bundle(store, folder) == signed.id
-    assert len(store.entries()) == 1
-    for digest, data in artefacts.items():
-        assert store.objects.read(digest) == data
-
-
 def test_a_bundle_that_is_refused_leaves_nothing(tmp_path, store, key):
     signed, artefacts = tiny_submission(store, key, created=ANY_TIME)
     folder = bundle(tmp_path / "old", signed, artefacts)
@@ -337,16 +319,6 @@ def test_an_old_board_accepts_its_reference_rows_whatever_else_has_their_name(
 # Withdrawals.
 
 
-def test_a_withdrawal_is_final(store, key):
-    signed = put_submission(store, key)
-    withdrawal = signed_withdrawal(store, signed.id, key, "a bug")
-    assert store.withdraw(withdrawal)
-    assert not store.withdraw(withdrawal)
-    entry = store.entry(signed.id)
-    assert entry.status == "withdrawn"
-    assert code_of(lambda: receive(store, signed)) == "withdrawn"
-
-
 def test_only_the_submitter_withdraws_for_this_board_and_in_plain_text(store, key):
     """A submission's id is the same on every board, so only the signature names the board."""
     signed = put_submission(store, key)
@@ -402,21 +374,6 @@ def test_an_upload_is_signed_for_one_object_one_board_and_one_address(store, key
     assert code_of(lambda: sender(forged)) == "bad_signature"
 
 
-@pytest.mark.parametrize("minutes", [-11, 11])
-def test_an_upload_is_signed_for_ten_minutes(store, key, minutes):
-    digest, receiver = "sha256:" + "1" * 64, Receiver(store.document.key, "https://board.example")
-    header = admission.upload_header(key, digest, receiver)
-    moment = datetime.datetime.now(datetime.UTC)
-    nearly = moment + datetime.timedelta(minutes=minutes * 9 / 11)
-    past = moment + datetime.timedelta(minutes=minutes)
-
-    def sender(at):
-        return admission.uploader(store.document, header, digest, receiver.address, at)
-
-    assert sender(nearly) == key.public
-    assert code_of(lambda: sender(past)) == "stale_time"
-
-
 def test_upload_quotas_count_stored_bytes(tmp_path, key, monkeypatch):
     limits = {"upload_bytes_per_day": 1000, "total_bytes": 2000, "artefact_bytes": 900}
     with tiny_board(tmp_path / "b", limits=limits) as store:
@@ -431,9 +388,10 @@ def test_upload_quotas_count_stored_bytes(tmp_path, key, monkeypatch):
 
 
 def test_documents_count_like_artefacts(store, key):
+    put(store, key, {sha256_of(b"12345"): b"12345"})  # which no submission names
     signed = put_submission(store, key)
     (artefact,) = {run.artefact.size for run in signed.content.runs if run.artefact}
-    used = artefact + len(signed.to_bytes())
+    used = 5 + artefact + len(signed.to_bytes())
     assert store.uploaded_bytes(key.public, ANY_TIME) == store.total_bytes() == used
     assert run_scorer(store.folder.path) == 1
     used += document_path(store.folder.path, signed.id, "result").stat().st_size

@@ -348,8 +348,10 @@ def test_everything_a_submitter_needs_is_at_the_boards_address(scored):
         assert f"{url}/submissions/{hex_of(id)}" in sent.stderr
         assert f"sme-leaderboard show {url} {id}" in sent.stderr
         assert "waiting" in good("show", url, id)
-        good("withdraw", url, id)
-        assert "withdrawn" in good("show", url, id)
+        good("withdraw", url, id, "--reason", "a bug")
+        words = good("show", url, id)
+        assert "withdrawn" in words
+        assert "a bug" in words
         assert "WD regret" in good("show", url, scored)
         remote = json.loads(good("show", url, scored, "--json"))
     assert remote["result"]["scores"]["wd_regret"]["value"] > 0

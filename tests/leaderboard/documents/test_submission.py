@@ -123,12 +123,6 @@ def test_a_content_nested_as_deeply_as_the_parser_allows_is_refused():
         depth *= 2
 
 
-def test_a_document_is_written_as_it_was_read():
-    signed = Signed[Submission].read(text(PLAIN))
-    assert (signed.content.signer, signed.receiver) == (KEY.public, Receiver(BOARD))
-    assert json.loads(signed.to_bytes()) == json.loads(text(PLAIN))
-
-
 def test_a_signature_covers_every_field():
     """The board keeps the whole document, which its signature must still fit."""
     removals = [

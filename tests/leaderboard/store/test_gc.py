@@ -62,13 +62,6 @@ def test_a_dry_run_counts_the_same_and_ages_are_arguments(store, litter):
     assert counted == collect_garbage(store)
 
 
-def test_uploading_an_object_again_resets_its_age(store, key, litter):
-    old, _, _ = litter
-    assert put(store, key, b"old and not submitted") == old
-    assert collect_garbage(store).objects == 0
-    assert store.objects.has(old)
-
-
 def test_gc_keeps_an_upload_in_progress(store, key):
     data = b"first half, second half"
     digest = sha256_of(data)

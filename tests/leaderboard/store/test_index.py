@@ -7,7 +7,7 @@ import traceback
 import pytest
 
 from leaderboard.documents.signed import SigningKey
-from leaderboard.errors import BoardError, Rejection
+from leaderboard.errors import BoardError
 from leaderboard.store import Index, Store, collect_garbage
 from tests.leaderboard.conftest import (
     derived,
@@ -45,52 +45,6 @@ def test_a_grown_index_equals_a_rebuilt_one_in_the_same_file(tmp_path, key):
     (tmp_path / "copy" / "index.sqlite").unlink()
     with Store.open(tmp_path / "copy") as store, Store.open(tmp_path / "board") as other:
         assert derived(store) == derived(other)
-
-
-def test_an_entry_row_has_the_fields_of_pages_and_ranking(store, key):
-    fill(store, key, waiting=True)
-    rows = store.entries()
-    assert [row.status for row in rows] == ["scored", "rejected", "withdrawn", "waiting"]
-    assert [row.code for row in rows] == ["", "onnx_op", "", ""]
-    assert [row.method for row in rows] == [f"Linear {number}" for number in range(4)]
-    assert {(row.runs, row.steps, row.key) for row in rows} == {(1, 1000, key.public)}
-    for row in rows:
-        assert store.entry(row.id) == row
-        result = store.result(row.id)
-        assert (row.scores is None) == (result is None or result.scores is None)
-        if row.scores is not None:
-            assert row.scores == result.scores
-        assert (store.withdrawal(row.id) is not None) == (row.status == "withdrawn")
-    assert store.queue.waiting() == 1
-    assert store.queue.done() == 3
-
-
-def test_rows_signed_by_the_boards_key_are_reference_rows(store, key):
-    method = {"name": "constant", "version": "1", "family": "reference", "knowledge": "family"}
-    reference = put_submission(store, store.folder.signing_key(), 1, method=method)
-    pretender = put_submission(store, key, 2, method=method)
-    assert store.entry(reference.id).reference
-    assert not store.entry(pretender.id).reference
-    assert not store.receive(pretender)  # a second time
-    assert len(store.entries()) == store.head.sequence == 2
-    assert store.submission(pretender.id) == pretender
-
-
-def test_only_the_submissions_own_key_withdraws_it_and_only_once(store, key, submit):
-    signed, unknown = submit(), "sha256:" + "0" * 64
-    with pytest.raises(Rejection) as refused:
-        store.withdraw(signed_withdrawal(store, signed.id, SigningKey.generate()))
-    assert refused.value.code == "bad_signature"
-    assert store.withdraw(signed_withdrawal(store, signed.id, key))
-    assert not store.withdraw(signed_withdrawal(store, signed.id, key))
-    assert store.entry(signed.id).status == "withdrawn"
-    assert store.queue.waiting() == 0
-    with pytest.raises(Rejection, match="unknown_submission"):
-        store.submission(unknown)
-    with pytest.raises(Rejection, match="unknown_submission"):
-        store.withdraw(signed_withdrawal(store, unknown, key))
-    assert store.result(unknown) is None
-    assert store.entry(unknown) is None
 
 
 @pytest.fixture(scope="module")

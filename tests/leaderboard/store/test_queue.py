@@ -218,6 +218,7 @@ def test_a_submission_withdrawn_during_scoring_gets_no_result(store, key, submit
     assert not store.queue.heartbeat(claim)
     assert not store.queue.finish(claim, synthetic_result(store, claim.id))
     assert store.result(signed.id) is None
+    assert store.queue.waiting() == 0
     assert store.queue.claim("worker") is None
 
 

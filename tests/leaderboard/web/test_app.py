@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import socket
+import stat
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -501,6 +502,9 @@ def test_an_upload_without_a_signature_or_signed_at_another_time_is_refused(refu
     assert refusal(answer) == (403, "bad_signature")
 
     now = datetime.datetime.now(datetime.UTC)
+    for minutes in (-9, 9):
+        header = authorization(url, key, digest, utc(now + datetime.timedelta(minutes=minutes)))
+        assert put(url, key, b"x", Authorization=header).status_code in (200, 201)
     times = [utc(now + datetime.timedelta(minutes=minutes)) for minutes in (-11, 11, 10**6)]
     for time_ in (*times, "2026-02-31T00:00:00Z"):
         header = authorization(url, key, digest, time_)
@@ -601,6 +605,7 @@ def test_a_policy_is_stored_and_its_submission_accepted_once(url, store, key):
     data = linear_onnx(0)
     assert put(url, key, data).status_code == 200
     assert store.objects.read(sha256_of(data)) == data
+    assert stat.S_IMODE(store.folder.object(sha256_of(data)).stat().st_mode) == 0o644
     assert store.uploaded_bytes(key.public, "2000-01-01T00:00:00Z") == len(data)
     first, second = post(url, signed.to_bytes()), post(url, signed.to_bytes())
     assert (first.status_code, second.status_code) == (202, 200)
@@ -615,24 +620,18 @@ NEVER = "sha256:" + "1" * 64
 
 
 def changed(plain, path, value):
-    """Set what is at a path, such as `runs.0.spec`; None removes it."""
+    """Set what is at a path, such as `runs.0.spec`."""
     *names, last = path.split(".")
     for name in names:
         plain = plain[int(name)] if name.isdigit() else plain[name]
-    if value is None:
-        del plain[last]
-    else:
-        plain[last] = value
+    plain[last] = value
 
 
 @pytest.mark.parametrize(
     ("path", "value", "code"),
     [
         ("score", 0.0, "schema"),
-        ("method", None, "schema"),
         ("created", "2020-01-01T00:00:00Z", "stale_time"),
-        ("created", "2120-01-01T00:00:00Z", "stale_time"),
-        ("created", "2026-02-31T00:00:00Z", "schema"),
         ("suite", {"name": "other-v1", "digest": NEVER}, "unknown_suite"),
         ("runs.0.spec", NEVER, "unknown_spec"),
         ("runs", "twice", "duplicate_run"),

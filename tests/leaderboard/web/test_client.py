@@ -87,25 +87,6 @@ def scripted(script, bodies=False):
             thread.join()
 
 
-def test_a_bundle_arrives_whole_and_once_and_has_a_status(tmp_path, url, store, key):
-    folder, signed = bundle_of(tmp_path / "bundle", store, key)
-    with pytest.raises(Rejection, match="unknown_submission"):
-        client.status(url, signed.id)
-    seen = []
-    assert client.submit(url, folder, key, progress=lambda *at: seen.append(at)) == signed.id
-    assert client.submit(url + "/", folder, key) == signed.id
-    assert seen == [(1, 1)]
-    assert [entry.id for entry in store.entries()] == [signed.id]
-    assert all(store.objects.has(run.artefact.sha256) for run in signed.content.runs)
-    assert client.status(url, signed.id)["status"] == "waiting"
-    with pytest.raises(Rejection) as caught:
-        client.withdraw(url, signed.id, SigningKey.generate())
-    assert caught.value.code == "bad_signature"
-    client.withdraw(url, signed.id, key, "a bug")
-    assert client.status(url, hex_of(signed.id))["status"] == "withdrawn"
-    assert store.withdrawal(signed.id).content.reason == "a bug"
-
-
 def test_bytes_are_sent_even_if_the_board_has_them_and_lost_requests_are_repeated(
     tmp_path, store, key
 ):
@@ -291,8 +272,11 @@ def test_what_is_signed_for_one_board_is_not_sent_to_another(tmp_path, store, ke
 
 def test_a_name_for_this_machine_and_the_usual_port_are_the_same_address(tmp_path, store, key):
     folder, signed = bundle_of(tmp_path / "bundle", store, key)
+    seen = []
     with serving(store.folder.path) as url:
-        assert client.submit(url.replace("127.0.0.1", "LOCALHOST") + "/", folder, key) == signed.id
+        here = url.replace("127.0.0.1", "LOCALHOST") + "/"
+        assert client.submit(here, folder, key, progress=lambda *at: seen.append(at)) == signed.id
+    assert seen == [(1, 1)]
     for one, other in (
         ("https://Board.example", "https://board.example:443/"),
         ("http://board.example/b/", "http://board.example:80/b"),

@@ -179,34 +179,22 @@ def follow_links(pages, site):
     return followed
 
 
-def test_the_board_states_its_digests_and_what_it_proves(pages, board):
+def test_the_board_states_its_digests(pages, board):
     store, _ = board
     for name in ("index.html", "ood_regret.html", "ood_decay.html"):
         words = pages[name].words
-        assert "This board proves performance, not learning." in words
-        assert "specs are public, so anyone can compute π*" in words
         for digest in (store.document.suite.digest, store.document.protocol.digest):
             assert digest in words
         assert store.document.key in words
         assert store.head[1] in words
-    assert "Ranked only where the upper bound of N₀ is at most 0.5" in pages["ood_decay.html"].words
-    assert "Ranked only where" not in pages["index.html"].words
 
 
 def test_a_board_says_how_to_submit_and_its_limits_unless_it_accepts_nothing(board, pages):
     for name in ("index.html", "ood_regret.html", "ood_decay.html"):
         assert "This copy of the board accepts no submissions." in pages[name].words
         words = pages[name].words.split("How to submit")[1]
-        for text in (
-            "sme-leaderboard submit ppo ADDRESS",
-            "--seeds 10",
-            "A rank needs 30 trained policies",
-            "sme train --suite",
-            "sme-leaderboard new",
-            "20 submissions and 1,024 MiB",
-            "8 MiB",
-        ):
-            assert text in words
+        assert "A rank needs 30 trained policies" in words
+        assert "20 submissions and 1,024 MiB" in words
     for name, page in pages.items():
         assert any(a["href"].endswith("index.html#submit") for a in page.all("a")), name
     page = Page(html(Pages(board[0], "https://x/<script>"), "index.html"))
@@ -217,15 +205,9 @@ def test_a_board_says_how_to_submit_and_its_limits_unless_it_accepts_nothing(boa
     assert "sme-leaderboard new" not in words
 
 
-def test_the_pages_of_method_log_and_suite_explain_what_they_must(pages, board):
+def test_the_log_states_its_head_and_the_suite_its_instances(pages, board):
     store, _ = board
-    words = pages["method.html"].words
-    assert "OOD decay and regret slope are 1, and the similarity loss is 100 points" in words
-    assert "symmetric: θ ± the longer arm" in words
-    words = pages["log.html"].words
-    assert "verify copy --contains DIGEST" in words
-    assert "Removing entries at the end leaves none" in words
-    assert store.head[1] in words
+    assert store.head[1] in pages["log.html"].words
     words = pages["suite.html"].words
     for digest, (member, spec) in store.document.instances.items():
         assert f"{spec.seed} {hex_of(digest)[:12]}" in words
