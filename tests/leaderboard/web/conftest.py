@@ -4,6 +4,8 @@ import os
 
 import pytest
 
+from tests.leaderboard.serving import serving
+
 
 @pytest.fixture(scope="package", autouse=True)
 def _no_fsync():
@@ -11,3 +13,10 @@ def _no_fsync():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda _: None)
         yield
+
+
+@pytest.fixture
+def url(store):
+    """The URL of the tiny board of `store`."""
+    with serving(store.folder.path) as url:
+        yield url

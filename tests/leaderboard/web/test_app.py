@@ -69,13 +69,6 @@ def refusing(tmp_path_factory):
         yield url, store
 
 
-@pytest.fixture
-def url(store):
-    """The URL of the tiny board of `store`."""
-    with serving(store.folder.path) as url:
-        yield url
-
-
 def refusal(answer):
     assert answer.headers["Content-Type"] == "application/json"
     body = answer.json()
@@ -634,8 +627,6 @@ def changed(plain, path, value):
         ("created", "2020-01-01T00:00:00Z", "stale_time"),
         ("suite", {"name": "other-v1", "digest": NEVER}, "unknown_suite"),
         ("runs.0.spec", NEVER, "unknown_spec"),
-        ("runs", "twice", "duplicate_run"),
-        ("runs_started.Tiny", 0, "missing_run"),
         ("method.name", "<script>alert(1)</script>", "unsafe_name"),
         ("runs.0.artefact.sha256", NEVER, "artefact_missing"),
         ("runs.0.artefact.size", 1, "artefact_digest"),
@@ -644,7 +635,7 @@ def changed(plain, path, value):
 def test_an_invalid_submission_has_its_code(refusing, key, path, value, code):
     url, store = refusing
     plain = uploaded(url, store, key).content.to_dict()
-    changed(plain, path, plain["runs"] * 2 if value == "twice" else value)
+    changed(plain, path, value)
     answer = post(url, _signed_anyway(plain, key, Receiver(store.document.key, url)))
     assert (answer.json()["code"], 400 <= answer.status_code < 500) == (code, True)
     assert set(answer.json()) == {"code", "message"}

@@ -31,12 +31,6 @@ def waits(monkeypatch):
     return waits
 
 
-@pytest.fixture
-def url(store):
-    with serving(store.folder.path) as url:
-        yield url
-
-
 def bundle_of(folder, store, key, number=0, **fields):
     """A bundle's folder of a tiny submission."""
     signed, artefacts = tiny_submission(store, key, number, **fields)

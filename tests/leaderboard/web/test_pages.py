@@ -573,15 +573,6 @@ def test_a_bar_spans_its_interval_and_marks_its_value():
     assert bar.find("line[@class='constant']").get("x1") == "97.00%"
 
 
-def test_a_chart_has_a_title_and_a_description_and_escapes_the_name():
-    profile = [Estimate(value=0.1, low=0.0, high=0.2)] * 2
-    chart = charts.regret_chart(profile, [(0, 0), (0, 1)], "<b>&\"'")
-    drawn = ElementTree.fromstring(chart)
-    assert drawn.get("aria-labelledby") == "chart-title chart-desc"
-    assert drawn.find("title").text == "Normalised regret of <b>&\"' by region"
-    assert "WD: 0.100, from 0.000 to 0.200" in drawn.find("desc").text
-
-
 @given(st.lists(st.floats(-1e6, 1e6), max_size=5))
 def test_a_scale_covers_every_value_with_round_ends(values):
     scale = charts.Scale.covering(*values)
