@@ -308,6 +308,7 @@ def nothing_is_left(tmp_path, error, match, *runs, **kwargs):
             r"unknown_spec: .*run 0: .*instances \(`sme show two-v1`\)",
         ),
         ({"spec": 1}, SpecError, "must be a list of runs"),
+        ([{"spec": A0.digest, "policy": None, "steps": 1}], SpecError, "run 0: seed: missing"),
         ([{**row(A0, None), "step": 1}], SpecError, "step=1: unknown field. Did you mean 'steps'"),
         ([row(A0, None, seed=-1)], SpecError, "seed=-1"),
         ([{**row(A0, None), "spec": "SME/Defalt-v1"}], SpecError, "run 0: .*Did you mean"),
