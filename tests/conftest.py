@@ -42,7 +42,8 @@ FIRST = (
     "tests/studies/engine/test_runner.py",
     "tests/leaderboard/test_cli.py",
 )
-ENOUGH = 1_250_000_000  # bytes of a worker with programs of JAX, which it then forgets
+LITTLE, MUCH = 30_000_000, 150_000_000  # bytes since programs were last forgotten
+_kept = 0
 
 settings.register_profile(
     "deterministic", derandomize=True, deadline=None, database=None, max_examples=50
@@ -88,12 +89,15 @@ def pytest_collection_modifyitems(items):
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown(item, nextitem):
     """The programs that a file compiled in JAX go with it: hundreds of them take gigabytes."""
+    global _kept
     jax = sys.modules.get("jax")
-    if jax and (nextitem is None or nextitem.path != item.path or _memory() > ENOUGH):
+    is_last = nextitem is None or nextitem.path != item.path
+    if jax and _memory() - _kept > (LITTLE if is_last else MUCH):
         jax.clear_caches()
         gc.collect()
         if sys.platform == "linux":
             ctypes.CDLL(None).malloc_trim(0)  # glibc keeps a third of what was freed
+        _kept = _memory()
 
 
 def _memory():
