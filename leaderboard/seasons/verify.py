@@ -55,7 +55,7 @@ def verify_seasons(
     folders = {read_season(folder).digest: Path(folder) for folder in published}
     rows, notes = [], []
     for row in store.seasons():
-        verifier = _Verifier(store, row, progress, folders)
+        verifier = _SeasonVerifier(store, row, progress, folders)
         verifier.check()
         rows += verifier.rows
         notes += verifier.notes
@@ -63,7 +63,7 @@ def verify_seasons(
 
 
 @dataclass
-class _Verifier:
+class _SeasonVerifier:
     """The checks of one season, and what they have found."""
 
     store: SeasonStore

@@ -49,9 +49,8 @@ in `curves` regret/agent_0.
     similarity                   mean r̃ over their steps, in [0, 1]
     length                       mean length of the episodes, in steps
 
-`load_streams` has lives in streams: an agent's training through a whole stream. Fresh agents, which
-train on one phase alone, are joined to it: a life has its plasticity and learning transfer once all
-of them have finished. `evaluation.retention` has the formulas.
+A life in a stream (`load_streams`) has its plasticity and learning transfer once the fresh agents
+of its phases have finished; `evaluation.retention` has the formulas.
 
 `lives`: one row per life and region, with the metrics at the end of the life.
 
@@ -65,8 +64,7 @@ of them have finished. `evaluation.retention` has the formulas.
     plasticity_ratio, plasticity_difference   of the visited phase's regret to a fresh agent's,
                                  mean over visits ≥ 1: in visit 0 a life is a fresh agent itself
 
-Columns of the life, repeated in each of its regions; NaN where it has no such number. Those that
-runs on single tasks have as well mean the same.
+Columns of the life, repeated in each of its regions; NaN where it has no such number:
 
     learning_transfer            1 − online regret / that of the fresh agents, mean over visits ≥ 1
     online_regret, dynamic_regret    mean of 1 − step reward over the life, in [0, 1]; its sum
