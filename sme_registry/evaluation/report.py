@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from pydantic import Field, model_validator
 from rich.markup import escape
 
-from sme_registry.evaluation.references import LABELS, NAMES, beside_safety
+from sme_registry.evaluation.references import LABELS, beside_safety
 from sme_registry.evaluation.regions import (
     Invariance,
     ObservationReport,
@@ -162,8 +162,7 @@ class EvaluationReport(ReportFile):
             return
         yield "agents", list(self.agents), []
         yield "safety.regions", _names_of(self.safety.regions), regions
-        # Reports of other versions have other references beside these.
-        known = sorted({*NAMES, *self.references})
+        known = sorted(self.references)  # other versions have others
         scores: dict[str, Mapping[str, Sequence[RegionReport] | Sequence[SafetyScore]]]
         scores = {"references": self.references, "safety.references": self.safety.references}
         for field, by_name in scores.items():
