@@ -35,7 +35,7 @@ from leaderboard.seasons.publication import name_of, read_season
 from leaderboard.seasons.season import Season
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.web.client import Progress as Sent
-from leaderboard.web.client import ServedBoard, answer_for
+from leaderboard.web.client import ServedBoard
 from sme_registry.errors import OptionError, SpecError
 from sme_registry.io import (
     check_new,
@@ -429,13 +429,8 @@ def send_entry(
     `answers` are the files that it names, by their digests; the rest is as for `submit`.
     """
     with ServedBoard(url, insecure=insecure) as served:
-        for done, (digest, data) in enumerate(answers.items(), start=1):
-            served.upload(digest, data, key, signed.receiver)
-            if progress is not None:
-                progress(done, len(answers))
         path = f"/api/seasons/{_name(season)}/entries"
-        answer = served.request("POST", path, signed.to_bytes())
-    return str(answer_for(signed.id, answer, url)["id"])
+        return served.send(path, signed, answers, answers.__getitem__, key, progress)
 
 
 def _name(id: str) -> str:

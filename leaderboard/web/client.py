@@ -11,13 +11,13 @@ import contextlib
 import functools
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 from leaderboard.admission import upload_header
 from leaderboard.bundle import Bundle
 from leaderboard.documents.board import BoardDocument, hex_of
-from leaderboard.documents.signed import Receiver, SigningKey
+from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import Withdrawal, now
 from leaderboard.errors import CODES, BoardError, Rejection
 from sme_registry.errors import MalformedDocumentError, OptionError, SealedError, SpecError
@@ -52,12 +52,7 @@ def submit(
     digests = dict.fromkeys(run.artefact.sha256 for run in runs if run.artefact)
     with ServedBoard(url, insecure=insecure) as served:
         signed = content.signed.for_receiver(served.receiver(), key)
-        for done, digest in enumerate(digests, start=1):
-            served.upload(digest, content.artefact(digest), key, signed.receiver)
-            if progress is not None:
-                progress(done, len(digests))
-        answer = served.request("POST", "/api/submissions", signed.to_bytes())
-    return str(answer_for(signed.id, answer, url)["id"])
+        return served.send("/api/submissions", signed, digests, content.artefact, key, progress)
 
 
 def receiver_of(url: str, *, insecure: bool = False) -> Receiver:
@@ -131,6 +126,23 @@ class ServedBoard:
         """Send an object, also if the board has it: only who has its bytes may submit it."""
         sign = functools.partial(upload_header, key, digest, receiver)
         self.request("PUT", f"/api/objects/{hex_of(digest)}", data, sign)
+
+    def send(
+        self,
+        path: str,
+        signed: Signed[Any],
+        digests: Collection[str],
+        data_of: Callable[[str], bytes],
+        key: SigningKey,
+        progress: Progress | None = None,
+    ) -> str:
+        """Send the objects that a signed document names, then itself; returns its id."""
+        for done, digest in enumerate(digests, start=1):
+            self.upload(digest, data_of(digest), key, signed.receiver)
+            if progress is not None:
+                progress(done, len(digests))
+        answer = self.request("POST", path, signed.to_bytes())
+        return str(answer_for(signed.id, answer, self.url)["id"])
 
     def request(
         self,
