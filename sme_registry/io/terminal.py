@@ -29,7 +29,7 @@ from rich.text import Text
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
-from sme_registry.errors import SMEError
+from sme_registry.errors import OptionError, SMEError
 from sme_registry.io.files import to_json
 from sme_registry.io.system import hidden_in, missing_dependency, visible
 
@@ -310,12 +310,14 @@ class CommandGroup(TyperGroup):
     """Commands that report invalid input as one line on standard error and an exit code.
 
     A command of `modules` is in the `app` of its module, which is imported when it is called; the
-    help shows its summary, in a panel if it has one. Without a summary it is hidden.
+    help shows its summary, in a panel if it has one. Without a summary it is hidden. A former
+    command of `replaced` says in one sentence what replaces it.
     """
 
     exit_codes: tuple[tuple[type[SMEError], int], ...] = ()  # the first match; else 2
     extra: str = ""  # of our package, which these commands need
     modules: ClassVar[Mapping[str, tuple[str, ...]]] = {}  # command → module, summary[, panel]
+    replaced: ClassVar[Mapping[str, str]] = {}
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
@@ -334,6 +336,8 @@ class CommandGroup(TyperGroup):
         return self.commands[name]
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args[0] in self.replaced and not ctx.resilient_parsing:  # not while the shell completes
+            raise OptionError(f"{args[0]}: {self.replaced[args[0]]}")
         name, command, rest = super().resolve_command(ctx, args)
         return name, None if command is None else self.load(args[0]), rest
 
