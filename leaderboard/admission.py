@@ -368,7 +368,7 @@ def check_stored(store: Store, key: str, declared: Artefact) -> None:
         raise Rejection(
             "artefact_digest",
             f"artefact={digest}: has {size:,} bytes, but the submission declares "
-            f"{declared.size:,}. Recreate the bundle with `sme-leaderboard new`.",
+            f"{declared.size:,}. Submit the runs again.",
         )
 
 

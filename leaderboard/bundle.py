@@ -84,7 +84,7 @@ class Bundle:
         text = _read(folder, FILE, MAX_BYTES)
         if text is None:
             raise OptionError(
-                f"{folder}: contains no {FILE}. Create a bundle with `sme-leaderboard new`."
+                f"{folder}: contains no {FILE}. `sme-leaderboard submit --out` writes a bundle."
             )
         return cls(folder, Signed[Submission].read(text))
 

@@ -117,7 +117,7 @@ def test_a_hostile_server_s_words_are_escapes_in_every_command_that_reaches_one(
         bundle_of(folder / "bundle", store, SigningKey.generate())
     commands = (
         "submit bundle URL",
-        "check bundle URL",
+        "submit bundle URL --dry-run",
         f"show URL {'0' * 64}",
         f"withdraw URL {'0' * 64}",
         "ticket URL autumn --method X --submitter Y --out new.json",

@@ -18,48 +18,54 @@ if find_spec("leaderboard.seasons") is not None:
 else:
     COMMANDS = {}
 
-_SUBMIT, _RESULTS = f"{__name__}.submissions", f"{__name__}.results"
-_ADMIN = f"{__name__}.admin"
+_SUBMIT, _RESULTS = f"{__name__}.submit", f"{__name__}.results"
+_HOST = f"{__name__}.admin"
 
 _PANELS = {
-    "Submissions": {
-        "keygen": (_SUBMIT, "Create your signing key, which proves who you are."),
-        "export-sb3": (_SUBMIT, "Export an SB3 model's deterministic policy to ONNX."),
-        "new": (_SUBMIT, "Create a signed submission from trained runs."),
-        "check": (_SUBMIT, "Score a submission locally, exactly as the board does."),
-        "submit": (_SUBMIT, "Send a submission to a board's folder or to a served board."),
+    "To submit": {
+        "submit": (_SUBMIT, "Submit trained runs to a board."),
         "withdraw": (_SUBMIT, "Withdraw your submission; its page stays and says so."),
     },
-    "Seasons": COMMANDS,
-    "Results": {
+    "To read": {
         "rank": (_RESULTS, "Rank the entries by a metric."),
         "show": (_RESULTS, "Show one submission: its method, runs and scores."),
         "fetch": (_RESULTS, "Copy the public part of a served board."),
         "verify": (_RESULTS, "Check every signature, digest, log entry and score."),
     },
-    "Administration": {
-        "init": (_ADMIN, "Create a board."),
-        "score": (_ADMIN, "Score all waiting submissions."),
-        "site": (_ADMIN, "Write the board as static pages."),
-        "serve": (_ADMIN, "Serve the board: its pages, and an API for submissions."),
-        "reindex": (_ADMIN, "Rebuild the index from the log and the documents."),
-        "clock": (_ADMIN, "Go on after the machine's clock was wrong."),
-        "gc": (_ADMIN, "Remove what no submission needs."),
-        "demo": (_ADMIN, "Put a trained run through the whole pipeline."),
+    "To host": {
+        "init": (_HOST, "Create a board."),
+        "serve": (_HOST, "Serve the board: its pages, and an API for submissions."),
+        "score": (_HOST, "Score all waiting submissions."),
+        "site": (_HOST, "Write the board as static pages."),
+        **{name: COMMANDS[name] for name in ("season",) if name in COMMANDS},
+        "admin": (_HOST, "Upkeep: your key, the index, the clock, files that nothing needs."),
+        "demo": (_HOST, "Put a trained run through the whole pipeline."),
     },
+    "Seasons": {name: command for name, command in COMMANDS.items() if name != "season"},
 }
+
+_UPKEEP = "is now `sme-leaderboard admin {}`."
+_SUBMITTED = "is part of `sme-leaderboard submit RUNS BOARD`"
 
 
 class _Commands(CommandGroup):
     exit_codes = ((Rejection, 1), (SealedError, 1), (TamperedError, 3))
     extra = "leaderboard"
     modules: ClassVar = {
-        **{
-            name: (module, summary, panel)
-            for panel, commands in _PANELS.items()
-            for name, (module, summary) in commands.items()
-        },
-        "export": (_SUBMIT, ""),  # the name that scripts rely on
+        name: (module, summary, panel)
+        for panel, commands in _PANELS.items()
+        for name, (module, summary) in commands.items()
+    }
+    replaced: ClassVar = {
+        "keygen": "`sme-leaderboard submit` creates your key; `admin key` shows it.",
+        "new": f"{_SUBMITTED}; with --dry-run --out BUNDLE it writes a bundle and sends nothing.",
+        "check": f"{_SUBMITTED}; with --dry-run it sends nothing.",
+        **dict.fromkeys(
+            ("export", "export-sb3"),
+            f"{_SUBMITTED}, which reads .zip files of Stable-Baselines3; with VecNormalize, use "
+            "`sme_registry.export_onnx(model, path, vec_normalize=…)`.",
+        ),
+        **{name: _UPKEEP.format(name) for name in ("reindex", "clock", "gc")},
     }
 
 
@@ -67,15 +73,15 @@ app = application(
     "sme-leaderboard",
     """A leaderboard that recomputes every score from the submitted policy.
 
-    A board is a folder. Create one, score it and rank its entries:
+    A board is a folder, or the address of one that is served. To take part:
 
-      sme-leaderboard init board --suite smoke
+      sme-leaderboard submit runs/smoke BOARD --method PPO --submitter "A Lab"
 
-      sme-leaderboard score board
+    To host one:
 
-      sme-leaderboard rank board
+      sme-leaderboard init board
 
-    To submit a method, use keygen, new, check and submit, in this order.
+      sme-leaderboard serve board
 
     Exit codes: 0 success, 1 rejected, 2 invalid usage, 3 tampering detected.
     """,

@@ -1,4 +1,4 @@
-"""`sme-leaderboard init · score · site · serve · reindex · gc · demo`: run a board."""
+"""`sme-leaderboard init · serve · score · site · admin · demo`: host a board."""
 
 from __future__ import annotations
 
@@ -16,15 +16,18 @@ from leaderboard import admission
 from leaderboard.bundle import make_bundle
 from leaderboard.cli import results
 from leaderboard.cli.options import (
+    DEFAULT_KEY,
     WITH_SEASONS,
     Board,
     BoardFolder,
     Json,
+    KeyFile,
     NewBoardFolder,
     SuiteName,
     complete_protocol,
     find_suite,
     open_board,
+    own_key,
 )
 from leaderboard.documents.board import RUNS_TO_RANK, Folder
 from leaderboard.documents.signed import Receiver, SigningKey
@@ -35,11 +38,13 @@ from leaderboard.store import collect_garbage
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.io.markup import plural
-from sme_registry.io.terminal import Progress, err, out, print_json
+from sme_registry.io.terminal import Progress, err, out, print_json, print_line
 from sme_registry.spec import EvaluationProtocol, ProtocolFile, Suite, SuiteFile, catalogue
 from sme_registry.training import RunRecord
 
 app = typer.Typer()
+admin = typer.Typer(no_args_is_help=True)
+app.add_typer(admin, name="admin", help="Upkeep, which a served board mostly does by itself.")
 
 UnsafeNoSandbox = Annotated[
     bool,
@@ -300,20 +305,36 @@ def serve(
     )
 
 
-@app.command()
+@admin.command()
+def key(key: KeyFile = DEFAULT_KEY) -> None:
+    """Show your public key and where its private half is; create it if there is none.
+
+    The organiser of a season with a list needs the public key.
+
+    Examples:
+
+      sme-leaderboard admin key
+
+      sme-leaderboard admin key --key lab.key
+    """
+    public = own_key(key).public
+    print_line(f"{escape(str(key))}\npublic key {public}")
+
+
+@admin.command()
 def reindex(board: BoardFolder = Path("board")) -> None:
     """Rebuild the index from the board's log and documents.
 
     Examples:
 
-      sme-leaderboard reindex board
+      sme-leaderboard admin reindex board
     """
 
     with Board.open(board, reindex=True) as store:
         out().print(f"Indexed {len(store.entries()):,} entries.")
 
 
-@app.command()
+@admin.command()
 def clock(
     board: BoardFolder = Path("board"),
     correct: Annotated[
@@ -330,9 +351,9 @@ def clock(
 
     Examples:
 
-      sme-leaderboard clock board
+      sme-leaderboard admin clock board
 
-      sme-leaderboard clock board --correct
+      sme-leaderboard admin clock board --correct
     """
 
     with Board.open(board) as store:
@@ -344,7 +365,7 @@ def clock(
         out().print(f"It is {store.time}; the board is written again.")
 
 
-@app.command()
+@admin.command()
 def gc(
     board: BoardFolder = Path("board"),
     older_than_hours: Annotated[
@@ -357,7 +378,7 @@ def gc(
 
     Examples:
 
-      sme-leaderboard gc board --dry-run
+      sme-leaderboard admin gc board --dry-run
     """
 
     if math.isnan(older_than_hours):

@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.markup import escape
 
 from leaderboard.documents.board import FILE, BoardDocument, Folder, refuse_unscored
-from leaderboard.documents.signed import Receiver
+from leaderboard.documents.signed import Receiver, SigningKey
 from leaderboard.store import Store
 from leaderboard.web import client
 from sme_registry.errors import OptionError
-from sme_registry.io.terminal import Progress, err
+from sme_registry.io.terminal import Progress, err, print_note
 from sme_registry.spec import ProtocolFile, SuiteFile, catalogue
 
 WITH_SEASONS = find_spec("leaderboard.seasons") is not None
@@ -40,7 +41,7 @@ def board_folder(board: str | Path) -> Path:
     if is_url(str(board)):
         raise OptionError(
             f"{str(board)!r}: must be a board's folder: this command reads its files. Open the URL "
-            "in a browser for the ranking. `submit`, `show`, `check` and `withdraw` accept a URL."
+            "in a browser for the ranking. `submit`, `show` and `withdraw` accept a URL."
         )
     if not path.is_dir():
         raise OptionError(
@@ -101,8 +102,6 @@ BoardOrUrl = Annotated[
         parser=board_or_url,
     ),
 ]
-BundleFolder = Annotated[Path, typer.Argument(metavar="BUNDLE", help="The submission's folder.")]
-
 SuiteName = Annotated[
     str,
     typer.Option(
@@ -119,31 +118,47 @@ KeyFile = Annotated[
     typer.Option(
         "--key",
         envvar=KEY_VARIABLE,
-        help="Your signing key, as `keygen` creates it.",
+        help="Your signing key, created when you first need it.",
         show_default="sme-leaderboard/ed25519.key in your settings folder",
     ),
 ]
 
-MethodName = Annotated[
-    str,
-    typer.Option(
-        "--method",
-        help="Name of the method: letters a–z, digits, single spaces and ._+-().",
-    ),
+ADVANCED = "Advanced"
+"""The panel of the options that few need, where a command has more than ten."""
+
+method_name = typer.Option(
+    "--method", help="Name of the method: letters a–z, digits, single spaces and ._+-()."
+)
+submitter_name = typer.Option(
+    "--submitter",
+    help="Your name or your lab's; on a board it belongs to the first key that uses it.",
+)
+MethodName = Annotated[str, method_name]
+SubmitterName = Annotated[str, submitter_name]
+MethodVersion = Annotated[
+    str, typer.Option(help="Version of the method.", rich_help_panel=ADVANCED)
 ]
-SubmitterName = Annotated[
-    str,
-    typer.Option(
-        "--submitter",
-        help="Your name or your lab's; on a board it belongs to the first key that uses it.",
-    ),
-]
-MethodVersion = Annotated[str, typer.Option(help="Version of the method.")]
 Family = Annotated[
-    str | None, typer.Option(help="Family such as PPO; the method's name by default.")
+    str | None,
+    typer.Option(
+        help="Family such as PPO; the method's name by default.", rich_help_panel=ADVANCED
+    ),
 ]
 CodeLink = Annotated[str | None, typer.Option("--code", help="An https link to the code.")]
-Statement = Annotated[str, typer.Option(help="A note for readers of the board.")]
+Statement = Annotated[
+    str, typer.Option(help="A note for readers of the board.", rich_help_panel=ADVANCED)
+]
+
+
+def own_key(path: Path) -> SigningKey:
+    """The user's signing key, created when it is first needed."""
+    if not path.exists():
+        SigningKey.generate().write(path)
+        print_note(
+            f"Created your signing key, {escape(str(path))}. It proves who you are: keep it "
+            "secret, and keep a copy."
+        )
+    return SigningKey.read(path)
 
 
 def find_suite(name: str) -> SuiteFile:

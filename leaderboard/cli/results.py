@@ -230,7 +230,7 @@ def _print_submission(view: PublicView) -> None:
         "statement": submission.statement or "none",
     }
     if view.place:
-        pairs["place in the queue"] = view.place
+        pairs["place in the queue"] = f"{view.place} of {view.queue}"
     if view.faults:
         pairs["failed attempts"] = f"{view.faults}, no verdict; the last: {view.fault}"
     if view.not_ranked not in ("", "reference"):

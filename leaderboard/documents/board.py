@@ -277,9 +277,8 @@ def check_receiver(board: BoardDocument, receiver: Receiver, address: str | None
         stated = "none" if receiver.board is None else f"{receiver.board[:16]}…"
         raise Rejection(
             "wrong_board",
-            f"board={stated}: the signature must be for this board, {board.key[:16]}…. Send a "
-            "bundle that is signed for no board with `sme-leaderboard submit`, or create it with "
-            "`sme-leaderboard new --board`.",
+            f"board={stated}: the signature must be for this board, {board.key[:16]}…. Submit "
+            "the runs to this one.",
         )
     if address not in (None, receiver.address):
         raise Rejection(

@@ -90,8 +90,7 @@ class SigningKey:
         except ValueError:
             reason = "not 64 hex digits"
         raise BoardError(
-            f"{path}: no signing key: {reason}. Restore it, or create one with `sme-leaderboard "
-            "keygen`."
+            f"{path}: no signing key: {reason}. Restore it; `sme-leaderboard submit` creates one."
         )
 
     def write(self, path: str | os.PathLike[str]) -> Path:

@@ -298,7 +298,7 @@ class Confined:
         raise Rejection(
             "run_failed",
             f"policy: the model crashed its process, which ended with status {status}. Run it on "
-            "your machine with `sme-leaderboard check`.",
+            "your machine with `sme-leaderboard submit --dry-run`.",
         )
 
     def _raise_if_memory_was_short(self, what: str) -> None:

@@ -8,8 +8,8 @@ and checked (`verify`).
 _ENTRANT, _ORGANISER = f"{__name__}.entrant", f"{__name__}.cli"
 
 COMMANDS = {
+    "enter": (_ENTRANT, "Take part in a sealed-offline season."),
     "ticket": (_ENTRANT, "Start a ticket: hidden tasks of a season, for you alone."),
     "answer": (_ENTRANT, "Answer the challenges of a ticket with trained policies."),
-    "enter": (_ENTRANT, "Take part in a sealed-offline season."),
     "season": (_ORGANISER, "Sealed seasons: tasks that nobody but the organiser knows."),
 }

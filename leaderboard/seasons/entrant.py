@@ -24,6 +24,7 @@ from leaderboard.cli.options import (
     Statement,
     SubmitterName,
     is_url,
+    own_key,
     receiver_of,
 )
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
@@ -100,7 +101,7 @@ def ticket(
     """
 
     check_new(out_file)
-    signing_key = SigningKey.read(key)
+    signing_key = own_key(key)
     # Kept until the ticket is: a request that was sent and not answered may have started one.
     request_file = out_file.with_name(f"{out_file.name}.request")
     repeated = request_file.exists()
@@ -324,7 +325,7 @@ def enter(
       sme-leaderboard enter board autumn '{name}.npy' --method X --submitter Y --failed deep-3
     """
 
-    season, signing_key = read_season(published), SigningKey.read(key)
+    season, signing_key = read_season(published), own_key(key)
     hidden = {name_of(each): each.member.setting for each in season.hidden}
     without = failed or []
     for name in without:

@@ -289,7 +289,7 @@ class Database:
         if head == EMPTY:
             return
         where = f"log/{head.sequence:08d}.json"
-        remedy = "Restore the log, or accept the present one with `sme-leaderboard reindex`"
+        remedy = "Restore the log, or accept the present one with `sme-leaderboard admin reindex`"
         if not self._log.has(head.sequence):
             raise TamperedError(where, f"is missing, but the index recorded it. {remedy}")
         if self._log.read(head.sequence).digest != head.digest:

@@ -200,12 +200,12 @@ class Clock:
             raise ClockError(
                 f"clock={now()}: is behind the log's last entry, of {self.last}. Nothing was "
                 "changed. Set the machine's clock; if it is right, that entry is dated wrongly: "
-                "correct it with `sme-leaderboard clock --correct`."
+                "correct it with `sme-leaderboard admin clock --correct`."
             )
         if self.offset is not None and abs(clock_offset()[1] - self.offset) > LONGEST_JUMP:
             raise ClockError(
                 f"clock={now()}: has jumped since the board was first served. Nothing was changed. "
-                "Set the machine's clock; if it is right, go on with `sme-leaderboard clock`."
+                "Set the machine's clock; if it is right, go on with `sme-leaderboard admin clock`."
             )
         return self.time
 

@@ -313,7 +313,7 @@ class PublicView:
         or no scores.
       copy_of: earlier submissions of other keys that its policies behave like: their ids, and the
         number of its runs that do.
-      place: in the queue, from 1; 0 if it does not wait.
+      place, queue: in the queue, from 1, of how many that wait; 0 if it does not wait.
       faults, fault: how often a fault of the board's machine ended its scoring while it waits, and
         the last of them.
     """
@@ -328,6 +328,7 @@ class PublicView:
     not_ranked: str = ""
     copy_of: tuple[tuple[str, int], ...] = ()
     place: int = 0
+    queue: int = 0
     faults: int = 0
     fault: str = ""
 
@@ -349,6 +350,7 @@ class PublicView:
                 not_ranked=str(plain.get("not_ranked", "")),
                 copy_of=tuple((str(x["id"]), int(x["runs"])) for x in plain.get("copy_of", ())),
                 place=int(plain.get("place", 0)),
+                queue=int(plain.get("queue", 0)),
                 faults=int(plain.get("faults", 0)),
                 fault=str(plain.get("fault", "")),
             )
@@ -374,6 +376,7 @@ class PublicView:
             "not_ranked": self.not_ranked,
             "copy_of": [{"id": id, "runs": runs} for id, runs in self.copy_of],
             "place": self.place,
+            "queue": self.queue,
             "faults": self.faults,
             "fault": self.fault,
         }
@@ -382,6 +385,7 @@ class PublicView:
 def public_view(store: Store, entry: EntryRow) -> PublicView:
     """The public view of a submission; it has scores only while the board is publishable."""
     result, entries = store.result(entry.id), store.entries()
+    queue = places(entries)
     withheld, reason = "", ""
     if result is not None and result.scores is not None:
         try:
@@ -400,7 +404,8 @@ def public_view(store: Store, entry: EntryRow) -> PublicView:
         withdrawal=store.withdrawal(entry.id),
         not_ranked=reason,
         copy_of=() if withheld else tuple((each.id, each.runs) for each in entry.copy_of),
-        place=places(entries).get(entry.id, 0),
+        place=queue.get(entry.id, 0),
+        queue=len(queue) if entry.id in queue else 0,
         faults=entry.faults,
         fault=entry.fault,
     )

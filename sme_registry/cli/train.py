@@ -193,7 +193,7 @@ def train(
 
     --suite trains on all instances of a suite at once, as `sme study run --keep-models` would, into
     runs/SUITE-ALGORITHM, a study's folder: the same command continues it, `sme study status` and
-    `report` read it, and `sme-leaderboard new --runs` makes a submission of it.
+    `report` read it, and `sme-leaderboard submit` submits it.
 
     --resume continues an interrupted run from its last checkpoint; --steps may be larger.
 
@@ -331,16 +331,16 @@ def _train_suite(
     print_status(status, json)
     check_complete(status)
     if not json:
-        print_note(f"[dim]{escape(_next_step(name, suite, plan, folder))}[/]")
+        print_note(f"[dim]{escape(_next_step(suite, plan, folder))}[/]")
 
 
-def _next_step(name: str, suite: Suite, plan: StudyPlan, folder: Path) -> str:
+def _next_step(suite: Suite, plan: StudyPlan, folder: Path) -> str:
     if suite.streams:
         return f"To see what the agents retain: sme study report {folder}"
     instances = max(suite.runs.values())
     if plan.seeds < instances:
         return f"A leaderboard needs a run on every instance: use --seeds {instances} or more."
-    return f"To submit them: sme-leaderboard new BUNDLE --suite {name} --runs {folder}"
+    return f"To submit them: sme-leaderboard submit {folder} BOARD --method NAME --submitter NAME"
 
 
 def equal_runs(suite: Suite) -> int:

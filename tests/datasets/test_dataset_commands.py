@@ -71,15 +71,13 @@ def test_a_policys_onnx_acts_as_its_zip(tmp_path):
     from stable_baselines3 import TD3
 
     import sme_registry
-    from leaderboard.cli import app as leaderboard
     from sme_registry.io import sha256_of
 
     env = sme_registry.make("Default", action_range="symmetric")
     narrow = {"net_arch": [8]}
     model = TD3("MlpPolicy", env, seed=0, buffer_size=1, device="cpu", policy_kwargs=narrow)
     model.save(tmp_path / "mine.zip")
-    exported = CliRunner().invoke(leaderboard, ["export-sb3", "mine.zip", "-o", "mine.onnx"])
-    assert exported.exit_code == 0, exported.output
+    sme_registry.export_onnx(model, tmp_path / "mine.onnx")
     sets = {}
     for suffix in ("zip", "onnx"):
         good("make", "Default", "--mix", f"policy=mine.{suffix}:1", "-n", "60",

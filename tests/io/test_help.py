@@ -67,7 +67,7 @@ def test_examples_are_lines_without_empty_ones_between_and_a_suggestion_has_one_
         ("sme", "sme evaluate linear Default --protocol qu", {"quick"}),
         ("sme", "sme evaluate opt", {"optimal"}),
         ("sme-leaderboard", "sme-leaderboard init board --suite cor", {"core"}),
-        ("sme-leaderboard", "sme-leaderboard new b --suite smo", {"smoke"}),
+        ("sme-leaderboard", "sme-leaderboard sea", {"season"}),
     ],
 )
 def test_the_shell_completes_names(program, line, expected):

@@ -3,6 +3,7 @@
 import contextlib
 import inspect
 import json
+import re
 import shutil
 import sqlite3
 from pathlib import Path
@@ -25,10 +26,13 @@ from sme_registry.training import train
 from tests.leaderboard.conftest import document_path, linear_onnx, tiny_suite
 from tests.leaderboard.serving import serving
 
-COMMANDS = (
-    *("keygen", "export-sb3", "export", "new", "check", "submit", "withdraw", "rank", "show"),
-    *("verify", "init", "score", "site", "serve", "reindex", "gc", "demo"),
-)
+PANELS = {
+    "To submit": "submit withdraw",
+    "To read": "rank show fetch verify",
+    "To host": "init serve score site season admin demo",
+    "Seasons": "enter ticket answer",
+}
+SUBMIT = ("--method", "Linear", "--submitter", "A Lab")
 
 
 def board_command(*arguments):
@@ -78,17 +82,19 @@ def _home(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def scored_folder(tmp_path_factory):
-    """A key, a bundle, the board on which it is scored; and the submission's id."""
+    """A board on which runs are scored, their bundle and its key; and the submission's id."""
     folder = tmp_path_factory.mktemp("scored")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setenv(KEY_VARIABLE, str(folder / "my.key"))
         furnish(folder)
-        assert "public key" in good("keygen")
         make_board()
-        id = make_bundle()
-        assert good("submit", "bundle", "board").strip() == id
-        assert good("submit", "bundle", "board").strip() == id  # twice is once
+        sent = board_command("submit", "runs.json", "board", *SUBMIT, "--out", "bundle")
+        assert sent.exit_code == 0, sent.output
+        assert f"Created your signing key, {folder / 'my.key'}" in sent.stderr
+        assert "Next: sme-leaderboard score board" in sent.stderr
+        id = sent.stdout.splitlines()[-1]
+        assert good("submit", "bundle", "board").splitlines()[-1] == id  # twice is once
         assert good("score", "board").strip() == "3 scored."
         assert good("score", "board").strip() == "No submission is waiting."
     return folder, id
@@ -108,33 +114,54 @@ def make_board():
     )  # fmt: skip
 
 
-def make_bundle(name="bundle", *more, suite="tiny-v1.json"):
-    """The submission's id."""
-    method = () if "--method" in more else ("--method", "Linear")
-    return good(
-        "new", name, "--runs", "runs.json", "--suite", suite, "--submitter", "A Lab", *method, *more
-    ).split()[0]
+def make_bundle(name="bundle", *more, board="board"):
+    """The id of a submission for a board, which is not sent."""
+    options = ("--out", name, "--dry-run", "--no-check", *SUBMIT, *more)
+    return good("submit", "runs.json", board, *options).split()[-1]
 
 
-def test_help_teaches_every_command_with_an_example_that_is_printed_unchanged(monkeypatch):
-    """Markdown would remove asterisks and angle brackets."""
+def test_help_teaches_every_command_with_an_example_and_few_options(monkeypatch):
+    """Markdown would remove asterisks and angle brackets of examples."""
     monkeypatch.setenv("COLUMNS", "80")
     group = get_command(app)
-    commands = {name: group.load(name) for name in group.modules}
-    assert set(COMMANDS) <= set(commands)
-    shown_alone = {**commands, "export": None, "season": None}  # another name, and a group
-    names = {name: command.callback for name, command in shown_alone.items() if command}
-    top = good("--help")
-    for name, callback in names.items():
-        assert name in top
-        shown = " ".join(good(name, "--help").replace("│", " ").split())
-        assert f"sme-leaderboard {name}" in shown
-        examples = inspect.getdoc(callback).partition("Examples:")[2].split("\n\n")
-        for example in filter(None, map(str.strip, examples)):
-            assert example in shown
-        if name in ("withdraw", "show"):
-            assert "in full for a URL" in shown
-            assert f"sme-leaderboard {name} https://board.example sha256:" in shown
+    loaded = {name: group.load(name) for names in PANELS.values() for name in names.split()}
+    commands = {(name,): command for name, command in loaded.items()}
+    for name in ("season", "admin"):
+        group_of = commands.pop((name,))
+        commands |= {(name, each): command for each, command in group_of.commands.items()}
+    panels = good("--help").split("╭─ ")[2:]
+    listed = {text.partition(" ─")[0]: re.findall(r"^│ (\w+)", text, re.M) for text in panels}
+    assert {panel: " ".join(names) for panel, names in listed.items()} == PANELS
+    for path, command in commands.items():
+        lines = good(*path, "--help").splitlines()
+        prose = lines[: next(n for n, line in enumerate(lines) if line.startswith("╭"))]
+        assert len([line for line in prose[2:] if line.strip()]) <= 15
+        text = " ".join(" ".join(lines).replace("│", " ").split())
+        options = text.partition("─ Options")[2].partition("╯")[0]
+        assert 1 <= len(re.findall(r" --[a-z]", options)) <= 10
+        examples = inspect.getdoc(command.callback).partition("Examples:")[2].split("\n\n")
+        examples = list(filter(None, map(str.strip, examples)))
+        name = f"sme-leaderboard {' '.join(path)}"
+        assert any(each.startswith(name) for each in examples)
+        assert all(each in text for each in examples)
+
+
+@pytest.mark.parametrize(
+    ("former", "words"),
+    [
+        ("keygen", "admin key"),
+        ("new b --runs r", "submit RUNS BOARD"),
+        ("check b", "--dry-run"),
+        ("export-sb3 model.zip", "export_onnx"),
+        ("export model.zip", "export_onnx"),
+        ("reindex board", "admin reindex"),
+        ("clock board", "admin clock"),
+        ("gc board", "admin gc"),
+    ],
+)
+def test_a_former_command_says_what_replaces_it(former, words):
+    (line,) = fails(2, *former.split()).splitlines()
+    assert words in line
 
 
 def test_scoring_refuses_a_broken_bubblewrap_and_warns_of_a_missing_one(monkeypatch):
@@ -146,9 +173,7 @@ def test_scoring_refuses_a_broken_bubblewrap_and_warns_of_a_missing_one(monkeypa
     monkeypatch.setenv("PATH", str(broken.parent))
     isolation._bwrap.cache_clear()
     assert "bubblewrap is installed" in fails(2, "score", "board")
-    good("keygen")
-    make_bundle()
-    good("check", "bundle", "--suite", "tiny-v1.json", "--protocol", "small-v1.json")  # one's own
+    good("submit", "runs.json", "board", *SUBMIT, "--dry-run")  # one's own
     assert isolation.isolation_for_own() == "process"
     broken.unlink()
     result = board_command("score", "board")
@@ -213,46 +238,51 @@ def test_a_withdrawal_grows_the_log_that_verify_has_printed_the_digest_of(scored
     assert plain["withdrawal"]["withdrawal"]["reason"] == reason
 
 
-def test_check_computes_the_same_scores_as_the_board(scored):
+def test_a_dry_run_computes_the_same_scores_as_the_board_and_sends_nothing(scored):
     on_board = json.loads(good("show", "board", scored, "--json"))["result"]
-    here = ("--suite", "tiny-v1.json", "--protocol", "small-v1.json")
-    for arguments in (here, ("board",)):
-        at_home = json.loads(good("check", "bundle", *arguments, "--json"))
-        # Two runs suffice on this board, and ten elsewhere.
-        assert at_home["enough_runs"] == (arguments == ("board",))
-        for run in (*at_home["runs"], *on_board["runs"]):
-            run.pop("rounding", None)  # measured on random states
-        for field in ("scores", "runs", "classes", "suite", "protocol"):
-            assert at_home[field] == on_board[field]
-    assert "WD regret" in good("check", "bundle", *here)
-    message = fails(2, "check", "bundle", "board", "--protocol", "small-v1.json")
-    assert "BOARD has both" in message
+    answer = json.loads(good("submit", "bundle", "board", "--dry-run", "--json"))
+    assert (answer["id"], answer["sent"], answer["page"]) == (scored, False, None)
+    at_home = answer["result"]
+    assert at_home["enough_runs"]
+    for run in (*at_home["runs"], *on_board["runs"]):
+        run.pop("rounding", None)  # measured on random states
+    for field in ("scores", "runs", "classes", "suite", "protocol"):
+        assert at_home[field] == on_board[field]
+    before = good("rank", "board", "--csv").count("\n")
+    assert "WD regret" in good("submit", "runs.json", "board", *SUBMIT, "--dry-run")
+    assert good("rank", "board", "--csv").count("\n") == before
+    assert "waiting" not in good("score", "board").replace("No submission is waiting", "")
 
 
-def test_a_rejection_exits_with_1_and_its_code():
-    good("keygen")
+def test_a_rejection_exits_with_1_and_its_code_and_sends_nothing():
     make_board()
     Path("policy.onnx").write_bytes(b"not a model")
-    new = ("new", "bundle", "--runs", "runs.json", "--suite", "tiny-v1.json")
-    assert "onnx_malformed" in fails(1, *new, "--method", "M", "--submitter", "S")
+    new = ("submit", "runs.json", "board", *SUBMIT, "--out", "bundle")
+    assert "onnx_malformed" in fails(1, *new)
     assert not Path("bundle").exists()
 
-    Path("policy.onnx").write_bytes(linear_onnx(300))
-    make_bundle()
+    Path("policy.onnx").write_bytes(linear_onnx(float("nan")))
+    assert "run_not_finite" in fails(1, *new)
+    with Store.open("board", read_only=True) as store:
+        assert len(store.entries()) == 2  # the reference rows
     next(Path("bundle/artefacts").iterdir()).write_bytes(linear_onnx(301))
-    assert "artefact_digest" in fails(1, "submit", "bundle", "board")
-    assert "artefact_digest" in fails(1, "check", "bundle", "--suite", "tiny-v1.json")
+    for options in ((), ("--dry-run",), ("--no-check",)):
+        assert "artefact_digest" in fails(1, "submit", "bundle", "board", *options)
 
 
 def test_invalid_usage_exits_with_2():
-    good("keygen")
-    assert "already exists" in fails(2, "keygen")
+    public = good("admin", "key").split()[-1]
+    assert good("admin", "key").split()[-1] == public
     assert "init" in fails(2, "rank", "nowhere")
-    new = ("new", "b", "--method", "M", "--submitter", "S", "--suite", "tiny-v1.json", "--runs")
-    assert "no such folder" in fails(2, *new, "runs/*")
-    assert "knowledge" in fails(2, *new, "runs.json", "--knowledge", "much")
-    assert "CLASS=N" in fails(2, *new, "runs.json", "--started", "many")
     make_board()
+    new = ("submit", "runs.json", "board", *SUBMIT)
+    assert "no such folder" in fails(2, "submit", "runs/*", "board", *SUBMIT)
+    assert "knowledge" in fails(2, *new, "--knowledge", "much")
+    assert "CLASS=N" in fails(2, *new, "--started", "many")
+    assert "--method, --submitter" in fails(2, *new[:3])
+    make_bundle()
+    assert "already exists" in fails(2, *new, "--out", "bundle")
+    assert "--method, --submitter: RUNS is a bundle" in fails(2, "submit", "bundle", *new[2:])
     assert "at most one" in fails(2, "rank", "board", "--json", "--csv")
     assert "new folder" in fails(2, "init", "board", "--suite", "tiny-v1.json")
     assert "no submission" in fails(2, "show", "board", "abcdef0123")
@@ -262,8 +292,8 @@ def test_what_is_no_board_is_refused_with_advice():
     make_board()
     Path("empty").mkdir()
     before = sorted(Path().rglob("*"))
-    for command in ("verify", "score", "site", "serve", "reindex", "gc", "rank"):
-        assert "Open the URL" in fails(2, command, "http://127.0.0.1:8000")
+    for command in ("verify", "score", "site", "serve", "admin reindex", "admin gc", "rank"):
+        assert "Open the URL" in fails(2, *command.split(), "http://127.0.0.1:8000")
     for board, advice in {
         "board/board.json": "Give the folder",
         "tiny-v1.json": "Give the folder",
@@ -288,16 +318,13 @@ def test_a_folder_may_have_the_name_of_a_suite():
 
 
 def test_a_practice_board_ranks_few_runs_and_says_so():
-    good("keygen")
     created = good("init", "board", "--suite", "tiny-v1.json", "--practice")
     assert "practice" in created
     with Store.open("board", read_only=True) as store:
         assert (store.document.runs_to_rank, store.document.protocol_name) == (1, "quick-v1")
         assert store.document.runs_needed == 1
         assert store.document.practice
-    make_bundle()
-    assert "without a rank" not in good("check", "bundle", "board")
-    good("submit", "bundle", "board")
+    assert "without a rank" not in good("submit", "runs.json", "board", *SUBMIT)
     good("score", "board")
     ranking = json.loads(good("rank", "board", "--json"))
     assert ranking["runs_to_rank"] == 1
@@ -322,32 +349,27 @@ def test_a_board_keeps_the_description_and_tags_of_its_suite_if_there_are_any():
     assert not [name for name in names if "suite_d" in name]
 
 
-def test_a_bundle_for_one_board_is_accepted_there_only():
-    good("keygen")
+def test_a_bundle_is_accepted_by_the_board_that_it_is_for():
     make_board()
     good("init", "other", "--suite", "tiny-v1.json", "--protocol", "small-v1.json")
-    arguments = ("--runs", "runs.json", "--method", "Linear", "--submitter", "A Lab")
-    assert "--suite" in fails(
-        2, "new", "bundle", "--board", "board", "--suite", "tiny-v1.json", *arguments
-    )
-    id = good("new", "bundle", "--board", "board", *arguments).split()[0]
-    assert "wrong_board" in fails(1, "submit", "bundle", "other")
-    assert good("submit", "bundle", "board").strip() == id
-    unbound = make_bundle("unbound")
-    for board in ("board", "other"):  # signed anew for each
-        assert good("submit", "unbound", board).strip() == unbound
+    id = make_bundle()
+    assert "wrong_board" in fails(1, "submit", "bundle", "other", "--no-check")
+    assert good("submit", "bundle", "board", "--no-check").strip() == id
 
 
 def test_everything_a_submitter_needs_is_at_the_boards_address(scored):
     with serving(Path("board")) as url:
         Path("policy.onnx").write_bytes(linear_onnx(301))
-        id = make_bundle("other", "--method", "Other", suite=url)
-        assert json.loads(good("check", "other", url, "--json"))["enough_runs"]
-        sent = board_command("submit", "other", url)
-        assert (sent.exit_code, sent.stdout.strip()) == (0, id)
+        named = ("--method", "Other", "--submitter", "A Lab")
+        sent = board_command("submit", "runs.json", url, *named)
+        assert sent.exit_code == 0, sent.output
+        id = sent.stdout.splitlines()[-1]
+        assert "WD regret" in sent.stdout
         assert f"{url}/submissions/{hex_of(id)}" in sent.stderr
         assert f"sme-leaderboard show {url} {id}" in sent.stderr
-        assert "waiting" in good("show", url, id)
+        shown = good("show", url, id)
+        assert "waiting" in shown
+        assert re.search(r"place in the queue +1 of 1$", shown, re.M)
         good("withdraw", url, id, "--reason", "a bug")
         words = good("show", url, id)
         assert "withdrawn" in words
@@ -366,8 +388,8 @@ def test_a_board_whose_references_wait_shows_nothing():
 
 def test_score_lists_what_it_could_not_score_and_why_and_counts_its_own(scored):
     Path("policy.onnx").write_bytes(linear_onnx(301))
-    id = make_bundle("other", "--method", "Other")
-    good("submit", "other", "board")
+    named = ("--method", "Other", "--submitter", "A Lab")
+    id = good("submit", "runs.json", "board", *named, "--no-check").strip()
     with Store.open("board", read_only=True) as store:
         run = next(run for run in store.submission(id).content.runs if run.artefact)
         path = store.folder.object(run.artefact.sha256)
@@ -394,14 +416,12 @@ def test_an_altered_result_exits_with_3_and_is_named(scored):
 
 
 def test_a_board_without_its_key_accepts_nothing():
-    good("keygen")
     make_board()
     make_bundle()
     Path("board/board.key").unlink()
     before = sorted(Path("board/objects").rglob("*"))
     message = fails(2, "submit", "bundle", "board")
     assert "without the board's key" in " ".join(message.split())
-    assert "keygen" not in message
     assert sorted(Path("board/objects").rglob("*")) == before
 
 
@@ -411,7 +431,7 @@ def test_the_index_comes_back_from_the_files(scored, monkeypatch):
     before = good("rank", "board", "--csv")
     for path in Path("board").glob("index.sqlite*"):
         path.unlink()
-    assert "Indexed 3 entries" in good("reindex", "board")
+    assert "Indexed 3 entries" in good("admin", "reindex", "board")
     assert good("rank", "board", "--csv") == before
     with contextlib.closing(sqlite3.connect("board/index.sqlite")) as index:
         assert index.execute("PRAGMA integrity_check").fetchone() == ("ok",)
@@ -423,10 +443,10 @@ def test_gc_removes_unnamed_artefacts_and_a_dry_run_only_counts_them(scored):
     digest = sha256_of(data)
     with Store.open("board") as store:
         store.put_object(digest, [data], by=key.public)
-    assert "1 files" in good("gc", "board", "--older-than-hours", "0", "--dry-run")
+    assert "1 files" in good("admin", "gc", "board", "--older-than-hours", "0", "--dry-run")
     with Store.open("board") as store:
         assert store.objects.has(digest)
-    good("gc", "board", "--older-than-hours", "0")
+    good("admin", "gc", "board", "--older-than-hours", "0")
     with Store.open("board") as store:
         assert not store.objects.has(digest)
     assert "Verified" in good("verify", "board")

@@ -39,14 +39,13 @@ def run(tmp_path, monkeypatch):
 
 def test_the_open_board_works_without_the_folder_of_seasons(run):
     assert "ticket" not in run("--help")
-    run("keygen")
     run("init", "board", *TINY, "--protocol", "small-v1.json", "--runs-to-rank", "2")
-    run("new", "bundle", "--runs", "runs.json", *TINY, "--submitter", "A Lab", "--method", "Linear")
     serve = (*COMMAND, "serve", "board", "--port", "0", "--workers", "0")
     with subprocess.Popen(serve, stdout=subprocess.PIPE, text=True) as served:
         try:
             url = next(word for word in served.stdout.readline().split() if "://" in word)
-            id = run("submit", "bundle", url).split()[0]
+            id = run("submit", "runs.json", url, "--submitter", "A Lab", "--method", "Linear")
+            id = id.split()[-1]
             assert httpx.get(f"{url}/api/seasons").status_code == 404
             entries = httpx.get(f"{url}/api/log").json()["entries"]
             assert [each["event"] for each in entries] == ["opened", *["received"] * 3]

@@ -85,10 +85,10 @@ def test_entries_of_a_machine_that_started_with_a_wrong_clock_are_corrected(
         with served(board) as url:
             assert withdraw(url, store, key, signed) == 200
     set_clocks(monkeypatch)
-    message = fails(2, "clock", "board")
+    message = fails(2, "admin", "clock", "board")
     assert "is behind the log's last entry" in message
-    assert "entries 3 and later" in good("clock", "board", "--correct")
-    assert "no entry" in good("clock", "board", "--correct")
+    assert "entries 3 and later" in good("admin", "clock", "board", "--correct")
+    assert "no entry" in good("admin", "clock", "board", "--correct")
     with served(board) as url:
         assert board.ticket(url, key).ticket == 1
     assert events(board)[2:] == ["received", "withdrawn", "clock", "ticket"]
@@ -108,7 +108,7 @@ def test_a_clock_that_has_jumped_while_serving_is_right_when_the_organiser_says_
         with served(board) as url:
             assert board.send(url, board.request(key, 1), key).status_code == 503
     with served(board) as url:
-        good("clock", "board")
+        good("admin", "clock", "board")
         assert board.ticket(url, key, 1).ticket == 2
 
 
@@ -117,7 +117,7 @@ def test_a_running_ticket_has_the_deadline_of_its_corrected_start(board, key, mo
     with served(board) as url:
         board.ticket(url, key)
         set_clocks(monkeypatch)
-        assert "entries 2 and later" in good("clock", "board", "--correct")
+        assert "entries 2 and later" in good("admin", "clock", "board", "--correct")
         set_clocks(monkeypatch, passed=25)
         assert "ended" in events(board, 20, "ended")
 
@@ -131,7 +131,7 @@ def test_a_ticket_that_a_wrong_clock_has_ended_stays_ended_and_its_season_verifi
     with served(board):
         assert "ended" in events(board, 20, "ended")
     set_clocks(monkeypatch)
-    assert "entries 3 and later" in good("clock", "board", "--correct")
+    assert "entries 3 and later" in good("admin", "clock", "board", "--correct")
     set_clocks(monkeypatch, passed=25)
     good("season", "reveal", "board", board.season.id, "--secret", board.secret)
     good("verify", "board")

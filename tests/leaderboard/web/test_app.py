@@ -253,7 +253,7 @@ def test_the_pages_say_how_to_submit_at_the_configured_address(tmp_path):
         with serving(store.folder.path, url="https://board.example") as url:
             copy = HTTP.get(url, headers=forged).text
     assert "curl -O https://board.example/sme/suite.json" in known
-    assert "sme-leaderboard submit ppo https://board.example/sme\n" in known
+    assert "sme-leaderboard submit runs/mine https://board.example/sme \\\n" in known
     assert "ADDRESS" not in known
     assert f"curl -O {where}/suite.json" in default
     assert "accepts no submissions" in copy

@@ -198,11 +198,11 @@ def test_a_board_says_how_to_submit_and_its_limits_unless_it_accepts_nothing(boa
     for name, page in pages.items():
         assert any(a["href"].endswith("index.html#submit") for a in page.all("a")), name
     page = Page(html(Pages(board[0], "https://x/<script>"), "index.html"))
-    assert "submit ppo https://x/<script>" in page.words
+    assert "submit runs/mine https://x/<script>" in page.words
     with SeasonStore.open(OLD, read_only=True) as store:
         words = Page(html(Pages(store), "index.html")).words.split("How to submit")[1]
     assert "accepts no submissions" in words
-    assert "sme-leaderboard new" not in words
+    assert "sme-leaderboard submit" not in words
 
 
 def test_the_log_states_its_head_and_the_suite_its_instances(pages, board):
