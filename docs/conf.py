@@ -31,14 +31,16 @@ extensions = [
     "sphinx_design",
     "code_links",
     "command_reference",
-    "contents",
     "docstrings",
     "links",
     "python_reference",
     "schema_files",
     "tutorial_cells",
 ]
-exclude_patterns = ["_build", "_extensions", "**/.ipynb_checkpoints"]
+exclude_patterns = [
+    "_build", "_extensions", "**/.ipynb_checkpoints",
+    "reference/generated/codes.md",  # a part of the page of the command
+]  # fmt: skip
 
 # Markdown: the sources are read on GitHub too, so only what GitHub also shows.
 myst_enable_extensions = ["colon_fence", "attrs_block"]

@@ -1,5 +1,6 @@
 """Links that work on GitHub work on the site as well.
 
+- The front page begins with the repository's README, with its links into `docs/`.
 - A link to a page outside `docs/` that the site contains (`_PAGES`) leads there. MyST makes a link
   to any other file a download. A folder cannot be downloaded: its link becomes plain text.
 - A link whose text is a file's name, such as `[teams.md](teams.md)`, has the page's title as its
@@ -19,6 +20,7 @@ _PAGES = {
     "CHANGELOG.md": "project/changelog.md",
     "CONTRIBUTING.md": "project/contributing.md",
 }
+_FROM_ROOT = re.compile(r"\]\((?!https?:|#)(docs/)?([^)]*)\)")
 _FILE_NAME = re.compile(r"(?<!!)\[[\w/-]+\.md\](?=\([^):\s]+\))")
 _LINK = re.compile(r"(?<!!)\[(?P<text>[^\]]*)\]\((?P<path>\.\./[^)#\s]*)(?P<anchor>#[^)\s]*)?\)")
 
@@ -42,8 +44,16 @@ def rewrite(text: str, folder: str, root: Path) -> str:
     return _FILE_NAME.sub("[]", _LINK.sub(replaced, text))
 
 
+def front(readme: str) -> str:
+    """The README as a page of `docs/`: its links are relative to the repository's root."""
+    return _FROM_ROOT.sub(lambda link: f"]({'' if link[1] else '../'}{link[2]})", readme)
+
+
 def _on_read(app: Sphinx, name: str, source: list[str]) -> None:
-    source[0] = rewrite(source[0], posixpath.dirname(name), Path(app.srcdir))
+    root = Path(app.srcdir)
+    if name == app.config.root_doc:
+        source[0] = front((root.parent / "README.md").read_text(encoding="utf-8")) + source[0]
+    source[0] = rewrite(source[0], posixpath.dirname(name), root)
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

@@ -1,7 +1,7 @@
-"""The reference of Python names: one page for each public module, from its docstrings.
+"""The reference of Python names: a page for each entry of a list of modules, from their docstrings.
 
-The public modules are those that `docs/reference/python.md` lists. Before a build, a page of
-autodoc directives for each is written to `docs/reference/python/`, which git ignores. An object is
+The list is in `docs/reference/python.md`. Before a build, a page of autodoc directives for each
+entry is written to `docs/reference/python/`, which git ignores. An object is
 documented once, under its shortest name, which is also the one that people import; other modules
 link to it.
 """
@@ -12,6 +12,7 @@ import importlib
 import inspect
 import re
 import typing
+from itertools import chain
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -28,10 +29,10 @@ aliases: dict[str, str] = {}  # other public paths of an object → the one that
 _LISTED = re.compile(r"`((?:sme_registry|leaderboard)[a-z0-9_.]*)`")
 
 
-def modules(page: str) -> list[str]:
-    """The modules that the page lists: those in code, in its bulleted lists."""
-    bullets = re.findall(r"^- (.*(?:\n  .*)*)", page, re.M)
-    return list(dict.fromkeys(name for bullet in bullets for name in _LISTED.findall(bullet)))
+def modules(page: str) -> list[list[str]]:
+    """The modules of each entry: those in code at the beginning of a bullet."""
+    bullets = re.findall(r"^- ([^:]*):", page, re.M)
+    return [found for bullet in bullets if (found := _LISTED.findall(bullet))]
 
 
 def names(module: ModuleType) -> list[str]:
@@ -49,11 +50,12 @@ def _has_a_name(value: Any) -> bool:
     return inspect.isclass(value) or inspect.isroutine(value)
 
 
-def pages(listed: list[str]) -> dict[str, str]:
-    """Each module's page as reStructuredText, by the module's name."""
+def pages(listed: list[list[str]]) -> dict[str, str]:
+    """Each entry's page as reStructuredText, by the name of its first module."""
     documented: dict[int, str] = {}
-    by_depth = sorted(listed, key=lambda name: name.count("."))
-    return {name: _page(importlib.import_module(name), documented) for name in by_depth}
+    by_depth = sorted(chain.from_iterable(listed), key=lambda name: name.count("."))
+    parts = {name: _page(importlib.import_module(name), documented) for name in by_depth}
+    return {entry[0]: "\n".join(map(parts.__getitem__, entry)) for entry in listed}
 
 
 def _page(module: ModuleType, documented: dict[int, str]) -> str:
@@ -111,7 +113,7 @@ def write(source: Path) -> None:
 
 def _on_read(app: Sphinx, name: str, source: list[str]) -> None:
     if name == PAGE:
-        below = "\n".join(f"python/{module}" for module in modules(source[0]))
+        below = "\n".join(f"python/{entry[0]}" for entry in modules(source[0]))
         source[0] += f"\n```{{toctree}}\n:hidden:\n\n{below}\n```\n"
 
 

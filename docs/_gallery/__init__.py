@@ -1,6 +1,6 @@
-"""The gallery: a card for each environment and stream of the catalogue."""
+"""The catalogue's pages: a card for each environment and stream."""
 
-from .page import anchor, gallery
+from .page import READING, anchor, gallery, group_of
 from .pictures import draw
 
-__all__ = ["anchor", "draw", "gallery"]
+__all__ = ["READING", "anchor", "draw", "gallery", "group_of"]

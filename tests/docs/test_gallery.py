@@ -16,9 +16,13 @@ pytest.importorskip("matplotlib")
 
 from _gallery import measured, pictures, results
 
-PAGE = (ROOT / "docs" / "reference" / "gallery.md").read_text(encoding="utf-8")
+PAGES = sorted((ROOT / "docs" / "reference" / "generated").glob("catalogue-*.md"))
 FOLDER = ROOT / "docs" / "reference" / "gallery"
-CARDS = dict(re.findall(r"^### (\S+)\n(.*?)(?=^###? |\Z)", PAGE, re.M | re.S))
+CARDS = dict(
+    card
+    for page in PAGES
+    for card in re.findall(r"^## (\S+)\n(.*?)(?=^## |\Z)", page.read_text("utf-8"), re.M | re.S)
+)
 ENTRIES = {file.name: file for kind in (EnvFile, StreamFile) for file in catalogue.entries(kind)}
 
 
@@ -27,14 +31,8 @@ def test_every_entry_of_the_catalogue_has_a_card_with_its_description_and_a_pict
     for name, file in ENTRIES.items():
         assert file.description in CARDS[name], name
         assert f"`SME/{file.versioned_name}`" in CARDS[name]
-        (picture,) = re.findall(r"\]\((gallery/\S+\.png)\)", CARDS[name])
+        (picture,) = re.findall(r"\]\(\.\./(gallery/\S+\.png)\)", CARDS[name])
         assert (ROOT / "docs" / "reference" / picture).is_file()
-
-
-def test_every_group_of_the_gallery_has_a_card():
-    titles = re.findall(r"^## .*\n\n(###)?", PAGE, re.M)
-    assert len(titles) > 10
-    assert all(titles)
 
 
 @pytest.mark.parametrize("name", ["ActionDim1", "Team2", "Safety10", "Cycle2"])

@@ -51,7 +51,7 @@ def test_the_extras_of_a_tutorial_exist_and_its_text_names_them(name):
     (extras,) = re.findall(r"^<!-- extras: (.*?) -->$", PAGES[name], re.M)
     assert set(extras.split(",")) <= set(known["optional-dependencies"])
     assert all(f"`{extra}`" in PAGES[name] for extra in extras.split(","))
-    assert "](installation.md)" in PAGES[name]
+    assert "](../../README.md#install)" in PAGES[name]
 
 
 def requirement(source, monkeypatch, tmp_path):

@@ -11,9 +11,10 @@ from tests.docs.conftest import PAGES, ROOT
 
 WIDTHS = {"phone": 400, "desktop": 1280}
 SAMPLE = (
-    "index", "tutorials/first_agent", "tutorials/sweep_figure", "tutorials/installation",
+    "index", "tutorials/first_agent", "tutorials/sweep_figure", 
     "guides/studies", "guides/frameworks", "explanation/method", "results/ablations_in_jax",
-    "reference/catalogue", "reference/gallery", "reference/sme", "reference/schemas",
+    "reference/generated/catalogue", "reference/generated/catalogue-safety", "reference/sme",
+    "reference/generated/files",
     "reference/python/sme_registry", "reference/python/sme_registry.spec", "genindex",
 )  # fmt: skip
 
@@ -35,7 +36,7 @@ class Loaded(html.parser.HTMLParser):
 
 def test_no_page_loads_anything_from_another_host(site):
     pages = sorted(site.rglob("*.html"))
-    assert len(pages) > 60
+    assert 40 < len(pages) <= 75
     for page in pages:
         parser = Loaded()
         parser.feed(page.read_text(encoding="utf-8"))
@@ -46,7 +47,7 @@ def test_no_page_loads_anything_from_another_host(site):
 
 
 def test_every_page_of_the_sources_is_in_the_site(site):
-    hidden = {"_build", "_extensions", "python"}
+    hidden = {"_build", "_extensions", "python", "codes.md"}
     sources = [p.relative_to(ROOT / "docs") for p in (ROOT / "docs").rglob("*.md")]
     pages = [p for p in sources if not hidden.intersection(p.parts)]
     assert len(pages) > 40
