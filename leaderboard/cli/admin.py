@@ -166,11 +166,7 @@ def score(
 
 
 def score_waiting(board: Path, workers: int, isolation: Isolation) -> None:
-    """Score all waiting submissions of a board, and print what became of them.
-
-    Raises:
-      typer.Exit: with code 1, if some could not be scored because of a fault of the machine.
-    """
+    """Score all waiting submissions of a board, and print what became of them."""
 
     with Board.open(board) as store:
         entries = store.entries()

@@ -52,11 +52,7 @@ def board_folder(board: str | Path) -> Path:
 
 
 def open_board(board: Path) -> Store:
-    """Open a board read-only; a bar shows the progress if its log is long.
-
-    Raises:
-      BoardError, TamperedError: as `Store.open`.
-    """
+    """Open a board read-only; a bar shows the progress if its log is long."""
 
     log = Folder(board).log
     entries = sum(1 for _ in os.scandir(log)) if log.is_dir() else 0
@@ -162,12 +158,7 @@ def own_key(path: Path) -> SigningKey:
 
 
 def find_suite(name: str) -> SuiteFile:
-    """A suite by its name in the catalogue, its file's path, or a board that has it.
-
-    Raises:
-      UnknownNameError, SpecError: there is none, it is invalid, or boards do not score it.
-      BoardError: the served board cannot be reached.
-    """
+    """A suite by its name in the catalogue, its file's path, or a board that has it."""
     if is_url(name) or os.path.isfile(os.path.join(name, FILE)):
         return board_document(name).suite_file
     is_path = name.endswith(".json") or (os.sep in name and os.path.isfile(name))
@@ -177,11 +168,7 @@ def find_suite(name: str) -> SuiteFile:
 
 
 def board_document(board: str) -> BoardDocument:
-    """The definition of a board, by its folder or URL.
-
-    Raises:
-      BoardError: there is no board, or it cannot be reached.
-    """
+    """The definition of a board, by its folder or URL."""
 
     return client.board_document(board) if is_url(board) else Folder(board).read()
 

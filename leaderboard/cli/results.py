@@ -31,8 +31,8 @@ from leaderboard.scoring.verify import VerifyReport
 from leaderboard.scoring.verify import verify as verify_board
 from leaderboard.store import EntryRow, Store
 from leaderboard.web import client
-from leaderboard.web.fetch import MOST_BYTES
-from leaderboard.web.fetch import fetch as fetch_board
+from leaderboard.web.client import MOST_BYTES
+from leaderboard.web.client import fetch as fetch_board
 from leaderboard.web.tables import PublicView, RankingFile, public_view, steps_text
 from sme_registry.errors import OptionError
 from sme_registry.io.markup import Table
@@ -267,11 +267,7 @@ def _class_table(result: Result) -> Table:
 
 
 def find_entry(store: Store, id: str) -> EntryRow:
-    """The entry with this id, or whose id starts with these digits.
-
-    Raises:
-      BoardError: there is no such entry, or there are several.
-    """
+    """The entry with this id, or whose id starts with these digits."""
     digits = id.removeprefix("sha256:").lower()
     matches = [
         entry for entry in store.entries() if entry.id.removeprefix("sha256:").startswith(digits)

@@ -95,11 +95,7 @@ class Refused(Exception):
 
 
 def read(data: bytes, observation_dim: int, action_dim: int, operators: Collection[str]) -> Any:
-    """The model in a file, a feed-forward network of these widths and operators.
-
-    Raises:
-      Refused: with a code `onnx_…`.
-    """
+    """The model in a file, a feed-forward network of these widths and operators."""
     import onnx
     from google.protobuf.message import DecodeError
 
@@ -120,7 +116,7 @@ def read(data: bytes, observation_dim: int, action_dim: int, operators: Collecti
 
 
 def numbers(model: Any) -> bytes:
-    """The network of a model, as JSON for `network.network_of`."""
+    """The network of a model, as JSON for `explorers.network_of`."""
     import onnx
 
     def tensor(value: Any) -> dict[str, Any]:

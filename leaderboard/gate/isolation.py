@@ -35,12 +35,7 @@ _SYSTEM_FOLDERS = ("/usr", "/lib", "/lib64", "/etc/ld.so.cache")
 
 
 def available_isolation() -> Isolation:
-    """The isolation that this machine has: "bwrap", or "process" if bubblewrap is not installed.
-
-    Raises:
-      ScoringFault: bubblewrap is installed, but does not start a process here.
-      MissingDependencyError: onnxruntime is not installed.
-    """
+    """The isolation that this machine has: "bwrap", or "process" if bubblewrap is not installed."""
     if shutil.which("bwrap") is None:
         return "process"
     _bwrap()
@@ -48,11 +43,7 @@ def available_isolation() -> Isolation:
 
 
 def isolation_for_own() -> Isolation:
-    """The isolation for policies of one's own: a broken bubblewrap is no reason to refuse them.
-
-    Raises:
-      MissingDependencyError: onnxruntime is not installed.
-    """
+    """The isolation for policies of one's own: a broken bubblewrap is no reason to refuse them."""
     try:
         return available_isolation()
     except ScoringFault:
@@ -60,12 +51,7 @@ def isolation_for_own() -> Isolation:
 
 
 def start(isolation: Isolation, arguments: Sequence[int]) -> subprocess.Popen[bytes]:
-    """Start a child with its limits, its pipes open and unbuffered.
-
-    Raises:
-      ScoringFault: bubblewrap is missing or does not work, or the system starts no process.
-      MissingDependencyError: onnxruntime is not installed.
-    """
+    """Start a child with its limits, its pipes open and unbuffered."""
     return _start(_bwrap() if isolation == "bwrap" else (), arguments)
 
 

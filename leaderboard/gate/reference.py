@@ -48,19 +48,10 @@ _LAST_CELL = int(_LIMIT * _CELLS_PER_UNIT)
 
 
 def optimal_onnx(spec: SMESpec) -> bytes:
-    """π* of a task as an ONNX file.
+    """π* of a task as an ONNX file, of the widths of `sandbox.widths`.
 
-    Args:
-      spec: the task.
-
-    Returns:
-      The file's bytes: input `observations` `[B, S + 2]` float32, output `actions` `[B, A]`
-      float32 in [0, 1], the nearest float32 to π*(s) up to an error of about 1e-10. A team's has
-      the widths of `gate.widths`.
-
-    Raises:
-      ResourceLimitError: the task does not fit in memory.
-      MissingDependencyError: the package `onnx` is not installed.
+    From `observations` `[B, S + 2]` to `actions` `[B, A]` in [0, 1], float32, the nearest to π*(s)
+    up to an error of about 1e-10.
     """
     graph = _Graph(spec)
     cells = np.arange(_LAST_CELL + 1)
@@ -115,17 +106,7 @@ def _selected(graph: _Graph, index: int, x: str, action: str) -> str:
 
 
 def constant_onnx(spec: SMESpec) -> bytes:
-    """The constant policy as an ONNX file: exactly ½ in every channel of every row.
-
-    Args:
-      spec: the task.
-
-    Returns:
-      The file's bytes, with the interface of `optimal_onnx`.
-
-    Raises:
-      MissingDependencyError: the package `onnx` is not installed.
-    """
+    """The constant policy as such a file: exactly ½ in every channel of every row."""
     graph = _Graph(spec)
     graph.constant("zero", np.zeros((graph.observation_dim, graph.action_dim), np.float32))
     graph.constant("half", np.full(graph.action_dim, 0.5, np.float32))

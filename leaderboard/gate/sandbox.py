@@ -88,30 +88,19 @@ _BUSY = 0.5  # of its wall time: with less processor time, the machine and not t
 
 @dataclass(frozen=True)
 class SandboxLimits:
-    """Limits of one model.
+    """Limits of one model; `memory_bytes` are in addition to what the libraries use.
 
-    Attributes:
-      memory_bytes: address space, in addition to that of the libraries; a machine that has less to
-        spare grants less.
-      cpu_seconds: total processor time.
-      call_seconds: wall time of loading the model, and of each batch.
-      start_seconds: wall time of starting the process; exceeding it is the machine's fault.
+    A machine that has less memory to spare grants less, and whose start takes longer is at fault.
     """
 
     memory_bytes: int = 2 * 2**30
     cpu_seconds: int = 300
-    call_seconds: float = 60.0
+    call_seconds: float = 60.0  # wall time of loading the model, and of each batch
     start_seconds: float = START_SECONDS
 
     @classmethod
     def for_policy(cls, file_bytes: int, states: int, agents: int = 1) -> Self:
-        """The limits of a policy, its processor time derived from an honest policy's.
-
-        Args:
-          file_bytes: the size of its file.
-          states: states at which it is evaluated, in all regions together.
-          agents: number of agents that call it in each state.
-        """
+        """The limits of a policy that so many agents call in so many states of all regions."""
         each = STATE_SECONDS + STATE_BYTE_SECONDS * file_bytes
         return cls(cpu_seconds=math.ceil(BASE_SECONDS + states * agents * each))
 
@@ -119,21 +108,10 @@ class SandboxLimits:
 class Confined:
     """A child process that reads files of strangers. Leaving the `with` block ends it.
 
-    Use it in the thread that created it: the process ends with that thread.
-
-    Args:
-      limits: of time and memory.
-      isolation: "bwrap", "process" (resource limits alone), or None for `available_isolation()`.
-
-    Raises:
-      ScoringFault: the isolation does not work, the process cannot be started or was ended from
-        outside, or the machine lacks memory or processor time. Nothing is judged.
-      BoardError: this system is not Linux.
-      MissingDependencyError: onnxruntime or onnx is not installed.
-
-    Attributes:
-      isolation: of the process.
-      runtime: the version of onnxruntime, as the process reports it before it reads any file.
+    Use it in the thread that created it: the process ends with that thread. `isolation` is None for
+    the one that this machine has. `runtime` is the version of onnxruntime that the process reports
+    before it reads any file. A Rejection closes the process, as all errors do; a ScoringFault, of
+    the isolation or of a machine without memory or processor time, judges nothing.
     """
 
     def __init__(
@@ -163,12 +141,7 @@ class Confined:
                 self._raise_if_memory_was_short("The sandbox reads no file")
 
     def inspect(self, data: bytes, observation_dim: int, action_dim: int) -> None:
-        """Reject a file that is no feed-forward network of these widths; see `gate.py`.
-
-        Raises:
-          Rejection: `too_large`, or a code `onnx_…`; this closes the process, as all errors do.
-          ScoringFault: see the class.
-        """
+        """Reject a file that is no feed-forward network of these widths; see `gate.py`."""
         self._send_file(child.INSPECT, data, observation_dim, action_dim)
 
     def network(self, data: bytes, observation_dim: int, action_dim: int) -> bytes:
@@ -319,18 +292,7 @@ class Confined:
 
 
 class Sandbox(Confined):
-    """A loaded model as a function of observations.
-
-    Args:
-      data: the bytes of the ONNX file.
-      observation_dim: S + 2.
-      action_dim: A.
-      limits, isolation: as in `Confined`.
-
-    Raises:
-      Rejection: a code of `inspect`, or `onnx_refused`, `run_failed`, `run_time` or `run_memory`.
-      Other errors of `Confined`.
-    """
+    """A loaded model, of an ONNX file of these widths, as a function of observations."""
 
     def __init__(
         self,
@@ -350,20 +312,7 @@ class Sandbox(Confined):
         self._send_file(child.LOAD, data, *self._widths)
 
     def __call__(self, observations: Observations) -> Actions:
-        """The model's actions, finite but not clipped.
-
-        Args:
-          observations: `[B, S + 2]` float32.
-
-        Returns:
-          `[B, A]` float32.
-
-        Raises:
-          Rejection: `run_failed`, `run_output`, `run_not_finite`, `run_time` or `run_memory`.
-          ScoringFault: see the class; this closes the sandbox, as a rejection does.
-          BoardError: the sandbox is closed.
-          StateError: the observations have another shape.
-        """
+        """The model's actions `[B, A]`, finite but not clipped, on observations `[B, S + 2]`."""
         a = self._run(observations)
         if not np.isfinite(a).all():
             self.close()
@@ -379,14 +328,8 @@ class Sandbox(Confined):
         """Reject a model whose action in a state depends on the other rows of the batch.
 
         The batch in random order and in two parts, and some rows one at a time, must give the same
-        actions as the batch. Actions are compared as they are scored, clipped to [0, 1].
-
-        Args:
-          observations: `[B, S + 2]` float32, B ≥ 1, preferably a batch that is scored.
-          rows: number of rows evaluated one at a time; the system's randomness draws them.
-
-        Raises:
-          Rejection: `run_batch_dependent`, or the codes of a call.
+        actions as the batch. Actions are compared as they are scored, clipped to [0, 1]. The
+        system's randomness draws the `rows` that are evaluated one at a time.
         """
         rng = np.random.default_rng(secrets.randbits(128))
         batched = self(observations)
@@ -410,9 +353,6 @@ class Sandbox(Confined):
 
         Measured: at most 4e-8 for the policies of examples/board; 3e-6 for the optimal policy in
         float32 at complexity 50, the most sensitive honest policy found.
-
-        Raises:
-          Rejection: `run_rounding`, or the codes of a call.
         """
         rng = np.random.default_rng(secrets.randbits(128))
         ends = rng.choice(np.array([-np.inf, np.inf], np.float32), observations.shape)

@@ -29,7 +29,7 @@ from leaderboard.seasons.season import (
 )
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.store import Store
-from leaderboard.web.fetch import Files
+from leaderboard.web.client import Files
 from sme_registry.datasets import DatasetRecipe, SealedDataset
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.io import build_folder, read_json, read_regular, sha256_of, to_json, versions

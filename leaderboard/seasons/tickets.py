@@ -16,7 +16,7 @@ import logging
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -176,13 +176,15 @@ class Ticket:
             return None
         return sha256_of(read_regular(self._end_path, MAX_BYTES))
 
-    def status(self, now: str) -> wire.TicketStatus:
-        """How far the entrant is."""
+    def status(self, now: str, places: Mapping[str, int]) -> wire.TicketStatus:
+        """How far the entrant is; `places` are those of all that waits to be scored."""
         return wire.TicketStatus(
             ticket=self.number,
             phase="ended" if self.is_over(now) else "running",
             deadline=self.deadline,
             instances=tuple(each.status for each in self.instances),
+            place=places.get(self.id, 0),
+            queue=len(places) if self.id in places else 0,
         )
 
     def instance(self, number: int) -> Instance:
@@ -313,7 +315,7 @@ class Sessions:
         """How far an entrant is, with the password of the ticket."""
         ticket = self.ticket(number)
         ticket.check_token(token)
-        return ticket.status(self._store.clock.time)
+        return ticket.status(self._store.clock.time, self._store.queue.places())
 
     def open(self, number: int, token: str, instance: int) -> Instance:
         """An instance, with the password of its ticket."""

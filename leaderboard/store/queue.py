@@ -47,6 +47,11 @@ SELECT id, coalesce(attempt, 0), coalesce(faults, 0), coalesce(fault, '')
 FROM job LEFT JOIN lease ON submission = id
 WHERE submission IS NULL OR boot <> ? OR expires <= ? ORDER BY job.rowid LIMIT 1
 """
+_WAITING = """
+SELECT id FROM (SELECT id, 2 AS rank, rowid AS at FROM job
+  UNION ALL SELECT id, reference, sequence FROM entry WHERE status = 'waiting')
+ORDER BY rank DESC, at
+"""
 
 
 @dataclass(frozen=True)
@@ -221,6 +226,12 @@ class Queue:
         """Number of faults that waiting submissions have met."""
         with self._database.reading() as index:
             return index.number("SELECT coalesce(sum(faults), 0) FROM lease")
+
+    def places(self) -> dict[str, int]:
+        """The place of each job and submission that waits, from 1: first come, first served."""
+        with self._database.reading() as index:
+            waiting = index.connection.execute(_WAITING).fetchall()
+        return {id: place for place, (id,) in enumerate(waiting, start=1)}
 
     def _count(self, clauses: str, *values: Any) -> int:
         with self._database.reading() as index:

@@ -70,15 +70,12 @@ def create_app(
     isolation: Isolation = "bwrap",
     season_secrets: Iterable[str | os.PathLike[str]] = (),
 ) -> FastAPI:
-    """The ASGI application of a board.
+    """The ASGI application of the board in a folder.
 
-    Args:
-      path: the board's folder.
-      url: the board's address, which its pages show, and for which whatever is sent must be signed.
-        It is never taken from a request, whose Host header anyone can choose.
-      score_workers: number of scorer processes that run as long as the application does.
-      isolation: of the processes that read and run policies; "process" if nobody else can submit.
-      season_secrets: the masters of the sealed-online seasons that this server steps.
+    Its pages show `url`, and whatever is sent must be signed for it: it is never taken from a
+    request, whose Host header anyone can choose. `score_workers` processes score as long as it
+    runs. `isolation` is that of policies: "process" if nobody else can submit. `season_secrets` are
+    the masters of the online seasons that it steps.
     """
     _refuse_missing(isolation)
     store = _Board.open(os.fspath(path))
@@ -272,7 +269,7 @@ class _CachedFile(NamedTuple):
 
 
 class _PageCache:
-    """Rendered files, discarded when the log grows or a scoring fails.
+    """Rendered files, discarded when the log grows, the queue changes or a scoring fails.
 
     At most 256 files of together 64 MiB are kept, those that were used last. One thread uses it
     at a time: rendering is bound by Python, and clients that ask at once for a page that is not
@@ -283,13 +280,14 @@ class _PageCache:
         self._store, self._sections = store, sections
         # A copy without its key accepts no submissions.
         self._address = url if store.folder.key.is_file() else None
-        self._head: tuple[Head, int] | None = None
+        self._state: tuple[Head, int, dict[str, int]] | None = None
         self._files: dict[tuple[_Render, str], _CachedFile] = {}  # in the order of their last use
 
     def get(self, render: _Render, name: str) -> _CachedFile:
-        head = self._store.head, self._store.queue.faults()
-        if head != self._head:
-            self._head = head
+        queue = self._store.queue
+        state = self._store.head, queue.faults(), queue.places()
+        if state != self._state:
+            self._state = state
             self._pages = Pages(self._store, self._address, sections=self._sections)
             self._files.clear()
         file = self._files.pop((render, name), None) or _rendered(self._pages, render, name)

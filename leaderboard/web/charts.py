@@ -1,4 +1,4 @@
-"""What the pages draw: scores as inline SVG, and explorers of policies, which are pages.
+"""What the pages draw: scores as inline SVG.
 
 Drawings have no styles, so that the pages can forbid inline styles.
 
@@ -15,8 +15,6 @@ from dataclasses import dataclass
 from markupsafe import Markup, escape
 
 from leaderboard.documents.result import Estimate
-from sme_registry import SMESpec
-from sme_registry.errors import OptionError, PolicyError, ResourceLimitError
 from sme_registry.io.terminal import fixed
 
 Edges = Sequence[tuple[float, float]]
@@ -233,41 +231,3 @@ def _anchor(part: float) -> str:
 
 def _short(value: float) -> str:
     return f"{value:g}".replace("-", "\u2212")
-
-
-_UNKNOWN = (
-    "This page cannot compute the network of this policy. It shows the task, with a linear and a "
-    "constant policy."
-)
-
-
-def can_show(spec: SMESpec) -> bool:
-    """Whether a task is small enough for the page of an explorer."""
-    from sme_registry.explorer import check_size
-
-    try:
-        check_size(spec)
-    except (OptionError, ResourceLimitError):
-        return False
-    return True
-
-
-def explorer(name: str, data: bytes, spec: SMESpec) -> str:
-    """The page that computes a policy's network, of its ONNX file, in the browser.
-
-    A stranger's network reaches it as numbers only, through `gate.network`; of one that is not
-    understood in full, or whose actions are not finite, it shows the task alone.
-    """
-    from leaderboard.gate.network import network_of
-    from leaderboard.gate.sandbox import widths
-    from sme_registry.diagnosis import load_policy
-    from sme_registry.explorer import explorer_page, facts
-
-    network = network_of(data, *widths(spec))
-    if network is not None:
-        try:
-            subject = load_policy(network, spec, action_range="unit", name=name)
-            return explorer_page(facts(subject), "../static/")
-        except PolicyError:
-            pass
-    return explorer_page(facts(spec, remark=_UNKNOWN), "../static/")

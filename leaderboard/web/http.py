@@ -27,35 +27,21 @@ HTTP_CODES = {
 }
 
 STATUSES = {
-    "not_json": 400,
-    "unsafe_name": 400,
-    "bad_signature": 403,
-    "wrong_board": 403,
-    "stale_time": 403,
-    "token_wrong": 403,
-    "not_admitted": 403,
-    "unknown_submission": 404,
-    "season_unknown": 404,
-    "ticket_unknown": 404,
-    "instance_unknown": 404,
-    "not_found": 404,
-    "method_not_allowed": 405,
-    "start_conflict": 409,
-    "step_conflict": 409,
-    "step_ahead": 409,
-    "budget_spent": 409,
-    "instance_phase": 409,
-    "answer_conflict": 409,
-    "withdrawn": 410,
-    "ticket_ended": 410,
-    "too_large": 413,
-    "quota": 429,
-    "ticket_limit": 429,
-    "internal": 500,
-    "season_not_served": 503,
-    "clock_wrong": 503,
-    "not_publishable": 503,
-    "storage_full": 507,
+    code: status
+    for status, codes in {
+        400: "not_json unsafe_name",
+        403: "bad_signature wrong_board stale_time token_wrong not_admitted",
+        404: "unknown_submission season_unknown ticket_unknown instance_unknown not_found",
+        405: "method_not_allowed",
+        409: "start_conflict step_conflict step_ahead budget_spent instance_phase answer_conflict",
+        410: "withdrawn ticket_ended",
+        413: "too_large",
+        429: "quota ticket_limit",
+        500: "internal",
+        503: "season_not_served clock_wrong not_publishable",
+        507: "storage_full",
+    }.items()
+    for code in codes.split()
 }
 """Any other code of a `Rejection` is 422, any other code is 400."""
 

@@ -20,6 +20,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, cached_property, partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -366,7 +367,15 @@ class Pages:
         assert run.artefact is not None  # it is explored
         data = self.store.objects.read(run.artefact.sha256)
         title = f"{method.name} {method.version}"
-        return charts.explorer(title, data, self._shown[run.spec]).encode()
+        page: str = self._explorer_pages.explorer(title, data, self._shown[run.spec])
+        return page.encode()
+
+    @cached_property
+    def _explorer_pages(self) -> ModuleType:
+        """The module for explorers, which takes a second to import."""
+        from leaderboard.web import explorers
+
+        return explorers
 
     @cached_property
     def _shown(self) -> dict[str, SMESpec]:
@@ -374,7 +383,7 @@ class Pages:
         return {
             digest: spec.named(f"{name}, instance {digest[7:19]}")
             for digest, (name, spec) in self.document.instances.items()
-            if charts.can_show(spec)
+            if self._explorer_pages.can_show(spec)
         }
 
     @cached_property
@@ -383,9 +392,8 @@ class Pages:
         files = _static(*self._folders)
         if not self._explorers:
             return files
-        from sme_registry.explorer import STATIC as of_explorers
-
-        return {**files, **{name: text.encode() for name, text in of_explorers.items()}}
+        of_explorers = self._explorer_pages.STATIC.items()
+        return {**files, **{name: text.encode() for name, text in of_explorers}}
 
     @cached_property
     def _files(self) -> list[dict[str, Callable[[], str]]]:
@@ -438,7 +446,7 @@ class Pages:
             "marks": tables.MARKS,
             "address_digits": SHORT,
             "metrics": list(RANKED.values()),
-            "places": tables.places(self._listed),
+            "places": self.store.queue.places(),
         }
 
     def render(self, template: str, **values: Any) -> str:

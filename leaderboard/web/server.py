@@ -51,21 +51,10 @@ def serve(
 ) -> None:
     """Serve a board and run its scorers until Ctrl-C or SIGTERM, which both end it cleanly.
 
-    Call it in the main thread, where signals arrive.
-
-    Args:
-      path: the board's folder.
-      host: address to listen on; any but the loopback needs `behind_proxy`.
-      port: 0 for any free port.
-      workers: number of scorer processes; 0 for none.
-      announce: called with the board's URL once it listens.
-      url: the board's public address, which its pages show, and for which whatever is sent must be
-        signed; by default where it listens.
-      behind_proxy: only a reverse proxy reaches this address, as in docs/guides/deployment.md.
-      unsafe_no_sandbox: score without bubblewrap. Submitted policies could then read the files of
-        this account and use the network, so nobody else may be able to submit. Not with the master
-        of a season, which is one of these files.
-      season_secrets: the files of the masters of the sealed-online seasons that are stepped.
+    Call it in the main thread, where signals arrive. Any address but the loopback needs
+    `behind_proxy`; port 0 is any free one; `announce` gets the URL once it listens. What is sent is
+    signed for `url`, by default where it listens. With `unsafe_no_sandbox`, submitted policies
+    could read the files of this account and use the network: nobody else may submit.
     """
     if url and not _PUBLIC_URL.fullmatch(url):
         raise OptionError(

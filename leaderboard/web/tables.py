@@ -385,7 +385,7 @@ class PublicView:
 def public_view(store: Store, entry: EntryRow) -> PublicView:
     """The public view of a submission; it has scores only while the board is publishable."""
     result, entries = store.result(entry.id), store.entries()
-    queue = places(entries)
+    queue = store.queue.places()
     withheld, reason = "", ""
     if result is not None and result.scores is not None:
         try:
@@ -409,10 +409,3 @@ def public_view(store: Store, entry: EntryRow) -> PublicView:
         faults=entry.faults,
         fault=entry.fault,
     )
-
-
-def places(entries: list[EntryRow]) -> dict[str, int]:
-    """The place in the queue of each submission that waits, from 1: first come, first served."""
-    waiting = [entry for entry in entries if entry.status == "waiting"]
-    waiting.sort(key=lambda entry: (not entry.reference, entry.sequence))
-    return {entry.id: place for place, entry in enumerate(waiting, start=1)}

@@ -86,6 +86,10 @@ def test_a_tickets_learning_curve_is_shown_when_it_ends(board, key):
     assert "running" in running.words
     assert request.content.nonce not in running.words
     assert request.signature not in running.words
+    board.queue.add_jobs([request.id])
+    over = page(board, "seasons/winter.html").words
+    assert "waits to be scored: place 1 of 1 in the queue" in over
+    assert "running" not in over
     board.end_ticket(ONLINE.digest, 1, result(ONLINE, request.id))
     ended = page(board, "seasons/winter.html")
     assert "0.625" in ended.words

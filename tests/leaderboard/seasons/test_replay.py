@@ -13,7 +13,7 @@ from leaderboard.seasons.season import Reveal
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.store.blobs import digest_of
 from leaderboard.store.log import Clock
-from leaderboard.web.fetch import fetch
+from leaderboard.web.client import fetch
 from sme_registry.seasons import wire
 from tests.leaderboard.clocks import AFTERWARDS, move_clock
 from tests.leaderboard.seasons.playing import LANES, ROWS, online_board, playing, request, scored

@@ -216,14 +216,17 @@ def test_who_waits_sees_a_place_in_the_queue(tmp_path):
         scored = boards.submit(store, SigningKey.generate(), "Done", [0.2] * 6)
         ids = [boards.submit(store, SigningKey.generate(), name, None) for name in "AB"]
         with serving(store.folder.path) as url:
+            assert "place 2 of 2" in HTTP.get(f"{url}/submissions/{hex_of(ids[1])}.html").text
+            store.queue.add_jobs(["a ticket that is over"])  # and which the log does not know of
             views = [
                 HTTP.get(f"{url}/api/submissions/{hex_of(id)}").json() for id in (scored, *ids)
             ]
             page = HTTP.get(f"{url}/submissions/{hex_of(ids[1])}.html").text
             board = HTTP.get(url).text
-        assert [view["place"] for view in views] == [0, 1, 2]
-        assert "place 2 of 2 in the queue" in page
-        assert re.findall(r'data-label="Place">(\d+)<', board) == ["1", "2"]
+        assert [view["place"] for view in views] == [0, 2, 3]
+        assert [view["queue"] for view in views] == [0, 3, 3]
+        assert "place 3 of 3 in the queue" in page
+        assert re.findall(r'data-label="Place">(\d+)<', board) == ["2", "3"]
         assert store.queue.claim("scorer").id == ids[0]
 
 

@@ -13,8 +13,7 @@ from leaderboard.seasons.publication import files_of_seasons
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.seasons.verify import verify_seasons
 from leaderboard.store import Store
-from leaderboard.web.client import ServedBoard
-from leaderboard.web.fetch import fetch
+from leaderboard.web.client import ServedBoard, fetch
 from tests.leaderboard.serving import serving
 
 ROOT = Path(__file__).resolve().parents[3]
