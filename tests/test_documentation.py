@@ -59,7 +59,6 @@ def in_process(monkeypatch):
                 "STEPS = 5_000": "STEPS = 200",
                 'catalogue.find(SuiteFile, "smoke")': 'SuiteFile.read("two.json")',
                 "init board --practice": "init board --practice --suite two.json",
-                "new mine": "new mine --suite two.json",
             },
         ),
         (
