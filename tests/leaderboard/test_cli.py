@@ -175,6 +175,8 @@ def test_scoring_refuses_a_broken_bubblewrap_and_warns_of_a_missing_one(monkeypa
     assert "bubblewrap is installed" in fails(2, "score", "board")
     good("submit", "runs.json", "board", *SUBMIT, "--dry-run")  # one's own
     assert isolation.isolation_for_own() == "process"
+    asked = board_command("score", "board", "--unsafe-no-sandbox")
+    assert (asked.exit_code, "bubblewrap" in asked.stderr) == (0, False)
     broken.unlink()
     result = board_command("score", "board")
     assert result.exit_code == 0
@@ -182,17 +184,6 @@ def test_scoring_refuses_a_broken_bubblewrap_and_warns_of_a_missing_one(monkeypa
     with Store.open("board", read_only=True) as store:
         kinds = {store.result(entry.id).isolation for entry in store.entries()}
     assert kinds == {"process"}
-
-
-def test_scoring_without_a_sandbox_can_be_asked_for(monkeypatch):
-    make_board()
-    asked = []
-    monkeypatch.setattr(
-        "leaderboard.cli.admin.run_scorers",
-        lambda *_, isolation, **more: asked.append(isolation) or 0,
-    )
-    result = board_command("score", "board", "--unsafe-no-sandbox")
-    assert ("bubblewrap" in result.stderr, asked) == (False, ["process"])
 
 
 def test_a_scored_board_is_ranked_shown_verified_and_written_as_pages(scored):

@@ -7,8 +7,7 @@ import pytest
 
 from leaderboard.gate.reference import constant_onnx, optimal_onnx
 from leaderboard.gate.sandbox import inspect_own, widths
-from leaderboard.web.charts import can_show, explorer
-from leaderboard.web.explorers import network_of
+from leaderboard.web.explorers import can_show, explorer, network_of
 from sme_registry import SMESpec, evaluate, materialize
 from sme_registry.export import onnx_bytes
 from tests.explorer.networks import offline, perceptron

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.result import Estimate
 from leaderboard.documents.signed import SigningKey
-from leaderboard.errors import BoardError, NotPublishable
+from leaderboard.errors import NotPublishable
 from leaderboard.seasons.store import SeasonStore
 from leaderboard.store import Copies, Store
 from leaderboard.web import charts, tables
@@ -179,16 +179,6 @@ def follow_links(pages, site):
     return followed
 
 
-def test_the_board_states_its_digests(pages, board):
-    store, _ = board
-    for name in ("index.html", "ood_regret.html", "ood_decay.html"):
-        words = pages[name].words
-        for digest in (store.document.suite.digest, store.document.protocol.digest):
-            assert digest in words
-        assert store.document.key in words
-        assert store.head[1] in words
-
-
 def test_a_board_says_how_to_submit_and_its_limits_unless_it_accepts_nothing(board, pages):
     for name in ("index.html", "ood_regret.html", "ood_decay.html"):
         assert "This copy of the board accepts no submissions." in pages[name].words
@@ -249,14 +239,6 @@ def test_the_board_shows_rank_ranges_references_and_what_is_not_ranked_with_its_
     assert 'data-label="Steps per run" data-value="1000000">1 M</td>' in rows[3][2]
     assert re.search(r'<time datetime="(\d{4}-\d\d-\d\d)T[^"]*">\1</time>', rows[3][2])
     assert all('class="bar"' in row and 'class="spark"' in row for _, _, row in rows)
-
-
-def test_an_entry_that_has_not_learned_has_no_rank_by_ood_decay(site):
-    rows = {name: (rank, row) for rank, name, row in rows_of((site / "ood_decay.html").read_text())}
-    rank, row = rows["A method with quite a long name (ensemble of 16 critics)"]
-    assert rank == "–"
-    assert ">not learned</span>" in row
-    assert rows["SAC"][0] == "2–4"
 
 
 def test_the_decay_page_ranks_by_the_floored_value_and_shows_the_entrys_own(small):
@@ -449,12 +431,6 @@ def test_a_board_with_wrong_references_writes_no_pages(tmp_path):
         assert Pages(store).read("static/board.css")
 
 
-def test_a_folder_that_is_not_writable_is_an_error(board, tmp_path):
-    (tmp_path / "site").write_text("a file")
-    with pytest.raises(BoardError, match="cannot be written"):
-        write_site(board[0], tmp_path / "site")
-
-
 def test_pages_never_replace_a_boards_own_files(small, tmp_path):
     (tmp_path / "link").symlink_to("board")
     (tmp_path / "keyed").mkdir()
@@ -497,12 +473,6 @@ def test_a_long_log_has_pages_and_full_ones_never_change(board, monkeypatch):
     newest = pages.read("log.html")
     assert newest == pages.read(f"log-{count - 1}.html")
     assert Page(newest.decode()).all("nav")[1]["aria-label"] == "Pages of the log"
-
-
-def test_an_empty_board_has_a_page(small):
-    page = Page(html(Pages(small), "index.html"))
-    assert "No entry is ranked yet." in page.words
-    assert "0 ranked of 0 submitted" in page.words
 
 
 def test_steps_are_short_and_only_https_becomes_a_link():
