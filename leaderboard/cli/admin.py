@@ -35,6 +35,8 @@ from leaderboard.errors import BoardError
 from leaderboard.gate.isolation import Isolation, available_isolation, isolation_for_own
 from leaderboard.scoring.worker import Work, run_scorers
 from leaderboard.store import collect_garbage
+from leaderboard.web import server
+from leaderboard.web.pages import Section
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.io.markup import plural
@@ -225,9 +227,6 @@ def site(
 
       sme-leaderboard site board --explorers
     """
-    from leaderboard.web.pages import Section
-    from leaderboard.web.server import write_site
-
     sections: list[Section] = []
     if WITH_SEASONS:
         from leaderboard.seasons.pages import SECTION
@@ -238,7 +237,7 @@ def site(
     with open_board(board) as store:
         total = len(store.entries())
         with Progress("writing", total, console=err(), unit="pages") as progress:
-            index = write_site(
+            index = server.write_site(
                 store, target, progress.update_of, explorers=explorers, sections=sections
             )
     out().print(str(index.resolve()), soft_wrap=True, markup=False)
@@ -286,10 +285,8 @@ def serve(
 
       sme-leaderboard serve board --url https://board.example
     """
-    from leaderboard.web.server import serve as serve_board
-
     Folder(board).read()  # a wrong folder fails before anything listens
-    serve_board(
+    server.serve(
         board,
         host=host,
         port=port,

@@ -302,35 +302,27 @@ def _interval(estimate: Estimate) -> str:
     return f"{value} [${fixed(low)}$, ${fixed(high)}$]"
 
 
+_TEXTS = ("id", "status", "received", "withheld", "not_ranked", "fault")
+_NUMBERS = ("place", "queue", "faults")
+
+
 @dataclass(frozen=True)
 class PublicView:
-    """What the board publishes about one submission.
-
-    Attributes:
-      result: None before scoring, and while its scores are withheld.
-      withheld: why the scores are withheld; empty if they are not.
-      not_ranked: why it has no rank by any metric, a key of `ranking.REASONS`; empty if it has one,
-        or no scores.
-      copy_of: earlier submissions of other keys that its policies behave like: their ids, and the
-        number of its runs that do.
-      place, queue: in the queue, from 1, of how many that wait; 0 if it does not wait.
-      faults, fault: how often a fault of the board's machine ended its scoring while it waits, and
-        the last of them.
-    """
+    """What the board publishes about one submission."""
 
     id: str
     status: str
     received: str
     signed: Signed[Submission]
-    result: Result | None
-    withheld: str
+    result: Result | None  # None before scoring, and while its scores are withheld
+    withheld: str  # why the scores are withheld; empty if they are not
     withdrawal: Signed[Withdrawal] | None
-    not_ranked: str = ""
-    copy_of: tuple[tuple[str, int], ...] = ()
-    place: int = 0
-    queue: int = 0
-    faults: int = 0
-    fault: str = ""
+    not_ranked: str = ""  # by any metric, a key of `ranking.REASONS`; empty without scores
+    copy_of: tuple[tuple[str, int], ...] = ()  # of other keys: ids, and the number of runs alike
+    place: int = 0  # in the queue, from 1; 0 if it does not wait
+    queue: int = 0  # how many wait, if it does
+    faults: int = 0  # of the board's machine, which ended its scoring while it waits
+    fault: str = ""  # the last of them
 
     @classmethod
     def from_dict(cls, plain: dict[str, Any]) -> PublicView:
@@ -339,20 +331,14 @@ class PublicView:
             result, withdrawal = plain["result"], plain["withdrawal"]
             signed = {name: plain[name] for name in ("submission", "signature")}
             signed |= {name: plain.get(name) for name in Receiver._fields}  # absent in older ones
+            values: dict[str, Any] = {name: str(plain.get(name, "")) for name in _TEXTS}
+            values |= {name: int(plain.get(name, 0)) for name in _NUMBERS}
             view = cls(
-                id=str(plain["id"]),
-                status=str(plain["status"]),
-                received=str(plain["received"]),
+                **values,
                 signed=Signed[Submission].from_dict(signed),
                 result=None if result is None else Result.from_dict(result),
-                withheld=str(plain["withheld"]),
                 withdrawal=None if withdrawal is None else Signed[Withdrawal].from_dict(withdrawal),
-                not_ranked=str(plain.get("not_ranked", "")),
                 copy_of=tuple((str(x["id"]), int(x["runs"])) for x in plain.get("copy_of", ())),
-                place=int(plain.get("place", 0)),
-                queue=int(plain.get("queue", 0)),
-                faults=int(plain.get("faults", 0)),
-                fault=str(plain.get("fault", "")),
             )
         except SpecError:
             raise
@@ -366,19 +352,11 @@ class PublicView:
 
     def to_dict(self) -> dict[str, Any]:
         return {
-            "id": self.id,
-            "status": self.status,
-            "received": self.received,
+            **{name: getattr(self, name) for name in (*_TEXTS, *_NUMBERS)},
             **self.signed.to_dict(),
             "result": self.result and self.result.to_dict(),
-            "withheld": self.withheld,
             "withdrawal": self.withdrawal and self.withdrawal.to_dict(),
-            "not_ranked": self.not_ranked,
             "copy_of": [{"id": id, "runs": runs} for id, runs in self.copy_of],
-            "place": self.place,
-            "queue": self.queue,
-            "faults": self.faults,
-            "fault": self.fault,
         }
 
 
