@@ -63,7 +63,7 @@ class _Commands(CommandGroup):
         **dict.fromkeys(
             ("export", "export-sb3"),
             f"{_SUBMITTED}, which reads .zip files of Stable-Baselines3; with VecNormalize, use "
-            "`sme_registry.export_onnx(model, path, vec_normalize=…)`.",
+            "`sme_registry.export_onnx(model, task, path, vec_normalize=…)`.",
         ),
         **{name: _UPKEEP.format(name) for name in ("reindex", "clock", "gc")},
     }

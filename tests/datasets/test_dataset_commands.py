@@ -77,7 +77,7 @@ def test_a_policys_onnx_acts_as_its_zip(tmp_path):
     narrow = {"net_arch": [8]}
     model = TD3("MlpPolicy", env, seed=0, buffer_size=1, device="cpu", policy_kwargs=narrow)
     model.save(tmp_path / "mine.zip")
-    sme_registry.export_onnx(model, tmp_path / "mine.onnx")
+    sme_registry.export_onnx(model, "Default", tmp_path / "mine.onnx")
     sets = {}
     for suffix in ("zip", "onnx"):
         good("make", "Default", "--mix", f"policy=mine.{suffix}:1", "-n", "60",
