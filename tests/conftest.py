@@ -1,5 +1,6 @@
 """Shared by every test: the same examples, threads and signals on every run and machine."""
 
+import contextlib
 import ctypes
 import gc
 import importlib.util
@@ -16,6 +17,9 @@ from hypothesis import settings
 
 from tests.browser import launched
 
+# Compiled once, and not by every worker and child: rewritten tests, and the packages.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # The workers share the cores. Read when NumPy, Torch and JAX are imported, here and in children.
 for library in ("OMP", "OPENBLAS", "MKL"):
     os.environ[f"{library}_NUM_THREADS"] = "1"
@@ -42,6 +46,7 @@ FIRST = (
     "tests/studies/engine/test_runner.py",
     "tests/leaderboard/test_cli.py",
 )
+ROOT = Path(__file__).parent.parent
 LITTLE, MUCH = 30_000_000, 150_000_000  # bytes since programs were last forgotten
 _kept = 0
 
@@ -69,6 +74,15 @@ def pytest_configure(config):
     for envs, dtype in ((f"[{SINGLE}]", "np.float32"), (f"[{BATCH}, {SINGLE}]", "float")):
         script = KERNELS.format(envs=envs, dtype=dtype)
         _compiling.append(subprocess.Popen([sys.executable, "-c", script]))
+
+
+def pytest_collection(session):
+    """Every second worker begins with the last files, so that two compile half of them each."""
+    worker = getattr(session.config, "workerinput", {}).get("workerid", "gw0")
+    if int(worker.removeprefix("gw")) % 2:
+        for path in sorted(Path(__file__).parent.rglob("test_*.py"), reverse=True):
+            with contextlib.suppress(pytest.skip.Exception):  # where an extra is missing
+                importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))
 
 
 def pytest_unconfigure():
