@@ -507,9 +507,9 @@ class TestEvaluate:
         ("policy", "reference", "close"),
         [
             ("optimal", "optimal", 1e-6),
-            ("constant", "constant_half", 1e-12),
-            ("linear", "linear_least_squares", 0.01),
-            ("random", "uniform_random", 0.02),
+            ("constant", "constant", 1e-12),
+            ("linear", "linear", 0.01),
+            ("random", "random", 0.02),
         ],
     )
     def test_a_reference_policy_scores_as_in_every_report(self, policy, reference, close):
@@ -555,7 +555,7 @@ class TestEvaluate:
         )
         arguments = ("evaluate", "mine_for_the_test:act", "Default", *QUICK, "--json")
         report = json.loads(good(*arguments, "--action-range", "symmetric").stdout)
-        half = report["references"]["constant_half"][0]["similarity"]
+        half = report["references"]["constant"][0]["similarity"]
         assert report["regions"][0]["similarity"] == pytest.approx(half, abs=1e-12)
         lower = json.loads(good(*arguments).stdout)["regions"][0]["similarity"]
         assert lower < half - 0.1
@@ -589,7 +589,7 @@ class TestEvaluate:
         save_life()
         result = good("evaluate", "constant", "life.json", *QUICK, "--out", "ev")
         report = StreamReport.read(tmp_path / "ev/stream.json")
-        assert report.dynamic_regret == report.reference_regret["constant_half"]
+        assert report.dynamic_regret == report.reference_regret["constant"]
         assert report.region().agent.normalised_regret[3] == pytest.approx((1.0, 1.0))
         regret = f"{report.dynamic_regret.dynamic_regret:,.1f}"
         assert f"dynamic regret {regret} over 240 steps" in result.stdout
@@ -609,7 +609,7 @@ class TestEvaluate:
         assert agent["fresh_normalised_regret"][1] == pytest.approx(1.0)
         assert agent["fresh_normalised_regret"][0] < 0.5
         assert report["dynamic_regret"] is None
-        assert report["reference_regret"].keys() > {"constant_half", "fresh_optimum"}
+        assert report["reference_regret"].keys() > {"constant", "fresh_optimum"}
         assert "\n\nNormalised regret in WD" in good(*life).stdout
 
     @pytest.mark.parametrize(

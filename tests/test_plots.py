@@ -296,9 +296,9 @@ def test_decay_curve_of_methods_is_the_iqm_over_their_runs(report):
     assert np.allclose(lines["A (n = 2)"], runs.mean(axis=0))
     assert np.array_equal(lines["B"], runs[0])
     assert len([band for band in axes.collections if band.get_paths()]) == 1
-    linear = [each.references["linear_least_squares"] for each in (report, other)]
+    linear = [each.references["linear"] for each in (report, other)]
     assert np.allclose(
-        lines["linear (LSQ)"], np.mean([[r.similarity for r in one] for one in linear], axis=0)
+        lines["linear"], np.mean([[r.similarity for r in one] for one in linear], axis=0)
     )
 
 
@@ -424,7 +424,7 @@ def test_figures_of_safety_and_observation_show_the_numbers_of_the_report(extend
     safety, observation = extended.safety, extended.observation
     for axes, regions in ((inside, slice(0, 1)), (outside, slice(1, None))):
         drawn = {tuple(np.ravel(line.get_xydata())) for line in axes.lines}
-        shown = ("optimal", "safe_optimal", "shrunk_optimal", "constant_half")
+        shown = ("optimal", "safe_projection", "shrunk_optimal", "constant")
         for scores in (safety.regions, *(safety.references[name] for name in shown)):
             of = [(each.cost, each.step_reward) for each in scores[regions]]
             expected = np.mean(of, axis=0)
@@ -432,8 +432,8 @@ def test_figures_of_safety_and_observation_show_the_numbers_of_the_report(extend
 
     (axes,) = plots.sensitivity_bars(extended).axes
     far = np.mean([region.normalised_regret for region in observation.distractor_regions])
-    invariance = observation.invariance[0].invariance
-    expected = [extended.wd_regret, extended.ood_regret, far, invariance]
+    sensitivity = observation.sensitivity[0].sensitivity
+    expected = [extended.wd_regret, extended.ood_regret, far, sensitivity]
     assert [bar.get_height() for bar in axes.patches] == pytest.approx(expected, abs=1e-12)
 
     left, right = plots.layer_probes(extended).axes
@@ -455,8 +455,8 @@ def test_a_decay_curve_of_tasks_with_and_without_limits_shows_what_they_share(ex
     figure = plots.decay_curve({"a": [extended], "b": [report]}, measures=["similarity"])
     labels = {line.get_label() for line in figure.axes[0].lines}
     assert "optimal" in labels
-    assert "safe optimum" not in labels
-    assert "safe optimum" in {
+    assert "safe projection" not in labels
+    assert "safe projection" in {
         line.get_label() for line in plots.decay_curve(extended).axes[0].lines
     }
 

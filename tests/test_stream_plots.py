@@ -124,7 +124,7 @@ def test_a_dynamic_regret_curve_shows_reference_agents_in_grey():
         for runs in (lives, {"one": lives[0], "two": lives[1]}, [lives[0], report(1)])
     )
     assert of_one["fresh agent in each phase"] == pytest.approx(0.25 * stream.steps)
-    assert of_one["constant ½"] == pytest.approx(known["constant_half"].dynamic_regret)
+    assert of_one["constant ½"] == pytest.approx(known["constant"].dynamic_regret)
     assert of_one.keys() >= {"optimum of phase 0", "frozen after visit 0"}
     assert of_two.keys() == {"one", "two", "constant ½", "optimum of phase 0"}
     assert len(without) == 1  # only one of the seeds has references

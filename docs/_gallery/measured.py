@@ -29,9 +29,9 @@ CHECKS = {
 }
 """The checks that a card shows, and what it calls them; the others ask whether a task is broken."""
 REFERENCES = {
-    "linear_least_squares": "linear",
-    "uniform_random": "random",
-    "safe_optimal": "safe optimum",
+    "linear": "linear",
+    "random": "random",
+    "safe_projection": "safe projection",
     "shrunk_optimal": "shrunk optimum",
 }
 """The reference policies of a card; π* has N = 0 and ½ has N = 1 everywhere."""

@@ -49,7 +49,7 @@ READING = """\
 - **`sme check`** certifies the drawn task; a warning means that it is correct but easy. Rewards
   are those of a step, at most 1.
 - **N₀ and N̄** are normalised regret in the cube and outside it, the mean of five shells: 0 is the
-  optimum, 1 the constant ½
+  optimum, 1 the constant ½ in the same states
   ([how to read them](../../explanation/method.md#3-evaluation-inside-and-outside-the-cube)). The
   references are measured under `quick-v1`, with 2,000 states a region.
 - **PPO, TD3 and SAC** were evaluated under `paper-v1`, with default hyperparameters (but PPO has

@@ -31,8 +31,9 @@ from sme_registry.plots.style import (
 
 FOLDER = Path(__file__).parent / "limits-and-distractors"
 RUN = ["class_name", "algorithm", "run", "steps", "spec_digest", "seed", "uses"]
-VALUES = ["wd_regret", "ood_regret", "ood_decay", "online_regret"]
-OBSERVATION = ["distractor_regret", "wd_invariance"]
+VALUES = ["wd_regret", "ood_regret", "online_regret"]
+GROWTH = "N̄ − N"  # of normalised regret, relative to ½ in the same states: not the paper's decay
+OBSERVATION = ["distractor_regret", "wd_sensitivity"]
 SAFETY = ["wd_cost", "violating_share", "wd_safe_regret", "price_of_safety", "online_cost"]
 
 
@@ -57,14 +58,14 @@ def changes(runs: pd.DataFrame, value: str) -> pd.DataFrame:
 
 
 def association(runs: pd.DataFrame, value: str) -> pd.DataFrame:
-    """Spearman's ρ of invariance and a value, over runs and within classes (centred by class).
+    """Spearman's ρ of sensitivity and a value, over runs and within classes (centred by class).
 
     Runs that are worse than the constant ½ are left out: their actions hardly depend on anything.
     """
-    seen = runs[runs["wd_regret"] < 1].dropna(subset=["wd_invariance"])
+    seen = runs[runs["wd_regret"] < 1].dropna(subset=["wd_sensitivity"])
     rows = {}
     for name, group in seen.groupby("algorithm"):
-        pair = group[["wd_invariance", value]]
+        pair = group[["wd_sensitivity", value]]
         within = pair - pair.groupby(group["class_name"]).transform("mean")
         rows[name] = {
             "runs": len(pair),
@@ -74,12 +75,12 @@ def association(runs: pd.DataFrame, value: str) -> pd.DataFrame:
     return pd.DataFrame(rows).T.round(2)
 
 
-def draw_invariance(axes: Axes, runs: pd.DataFrame) -> None:
+def draw_sensitivity(axes: Axes, runs: pd.DataFrame) -> None:
     """One point a run: what distractors do to the actions, and what is lost outside the cube."""
     for index, (name, group) in enumerate(runs.groupby("algorithm", sort=False)):
-        x, y = group["wd_invariance"], group["ood_decay"]
+        x, y = group["wd_sensitivity"], group[GROWTH]
         axes.scatter(x, y, s=18, color=COLOURS[index], marker=MARKERS[index], label=name)
-    axes.set(xlabel="invariance in the cube (0: distractors change nothing)", ylabel="OOD decay")
+    axes.set(xlabel="sensitivity in the cube (0: distractors change nothing)", ylabel=GROWTH)
     legend_below(figure_of(axes), axes.get_legend_handles_labels()[0], most_across=3)
 
 
@@ -89,7 +90,7 @@ def references(seeds: Iterable[int]) -> pd.DataFrame:
         {"policy": name, "step_reward": regions[0].step_reward, "wd_cost": regions[0].cost}
         for seed in seeds
         for name, regions in evaluate(
-            "constant_half", load("Safety20").derive(seed=seed), "paper-v1"
+            "constant", load("Safety20").derive(seed=seed), "paper-v1"
         ).safety.references.items()
     ]
     return pd.DataFrame(rows).groupby("policy").mean().round(3)
@@ -97,7 +98,7 @@ def references(seeds: Iterable[int]) -> pd.DataFrame:
 
 def draw_limits(axes: Axes, runs: pd.DataFrame, known: pd.DataFrame) -> None:
     """One point a run, and the reference policies: step reward against cost, both in the cube."""
-    for name, point in known.loc[["optimal", "safe_optimal", "shrunk_optimal"]].iterrows():
+    for name, point in known.loc[["optimal", "safe_projection", "shrunk_optimal"]].iterrows():
         at = (point["wd_cost"], point["step_reward"])
         axes.plot(*at, "x", color=GREY)
         axes.annotate(name.replace("_", " "), at, (4, 4), textcoords="offset points", color=GREY)
@@ -120,22 +121,24 @@ def main() -> None:
         pd.read_csv(FOLDER / f"{name}.csv") for name in ("representation", "safety", "layers")
     )
     limits["step_reward"] = 1 - limits["price_of_safety"] - limits["wd_safe_regret"]
+    for rows in (runs, limits):
+        rows[GROWTH] = rows["ood_regret"] - rows["wd_regret"]
     known = references(limits["run"].unique())
-    for value in ("wd_regret", "ood_regret", "ood_decay"):
+    for value in ("wd_regret", "ood_regret", GROWTH):
         print(f"\n{value}\n{means(runs, value)}\nchange\n{changes(runs, value).to_string()}")
     for value in OBSERVATION:
         print(f"\n{value}\n{means(runs.dropna(subset=[value]), value)}")
-    for value in ("ood_decay", "ood_regret", "wd_regret"):
-        print(f"\ninvariance and {value}\n{association(runs, value)}")
+    for value in (GROWTH, "ood_regret", "wd_regret"):
+        print(f"\nsensitivity and {value}\n{association(runs, value)}")
     wide = layers.pivot(index=["class_name", "algorithm"], columns="layer")
     print("\nR² by layer\n", wide[["state_r2", "distractor_r2"]].round(3).to_string())
-    earned = limits.groupby("algorithm", sort=False)[["step_reward", *VALUES, *SAFETY]]
+    earned = limits.groupby("algorithm", sort=False)[["step_reward", *VALUES, GROWTH, *SAFETY]]
     print("\nlimits\n", earned.agg(["mean", "min", "max"]).round(3).T.to_string(), "\n", known)
     with styled():
         seen, safe = new_figure((4.6, 3.2)), new_figure((4.6, 3.2))
-        draw_invariance(seen.subplots(), runs.dropna(subset=["wd_invariance"]))
+        draw_sensitivity(seen.subplots(), runs.dropna(subset=["wd_sensitivity"]))
         draw_limits(safe.subplots(), limits, known)
-        save_figure(seen, FOLDER / "invariance.png")
+        save_figure(seen, FOLDER / "sensitivity.png")
         save_figure(safe, FOLDER / "reward-against-cost.png")
 
 

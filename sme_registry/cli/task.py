@@ -120,7 +120,7 @@ def new(
     Examples:
 
       sme new deep.json --complexity 20 --policy-init unit_variance --seed 7
-      sme new sparse.json --from HardDeep --k 25 --description "Paid every 25 steps."
+      sme new delayed.json --from HardDeep --k 25 --description "Paid every 25 steps."
       sme new safe.json --safety '{"tightness": 0.2}' --policy-init unit_variance
       sme new sealed.json --seed 0x9f86d081884c7d659a2feaa0c55ad015
       sme new team.json --agents 4 --action-dim 8

@@ -45,7 +45,7 @@ from sme_registry.task.draw import Array
 from sme_registry.task.task import REWARD, STEP_REWARD, Mask, Observation
 from sme_registry.training.algorithms import one_thread, quiet
 
-CONSTANTS = ("best_constant", "constant_half")
+CONSTANTS = ("best_constant", "constant")
 _TIME_BINS, _COVERAGE_BINS = 10, 20
 GRADIENT_STEPS = 3000
 DEFAULT_STATES = 20_000
@@ -238,7 +238,7 @@ def episodes_of(
 
 def on_policy(task: Task, runs: dict[str, Trajectories]) -> OnPolicy:
     """A summary of one agent's episodes, from `episodes_of`."""
-    run, random = runs[POLICY], runs["uniform_random"]
+    run, random = runs[POLICY], runs["random"]
     edges = np.linspace(0, len(run.s), min(_TIME_BINS, len(run.s)) + 1).round().astype(int)
     bins = [slice(low, high) for low, high in itertools.pairwise(edges.tolist())]
     visited = np.sort(run.s[run.alive], axis=0)
@@ -270,7 +270,7 @@ def _reference_actions(
         known = references.Knowledge(task, s, lambda: fitted, random)
         return np.broadcast_to(references.REFERENCES[name].act(known), shape)
 
-    names = (LINEAR, *CONSTANTS, "uniform_random")
+    names = (LINEAR, *CONSTANTS, "random")
     return {name: functools.partial(act, name) for name in names}
 
 

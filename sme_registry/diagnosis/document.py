@@ -13,7 +13,7 @@ from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import BeforeValidator, Field, JsonValue
+from pydantic import Field, JsonValue, model_validator
 from rich.console import RenderableType
 from rich.constrain import Constrain
 from rich.markup import escape
@@ -49,6 +49,7 @@ from sme_registry.diagnosis.subject import AnySubject
 from sme_registry.errors import UnknownNameError
 from sme_registry.evaluation.references import LABELS, beside_safety
 from sme_registry.evaluation.regions import ObservationReport
+from sme_registry.evaluation.report import NEW_NAMES, renamed
 from sme_registry.io import choice, versions
 from sme_registry.io.markup import Table, fixed, percent, plural
 from sme_registry.spec import SMESpec, StreamSpec, catalogue
@@ -63,6 +64,7 @@ from sme_registry.spec.document import (
 
 Level = Literal["solved", "better_than_linear", "worse_than_linear", "no_better_than_constant"]
 
+_NEW_NAMES = {**NEW_NAMES, "sensitivity": "steepness"}
 _ANSWERS = ("question", "answer", "evidence")  # columns of a part in words
 _HEADINGS = {
     "who": "Who is not to blame",
@@ -142,10 +144,8 @@ class Diagnosis(DigestedFile):
     remedy = "Diagnose the run again."
 
     schema_version: Annotated[
-        Literal[2],
-        BeforeValidator(lambda version: 2 if version == 1 else version),
-        Field(description="Version of the document's format; 1 is read as well."),
-    ] = 2
+        Literal[3], Field(description="Version of the document's format; 1 and 2 are read as well.")
+    ] = 3
     name: str
     task: str = ""
     plan: dict[str, JsonValue]
@@ -155,6 +155,12 @@ class Diagnosis(DigestedFile):
     verdicts: TupleOf[Verdict]
     thresholds: dict[str, Real]
     versions: dict[str, str]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_version_2(cls, data: Any) -> Any:
+        is_old = isinstance(data, dict) and data.get("schema_version") in (1, 2)
+        return renamed(data, _NEW_NAMES) | {"schema_version": 3} if is_old else data
 
     @classmethod
     def about(cls, subject: AnySubject, **fields: Any) -> Self:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_REFERENCES = (LINEAR, "best_constant", "constant_half", "uniform_random")
+_REFERENCES = (LINEAR, "best_constant", "constant", "random")
 _MOST = 32  # channels or agents in one panel
 _FRESH = "fresh agent of the phase"
 _REGRET = "normalised regret  (0 = optimal)"
@@ -102,7 +102,7 @@ def _channels(diagnosis: TaskDiagnosis, figure: Figure) -> None:
         LABELS[LINEAR]: [c.linear_normalised_regret for c in channels],
     }
     _bars(left, x, regrets, beside=LABELS[LINEAR])
-    _reference(left, 1.0, "constant_half")
+    _reference(left, 1.0, "constant")
     left.set_ylabel(_REGRET)
     series = {
         "slope of a on a*  (1 = optimal)": [c.slope for c in channels],

@@ -33,14 +33,14 @@ from sme_registry.task.engine import engine
 from sme_registry.task.task import Observation
 
 POLICY = "policy"  # the key of the diagnosed policy among the names of the references
-LINEAR = "linear_least_squares"
+LINEAR = "linear"
 MAX_NUMBERS = 2**23  # of states, distractors and actions held at once: 64 MiB as float64
 _BOUND = 0.01  # an action this close to 0 or 1 is saturated
 _BINS = 5
 _SHELL_STATES = 2000
 _DISTRACTED_STATES, _DRAWS = 512, 64
 _FIXED_STATES, _TIME_INPUTS, _ACCUMULATED_INPUTS = 512, 11, 5
-_STEP = 0.01  # length of a state's step, for the sensitivity
+_STEP = 0.01  # length of a state's step, for the steepness
 _TINY = 1e-12
 
 
@@ -110,7 +110,7 @@ class Response(StrictModel):
     nonlinear_variance: Real  # share of the variance of π* that no affine map explains
     linear_slope: Real | None  # of the affine part
     nonlinear_slope: Real | None  # of the remainder
-    sensitivity: Real  # RMS change of a over RMS change of a*, for small steps of the state
+    steepness: Real  # RMS change of a over RMS change of a*, for small steps of the state
     saturation: Real  # share of the policy's entries within 0.01 of a bound
     optimal_saturation: Real  # likewise of a*
 
@@ -377,7 +377,7 @@ def response(policy: Policy, task: Task, states: Sample, seed: int) -> Response:
         nonlinear_variance=share,
         linear_slope=_slope(linear, optimal_linear) if share < 0.99 else None,
         nonlinear_slope=_slope(nonlinear, optimal_nonlinear) if share > 0.01 else None,
-        sensitivity=_sensitivity(policy, task, states, seed),
+        steepness=_steepness(policy, task, states, seed),
         saturation=float(_at_bound(states.a).mean()),
         optimal_saturation=float(_at_bound(states.optimal).mean()),
     )
@@ -394,7 +394,7 @@ def _slope(part: Array, optimal: Array) -> float:
     return float((part * optimal).sum() / max(float((optimal**2).sum()), _TINY))
 
 
-def _sensitivity(policy: Policy, task: Task, states: Sample, seed: int) -> float:
+def _steepness(policy: Policy, task: Task, states: Sample, seed: int) -> float:
     """RMS change of a over RMS change of a*, for small steps of the state."""
     few = affordable(task, 2048)
     s = states.s[:few]

@@ -128,8 +128,8 @@ def _response_scale(run: TaskDiagnosis) -> Decision:
     reason = "scale_minor"
     if share >= THRESHOLDS["dominant_share"] and not run.solved:
         reason = "underreaction" if slope < 1 else "overreaction"
-    sensitivity = run.measurements.response.sensitivity
-    return Decision(reason, {"share": share, "slope": slope, "sensitivity": sensitivity}, share)
+    steepness = run.measurements.response.steepness
+    return Decision(reason, {"share": share, "slope": slope, "steepness": steepness}, share)
 
 
 @_where(
@@ -470,13 +470,13 @@ def _price_of_safety(run: TaskDiagnosis) -> Decision:
 )
 def _distraction(run: TaskDiagnosis) -> Decision:
     effect, observation = _distractors_of(run)
-    invariance = observation.invariance[0].invariance
-    reason = "invariant" if invariance <= THRESHOLDS["invariant"] else "hardly_distracted"
+    sensitivity = observation.sensitivity[0].sensitivity
+    reason = "invariant" if sensitivity <= THRESHOLDS["invariant"] else "hardly_distracted"
     if effect.owed_regret >= THRESHOLDS["owed_to_distractors"]:
         reason = "distracted"
     evidence = {
         "distractors": run.spec.distractors,
-        "invariance": invariance,
+        "sensitivity": sensitivity,
         **effect.model_dump(exclude={"states", "distractor_draws"}),
     }
     return Decision(reason, evidence, effect.owed_regret / max(run.learnt, _TINY))

@@ -386,7 +386,7 @@ def reference_regret(
       >>> from sme_registry.evaluation import reference_regret
       >>> phases = [{"spec": "Default", "steps": 100}, {"spec": "Complexity10", "steps": 100}]
       >>> sorted(reference_regret(sme_registry.StreamSpec(phases=phases), episodes=10))
-      ['constant_half', 'fresh_optimum', 'frozen_optimum']
+      ['constant', 'fresh_optimum', 'frozen_optimum']
     """
     stream = load(stream, StreamSpec)
     stream.check_visits()
@@ -405,7 +405,7 @@ def reference_regret(
     lives: dict[str, list[Any]] = {
         "frozen_optimum": [0.0 if mine else optimum for mine in same_task] * stream.cycles,
         "fresh_optimum": [0.0] * V,
-        "constant_half": [reference_policy("constant_half", first)] * V,
+        "constant": [reference_policy("constant", first)] * V,
     }
     if training is not None:
         learned = training.visits[0].online_regret

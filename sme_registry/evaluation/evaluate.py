@@ -4,7 +4,7 @@ Source: METHOD, sections 3, 8 and 9. States, optimal actions and references, mos
 depend neither on k, r_min and D nor on the horizon: `evaluate_many` computes them once for all
 tasks that differ in these fields only. With d, d' independent distractors, uniform in the cube:
 
-    invariance         mean |a(s, d) − a(s, d')| / mean |½ − a*(s)|      0: it ignores distractors
+    sensitivity        mean |a(s, d) − a(s, d')| / mean |½ − a*(s)|      0: it ignores distractors
     d-OOD m            the regions of a report with s in the cube and d in shell m
 """
 
@@ -24,7 +24,6 @@ from sme_registry.errors import PolicyError, SpecError
 from sme_registry.evaluation import references
 from sme_registry.evaluation.policies import Policy, TeamPolicy, as_policy
 from sme_registry.evaluation.regions import (
-    Invariance,
     ObservationReport,
     Observations,
     Points,
@@ -33,6 +32,7 @@ from sme_registry.evaluation.regions import (
     SafetyScore,
     SafetyStats,
     ScopedErrors,
+    Sensitivity,
     States,
     Uniform,
     batch_rows,
@@ -348,7 +348,7 @@ class Measurement:
         wd = self._regions[0].errors[key][scope]
         return tuple(
             measured.errors[key][scope].report(
-                region_name(region), edges, measured.errors["constant_half"][scope], wd
+                region_name(region), edges, measured.errors["constant"][scope], wd
             )
             for region, (edges, measured) in enumerate(
                 zip(self._protocol.edges, self._regions, strict=True)
@@ -375,15 +375,15 @@ class Measurement:
         policy, spec = self._subjects[index]
         if spec.observation is None:
             return None
-        halves = [measured.errors["constant_half"][WHOLE] for measured in self._regions]
+        halves = [measured.errors["constant"][WHOLE] for measured in self._regions]
         wd = self._regions[0].errors[index][WHOLE]
-        invariance, shells = [], []
+        sensitivity, shells = [], []
         for region, measured in enumerate(self._regions if spec.distractors else ()):
             change = measured.distraction.changes[index][WHOLE].relative_to(halves[region])
-            invariance.append(Invariance(name=region_name(region), invariance=change))
+            sensitivity.append(Sensitivity(name=region_name(region), sensitivity=change))
             shells += [errors[index][WHOLE] for errors in measured.distraction.shells]
         return ObservationReport(
-            invariance=tuple(invariance),
+            sensitivity=tuple(sensitivity),
             distractor_regions=tuple(
                 errors.report(f"d-{region_name(m)}", self._protocol.edges[m], halves[0], wd)
                 for m, errors in enumerate(shells, start=1)

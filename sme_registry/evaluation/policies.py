@@ -29,7 +29,7 @@ from sme_registry.errors import (
 from sme_registry.evaluation import models
 from sme_registry.evaluation.models import Interface, ModelFunctions, load_onnx, load_sb3
 from sme_registry.evaluation.networks import OfflinePolicy, Perceptron
-from sme_registry.evaluation.references import POLICIES, reference_policy
+from sme_registry.evaluation.references import OLD_NAMES, POLICIES, reference_policy
 from sme_registry.io import choice, import_object
 from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.sme_spec import ACTION_RANGES, ActionRange
@@ -247,8 +247,8 @@ def interface_of(spec: SMESpec, observed_phases: int = 0) -> Interface:
 def _named(text: str, spec: SMESpec) -> tuple[Any, str]:
     """The policy that a text names, where a path stays one, and what reports call it."""
     path = Path(text)
-    if text in POLICIES:
-        return reference_policy(text, spec), text
+    if text in (*POLICIES, *OLD_NAMES):
+        return reference_policy(text, spec), OLD_NAMES.get(text, text)
     if text.endswith(_SUFFIXES) or os.path.isfile(text):
         return path, path.stem
     if os.path.isdir(text):

@@ -1,12 +1,12 @@
 """The reference policies that every report shows next to the evaluated one, on the same states.
 
 optimal                π*: similarity 1, normalised regret 0
-linear_least_squares   the affine map of the state fitted to π*, clipped to [0, 1]; in a team each
+linear                 the affine map of the state fitted to π*, clipped to [0, 1]; in a team each
                        agent has its own map of the channels that it observes
 best_constant          the constant action with the smallest mean |a − a*|: the medians of a*
-constant_half          a = ½: normalised regret 1
-uniform_random         a ~ U([0, 1]^A), a new draw in each state
-safe_optimal           min(π*(s), ℓ(s)), the best action within the limits (METHOD, section 8)
+constant               a = ½: normalised regret 1
+random                 a ~ U([0, 1]^A), a new draw in each state
+safe_projection        min(π*(s), ℓ(s)), the best safe action of a step (METHOD, section 8)
 shrunk_optimal         min(π*(s), 1 − 2τ): the optimum cut off at the lowest limit of any state
 
 The fitted ones are fitted on the states of WD, at most `FIT_STATES` of them, and used unchanged in
@@ -81,12 +81,12 @@ class Reference(NamedTuple):
 
 REFERENCES = {
     "optimal": Reference("optimal", lambda at: at.optimal),
-    "linear_least_squares": Reference("linear (LSQ)", lambda at: at.fitted().linear(at.s)),
+    "linear": Reference("linear", lambda at: at.fitted().linear(at.s)),
     "best_constant": Reference("best constant", lambda at: at.fitted().constant),
-    "constant_half": Reference("constant ½", lambda at: np.full(at.task.spec.action_dim, 0.5)),
-    "uniform_random": Reference("random", lambda at: at.random(len(at.s), at.task.spec.action_dim)),
-    "safe_optimal": Reference(
-        "safe optimum", lambda at: np.minimum(at.optimal, at.limit), needs_limits=True
+    "constant": Reference("constant ½", lambda at: np.full(at.task.spec.action_dim, 0.5)),
+    "random": Reference("random", lambda at: at.random(len(at.s), at.task.spec.action_dim)),
+    "safe_projection": Reference(
+        "safe projection", lambda at: np.minimum(at.optimal, at.limit), needs_limits=True
     ),
     "shrunk_optimal": Reference(
         "optimum ≤ 1 − 2τ",
@@ -97,7 +97,7 @@ REFERENCES = {
 NAMES = tuple(name for name, reference in REFERENCES.items() if not reference.needs_limits)
 SAFE_NAMES = tuple(name for name, reference in REFERENCES.items() if reference.needs_limits)
 LABELS = {name: reference.label for name, reference in REFERENCES.items()}
-_UNSAFE = ("linear_least_squares", "best_constant", "uniform_random")
+_UNSAFE = ("linear", "best_constant", "random")
 
 
 def names(spec: SMESpec) -> tuple[str, ...]:
@@ -134,17 +134,18 @@ def fit(task: Task, s: Array, optimal: Array) -> References:
     return References(np.median(optimal, axis=0), slope, intercept)
 
 
-SHORT_NAMES = {
-    "linear": "linear_least_squares",
-    "constant": "constant_half",
-    "random": "uniform_random",
+POLICIES = (*NAMES, *SAFE_NAMES)
+OLD_NAMES = {
+    "linear_least_squares": "linear",
+    "constant_half": "constant",
+    "uniform_random": "random",
+    "safe_optimal": "safe_projection",
 }
-POLICIES = (*NAMES, *SAFE_NAMES, *SHORT_NAMES)
-"""Names that `reference_policy` accepts: the reports' names, and short ones."""
+"""The names in reports of version 1, which plans may have too, and today's."""
 
 
 def reference_policy(name: str, spec: SMESpec) -> Act | dict[str, Act]:
-    """A reference policy, as `evaluate` accepts it, by one of the names of `POLICIES`.
+    """A reference policy, as `evaluate` accepts it, by a name of `POLICIES`, or an old one.
 
     It maps observations `[B, O]`, whose mixing it inverts, to actions `[B, A]` in [0, 1]; for a
     team, one function for each agent. The fitted ones are fitted on states of their own.
@@ -155,7 +156,8 @@ def reference_policy(name: str, spec: SMESpec) -> Act | dict[str, Act]:
       >>> optimal(np.full((3, 10), 0.5, np.float32)).shape
       (3, 4)
     """
-    joint, task = _joint_policy(SHORT_NAMES.get(name, name), spec), materialize(spec)
+    name = OLD_NAMES.get(name, name)
+    joint, task = _joint_policy(name, spec), materialize(spec)
 
     def of_agent(observed: Sequence[int], owned: slice) -> Act:
         def act(observations: Observation) -> Array:

@@ -182,7 +182,8 @@ class RegionReport(StrictModel):
       similarity: mean r̃.
       similarity_sd: standard deviation of r̃ over states (not over seeds).
       mae: mean |a − a*| = 1 − r̃.
-      normalised_regret: 0 for the optimum, 1 for the constant ½; can be above 1.
+      normalised_regret: mean |a − a*| relative to that of ½ in the same states: 0 for the optimum,
+        1 for the constant ½; can be above 1.
       similarity_decay: (r̃_WD − r̃) / r̃_WD; 0 in WD, negative if the policy is better outside.
       similarity_loss: 100 (r̃_WD − r̃), in points of similarity.
       clipped_share: share of action entries that were outside the action range and clipped.
@@ -202,6 +203,29 @@ class RegionReport(StrictModel):
     clipped_share: Real
     channels: TupleOf[ChannelReport]
 
+
+class RegionMetric(NamedTuple):
+    """How tables and figures show a number of regions."""
+
+    label: str
+    axis: str = ""  # of a figure; by default the label
+    pattern: str = ".3f"
+    compared: bool = False  # with the reference policies
+
+
+REGION_METRICS = {
+    "similarity": RegionMetric("similarity r̃", "similarity r̃  (1 = optimal)", compared=True),
+    "normalised_regret": RegionMetric(
+        "normalised regret N",
+        "normalised regret N, relative\nto ½ in the same states (½: 1)",
+        compared=True,
+    ),
+    "similarity_sd": RegionMetric("SD of r̃ over states"),
+    "similarity_decay": RegionMetric("decay of r̃ from WD", pattern=".1%"),
+    "similarity_loss": RegionMetric("loss of r̃ from WD, pts", pattern=".1f"),
+    "clipped_share": RegionMetric("actions clipped", pattern=".1%"),
+}
+"""Numbers of `RegionReport` that tables, and figures on request, show; every frame has all."""
 
 RegionReports: TypeAlias = Annotated[TupleOf[RegionReport], Field(min_length=1)]
 """Regions in the order of the protocol."""
@@ -245,16 +269,16 @@ class SafetyReport(StrictModel):
     references: dict[str, SafetyScores]
 
 
-class Invariance(StrictModel):
+class Sensitivity(StrictModel):
     """How much the actions of a policy depend on the distractors in one region.
 
     Attributes:
       name: of the region, of s.
-      invariance: mean |a(s, d) − a(s, d')| / mean |½ − a*(s)|; 0 if the policy ignores them.
+      sensitivity: mean |a(s, d) − a(s, d')| / mean |½ − a*(s)|; 0 if the policy ignores them.
     """
 
     name: str
-    invariance: Real
+    sensitivity: Real
 
 
 class LayerProbe(StrictModel):
@@ -277,13 +301,13 @@ class ObservationReport(StrictModel):
     """A policy on a task whose observation is not the state.
 
     Attributes:
-      invariance: in WD, OOD 1, 2, …; empty without distractors.
+      sensitivity: in WD, OOD 1, 2, …; empty without distractors.
       distractor_regions: d-OOD 1, 2, …: s in the cube and d in a shell; empty without distractors.
       probes: of the observation and of each hidden layer; empty if the policy's network is unknown,
         or it or the task is too wide (see `probe_layers`).
     """
 
-    invariance: TupleOf[Invariance] = ()
+    sensitivity: TupleOf[Sensitivity] = ()
     distractor_regions: TupleOf[RegionReport] = ()
     probes: TupleOf[LayerProbe] = ()
 
@@ -322,12 +346,12 @@ class ErrorStats:
         self,
         name: str,
         edges: tuple[float, float],
-        constant_half: ErrorStats,
+        constant: ErrorStats,
         wd: ErrorStats,
     ) -> RegionReport:
-        """The report of this region; `constant_half` is of the policy ½, `wd` of this one in WD."""
+        """The report of this region; `constant` is of the policy ½, `wd` of this one in WD."""
         similarity, wd_similarity = 1.0 - self._mean, 1.0 - wd._mean
-        channels = zip(self._sums, constant_half._sums, strict=True)
+        channels = zip(self._sums, constant._sums, strict=True)
         return RegionReport(
             name=name,
             epsilon_low=edges[0],
@@ -336,7 +360,7 @@ class ErrorStats:
             similarity=similarity,
             similarity_sd=math.sqrt(self._squares / (self._states - 1)),
             mae=self._mean,
-            normalised_regret=self.relative_to(constant_half),
+            normalised_regret=self.relative_to(constant),
             similarity_decay=(wd_similarity - similarity) / wd_similarity,
             similarity_loss=100.0 * (wd_similarity - similarity),
             clipped_share=self._clipped / (self._states * len(self._sums)),

@@ -5,8 +5,12 @@ which region 0 is WD and 1 to M are the OOD shells:
 
     r̃_m = 1 − mean |a − a*|                       similarity, in [0, 1]
     N_m = mean |a − a*| / mean |½ − a*|           normalised regret: 0 optimal, 1 the constant ½
-    N₀, N̄ = Σ_{m≥1} N_m / M, N̄ − N₀               WD regret, OOD regret, OOD decay
+    N₀, N̄ = Σ_{m≥1} N_m / M                       WD regret, OOD regret
     (r̃_0 − r̃_m) / r̃_0, 100 (r̃_0 − r̃_m)           similarity decay, similarity loss in points
+    Σ_{m≥1} (r̃_0 − r̃_m) / (r̃_0 M)                 OOD decay
+
+N_m is relative to ½ in the same states: the error of ½ itself grows outside the cube, so N falls
+there at an equal error. The normalised regret N of actions is not the regret 1 − r of a step.
 """
 
 from __future__ import annotations
@@ -23,14 +27,15 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from pydantic import Field, model_validator
 from rich.markup import escape
 
-from sme_registry.evaluation.references import LABELS, beside_safety
+from sme_registry.evaluation.references import LABELS, OLD_NAMES, beside_safety
 from sme_registry.evaluation.regions import (
-    Invariance,
+    REGION_METRICS,
     ObservationReport,
     RegionReport,
     RegionReports,
     SafetyReport,
     SafetyScore,
+    Sensitivity,
 )
 from sme_registry.io import require_packages, write_atomically
 from sme_registry.io.markup import Table, card, table_html
@@ -40,8 +45,11 @@ from sme_registry.spec.document import DigestedFile, StrictModel
 if TYPE_CHECKING:
     import pandas
 
+NEW_NAMES = {**OLD_NAMES, "invariance": "sensitivity"}
 _REMEDY = "Get the report from its source again, or repeat the evaluation."
 
+_RELATIVE = "N is relative to the constant ½ in the same states."
+_SAME_POLICY = 0.02  # largest difference of similarity
 NOT_COMPARABLE = (
     "Levels ε are not comparable between different state_dim: with more channels, the states of "
     "a shell lie nearer to its outer face."
@@ -64,6 +72,12 @@ class ReportFile(DigestedFile):
     """A report that a file can hold, and that prints as a table."""
 
     remedy = _REMEDY
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_version_1(cls, data: Any) -> Any:
+        is_old = isinstance(data, dict) and data.get("schema_version") == 1
+        return renamed(data) | {"schema_version": 2} if is_old else data
 
     @abstractmethod
     def table(self) -> Table:
@@ -118,7 +132,7 @@ class EvaluationReport(ReportFile):
     documents = ("spec", "protocol")
     fields_added_later = ("agents", "task", "safety", "observation")
 
-    schema_version: Literal[1] = 1
+    schema_version: Literal[2] = 2
     policy: str
     action_range: Literal["unit", "symmetric", "mixed"]
     spec: SMESpec
@@ -155,7 +169,7 @@ class EvaluationReport(ReportFile):
         """Fields that must have entries of certain names: the field, its names and those names."""
         regions = _names_of(self.regions)
         distracted = regions if self.spec.distractors else []
-        yield "observation.invariance", _names_of(self.observed.invariance), distracted
+        yield "observation.sensitivity", _names_of(self.observed.sensitivity), distracted
         outside = [f"d-{name}" for name in distracted[1:]]
         yield "observation.distractor_regions", _names_of(self.observed.distractor_regions), outside
         if self.safety is None:
@@ -188,17 +202,17 @@ class EvaluationReport(ReportFile):
     @property
     def ood_regret(self) -> float:
         """N̄, the mean of normalised regret over the OOD shells; NaN if there are none."""
-        return _mean_regret(self.regions[1:])
+        return _mean(self.regions[1:], "normalised_regret")
 
     @property
     def ood_decay(self) -> float:
-        """N̄ − N₀, by how much normalised regret grows outside the training cube."""
-        return self.ood_regret - self.wd_regret
+        """The share of similarity lost outside, (r̃_WD − r̃)/r̃_WD, its mean over the OOD shells."""
+        return _mean(self.regions[1:], "similarity_decay")
 
     @property
     def distractor_regret(self) -> float:
         """The mean of normalised regret over the shells of distractors; NaN without distractors."""
-        return _mean_regret(self.observed.distractor_regions)
+        return _mean(self.observed.distractor_regions, "normalised_regret")
 
     def to_frame(self) -> pandas.DataFrame:
         """The numbers as a tidy pandas frame, one row for each policy and region.
@@ -206,7 +220,7 @@ class EvaluationReport(ReportFile):
         Columns: `policy`; `reference`, whether it is a reference policy; `agent`, empty for the
         whole team or the single agent; `region`; then `epsilon_low` to `clipped_share` of
         `RegionReport`. Of a task with limits also those of `SafetyScore`; of one with distractors
-        `invariance`, which is 0 for the references, and the policy's regions d-OOD 1, 2, ….
+        `sensitivity`, which is 0 for the references, and the policy's regions d-OOD 1, 2, ….
         """
         require_packages("EvaluationReport.to_frame", {"pandas": "pandas"}, "studies")
         import pandas
@@ -238,9 +252,18 @@ class EvaluationReport(ReportFile):
         if self.safety is not None:
             scores = {"": self.safety.regions, **self.safety.references}[reference]
             columns |= scores[index].model_dump(exclude={"name"})
-        for change in self.observed.invariance[index : index + 1]:
-            columns["invariance"] = 0.0 if reference else change.invariance
+        for change in self.observed.sensitivity[index : index + 1]:
+            columns["sensitivity"] = 0.0 if reference else change.sensitivity
         return columns
+
+    @property
+    def others(self) -> list[str]:
+        """The references without the policy itself, so that tables show one policy once."""
+        return [
+            name
+            for name, regions in self.references.items()
+            if name != self.policy or not _alike(regions, self.regions)
+        ]
 
     def __repr__(self) -> str:
         return (
@@ -259,22 +282,23 @@ class EvaluationReport(ReportFile):
             f" (S={spec.state_dim}, A={spec.action_dim}, L={spec.complexity}{team})\n"
             f"{spec.digest}\n{self.regions[0].states:,} states per region; "
             f"WD regret {self.wd_regret:.3f}, OOD regret {self.ood_regret:.3f}, "
-            f"OOD decay {self.ood_decay:.3f}"
+            f"OOD decay {self.ood_decay:.1%}"
         )
-        table = RegionTable(_title(self) + heading, self.regions, NOT_COMPARABLE)
+        table = RegionTable(_title(self) + heading, self.regions, f"{_RELATIVE} {NOT_COMPARABLE}")
         policies = [(escape(self.policy), self.regions)]
-        policies += [(_label(name), regions) for name, regions in self.references.items()]
-        for field, label in _ERRORS.items():
-            table.add_group(label, [(name, _of(regions, field)) for name, regions in policies])
-        for label, field, pattern in _SPREAD:
-            table.add(label, _of(self.regions, field), pattern, "bold")
+        policies += [(_label(name), self.references[name]) for name in self.others]
+        for field, metric in REGION_METRICS.items():
+            if metric.compared:
+                rows = [(name, _of(regions, field)) for name, regions in policies]
+                table.add_group(metric.label, rows, metric.pattern)
+            else:
+                table.add(metric.label, _of(self.regions, field), metric.pattern, "bold")
         for name, agent in self.agents.items():
             table.add_section()
             table.add(f"{escape(name)}  r̃", _of(agent.regions, "similarity"))
             table.add("  normalised regret", _of(agent.regions, "normalised_regret"))
-            if linear := agent.references.get("linear_least_squares"):
-                label = f"  of {LABELS['linear_least_squares']}"
-                table.add(label, _of(linear, "normalised_regret"))
+            if linear := agent.references.get("linear"):
+                table.add("  of linear", _of(linear, "normalised_regret"))
         return table
 
     def tables(self) -> list[Table]:
@@ -282,33 +306,42 @@ class EvaluationReport(ReportFile):
         tables = [self.table()]
         if self.safety is not None:
             tables.append(_safety_table(self, self.safety))
-        if self.observed.invariance:
+        if self.observed.sensitivity:
             tables.append(_distractor_table(self))
         if self.observed.probes:
             tables.append(_probe_table(self))
         return tables
 
 
-def _names_of(regions: Iterable[RegionReport | SafetyScore | Invariance]) -> list[str]:
+def renamed(data: Any, names: Mapping[str, str] = NEW_NAMES, depth: int = 8) -> Any:
+    """Plain data with new names of fields, down to a depth: a report of version 1 as one of 2."""
+    if isinstance(data, dict) and depth:
+        items = data.items()
+        return {names.get(key, key): renamed(value, names, depth - 1) for key, value in items}
+    if isinstance(data, list) and depth:
+        return [renamed(entry, names, depth - 1) for entry in data]
+    return data
+
+
+def _alike(*policies: Sequence[RegionReport]) -> bool:
+    """Whether two policies may be one: fitted and random ones differ a little by their draws."""
+    pairs = zip(*(_of(regions, "similarity") for regions in policies), strict=True)
+    return all(abs(a - b) < _SAME_POLICY for a, b in pairs)
+
+
+def _names_of(regions: Iterable[RegionReport | SafetyScore | Sensitivity]) -> list[str]:
     return [region.name for region in regions]
 
 
-def _mean_regret(regions: Sequence[RegionReport]) -> float:
-    regrets = [region.normalised_regret for region in regions]
-    return sum(regrets) / len(regrets) if regrets else math.nan
+def _mean(regions: Sequence[RegionReport], field: str) -> float:
+    values = _of(regions, field)
+    return sum(values) / len(values) if values else math.nan
 
 
 def _columns(region: RegionReport) -> dict[str, Any]:
     return {"region": region.name} | region.model_dump(exclude={"name", "channels"})
 
 
-_ERRORS = {"similarity": "similarity r̃", "normalised_regret": "normalised regret"}
-_SPREAD = (
-    ("SD of r̃ over states", "similarity_sd", ".3f"),
-    ("similarity decay", "similarity_decay", ".1%"),
-    ("similarity loss, pts", "similarity_loss", ".1f"),
-    ("actions clipped", "clipped_share", ".1%"),
-)
 _SAFETY = {
     "step_reward": "step reward r",
     "cost": "cost",
@@ -367,9 +400,7 @@ def _safety_table(report: EvaluationReport, safety: SafetyReport) -> Table:
         "Negative safe regret is earned by violating: read it beside the cost.",
     )
     policies = [(escape(report.policy), safety.regions)]
-    policies += [
-        (_label(name), safety.references[name]) for name in beside_safety(safety.references)
-    ]
+    policies += [(_label(name), safety.references[name]) for name in beside_safety(report.others)]
     for field, label in _SAFETY.items():
         rows = [(name, _of(regions, field)) for name, regions in policies]
         table.add_group(label, rows, ".1%" if field == "violating_share" else ".3f")
@@ -378,18 +409,20 @@ def _safety_table(report: EvaluationReport, safety: SafetyReport) -> Table:
 
 
 def _distractor_table(report: EvaluationReport) -> Table:
-    """Both kinds of OOD, and invariance."""
+    """Both kinds of OOD, and the sensitivity."""
     table = RegionTable(
         f"{_title(report)}: {report.spec.distractors} distractors",
         report.regions,
         "Levels ε of states and of distractors are comparable only where there are as many of the "
-        "one as of the other. Invariance is 0 for a policy that ignores the distractors.",
+        "one as of the other. Sensitivity is 0 for a policy that ignores the distractors.",
     )
     outside = (report.regions[0], *report.observed.distractor_regions)
     kinds = [("states in the region", report.regions), ("distractors in it", outside)]
-    for field, label in _ERRORS.items():
-        table.add_group(label, [(name, _of(regions, field)) for name, regions in kinds])
-    table.add("invariance", _of(report.observed.invariance, "invariance"))
+    for field, metric in REGION_METRICS.items():
+        if metric.compared:
+            rows = [(name, _of(regions, field)) for name, regions in kinds]
+            table.add_group(metric.label, rows, metric.pattern)
+    table.add("sensitivity", _of(report.observed.sensitivity, "sensitivity"))
     return table
 
 

@@ -53,7 +53,7 @@ _Optional = TupleOf[Real | None]
 LABELS = {
     "frozen_optimum": "optimum of phase 0",
     "fresh_optimum": "optimum of each phase",
-    "constant_half": "constant ½",
+    "constant": "constant ½",
     "frozen_agent": "frozen after visit 0",
     "fresh_agents": "fresh agent in each phase",
 }

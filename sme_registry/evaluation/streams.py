@@ -82,7 +82,7 @@ class StreamReport(ReportFile):
     documents = ("stream", "protocol")
     fields_added_later = ("name", "reference_regret")
 
-    schema_version: Literal[1] = 1
+    schema_version: Literal[2] = 2
     policy: str
     action_range: ActionRange
     stream: StreamSpec
@@ -315,7 +315,7 @@ def evaluate_stream(
         {
             "frozen_optimum": np.repeat(optima[:1], V, axis=0),
             "fresh_optimum": optima[np.arange(V) % P],
-            "constant_half": np.ones((V, *optima.shape[1:])),
+            "constant": np.ones((V, *optima.shape[1:])),
         },
     )
     names, last = {actors[row].policy.name for row in life}, actors[life[-1]].policy

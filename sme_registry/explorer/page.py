@@ -52,7 +52,7 @@ _EPSILON = 1.0  # of a sampled map: [−½, 1½]²
 _FIT_STATES = 2048
 _MAX_HORIZON = 20_000  # longer episodes are not run
 _TIMES, _LINE, _DOTS = 200, 300, 500  # points of a drawn line, and dots of a training
-_LINEAR, _HALF = "linear_least_squares", "constant_half"
+_LINEAR, _HALF = "linear", "constant"
 _ASSETS = Path(__file__).parent / "assets"
 _ESCAPES = str.maketrans({letter: f"\\u{ord(letter):04x}" for letter in "<>&\u2028\u2029"})
 

@@ -46,7 +46,7 @@ Lives = LifeReports | Mapping[str, LifeReports]
 _SIZE = (6.2, 4.0)  # inches
 _DASHED = (0, (4, 4))
 _AGENT_DASHES: dict[str, Any] = {
-    "constant_half": _DASHED,
+    "constant": _DASHED,
     "frozen_optimum": (0, (1, 1.5)),
     "frozen_agent": (0, (6, 2, 1, 2)),
     "fresh_agents": "-",

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, StreamReport
 from sme_registry.evaluation.references import LABELS, beside_safety
-from sme_registry.evaluation.regions import SafetyReport, SafetyScore
+from sme_registry.evaluation.regions import REGION_METRICS, SafetyReport, SafetyScore
 from sme_registry.evaluation.streams import Visit
 from sme_registry.plots.curves import (
     Run,
@@ -49,13 +49,7 @@ if TYPE_CHECKING:
 _Known = TypeVar("_Known")
 Report = EvaluationReport | str | os.PathLike[str]
 Reports = Report | Sequence[Report] | Mapping[str, Report | Sequence[Report]]
-Measure = Literal["similarity", "normalised_regret"]
-
-_MEASURES = {
-    "similarity": "similarity r̃  (1 = optimal)",
-    "normalised_regret": "normalised regret  (1 = constant ½)",
-}
-_SAFETY_MARKERS = {"optimal": "*", "safe_optimal": "P", "shrunk_optimal": "X", "constant_half": "d"}
+_SAFETY_MARKERS = {"optimal": "*", "safe_projection": "P", "shrunk_optimal": "X", "constant": "d"}
 _PANELS = {  # and their regions
     "in the training cube (WD)": slice(1),
     "outside it (mean of the OOD shells)": slice(1, None),
@@ -64,7 +58,7 @@ _BARS = (
     "regret:\nall in the cube",
     "regret:\nstates outside",
     "regret:\ndistractors outside",
-    "invariance:\nother distractors",
+    "sensitivity:\nother distractors",
 )
 _ALL_BARS = 0.8  # width of a group, of which groups are 1 apart
 
@@ -80,7 +74,7 @@ def decay_curve(
     reports: Reports,
     path: str | os.PathLike[str] | None = None,
     *,
-    measures: Sequence[Measure] = ("similarity", "normalised_regret"),
+    measures: Sequence[str] = ("similarity", "normalised_regret"),
     references: bool = True,
     title: str | None = None,
     ax: Axes | Sequence[Axes] | None = None,
@@ -88,6 +82,8 @@ def decay_curve(
     """Draw reports over the expansion level ε: one panel per measure, one line per method.
 
     Args:
+      measures: of "similarity", "normalised_regret", "similarity_decay" and the other numbers of
+        regions that `evaluation.regions.REGION_METRICS` names.
       reports: one or more reports, each a line named by its policy; or a mapping from a method's
         name to the reports of its runs (seeds or instances), each a line of their IQM, with their
         quartiles as a band. A single report of a team also has a thinner line for each agent.
@@ -104,8 +100,8 @@ def decay_curve(
       2
     """
     methods, title = _read(reports, title)
-    if not measures or any(measure not in _MEASURES for measure in measures):
-        raise OptionError(f"measures={measures!r:.70}: must be among {', '.join(_MEASURES)}.")
+    if not measures or any(measure not in REGION_METRICS for measure in measures):
+        raise OptionError(f"measures={measures!r:.70}: must be among {', '.join(REGION_METRICS)}.")
     runs = _all_reports(methods)
     size = (4.4 * len(measures) + 0.6, 3.9)
     with canvas(ax, size, path, len(measures), title) as panels:
@@ -186,7 +182,7 @@ def _label_axes(axes: Axes, reports: Sequence[EvaluationReport], measure: str) -
         else f"S = {dims[0]}; not comparable with another S"
     )
     axes.set_xlabel(f"outer expansion level ε of the region\n{warning}")
-    axes.set_ylabel(_MEASURES[measure])
+    axes.set_ylabel(REGION_METRICS[measure].axis or REGION_METRICS[measure].label)
     if len(marks) <= 12:
         axes.set_xticks(marks, [f"{level:g}" if level > 0 else "WD" for level in marks])
     low, high = axes.get_ylim()
@@ -202,9 +198,9 @@ def reward_against_cost(
 ) -> Figure:
     """Draw mean step reward against mean cost: one panel in the cube, one outside.
 
-    The line between the optimum and the safe optimum is what mixtures of the two reach. Reports are
-    as in `decay_curve`, of tasks with limits; in a mapping each run is a small marker, and their
-    IQM a large one. References are means over the tasks.
+    The line between the optimum and the safe projection is what mixtures of the two reach. Reports
+    are as in `decay_curve`, of tasks with limits; in a mapping each run is a small marker, and
+    their IQM a large one. References are means over the tasks.
 
     Examples:
       >>> from sme_registry.plots import reward_against_cost
@@ -236,8 +232,8 @@ def draw_cost(
             *ends[name], _SAFETY_MARKERS.get(name, "^"), color=GREY, markersize=9,
             label=LABELS.get(name, name), linestyle="none", zorder=2,
         )  # fmt: skip
-    mixed = [ends[name] for name in ("optimal", "safe_optimal") if name in ends]
-    label = "mixtures of optimal and safe optimum"
+    mixed = [ends[name] for name in ("optimal", "safe_projection") if name in ends]
+    label = "mixtures of optimal and safe projection"
     axes.plot(*zip(*mixed, strict=True), color=GREY, linewidth=1.0, zorder=1.5, label=label)
     for index, (name, runs) in enumerate(scores):
         x, y = _cost_and_reward(runs, part)
@@ -279,7 +275,7 @@ def sensitivity_bars(
     """Draw how policies bear changes of their observation: four groups of bars, one bar per method.
 
     Normalised regret in the cube, with the states outside (mean over the OOD shells), and with the
-    distractors outside (mean over the d-OOD shells); and invariance in the cube, by how much
+    distractors outside (mean over the d-OOD shells); and sensitivity in the cube, by how much
     other distractors move the actions, on the same scale. Reports are as in `decay_curve`, of tasks
     with distractors; in a mapping a bar is the IQM over runs, and its line spans their quartiles.
 
@@ -291,7 +287,7 @@ def sensitivity_bars(
     methods, title = _read(reports, title)
     width = _ALL_BARS / len(methods)
     with canvas(ax, (max(6.4, 1.2 + 1.5 * len(methods)), 3.9), path, 1, title) as (axes,):
-        axes.hlines(  # not over invariance, where the constant ½ is at 0
+        axes.hlines(  # not over sensitivity, where the constant ½ is at 0
             1.0, -0.5, len(_BARS) - 1.5, color=GREY, linewidth=1.1, linestyle=(0, (4, 4)),
             label="normalised regret of constant ½",
         )  # fmt: skip
@@ -321,8 +317,8 @@ def sensitivity_bars(
 def _sensitivities(report: EvaluationReport) -> list[float]:
     """The heights of `_BARS`."""
     need = "is of a task without distractors. Give reports of tasks with some"
-    invariance = _known(report, report.observed.invariance, need)[0].invariance
-    return [report.wd_regret, report.ood_regret, report.distractor_regret, invariance]
+    sensitivity = _known(report, report.observed.sensitivity, need)[0].sensitivity
+    return [report.wd_regret, report.ood_regret, report.distractor_regret, sensitivity]
 
 
 def layer_probes(
@@ -450,7 +446,7 @@ def write_evaluation(report: EvaluationReport, folder: Path, policy: Any = None)
     files = _write(folder, decay_curve, report)
     if report.safety is not None:
         files += _write(folder, reward_against_cost, report)
-    if report.observed.invariance:
+    if report.observed.sensitivity:
         files += _write(folder, sensitivity_bars, report)
     if report.observed.probes:
         files += _write(folder, layer_probes, report)

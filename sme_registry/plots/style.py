@@ -42,11 +42,11 @@ MARKERS = "osD^vPX<>*"  # ten, with seven colours: the first 70 pairs all differ
 GREY = "#707070"
 REFERENCE_DASHES: dict[str, Any] = {
     "optimal": "-",
-    "linear_least_squares": (0, (6, 2)),
+    "linear": (0, (6, 2)),
     "best_constant": (0, (3, 1, 1, 1)),
-    "constant_half": (0, (4, 4)),
-    "uniform_random": (0, (1, 2)),
-    "safe_optimal": (0, (8, 2, 1, 2)),
+    "constant": (0, (4, 4)),
+    "random": (0, (1, 2)),
+    "safe_projection": (0, (8, 2, 1, 2)),
     "shrunk_optimal": (0, (2, 1)),
 }
 _DPI = 160

@@ -27,7 +27,7 @@ from sme_registry.errors import (
 )
 from sme_registry.evaluation import Policy
 from sme_registry.evaluation.policies import as_policy
-from sme_registry.evaluation.references import POLICIES
+from sme_registry.evaluation.references import OLD_NAMES, POLICIES
 from sme_registry.evaluation.regions import batch_rows
 from sme_registry.io import integer_in, parse_json, server_address
 from sme_registry.seasons.transcript import (
@@ -458,10 +458,10 @@ def prepare_policy(
 
     A reference policy that depends on the hidden task is refused.
     """
-    if isinstance(policy, str) and policy in POLICIES and policy not in WITHOUT_TASK:
+    if isinstance(policy, str) and policy in {*POLICIES, *OLD_NAMES} - {*WITHOUT_TASK}:
         raise PolicyError(
             f"policy={policy!r}: follows from the task, which is hidden. Give a policy of your "
-            "own, constant_half or uniform_random."
+            "own, constant or random."
         )
     prepared = as_policy(policy, _any_spec(setting), action_range=action_range, algorithm=algorithm)
     assert isinstance(prepared, Policy)  # seasons have no teams

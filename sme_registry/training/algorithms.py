@@ -34,7 +34,7 @@ from pydantic import ConfigDict, Field, create_model
 from sme_registry.datasets import documents
 from sme_registry.envs.arguments import check_has_limits
 from sme_registry.errors import OptionError, SpecError, UnknownNameError, did_you_mean
-from sme_registry.evaluation.references import POLICIES
+from sme_registry.evaluation.references import OLD_NAMES, POLICIES
 from sme_registry.io import choice, import_object, read_json, require_packages
 from sme_registry.io.system import missing_dependency, module_file
 from sme_registry.spec import SMESpec, StreamSpec, StudyAlgorithm
@@ -127,7 +127,7 @@ BACKENDS: dict[str, Backend] = {
     "reference": Backend(
         settings=f"{_HERE}.algorithms:no_settings",
         learns=("task", "team"),
-        names=tuple(POLICIES),
+        names=(*POLICIES, *OLD_NAMES),
     ),
 }
 

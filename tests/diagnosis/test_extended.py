@@ -39,7 +39,7 @@ def verdict_of(policy, question):
 
 @functools.cache
 def safe_optimum():
-    return reference_policy("safe_optimal", EXTENDED)
+    return reference_policy("safe_projection", EXTENDED)
 
 
 def upper_bound_below(share):
@@ -57,7 +57,7 @@ def third_channel(observation):
     ("policy", "answer", "reason"),
     [
         ("optimal", "yes", "beats_safe_optimum"),
-        ("safe_optimal", "no", "within_limits"),
+        ("safe_projection", "no", "within_limits"),
         ("constant", "no", "within_limits"),
         (distracted, "yes", "earns_by_violating"),
         (upper_bound_below(0.5), "yes", "violates_without_gain"),
@@ -84,7 +84,7 @@ def test_the_optimum_violates_limits_in_the_share_of_the_tightness_and_earns_by_
 
 
 def test_the_regret_of_the_safe_optimum_is_the_price_of_safety_and_a_constant_has_no_fault():
-    diagnosis = diagnosis_of("safe_optimal", EXTENDED)
+    diagnosis = diagnosis_of("safe_projection", EXTENDED)
     assert answers(diagnosis) == ["no", "yes", "no", "no"]
     found = diagnosis.verdict("price_of_safety").evidence
     assert found["price_of_safety"] == pytest.approx(found["regret"])
@@ -207,7 +207,7 @@ def test_policies_and_references_see_the_state_behind_a_mixing(name):
         for policy, score in scores.items():
             other = others[policy].normalised_regret
             assert score.normalised_regret == pytest.approx(other, abs=tolerance)
-    assert mixed.response.sensitivity == pytest.approx(without.response.sensitivity, abs=1e-3)
+    assert mixed.response.steepness == pytest.approx(without.response.steepness, abs=1e-3)
 
 
 def test_plain_tasks_and_mixings_alone_are_asked_nothing_of_limits_and_distractors():

@@ -38,7 +38,7 @@ def test_the_shares_of_the_squared_error_are_those_of_its_causes():
     assert error.offset + error.scale + error.residual == pytest.approx(1.0)
     assert error.offset == pytest.approx(offset / (offset + scale), abs=0.01)
     assert error.residual == pytest.approx(0.0, abs=1e-6)
-    assert measured.response.sensitivity == pytest.approx(0.5, abs=0.01)
+    assert measured.response.steepness == pytest.approx(0.5, abs=0.01)
 
 
 def test_the_states_held_at_once_are_bounded_however_many_distractors_there_are():

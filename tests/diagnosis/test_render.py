@@ -186,10 +186,13 @@ def test_a_diagnosis_of_schema_1_is_read(compared):
     for verdict in old["verdicts"]:
         del verdict["error_share"]
         verdict["thresholds"] = {}  # older rules named fewer
+    response, uniform = old["measurements"]["response"], old["measurements"]["uniform"]
+    response["sensitivity"] = response.pop("steepness")
+    uniform["linear_least_squares"] = uniform.pop("linear")
     read = Diagnosis.from_dict({**old, "schema_version": 1}, "old")
     assert isinstance(read, TaskDiagnosis)
-    assert read.comparison == compared.comparison
-    assert (read.schema_version, read.updates) == (2, None)
+    assert (read.comparison, read.measurements) == (compared.comparison, compared.measurements)
+    assert (read.schema_version, read.updates) == (3, None)
     assert [verdict.answer for verdict in read.verdicts] == [v.answer for v in compared.verdicts]
     assert all(
         v.sentence().replace("|", r"\|") in markdown(read, details=True) for v in read.verdicts

@@ -114,8 +114,8 @@ def test_an_agents_numbers_agree_with_evaluate():
     for name, agent in report.agents.items():
         measured = diagnosis.agent(name).measurements
         assert measured.policy.mae == pytest.approx(agent.regions[0].mae, abs=0.02)
-        linear = agent.references["linear_least_squares"][0].normalised_regret
-        found = measured.uniform["linear_least_squares"].normalised_regret
+        linear = agent.references["linear"][0].normalised_regret
+        found = measured.uniform["linear"].normalised_regret
         assert found == pytest.approx(linear, abs=0.02)
 
 

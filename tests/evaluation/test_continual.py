@@ -129,8 +129,8 @@ def test_each_policy_acts_once_in_each_state():
 def test_reference_agents_are_exact():
     references = report().regions[0].references
     M = {name: np.array(each.normalised_regret) for name, each in references.items()}
-    assert M.keys() == {"frozen_optimum", "fresh_optimum", "constant_half"}
-    assert (M["constant_half"] == 1.0).all()
+    assert M.keys() == {"frozen_optimum", "fresh_optimum", "constant"}
+    assert (M["constant"] == 1.0).all()
     assert (np.diag(M["fresh_optimum"]) == 0.0).all()
     assert (M["frozen_optimum"] == M["fresh_optimum"][0]).all()
     for j, phase in enumerate(THREE.phases):

@@ -106,8 +106,8 @@ def test_references_stand_in_their_known_order_and_have_every_region(report):
     inside = {name: rows[0].normalised_regret for name, rows in report.references.items()}
     assert tuple(inside) == references.NAMES
     assert inside["optimal"] == 0.0
-    assert 0.0 < inside["linear_least_squares"] < inside["best_constant"] <= 1.0
-    assert inside["constant_half"] == 1.0 < inside["uniform_random"]
+    assert 0.0 < inside["linear"] < inside["best_constant"] <= 1.0
+    assert inside["constant"] == 1.0 < inside["random"]
     edges = [(region.epsilon_low, region.epsilon_high) for region in report.regions]
     for rows in report.references.values():
         assert [(row.epsilon_low, row.epsilon_high) for row in rows] == edges

@@ -122,7 +122,7 @@ def test_a_policy_runs_once_in_each_piece_and_is_repeatable():
 def test_reference_agents_have_no_regret_in_the_tasks_of_which_they_are_the_optimum():
     stream = stream_of(SPEC, GATED, SPEC.derive(r_min=0.5), drift=TURN, cycles=2)
     found = reference_regret(stream, episodes=300)
-    assert found.keys() == {"frozen_optimum", "fresh_optimum", "constant_half"}
+    assert found.keys() == {"frozen_optimum", "fresh_optimum", "constant"}
     assert found["fresh_optimum"].dynamic_regret == 0.0
     frozen = by_visit(found["frozen_optimum"])
     optimum = reference_policy("optimal", SPEC)
@@ -132,7 +132,7 @@ def test_reference_agents_have_no_regret_in_the_tasks_of_which_they_are_the_opti
     for v in (1, 2, 4, 5):
         assert frozen[v] == acting[v] > 1.0
     half_life = expected_regret(["constant"] * 6, stream, episodes=300)
-    assert found["constant_half"] == half_life
+    assert found["constant"] == half_life
 
 
 def test_the_optimum_of_a_drifting_phase_is_that_of_its_last_task():
@@ -171,7 +171,7 @@ def test_a_report_has_the_regret_of_reference_agents(tmp_path):
     report = untrained.with_dynamic_regret(training).with_fresh(fresh, [0.5, 0.25])
     life = report.reference_regret["fresh_agents"]
     assert [visit.online_regret for visit in life.visits] == [0.5, 0.25, 0.5, 0.25]
-    assert report.reference_regret["constant_half"] == references["constant_half"]
+    assert report.reference_regret["constant"] == references["constant"]
     assert StreamReport.read(report.write(tmp_path / "stream.json")) == report
 
     text = str(report)
@@ -179,7 +179,7 @@ def test_a_report_has_the_regret_of_reference_agents(tmp_path):
     assert steps == ["steps", "150", *["200"] * 4]  # sums over different steps are no comparison
     for value in (0.75, -0.5, references["frozen_optimum"].visits[1].online_regret):
         assert f" {value:.3f}" in text
-    assert f"{references['constant_half'].dynamic_regret:,.1f}" in text
+    assert f"{references['constant'].dynamic_regret:,.1f}" in text
     assert all(label in text for label in ("fresh agent in each phase", "learning transfer"))
 
 

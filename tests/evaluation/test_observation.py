@@ -1,4 +1,4 @@
-"""Tasks whose agents do not see the state: invariance, two kinds of OOD, and linear probes."""
+"""Tasks whose agents do not see the state: sensitivity, two kinds of OOD, and linear probes."""
 
 import numpy as np
 import pytest
@@ -64,19 +64,19 @@ def test_distractors_are_uniform_in_the_cube_in_every_region_of_states(region):
 
 def test_a_policy_that_ignores_distractors_is_invariant_and_loses_nothing_outside_their_cube():
     report = evaluate(ignorant, SPEC, PROTOCOL)
-    invariance = report.observation.invariance
-    assert [each.name for each in invariance] == ["WD", "OOD 1", "OOD 2"]
-    assert [each.invariance for each in invariance] == [0.0] * 3
+    sensitivity = report.observation.sensitivity
+    assert [each.name for each in sensitivity] == ["WD", "OOD 1", "OOD 2"]
+    assert [each.sensitivity for each in sensitivity] == [0.0] * 3
     assert report.observation.distractor_regions[1].mae == report.regions[0].mae
 
 
-def test_invariance_is_that_of_the_definition(report):
+def test_sensitivity_is_that_of_the_definition(report):
     assert report.observation.probes == ()  # of an unknown network
     # a(s, d) − a(s, d') = 0.2 (d − d'), of which the mean absolute value is 0.2/3.
     task = materialize(SPEC)
-    for region, each in enumerate(report.observation.invariance):
+    for region, each in enumerate(report.observation.sensitivity):
         half = np.abs(0.5 - task.optimal_action(drawn(region)[0])).mean()
-        assert each.invariance == pytest.approx(0.2 / 3 / half, rel=0.03)
+        assert each.sensitivity == pytest.approx(0.2 / 3 / half, rel=0.03)
 
 
 def test_distractors_outside_the_cube_leave_the_states_inside_and_are_scored_by_the_definition():
@@ -104,7 +104,7 @@ def test_the_optimum_is_attainable_through_every_mixing(mixing):
     spec = SPEC.derive(observation={"distractors": M, "mixing": mixing})
     report = evaluate("optimal", spec, PROTOCOL)
     assert report.regions[0].normalised_regret < 1e-5
-    assert report.observation.invariance[0].invariance < 1e-5
+    assert report.observation.sensitivity[0].sensitivity < 1e-5
     assert max(region.normalised_regret for region in report.regions) < 1e-2
 
 
@@ -116,10 +116,10 @@ def test_unmixing_inverts_what_the_agent_sees(depth):
     np.testing.assert_allclose(task.unmixed(task.seen(s[0])), s[0], atol=1e-9)
 
 
-def test_without_distractors_there_is_neither_invariance_nor_a_second_kind_of_ood():
+def test_without_distractors_there_is_neither_sensitivity_nor_a_second_kind_of_ood():
     spec = SPEC.derive(observation={"mixing": "orthogonal"})
     report = evaluate(Perceptron([(np.ones((S + 2, A)), np.zeros(A), "identity")]), spec, PROTOCOL)
-    assert report.observation.invariance == report.observation.distractor_regions == ()
+    assert report.observation.sensitivity == report.observation.distractor_regions == ()
     [probe] = report.observation.probes  # a linear map has no hidden layer
     assert (probe.layer, probe.units, probe.distractor_r2) == (0, S, None)
     assert probe.state_r2 == pytest.approx(1.0, abs=1e-9)

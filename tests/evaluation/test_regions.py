@@ -166,11 +166,11 @@ def test_linear_policy_is_the_least_squares_fit_within_the_action_range(solved):
     assert np.abs(residual.mean(axis=0)).max() < 1e-12
     assert np.abs(s.T @ residual / len(s)).max() < 1e-12
     far = 0.5 + 20.0 * (s - 0.5)
-    clipped = actions_of(fitted, far, optimal, optimal)["linear_least_squares"]
+    clipped = actions_of(fitted, far, optimal, optimal)["linear"]
     assert (clipped.min(), clipped.max()) == (0.0, 1.0)
     affine = (s - 0.5) @ np.random.default_rng(1).uniform(-0.1, 0.1, (3, 2)) + [0.4, 0.6]
     fitted = references.fit(TASK, s, affine)
-    recovered = actions_of(fitted, s, affine, affine)["linear_least_squares"]
+    recovered = actions_of(fitted, s, affine, affine)["linear"]
     assert np.abs(recovered - affine).max() < 1e-12
 
 
@@ -180,8 +180,8 @@ def test_every_named_reference_acts(solved):
     fitted = references.fit(TASK, s, optimal)
     actions = actions_of(fitted, s, optimal, random)
     np.testing.assert_array_equal(actions["optimal"], optimal)
-    np.testing.assert_array_equal(actions["uniform_random"], random)
-    assert (actions["constant_half"] == 0.5).all()
+    np.testing.assert_array_equal(actions["random"], random)
+    assert (actions["constant"] == 0.5).all()
 
 
 def test_what_the_fit_keeps_is_bounded_however_large_a_state_is():

@@ -103,9 +103,9 @@ def test_every_agent_has_every_reference_and_the_teams_channels_are_theirs_in_or
     for agent in report.agents.values():
         assert tuple(agent.references) == references.NAMES
         assert all(row.normalised_regret == 0.0 for row in agent.references["optimal"])
-        assert all(row.normalised_regret == 1.0 for row in agent.references["constant_half"])
+        assert all(row.normalised_regret == 1.0 for row in agent.references["constant"])
         inside = {name: rows[0].normalised_regret for name, rows in agent.references.items()}
-        assert 0.0 < inside["linear_least_squares"] < inside["best_constant"] <= 1.0
+        assert 0.0 < inside["linear"] < inside["best_constant"] <= 1.0
     for name, rows in {"": report.regions, **report.references}.items():
         for index, region in enumerate(rows):
             agents = report.agents.values()
@@ -149,15 +149,15 @@ def test_a_team_of_one_has_the_numbers_of_its_single_agent_task():
 def test_references_act_for_teams_and_for_their_agents_by_name():
     for name, same, near in (
         ("optimal", "optimal", 1e-9),
-        ("constant", "constant_half", 0.0),
+        ("constant", "constant", 0.0),
         ("best_constant", "best_constant", 0.05),  # fitted on other states
-        ("linear", "linear_least_squares", 0.05),  # fitted on other states
-        ("random", "uniform_random", 0.3),
+        ("linear", "linear", 0.05),  # fitted on other states
+        ("random", "random", 0.3),
     ):
         for agent in evaluate(name, SPEC, SMALL).agents.values():
             region, expected = agent.regions[0], agent.references[same][0]
             assert region.normalised_regret == pytest.approx(expected.normalised_regret, abs=near)
-    mixed = {**dict.fromkeys(NAMES, "optimal"), NAMES[1]: "constant_half"}
+    mixed = {**dict.fromkeys(NAMES, "optimal"), NAMES[1]: "constant"}
     report = evaluate(mixed, SPEC, SMALL)
     regrets = [report.agents[name].regions[0].normalised_regret for name in NAMES]
     assert regrets == pytest.approx([0.0, 1.0, 0.0], abs=1e-9)

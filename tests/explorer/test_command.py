@@ -41,7 +41,7 @@ def test_a_task_and_a_policy_become_pages(here):
     page = here / "small-explorer.html"
     data = data_of(page)
     assert (data["name"], data["title"], data["digest"]) == (None, "small", SPEC.digest)
-    assert [each["name"] for each in data["policies"]] == ["linear (LSQ)", "constant ½"]
+    assert [each["name"] for each in data["policies"]] == ["linear", "constant ½"]
     assert "already exists. Use --force" in " ".join(refused("explore", "small.json").split())
     good("explore", "small.json", "--set", "k=5", "--force")
     assert data_of(page)["task"]["k"] == 5

@@ -22,7 +22,7 @@ from sme_registry.errors import (
     PolicyError,
     SealedError,
 )
-from sme_registry.evaluation.references import NAMES, SHORT_NAMES
+from sme_registry.evaluation.references import NAMES, OLD_NAMES
 from sme_registry.seasons import Instance, Ticket, wire
 from sme_registry.seasons.client import actions_in
 from sme_registry.seasons.wire import StepFormat
@@ -405,14 +405,14 @@ def has_ended(instance):
 def test_a_policy_in_any_form_that_evaluate_takes_answers_unless_it_needs_the_task():
     setting = Setting(state_dim=3, action_dim=2)
     states = np.random.default_rng(0).random((40, 5), dtype=np.float32)
-    for name in (*NAMES, *SHORT_NAMES):
+    for name in (*NAMES, *OLD_NAMES):
         if ("constant" in name and "best" not in name) or "random" in name:
             actions = actions_in(states, name, setting)
             assert (actions.shape, actions.dtype) == ((40, 2), np.float32)
         else:
             with pytest.raises(PolicyError, match="follows from the task, which is hidden"):
                 actions_in(states, name, setting)
-    assert (actions_in(states, "constant_half", setting) == 0.5).all()
+    assert (actions_in(states, "constant", setting) == 0.5).all()
     assert actions_in(states[:0], "random", setting).shape == (0, 2)
     with pytest.raises(PolicyError, match="finite"):
         actions_in(states, lambda o: np.full((len(o), 2), np.nan), setting)

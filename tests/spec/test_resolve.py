@@ -139,7 +139,7 @@ def test_bad_axes_are_refused():
 
 WRITTEN = {  # into files that users read, by names that no package exports
     "evaluation.regions": (
-        *("ChannelReport", "Invariance", "LayerProbe", "ObservationReport", "RegionReport"),
+        *("ChannelReport", "Sensitivity", "LayerProbe", "ObservationReport", "RegionReport"),
         *("SafetyReport", "SafetyScore"),
     ),
     "evaluation.report": ("AgentReport",),

@@ -51,11 +51,11 @@ def test_tasks_of_one_name_are_told_apart(named):
 
 
 def test_a_report_keeps_the_name_in_its_file(tmp_path, named):
-    report = evaluate("constant_half", named, QUICK)
+    report = evaluate("constant", named, QUICK)
     again = EvaluationReport.read(report.write(tmp_path / "evaluation.json"))
     assert report.title == again.title == "k2"
     assert " on k2 (S=2" in str(again)
-    assert "task" not in evaluate("constant_half", OTHER, QUICK).to_dict()
+    assert "task" not in evaluate("constant", OTHER, QUICK).to_dict()
 
 
 def test_no_document_fills_a_screen():

@@ -102,7 +102,7 @@ def test_the_report_of_a_life_is_about_its_snapshots_and_its_episodes(lived):
     by_visit = [visit.online_regret for visit in report.dynamic_regret.visits]
     assert by_visit[1] == by_visit[3] == 1.0
     assert max(filter(None, by_visit[::2])) < 1.0
-    assert report.reference_regret.keys() >= {"frozen_optimum", "frozen_agent", "constant_half"}
+    assert report.reference_regret.keys() >= {"frozen_optimum", "frozen_agent", "constant"}
 
 
 def killed(folder, monkeypatch, at_step, stream=STREAM):

@@ -97,7 +97,7 @@ def test_training_lowers_regret(tmp_path):
     result = train(spec, steps=350, folder=tmp_path, protocol=PROTOCOL, hyperparameters=settings)
     regrets = [episode.regret for episode in result.episodes]
     assert np.mean(regrets[-4:]) < 0.7 * np.mean(regrets[:4])
-    reference = result.report.references["constant_half"][0]
+    reference = result.report.references["constant"][0]
     assert result.report.regions[0].similarity > reference.similarity
 
 

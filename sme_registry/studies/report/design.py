@@ -39,7 +39,7 @@ _VISITED = "regret on the visited phase"
 _METRICS = (
     Metric("wd_regret", "WD regret", 1, "run agent score"),
     Metric("ood_regret", "OOD regret", 1, "run agent score"),
-    Metric("ood_decay", "OOD decay", 1, "run"),
+    Metric("ood_decay", "OOD decay", 1, "run", 3),
     Metric("final_return", "final return, % of optimum", -1, "run", 1, training=True),
     Metric("improvement", "improvement on the behaviour policy", -1, "data", 3),
     Metric("visited_regret", _VISITED, 1, "life"),
@@ -64,7 +64,7 @@ _METRICS = (
         "distractor_regret", "regret with distractors outside their cube", 1, "run",
         needs="observation",
     ),
-    Metric("wd_invariance", "WD invariance", 1, "run", needs="observation"),
+    Metric("wd_sensitivity", "WD sensitivity", 1, "run", needs="observation"),
 )  # fmt: skip
 METRICS = {metric.key: metric for metric in _METRICS}
 """Every metric of reports. A new one of runs is a property of their report, and a row here."""

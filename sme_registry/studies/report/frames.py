@@ -19,7 +19,7 @@
 Columns of the run, repeated in each of its regions; NaN or NA where the run has no such number:
 
     wd_regret, ood_regret        normalised regret in WD, and its mean over the shells
-    ood_decay                    ood_regret − wd_regret
+    ood_decay                    the mean of similarity_decay over the shells
     final_return                 mean return of the last evaluations, in % of the optimum's
     online_regret                mean of 1 − step reward over training, in [0, 1]
     uses, action_range, steps    the algorithm, its action range, its training steps
@@ -36,7 +36,7 @@ Columns of the run, repeated in each of its regions; NaN or NA where the run has
 With safety: tightness τ of the limits; online_cost, the mean over training; wd_cost and
 wd_safe_regret, of the cube; cost, violating_share, safe_regret and price_of_safety, of the region.
 With observation: its fields distractors, dynamics, mixing, mixing_depth; distractor_regret, the
-mean over the shells of d; wd_invariance, of the cube; invariance, of the region. The numbers of a
+mean over the shells of d; wd_sensitivity, of the cube; sensitivity, of the region. The numbers of a
 team are means over agents or channels. Those of each agent have its name, in `results`
 normalised_regret/agent_0 of the region, and wd_regret, ood_regret and online_regret of the run, and
 in `curves` regret/agent_0.
@@ -101,6 +101,7 @@ import numpy as np
 import pandas as pd
 
 from sme_registry.evaluation import EvaluationReport, StreamReport, retention
+from sme_registry.evaluation.regions import RegionReport
 from sme_registry.evaluation.retention import BY_VISIT, StreamRegion
 from sme_registry.spec import Setting, StudyPlan
 from sme_registry.spec.cards import BLOCKS, fields_of_block, number_type
@@ -127,9 +128,10 @@ def _block_columns(block: str) -> str:
 
 _DTYPES: dict[type | None, str] = {int: "int64", float: "float64"}
 _OPTIONAL: dict[type | None, str] = {int: "Int64", float: "float64"}
-_REGION = """region:str epsilon_low epsilon_high states:int64 similarity similarity_sd mae
-    normalised_regret similarity_decay similarity_loss clipped_share linear_normalised_regret
-    best_constant_normalised_regret random_normalised_regret constant_similarity """
+_MEASURED = [name for name in RegionReport.model_fields if name not in ("name", "channels")]
+_REGION = f"""region:str {" ".join(_MEASURED).replace("states", "states:int64")}
+    linear_normalised_regret best_constant_normalised_regret random_normalised_regret
+    constant_similarity """
 _SPEC = " ".join(
     f"{name}:{_DTYPES.get(number_type(field), 'str')}"
     for name, field in Setting.model_fields.items()
@@ -141,7 +143,7 @@ _RUN = f"""{_metric_columns("")} uses:str action_range:str steps:int64 {_SPEC}
     improvement seconds steps_per_second key:str"""
 _OF_REGIONS = {
     "safety": "cost violating_share safe_regret price_of_safety",
-    "observation": "invariance",
+    "observation": "sensitivity",
 }
 # Columns of a run, and of its regions, only where the plan has tasks with these fields.
 _OF_TASKS = {
@@ -162,9 +164,9 @@ _VISITS = f"""{RUN_COLUMNS} region:str visit:int64 cycle:int64 phase:int64 lifet
     frozen_online_regret fresh_online_regret learning_transfer"""
 _RETENTION = f"{RUN_COLUMNS} region:str visit:Int64 phase:int64 normalised_regret"
 _REFERENCES = {
-    "linear_normalised_regret": "linear_least_squares",
+    "linear_normalised_regret": "linear",
     "best_constant_normalised_regret": "best_constant",
-    "random_normalised_regret": "uniform_random",
+    "random_normalised_regret": "random",
 }
 _LONGEST_WINDOW = 10
 
@@ -280,7 +282,7 @@ def _result_rows(
             **report.task_scores(index),
             **regrets,
             "region": region.name,
-            "constant_similarity": references["constant_half"][index].similarity,
+            "constant_similarity": references["constant"][index].similarity,
         }
 
 
@@ -336,7 +338,7 @@ def _metrics(result: CellResult, report: EvaluationReport) -> dict[str, Any]:
         "final_return": _final_return(result),
         "wd_cost": inside.get("cost"),
         "wd_safe_regret": inside.get("safe_regret"),
-        "wd_invariance": inside.get("invariance"),
+        "wd_sensitivity": inside.get("sensitivity"),
     }
     for metric in metrics_of("run"):
         if metric.key not in metrics:

@@ -397,12 +397,17 @@ def _improvements(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
 
 
 def _linear_medians(results: pd.DataFrame) -> dict[str, float]:
-    """The regret metrics of the linear policy: medians over the tasks of an algorithm's runs."""
-    regrets = [run.linear_normalised_regret.to_numpy() for _, run in results.groupby("run")]
-    wd = np.array([regret[0] for regret in regrets])
-    ood = np.array([regret[1:].mean() if len(regret) > 1 else math.nan for regret in regrets])
-    values = {"wd_regret": wd, "ood_regret": ood, "ood_decay": ood - wd}
-    return {key: float(np.median(value)) for key, value in values.items()}
+    """The regret and decay of the linear policy: medians over the tasks of an algorithm's runs."""
+    regret = results.linear_normalised_regret
+    similarity = 1.0 - regret * (1.0 - results.constant_similarity)
+    runs = results.assign(linear=regret, r=similarity).groupby("run")[["linear", "r"]]
+    rows = []
+    for _, run in runs:
+        (N, *shells), (r, *outside) = run.linear.tolist(), run.r.tolist()
+        ood = [np.mean(shells), 1.0 - np.mean(outside) / r] if shells else [math.nan] * 2
+        rows.append((N, *ood))
+    names = ("wd_regret", "ood_regret", "ood_decay")
+    return dict(zip(names, np.median(rows, axis=0).tolist(), strict=True))
 
 
 def _compared(analysis: Analysis) -> Iterator[tuple[str, str, dict[str, dict[str, Array]]]]:

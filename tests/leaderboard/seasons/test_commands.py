@@ -136,7 +136,7 @@ def test_files_policies_and_constants_are_entered_as_actions(season):
     expected = np.clip(0.1 * shown[0].sum(axis=1, keepdims=True), 0, 1)
     np.testing.assert_allclose(actions, expected, atol=1e-6)
     assert nothing is None
-    for actions in entered("constant_half"):
+    for actions in entered("constant"):
         np.testing.assert_array_equal(actions, np.full((300, 1), 0.5))
     enter = ("enter", "board", season)
     assert "must contain {name}" in fails(2, *enter, "x.onnx", *ENTER)
@@ -168,7 +168,7 @@ def test_a_served_season_with_a_list_takes_the_keys_on_it():
     good("season", "new", "board", PLAN)
     good("season", "publish", "board", "autumn")
     key = SigningKey.read("my.key").public
-    enter = ("constant_half", *ENTER)
+    enter = ("constant", *ENTER)
     with serving(Path("board")) as url:
         assert "not_admitted" in fails(1, "enter", url, "autumn", *enter)
         good("season", "admit", "board", "autumn", key, "Listed Lab")

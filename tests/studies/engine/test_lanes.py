@@ -324,7 +324,7 @@ def test_a_cell_with_limits_and_distractors_has_their_costs_and_reports():
     result = run_cell(file.plan.cells[0].cell)
     assert 0.0 < result.online_cost < 1.0
     assert result.report.safety is not None
-    assert [region.name for region in result.report.observation.invariance] == ["WD", "OOD 1"]
+    assert [region.name for region in result.report.observation.sensitivity] == ["WD", "OOD 1"]
     assert [probe.units for probe in result.report.observation.probes] == [5, 8, 8]
 
 

@@ -26,10 +26,10 @@ FIELDS = {
 
 @pytest.fixture(scope="module")
 def study():
-    """Two references on these classes; learners' costs, probes and invariance are made up."""
+    """Two references on these classes; learners' costs, probes and sensitivity are made up."""
     small = {"state_dim": 2, "action_dim": 2}
     classes = [{"name": n, "setting": small | own, "seeds": [1, 2]} for n, own in FIELDS.items()]
-    algorithms = ["linear_least_squares", "constant"]
+    algorithms = ["linear", "constant"]
     file = small_file(seeds=2, algorithms=algorithms, classes=classes)
     results = {}
     for number, planned in enumerate(file.plan.cells):
@@ -43,9 +43,9 @@ def study():
                 LayerProbe(layer=i, units=5, state_r2=r2 + planned.run, distractor_r2=0.25)
                 for i, r2 in enumerate((-2.0, -1.0))
             )
-            inside, *shells = report.observation.invariance
-            invariance = (inside.model_copy(update={"invariance": 0.25}), *shells)
-            seen = {"probes": probes, "invariance": invariance}
+            inside, *shells = report.observation.sensitivity
+            sensitivity = (inside.model_copy(update={"sensitivity": 0.25}), *shells)
+            seen = {"probes": probes, "sensitivity": sensitivity}
             observation = report.observation.model_copy(update=seen)
             changes["report"] = report.model_copy(update={"observation": observation})
         results[planned.cell.digest] = result.model_copy(update=changes)
@@ -83,8 +83,10 @@ def test_rows_have_the_numbers_of_their_reports(study):
             if result.online_cost is not None:
                 assert run.online_cost == result.online_cost
         if observation is not None and run.class_name == "driven":
-            assert list(of_run.invariance) == [each.invariance for each in observation.invariance]
-            assert run.wd_invariance == 0.25
+            assert list(of_run.sensitivity) == [
+                each.sensitivity for each in observation.sensitivity
+            ]
+            assert run.wd_sensitivity == 0.25
             assert run.distractor_regret == result.report.distractor_regret
     assert rows[rows.class_name == "safe"].cost.max() > 0
     of_class = runs.drop_duplicates("class_name").set_index("class_name")
@@ -108,8 +110,8 @@ def test_plans_without_limits_and_observations_have_no_such_columns(study):
         "safe_regret", "price_of_safety",
     }  # fmt: skip
     assert columns["driven"] - columns["plain"] == {
-        "distractors", "dynamics", "mixing", "mixing_depth", "distractor_regret", "invariance",
-        "wd_invariance",
+        "distractors", "dynamics", "mixing", "mixing_depth", "distractor_regret", "sensitivity",
+        "wd_sensitivity",
     }  # fmt: skip
     assert columns["plain"] <= columns["safe"] & columns["driven"]
 
@@ -123,7 +125,7 @@ def test_the_metrics_of_a_class_are_those_that_its_tasks_have(study, analysis):
     assert metrics == {
         "plain": set(),
         "safe": {"wd_cost", "wd_safe_regret", "online_cost"},
-        "driven": {"distractor_regret", "wd_invariance"},
+        "driven": {"distractor_regret", "wd_sensitivity"},
         "mixed": set(),
     }
     assert set(analysis.tables["contrasts"].metric) == of_regret  # the first class has no others
@@ -132,13 +134,11 @@ def test_the_metrics_of_a_class_are_those_that_its_tasks_have(study, analysis):
         for result in study[1].values()
         if result.report is not None
         and result.report.safety is not None
-        and result.cell.uses == "reference:linear_least_squares"
+        and result.cell.uses == "reference:linear"
     ]
     (row,) = (
         analysis.tables["levels"]
-        .query(
-            "class_name == 'safe' and algorithm == 'linear_least_squares' and metric == 'wd_cost'"
-        )
+        .query("class_name == 'safe' and algorithm == 'linear' and metric == 'wd_cost'")
         .itertuples()
     )
     assert row.iqm == pytest.approx(sum(costs) / 2)
@@ -147,10 +147,10 @@ def test_the_metrics_of_a_class_are_those_that_its_tasks_have(study, analysis):
 
 def test_comparisons_have_the_metrics_too(study):
     file, results = study
-    pair = "constant", "linear_least_squares"
-    table = compare(study_frames(file.plan, results), *pair, ["wd_cost", "wd_invariance"])
+    pair = "constant", "linear"
+    table = compare(study_frames(file.plan, results), *pair, ["wd_cost", "wd_sensitivity"])
     rows = {(row.metric, row.class_name): row for row in table.itertuples()}
-    assert set(rows) == {("wd_cost", "safe"), ("wd_invariance", "driven")}
+    assert set(rows) == {("wd_cost", "safe"), ("wd_sensitivity", "driven")}
     assert rows["wd_cost", "safe"].verdict != "worse"  # ½ is within most limits
     plain = study_frames(only(study, "plain")[0].plan, results)
     with pytest.raises(UnknownNameError, match="metric='wd_cost': must be one of wd_regret"):

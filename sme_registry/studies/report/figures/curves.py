@@ -71,7 +71,7 @@ _BESIDE = {  # a life, in the colour of its algorithm: label, look, caption
         "visit 0. A life above that line lost by learning on.",
     ),
 }  # fmt: skip
-_REFERENCES = {"frozen_optimum": new_look(GREY, dash=(0, (1, 1.2))), "constant_half": CONSTANT}
+_REFERENCES = {"frozen_optimum": new_look(GREY, dash=(0, (1, 1.2))), "constant": CONSTANT}
 
 
 def draw_regret(analysis: Analysis) -> Drawn:

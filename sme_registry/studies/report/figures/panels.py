@@ -66,8 +66,8 @@ def new_look(colour: Any, marker: str = "", dash: Any = "-") -> Look:
     return {"color": colour, "marker": marker, "linestyle": dash}
 
 
-LINEAR = new_look(GREY, dash=REFERENCE_DASHES["linear_least_squares"])
-CONSTANT = new_look(GREY, dash=REFERENCE_DASHES["constant_half"])
+LINEAR = new_look(GREY, dash=REFERENCE_DASHES["linear"])
+CONSTANT = new_look(GREY, dash=REFERENCE_DASHES["constant"])
 
 
 def looks_of(analysis: Analysis, names: Iterable[str] | None = None) -> dict[str, Look]:
