@@ -16,6 +16,7 @@ beyond its quota costs no more than the files that it has uploaded.
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import os
 import re
@@ -36,8 +37,10 @@ from leaderboard.documents.submission import (
     Run,
     Submission,
     Submitter,
+    Withdrawal,
     check_names,
     check_runs,
+    check_text,
     now,
     shifted,
     utc,
@@ -46,7 +49,7 @@ from leaderboard.errors import Rejection
 from leaderboard.gate.isolation import Isolation, isolation_for_own
 from leaderboard.gate.reference import constant_onnx, optimal_onnx
 from leaderboard.gate.sandbox import Confined, widths
-from leaderboard.store import Store, expire_uploads
+from leaderboard.store import Store, expire_uploads, unknown_submission
 from sme_registry.io import sha256_of
 from sme_registry.spec import SMESpec
 
@@ -72,24 +75,15 @@ _verdicts: dict[_Case, Rejection | None] = {}
 
 
 def upload_header(key: SigningKey, digest: str, receiver: Receiver, time: str | None = None) -> str:
-    """The value of `Authorization` that lets a key upload one object within ten minutes.
-
-    `digest` is the object's, and `time` that of signing, as documents write it; now by default.
-    """
+    """The value of `Authorization` that lets a key upload an object of this digest at a time."""
     time = time or now()
     signature = key.sign("upload", f"{digest} {time}", receiver)
     named = "".join(f"{name}={value}," for name, value in receiver._asdict().items() if value)
     return f"SME-Ed25519 key={key.public},{named}time={time},signature={signature}"
 
 
-def uploader(
-    board: BoardDocument,
-    header: str | None,
-    digest: str,
-    address: str,
-    at: datetime.datetime | None = None,
-) -> str:
-    """The public key whose header permits an upload to a server's address at a time, or now.
+def uploader(board: BoardDocument, header: str | None, digest: str, address: str) -> str:
+    """The public key whose header permits an upload to a server's address now.
 
     A `Rejection` is `bad_signature`, `wrong_board` or `stale_time`.
     """
@@ -109,24 +103,24 @@ def uploader(
             "Authorization: the signature does not match this object, this time and the key "
             f"{key[:16]}…. Sign each upload separately.",
         )
-    moment = at or datetime.datetime.fromisoformat(now())
-    try:
-        age = abs(moment - datetime.datetime.fromisoformat(time))
-        fresh = age <= datetime.timedelta(minutes=UPLOAD_MINUTES)
-    except ValueError:
-        fresh = False
+    here, fresh = now(), False
+    with contextlib.suppress(ValueError):  # of a time that does not exist
+        fresh = abs(_moment(here) - _moment(time)) <= datetime.timedelta(minutes=UPLOAD_MINUTES)
     if not fresh:
         raise Rejection(
             "stale_time",
-            f"time={time}: must be within {UPLOAD_MINUTES} minutes of the board's {utc(moment)}. "
+            f"time={time}: must be within {UPLOAD_MINUTES} minutes of the board's {here}. "
             "Set your clock, and sign each upload just before sending it.",
         )
     return key
 
 
-def a_day_ago(store: Store) -> str:
+_moment = datetime.datetime.fromisoformat
+
+
+def _a_day_ago(store: Store) -> str:
     """After which submissions and uploads count towards a day's quotas."""
-    return utc(shifted(datetime.datetime.fromisoformat(store.time), -_DAY))
+    return utc(shifted(_moment(store.time), -_DAY))
 
 
 def check_upload(store: Store, key: str, size: int) -> None:
@@ -138,17 +132,17 @@ def check_upload(store: Store, key: str, size: int) -> None:
             f"object: {size:,} bytes: must be at most {limits.artefact_bytes:,}. "
             "Export a smaller network.",
         )
-    used = store.uploaded_bytes(key, a_day_ago(store))
+    used = store.uploaded_bytes(key, _a_day_ago(store))
     if used + size > limits.upload_bytes_per_day:
         raise Rejection(
             "quota",
             f"key={key[:16]}…: has uploaded {used:,} of {limits.upload_bytes_per_day:,} bytes "
             "within 24 hours. Upload the rest 24 hours after the first of them.",
         )
-    check_room(store, size)
+    _check_room(store, size)
 
 
-def check_room(store: Store, size: int) -> None:
+def _check_room(store: Store, size: int) -> None:
     """Reject (`quota`) so many bytes that do not fit onto a board, without expired uploads."""
     expire_uploads(store)
     if store.total_bytes() + size > store.document.limits.total_bytes:
@@ -168,16 +162,10 @@ def admit(
 ) -> bool:
     """Check a submission, its signature verified, and store it; False if the board has it.
 
-    Args:
-      store, signed: the board and the submission.
-      policy_file: returns a file's bytes by digest, of the size in the submission; they are
-        stored with the submission. By default the submitter's key has uploaded them.
-      isolation: of the process that reads its policies; None for the one that this machine has.
-      address: of the server that it was sent to; None if it was given to the board's folder.
-
-    Raises:
-      Rejection: with the code of the first fault.
-      ScoringFault: that process does not start; nothing is judged.
+    `policy_file` returns a file's bytes by digest, of the size in the submission, which are stored
+    with it; by default the submitter's key has uploaded them. `isolation` is of the process that
+    reads its policies; if that does not start, a `ScoringFault` judges nothing. `address` is of the
+    server that it was sent to; None if it was given to the board's folder.
     """
     check_receiver(store.document, signed.receiver, address)
     known = store.entry(signed.id)
@@ -193,7 +181,7 @@ def admit(
     key = submission.submitter.key
     # The board's own rows are signed at its opening, and added at any time.
     time = submission.created if key == store.document.key else store.time
-    check_submission(store.document, submission, datetime.datetime.fromisoformat(time))
+    check_submission(store.document, submission, _moment(time))
     _check_files(store, submission, policy_file, isolation)
     with store.transaction():  # no other submission can use the quota or the name in between
         check_entrant(store, submission.submitter, len(signed.to_bytes()))
@@ -222,12 +210,31 @@ def submit_bundle(
     return signed.id
 
 
-def check_submission(board: BoardDocument, submission: Submission, at: datetime.datetime) -> None:
-    """Reject what a board does not accept at its time `at`, whatever else is on it.
+def withdraw(store: Store, signed: Signed[Withdrawal], address: str | None = None) -> bool:
+    """Withdraw a submission, whose page stays; False if it was withdrawn before.
 
-    The first failure is reported: those of `check_manifest`, `unknown_suite`, those of
-    `check_runs`, `too_large`.
+    `address` is of the server that it was sent to; None if it was given to the board's folder. A
+    `Rejection` is `unknown_submission`, `unsafe_name` (the reason), `wrong_board`, or
+    `bad_signature`, if the submission's own key did not sign it.
     """
+    withdrawal = signed.content
+    with store.transaction():
+        row = store.entry(withdrawal.submission)
+        if row is None:
+            raise unknown_submission(withdrawal.submission)
+        check_text("reason", withdrawal.reason)
+        check_receiver(store.document, signed.receiver, address)
+        if not signed.is_valid(signed.board, row.key):
+            raise Rejection(
+                "bad_signature",
+                f"signature={signed.signature[:16]}…: does not match this withdrawal and the "
+                f"key {row.key[:16]}…. Sign it with the key that signed the submission.",
+            )
+        return store.withdraw(signed)
+
+
+def check_submission(board: BoardDocument, submission: Submission, at: datetime.datetime) -> None:
+    """Reject what a board does not accept at its time `at`, whatever else is on it."""
     check_manifest(board, submission, at)
     expected = board.suite_reference
     if submission.suite != expected:
@@ -254,7 +261,7 @@ def check_manifest(board: BoardDocument, manifest: Manifest, at: datetime.dateti
     check_names(manifest, board.key)
     created, age_days = manifest.created, board.limits.age_days
     try:
-        moment = datetime.datetime.fromisoformat(created)
+        moment = _moment(created)
     except ValueError:
         raise Rejection(
             "schema", f"created={created!r}: must be an existing time. Correct it."
@@ -289,19 +296,19 @@ def check_entrant(store: Store, submitter: Submitter, size: int) -> None:
     key, most = submitter.key, store.document.limits.submissions_per_day
     if key == store.document.key:
         return
-    times = store.submission_times(key, a_day_ago(store))
+    times = store.submission_times(key, _a_day_ago(store))
     if len(times) >= most:
-        free = shifted(datetime.datetime.fromisoformat(times[-most]), _DAY)
+        free = shifted(_moment(times[-most]), _DAY)
         raise Rejection(
             "quota",
             f"key={key[:16]}…: has sent {len(times)} of {most} submissions within 24 hours. Send "
             f"the next one after {utc(free)}.",
         )
-    check_room(store, size)
+    _check_room(store, size)
 
 
 def _check_queue(store: Store) -> None:
-    waiting = store.queue.queued()  # those that faults have stopped take nobody's place
+    waiting = store.queue.count("queued")  # those that faults have stopped take nobody's place
     most = store.document.limits.waiting_submissions
     if waiting >= most:
         raise Rejection(
@@ -373,7 +380,7 @@ def check_stored(store: Store, key: str, declared: Artefact) -> None:
 
 
 class Reference(NamedTuple):
-    """A reference policy; `onnx` makes its artefact for a spec."""
+    """A reference policy, by the name that it has everywhere; `onnx` exports it for a spec."""
 
     name: str
     knowledge: Knowledge
@@ -398,18 +405,16 @@ REFERENCES: tuple[Reference, ...] = (
 
 
 def submit_references(store: Store) -> list[str]:
-    """Submit π* and the constant ½ as every policy is; returns the ids of `optimal` and `constant`.
+    """Submit `optimal` and `constant` as every policy is, unless they exist; returns their ids.
 
-    The board's own key signs them at the time when the board was opened. A row that exists is
-    kept, so a board has one of each, however often this is called: another version of `onnx` would
-    write other bytes.
+    The board's own key signs them at the time when the board was opened. Another version of `onnx`
+    would write other bytes, so a row that exists is kept.
     """
     existing = {row.method: row.id for row in store.entries() if row.reference}
     return [existing.get(each.name) or _submit_reference(store, each) for each in REFERENCES]
 
 
 def _submit_reference(store: Store, reference: Reference) -> str:
-    """Submit one run of a reference policy on each instance."""
     key, instances = store.folder.signing_key(), store.document.instances
     files: dict[str, bytes] = {}
     runs = []

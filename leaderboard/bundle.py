@@ -20,7 +20,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.signed import MAX_BYTES, NOBODY, Receiver, Signed, SigningKey
@@ -38,7 +38,7 @@ from leaderboard.documents.submission import (
 )
 from leaderboard.errors import Rejection
 from leaderboard.gate.sandbox import inspect_own, widths
-from sme_registry import SMESpec, load
+from sme_registry import SMESpec, load, studies
 from sme_registry.errors import OptionError, PolicyError, SMEError, SpecError
 from sme_registry.evaluation import load_sb3
 from sme_registry.export import onnx_bytes
@@ -56,9 +56,6 @@ from sme_registry.io import (
 from sme_registry.spec import SuiteFile
 from sme_registry.spec.document import Integer, StrictModel, matching
 from sme_registry.training import RunRecord, model_of_cell
-
-if TYPE_CHECKING:
-    from sme_registry.studies import CellStatus
 
 Progress = Callable[[int, int], None]
 
@@ -165,13 +162,11 @@ def make_bundle(
 ) -> Bundle:
     """Export the policies of runs, and sign a submission of them, written completely or not at all.
 
+    What the board would reject is rejected here, with the same code. A Stable-Baselines3 .zip can
+    run code when it is loaded: give only files that you trust.
+
     Args:
-      folder: the bundle to write.
-      suite, key: the suite of the runs, and the submitter's key.
-      runs: folders of `sme train` or `sme study run`, folders that contain such, and tables. A
-        Stable-Baselines3 .zip can run code when it is loaded: give only files that you trust.
-      method, version, family, knowledge: as in `Method`; by default the family is the name.
-      submitter, code, statement: as in `Submission`.
+      runs: folders of `sme train` or `sme study run`, folders that contain such, and tables.
       runs_started: all runs ever started with this method, by class; for other classes, the number
         of listed runs.
       training: facts of the training; None takes them from the records of the runs.
@@ -180,11 +175,6 @@ def make_bundle(
         `submit_bundle` or `client.submit` signs for the board that it is sent to.
       force: replace an existing bundle.
       progress: called after each run with the number of finished runs and of all runs.
-
-    Raises:
-      OptionError, SpecError: the folder exists, or a path, a table or a record is invalid.
-      PolicyError: a model cannot be exported.
-      Rejection: the board would reject the submission, with the same code.
     """
     folder = Path(folder)
     _refuse_existing(folder, force)
@@ -249,10 +239,11 @@ def _training_facts(listed: list[SubmittedRun]) -> Training:
     known = [run.provenance for run in listed if run.provenance is not None]
     if not known:
         return Training()
-    libraries = set()
-    for versions in (each.versions for each in known):
-        names = ("stable_baselines3", "torch", "sme_registry", "python")
-        libraries.add(", ".join(f"{name} {versions[name]}" for name in names if name in versions))
+    names = ("stable_baselines3", "torch", "sme_registry", "python")
+    libraries = {
+        ", ".join(f"{name} {each.versions[name]}" for name in names if name in each.versions)
+        for each in known
+    }
     seconds = [each.seconds for each in known]
     return Training(
         library=_cut("; ".join(sorted(libraries)), 200),
@@ -317,12 +308,9 @@ def export_sb3(
 ) -> Path:
     """Write a model's deterministic policy as an ONNX file that boards accept; returns the path.
 
-    Args:
-      model: a model of Stable-Baselines3 or sb3-contrib, or the path of its .zip (loading a .zip
-        can run its author's code). Its action space is [0, 1] or [−1, 1] in every channel.
-      path: the file to write, completely or not at all; an existing file is replaced.
-      vec_normalize: see `sme_registry.export_onnx`.
-      spec: the task, to check the widths; None skips the check.
+    `model` is one of Stable-Baselines3 or sb3-contrib, or the path of its .zip; loading a .zip can
+    run its author's code. `vec_normalize` is as in `sme_registry.export_onnx`; with `spec`, the
+    widths are checked. An existing file is replaced.
     """
     return write_atomically(path, _exported(model, spec, vec_normalize))
 
@@ -425,23 +413,9 @@ def _trained(folder: Path, record: RunRecord | None) -> SubmittedRun:
 
 
 def _cells(study: Path, algorithm: str | None) -> list[SubmittedRun]:
-    """The cells of one algorithm of a study; failed ones have no policy."""
-    cells = _chosen(study, algorithm)
-    unfinished = sum(cell.state not in ("done", "failed") for cell in cells)
-    if unfinished:
-        raise OptionError(
-            f"runs={str(study)!r}: {unfinished} of {len(cells)} runs are not finished. Run the "
-            "study to its end with `sme study run`; `sme study status` shows its state."
-        )
-    return [_cell(study, cell) for cell in cells]
-
-
-def _chosen(study: Path, algorithm: str | None) -> list[CellStatus]:
-    """The cells of an algorithm; by default of the only one that ran."""
-    from sme_registry.studies import study_status
-
+    """The cells of an algorithm of a study, by default of the only one that ran."""
     # Every cell of the plan counts, also one that no run asked for: leaving it out would select.
-    cells = study_status(study, only=()).cells
+    cells = studies.study_status(study, only=()).cells
     ran = [cell for cell in cells if cell.state != "waiting"]
     names = list(dict.fromkeys(cell.planned.algorithm for cell in ran or cells))
     wanted = names[0] if algorithm is None and len(names) == 1 else algorithm or ""
@@ -451,12 +425,16 @@ def _chosen(study: Path, algorithm: str | None) -> list[CellStatus]:
             f"algorithm={algorithm!r}: the study {study} has runs of {', '.join(names)}, and a "
             f"submission is of one method. Choose one, such as --algorithm {names[0]}."
         )
-    return chosen
+    unfinished = sum(cell.state not in ("done", "failed") for cell in chosen)
+    if unfinished:
+        raise OptionError(
+            f"runs={str(study)!r}: {unfinished} of {len(chosen)} runs are not finished. Run the "
+            "study to its end with `sme study run`; `sme study status` shows its state."
+        )
+    return [_cell(study, cell) for cell in chosen]
 
 
-def _cell(study: Path, status: CellStatus) -> SubmittedRun:
-    from sme_registry.studies import CellResult
-
+def _cell(study: Path, status: studies.CellStatus) -> SubmittedRun:
     planned, cell = status.planned, status.planned.cell
     source = f"{study}, {planned.algorithm} on {planned.class_name}, run {planned.run}"
     if status.state == "failed":
@@ -469,7 +447,7 @@ def _cell(study: Path, status: CellStatus) -> SubmittedRun:
         )
     if cell.uses.startswith("independent:"):
         raise OptionError(f"{source}: {_INDEPENDENT}")
-    result = CellResult.from_dict(read_json(study / "cells" / f"{stem}.json"))
+    result = studies.CellResult.from_dict(read_json(study / "cells" / f"{stem}.json"))
     steps = max((cell.steps, *result.curve.steps))  # the last rollout can exceed the plan
     changed = to_json(cell.hyperparameters) if cell.hyperparameters else "default hyperparameters"
     settings = f"{cell.uses}, {changed}; actions in {_RANGES[cell.action_range]}; num_envs=1"

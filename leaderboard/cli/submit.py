@@ -304,5 +304,5 @@ def withdraw(
         with Board.open(Path(board)) as store:
             id = find_entry(store, id).id
             withdrawal = Withdrawal(submission=id, created=now(), reason=reason)
-            store.withdraw(withdrawal.signed(signing_key, Receiver(store.document.key)))
+            admission.withdraw(store, withdrawal.signed(signing_key, Receiver(store.document.key)))
     print_line(f"{id} withdrawn")

@@ -22,11 +22,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, field_validator, mode
 
 from leaderboard.documents.signed import MAX_BYTES as MAX_SIGNED_BYTES
 from leaderboard.documents.signed import PublicKey, Receiver, SigningKey
-from leaderboard.documents.submission import (
-    MAX_ARTEFACT_BYTES,
-    SuiteReference,
-    Track,
-)
+from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, SuiteReference, Track
 from leaderboard.errors import BoardError, Rejection
 from sme_registry.errors import SMEError, SpecError
 from sme_registry.io import parse_json, read_regular
@@ -154,10 +150,9 @@ class BoardDocument(Document):
         """The suite as a file, from which others train on it."""
         name, _, version = self.suite_name.rpartition("-v")
         named = {"name": name, "version": int(version)} if name and version.isdecimal() else {}
-        named = named or {"name": self.suite_name}
         return SuiteFile.from_dict(
             {
-                **named,
+                **(named or {"name": self.suite_name}),
                 "description": self.suite_description,
                 "tags": self.suite_tags,
                 "digest": self.suite.digest,
@@ -184,11 +179,7 @@ class BoardDocument(Document):
 
 
 class Folder:
-    """The paths of a board's files; creates and reads nothing by itself.
-
-    Args:
-      path: the board's folder.
-    """
+    """The paths of a board's files; creates and reads nothing by itself."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -200,11 +191,7 @@ class Folder:
         self.index = self.path / "index.sqlite"
 
     def read(self) -> BoardDocument:
-        """The board's document.
-
-        Raises:
-          BoardError: the folder contains no valid board.
-        """
+        """The board's document."""
         if not os.path.lexists(self.board):
             raise BoardError(
                 f"{self.path}: contains no board (no {FILE}). Give a board's folder, or create a "
@@ -245,11 +232,7 @@ class Folder:
 
 
 def hex_of(digest: str) -> str:
-    """The 64 hex digits of a digest, a safe file name.
-
-    Raises:
-      ValueError: it is not a digest; callers check untrusted input before.
-    """
+    """The 64 hex digits of a digest, a safe file name; ValueError if it is not a digest."""
     digits = digest.removeprefix("sha256:")
     if len(digits) != 64 or not set(digits) <= set("0123456789abcdef"):
         raise ValueError(f"not a digest: {digest!r:.90}")
@@ -260,12 +243,8 @@ def check_receiver(board: BoardDocument, receiver: Receiver, address: str | None
     """Reject (`wrong_board`) a signature that is not for this board, or not for its address.
 
     Otherwise a server that stands between could pass on what it was sent, and take part in another
-    board under the sender's name.
-
-    Args:
-      board: the board.
-      receiver: that the signature is for.
-      address: of the server that it was sent to; None if it was given to the board's folder.
+    board under the sender's name. `address` is of the server that it was sent to; None if it was
+    given to the board's folder.
     """
     if board.rules != RULES:
         raise Rejection(

@@ -16,6 +16,8 @@ how runs become scores. Fields younger than version 1 are left out of the JSON a
 
 from __future__ import annotations
 
+import functools
+import json
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, NamedTuple, Self, get_args
@@ -58,10 +60,14 @@ class MetricText(NamedTuple):
         return "index.html" if self.stem == "board" else f"{self.stem}.html"
 
 
-_KNOWN = {"optimal": 0.0, "constant": 1.0}
+REFERENCES = {"optimal": 0.0, "constant": 1.0}
+"""N_m of each reference row in every region, by its method's name."""
+
 _TEXTS = (
-    MetricText("wd_regret", "WD regret N₀", "N₀", "WD regret $N_0$", "board", _KNOWN),
-    MetricText("ood_regret", "OOD regret N̄", "N̄", r"OOD regret $\bar{N}$", "ood_regret", _KNOWN),
+    MetricText("wd_regret", "WD regret N₀", "N₀", "WD regret $N_0$", "board", REFERENCES),
+    MetricText(
+        "ood_regret", "OOD regret N̄", "N̄", r"OOD regret $\bar{N}$", "ood_regret", REFERENCES
+    ),
     MetricText("ood_decay", "OOD decay", "decay", "OOD decay", "ood_decay", {"optimal": 0.0}),
     MetricText("regret_slope", "regret slope on ε"),
     MetricText("similarity_loss", "similarity loss, points"),
@@ -178,6 +184,23 @@ class Scores(StrictModel):
     regret_slope: Estimate
     similarity_loss: Estimate
     normalised_regret: Annotated[tuple[Estimate, ...], Field(strict=False, min_length=2)]
+
+    def to_text(self) -> str:
+        """Lists of numbers without names, because rankings read thousands of them."""
+        estimates = [*(getattr(self, metric) for metric in METRICS), *self.normalised_regret]
+        return json.dumps([[each.value, each.low, each.high] for each in estimates])
+
+    @classmethod
+    @functools.lru_cache(maxsize=4096)  # frozen, and read again whenever the log grows
+    def from_text(cls, text: str) -> Scores:
+        """The inverse of `to_text`; not validated, because a valid `Result` was written."""
+        estimates = [
+            Estimate.model_construct(value=value, low=low, high=high)
+            for value, low, high in json.loads(text)
+        ]
+        named = dict(zip(METRICS, estimates, strict=False))
+        others = tuple(estimates[len(METRICS) :])
+        return cls.model_construct(None, **named, normalised_regret=others)
 
 
 class Result(Document):

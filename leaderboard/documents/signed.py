@@ -200,17 +200,11 @@ class PlainDocument(Document):
 
 
 class Signable(PlainDocument):
-    """What an entrant signs.
-
-    Attributes:
-      PURPOSE: of the signature.
-      FIELD: of the content in the envelope.
-      COMMAND: of `sme-leaderboard`, which writes the file.
-    """
+    """What an entrant signs."""
 
     PURPOSE: ClassVar[Purpose]
-    FIELD: ClassVar[str]
-    COMMAND: ClassVar[str]
+    FIELD: ClassVar[str]  # of the content in the envelope
+    COMMAND: ClassVar[str]  # of `sme-leaderboard`, which writes the file
 
     @property
     def signer(self) -> str | None:
@@ -226,14 +220,7 @@ class Signable(PlainDocument):
 
 
 class Seal(StrictModel):
-    """A signature, and who may take it.
-
-    Attributes:
-      signature: for one content and receiver.
-      board: the public key of the only board that accepts it; None if it is not known yet.
-      address: at which the signer has reached the board; None for the board's folder, and in
-        documents of earlier versions.
-    """
+    """A signature for one content, and who may take it: see `Receiver`."""
 
     signature: Signature
     board: PublicKey | None = None
@@ -255,9 +242,8 @@ Kind = TypeVar("Kind", bound=Signable, covariant=True)
 class Signed(Seal, Generic[Kind]):
     """A document with the signature of the entrant's key, for one receiver.
 
-    Attributes:
-      content: in the JSON, the field is called `Kind.FIELD`, and comes first. `board` and `address`
-        are left out where they are None.
+    In the JSON, the content is called `Kind.FIELD`, and comes first; `board` and `address` are left
+    out where they are None.
     """
 
     content: Kind

@@ -11,6 +11,7 @@ A bundle is the submitted folder: `submission.json` (a `Signed[Submission]`) and
 from __future__ import annotations
 
 import datetime
+import operator
 import re
 import time
 import unicodedata
@@ -252,24 +253,17 @@ def check_names(manifest: Manifest, board_key: str | None = None) -> None:
 
     So are the board's own names, but for its key; None if the board is not known yet.
     """
-    method, training = manifest.method, manifest.training
-    for field, name in (
-        ("method.name", method.name),
-        ("method.version", method.version),
-        ("method.family", method.family),
-        ("submitter.name", manifest.submitter.name),
-    ):
+    for field in ("method.name", "method.version", "method.family", "submitter.name"):
+        name = operator.attrgetter(field)(manifest)
         if not _NAME.fullmatch(name):
             raise Rejection(
                 "unsafe_name",
                 f"{field}={name!a}: must begin with a letter or digit, and contain only "
                 "letters a–z, digits, single spaces and '._+-()'. Rename it.",
             )
-    for field, name, reserved in (
-        ("submitter.name", manifest.submitter.name, THE_BOARD),
-        ("method.family", method.family, REFERENCE_FAMILY),
-    ):
-        if skeleton(name) == skeleton(reserved) and manifest.submitter.key != board_key:
+        reserved = {"submitter.name": THE_BOARD, "method.family": REFERENCE_FAMILY}.get(field, "")
+        own = manifest.submitter.key == board_key
+        if reserved and skeleton(name) == skeleton(reserved) and not own:
             raise Rejection(
                 "unsafe_name",
                 f"{field}={name!a}: reserved for the board's own reference rows. Rename it.",
@@ -280,13 +274,8 @@ def check_names(manifest: Manifest, board_key: str | None = None) -> None:
             f"code={manifest.code!a}: must contain only the characters of a URL. "
             "Write others as %XX.",
         )
-    for field, text in (
-        ("training.library", training.library),
-        ("training.hyperparameters", training.hyperparameters),
-        ("training.hardware", training.hardware),
-        ("statement", manifest.statement),
-    ):
-        check_text(field, text)
+    for field in ("training.library", "training.hyperparameters", "training.hardware", "statement"):
+        check_text(field, operator.attrgetter(field)(manifest))
 
 
 def check_text(field: str, text: str) -> None:
@@ -322,11 +311,11 @@ def check_runs(suite: Suite, submission: Submission, sources: Sequence[str] = ()
     """
     class_of = {spec.digest: member.name for member in suite.classes for spec in member.instances}
     names = sources or [f"runs.{index}" for index in range(len(submission.runs))]
-    for index, run in enumerate(submission.runs):
+    for name, run in zip(names, submission.runs, strict=True):
         if run.spec not in class_of:
             raise Rejection(
                 "unknown_spec",
-                f"{names[index]}: spec={run.spec}: must be the digest of one of the suite's "
+                f"{name}: spec={run.spec}: must be the digest of one of the suite's "
                 f"{len(class_of)} instances (`sme show {submission.suite.name}`). Train on those, "
                 "or submit to a board of its suite.",
             )
@@ -350,11 +339,9 @@ def check_runs(suite: Suite, submission: Submission, sources: Sequence[str] = ()
 def _check_duplicates(submission: Submission, sources: Sequence[str]) -> None:
     first: dict[tuple[str, str, int | str], int] = {}
     for index, run in enumerate(submission.runs):
-        values: list[tuple[str, int | str]] = [("seed", run.seed)]
-        if run.artefact is not None:
-            values.append(("policy", run.artefact.sha256))
-        for name, value in values:
-            before = first.setdefault((run.spec, name, value), index)
+        policy = None if run.artefact is None else run.artefact.sha256
+        for name, value in (("seed", run.seed), ("policy", policy)):
+            before = index if value is None else first.setdefault((run.spec, name, value), index)
             if before != index:
                 raise Rejection(
                     "duplicate_run",

@@ -66,16 +66,7 @@ def result_of(
     unlisted: Sequence[RunScore] = (),
     isolation: Isolation = "",
 ) -> Result:
-    """The result of scored runs: θ, intervals and flags.
-
-    Args:
-      board: the suite, the rules, and the numbers of runs and bootstrap draws.
-      submission: its id.
-      runs: the listed runs, at least one of each class.
-      versions: of packages.
-      unlisted: the runs that were started and not listed, as `never_listed` gives them.
-      isolation: of the sandbox.
-    """
+    """The result of the listed runs, at least one of each class, and of the `never_listed` ones."""
     counted = [*runs, *unlisted]
     groups = groups_of(board, counted)
     scores = method_scores(groups, board.draws, f"{board.suite.digest}\n{board.protocol.digest}")
@@ -102,10 +93,7 @@ def never_listed(board: BoardDocument, submission: Submission) -> list[RunScore]
     """A score of 1 for each run that was started and is not listed, in the order of classes.
 
     Each is on the instance of its class with the fewest runs so far, the first of these in the
-    suite's order.
-
-    Raises:
-      Rejection: a code of `check_runs`.
+    suite's order. A `Rejection` is one of `check_runs`.
     """
     check_runs(board.suite, submission)
     listed = Counter(run.spec for run in submission.runs)
@@ -133,15 +121,7 @@ def groups_of(board: BoardDocument, runs: Sequence[RunScore]) -> Groups:
 def class_mean(
     members: dict[str, list[RunScore]], values: Callable[[RunScore], Sequence[float]]
 ) -> Array:
-    """The score of a class: the mean over its groups of the IQM over a group's runs.
-
-    Args:
-      members: the class's runs by group.
-      values: `[K]` of a run.
-
-    Returns:
-      `[K]`.
-    """
+    """The score `[K]` of a class: the mean over its groups of the IQM over a group's `values`."""
     return mean([iqm([values(run) for run in group]) for group in members.values()])
 
 
@@ -160,13 +140,7 @@ def class_score(name: str, members: dict[str, list[RunScore]]) -> ClassScore:
 
 
 def method_scores(groups: Groups, draws: int, seed: str) -> Scores:
-    """θ of each metric and each region, with intervals.
-
-    Args:
-      groups: the runs by class, and in each class by group.
-      draws: number of bootstrap resamples.
-      seed: of the bootstrap.
-    """
+    """θ of each metric and each region, with intervals."""
     strata: dict[str, Array] = {}
     statistics: dict[str, Statistic] = {}
     weights: dict[str, float] = {}
@@ -229,16 +203,8 @@ def run_metrics(
 ) -> dict[str, float]:
     """The metrics of one run by name, as defined in `documents.result`.
 
-    Args:
-      normalised_regret: N_m of each region, WD first.
-      similarity: mean r̃ of each region, in [0, 1]; None without a policy.
-      levels: ε_m, 0 for WD.
-      rules: of the board.
-
-    Returns:
-      `wd_regret`, `ood_regret`, `ood_decay` and `regret_slope`, dimensionless, and
-      `similarity_loss`, in points (hundredths of r̃). Without a policy each is 1 (100 points), and
-      not what N_m = 1 everywhere gives: a decay of 0 would reward leaving out runs.
+    `similarity` is None without a policy; then each is 1 (100 points), and not what N_m = 1
+    everywhere gives: a decay of 0 would reward leaving out runs. `levels` are ε_m, 0 for WD.
     """
     if similarity is None:
         return {**dict.fromkeys(METRICS, 1.0), "similarity_loss": 100.0}

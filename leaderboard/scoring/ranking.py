@@ -25,14 +25,13 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from leaderboard.documents.result import Estimate, Metric, Scores
+from leaderboard.documents.result import REFERENCES, Estimate, Metric, Scores
 from leaderboard.documents.submission import skeleton
 from leaderboard.errors import NotPublishable
 from leaderboard.store import EntryRow
 
 NotRanked = Literal["", "reference", "too_few_runs", "copy", "superseded", "not_learned"]
 
-REFERENCES = {"optimal": 0.0, "constant": 1.0}  # N_m of each reference row, by its method's name
 TOLERANCE = 1e-6
 LEARNED = 0.5  # the largest upper bound of N₀ of an entry ranked by OOD decay
 AS_GOOD = 0.02
@@ -55,20 +54,13 @@ _BLOCK = 2**18  # pairs of entries compared at once, few enough for a processor 
 
 @dataclass(frozen=True)
 class RankedRow:
-    """A row of the ranking.
+    """A row of the ranking."""
 
-    Attributes:
-      entry: the entry; its scores are never null here.
-      first, last: the best and the worst rank that the intervals allow; None if not ranked.
-      reason: why it is not ranked, a key of `REASONS`; empty if it is.
-      value: what it is ordered by: its score, or for the decay what the head of this module says.
-    """
-
-    entry: EntryRow
-    first: int | None
+    entry: EntryRow  # with scores
+    first: int | None  # the best and the worst rank that the intervals allow; None if not ranked
     last: int | None
-    reason: NotRanked
-    value: Estimate
+    reason: NotRanked  # why it is not ranked, a key of `REASONS`; empty if it is
+    value: Estimate  # what it is ordered by: its score, or what the head of this module says
 
     @property
     def ranks(self) -> str:
@@ -145,14 +137,8 @@ def superseded(entries: list[EntryRow]) -> set[str]:
 def not_above_the_better(decay: _Numbers, regret: _Numbers) -> _Numbers:
     """Decays lifted to those of the entries that are at least as good in every region.
 
-    Args:
-      decay: `[N, K]` value and interval ends of N entries, at least 0.
-      regret: `[N, M + 1]` N_m of each region; another entry's is at least as good if it is below
-        or at most `AS_GOOD` above.
-
-    Returns:
-      `[N, K]`: of each column the largest number among the entry's own and those of the entries
-      that are at least as good in every region. In O(N² M), 0.3 s for 5,000 entries.
+    Of `[N, K]` values and interval ends, and `[N, M + 1]` N_m of each region, of which another
+    entry's is at least as good up to `AS_GOOD` above. In O(N² M), 0.3 s for 5,000 entries.
     """
     lifted = decay.copy()
     orders = np.argsort(-decay, axis=0, kind="stable")  # the largest first
@@ -177,15 +163,7 @@ def _regret(scores: list[Scores]) -> _Numbers:
 def rank_ranges(
     low: npt.ArrayLike, high: npt.ArrayLike
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """The best and the worst rank that each entry's interval allows; lower scores are better.
-
-    Args:
-      low: `[N]` lower ends.
-      high: `[N]` upper ends, none below its lower end.
-
-    Returns:
-      `first` and `last`, `[N]` each, 1 ≤ first ≤ last ≤ N. In O(N log N).
-    """
+    """The best and worst rank, in [1, N], that each of N intervals allows; in O(N log N)."""
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     first = 1 + np.searchsorted(np.sort(high), low, side="left")
     last = np.searchsorted(np.sort(low), high, side="right")
@@ -193,12 +171,7 @@ def rank_ranges(
 
 
 def refuse_unpublishable(entries: list[EntryRow]) -> None:
-    """Refuse to publish numbers of a board whose reference rows do not have their known scores.
-
-    Raises:
-      NotPublishable: a reference row is missing or not scored, or differs from 0 or 1 by more than
-        1e-6.
-    """
+    """Refuse (`NotPublishable`) a board whose reference rows do not have their known scores."""
     for name, regret in REFERENCES.items():
         rows = [entry for entry in entries if entry.reference and entry.method == name]
         scored = [row.scores for row in rows if row.status == "scored" and row.scores is not None]

@@ -122,25 +122,17 @@ def score_submission(
     *,
     isolation: Isolation | None = None,
 ) -> Result:
-    """Score every run of a submission, and the method over its runs.
+    """Score every run of an admitted submission, and the method over its runs.
+
+    The result is a function of board, submission and files up to floating-point rounding, but for
+    `RunScore.actions`, and a rejection if a policy file, or its behaviour, is rejected. Where a
+    sandbox does not start, was ended from outside, or lacks memory or processor time, a
+    `ScoringFault` judges nothing.
 
     Args:
-      board: the suite, the rules, the protocol, and the numbers of runs and bootstrap draws.
-      submission: accepted by `checks`.
       policy_file: returns a file's bytes by its digest.
       progress: called after each batch with the number of evaluated states and of all states.
       isolation: of the sandbox; None for the one that this machine has.
-
-    Returns:
-      The result, a function of board, submission and files up to floating-point rounding, but for
-      `RunScore.actions`. It is a rejection if a policy file, or its behaviour, is rejected.
-
-    Raises:
-      ScoringFault: a sandbox does not start, was ended from outside, or lacks memory or processor
-        time. The submission is not judged.
-      BoardError: this system is not Linux.
-      MissingDependencyError: onnxruntime is not installed.
-      Errors of `policy_file` and `progress`; a `Rejection` becomes the result.
     """
     machine = _Machine(isolation or available_isolation())
     try:
@@ -304,31 +296,17 @@ class _Actions:
 
 
 class Behaviours:
-    """The behaviour of a submission's runs, in the order in which they are observed.
-
-    Args:
-      protocol: the board's.
-      submission: the submission's id.
-    """
+    """The behaviour of a submission's runs, in the order in which they are observed."""
 
     def __init__(self, protocol: EvaluationProtocol, submission: str) -> None:
         self._protocol, self._submission = protocol, submission
         self._runs: dict[str, list[tuple[str, list[_Actions]]]] = defaultdict(list)
 
     def observe(self, run: str, spec: SMESpec, policy: Callable[[Any], Any]) -> str | None:
-        """Compare a run's policy with those observed before.
+        """Reject (`run_repeated`) a run, so named, whose policy is like one observed before.
 
-        Args:
-          run: what to call the run in an error.
-          spec: its instance.
-          policy: from observations to actions of the unit range, as `evaluate` accepts it.
-
-        Returns:
-          The digest of its actions in the board's states; None if it hardly varies there.
-
-        Raises:
-          Rejection: `run_repeated`.
-          PolicyError: the policy fails.
+        Returns the digest of its actions, which are of the unit range, in the board's states; None
+        if it hardly varies there.
         """
         prepared = as_policy(policy, spec, action_range="unit")
         actions = self._actions(spec, prepared, self._submission)

@@ -39,7 +39,6 @@ from leaderboard.scoring.aggregation import (
 )
 from leaderboard.scoring.score import agent_names, evaluation_seed, score_submission
 from leaderboard.store import LogEntry, Store, digest_of, read_document
-from leaderboard.store.blobs import MAX_LOG_ENTRY_BYTES
 from sme_registry import SMESpec
 from sme_registry.errors import OptionError
 from sme_registry.io import TEMPORARY, integer_in
@@ -92,23 +91,14 @@ Part = Callable[[Store, Progress], tuple[list[Row], list[Note]]]
 
 @dataclass(frozen=True)
 class VerifyReport:
-    """What was verified.
+    """What was verified."""
 
-    Attributes:
-      log_sequence, log_digest: of the last log entry. Keep the digest elsewhere to detect later
-        whether the log was cut or rewritten.
-      rows: what was checked, and what was not.
-      notes: the entries that are not confirmed here.
-      missing: published files that are not in this folder.
-      rescore_seed: of the draw of the submissions that were scored again, which repeats it.
-    """
-
-    log_sequence: int
-    log_digest: str
-    rows: tuple[Row, ...]
-    notes: tuple[Note, ...]
-    missing: tuple[str, ...]
-    rescore_seed: int | None
+    log_sequence: int  # of the last log entry
+    log_digest: str  # which, kept elsewhere, shows later whether the log was cut or rewritten
+    rows: tuple[Row, ...]  # what was checked, and what was not
+    notes: tuple[Note, ...]  # the entries that are not confirmed here
+    missing: tuple[str, ...]  # published files that are not in this folder
+    rescore_seed: int | None  # repeats the draw of the submissions that were scored again
 
     @property
     def is_confirmed(self) -> bool:
@@ -126,22 +116,15 @@ def verify(
     parts: Sequence[Part] = (),
     progress: Progress | None = None,
 ) -> VerifyReport:
-    """Verify a board without writing anything.
+    """Verify a board without writing anything; a `TamperedError` names the first altered value.
 
     Args:
-      path: the board's folder.
       rescore: number of results, rejections too, whose submissions to score again; or "all".
       seed: of their draw, to repeat one; None for the system's randomness, which nobody predicts.
       contains: digest of an entry that the log once had; None to skip this check.
       board: how to open it: one with further tracks needs their class.
       parts: what else to verify, of further tracks.
       progress: called with what was just checked.
-
-    Raises:
-      TamperedError: names the first altered file or value.
-      BoardError: the folder holds no board.
-      ScoringFault: this machine cannot score a submission again.
-      OptionError: `rescore` or `seed` is negative, or `contains` is not a digest.
     """
     if rescore != "all":
         integer_in("rescore", rescore, 0, advice="Leave it out for none.")
@@ -261,7 +244,7 @@ def _check_opening(folder: Folder) -> None:
     folder.read()
     document = read_document(folder, folder.board, BoardDocument)
     if folder.log_entry(0).exists():  # otherwise the log says so
-        first = read_document(folder, folder.log_entry(0), LogEntry, limit=MAX_LOG_ENTRY_BYTES)
+        first = read_document(folder, folder.log_entry(0), LogEntry)
         if first.document != digest_of(document):
             raise TamperedError("board.json", "differs from the board that the log opened")
     if folder.key.exists() and folder.signing_key().public != document.key:

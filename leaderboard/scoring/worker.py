@@ -27,7 +27,7 @@ from leaderboard.documents.result import Result
 from leaderboard.errors import BoardError
 from leaderboard.gate.isolation import Isolation
 from leaderboard.scoring.score import Progress, score_submission
-from leaderboard.store import LEASE_SECONDS, Claim, Store
+from leaderboard.store import Claim, Store
 from sme_registry.errors import MissingDependencyError, SMEError
 from sme_registry.io import integer_in
 from sme_registry.io.system import block_interrupts, defer_interrupts, unblock_interrupts
@@ -48,15 +48,11 @@ Job = Callable[[Store, str], None]
 
 @dataclass(frozen=True)
 class Work:
-    """What a scorer does: submissions, and jobs if it knows how; it can be pickled.
-
-    Attributes:
-      board: how to open it: one with further tracks needs their class.
-    """
+    """What a scorer does: submissions, and jobs if it knows how; it can be pickled."""
 
     submissions: bool = True
     job: Job | None = None
-    board: type[Store] = Store
+    board: type[Store] = Store  # one with further tracks needs their class
 
 
 def worker_name() -> str:
@@ -71,7 +67,6 @@ def run_scorer(
     until_empty: bool = True,
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
-    lease_seconds: float = LEASE_SECONDS,
     retry: bool = True,
     isolation: Isolation | None = None,
     work: Work = Work(),  # frozen
@@ -79,7 +74,8 @@ def run_scorer(
     """Score in this process, one submission after another.
 
     A submission that cannot be scored because of a fault (no memory, an altered file, a sandbox
-    that does not start) waits, with the fault in its `EntryRow`.
+    that does not start) waits, with the fault in its `EntryRow`. If the board cannot be written to,
+    a result is kept for a while before that is an error.
 
     Args:
       path: the board's folder.
@@ -87,18 +83,10 @@ def run_scorer(
       until_empty: return when nothing can be claimed; otherwise wait for more.
       progress: called while a submission is scored, with the states done and the states in all.
       stop: called between two submissions; True ends the scorer.
-      lease_seconds: how long a claim outlives its scorer.
       retry: whether submissions that earlier faults have postponed are tried at once.
-      isolation: of the sandboxes; None for the one that this machine has.
-      work: what to do.
 
     Returns:
       The number of results written.
-
-    Raises:
-      BoardError: the board cannot be written to; a result is kept for a while before that.
-      MissingDependencyError: onnxruntime is not installed.
-      TamperedError: the log was altered.
     """
     worker = worker_name() if worker is None else worker
     patience = _UNWRITTEN_SECONDS if until_empty else _UNWRITTEN_SECONDS_SERVED
@@ -109,22 +97,19 @@ def run_scorer(
             store.queue.retry()
         while not stop():
             claim = store.queue.claim(
-                worker,
-                seconds=lease_seconds,
-                submissions=work.submissions,
-                jobs=work.job is not None,
+                worker, submissions=work.submissions, jobs=work.job is not None
             )
-            if claim is not None and claim.is_job and work.job is not None:
-                with _heartbeats(store, claim):
+            if claim is None:
+                if until_empty:
+                    break
+                time.sleep(_POLL_SECONDS)
+                continue
+            with _heartbeats(store, claim):
+                if claim.is_job and work.job is not None:
                     _do(store, claim, work.job)
-            elif claim is not None:
-                with _heartbeats(store, claim):
+                else:
                     result = _score(store, claim, progress, isolation)
                     written += result is not None and _finish(store, claim, result, patience, stop)
-            elif until_empty:
-                break
-            else:
-                time.sleep(_POLL_SECONDS)
     return written
 
 
@@ -138,7 +123,7 @@ def _do(store: Store, claim: Claim, job: Job) -> None:
         raise
     except Exception as error:  # whose text may name what is hidden
         _log.warning("%s: attempt %d: %s", claim.id, claim.attempt, type(error).__name__)
-        store.queue.fault(claim, type(error).__name__)
+        store.queue.release(claim, type(error).__name__)
 
 
 def _score(
@@ -156,7 +141,7 @@ def _score(
     except Exception as error:
         _log.warning("%s: attempt %d: %r", claim.id, claim.attempt, error, exc_info=True)
         text = str(error) if isinstance(error, SMEError) else f"{type(error).__name__}: {error}"
-        store.queue.fault(claim, text.replace(f"{store.folder.path}{os.sep}", ""))
+        store.queue.release(claim, text.replace(f"{store.folder.path}{os.sep}", ""))
         return None
 
 
@@ -165,11 +150,7 @@ def _finish(
 ) -> bool:
     """Write a result, and keep trying for so many seconds, for example while the disk is full.
 
-    Returns:
-      Whether the claim was still current.
-
-    Raises:
-      BoardError: it cannot be written; the claim is returned without a fault.
+    Returns whether the claim was still current. If it cannot be written, that is no fault.
     """
     deadline = time.monotonic() + patience
     while True:
@@ -262,7 +243,6 @@ def run_scorers(
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
     started: Callable[[int], None] | None = None,
-    lease_seconds: float = LEASE_SECONDS,
     isolation: Isolation | None = None,
     work: Work = Work(),  # frozen
 ) -> int:
@@ -280,30 +260,20 @@ def run_scorers(
       progress: called with the submissions done since the start, and these plus those that wait.
       stop: called a few times a second; True ends the scoring.
       started: called with the process id of each new process.
-      lease_seconds: how long a claim outlives its scorer if its death goes unnoticed.
-      isolation: of the sandboxes; None for the one that this machine has.
-      work: what to do.
 
     Returns:
       The number of submissions done since the start.
-
-    Raises:
-      OptionError: `workers` is below 1.
-      BoardError: the board cannot be written to, or (`until_empty`) the processes die one after
-        another and claim nothing.
-      MissingDependencyError: onnxruntime is not installed.
-      TamperedError: the log was altered.
     """
     integer_in("workers", workers, 1, advice="Leave it out for one.")
     with work.board.open(path) as store:
-        scorers = _Scorers(path, store, workers, (until_empty, lease_seconds, isolation, work))
-        before = store.queue.done()
+        scorers = _Scorers(path, store, workers, (until_empty, isolation, work))
+        before = store.queue.count("done")
         store.queue.retry()
 
         def report() -> int:
-            done = store.queue.done() - before
+            done = store.queue.count("done") - before
             if progress is not None:
-                progress(done, done + store.queue.waiting())
+                progress(done, done + store.queue.count("waiting"))
             return done
 
         try:
@@ -336,32 +306,28 @@ class _Scorers:
         path: str | Path,
         store: Store,
         workers: int,
-        options: tuple[bool, float, Isolation | None, Work],
+        options: tuple[bool, Isolation | None, Work],
     ) -> None:
         self._path, self._store, self._workers = path, store, workers
         self._options, self._until_empty = options, options[0]
         self._running: dict[str, _Scorer] = {}
-        self._futile_deaths, self._done = 0, store.queue.done()
+        self._futile_deaths, self._done = 0, store.queue.count("done")
         self._paused_until, self._stopping = 0.0, False
 
     def are_needed(self) -> bool:
         """Whether a submission can be claimed, or is claimed, by a process of any command."""
         queue = self._store.queue
-        return bool(queue.claimable() or queue.claimed())
+        return bool(queue.count("claimable") or queue.count("claimed"))
 
     def fill(self) -> Iterator[int]:
-        """Start processes up to the number of workers, or of submissions that can be claimed.
-
-        Yields:
-          The process id of each.
-        """
+        """Start processes up to the number of workers or of submissions; yields their ids."""
         queue = self._store.queue
         while (
             len(self._running) < self._workers
             and time.monotonic() >= self._paused_until
             and (
                 not self._until_empty
-                or (len(self._running) < queue.waiting() and queue.claimable())
+                or (len(self._running) < queue.count("waiting") and queue.count("claimable"))
             )
         ):
             name = worker_name()
@@ -383,17 +349,13 @@ class _Scorers:
         return _Scorer(process, errors)
 
     def watch(self) -> None:
-        """Wait a moment, and remove the processes that have ended.
-
-        Raises:
-          SMEError: (`until_empty`) every further process would fail as these have.
-        """
+        """Wait a moment, remove the processes that have ended, and pause if all fail."""
         sentinels = [scorer.process.sentinel for scorer in self._running.values()]
         connection.wait(sentinels, _POLL_SECONDS)
         deaths, error = self._remove_ended()
         if error is not None and self._until_empty:
             raise error
-        previously, self._done = self._done, self._store.queue.done()
+        previously, self._done = self._done, self._store.queue.count("done")
         self._futile_deaths = 0 if self._done > previously else self._futile_deaths + deaths
         excess = self._futile_deaths - _FUTILE_DEATHS * self._workers
         if not deaths or excess < 0:
@@ -423,11 +385,7 @@ class _Scorers:
         self._remove_ended()
 
     def _remove_ended(self) -> tuple[int, SMEError | None]:
-        """End the claims of ended processes at once.
-
-        Returns:
-          The number that died, or sent an error, without a claim; and the last error.
-        """
+        """End the claims of ended processes; how many died for nothing, and the last error."""
         deaths, last_error = 0, None
         for name, scorer in list(self._running.items()):
             if scorer.process.is_alive():
@@ -454,7 +412,6 @@ def _scorer_process(
     worker: str,
     errors: Connection,
     until_empty: bool,
-    lease_seconds: float,
     isolation: Isolation | None,
     work: Work,
 ) -> None:
@@ -474,7 +431,6 @@ def _scorer_process(
             worker=worker,
             until_empty=until_empty,
             stop=lambda: parent is not None and not parent.is_alive(),
-            lease_seconds=lease_seconds,
             retry=False,
             isolation=isolation,
             work=work,

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from leaderboard.documents.result import Scores
 from leaderboard.documents.signed import Signed
 from leaderboard.errors import Rejection
 from leaderboard.seasons.entry import Entry, SealedManifest, TicketRequest
@@ -23,7 +24,7 @@ from leaderboard.seasons.season import (
 )
 from leaderboard.store.index import KINDS, Index, Kinds
 from leaderboard.store.log import LogEntry
-from leaderboard.store.rows import EntryRow, scores_of, scores_text
+from leaderboard.store.rows import EntryRow
 from sme_registry.seasons.transcript import EVERY
 from sme_registry.seasons.wire import table_bytes
 
@@ -280,30 +281,19 @@ class Seasons:
         policies: int,
         played: int,
     ) -> None:
-        if self._index.one("SELECT 1 FROM entry WHERE id = ?", entry.subject) is not None:
-            raise entry.contradiction("receives an entry or ticket twice")
-        method, submitter = signed.content.method, signed.content.submitter
-        values = {
-            "id": entry.subject,
-            "status": "entered",
-            "track": season.digest,
-            "number": self.next_number(season.digest),
-            "sequence": entry.sequence,
-            "received": entry.time,
-            "created": signed.content.created,
-            "document": entry.document,
-            "method": method.name,
-            "version": method.version,
-            "family": method.family,
-            "knowledge": method.knowledge,
-            "submitter": self.admitted(season.digest).get(submitter.key, submitter.name),
-            "key": submitter.key,
-            "code_link": signed.content.code,
-            "runs": season.instances,
-            "policies": policies,
-            "reserved": played,
-        }
-        self._index.insert("entry", values)
+        key, name = signed.content.submitter.key, signed.content.submitter.name
+        self._index.add_entrant(
+            entry,
+            signed.content,
+            status="entered",
+            track=season.digest,
+            number=self.next_number(season.digest),
+            created=signed.content.created,
+            submitter=self.admitted(season.digest).get(key, name),
+            runs=season.instances,
+            policies=policies,
+            reserved=played,
+        )
 
     def _result(self, entry: LogEntry) -> None:
         row = self.entrant(entry.subject)
@@ -325,7 +315,7 @@ class Seasons:
                 *(entry.document, entry.time),
                 sum(run.artefact is not None for run in result.runs),
                 sum(each.steps for each in result.stepping),
-                *(result.oracle_like, scores_text(result.scores)),
+                *(result.oracle_like, result.scores.to_text()),
                 played_bytes(self.read(season), result) if online else 0,
                 entry.subject,
             ),
@@ -425,6 +415,6 @@ def _sealed(row: tuple[Any, ...]) -> SealedRow:
         code="",
         enough_runs=False,
         reference=False,
-        scores=None if scores is None else scores_of(scores),
+        scores=None if scores is None else Scores.from_text(scores),
     )
     return SealedRow(season, number, created, document, result, finished, entrant)

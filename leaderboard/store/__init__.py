@@ -5,22 +5,22 @@ The signed log is authoritative, the other files hold the documents that it name
 next one continues from the state it leaves.
 """
 
-from leaderboard.store.blobs import Objects, digest_of, read_document
+from leaderboard.store.blobs import (
+    Garbage,
+    Objects,
+    collect_garbage,
+    digest_of,
+    expire_uploads,
+    read_document,
+)
 from leaderboard.store.index import Index
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
-from leaderboard.store.queue import LEASE_SECONDS, Claim, Queue
+from leaderboard.store.queue import Claim, Queue
 from leaderboard.store.rows import Copies, EntryRow
-from leaderboard.store.store import (
-    Garbage,
-    Store,
-    collect_garbage,
-    expire_uploads,
-    unknown_submission,
-)
+from leaderboard.store.store import Store, unknown_submission
 
 __all__ = [
     "EMPTY",
-    "LEASE_SECONDS",
     "Claim",
     "Copies",
     "EntryRow",

@@ -8,20 +8,26 @@ logged entry survives a loss of power, and makes files readable to everyone.
 from __future__ import annotations
 
 import contextlib
+import datetime
 import functools
 import hashlib
 import os
 import time
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, TypeVar
+from typing import TYPE_CHECKING, BinaryIO, TypeVar
 
 from leaderboard.documents.board import Folder
+from leaderboard.documents.submission import shifted, utc
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from sme_registry import io
 from sme_registry.errors import SMEError
-from sme_registry.io import is_regular, read_regular, sha256_of
+from sme_registry.io import TEMPORARY, is_regular, read_regular, sha256_of
 from sme_registry.spec.document import StrictModel
+
+if TYPE_CHECKING:
+    from leaderboard.store.store import Store
 
 try:
     import fcntl
@@ -32,7 +38,7 @@ BUSY_SECONDS = 60.0
 MAX_DOCUMENT_BYTES = 16 * 2**20
 """Of a file that a board has written: a result of 10,000 failed runs has 3.3 MiB."""
 
-MAX_LOG_ENTRY_BYTES = 4096
+_UNNAMED_SECONDS = 3600.0
 _Model = TypeVar("_Model", bound=StrictModel)
 
 
@@ -72,7 +78,7 @@ def to_bytes(document: StrictModel) -> bytes:
 
 def digest_of(document: StrictModel) -> str:
     """`sha256:` and 64 hex digits of the document's file, as `sha256sum` prints them."""
-    return io.sha256_of(to_bytes(document))
+    return sha256_of(to_bytes(document))
 
 
 def write_document(path: Path, document: StrictModel, *, new: bool = False) -> None:
@@ -80,27 +86,20 @@ def write_document(path: Path, document: StrictModel, *, new: bool = False) -> N
     write_file(path, to_bytes(document), new=new)
 
 
-def read_document(
-    folder: Folder,
-    path: Path,
-    kind: type[_Model],
-    *,
-    limit: int = MAX_DOCUMENT_BYTES,
-) -> _Model:
+def read_document(folder: Folder, path: Path, kind: type[_Model]) -> _Model:
     """Read board.json or a log entry, whose digest nothing names."""
     where = path.relative_to(folder.path).as_posix()
     try:
-        data = read_regular(path, limit)
+        data = read_regular(path, MAX_DOCUMENT_BYTES)
     except OSError as error:
         raise TamperedError(where, f"cannot be read: {error.strerror}") from None
-    document = parse_document(data, kind, where)
+    document = _parsed(data, kind, where)
     if to_bytes(document) != data:
         raise TamperedError(where, "is not in the form in which the board writes it")
     return document
 
 
-def parse_document(data: bytes, kind: type[_Model], where: str) -> _Model:
-    """A document from its bytes, which `where` names in errors."""
+def _parsed(data: bytes, kind: type[_Model], where: str) -> _Model:
     try:
         return kind.from_dict(io.parse_json(data, where), where)
     except SMEError as error:
@@ -128,13 +127,14 @@ class FolderLock:
     @contextlib.contextmanager
     def hold(self, *, exclusive: bool) -> Iterator[None]:
         """Hold the lock for the block; a shared one admits other shared holders."""
+        board = self._path.parent
         if not self._open:
-            raise BoardError(f"{self._path.parent}: the store is closed. Open it again.")
+            raise BoardError(f"{board}: the store is closed. Open it again.")
         if self._handle is None:
             if exclusive:
                 raise BoardError(
-                    f"{self._path.parent}: a board can only be written on Linux and macOS. "
-                    "Open it read-only here."
+                    f"{board}: a board can only be written on Linux and macOS. Open it read-only "
+                    "here."
                 )
             yield  # no process of this system can write
             return
@@ -147,8 +147,8 @@ class FolderLock:
             except BlockingIOError:
                 if time.monotonic() > deadline:
                     raise BoardError(
-                        f"{self._path.parent}: another process has locked the board for "
-                        f"{BUSY_SECONDS:.0f} s. Find the process that hangs, then try again."
+                        f"{board}: another process has locked the board for {BUSY_SECONDS:.0f} s. "
+                        "Find the process that hangs, then try again."
                     ) from None
                 time.sleep(0.002)
         try:
@@ -158,33 +158,19 @@ class FolderLock:
 
 
 class Objects:
-    """The documents and policy files of one board.
-
-    Args:
-      folder: the board's.
-      by_kind: whether its documents lie in folders for each kind, as by rules 2.
-    """
+    """The documents and policy files of one board; by rules 2 (`by_kind`) in folders by kind."""
 
     def __init__(self, folder: Folder, *, by_kind: bool = False) -> None:
         self.folder = folder
         self._is_by_kind = by_kind
 
     def put(self, digest: str, chunks: Iterable[bytes], limit: int) -> int:
-        """Write an artefact of at most `limit` bytes; it exists only once all of it is verified.
-
-        If it exists, its bytes are verified, too, but not written. Arguments and errors as for
-        `Store.put_object`.
-
-        Returns:
-          Its size in bytes.
-        """
+        """Verify an artefact's bytes, and write them unless they exist; returns their number."""
+        verified = _verified(digest, chunks, limit)
         if self.touch(digest):
-            return sum(len(chunk) for chunk in _verified(digest, chunks, limit))
-        size = 0
+            return sum(map(len, verified))
         with durable_file(self.folder.object(digest)) as stream:
-            for chunk in _verified(digest, chunks, limit):
-                size += stream.write(chunk)
-        return size
+            return sum(map(stream.write, verified))
 
     def write(self, document: StrictModel) -> str:
         """Write a document, and return its digest."""
@@ -234,18 +220,13 @@ class Objects:
         except BoardError:
             where = self._where(digest)
             raise TamperedError(where, "is missing, altered, or no regular file") from None
-        return parse_document(data, kind, self._where(digest))
+        return _parsed(data, kind, self._where(digest))
 
     def paths(self) -> Iterator[tuple[str, Path]]:
         """Digest and path of every file in objects/, sorted."""
-        if not self.folder.objects.is_dir():
-            return
-        for shelf in sorted(self.folder.objects.iterdir()):
-            if not shelf.is_dir():
-                continue
-            for path in sorted(shelf.iterdir()):
-                if not path.name.startswith("."):
-                    yield f"sha256:{shelf.name}{path.name}", path
+        for path in sorted(self.folder.objects.glob("*/*")):
+            if not path.name.startswith("."):
+                yield f"sha256:{path.parent.name}{path.name}", path
 
     def _where(self, digest: str) -> str:
         if self._is_by_kind and not self.has(digest):  # its file, which was altered, has another
@@ -255,14 +236,12 @@ class Objects:
     @functools.cached_property
     def _by_kind(self) -> dict[str, Path]:
         """The documents of a board of rules 2, by digest."""
-        found: dict[str, Path] = {}
-        if not self._is_by_kind:
-            return found
-        for kind in ("submissions", "withdrawals", "results", "seasons"):
+        paths: dict[str, Path] = {}
+        for kind in ("submissions", "withdrawals", "results", "seasons") * self._is_by_kind:
             for path in sorted((self.folder.path / kind).rglob("*.json")):
                 with contextlib.suppress(OSError):
-                    found[sha256_of(read_regular(path, MAX_DOCUMENT_BYTES))] = path
-        return found
+                    paths[sha256_of(read_regular(path, MAX_DOCUMENT_BYTES))] = path
+        return paths
 
 
 def _verified(digest: str, chunks: Iterable[bytes], limit: int) -> Iterator[bytes]:
@@ -284,3 +263,77 @@ def _verified(digest: str, chunks: Iterable[bytes], limit: int) -> Iterator[byte
             f"artefact={digest[:19]}…: the bytes have the digest {actual[:19]}…. "
             "Upload the file that was hashed.",
         )
+
+
+@dataclass(frozen=True)
+class Garbage:
+    """What `collect_garbage` removed, or would remove."""
+
+    temporary: int  # half-written files of dead processes
+    objects: int  # artefacts that no submission names
+    bytes: int  # of both
+
+    @property
+    def files(self) -> int:
+        """Number of files of both kinds."""
+        return self.temporary + self.objects
+
+
+def collect_garbage(
+    store: Store,
+    *,
+    temporary_older_than: float = 3600.0,
+    objects_older_than: float = 86400.0,
+    dry_run: bool = False,
+) -> Garbage:
+    """Remove half-written files of dead processes and artefacts that no submission names.
+
+    Ages are in seconds since a file was last written to: a younger one may belong to an upload in
+    progress, or its submission may follow. `dry_run` only counts.
+    """
+    now = time.time()
+
+    def is_older(path: Path, seconds: float) -> bool:
+        return path.lstat().st_mtime <= now - seconds
+
+    with store.transaction() as index:
+        temporary = [
+            path
+            for path in store.folder.path.rglob(TEMPORARY)
+            if path.is_file() and is_older(path, temporary_older_than)
+        ]
+        named = set(store.named_objects())
+        objects = {
+            digest: path
+            for digest, path in store.objects.paths()
+            if digest not in named and is_older(path, objects_older_than)
+        }
+        paths = [*temporary, *objects.values()]
+        size = sum(path.lstat().st_size for path in paths)
+        if not dry_run:
+            for path in paths:
+                _remove(path)
+            for digest in objects:
+                index.connection.execute("DELETE FROM upload WHERE digest = ?", (digest,))
+    return Garbage(len(temporary), len(objects), size)
+
+
+def expire_uploads(store: Store) -> None:
+    """Remove uploads of more than an hour ago that no submission of their key has named."""
+    moment = datetime.datetime.fromisoformat(store.time)
+    until = utc(shifted(moment, -datetime.timedelta(seconds=_UNNAMED_SECONDS)))
+    held = "SELECT 1 FROM object WHERE digest = ?1 UNION SELECT 1 FROM upload WHERE digest = ?1"
+    with store.transaction() as index:
+        old = index.connection.execute(
+            "DELETE FROM upload WHERE time <= ? RETURNING digest", (until,)
+        ).fetchall()
+        for (digest,) in old:
+            if index.one(held, digest) is None:
+                _remove(store.folder.object(digest))
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise unwritable(path, error) from error

@@ -4,8 +4,12 @@ The tables `head`, `track`, `entry`, `run`, `object` and `artefact` are a functi
 so a rebuilt index equals one that grew. `entry` has the entrants of all tracks, and `track` the
 tracks besides the open one; `KINDS` says what each kind of log entry does to them. `lease` and
 `upload` are temporary state: the claims of scorers and the faults that ended them, and artefacts
-that no submission names yet.
-`clock` is how the machine's clock stood when the board was first served since the machine started.
+that no submission names yet. `clock` is how the machine's clock stood when the board was first
+served since the machine started.
+
+Runs are copies of earlier ones if their actions on the board's states are exactly equal. What
+counts is when their submissions were received, not when they were scored, and the reference rows
+are no source of copies.
 """
 
 from __future__ import annotations
@@ -15,20 +19,26 @@ import functools
 import os
 import sqlite3
 import zlib
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from leaderboard.documents.board import BoardDocument, Folder
-from leaderboard.documents.result import Result
+from leaderboard.documents.board import BoardDocument
+from leaderboard.documents.result import Result, RunScore, Scores
 from leaderboard.documents.signed import Signed
-from leaderboard.documents.submission import Artefact, Submission, Withdrawal
+from leaderboard.documents.submission import (
+    REFERENCE_FAMILY,
+    Artefact,
+    Manifest,
+    Submission,
+    Withdrawal,
+)
 from leaderboard.errors import BoardError, Rejection, TamperedError
-from leaderboard.store import rows
-from leaderboard.store.blobs import BUSY_SECONDS, Objects, digest_of, to_bytes
+from leaderboard.store.blobs import BUSY_SECONDS, Objects, digest_of, to_bytes, unwritable
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
-from leaderboard.store.rows import Copies, EntryRow, Status, scores_of, scores_text
+from leaderboard.store.rows import Copies, EntryRow, Status, sketches_alike
 from sme_registry.io import is_regular
 from sme_registry.spec.document import StrictModel
 
@@ -38,7 +48,7 @@ TIMES = (("track", "announced"), ("entry", "received"), ("object", "received"), 
 What an end or a reveal was decided by stays: it has happened.
 """
 
-SCHEMA = f"""
+SCHEMA = """
 CREATE TABLE head (
   zero INTEGER PRIMARY KEY CHECK (zero = 0),
   board TEXT NOT NULL, sequence INTEGER NOT NULL, digest TEXT NOT NULL, time TEXT NOT NULL
@@ -67,7 +77,14 @@ CREATE TABLE entry (
 CREATE UNIQUE INDEX entry_number ON entry (track, number);
 CREATE INDEX entry_waiting ON entry (sequence) WHERE status = 'waiting';
 CREATE INDEX entry_of_key ON entry (key, received);
-CREATE UNIQUE INDEX entry_sequence ON entry (sequence);{rows.SCHEMA}
+CREATE UNIQUE INDEX entry_sequence ON entry (sequence);
+CREATE TABLE run (
+  position INTEGER PRIMARY KEY, submission TEXT NOT NULL, sequence INTEGER NOT NULL,
+  spec TEXT NOT NULL, actions TEXT NOT NULL, -- their digest, or a sketch
+  first INTEGER -- sequence of the first submission with a run like it, if it is an earlier one
+) STRICT;
+CREATE INDEX run_actions ON run (spec, actions);
+CREATE INDEX run_alike ON run (submission) WHERE first IS NOT NULL;
 CREATE TABLE object (
   digest TEXT PRIMARY KEY, size INTEGER NOT NULL, key TEXT NOT NULL, received TEXT NOT NULL
 ) STRICT, WITHOUT ROWID;
@@ -89,65 +106,49 @@ CREATE TABLE clock (boot TEXT PRIMARY KEY, offset REAL NOT NULL) STRICT, WITHOUT
 """
 VERSION = zlib.crc32(SCHEMA.encode()) & 0x7FFFFFFF  # changes with the schema's text
 
+_Model = TypeVar("_Model", bound=StrictModel)
+Kinds = Mapping[str, "Callable[[Index, LogEntry], None]"]
+
+
 _COLUMNS = tuple(field.name for field in fields(EntryRow) if field.name != "alike")
 _OF_LEASE = {"faults": "coalesce(faults, 0)", "fault": "coalesce(fault, '')"}
 _ROW = ", ".join(_OF_LEASE.get(name, f"entry.{name}") for name in _COLUMNS)
 _ROWS = f"SELECT {_ROW} FROM entry LEFT JOIN lease ON submission = id WHERE track = ''"
 
 
-_Model = TypeVar("_Model", bound=StrictModel)
-Kinds = Mapping[str, "Callable[[Index, LogEntry], None]"]
-
-
 class Index:
-    """A connection to a database with the schema's tables, of a board's folder and document."""
+    """A connection to a database with the schema's tables, of a board's document and objects."""
 
     def __init__(
         self,
         connection: sqlite3.Connection,
-        folder: Folder,
+        objects: Objects,
         document: BoardDocument,
         kinds: Kinds,
     ) -> None:
-        self.connection = connection
-        self.folder = folder
-        self.document = document
-        self.objects = Objects(folder, by_kind=document.rules == 2)
-        self._board = document.digest
-        self._written: StrictModel | None = None
+        self.connection, self.objects, self.document = connection, objects, document
         self._kinds = kinds
+        self._written: StrictModel | None = None
 
     @classmethod
-    def open(cls, folder: Folder, document: BoardDocument, kinds: Kinds) -> Index:
-        """Connect to a board's index, whose file is created if it does not exist.
-
-        Raises:
-          sqlite3.Error: the file is no database, or is broken.
-          OSError: it, or one of those beside it, is no regular file.
-        """
-        *files, journal = files_of(folder.index)
-        if os.path.lexists(journal):  # from which SQLite would restore, and delete, what it names
-            raise OSError(f"{journal.name} exists, which a board never writes")
-        for path in files:
-            if os.path.lexists(path) and not is_regular(path):
-                raise OSError(f"{path.name} is not a regular file")
-        connection = _connect(str(folder.index))
+    def open(cls, objects: Objects, document: BoardDocument, kinds: Kinds) -> Index:
+        """Connect to a board's index, in a new file if there is none or the old one is unusable."""
+        path = objects.folder.index
         try:
-            connection.execute("PRAGMA trusted_schema = OFF")
-            connection.execute("PRAGMA journal_mode = WAL")
-            connection.execute("PRAGMA synchronous = FULL")
-            (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-            if verdict != "ok":
-                raise sqlite3.DatabaseError(verdict)
-        except BaseException:
-            connection.close()
-            raise
-        return cls(connection, folder, document, kinds)
+            connection = _opened(path)
+        except (sqlite3.Error, OSError):
+            try:
+                for each in _files_of(path):
+                    each.unlink(missing_ok=True)
+                connection = _opened(path)
+            except OSError as error:
+                raise unwritable(path, error) from error
+        return cls(connection, objects, document, kinds)
 
     @classmethod
-    def empty(cls, folder: Folder, document: BoardDocument, kinds: Kinds) -> Index:
+    def empty(cls, objects: Objects, document: BoardDocument, kinds: Kinds) -> Index:
         """An empty index in memory, or if it grows in a file that no other process sees."""
-        index = cls(_connect(""), folder, document, kinds)
+        index = cls(_connect(""), objects, document, kinds)
         with index.transaction():
             index.clear()
         return index
@@ -155,32 +156,24 @@ class Index:
     @property
     def is_current(self) -> bool:
         """Whether it has exactly the tables of this version, and is of this board."""
-        (version,) = self.connection.execute("PRAGMA user_version").fetchone()
-        if version != VERSION or _definitions(self.connection) != _expected():
+        if self.one("PRAGMA user_version") != (VERSION,):
             return False
-        row = self.one("SELECT board FROM head")
-        return row is not None and row[0] == self._board
+        if _definitions(self.connection) != _expected():
+            return False
+        return self.one("SELECT board FROM head") == (self.document.digest,)
 
     def clear(self) -> None:
-        """Replace all tables by empty ones of this version, in a transaction."""
-        for kind, name in self.connection.execute(
+        """Replace all tables by empty ones of this version; uploads, which no log names, stay."""
+        execute = self.connection.execute
+        uploads = execute("SELECT * FROM upload").fetchall() if self.is_current else []
+        for kind, name in execute(
             "SELECT type, name FROM sqlite_master WHERE type IN ('table', 'view')"
         ).fetchall():
-            self.connection.execute(f'DROP {kind} "{name}"')
+            execute(f'DROP {kind} "{name}"')
         for statement in SCHEMA.split(";"):
-            self.connection.execute(statement)
-        self.connection.execute(f"PRAGMA user_version = {VERSION}")
-
-    def uploads(self) -> list[tuple[Any, ...]]:
-        """Of files that no submission names yet, which are not in the log."""
-        return self.connection.execute("SELECT * FROM upload").fetchall()
-
-    def add_uploads(self, rows: list[tuple[Any, ...]]) -> None:
-        self.connection.executemany("INSERT INTO upload VALUES (?, ?, ?, ?)", rows)
-
-    def close(self) -> None:
-        """Close the connection."""
-        self.connection.close()
+            execute(statement)
+        execute(f"PRAGMA user_version = {VERSION}")
+        self.connection.executemany("INSERT INTO upload VALUES (?, ?, ?, ?)", uploads)
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
@@ -196,23 +189,18 @@ class Index:
     @property
     def head(self) -> Head:
         """The last log entry in the index."""
-        row = self.connection.execute("SELECT sequence, digest, time FROM head").fetchone()
+        row = self.one("SELECT sequence, digest, time FROM head")
         return EMPTY if row is None else Head(*row)
 
     def apply(self, entry: LogEntry, document: StrictModel | None = None) -> None:
-        """Apply the log entry after `head`, which may be one that is not written yet.
+        """Apply the log entry after `head`; neither it nor `document`, if given, is written yet.
 
-        Args:
-          entry: the entry.
-          document: that it names, where it is not written yet.
-
-        Raises:
-          Rejection: the document is not allowed at the entry's time, and is not written yet.
+        A `Rejection` says that the document is not allowed at the entry's time.
         """
         if entry.event not in self._kinds:
             raise BoardError(
-                f"log/{entry.sequence:08d}.json: event={entry.event}: must be one of "
-                f"{', '.join(self._kinds)}. Open the board with all its tracks."
+                f"{entry.file}: event={entry.event}: must be one of {', '.join(self._kinds)}. "
+                "Open the board with all its tracks."
             )
         if entry.time < self.head.time and self.document.rules > 2 and entry.event != "clock":
             raise entry.contradiction("is dated before the entry before it")
@@ -227,7 +215,7 @@ class Index:
             self._name_document(entry)
         self.connection.execute(
             "REPLACE INTO head VALUES (0, ?, ?, ?, ?)",
-            (self._board, entry.sequence, entry.digest, entry.time),
+            (self.document.digest, entry.sequence, entry.digest, entry.time),
         )
 
     def read(self, kind: type[_Model], entry: LogEntry) -> _Model:
@@ -238,26 +226,45 @@ class Index:
 
     def _name_document(self, entry: LogEntry) -> None:
         """Add the entry's document to the objects, as one of the entrant's or the board's."""
-        row = self.one("SELECT key FROM entry WHERE id = ?", entry.subject)
         if self._written is None:
             size = self.objects.path(entry.document).stat().st_size
         else:
             size = len(to_bytes(self._written))
-        key = self.document.key if row is None else row[0]
+        (key,) = self.one("SELECT key FROM entry WHERE id = ?", entry.subject) or (
+            self.document.key,
+        )
         self._name_object(entry.document, size, key, entry)
 
     def _name_object(self, digest: str, size: int, key: str, entry: LogEntry) -> None:
         row = digest, size, key, entry.time
         self.connection.execute("INSERT OR IGNORE INTO object VALUES (?, ?, ?, ?)", row)
-        self.connection.execute(
-            "DELETE FROM upload WHERE digest = ? AND key IN (?, '')", (digest, key)
-        )
+        self.connection.execute("DELETE FROM upload WHERE digest = ? AND key = ?", (digest, key))
 
     def name_artefact(self, artefact: Artefact, key: str, entry: LogEntry) -> None:
         """Add a file that an entrant's document names, which is no mere upload from then on."""
         self._name_object(artefact.sha256, artefact.size, key, entry)
         row = artefact.sha256, entry.subject
         self.connection.execute("INSERT OR IGNORE INTO artefact VALUES (?, ?)", row)
+
+    def add_entrant(self, entry: LogEntry, manifest: Manifest, **fields: Any) -> None:
+        """Add an entrant of any track, which the log receives once."""
+        if self.one("SELECT 1 FROM entry WHERE id = ?", entry.subject) is not None:
+            raise entry.contradiction("receives an entrant twice")
+        method, submitter = manifest.method, manifest.submitter
+        values = {
+            "id": entry.subject,
+            "sequence": entry.sequence,
+            "received": entry.time,
+            "document": entry.document,
+            "method": method.name,
+            "version": method.version,
+            "family": method.family,
+            "knowledge": method.knowledge,
+            "submitter": submitter.name,
+            "key": submitter.key,
+            "code_link": manifest.code,
+        }
+        self.insert("entry", values | fields)
 
     def insert(self, table: str, values: dict[str, Any]) -> None:
         """Insert a row, by its columns."""
@@ -271,35 +278,24 @@ class Index:
             raise TamperedError("board.json", "differs from the board that the log opened")
 
     def _received(self, entry: LogEntry) -> None:
-        if self.one("SELECT 1 FROM entry WHERE id = ?", entry.subject) is not None:
-            raise entry.contradiction("receives a submission twice")
         submission = self.read(Signed[Submission], entry).content
         entry.check_subject(submission.digest)
-        method, submitter = submission.method, submission.submitter
-        values = {
-            "id": entry.subject,
-            "sequence": entry.sequence,
-            "received": entry.time,
-            "document": entry.document,
-            "method": method.name,
-            "version": method.version,
-            "family": method.family,
-            "knowledge": method.knowledge,
-            "submitter": submitter.name,
-            "key": submitter.key,
-            "code_link": submission.code,
-            "runs": len(submission.runs),
-            "policies": sum(run.artefact is not None for run in submission.runs),
-            "steps": sum(run.steps for run in submission.runs),
-            "reference": submitter.key == self.document.key and method.family == "reference",
-        }
-        self.insert("entry", values)
-        for run in submission.runs:
-            if run.artefact is not None:
-                self.name_artefact(run.artefact, submitter.key, entry)
+        key, family = submission.submitter.key, submission.method.family
+        artefacts = [run.artefact for run in submission.runs if run.artefact is not None]
+        self.add_entrant(
+            entry,
+            submission,
+            runs=len(submission.runs),
+            policies=len(artefacts),
+            steps=sum(run.steps for run in submission.runs),
+            reference=key == self.document.key and family == REFERENCE_FAMILY,
+        )
+        for artefact in artefacts:
+            self.name_artefact(artefact, key, entry)
 
     def _result(self, entry: LogEntry) -> None:
-        if self.status(entry.subject) != "waiting":
+        row = self.one("SELECT status, sequence, reference FROM entry WHERE id = ?", entry.subject)
+        if row is None or row[0] != "waiting":
             raise entry.contradiction("the submission was not waiting for a result")
         result = self.read(Result, entry)
         entry.check_subject(result.submission)
@@ -309,36 +305,66 @@ class Index:
             (
                 *(entry.document, result.status, result.code),
                 *(result.enough_runs, result.oracle_like),
-                None if result.scores is None else scores_text(result.scores),
+                None if result.scores is None else result.scores.to_text(),
                 entry.subject,
             ),
         )
-        sequence, reference = self.one(
-            "SELECT sequence, reference FROM entry WHERE id = ?", entry.subject
-        ) or (0, True)
-        if not reference:
-            rows.add_runs(self.connection, entry.subject, sequence, result.runs)
-        self.connection.execute("DELETE FROM lease WHERE submission = ?", (entry.subject,))
+        if not row[2]:
+            for run in result.runs:
+                self._add_run(entry.subject, row[1], run)
+        self._end_lease(entry)
 
     def _withdrawn(self, entry: LogEntry) -> None:
         if self.status(entry.subject) in (None, "withdrawn"):
             raise entry.contradiction("the submission is unknown or already withdrawn")
-        signed = self.read(Signed[Withdrawal], entry)
-        entry.check_subject(signed.content.submission)
+        entry.check_subject(self.read(Signed[Withdrawal], entry).content.submission)
         self.connection.execute(
             "UPDATE entry SET status = 'withdrawn', withdrawal = ? WHERE id = ?",
             (entry.document, entry.subject),
         )
+        self._end_lease(entry)
+
+    def _end_lease(self, entry: LogEntry) -> None:
         self.connection.execute("DELETE FROM lease WHERE submission = ?", (entry.subject,))
 
     def _clock(self, entry: LogEntry) -> None:
-        first = Log(self.folder, self.document.key).first_after(self.head, entry.time)
+        first = Log(self.objects.folder, self.document.key).first_after(self.head, entry.time)
         if first is None or (first.digest, digest_of(first)) != (entry.subject, entry.document):
             raise entry.contradiction("does not name the first entry that is dated later")
         for table, column in TIMES:
             self.connection.execute(
                 f"UPDATE {table} SET {column} = ?1 WHERE {column} > ?1", (entry.time,)
             )
+
+    def _add_run(self, submission: str, sequence: int, run: RunScore) -> None:
+        """Add a scored run, and update the later ones that are like it."""
+        actions = run.actions or run.sketch
+        if run.spec is None or not actions:
+            return
+        alike = self._runs_like(run.spec, actions)
+        first = min((other for _, other in alike if other < sequence), default=None)
+        self.connection.execute(
+            "INSERT INTO run (submission, sequence, spec, actions, first) VALUES (?, ?, ?, ?, ?)",
+            (submission, sequence, run.spec, actions, first),
+        )
+        self.connection.executemany(
+            "UPDATE run SET first = min(coalesce(first, ?1), ?1) WHERE position = ?2",
+            [(sequence, position) for position, other in alike if other > sequence],
+        )
+
+    def _runs_like(self, spec: str, actions: str) -> list[tuple[int, int]]:
+        """Position and sequence of the runs on an instance that act like one."""
+        if actions.startswith("sha256:"):
+            return self.connection.execute(
+                "SELECT position, sequence FROM run WHERE spec = ? AND actions = ?", (spec, actions)
+            ).fetchall()
+        runs = self.connection.execute(
+            "SELECT position, sequence, actions FROM run "
+            "WHERE spec = ? AND actions NOT LIKE 'sha256:%' ORDER BY position",
+            (spec,),
+        ).fetchall()
+        alike = sketches_alike(actions, [sketch for *_, sketch in runs])
+        return [(run[0], run[1]) for run, is_alike in zip(runs, alike, strict=True) if is_alike]
 
     def one(self, statement: str, *values: Any) -> tuple[Any, ...] | None:
         """The first row of a query; None if there is none."""
@@ -354,17 +380,27 @@ class Index:
         row = self.one("SELECT status FROM entry WHERE id = ? AND track = ''", id)
         return None if row is None else row[0]
 
-    def entries(self) -> list[EntryRow]:
-        """All submissions, in the order in which they were received."""
-        alike = rows.copies_of(self.connection)
-        return [
-            _entry_row(row, alike) for row in self.connection.execute(f"{_ROWS} ORDER BY sequence")
-        ]
-
-    def entry(self, id: str) -> EntryRow | None:
-        """One submission; None if there is no such submission."""
-        row = self.one(f"{_ROWS} AND id = ?", id)
-        return None if row is None else _entry_row(row, rows.copies_of(self.connection, id))
+    def entries(self, id: str | None = None) -> list[EntryRow]:
+        """All submissions, in the order in which they were received; or only that of an id."""
+        alike: dict[str, list[Copies]] = defaultdict(list)
+        for submission, *copies in self.connection.execute(
+            "SELECT run.submission, entry.id, entry.key, count(*) FROM run "
+            "JOIN entry ON entry.sequence = run.first "
+            "WHERE run.first IS NOT NULL AND (?1 IS NULL OR run.submission = ?1) "
+            "GROUP BY run.submission, run.first ORDER BY run.submission, run.first",
+            (id,),
+        ):
+            alike[submission].append(Copies(*copies))
+        rows = []
+        clauses = "ORDER BY sequence" if id is None else "AND id = ?"
+        for row in self.connection.execute(f"{_ROWS} {clauses}", (id,) if id else ()):
+            values = dict(zip(_COLUMNS, row, strict=True))
+            for name in ("enough_runs", "oracle_like", "reference"):
+                values[name] = bool(values[name])
+            if values["scores"] is not None:
+                values["scores"] = Scores.from_text(values["scores"])
+            rows.append(EntryRow(**values, alike=tuple(alike.get(values["id"], ()))))
+        return rows
 
 
 KINDS: Kinds = {
@@ -377,18 +413,37 @@ KINDS: Kinds = {
 """Of log entries, on every board: what each does to the index."""
 
 
-def files_of(index: Path) -> list[Path]:
+def _files_of(index: Path) -> list[Path]:
     """The paths of a database and of what SQLite writes beside it."""
     return [index.with_name(index.name + end) for end in ("", "-wal", "-shm", "-journal")]
+
+
+def _opened(index: Path) -> sqlite3.Connection:
+    """Connect to a file; an error if it is no database, broken, or no regular file."""
+    *paths, journal = _files_of(index)
+    if os.path.lexists(journal):  # from which SQLite would restore, and delete, what it names
+        raise OSError(f"{journal.name} exists, which a board never writes")
+    for path in paths:
+        if os.path.lexists(path) and not is_regular(path):
+            raise OSError(f"{path.name} is not a regular file")
+    connection = _connect(str(index))
+    try:
+        connection.execute("PRAGMA trusted_schema = OFF")
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA synchronous = FULL")
+        (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+        if verdict != "ok":
+            raise sqlite3.DatabaseError(verdict)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
 
 
 def _connect(target: str) -> sqlite3.Connection:
     # Transactions begin explicitly; the store's lock admits one thread at a time.
     return sqlite3.connect(
-        target,
-        timeout=BUSY_SECONDS,
-        isolation_level=None,
-        check_same_thread=False,
+        target, timeout=BUSY_SECONDS, isolation_level=None, check_same_thread=False
     )
 
 
@@ -404,13 +459,3 @@ def _expected() -> list[tuple[Any, ...]]:
     with contextlib.closing(_connect(":memory:")) as connection:
         connection.executescript(SCHEMA)
         return _definitions(connection)
-
-
-def _entry_row(row: tuple[Any, ...], alike: dict[str, tuple[Copies, ...]]) -> EntryRow:
-    values = dict(zip(_COLUMNS, row, strict=True))
-    values["alike"] = alike.get(values["id"], ())
-    for name in ("enough_runs", "oracle_like", "reference"):
-        values[name] = bool(values[name])
-    if values["scores"] is not None:
-        values["scores"] = scores_of(values["scores"])
-    return EntryRow(**values)

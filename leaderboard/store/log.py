@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import datetime
 import functools
-import hashlib
 import time
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -23,7 +22,8 @@ from leaderboard.documents.board import Folder
 from leaderboard.documents.signed import PlainDocument, Signature, SigningKey, plain_json, verifies
 from leaderboard.documents.submission import UtcTime, now
 from leaderboard.errors import ClockError, TamperedError
-from leaderboard.store.blobs import MAX_LOG_ENTRY_BYTES, read_document, write_document
+from leaderboard.store.blobs import read_document, write_document
+from sme_registry.io import sha256_of
 from sme_registry.spec.document import Digest, Integer, SchemaVersion
 
 NOTHING = "sha256:" + "0" * 64
@@ -32,13 +32,9 @@ MOST_BEHIND, LONGEST_JUMP = 60.0, 300.0
 
 
 class Head(NamedTuple):
-    """The last entry of a log or an index, which the next entry must follow.
+    """The last entry of a log or an index, which the next entry must follow."""
 
-    Attributes:
-      sequence: its number; −1 if there is none.
-    """
-
-    sequence: int
+    sequence: int  # its number; −1 if there is none
     digest: str
     time: str
 
@@ -82,7 +78,7 @@ class LogEntry(PlainDocument):
         """Digest of the entry without its signature."""
         fields = self.to_dict()
         del fields["signature"]
-        return _digest(fields)
+        return sha256_of(plain_json(fields))
 
     @property
     def file(self) -> str:
@@ -115,51 +111,40 @@ class Log:
         """Whether the entry of this number exists."""
         return self.folder.log_entry(sequence).exists()
 
-    def read(self, sequence: int) -> LogEntry:
-        """Read an entry and verify its signature, but not the entries before it."""
-        path = self.folder.log_entry(sequence)
-        entry = read_document(self.folder, path, LogEntry, limit=MAX_LOG_ENTRY_BYTES)
-        where = path.relative_to(self.folder.path).as_posix()
+    def read(self, sequence: int, after: Head | None = None) -> LogEntry:
+        """Read an entry and verify its signature; and that it follows `after`, if that is given."""
+        entry = read_document(self.folder, self.folder.log_entry(sequence), LogEntry)
         if entry.sequence != sequence:
-            raise TamperedError(where, f"holds entry {entry.sequence}")
-        self._check_signature(entry)
+            raise TamperedError(f"log/{sequence:08d}.json", f"holds entry {entry.sequence}")
+        self.check(entry, after)
         return entry
 
-    def read_after(self, head: Head) -> LogEntry:
-        """Read the entry after `head` and verify that it follows it."""
-        entry = self.read(head.sequence + 1)
-        self._check_order(entry, head)
-        return entry
-
-    def check(self, entry: LogEntry, head: Head) -> None:
-        """Raise `TamperedError` unless the board has signed an entry, and it follows `head`."""
-        self._check_signature(entry)
-        self._check_order(entry, head)
-
-    def _check_signature(self, entry: LogEntry) -> None:
+    def check(self, entry: LogEntry, after: Head | None) -> None:
+        """Raise `TamperedError` unless the board has signed an entry, and it follows `after`."""
         if not verifies(self.key, entry.signature, "log", entry.signed_digest):
             raise TamperedError(entry.file, "its signature does not match the board's key")
-
-    def _check_order(self, entry: LogEntry, head: Head) -> None:
-        if (entry.sequence, entry.previous) != (head.sequence + 1, head.digest):
+        if after is None:
+            return
+        if (entry.sequence, entry.previous) != (after.sequence + 1, after.digest):
             raise TamperedError(entry.file, "does not follow the entry before it: one was replaced")
         if (entry.event == "opened") != (entry.sequence == 0):
             raise TamperedError(entry.file, "only the first entry may open a board")
 
     def entry(
-        self, key: SigningKey, head: Head, event: str, subject: str, document: str, time: str
+        self, key: SigningKey, after: Head, event: str, subject: str, document: str, time: str
     ) -> LogEntry:
-        """The entry after `head`, which is not written yet."""
-        fields = {
+        """The next entry, which is not written yet."""
+        fields: dict[str, Any] = {
             "schema_version": 1,
-            "sequence": head.sequence + 1,
-            "previous": head.digest,
+            "sequence": after.sequence + 1,
+            "previous": after.digest,
             "time": time,
             "event": event,
             "subject": subject,
             "document": document,
         }
-        return LogEntry.from_dict({**fields, "signature": key.sign("log", _digest(fields))})
+        signature = key.sign("log", sha256_of(plain_json(fields)))
+        return LogEntry.from_dict({**fields, "signature": signature})
 
     def write(self, entry: LogEntry) -> None:
         """Write an entry."""
@@ -231,7 +216,3 @@ def clock_offset() -> tuple[str, float]:
     """The boot id, and what the machine's clock is ahead of its uptime, in seconds."""
     boot, seconds = uptime()
     return boot, time.time() - seconds
-
-
-def _digest(fields: dict[str, Any]) -> str:
-    return "sha256:" + hashlib.sha256(plain_json(fields)).hexdigest()

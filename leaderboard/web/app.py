@@ -167,8 +167,8 @@ class _Routes:
         """Whether scoring works: "ok", "waiting" for its turn, or "fault"."""
         queue = self._store.queue
         try:
-            faulty = queue.faults() or not self._store.time  # which the clock may not allow
-            return "fault" if faulty else "waiting" if queue.waiting() else "ok"
+            faulty = queue.count("faults") or not self._store.time  # which the clock may not allow
+            return "fault" if faulty else "waiting" if queue.count("waiting") else "ok"
         except SMEError:
             return "fault"
 
@@ -226,7 +226,7 @@ class _Routes:
 
         def withdraw() -> str:
             signed = Signed[Withdrawal].read_unverified(text)
-            self._store.withdraw(signed, self._address)
+            admission.withdraw(self._store, signed, self._address)
             return signed.content.submission
 
         id = await to_thread.run_sync(withdraw, limiter=self._documents)
@@ -285,7 +285,7 @@ class _PageCache:
 
     def get(self, render: _Render, name: str) -> _CachedFile:
         queue = self._store.queue
-        state = self._store.head, queue.faults(), queue.places()
+        state = self._store.head, queue.count("faults"), queue.places()
         if state != self._state:
             self._state = state
             self._pages = Pages(self._store, self._address, sections=self._sections)

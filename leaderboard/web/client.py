@@ -293,7 +293,7 @@ class _Copy:
         """Get the entries that are not there yet, each after its document; returns their number."""
         log, head = Log(self.folder, self._document.key), EMPTY
         while log.has(head.sequence + 1):
-            head = log.read_after(head).head
+            head = log.read(head.sequence + 1, head).head
         while True:
             entries = self._entries(head.sequence + 1)
             for entry in entries:

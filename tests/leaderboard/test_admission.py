@@ -236,9 +236,9 @@ def test_a_full_queue_accepts_only_references_and_faults_make_room_in_it(tmp_pat
         signed = uploaded(store, key, 2)
         assert code_of(lambda: receive(store, signed)) == "quota"
         claim = store.queue.claim("worker")
-        store.queue.fault(claim, "no memory")
+        store.queue.release(claim, "no memory")
         assert receive(store, signed) == signed.id
-        assert (store.queue.waiting(), store.queue.queued()) == (2, 1)
+        assert (store.queue.count("waiting"), store.queue.count("queued")) == (2, 1)
         assert len(admission.submit_references(store)) == 2  # without them nothing is ever shown
 
 
@@ -336,9 +336,11 @@ def test_only_the_submitter_withdraws_for_this_board_and_in_plain_text(store, ke
         unsafe = signed_withdrawal(store, signed.id, key, f"a bug{letter}[2J")
         refused.append((unsafe, "unsafe_name"))
     for withdrawal, code in refused:
-        assert code_of(partial(store.withdraw, withdrawal)) == code
+        assert code_of(partial(admission.withdraw, store, withdrawal)) == code
     assert store.withdrawal(signed.id) is None
-    store.withdraw(signed_withdrawal(store, signed.id, key, "ein Käfer <b>,\nzweite Zeile"))
+    assert admission.withdraw(
+        store, signed_withdrawal(store, signed.id, key, "ein Käfer <b>,\nzweite Zeile")
+    )
 
 
 # Uploads.

@@ -32,7 +32,7 @@ class Killer(threading.Thread):
     def run(self):
         last = SUBMISSIONS - 2 * SCORERS
         for moment in sorted(self._random.sample(range(last), KILLS)):
-            while self._store.queue.done() < moment and not self.over.is_set():
+            while self._store.queue.count("done") < moment and not self.over.is_set():
                 time.sleep(0.01)
             time.sleep(self._random.uniform(0.0, 0.2))
             while not self.over.is_set() and not self._kill_one():
@@ -71,7 +71,7 @@ def test_killed_scorers_lose_nothing_and_score_nothing_twice(tmp_path, key):
         finally:
             killer.over.set()
             killer.join()
-        if store.queue.waiting():  # those whose scorers were killed twice, which waits ten seconds
+        if store.queue.count("waiting"):  # postponed, as their scorers were killed twice
             done += run_scorers(board, SCORERS)  # tries them at once
 
         assert done == SUBMISSIONS

@@ -1,5 +1,6 @@
 """Scorers: one in this process, several in their own, and what may stop them."""
 
+import functools
 import itertools
 import logging
 import multiprocessing
@@ -94,7 +95,7 @@ def test_faults_leave_a_submission_waiting_and_others_are_scored(
             # At once and again at first; once each time that the scorer starts after that.
             assert [(row.status, row.faults) for row in rows] == [("waiting", 2 + number)] * 2
             assert all(type(error).__name__ in row.fault or str(error) in row.fault for row in rows)
-            assert not store.queue.claimable()
+            assert not store.queue.count("claimable")
     assert rows[0].fault == f"{error}"
     assert len(caplog.records) == 2 * 6
     assert store.entry(whole.id).status == "scored"
@@ -134,7 +135,7 @@ def test_a_result_waits_for_room_on_the_disk_and_is_computed_once(
     def full(queue, claim, result):
         written.append(result)
         if len(written) < 4:
-            assert store.queue.claimed() == 1
+            assert store.queue.count("claimed") == 1
             raise BoardError("results: No space left on device")
         return real(queue, claim, result)
 
@@ -186,7 +187,8 @@ def test_heartbeats_keep_a_claim_for_as_long_as_it_is_scored(store, submit, monk
     monkeypatch.setattr("leaderboard.store.queue.uptime", lambda: ("boot", uptime[0]))
     monkeypatch.setattr(Queue, "heartbeat", heartbeat)
     monkeypatch.setattr(scorer, "score_submission", lambda *some, **_: slow(*some))
-    assert run_scorer(store.folder.path, lease_seconds=0.2) == 1
+    monkeypatch.setattr(Queue, "claim", functools.partialmethod(Queue.claim, seconds=0.2))
+    assert run_scorer(store.folder.path) == 1
     assert claims == [None] * 3
 
 
@@ -195,7 +197,7 @@ def test_a_scorer_stops_on_request(store, submit, quick):
     submit(2)
     answers = iter([False, True])
     assert run_scorer(store.folder.path, until_empty=False, stop=lambda: next(answers)) == 1
-    assert store.queue.waiting() == 1
+    assert store.queue.count("waiting") == 1
 
 
 # Processes.
@@ -207,7 +209,7 @@ def test_several_processes_score_everything_once(store, board):
     def report(done, total):
         seen.append((done, total))
         if done == 2:  # the last is done after the last look at the queue, and counts
-            wait_until(lambda: store.queue.done() == 3)
+            wait_until(lambda: store.queue.count("done") == 3)
 
     assert run_scorers(board, 2, progress=report, started=pids.append) == 3
     assert seen[-1] == (3, 3)
@@ -233,7 +235,7 @@ def test_processes_that_keep_dying_end_the_command(store, board, monkeypatch):
     monkeypatch.setattr(scorer, "_FUTILE_DEATHS", 2)
     with pytest.raises(BoardError, match="2 scorers died"):
         run_scorers(board, 1, started=lambda pid: os.kill(pid, signal.SIGKILL))
-    assert store.queue.waiting() == 3
+    assert store.queue.count("waiting") == 3
     assert [row.faults for row in store.entries()] == [0, 0, 0]
 
 
@@ -327,9 +329,9 @@ def test_ctrl_c_in_a_terminal_stops_scoring_and_gives_claims_back(tmp_path, key,
     with Store.open(tmp_path / "board") as store:
 
         def one_is_done():
-            if store.queue.waiting() < 3:
+            if store.queue.count("waiting") < 3:
                 put_submission(store, key, next(numbers))
-            return store.queue.done() > 0
+            return store.queue.count("done") > 0
 
         wait_until(one_is_done)
         os.killpg(process.pid, signal.SIGINT)  # parent and children
@@ -337,7 +339,7 @@ def test_ctrl_c_in_a_terminal_stops_scoring_and_gives_claims_back(tmp_path, key,
         assert process.returncode == 130, stderr
         assert "Traceback" not in stderr
         assert_ended([pid])
-        assert store.queue.claimable() == store.queue.waiting() > 0
+        assert store.queue.count("claimable") == store.queue.count("waiting") > 0
 
 
 def test_scorers_end_when_who_started_them_is_killed(served):

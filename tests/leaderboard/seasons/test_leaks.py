@@ -152,7 +152,7 @@ def test_a_fault_is_logged_without_its_text(tmp_path, caplog, monkeypatch):
             until_empty=False,
             stop=stop.__next__,
         )
-        assert played.store.queue.faults() == 1
+        assert played.store.queue.count("faults") == 1
     assert caplog.text.count("SMEError") == 2
     assert "5eed" not in caplog.text
 

@@ -17,7 +17,6 @@ from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.verify import verify
 from leaderboard.store import Store
 from sme_registry.errors import SMEError
-from sme_registry.io import is_regular, open_regular, read_regular
 from tests.leaderboard.conftest import document_path, put_submission, tiny_board
 from tests.leaderboard.store.synthetic import synthetic_result
 
@@ -103,23 +102,6 @@ HARMS = (pipe, endless_link, link_to_a_copy, terabyte, deaf_socket, Path.mkdir)
 def replace(path, harm):
     path.unlink(missing_ok=True)
     harm(path)
-
-
-@pytest.mark.parametrize("harm", HARMS)
-def test_only_regular_files_of_limited_size_are_read(tmp_path, harm):
-    (tmp_path / "plain").write_bytes(b"abc")
-    assert read_regular(tmp_path / "plain", 3) == b"abc"
-    with pytest.raises(OSError, match="has more than 2 bytes"):
-        read_regular(tmp_path / "plain", 2)
-    assert is_regular(tmp_path / "plain")
-    harm(tmp_path / "odd")
-    with pytest.raises(OSError, match=r"regular file|has more than") as refused:
-        read_regular(tmp_path / "odd", 10)
-    assert refused.value.strerror
-    assert is_regular(tmp_path / "odd") == (harm is terabyte)
-    if harm is not terabyte:
-        with pytest.raises(OSError, match="regular file"):
-            open_regular(tmp_path / "odd")
 
 
 FILES = ("board", "log", "submission", "result", "object", "next log")

@@ -21,11 +21,11 @@ def clock(monkeypatch):
 
 def test_the_oldest_is_claimed_first_and_by_one_worker_only(store, submit):
     ids = [submit(number).id for number in range(3)]
-    assert store.queue.claimable() == 3
+    assert store.queue.count("claimable") == 3
     claims = [store.queue.claim(worker) for worker in ("a", "b", "c", "d")]
     assert [claim and claim.id for claim in claims] == [*ids, None]
-    assert store.queue.claimable() == 0
-    assert store.queue.waiting() == 3
+    assert store.queue.count("claimable") == 0
+    assert store.queue.count("waiting") == 3
 
 
 def test_an_expired_claim_is_claimed_again_and_the_late_result_rejected(store, submit):
@@ -108,11 +108,12 @@ def test_faults_postpone_a_submission_ever_longer_and_never_reject_it(store, sub
     for number in range(1, 13):
         claim = store.queue.claim("worker")
         assert claim.attempt == number
-        store.queue.fault(claim, f"fault\nno. {number}")
+        store.queue.release(claim, f"fault\nno. {number}")
         row = store.entry(faulty.id)
         assert (row.status, row.faults, row.fault) == ("waiting", number, f"fault no. {number}")
         waits.append(retry_seconds(number))
-        assert (store.queue.claimable(), store.queue.claimed()) == (int(number == 1), 0)
+        assert store.queue.count("claimable") == (number == 1)
+        assert store.queue.count("claimed") == 0
         clock[0] += waits[-1]
     assert waits[:5] == [0, 10, 20, 40, 80]
     assert waits[-1] == retry_seconds(10**6) == 3600
@@ -124,7 +125,7 @@ def test_faults_postpone_a_submission_ever_longer_and_never_reject_it(store, sub
 def test_others_are_scored_while_a_submission_is_postponed(store, submit, clock):
     faulty, next_one = submit(0), submit(1)
     for _ in range(2):
-        store.queue.fault(store.queue.claim("worker"), "no memory")
+        store.queue.release(store.queue.claim("worker"), "no memory")
     assert [store.entry(each.id).faults for each in (faulty, next_one)] == [2, 0]
     assert store.queue.claim("worker").id == next_one.id
     assert store.queue.claim("worker") is None
@@ -139,7 +140,7 @@ def test_scorers_that_die_unnoticed_postpone_their_submission(store, submit, clo
     for number in range(1, 8):
         store.queue.claim(f"dead {number}", seconds=5)
         clock[0] += 5.0
-        assert store.queue.claimed() == 0
+        assert store.queue.count("claimed") == 0
         store.queue.claim("next") if number > 1 else store.queue.abandon("dead 1")
         assert store.entry(faulty.id).faults == number
         clock[0] += retry_seconds(number)
@@ -148,13 +149,13 @@ def test_scorers_that_die_unnoticed_postpone_their_submission(store, submit, clo
 
 def test_a_slow_scorer_may_still_finish_after_its_claim_ended_in_a_fault(store, submit, clock):
     submit()
-    store.queue.fault(store.queue.claim("one"), "no memory")
+    store.queue.release(store.queue.claim("one"), "no memory")
     slow = store.queue.claim("slow", seconds=5)
     clock[0] += 6.0
     assert store.queue.claim("other") is None
     assert store.queue.heartbeat(slow)
     clock[0] += 4.0
-    assert store.queue.claimed() == 1
+    assert store.queue.count("claimed") == 1
     assert store.queue.finish(slow, synthetic_result(store, slow.id))
 
 
@@ -164,7 +165,7 @@ def test_reference_rows_are_first_and_wait_like_others_after_a_fault(store, subm
     claims = [store.queue.claim(f"worker {number}") for number in range(3)]
     assert [claim.id for claim in claims] == [*references, other.id]
     for _ in range(9):
-        store.queue.fault(claims[0], "killed")
+        store.queue.release(claims[0], "killed")
         clock[0] += 3600
         claims[0] = store.queue.claim("worker")
         assert claims[0].id == references[0]
@@ -218,7 +219,7 @@ def test_a_submission_withdrawn_during_scoring_gets_no_result(store, key, submit
     assert not store.queue.heartbeat(claim)
     assert not store.queue.finish(claim, synthetic_result(store, claim.id))
     assert store.result(signed.id) is None
-    assert store.queue.waiting() == 0
+    assert store.queue.count("waiting") == 0
     assert store.queue.claim("worker") is None
 
 

@@ -202,7 +202,7 @@ def test_a_waiting_entry_shows_the_faults_that_postponed_it(tmp_path):
         with serving(store.folder.path) as url:
             before = [HTTP.get(url + path).text for path in paths]  # the server keeps them
             claim = store.queue.claim("scorer")
-            store.queue.fault(claim, "no space left <on> device")
+            store.queue.release(claim, "no space left <on> device")
             after = [HTTP.get(url + path).text for path in paths]
             view = HTTP.get(f"{url}/api/submissions/{hex_of(id)}").json()
     assert not any("no space left" in text for text in before)
@@ -299,7 +299,7 @@ def test_the_health_check_says_whether_scoring_works(url, store):
     put_submission(store, SigningKey.generate())
     assert scoring() == "waiting"
     claim = store.queue.claim("worker")
-    store.queue.fault(claim, "the sandbox does not start")
+    store.queue.release(claim, "the sandbox does not start")
     assert scoring() == "fault"
     store.folder.log_entry(1).write_bytes(b"rotten")
     assert scoring() == "fault"
@@ -703,9 +703,9 @@ def test_serving_outlives_its_scorers_and_stops_cleanly(tmp_path):
         admission.submit_references(store)
         with serving_process(store.folder.path, workers=1) as (url, process):
             killed, deadline = [], time.monotonic() + 300
-            while store.queue.waiting():
+            while store.queue.count("waiting"):
                 assert time.monotonic() < deadline
-                if not killed and store.queue.claimed():
+                if not killed and store.queue.count("claimed"):
                     killed = [child for child in _children(process.pid) if _may_be_killed(child)]
                     for child in killed:
                         with contextlib.suppress(ProcessLookupError):
