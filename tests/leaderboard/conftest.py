@@ -1,10 +1,12 @@
 """A board so small that scoring takes a moment, and policies that are real ONNX files."""
 
 import functools
+from collections import Counter
 from collections.abc import Callable
 
 import pytest
 
+from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.signed import Receiver, Signed, SigningKey
 from leaderboard.documents.submission import Submission, Withdrawal, now
 from leaderboard.seasons.store import SeasonStore
@@ -16,12 +18,45 @@ from tests.leaderboard.clocks import move_clock
 Submit = Callable[..., Signed[Submission]]
 
 
+def suite_of(**classes):
+    """Classes by name: their number of instances, and what differs from S = 2 and A = 1."""
+    members = [
+        {
+            "name": name,
+            "setting": {"state_dim": 2, "action_dim": 1, **setting},
+            "seeds": list(range(instances)),
+        }
+        for name, (instances, setting) in classes.items()
+    ]
+    return Suite.from_dict({"classes": members})
+
+
 def tiny_suite(instances=1):
-    """One class of the smallest tasks, S = 2 and A = 1."""
-    setting = {"state_dim": 2, "action_dim": 1}
-    return Suite.from_dict(
-        {"classes": [{"name": "Tiny", "setting": setting, "seeds": list(range(instances))}]}
-    )
+    """One class of the smallest tasks."""
+    return suite_of(Tiny=(instances, {}))
+
+
+def document_of(suite, **fields):
+    """A board's document, without its folder."""
+    plain = {"title": "Small", "suite_name": "small-v1", "protocol_name": "few-v1", "rules": 3}
+    protocol = EvaluationProtocol(states_per_region=60)
+    fields = {"suite": suite, "protocol": protocol, "key": "0" * 64, **fields}
+    return BoardDocument(**plain | fields)
+
+
+def plain_submission(document, runs, key="0" * 64, **fields):
+    """The fields of a submission with these runs, and no others started."""
+    instances = document.instances
+    names = Counter(instances[run["spec"]][0] for run in runs if run["spec"] in instances)
+    return {
+        "suite": document.suite_reference,
+        "method": {"name": "PPO", "version": "1.0", "family": "PPO", "knowledge": "generic"},
+        "submitter": {"name": "A Lab", "key": key},
+        "created": "2026-11-21T12:00:00Z",
+        "runs": runs,
+        "runs_started": dict(names),
+        **fields,
+    }
 
 
 def tiny_board(path, *, instances=1, **fields):
@@ -73,32 +108,21 @@ def tiny_submission(store, key, number=0, **fields):
     Another number is another policy.
     """
     data = linear_onnx(number)
-    digest = sha256_of(data)
-    plain = {
-        "suite": store.document.suite_reference,
-        "method": {
-            "name": f"Linear {number}",
-            "version": "1",
-            "family": "linear",
-            "knowledge": "generic",
-        },
+    policy = {"sha256": sha256_of(data), "size": len(data)}
+    runs = [
+        {"spec": spec.digest, "seed": number, "steps": 1000, "artefact": policy}
+        for spec in store.document.suite.instances
+    ]
+    method = {"name": f"Linear {number}", "version": "1", "family": "linear"}
+    own = {
+        "method": {**method, "knowledge": "generic"},
         "submitter": {"name": f"Tester {key.public[:8]}", "key": key.public},
         "created": now(),
-        "runs": [
-            {
-                "spec": spec.digest,
-                "seed": number,
-                "steps": 1000,
-                "artefact": {"sha256": digest, "size": len(data)},
-            }
-            for spec in store.document.suite.instances
-        ],
-        "runs_started": {
-            member.name: len(member.instances) for member in store.document.suite.classes
-        },
-        **fields,
     }
-    return Submission.from_dict(plain).signed(key, Receiver(store.document.key)), {digest: data}
+    plain = plain_submission(store.document, fields.pop("runs", runs), **own | fields)
+    return Submission.from_dict(plain).signed(key, Receiver(store.document.key)), {
+        policy["sha256"]: data
+    }
 
 
 def put_submission(store, key, number=0, **fields):

@@ -242,20 +242,6 @@ def test_a_full_queue_accepts_only_references_and_faults_make_room_in_it(tmp_pat
         assert len(admission.submit_references(store)) == 2  # without them nothing is ever shown
 
 
-def test_a_submission_is_for_one_board(tmp_path, store, key):
-    signed, artefacts = tiny_submission(store, key)
-    with tiny_board(tmp_path / "other") as other:
-        put(other, key, artefacts)
-        assert code_of(lambda: receive(other, signed)) == "wrong_board"
-        for_none = signed.content.signed(key)
-        assert code_of(lambda: receive(other, for_none)) == "wrong_board"
-        # Whoever has no key of the submitter cannot write another board into the envelope.
-        relabelled = signed.model_copy(update={"board": other.document.key})
-        assert code_of(lambda: receive(other, relabelled)) == "bad_signature"
-        assert receive(other, for_none.for_receiver(Receiver(other.document.key), key)) == signed.id
-    assert store.entries() == []
-
-
 # Bundles.
 
 

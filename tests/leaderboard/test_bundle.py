@@ -20,15 +20,9 @@ from sme_registry.studies import run_study
 from sme_registry.studies.result import CellFailure, CellResult
 from sme_registry.training import train
 from sme_registry.training.record import RunRecord
+from tests.leaderboard.conftest import suite_of
 
-SUITE = Suite.from_dict(
-    {
-        "classes": [
-            {"name": "A", "setting": {"state_dim": 2, "action_dim": 1}, "seeds": [0, 1]},
-            {"name": "B", "setting": {"state_dim": 3, "action_dim": 2}, "seeds": [0]},
-        ]
-    }
-)
+SUITE = suite_of(A=(2, {}), B=(1, {"state_dim": 3, "action_dim": 2}))
 FILE = SuiteFile(name="two", version=1, digest=SUITE.digest, suite=SUITE)
 A0, A1, B0 = SUITE.instances
 KEY = SigningKey.generate()

@@ -1,7 +1,6 @@
 """Boards of teams: one shared policy, from each agent's own observations; regret by agent."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from leaderboard import admission
 from leaderboard.bundle import make_bundle
 from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.signed import SigningKey
-from leaderboard.errors import Rejection, TamperedError
+from leaderboard.errors import Rejection
 from leaderboard.gate import sandbox
 from leaderboard.gate.isolation import available_isolation
 from leaderboard.gate.reference import optimal_onnx
@@ -20,22 +19,14 @@ from leaderboard.scoring.worker import run_scorer
 from leaderboard.store import Store
 from leaderboard.web.server import write_site
 from sme_registry import EvaluationProtocol
-from sme_registry.spec import Suite, SuiteFile
-from tests.leaderboard.conftest import document_path, linear_onnx
+from sme_registry.spec import SuiteFile
+from tests.leaderboard.conftest import linear_onnx, suite_of
 
 AGENTS = [
     {"name": "scout_0", "action_dim": 1, "observes": [0]},
     {"name": "driver_0", "action_dim": 2},
 ]
-SETTING = {"state_dim": 2, "action_dim": 3, "team": {"agents": AGENTS}}
-SUITE = Suite.from_dict(
-    {
-        "classes": [
-            {"name": "team", "setting": SETTING, "seeds": [0, 1]},
-            {"name": "alone", "setting": {"state_dim": 2, "action_dim": 1}, "seeds": [0]},
-        ]
-    }
-)
+SUITE = suite_of(team=(2, {"action_dim": 3, "team": {"agents": AGENTS}}), alone=(1, {}))
 FILE = SuiteFile(name="mixed", version=1, digest=SUITE.digest, suite=SUITE)
 TEAM = SUITE.instances[0]
 FIELDS = {
@@ -100,16 +91,6 @@ def test_a_board_of_teams_scores_a_shared_policy_and_each_agent(board, tmp_path)
     assert (failed.agents, alone.agents) == ((), ())
     page = (tmp_path / f"site/submissions/{id.removeprefix('sha256:')}.html").read_text()
     assert page.count("<bdi>driver_0</bdi>") == 1
-
-
-def test_an_altered_agent_is_found(board, tmp_path):
-    copy = shutil.copytree(board, tmp_path / "board")
-    with Store.open(copy, read_only=True) as store:
-        id = next(row.id for row in store.entries() if not row.reference)
-    path = document_path(copy, id, "result")
-    path.write_text(path.read_text().replace("driver_0", "driver_9", 1))
-    with pytest.raises(TamperedError, match=path.name):
-        verify(copy)
 
 
 def test_agents_receive_what_they_observe_and_their_rows_are_checked_in_every_region(monkeypatch):

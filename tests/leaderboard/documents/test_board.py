@@ -15,27 +15,12 @@ from leaderboard.errors import BoardError, Rejection
 from leaderboard.store import Store
 from sme_registry import EvaluationProtocol
 from sme_registry.errors import SpecError
-from sme_registry.spec import Suite, SuiteFile, catalogue
+from sme_registry.spec import SuiteFile, catalogue
+from tests.leaderboard.conftest import document_of, plain_submission, suite_of
 
-SETTING = {"state_dim": 2, "action_dim": 1}
-SUITE = Suite.from_dict(
-    {
-        "classes": [
-            {"name": "A", "setting": SETTING, "seeds": [0, 1]},
-            {"name": "B", "setting": {**SETTING, "complexity": 2}, "seeds": [0]},
-        ]
-    }
-)
-BOARD = BoardDocument(
-    title="A board",
-    suite_name="two-v1",
-    suite=SUITE,
-    protocol_name="paper-v1",
-    protocol=EvaluationProtocol(),
-    key="ab" * 32,
-    rules=3,
-    limits=Limits(artefact_bytes=1000, age_days=14),
-)
+SUITE = suite_of(A=(2, {}), B=(1, {"complexity": 2}))
+LIMITS = Limits(artefact_bytes=1000, age_days=14)
+BOARD = document_of(SUITE, suite_name="two-v1", key="ab" * 32, limits=LIMITS)
 A0, A1, B0 = (spec.digest for spec in SUITE.instances)
 NOW = datetime.datetime(2026, 11, 21, 12, tzinfo=datetime.UTC)
 
@@ -53,15 +38,8 @@ RUNS = [run(A0, 0, policy(1)), run(A1, 0, policy(2)), run(B0, 0, policy(3, size=
 
 def submission(**changes):
     """A submission that passes, but for what is changed; `method__name` is the method's name."""
-    plain = {
-        "suite": BOARD.suite_reference.to_dict(),
-        "method": {"name": "PPO", "version": "1.0", "family": "PPO", "knowledge": "generic"},
-        "submitter": {"name": "A Lab", "key": "cd" * 32},
-        "created": "2026-11-21T12:00:00Z",
-        "runs": RUNS,
-        "runs_started": {"A": 2, "B": 1},
-        "training": {},
-    }
+    started = {"A": 2, "B": 1}
+    plain = plain_submission(BOARD, RUNS, "cd" * 32, runs_started=started, training={})
     for field, value in changes.items():
         *outer, name = field.split("__")
         into = plain[outer[0]] if outer else plain
@@ -197,10 +175,7 @@ def test_runs_without_any_policy_are_refused():
 
 
 def board_of(instances, **fields):
-    suite = Suite.from_dict(
-        {"classes": [{"name": "A", "setting": SETTING, "seeds": list(range(instances))}]}
-    )
-    return BOARD.model_copy(update={"suite": suite, **fields})
+    return BOARD.model_copy(update={"suite": suite_of(A=(instances, {})), **fields})
 
 
 def signed_runs(board, count, **changes):
@@ -269,13 +244,11 @@ MIXED = {"observation": {"mixing": "orthogonal"}}
 
 @pytest.mark.parametrize("setting", [LIMITED, MIXED], ids=["safety", "observation"])
 def test_boards_refuse_classes_with_safety_or_observation(setting):
-    classes = [{"name": "Plain", "setting": {}, "seeds": [0]}]
-    classes.append({"name": "Other", "setting": setting, "seeds": [0]})
-    fields = {"title": "x", "suite_name": "x-v1", "protocol_name": "quick-v1", "protocol": {}}
-    fields |= {"key": "ab" * 32, "rules": 3}
-    BoardDocument.from_dict({**fields, "suite": Suite.from_dict({"classes": classes[:1]})})
+    plain = BOARD.to_dict()
+    BoardDocument.from_dict(plain)
+    suite = suite_of(Plain=(1, {}), Other=(1, setting))
     with pytest.raises(SpecError, match=r"suite: has classes .* \(Other\), and a leaderboard"):
-        BoardDocument.from_dict({**fields, "suite": Suite.from_dict({"classes": classes})})
+        BoardDocument.from_dict({**plain, "suite": suite.to_dict()})
 
 
 @pytest.mark.parametrize("name", ["safety", "representation"])

@@ -1,11 +1,12 @@
 """From runs to a method's scores: what an instance, a class and the method weigh."""
 
+from collections import Counter
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.result import METRICS, Estimate, Result, RunScore, Scores
 from leaderboard.documents.submission import Submission
 from leaderboard.scoring.aggregation import (
@@ -16,28 +17,10 @@ from leaderboard.scoring.aggregation import (
     run_metrics,
 )
 from sme_registry import EvaluationProtocol
-from sme_registry.spec import Suite
 from sme_registry.statistics import iqm
+from tests.leaderboard.conftest import document_of, plain_submission, suite_of
 
-SETTING = {"state_dim": 2, "action_dim": 1}
-SUITE = Suite.from_dict(
-    {
-        "classes": [
-            {"name": "two", "setting": SETTING, "seeds": [0, 1]},
-            {"name": "three", "setting": {**SETTING, "complexity": 2}, "seeds": [0, 1, 2]},
-        ]
-    }
-)
-BOARD = BoardDocument(
-    title="Aggregation",
-    suite_name="five-v1",
-    suite=SUITE,
-    protocol_name="few-v1",
-    protocol=EvaluationProtocol(states_per_region=60),
-    key="0" * 64,
-    rules=3,
-    draws=200,
-)
+BOARD = document_of(suite_of(two=(2, {}), three=(3, {"complexity": 2})), draws=200)
 CLASS_OF = {digest: name for digest, (name, _) in BOARD.instances.items()}
 SPECS = list(CLASS_OF)
 TWO, THREE = SPECS[:2], SPECS[2:]
@@ -69,28 +52,18 @@ def scored(regrets, unlisted=None):
 
 
 def started(runs, unlisted):
-    artefact = {"sha256": "sha256:" + "a" * 64, "size": 1}
-    return Submission.from_dict(
+    listed = [
         {
-            "suite": BOARD.suite_reference,
-            "method": {"name": "m", "version": "1", "family": "f", "knowledge": "generic"},
-            "submitter": {"name": "s", "key": "0" * 64},
-            "created": "2026-11-21T09:30:00Z",
-            "runs": [
-                {
-                    "spec": each.spec,
-                    "seed": number,
-                    "steps": 1,
-                    "artefact": each.artefact and {**artefact, "sha256": f"sha256:{number:064x}"},
-                }
-                for number, each in enumerate(runs)
-            ],
-            "runs_started": {
-                name: sum(each.class_name == name for each in runs) + (unlisted or {}).get(name, 0)
-                for name in ("two", "three")
-            },
+            "spec": each.spec,
+            "seed": number,
+            "steps": 1,
+            "artefact": each.artefact and {"sha256": f"sha256:{number:064x}", "size": 1},
         }
-    )
+        for number, each in enumerate(runs)
+    ]
+    plain = plain_submission(BOARD, listed)
+    plain["runs_started"] = Counter(plain["runs_started"]) + Counter(unlisted)
+    return Submission.from_dict(plain)
 
 
 def theta(result, metric="wd_regret"):
@@ -216,8 +189,7 @@ def test_single_runs_of_several_instances_have_a_wide_interval_and_lone_ones_non
     single = result_of(BOARD, ID, drawn(3, [1] * 5), {})
     low, high = ends(single)
     assert low < theta(single) < high
-    suite = {"classes": [{"name": "two", "setting": SETTING, "seeds": [0]}]}
-    lone = BOARD.model_copy(update={"suite": Suite.from_dict(suite)})
+    lone = BOARD.model_copy(update={"suite": suite_of(two=(1, {}))})
     result = result_of(lone, ID, [run(TWO[0], 0.5)], {})
     assert ends(result) is None
     assert result.scores.wd_regret.ends == (theta(result),) * 2

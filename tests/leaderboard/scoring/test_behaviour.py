@@ -9,15 +9,13 @@ from leaderboard.errors import Rejection
 from leaderboard.scoring.score import CONSTANT, FLOOR, Behaviours
 from sme_registry import EvaluationProtocol
 from sme_registry.evaluation import reference_policy
-from sme_registry.spec import Suite
+from tests.leaderboard.conftest import suite_of
 
 PROTOCOL = EvaluationProtocol(states_per_region=100)
 
 
 def plane(**setting):
-    setting = {"state_dim": 2, "action_dim": 2, "complexity": 3, **setting}
-    suite = Suite.from_dict({"classes": [{"name": "a", "setting": setting, "seeds": [0]}]})
-    return suite.instances[0]
+    return suite_of(a=(1, {"action_dim": 2, "complexity": 3, **setting})).instances[0]
 
 
 SPEC = plane()

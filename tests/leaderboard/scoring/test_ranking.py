@@ -8,25 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.result import Estimate, Scores
-from leaderboard.documents.signed import SigningKey
 from leaderboard.errors import NotPublishable
 from leaderboard.scoring.ranking import ranking, refuse_unpublishable, superseded
 from leaderboard.store import Copies, EntryRow
 from leaderboard.web.tables import RankingFile
-from sme_registry import EvaluationProtocol
-from tests.leaderboard.conftest import tiny_suite
+from tests.leaderboard.conftest import document_of, tiny_suite
 
-BOARD = BoardDocument(
-    title="Small",
-    suite_name="small_suite-v1",
-    suite=tiny_suite(),
-    rules=3,
-    protocol_name="few-v1",
-    protocol=EvaluationProtocol(states_per_region=60),
-    key=SigningKey.generate().public,
-)
+BOARD = document_of(tiny_suite(), suite_name="small_suite-v1")
 HEAD = (7, "sha256:" + "ab" * 32)
 DATE = "2026-11-21T09:30:00Z"
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from onnx import numpy_helper
 
-from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.result import METRICS
 from leaderboard.documents.signed import SigningKey
 from leaderboard.documents.submission import Submission
@@ -23,33 +22,14 @@ from leaderboard.scoring.score import evaluation_seed, score_submission
 from sme_registry import EvaluationProtocol, evaluate
 from sme_registry.io import sha256_of
 from sme_registry.spec import Suite
+from tests.leaderboard.conftest import document_of, plain_submission, suite_of
 from tests.leaderboard.gate import models
 from tests.leaderboard.gate.test_sandbox import children
 
 KEY = SigningKey.generate()
-SUITE = Suite.from_dict(
-    {
-        "classes": [
-            {
-                "name": name,
-                "setting": {"state_dim": 2, "action_dim": 2, "complexity": L},
-                "seeds": seeds,
-            }
-            for name, L, seeds in [("shallow", 1, [0, 1]), ("deep", 3, [0])]
-        ]
-    }
-)
-BOARD = BoardDocument(
-    title="Small",
-    suite_name="small-v1",
-    suite=SUITE,
-    protocol_name="few-v1",
-    protocol=EvaluationProtocol(states_per_region=60),
-    key=KEY.public,
-    rules=2,
-    runs_to_rank=2,
-    draws=200,
-)
+SMALL = {"action_dim": 2}
+SUITE = suite_of(shallow=(2, SMALL), deep=(1, {**SMALL, "complexity": 3}))
+BOARD = document_of(SUITE, key=KEY.public, rules=2, runs_to_rank=2, draws=200)
 ONE = BOARD.model_copy(update={"suite": Suite.from_dict({"classes": [SUITE.classes[1].to_dict()]})})
 """The deep instance alone."""
 
@@ -71,20 +51,9 @@ def score(*policies, progress=None, opened=None, board=BOARD, runs_started=None)
             data[sha256_of(content)] = content
             artefact = {"sha256": sha256_of(content), "size": len(content)}
         runs.append({"spec": spec.digest, "seed": index, "steps": 10, "artefact": artefact})
-    listed = {
-        member.name: sum(run["spec"] in {spec.digest for spec in member.instances} for run in runs)
-        for member in board.suite.classes
-    }
-    submission = Submission.from_dict(
-        {
-            "suite": board.suite_reference,
-            "method": {"name": "m", "version": "1", "family": "f", "knowledge": "generic"},
-            "submitter": {"name": "s", "key": KEY.public},
-            "created": "2026-11-21T09:30:00Z",
-            "runs": runs,
-            "runs_started": listed | (runs_started or {}),
-        }
-    )
+    plain = plain_submission(board, runs, KEY.public)
+    plain["runs_started"] |= runs_started or {}
+    submission = Submission.from_dict(plain)
 
     def artefact_of(digest):
         if opened is not None:

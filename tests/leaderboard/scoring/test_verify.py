@@ -203,11 +203,6 @@ def test_an_altered_document_is_named(board, number, kind):
     assert_named(board, path, None, b"", data.replace(b"  ", b"   "), data[:-9] + b"!" + data[-8:])
 
 
-def test_swapped_documents_are_named(board):
-    assert_swap_named(board, *(document_path(board, id) for id in ids(board)[:2]))
-    assert_swap_named(board, *(document_path(board, id, "result") for id in ids(board)[:2]))
-
-
 def test_a_signature_that_the_board_has_made_up_is_named(board):
     """What the board's own key cannot do: sign for a submitter."""
     waiting, withdrawn = ids(board)[WAITING], ids(board)[FAILED]

@@ -53,15 +53,6 @@ def test_garbage_is_temporary_files_and_unnamed_artefacts(store, litter):
     assert collect_garbage(store).files == 0
 
 
-def test_a_dry_run_counts_the_same_and_ages_are_arguments(store, litter):
-    before = sorted(store.folder.path.rglob("*"))
-    counted = collect_garbage(store, dry_run=True)
-    everything = collect_garbage(store, dry_run=True, temporary_older_than=0, objects_older_than=0)
-    assert (everything.temporary, everything.objects) == (4, 2)
-    assert sorted(store.folder.path.rglob("*")) == before
-    assert counted == collect_garbage(store)
-
-
 def test_gc_keeps_an_upload_in_progress(store, key):
     data = b"first half, second half"
     digest = sha256_of(data)
