@@ -40,7 +40,7 @@ from leaderboard.web.pages import Section
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.io.markup import plural
-from sme_registry.io.terminal import Progress, err, out, print_json, print_line
+from sme_registry.io.terminal import Progress, err, out, print_json, print_line, print_note
 from sme_registry.spec import EvaluationProtocol, ProtocolFile, Suite, SuiteFile, catalogue
 from sme_registry.training import RunRecord
 
@@ -122,17 +122,15 @@ def init(
     runs = document.runs_needed
     kind = "a practice board" if document.practice else "a board"
     out().print(f"Created {folder}: {kind} with suite {name} and protocol {protocol_name}.")
-    out().print(
+    print_line(
         f"A ranked entry needs {plural(runs, 'trained policy', 'trained policies')}: at "
         f"least {runs_to_rank} in each class ({classes}), equally many on each of its instances "
-        f"({instances} in the suite).",
-        soft_wrap=True,
+        f"({instances} in the suite)."
     )
-    out().print(
+    print_line(
         "Next, serve the board, which also scores its reference rows: "
         f"sme-leaderboard serve {folder}\n"
-        f"Or score them without a server: sme-leaderboard score {folder}",
-        soft_wrap=True,
+        f"Or score them without a server: sme-leaderboard score {folder}"
     )
 
 
@@ -159,10 +157,9 @@ def score(
 
     isolation: Isolation = "process" if unsafe_no_sandbox else available_isolation()
     if isolation == "process" and not unsafe_no_sandbox:
-        err().print(
+        print_note(
             "[bold red]Policies run without a sandbox[/]: bubblewrap is not installed, so they "
-            "could read your files and use your network. Install it: apt install bubblewrap.",
-            soft_wrap=True,
+            "could read your files and use your network. Install it: apt install bubblewrap."
         )
     score_waiting(board, workers, isolation)
 

@@ -36,7 +36,7 @@ from leaderboard.web.client import fetch as fetch_board
 from leaderboard.web.tables import PublicView, RankingFile, public_view, steps_text
 from sme_registry.errors import OptionError
 from sme_registry.io.markup import Table
-from sme_registry.io.terminal import err, fixed, out, print_json, print_pairs
+from sme_registry.io.terminal import err, fixed, out, print_json, print_line, print_pairs
 
 if WITH_SEASONS:
     from leaderboard.seasons.publication import files_of_seasons
@@ -191,11 +191,11 @@ def show(
     _print_submission(view)
     result = view.result
     if view.withheld:
-        out().print(f"[yellow]scores withheld[/]: {escape(view.withheld)}", soft_wrap=True)
+        print_line(f"[yellow]scores withheld[/]: {escape(view.withheld)}")
     if result is None:
         return
     if result.status == "rejected":
-        out().print(f"[red]{escape(result.code)}[/]: {escape(result.message)}", soft_wrap=True)
+        print_line(f"[red]{escape(result.code)}[/]: {escape(result.message)}")
         return
     out().print(_scores_table(result))
     out().print(_class_table(result))
@@ -320,7 +320,7 @@ def fetch(
         return
     size = f"{fetched.files:,} files, {fetched.bytes:,} bytes"
     out().print(f"{escape(str(folder))}: {fetched.entries:,} log entries; {size} new.")
-    out().print(f"Next: sme-leaderboard verify {escape(str(folder))}", soft_wrap=True)
+    print_line(f"Next: sme-leaderboard verify {escape(str(folder))}")
 
 
 @app.command()
@@ -392,16 +392,14 @@ def _print_verification(report: VerifyReport) -> None:
         found = note.difference
         line = f"not confirmed here: {note.entry}: {found.path}: recorded {found.recorded}"
         line += f", here {found.here}"
-        out().print(escape(line), soft_wrap=True)
+        print_line(escape(line))
     for digest in report.missing:
-        out().print(f"missing: {digest}", soft_wrap=True)
+        print_line(f"missing: {digest}")
     outcome = "[green]Verified[/]" if report.is_confirmed else "[yellow]Not confirmed here[/]"
     out().print(f"{outcome}: nothing was altered.")
     if report.rescore_seed is not None:
         out().print(f"Repeat the draw with --seed {report.rescore_seed}.")
-    out().print(
-        f"Digest of the last log entry, {report.log_sequence}:\n{report.log_digest}", soft_wrap=True
-    )
+    print_line(f"Digest of the last log entry, {report.log_sequence}:\n{report.log_digest}")
 
 
 def _rescore_count(text: str) -> int | Literal["all"]:
