@@ -179,14 +179,18 @@ def report(
         bool,
         typer.Option("--explorers", help="Also an explorer (`sme explore`) of each kept model."),
     ] = False,
+    full: Annotated[
+        bool,
+        typer.Option("--full", help="Also all figures and tables as files."),
+    ] = False,
 ) -> None:
     """Report which property of the task breaks an algorithm, and how certain that is.
 
     Of streams it reports what is forgotten, whether plasticity is lost, and what relatedness does.
 
-    It writes a self-contained page index.html, the figures as PNG and PDF, every number as CSV, and
-    LaTeX tables, by default to FOLDER/report. It uses the cells finished so far, so it may be run
-    during the study.
+    It writes a self-contained page index.html, its first figure, and a table as CSV and LaTeX; with
+    --full every figure and number; by default to FOLDER/report. It uses the cells finished so far,
+    so it may be run during the study.
 
     Maps of tasks with two state channels, and --explorers, need the models kept by `sme study run
     --keep-models`. The page links to each explorer, a file of 60 kB or more. Loading a model can
@@ -195,12 +199,12 @@ def report(
     Examples:
 
       sme study report runs/smoke
-      sme study report runs/all --out paper/study --format pdf,latex
+      sme study report runs/all --full --out paper/study --format pdf,latex
       sme study report runs/smoke --explorers
     """
     chosen = [name.strip() for name in formats.split(",") if name.strip()]
     files = studies.write_report(
-        folder, out_folder, tuple(dict.fromkeys(chosen)), explorers=explorers
+        folder, out_folder, tuple(dict.fromkeys(chosen)), explorers=explorers, full=full
     )
     _print_report(files)
 
@@ -208,9 +212,9 @@ def report(
 def _print_report(files: Sequence[Path]) -> None:
     """The page, and how many files are in each folder beside it."""
     for path in files:
-        if path.name == "index.html":
+        if path.parent == files[0].parent:
             print_line(escape(str(path)))
-    counts = Counter(path.parent for path in files if path.name != "index.html")
+    counts = Counter(path.parent for path in files if path.parent != files[0].parent)
     for parent, count in counts.items():
         print_line(f"{escape(str(parent))}  {count} files")
 
@@ -284,8 +288,9 @@ def compare(
 ) -> None:
     """Compare two algorithms of a study: the difference A − B on each class, with its interval.
 
-    Runs are compared in pairs: those on the same instance with the same seed. An interval that
-    excludes 0 and rests on at least 5 pairs is marked: * if A is worse, † if A is better.
+    Runs are compared in pairs: those on the same instance with the same seed. A is better or worse
+    (†) where the interval excludes 0 with at least 5 pairs per class; with fewer it is an
+    indication, otherwise open.
 
     Each .tex file is a complete table with its own caption and label: \\input it outside of any
     table environment.
@@ -312,7 +317,7 @@ def compare(
     if json:
         print_json(records(differences))
         return
-    for each in comparison_tables(differences):
+    for each in comparison_tables(differences, verdicts=True):
         out().print(Table.of(f"[bold]{escape(each.title)}[/]", each.frame.to_dict("records")))
     caveats = implementation_caveats(Ledger(folder).study_file().plan, (first, second))
     for sentence in (*difference_caveats(differences), *caveats):

@@ -266,6 +266,13 @@ class TeamDiagnosis(Diagnosis):
             "channel_share": len(agent.action_channels) / self.spec.action_dim,
         }
 
+    def parts(self) -> Iterator[Part]:
+        """A table of the agents; all answers on request."""
+        table, *others = self.tables()
+        yield table
+        answers = (self.findings("Findings", self.verdicts), *self.answers(self.verdicts))
+        yield from (part._replace(detail=True) for part in (*answers, *others))
+
     def tables(self) -> Iterator[Part]:
         """Each agent's numbers, and where its own error is."""
         rows = [

@@ -214,8 +214,9 @@ def _name(subject: Subject) -> str:
 
 
 def resting(spec: SMESpec) -> Array:
-    """The point at which a page opens: the cube's centre, halfway through an episode, r_cum = 0."""
-    return np.array([*[0.5] * (spec.state_dim + spec.distractors), 0.5, 0.0])
+    """Where a page opens: a random point (at the centre each optimum is ½), t = T/2, r_cum = 0."""
+    point = draw.uniform(0, "explorer/point", spec.state_dim + spec.distractors)
+    return np.array([*point.round(2), 0.5, 0.0])
 
 
 def _pair(channels: tuple[int, int], inputs: int) -> tuple[int, int]:

@@ -4,6 +4,7 @@ import copy
 import hashlib
 import json
 import pickle
+import re
 import struct
 from pathlib import Path
 
@@ -253,3 +254,22 @@ def test_the_digest_is_the_hash_of_every_field_in_canonical_form():
     assert SMESpec().canonical_json() == text.encode()
     assert SMESpec().digest == "sha256:" + hashlib.sha256(text.encode()).hexdigest()
     assert json.loads(text) == SMESpec().to_dict()
+
+
+def test_the_guides_vectors_of_digests_follow_from_its_rule():
+    """By a second implementation: the rule of docs/guides/specs.md in a few lines."""
+    guide = Path(__file__).parents[2] / "docs" / "guides" / "specs.md"
+    lines = re.findall(r'^(\{"D".*\})\n(sha256:[0-9a-f]{64})$', guide.read_text("utf-8"), re.M)
+    young = {"rotation": 0, "safety": None, "observation": None}
+    assert len(lines) == 3
+    for text, digest in lines:
+        spec = SMESpec.from_dict(json.loads(text))
+        fields = {name: getattr(spec, name) for name in SMESpec.model_fields}
+        fields = {k: v for k, v in fields.items() if k not in young or v != young[k]}
+        plain = {k: v.model_dump() if hasattr(v, "model_dump") else v for k, v in fields.items()}
+        whole = {
+            k: int(v) if isinstance(v, float) and v.is_integer() else v for k, v in plain.items()
+        }
+        canonical = json.dumps(whole, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+        assert canonical == text
+        assert "sha256:" + hashlib.sha256(canonical.encode()).hexdigest() == digest == spec.digest

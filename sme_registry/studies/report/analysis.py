@@ -260,10 +260,12 @@ def summary(
                 )  # fmt: skip
 
 
-def change_verdict(worsening: float, low: float, high: float) -> str:
-    """`worse` or `better` where the interval of a change excludes 0, else `open`."""
+def change_verdict(worsening: float, low: float, high: float, *, enough: bool = True) -> str:
+    """The one rule: open unless the interval excludes 0; an indication without enough pairs."""
     if not (low > 0.0 or high < 0.0):
         return "open"
+    if not enough:
+        return "indication"
     return "worse" if worsening > 0 else "better"
 
 

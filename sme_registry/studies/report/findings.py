@@ -28,6 +28,7 @@ from sme_registry.studies.report.analysis import (
     PLACE,
     Analysis,
     RunKind,
+    change_verdict,
     training_data,
 )
 from sme_registry.studies.report.design import (
@@ -129,6 +130,11 @@ def _rows(table: pd.DataFrame, **values: str) -> list[Any]:
     return list(table.itertuples())
 
 
+def _direction(row: Any) -> str:
+    """`worse`, `better` or `open`, however few the pairs of a contrast are."""
+    return change_verdict(row.change * METRICS[row.metric].worse, row.low, row.high)
+
+
 def _of_few(verdict: str, runs: int) -> str:
     return verdict if verdict == "open" or runs >= ENOUGH_RUNS else f"{verdict}_few"
 
@@ -147,13 +153,13 @@ def _task(analysis: Analysis, name: str) -> Found:
                 row,
             )  # fmt: skip
     contrasts = _rows(analysis.tables["contrasts"], **place)
-    contrasts.sort(key=lambda row: (row.verdict != "worse", -row.change))
+    contrasts.sort(key=lambda row: (_direction(row) != "worse", -row.change))
     largest = {row.axis or row.class_name: row for row in reversed(contrasts)}
     for row in reversed(largest.values()):
         verb = {"worse": "is higher", "better": "is lower", "open": "was not shown to be higher"}
         yield finding(
-            "tasks", "axis", _of_few(row.verdict, row.pairs),
-            f"Its WD regret {verb[row.verdict]} with {_property(analysis, row)}: on "
+            "tasks", "axis", _of_few(_direction(row), row.pairs),
+            f"Its WD regret {verb[_direction(row)]} with {_property(analysis, row)}: on "
             f"{row.class_name} by {_change(row)}.",
             row,
         )  # fmt: skip
@@ -164,7 +170,7 @@ def _worst(analysis: Analysis, name: str, metric: str) -> Found:
     """The largest change of a kind of regret that is shown, and whether others may be larger."""
     regret = METRICS[metric].label
     contrasts = _rows(analysis.tables["contrasts"], algorithm=name, metric=metric)
-    worse = [row for row in contrasts if row.verdict == "worse"]
+    worse = [row for row in contrasts if _direction(row) == "worse"]
     if not worse:
         text = f"No class was shown to raise the {regret} of {name}"
         text += f" from that on {analysis.base}, which does not show that none does."
@@ -296,9 +302,9 @@ def _changes(analysis: Analysis) -> Found:
         yield finding("stream_changes", "relatedness", verdict, text, class_name=name)
         for row in of_class.itertuples():
             metric = METRICS[row.metric].label
-            text = f"{row.algorithm}: {metric} is {row.verdict}, {fixed(row.base)} → "
+            text = f"{row.algorithm}: {metric} is {_direction(row)}, {fixed(row.base)} → "
             text += f"{fixed(row.level)}, by {_change(row)}."
-            verdict = _of_few(row.verdict, row.pairs)
+            verdict = _of_few(_direction(row), row.pairs)
             yield finding("stream_changes", metric, verdict, text, row)
 
 

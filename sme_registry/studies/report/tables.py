@@ -19,12 +19,13 @@ Columns of each table, those that name the row first; class_name and algorithm a
                       R² of a linear map from the layer to the state and to the distractors
     agents            agent, metric: runs, iqm, low, high; of each agent of a team
     contrasts         metric: axis; base, level: IQM on the first class and on this one; change,
-                      low, high; pairs; enough_pairs; verdict: worse, better or open
+                      low, high; pairs; enough_pairs; verdict: worse or better if the interval
+                      excludes 0, indication if it does with too few pairs, or open
     differences       first, second, metric: first_level, second_level: IQM over the pairs;
                       difference: IQM over pairs of  x_i(first) − x_i(second),  and for `ALL`
                       classes its mean over classes; low, high; pairs; instances: different ones
-                      among the pairs; enough_pairs; verdict of the first algorithm: worse or better
-                      if the interval excludes 0, indication if it does with too few pairs, or open
+                      among the pairs; enough_pairs (in each class); verdict of the first algorithm,
+                      as in contrasts
     aggregates        group, metric, statistic: classes, runs, fewest_runs (of a class); value: mean
                       over classes; low, high
     profiles          group, metric, threshold: fewest_runs; share: of runs whose value is above the
@@ -197,10 +198,9 @@ def paired(
     middle = float(statistics.aggregate(change)[0])
     ends = bootstrap.interval(change, *seed)
     sizes = [len(both) for both in classes.values()]
-    return (
-        *statistics.aggregate(classes), middle, *ends, sum(sizes), min(sizes) >= ENOUGH_RUNS,
-        change_verdict(middle * metric.worse, *ends),
-    )  # fmt: skip
+    enough = min(sizes) >= ENOUGH_RUNS
+    verdict = change_verdict(middle * metric.worse, *ends, enough=enough)
+    return (*statistics.aggregate(classes), middle, *ends, sum(sizes), enough, verdict)
 
 
 @table("differences", DIFFERENCES, both=True)
@@ -239,7 +239,6 @@ def differences(
             both = {key: group[columns].to_numpy() for key, group in part.items()}
             *numbers, enough, verdict = paired(both, metric, bootstrap, *seed, metric.key)
             instances = sum(group[instance].nunique() for group in part.values())
-            verdict = verdict if enough or verdict == "open" else "indication"
             yield (first, second, metric.key, name, *numbers, instances, enough, verdict)
 
 

@@ -29,11 +29,9 @@ _HEADINGS = {
     "class_name": "class", "nu": "ν", "group": "classes", "label": "metric"
 }  # fmt: skip
 _INTERVAL = "with its 95 % bootstrap interval"
-_MARKS = "*: worse, †: better, by an interval that excludes 0 and rests on enough pairs."
-_DIFFERENCE = (
-    f"{_INTERVAL}. *: the first algorithm is worse, †: better, by an interval that excludes 0 and "
-    f"rests on at least {ENOUGH_RUNS} pairs."
-)
+_MARK = " †"
+_MARKS = f"†: the interval excludes 0, with at least {ENOUGH_RUNS} pairs per class."
+_DIFFERENCE = f"{_INTERVAL}. {_MARKS}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +48,14 @@ class TextTable:
     def latex(self) -> str:
         """As a LaTeX `table` that is scaled down to the column's width; ASCII only."""
         columns = [escape_latex(name) for name in self.frame]
+        marked = any(_MARK in str(cell) for cell in self.frame.to_numpy().ravel())
+        caption = f"{self.title}. {_MARKS if marked else ''}".rstrip()
         body = self.frame.map(escape_latex).set_axis(columns, axis=1).to_latex(
             index=False, column_format="l" * self.names + "r" * (len(columns) - self.names)
         )  # fmt: skip
         return (
             "% needs \\usepackage{booktabs,graphicx}\n\\begin{table}\n\\centering\\footnotesize\n"
-            f"\\caption{{{escape_latex(f'{self.title}. {self.note}')}}}\n"
+            f"\\caption{{{escape_latex(caption)}}}\n"
             f"\\label{{tab:{self.label or self.name}}}\n"
             "\\resizebox{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}{!}{%\n"
             f"{body}}}\n\\end{{table}}\n"
@@ -84,12 +84,12 @@ def _change(row: Any, digits: int) -> str:
     """A change or difference with its interval; marked if it excludes 0 by enough pairs."""
     value = row.change if hasattr(row, "change") else row.difference
     count = "" if row.enough_pairs else " (1 pair)" if row.pairs == 1 else f" (n = {row.pairs})"
-    mark = {"worse": " *", "better": " †"}.get(row.verdict, "") if row.enough_pairs else ""
+    mark = _MARK if row.verdict in ("worse", "better") else ""
     return _with_interval(value, row, digits, signed) + count + mark
 
 
 def _improvement(row: Any, _: int) -> str:
-    mark = {"above": " †", "below": " *"}.get(row.verdict, "")
+    mark = _MARK if row.verdict in ("above", "below") else ""
     return _with_interval(row.improvement, row, 3, signed) + _few(row) + mark
 
 
@@ -161,8 +161,7 @@ LAYOUTS = (
     Layout(
         "offline-improvement", "Learning from data: r̃ minus the behaviour policy's",
         f"Mean over runs, with its 95 % bootstrap interval from {OFFLINE_INTERVAL} runs on. "
-        "†: above its data, *: below, by an interval that excludes 0 and rests on at least "
-        f"{ENOUGH_RUNS} runs.",
+        f"†: the interval excludes 0, with at least {ENOUGH_RUNS} runs.",
         ["class_name", "nu"], "learner", _improvement, table="improvement",
     ),
     Layout(
@@ -263,8 +262,8 @@ def text_tables(analysis: Analysis) -> list[TextTable]:
     ]
 
 
-def comparison_tables(differences: pd.DataFrame) -> list[TextTable]:
-    """The result of `compare` for people: a table for each metric, with the levels of both."""
+def comparison_tables(differences: pd.DataFrame, *, verdicts: bool = False) -> list[TextTable]:
+    """The result of `compare` for people: class, both levels, and the difference, by metric."""
     texts = []
     for key, rows in differences.groupby("metric", sort=False):
         (text,) = laid_out(_DIFFERENCES, _named(rows))
@@ -272,6 +271,8 @@ def comparison_tables(differences: pd.DataFrame) -> list[TextTable]:
             levels = [fixed(value, METRICS[key].digits + 1) for value in rows[f"{side}_level"]]
             text.frame.insert(place, rows[side].iloc[0], levels)
         pair = slug(text.frame.columns[-1])
+        if verdicts:
+            text.frame[f"{rows['first'].iloc[0]} is"] = rows.verdict.tolist()
         texts.append(replace(text, label=f"{text.name}-{pair}"))
     return texts
 

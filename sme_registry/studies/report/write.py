@@ -1,6 +1,11 @@
 """`write_report`: a study's folder to its report; `compare`: two of its algorithms.
 
     REPORT/index.html           the page: findings, figures and tables in one file
+    REPORT/figure.png .pdf      its first figure
+    REPORT/table.csv .tex       levels by class, of two algorithms with their difference
+
+Only in a full report:
+
     REPORT/findings.json        the findings as data
     REPORT/figures/*.png .pdf   the figures, at the width of a printed page
     REPORT/tables/*.csv         every number
@@ -85,8 +90,12 @@ def write_report(
     formats: Sequence[str] = FORMATS,
     *,
     explorers: bool = False,
+    full: bool = False,
 ) -> list[Path]:
     """Write the report of a study's finished runs, and return its files, the page first.
+
+    It has a page, a figure, table.csv and table.tex; if `full` also every figure and table as a
+    file of its own, and the findings as JSON.
 
     The maps of the plane and the explorers need the models that the study kept, and loading a model
     can run code of its author. All other files of the folder are read as data.
@@ -96,8 +105,8 @@ def write_report(
 
     Examples:
       >>> from sme_registry import studies
-      >>> studies.write_report("study", "report", formats=["csv"])[-1].suffix
-      '.csv'
+      >>> [path.name for path in studies.write_report("study", "report", formats=["csv"])]
+      ['table.csv']
     """
     unknown = [name for name in formats if name not in FORMATS]
     if unknown or not formats:
@@ -117,12 +126,12 @@ def write_report(
     models = {key: path for key in results if (path := ledger.model_path(key)).exists()}
     analysis = analyse(file, results, failures, requested=requested(ledger, file), models=models)
     pages = explorers_of(ledger, file, models) if explorers else []
-    contents = _contents(analysis, formats, pages)
+    contents = _contents(analysis, formats, pages, full=full)
     return [write_atomically(target / name, content) for name, content in contents.items()]
 
 
 def _contents(
-    analysis: Analysis, formats: Sequence[str], explorers: Sequence[Explorer]
+    analysis: Analysis, formats: Sequence[str], explorers: Sequence[Explorer], *, full: bool
 ) -> dict[str, str | bytes]:
     """The contents of each file, by its name in the report."""
     tables = text_tables(analysis)
@@ -132,6 +141,44 @@ def _contents(
     if "html" in formats:
         rows = findings(analysis)
         contents["index.html"] = page(analysis, rows, figures, absent, tables, explorers)
+    for ending in ("png", "pdf"):
+        if ending in formats and figures:
+            contents[f"figure.{ending}"] = _main_figure(figures).files[ending]
+    numbers, table = _main_table(analysis, tables)
+    if "csv" in formats:
+        contents["table.csv"] = numbers.to_csv(index=False, lineterminator="\n")
+    if "latex" in formats:
+        contents["table.tex"] = table.latex()
+    if full:
+        contents |= _every_file(analysis, formats, figures, tables)
+    return contents | {page.path: page.content for page in explorers}
+
+
+def _main_figure(figures: Sequence[Picture]) -> Picture:
+    """That of the only axis, or the first of the page."""
+    of_axes = [figure for figure in figures if figure.name.startswith("regret-")]
+    return of_axes[0] if len(of_axes) == 1 else figures[0]
+
+
+def _main_table(analysis: Analysis, tables: Sequence[TextTable]) -> tuple[pd.DataFrame, TextTable]:
+    """The numbers of a paper's first table, and the table of the first metric."""
+    name = "levels" if analysis.algorithms else "stream_metrics"
+    differences = analysis.tables["differences"]
+    if len(analysis.algorithms) == 2 and not differences.empty:
+        return differences, comparison_tables(differences)[0]
+    first = name.replace("_", "-")
+    return analysis.tables[name], next(t for t in tables if t.name.startswith(first))
+
+
+def _every_file(
+    analysis: Analysis,
+    formats: Sequence[str],
+    figures: Sequence[Picture],
+    tables: Sequence[TextTable],
+) -> dict[str, str | bytes]:
+    """What only a full report has."""
+    contents: dict[str, str | bytes] = {}
+    if "html" in formats:
         contents["findings.json"] = to_json(
             {
                 "schema_version": 2,  # 1 had nested documents instead of a table
@@ -139,7 +186,7 @@ def _contents(
                 "digest": analysis.file.digest,
                 "base": analysis.base,
                 "thresholds": THRESHOLDS,
-                "findings": records(rows),
+                "findings": records(findings(analysis)),
             }
         )
     for ending in ("png", "pdf"):
@@ -149,7 +196,7 @@ def _contents(
         contents |= {f"tables/{name}.csv": text for name, text in csv_tables(analysis).items()}
     if "latex" in formats:
         contents |= {f"tables/{table.name}.tex": table.latex() for table in tables}
-    return contents | {page.path: page.content for page in explorers}
+    return contents
 
 
 def page(

@@ -25,7 +25,9 @@ def contrasted(analysis, class_name, fields):
     for name, value in fields.items():
         rows.loc[at.all(axis=1), name] = value
     rows["enough_pairs"] = rows.pairs >= ENOUGH_RUNS
-    rows["verdict"] = [change_verdict(r.change, r.low, r.high) for r in rows.itertuples()]
+    rows["verdict"] = [
+        change_verdict(r.change, r.low, r.high, enough=r.enough_pairs) for r in rows.itertuples()
+    ]
     return with_tables(analysis, contrasts=rows)
 
 

@@ -176,9 +176,13 @@ def test_the_command_writes_tables_and_figures(finished, tmp_path):
     assert "(n = 3)" in text
     few = "With fewer than 5 pairs on a class, an interval covers"
     assert few in " ".join(text.split())
+    assert re.search(r"k-25 .*\(n = 3\).* indication", text)
     source = (tmp_path / "differences-wd-regret.tex").read_text()
     assert "\\label{tab:differences-wd-regret-Alpha-Beta}" in source
-    assert few in " ".join(source.split())
+    (caption,) = re.findall(r"caption{(.*)}", source)
+    assert caption.startswith("Difference of WD regret. ")
+    assert len(caption) < 120
+    assert "class & Alpha & Beta & Alpha" in source
 
 
 def test_pairs_that_share_an_instance_are_no_independent_draws_of_the_task(loaded):

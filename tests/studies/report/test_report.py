@@ -89,7 +89,7 @@ def report(finished, tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", saved)
-        files = write_report(finished, folder, ("html", "png", "csv", "latex"))
+        files = write_report(finished, folder, ("html", "png", "csv", "latex"), full=True)
     names = [path.stem for path in files if path.suffix == ".png"]
     return folder, dict(zip(names, figures, strict=True))
 
@@ -206,10 +206,10 @@ def test_maps_and_explorers_show_the_models_that_were_kept(tmp_path, drawn):
     model = tmp_path / "model.zip"
     result = run_cell(planned.cell, model_path=model)
     ledger.write(result)
-    (page, _) = write_report(tmp_path, formats=["html"])
+    (page,) = write_report(tmp_path, formats=["html"])
     assert "figure-maps" not in Page(page.read_text()).ids
     ledger.write(result, model.read_bytes())
-    page, *_, explorer = write_report(tmp_path, formats=["html"], explorers=True)
+    page, explorer = write_report(tmp_path, formats=["html"], explorers=True)
     assert "figure-maps" in Page(page.read_text()).ids
     assert explorer.parent == page.parent / "explorers"
     assert f'<a href="explorers/{explorer.name}">PPO on plane, run 0</a>' in page.read_text()
@@ -239,9 +239,16 @@ def test_algorithms_on_classes_without_any_run_are_not_missing(finished, tmp_pat
     for planned in Ledger(study).study_file().plan.cells:
         if planned.class_name != "default":
             (study / "cells" / f"{planned.cell.digest[7:]}.json").unlink(missing_ok=True)
-    page, _ = write_report(study, formats=["html"])
+    (page,) = write_report(study, formats=["html"])
     text = Page(page.read_text()).text
     assert "15 of 20 runs have finished. The plan has 55 more" in text  # one on k-25 has failed
+
+
+def test_by_default_a_report_is_a_page_a_figure_and_a_table(finished, tmp_path):
+    files = write_report(finished, tmp_path, ("html", "png", "csv", "latex"))
+    names = ["index.html", "figure.png", "table.csv", "table.tex"]
+    assert [path.relative_to(tmp_path).as_posix() for path in files] == names
+    assert set(pd.read_csv(files[2]).algorithm) == {"Alpha", "Beta", "constant"}
 
 
 NAMES = [

@@ -164,7 +164,7 @@ def test_learning_from_data_comes_first_in_the_report_and_has_every_format(
     for result in done.values():
         ledger.write(result)
     out = tmp_path / "out"
-    write_report(tmp_path / "study", out)
+    write_report(tmp_path / "study", out, full=True)
     labels = {axes.get_xlabel() for figure in drawn for axes in figure.axes}
     assert "gradient steps" in labels
     for ending in ("png", "pdf"):

@@ -354,7 +354,7 @@ def test_agents_that_have_learnt_nothing_are_marked(streams):
 def test_the_report_of_streams_alone_is_whole_readable_and_the_same_each_time(
     study, streams, tmp_path, drawn
 ):
-    files = write_report(study, tmp_path / "one", ["html", "csv", "latex"])
+    files = write_report(study, tmp_path / "one", ["html", "csv", "latex"], full=True)
     page = Page(files[0].read_text())
     page.assert_whole()
     names = [name.removeprefix("figure-") for name in page.ids if name.startswith("figure-")]
@@ -368,7 +368,7 @@ def test_the_report_of_streams_alone_is_whole_readable_and_the_same_each_time(
     written = {path.stem for path in files if path.suffix == ".csv"}
     assert "stream_lives" in written
     assert "results" not in written
-    again = write_report(study, tmp_path / "two", ["csv", "latex"])
+    again = write_report(study, tmp_path / "two", ["csv", "latex"], full=True)
     for path in again:
         first = tmp_path / "one" / path.relative_to(tmp_path / "two")
         assert path.read_bytes() == first.read_bytes()
