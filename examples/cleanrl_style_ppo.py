@@ -105,11 +105,11 @@ def main() -> None:
                 actions = agent.distribution(torch.as_tensor(observations)).sample().numpy()
             following, rewards, terminated, truncated, infos = envs.step(actions.clip(-1, 1))
             rollout.append((observations, actions, rewards, terminated | truncated))
-            regrets.append(infos["regret"])  # exact, of each environment; NaN at a reset
+            regrets.extend(infos["regret"][infos["_regret"]])  # exact; the mask leaves out resets
             observations = following
         learn(agent, optimiser, rollout, observations)
         steps = (rollout_index + 1) * ENVS * ROLLOUT
-        print(f"{steps:7} steps, exploring: regret {np.nanmean(regrets):.3f}", flush=True)
+        print(f"{steps:7} steps, exploring: regret {np.mean(regrets):.3f}", flush=True)
     evaluate()
 
 

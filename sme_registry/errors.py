@@ -6,7 +6,7 @@
     ├── ActionError, StateError, OptionError, NameTakenError, WireError (all ValueError)
     ├── UnknownNameError (LookupError), ResourceLimitError (MemoryError),
     │   MissingDependencyError (ImportError), EpisodeError (RuntimeError)
-    ├── WrapperError, PolicyError
+    ├── PolicyError
     └── SealedError: BudgetSpentError
 
 A message gives the field, its value, the allowed range and the fix:
@@ -80,10 +80,6 @@ class StateError(SMEError, ValueError):
 
 class EpisodeError(SMEError, RuntimeError):
     """`step` was called before `reset`, or after the episode had ended."""
-
-
-class WrapperError(SMEError):
-    """An outer wrapper would change the task, such as a time limit below the horizon."""
 
 
 class PolicyError(SMEError):

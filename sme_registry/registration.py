@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
-from pettingzoo.env_registry import registration as pettingzoo
 
 from sme_registry.errors import NameTakenError, OptionError
 from sme_registry.spec import SMESpec, StreamSpec
@@ -26,6 +25,11 @@ from sme_registry.spec.catalogue import (
 from sme_registry.spec.sme_spec import SpecLike
 from sme_registry.spec.stream import StreamLike
 
+try:
+    from pettingzoo.env_registry import registration as pettingzoo
+except ImportError:  # before 1.27 it has no registry, and AgileRL requires 1.26
+    pettingzoo = None
+
 if TYPE_CHECKING:
     from pettingzoo import AECEnv
 
@@ -40,6 +44,8 @@ _ENTRY_POINTS: dict[str, Any] = {
 def _register(env_id: str, kind: str, document: dict[str, Any] | str) -> None:
     """Register a document by an id; `kind` is "team", or its keyword, "spec" or "stream"."""
     if kind == "team":
+        if pettingzoo is None:
+            return
         kwargs = {"spec": document}
         pettingzoo.register("parallel", env_id, "sme_registry.teams:parallel_env", kwargs=kwargs)
         pettingzoo.register("aec", env_id, "sme_registry.teams:env", kwargs=kwargs)
@@ -52,7 +58,8 @@ def _register(env_id: str, kind: str, document: dict[str, Any] | str) -> None:
 
 
 def _is_registered(env_id: str) -> bool:
-    return env_id in gymnasium.registry or env_id in pettingzoo.parallel_registry
+    teams = {} if pettingzoo is None else pettingzoo.parallel_registry
+    return env_id in gymnasium.registry or env_id in teams
 
 
 def register_catalogue() -> None:

@@ -84,8 +84,7 @@ def env(
 class TurnBasedTeam(OrderEnforcingWrapper):  # type: ignore[misc]
     """A team, from its parallel environment, whose agents act in turn.
 
-    It rejects an invalid action in its agent's own turn, when it can still be corrected. Until the
-    first step its infos are empty: PettingZoo's `seed_test` compares them, and NaN equals nothing.
+    It rejects an invalid action in its agent's own turn, when it can still be corrected.
     """
 
     def __init__(self, parallel: Any) -> None:
@@ -99,11 +98,6 @@ class TurnBasedTeam(OrderEnforcingWrapper):  # type: ignore[misc]
         return f"{type(self).__name__}({self.unwrapped!r})"
 
     __str__ = __repr__
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-        super().reset(seed=seed, options=options)
-        for info in self.infos.values():
-            info.clear()
 
     def step(self, action: npt.NDArray[Any] | None) -> None:
         if not self._has_reset:
@@ -135,7 +129,7 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
 
     Observation of agent i: `[|O_i| + 2]` float32 in [0, 1]. Action: `[a_i]`, in [0, 1]
     (`action_range="unit"`) or [−1, 1] (`"symmetric"`), clipped. `infos[agent]` has the keys of
-    `SMEEnv`, NaN at reset, that agent's own; `similarity` is always over its own channels, while
+    `SMEEnv`, 0 at reset, that agent's own; `similarity` is always over its own channels, while
     `step_reward`, `regret` and `accumulated_reward` are those that it is paid for.
 
     Arguments and errors are as in `SMEEnv`.
@@ -177,12 +171,12 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         self.agents: list[str] = []
         self._begun = False
 
-        self._action_spaces, self._observation_spaces = {}, {}
+        self.action_spaces, self.observation_spaces = {}, {}
         for name, owned, part in zip(task.names, task.owned, columns, strict=True):
             width = owned.stop - owned.start
-            self._action_spaces[name], self._rescaled = arguments.action_space(action_range, width)
+            self.action_spaces[name], self._rescaled = arguments.action_space(action_range, width)
             observed = gymnasium.spaces.Box(0.0, 1.0, (len(part),), np.float32)
-            self._observation_spaces[name] = observed
+            self.observation_spaces[name] = observed
         self._allocate()
         self.state_space = gymnasium.spaces.Box(0.0, 1.0, (self.sme_spec.state_dim,), np.float64)
 
@@ -210,11 +204,16 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
 
     def observation_space(self, agent: str) -> gymnasium.spaces.Box:
         """The space of an agent's observations, the same object each time."""
-        return self._observation_spaces[self._checked_agent(agent)]
+        return self.observation_spaces[self._checked_agent(agent)]
 
     def action_space(self, agent: str) -> gymnasium.spaces.Box:
         """The space of an agent's actions, the same object each time."""
-        return self._action_spaces[self._checked_agent(agent)]
+        return self.action_spaces[self._checked_agent(agent)]
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """The generator of initial states, which wrappers may draw from."""
+        return self._batch.initial_states.generator(0)
 
     def state(self) -> Array:
         """The state s, `[S]` float64 in [0, 1] (a copy), unobserved channels included."""
@@ -223,7 +222,7 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
-        """Begin an episode; each agent's observation, and for each an info of NaN.
+        """Begin an episode; each agent's observation, and for each an info of zeros.
 
         `seed` and the option `state` are as in `SMEEnv.reset`. Other options are ignored, as in
         PettingZoo, except those that look like a mistyped "state".
@@ -259,8 +258,11 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         """One step of the whole team, from each agent's action `[a_i]`, finite; clipped.
 
         Returns observations, rewards (payouts, each in [0, k]), terminations, truncations and
-        infos, each by agent. An ActionError names the agent, and leaves the state unchanged.
+        infos, each by agent; empty ones for no actions after the end, as in PettingZoo. An
+        ActionError names the agent, and leaves the state unchanged.
         """
+        if self._begun and not self.agents and isinstance(actions, dict) and not actions:
+            return {}, {}, {}, {}, {}
         joint = self._joint(actions)
         try:
             result = self._batch.advance(joint)
@@ -322,7 +324,7 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
     def _checked(self, name: str, action: Any) -> Array:
         """One agent's action as float64, in the environment's range."""
         try:
-            return arguments.to_unit(action, self._action_spaces[name].shape, rescaled=False)
+            return arguments.to_unit(action, self.action_spaces[name].shape, rescaled=False)
         except ActionError as error:
             raise ActionError(f"{name}: {error}") from None
 
@@ -340,7 +342,7 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         return ActionError(f"actions: {problem}")
 
     def _checked_agent(self, agent: str) -> str:
-        if agent not in self._action_spaces:
+        if agent not in self.action_spaces:
             raise OptionError(
                 f"agent={agent!r}: no such agent.{did_you_mean(str(agent), self.possible_agents)} "
                 f"Agents: {', '.join(self.possible_agents)}."
@@ -350,7 +352,7 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
     def _repr_html_(self) -> str:
         status = "running" if self.agents else "ended" if self._begun else "not begun"
         first = self.possible_agents[0]
-        spaces = self._observation_spaces[first], self._action_spaces[first]
+        spaces = self.observation_spaces[first], self.action_spaces[first]
         return html_card(self, *spaces, status=status)
 
     def __repr__(self) -> str:

@@ -60,12 +60,10 @@ class _Recorder(Episodes):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._log = EpisodeLog(path)
 
-    def record(
-        self, rewards: Any, info: Mapping[str, Any], terminated: Any, ended: Any
-    ) -> list[dict[str, float]]:
-        """Add a step; returns what `info["episode"]` has of each episode that ended in it."""
+    def record(self, *step: Any) -> list[dict[str, float]]:
+        """`add` a step; returns what `info["episode"]` has of each episode that ended in it."""
         statistics = []
-        for episode in self.add(rewards, info, terminated, ended):
+        for episode in self.add(*step):
             if self._log is not None:
                 self._log.add(episode)
             safety = episode.safety._asdict() if episode.safety is not None else {}
@@ -162,6 +160,9 @@ class RecordVectorRegret(VectorWrapper):
         super().__init__(env)
         self._recorder = _Recorder(env.num_envs, self._sme_spec, path, force)
         self.episodes = self._recorder.finished
+        mode = env.metadata.get("autoreset_mode", "NextStep")
+        self._next_step = getattr(mode, "value", mode) == "NextStep"
+        self._resting = np.zeros(env.num_envs, bool)  # their next step begins an episode
 
     @property
     def online_regret(self) -> float:
@@ -173,7 +174,9 @@ class RecordVectorRegret(VectorWrapper):
         """Begin episodes; those that have not ended are not recorded."""
         mask = (options or {}).get("reset_mask")
         result = self.env.reset(seed=seed, options=options)
-        self._recorder.begin(slice(None) if mask is None else np.asarray(mask, bool))
+        envs = slice(None) if mask is None else np.asarray(mask, bool)
+        self._recorder.begin(envs)
+        self._resting[envs] = False
         return result
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -184,13 +187,14 @@ class RecordVectorRegret(VectorWrapper):
             for key, last in _numbers(info["final_info"]).items():
                 numbers[key][final] = last[final]
         ended, episode = terminated | truncated, {}
-        statistics = self._recorder.record(rewards, numbers, terminated, ended)
+        statistics = self._recorder.record(rewards, numbers, terminated, ended, ~self._resting)
+        if self._next_step:
+            self._resting = ended
         if statistics:
-            recorded = ended & ~np.isnan(numbers["regret"])
             for key in statistics[0]:
                 column = np.array([one[key] for one in statistics])
                 episode[key] = np.zeros(len(ended), column.dtype)
-                episode[key][recorded] = column
+                episode[key][ended] = column
             info["episode"] = {**episode, **info.get("episode", {})}
             info["_episode"] = ended
         return observations, rewards, terminated, truncated, info
@@ -263,7 +267,7 @@ class VectorStepWithCost(VectorWrapper):
         step, and last observations are also under Safety-Gymnasium's name, `final_observation`.
         """
         observations, rewards, terminated, truncated, info = self.env.step(actions)
-        costs = np.nan_to_num(np.array(info["cost"], np.float64))
+        costs = np.array(info["cost"], np.float64)
         if "final_info" in info:
             ended = info["_final_info"]
             costs[ended] = info["final_info"]["cost"][ended]

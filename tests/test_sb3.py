@@ -156,6 +156,10 @@ def test_attributes_and_methods_of_the_lanes_are_reached():
     assert env.env_is_wrapped(gymnasium.wrappers.TimeLimit, indices=[0]) == [False]
     with pytest.raises(AttributeError):
         env.env_method("no_such_method")
+    # SB3 reads attributes of Gymnasium's environments like this.
+    assert env.env_method("get_wrapper_attr", "sme_spec") == [env.sme_spec] * 3
+    assert env.env_method("set_wrapper_attr", "tick", 1, indices=[1]) == [True]
+    assert env.env_method("has_wrapper_attr", "tick") == [False, True, False]
     env.set_attr("plus", (5).__add__, indices=[0, 2])
     assert env.env_method("plus", 1, indices=[0, 2]) == [6, 6]
     env.close()

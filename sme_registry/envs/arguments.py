@@ -21,7 +21,6 @@ from sme_registry.errors import (
     SpecError,
     StateError,
     UnexpectedKeywordError,
-    WrapperError,
     did_you_mean,
 )
 from sme_registry.io import choice, integer_in
@@ -207,23 +206,19 @@ def check_has_limits(who: str, spec: SMESpec) -> None:
         )
 
 
-def check_outer_time_limit(horizon: int) -> None:
-    """Raise where the `reset` that calls this was called by a TimeLimit below the horizon."""
+def outer_time_limit(horizon: int) -> Any:
+    """The TimeLimit below the horizon around the environment whose `reset` calls this, or None.
+
+    The environment truncates the episode with it, since it alone can pay r_cum. Where wrappers
+    between the two repeat actions, the limit's own count says when.
+    """
     # An environment has no reference to its wrappers; but each calls the `reset` of the environment
     # inside it, so the callers' frames up to the first that is no reset are theirs.
-    frame = sys._getframe(2)
+    limits, frame = [], sys._getframe(2)
     while frame is not None and "reset" in frame.f_code.co_name:
         wrapper = frame.f_locals.get("self")
         if isinstance(wrapper, gymnasium.wrappers.TimeLimit):
-            check_time_limit(wrapper._max_episode_steps, horizon)
+            limits.append(wrapper)
         frame = frame.f_back  # type: ignore[assignment]  # typed as never None
-
-
-def check_time_limit(max_episode_steps: int, horizon: int) -> None:
-    if max_episode_steps < horizon:
-        raise WrapperError(
-            f"max_episode_steps={max_episode_steps}: must be at least the horizon, {horizon}: a "
-            "shorter TimeLimit would end the episode before its last payout. Make the task itself "
-            f"shorter, horizon={max_episode_steps}; or, where the limit comes from the EnvSpec of "
-            f"another horizon, pass max_episode_steps={horizon}."
-        )
+    below = [limit for limit in limits if limit._max_episode_steps < horizon]
+    return min(below, key=lambda limit: limit._max_episode_steps, default=None)

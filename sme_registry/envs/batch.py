@@ -23,9 +23,11 @@ from sme_registry.task import Task
 from sme_registry.task.engine import Engine, StepMany, draw, engine
 from sme_registry.task.loading import check_memory
 from sme_registry.task.task import (
+    ACCUMULATED_REWARD,
     OWN_DISTRACTORS,
     OWN_DRAWN,
     OWN_KEY,
+    REWARD,
     Array,
     Indices,
     Mask,
@@ -111,10 +113,15 @@ class InitialStates:
         self._generators[env] = seeding.np_random(seed)[0]
         self.count[env] = 0
 
+    def generator(self, env: int) -> np.random.Generator:
+        generator = self._generators[env]
+        if generator is None:
+            generator = self._generators[env] = seeding.np_random(None)[0]
+        return generator
+
     def skip(self, env: int, count: int) -> None:
         """Go on, after `seed`, where so many states have been drawn."""
-        generator = self._generators[env]
-        assert generator is not None
+        generator = self.generator(env)
         self.count[env] = count
         blocks, in_block = divmod(count, self._ahead)
         drawn = self._drawn[env]
@@ -126,10 +133,7 @@ class InitialStates:
         """The next state of each of these environments, `[len(envs), state_dim]`."""
         position = self.count[envs] % self._ahead
         for env in envs[position == 0].tolist():
-            generator = self._generators[env]
-            if generator is None:
-                generator = self._generators[env] = seeding.np_random(None)[0]
-            generator.random(out=self._drawn[env])
+            self.generator(env).random(out=self._drawn[env])
         states: Array = self._drawn[envs, position]
         self.count[envs] += 1
         return states
@@ -183,10 +187,17 @@ class Batch:
     Each environment has its own lifetime and segment of a stream. While one task is in force in all
     of them, as it nearly always is, it steps the batch; else those of each segment are a group.
     With `reuse`, for environments that copy their results, steps write into two sets of arrays in
-    turn.
+    turn. A `limit` below the horizon truncates episodes after so many steps, and pays r_cum.
     """
 
-    def __init__(self, schedule: Schedule | Task, num_envs: int, *, reuse: bool = False) -> None:
+    def __init__(
+        self,
+        schedule: Schedule | Task,
+        num_envs: int,
+        *,
+        reuse: bool = False,
+        limit: int | None = None,
+    ) -> None:
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule.of(schedule)
         self.num_envs = num_envs
         spec, n = self.task.spec, len(self.task.policies)
@@ -212,6 +223,7 @@ class Batch:
         self._soonest = 0  # so many steps at least until a segment is over
         self.lived: dict[str, Indices] = {}  # what infos say of each life in the last step
         self._reuse = reuse
+        self._limit = limit if limit is not None and limit < self.document.horizon else None
         self._load_engine()
 
     @property
@@ -372,7 +384,16 @@ class Batch:
             own[OWN_DRAWN, resting] = drawn
         if self.schedule.is_stream:
             self._live_on(observation, resting)
+        if self._limit is not None:
+            self._truncate(np.flatnonzero(self._t >= self._limit), observation, values, ends)
         return result
+
+    def _truncate(self, envs: Indices, observation: Observation, values: Array, ends: Mask) -> None:
+        ends[1, envs] = True
+        values[REWARD][:, envs] += self._accumulated[:, envs]
+        values[ACCUMULATED_REWARD][:, envs] = 0.0
+        self._accumulated[:, envs] = 0.0
+        observation[envs, self._of_t + 1 : self._of_phase] = 0.0
 
     def _live_on(self, observation: Observation, resting: Mask | None) -> None:
         self._lifetime += 1 if resting is None else ~resting

@@ -115,12 +115,13 @@ class Episodes:
         info: Mapping[str, Any],
         terminated: npt.ArrayLike,
         ended: npt.ArrayLike,
+        stepped: npt.ArrayLike | None = None,
     ) -> list[Episode]:
         """Add one or more steps of every environment; returns the episodes that ended in them.
 
         Each argument, and each entry of `info`, has an entry for each step, environment and agent:
-        `[B]`, `[N, B]` or `[N, B, n]`, or flat in that order. The regret is NaN where
-        an episode began instead.
+        `[B]`, `[N, B]` or `[N, B, n]`, or flat in that order. `stepped` is False where an episode
+        began instead.
         """
         shape = (-1, *self.sums.shape[1:])
         try:
@@ -130,7 +131,8 @@ class Episodes:
                 f"the environment's info has no {error}. Use an environment of sme_registry, with "
                 "wrappers that keep its info."
             ) from None
-        stepped = ~np.isnan(regret)
+        of_env = True if stepped is None else np.reshape(stepped, (-1, shape[1], 1))
+        stepped = np.broadcast_to(of_env, regret.shape)
         plain = [_numbers(rewards, shape), stepped, regret, similarity]
         values = np.array([*plain, *self._safety(info, shape)])
         if not stepped.all():

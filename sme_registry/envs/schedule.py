@@ -1,7 +1,7 @@
 """`Schedule`: which task is in force after how many environment steps; METHOD, section 7.
 
 A task is a stream of one segment that is never over, so every environment runs a schedule. It also
-says what infos hold: NumPy's float64 at a step, and NaN under the same keys at a reset. A stream's
+says what infos hold: NumPy's float64 at a step, and 0 under the same keys at a reset. A stream's
 also has `phase` and `lifetime`, int64.
 """
 
@@ -32,7 +32,7 @@ from sme_registry.task.task import (
     Observation,
 )
 
-_NAN = np.float64(np.nan)
+_ZERO = np.float64(0.0)
 
 
 class StepColumns(NamedTuple):
@@ -53,14 +53,15 @@ class StepColumns(NamedTuple):
         return cls(max(rows.values()) + 1, numbers, actions)
 
     def at_reset(self, width: int) -> dict[str, Any]:
-        """The info of a reset: NaN for every key, those of actions as fresh arrays `[width]`."""
-        arrays = {key: np.full(width, np.nan) for key in self.actions}
-        return {**arrays, **dict.fromkeys(self.numbers, _NAN)}
+        """The info of a reset: 0 for every key, those of actions as fresh arrays `[width]`."""
+        # NaN would make equal resets unequal, and the mean over the infos of a batch NaN.
+        arrays = {key: np.zeros(width) for key in self.actions}
+        return {**arrays, **dict.fromkeys(self.numbers, _ZERO)}
 
     def at_resets(self, num_envs: int, width: int) -> dict[str, Array]:
-        """The info of B resets: fresh arrays of NaN, of actions `[B, width]`, of numbers `[B]`."""
-        arrays = {key: np.full((num_envs, width), np.nan) for key in self.actions}
-        return arrays | {key: np.full(num_envs, np.nan) for key in self.numbers}
+        """The info of B resets: fresh arrays of 0, of actions `[B, width]`, of numbers `[B]`."""
+        arrays = {key: np.zeros((num_envs, width)) for key in self.actions}
+        return arrays | {key: np.zeros(num_envs) for key in self.numbers}
 
     def at_step(self, actions: Array, values: Array, rescaled: bool) -> dict[str, Any]:
         """The info of a step from its `actions` `[1 or 3, …, A]` and `values` `[5 or 7, …]`."""
@@ -173,8 +174,8 @@ class GymnasiumMixin(ScheduleMixin):
 def renamed_by_content(env_spec: EnvSpec | None, document: SMESpec | StreamSpec) -> EnvSpec | None:
     """Gymnasium's spec of an environment, as plain JSON; a derived task gets the id of its content.
 
-    Its `max_episode_steps` is the horizon, which wrappers ask for; a TimeLimit that Gymnasium makes
-    of it changes nothing, as the environment ends by itself.
+    Its `max_episode_steps` is the horizon, which wrappers ask for, or a batch's limit below it; a
+    TimeLimit that Gymnasium makes of it changes nothing, as the environment ends by itself.
     """
     if env_spec is None:
         return None
@@ -186,12 +187,13 @@ def renamed_by_content(env_spec: EnvSpec | None, document: SMESpec | StreamSpec)
     named = is_named and not fields & env_spec.kwargs.keys()
 
     plain = copy.deepcopy(env_spec)
+    limit = plain.kwargs.get("max_episode_steps", document.horizon)
     plain.kwargs = {
         key: value.value if isinstance(value, Enum) else value
         for key, value in plain.kwargs.items()
         if key not in fields and key != "max_episode_steps"
     }
-    plain.max_episode_steps = document.horizon
+    plain.max_episode_steps = min(limit, document.horizon)
     if not named or not isinstance(value, str | dict):
         plain.kwargs[argument] = document.to_dict()
     if not named:

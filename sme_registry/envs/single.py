@@ -46,7 +46,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
 
     `info` of each step, about the state acted in: `optimal_action` `[A]`, in the environment's
     action range; `similarity` r̃, `step_reward` r and `regret` 1 − r, each in [0, 1]; and
-    `accumulated_reward` r_cum after a payout's reset. At reset the same keys hold NaN.
+    `accumulated_reward` r_cum after a payout's reset. At reset the same keys hold 0.
 
     With `safety`, `info` also has `limit` and `safe_action` `[A]`, in the environment's action
     range; `cost` in [0, 1]; and `safe_regret`, the safe action's step reward minus r. With
@@ -94,6 +94,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         width = document.observation_dim
         self.observation_space = gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32)
         self._status = "not begun"
+        self._time_limit: Any = None  # an outer TimeLimit below the horizon
         self._keyed_by: np.random.Generator | None = None  # of which the distractors' stream is
         self._distractors = Distractors(self._schedule.tasks[0].spec.distractors, 1)
         # The lifetimes of a stream's next steps, the last one first; a task needs none.
@@ -158,10 +159,10 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         `[S]`, each entry in [0, 1]; where the task has distractors `{"distractors": d}` at d `[m]`;
         and of a stream `{"lifetime": n}` begins a life after n steps.
 
-        The info is of NaN. A WrapperError says that an outer TimeLimit would end the episode before
-        the horizon.
+        The info is of zeros. An outer TimeLimit below the horizon truncates the episode as the
+        horizon does: r_cum is paid.
         """
-        arguments.check_outer_time_limit(self.document.horizon)
+        self._time_limit = arguments.outer_time_limit(self.document.horizon)
         arguments.check_options(options, self._schedule.reset_options)
         S, seed = self.document.state_dim, arguments.checked_seed(seed)
         lifetime = arguments.lifetime_in(options)
@@ -284,7 +285,16 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
                 return observation, reward, end == 1.0 or end == 3.0, end >= 2.0, info
             return observation, reward, False, False, info
 
-        return step
+        return step if self._time_limit is None else _limited(step)
+
+    def _pay_out(self, observation: Observation, info: dict[str, Any]) -> float:
+        """End the episode before the horizon; returns the reward that waited."""
+        waiting = self._numbers[BUFFER_VALUES + ACCUMULATED_REWARD].item()
+        self._numbers[BUFFER_VALUES + ACCUMULATED_REWARD] = 0.0
+        observation[self.sme_spec.state_dim + self.sme_spec.distractors + 1] = 0.0
+        info["accumulated_reward"] = np.float64(0.0)
+        self._status, self._step = "ended", _check_running
+        return cast(float, waiting)
 
     def _refill(self) -> None:
         """Allocate what later steps write, each once. Half the cost of two `np.empty` a step."""
@@ -334,6 +344,19 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({title(self.document)})"
+
+
+def _limited(step: Callable[[Any, Any], _Result]) -> Callable[[Any, Any], _Result]:
+    """A step that ends the episode together with an outer TimeLimit, which counts it later."""
+
+    def limited(env: SMEEnv, action: Any) -> _Result:
+        observation, reward, terminated, truncated, info = step(env, action)
+        limit = env._time_limit
+        if not truncated and limit._elapsed_steps + 1 >= limit._max_episode_steps:
+            reward, truncated = reward + env._pay_out(observation, info), True
+        return observation, reward, terminated, truncated, info
+
+    return limited
 
 
 def _check_running(env: SMEEnv, action: Any) -> _Result:

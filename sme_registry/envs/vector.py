@@ -24,8 +24,6 @@ from sme_registry.spec.stream import StreamLike
 from sme_registry.task import Task
 from sme_registry.task.task import REWARD, Array, Indices, Mask, Observation
 
-_NONE: Indices = np.empty(0, np.int64)
-
 
 class EnvView:
     """One environment of a batch: attributes that all share, and its own."""
@@ -55,12 +53,25 @@ class EnvView:
     def unwrapped(self) -> EnvView:
         return self
 
+    # As every Gymnasium environment has them; `VecEnv.env_method` calls them by name.
+    def has_wrapper_attr(self, name: str) -> bool:
+        return hasattr(self, name)
+
+    def get_wrapper_attr(self, name: str) -> Any:
+        return getattr(self, name)
+
+    def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
+        if force or hasattr(self, name):
+            setattr(self, name, value)
+        return hasattr(self, name)
+
 
 class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
     """`num_envs` environments of one task or stream, bit-equal to `SMEEnv`s with the same seeds.
 
     Spaces, rewards and `info` are those of `SMEEnv` with a leading axis `[B]`; as in Gymnasium each
-    info `key` comes with a mask `_key`. A seed n seeds environment i with n + i.
+    info `key` comes with a mask `_key`, False (and the value 0) where an episode began instead of a
+    step. A seed n seeds environment i with n + i.
 
     Lives of a stream go on by themselves: with early termination they are at different steps, and
     near a switch in different phases. `get_attr("task")` gives the task in force in each
@@ -68,6 +79,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
 
     `autoreset_mode` is Gymnasium's: "NextStep", "SameStep" or "Disabled". With `render_mode`
     "rgb_array", `render_lanes` are the environments to draw, such as `[0, 1]`; None: all of them.
+    `max_episode_steps` below the horizon truncates episodes as the horizon does: r_cum is paid.
     Other keywords are fields of a task's spec to change.
 
     Examples:
@@ -97,9 +109,9 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         self.metadata = {**METADATA, "autoreset_mode": self.autoreset_mode}
         self.render_mode = render_mode
         self._schedule = Schedule.load(type(self), spec, overrides)
-        self._batch = Batch(self._schedule, num_envs)
         if max_episode_steps is not None:
-            arguments.check_time_limit(max_episode_steps, self.document.horizon)
+            integer_in("max_episode_steps", max_episode_steps, 1)
+        self._batch = Batch(self._schedule, num_envs, limit=max_episode_steps)
         self.num_envs = num_envs
         A, width = self.document.action_dim, self._batch.observation_dim
         self.single_action_space, self._rescaled = arguments.action_space(action_range, A)
@@ -144,8 +156,6 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         `seed` n seeds environment i with n + i, a list each; None continues the streams. `options`
         are those of `SMEEnv.reset`, with `state` `[S]` or `[B, S]` and `distractors` `[m]` or
         `[B, m]`; with `{"reset_mask": mask}` the environments where `mask` `[B]` is False stay.
-
-        Infos are NaN where an episode begins.
         """
         known = (*self._schedule.reset_options, "reset_mask")
         arguments.check_options(options, known)
@@ -175,7 +185,8 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         if self._renderer is not None:
             self._renderer.record(envs.tolist())
         info = self._schedule.columns.at_resets(self.num_envs, self.document.action_dim)
-        return observation, _masked({**info, **self._batch.life()}, mask)
+        nowhere = np.zeros(self.num_envs, bool)
+        return observation, _masked(info, nowhere) | _masked(self._batch.life(), mask)
 
     def step(  # type: ignore[override]  # Gymnasium types all three arrays alike; ends are bool
         self, actions: Any
@@ -205,25 +216,24 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         terminated, truncated = result.terminated, result.truncated
         columns = self._schedule.columns
         info = columns.at_step(result.actions, result.values[:, 0], self._rescaled)
-        info |= self._batch.lived
-        began = _NONE
-        if any_ended_before:
-            began = np.flatnonzero(ended_before)
+        life, final, began = self._batch.lived, {}, resting
+        if resting is not None:
             for array in (reward, terminated, truncated):
-                array[ended_before] = 0
-            self._begin(began, observation, info)
+                array[resting] = 0
+            self._begin(resting, observation, info, life)
         ended: Mask = terminated | truncated
         any_ended = int(np.count_nonzero(ended)) > 0  # a tenth of the time of any()
-        returned = _masked(info)
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
             self._ended, self._any_ended = ended, any_ended
         elif any_ended:
-            began = np.flatnonzero(ended)
-            returned |= self._last(observation, info, ended)
-            self._begin(began, observation, info)
+            began = ended
+            final = self._last(observation, info | life, ended)
+            self._begin(ended, observation, info, life)
         if self._renderer is not None:
-            self._renderer.record(began.tolist(), unit_actions, result)
-        return observation, reward, terminated, truncated, returned
+            envs = [] if began is None else np.flatnonzero(began).tolist()
+            self._renderer.record(envs, unit_actions, result)
+        infos = _masked(info, None if began is None else ~began) | _masked(life) | final
+        return observation, reward, terminated, truncated, infos
 
     def snapshot(self) -> dict[str, npt.NDArray[Any]]:
         """What the next steps of a task follow from, besides its spec and the seed: arrays.
@@ -300,14 +310,18 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         return f"{type(self).__name__}({title(self.document)}, num_envs={self.num_envs})"
 
     def _begin(
-        self, envs: Indices, observation: Observation, info: dict[str, npt.NDArray[Any]]
+        self,
+        began: Mask,
+        observation: Observation,
+        info: dict[str, npt.NDArray[Any]],
+        life: dict[str, Indices],
     ) -> None:
         """Put environments at the start of an episode; write their observations and infos."""
-        self._batch.begin(envs, observation)
-        self._ended[envs] = False
-        life = self._batch.life()
-        for key, value in info.items():
-            value[envs] = life[key][envs] if key in life else np.nan
+        self._batch.begin(np.flatnonzero(began), observation)
+        for value in info.values():
+            value[began] = 0.0
+        for key, now in self._batch.life().items():
+            life[key][began] = now[began]
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         """One seed or None for each environment."""
@@ -335,12 +349,13 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
 def _masked(info: Mapping[str, npt.NDArray[Any]], mask: Mask | None = None) -> dict[str, Any]:
     """Gymnasium's form of batched info: each key with its mask `_key`, 0 where that is False."""
     infos: dict[str, Any] = {}
-    if mask is None:
-        everywhere = np.ones(len(info["similarity"]), bool)
-        for key, value in info.items():
-            infos[key], infos[f"_{key}"] = value, everywhere
-        return infos
+    everywhere = None
     for key, value in info.items():
-        columns = mask.reshape(-1, *[1] * (value.ndim - 1))
-        infos[key], infos[f"_{key}"] = np.where(columns, value, value.dtype.type(0)), mask.copy()
+        if mask is None:
+            everywhere = np.ones(len(value), bool) if everywhere is None else everywhere
+            infos[key], infos[f"_{key}"] = value, everywhere
+        else:
+            columns = mask.reshape(-1, *[1] * (value.ndim - 1))
+            masked = np.where(columns, value, value.dtype.type(0))
+            infos[key], infos[f"_{key}"] = masked, mask.copy()
     return infos

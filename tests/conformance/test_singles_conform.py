@@ -6,6 +6,8 @@ safety and observation are in `tests/envs/test_safety_observation.py`, and teams
 
 import copy
 import functools
+import subprocess
+import sys
 import warnings
 
 import gymnasium
@@ -267,6 +269,20 @@ def test_single_agents_stay_out_of_pettingzoos_registry_and_teams_out_of_gymnasi
     assert ours == {env_id for env_id in pettingzoo.aec_registry if env_id.startswith("SME/")}
     assert {f"SME/{name}" for name in TEAMS} <= ours
     assert not ours & gymnasium.registry.keys()
+
+
+def test_pettingzoo_before_its_registry_has_everything_else():
+    code = """
+import sys
+import gymnasium, pettingzoo
+sys.modules["pettingzoo.env_registry"] = None  # as in 1.26, which AgileRL requires
+import sme_registry
+gymnasium.make("SME/Default-v1").reset(seed=0)
+sme_registry.register(sme_registry.load("Team2").derive(seed=7), "ApiDuo")
+assert sme_registry.make_parallel("ApiDuo").reset(seed=0)
+sme_registry.make_aec("Team2").reset(seed=0)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_a_spec_of_your_own_with_a_team_is_made_by_its_name():

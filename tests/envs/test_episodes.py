@@ -49,8 +49,10 @@ def test_an_episode_is_the_mean_over_its_steps_and_a_teams_over_its_agents():
 
 def test_lanes_that_began_an_episode_count_no_step():
     episodes = Episodes(envs=2)
-    info = {"regret": [0.5, np.nan], "similarity": [0.5, np.nan]}
-    [episode] = episodes.add([1.0, 0.0], info, [False, False], [True, False])
+    info = {"regret": [0.5, 0.0], "similarity": [0.5, 0.0]}
+    stepped = [True, False]
+    [episode] = episodes.add([1.0, 0.0], info, [False, False], [True, False], stepped)
+    assert episodes.online_regret == 0.5
     assert (episode.step, episode.length, episode.terminated) == (1, 1, 0)
     assert episodes.steps == 1
     assert not episodes.sums[:, 1].any()

@@ -154,9 +154,9 @@ def test_stepping_before_the_first_reset_and_after_the_end_is_refused():
         env.step(middle(env))
     env.reset(seed=0)
     env.step(middle(env))
-    for actions in (middle(env), {}):
-        with pytest.raises(EpisodeError, match=r"has ended. Call reset\(\) first"):
-            env.step(actions)
+    with pytest.raises(EpisodeError, match=r"has ended. Call reset\(\) first"):
+        env.step(middle(env))
+    assert env.step({}) == ({}, {}, {}, {}, {})  # SuperSuit's black_death steps once more
     env.reset()
     env.step(middle(env))
 
@@ -271,6 +271,21 @@ def test_a_rendered_team_is_a_picture_of_all_its_channels():
     env.close()
 
 
+def test_a_team_has_the_attributes_that_skrl_and_supersuit_read():
+    env = sme_registry.make_parallel("DuoDeep")
+    for name in env.possible_agents:
+        assert env.action_spaces[name] is env.action_space(name)
+        assert env.observation_spaces[name] is env.observation_space(name)
+    draws = []
+    for _ in range(2):
+        env.reset(seed=3)
+        draws.append(env.np_random.integers(2**40))
+    assert draws[0] == draws[1]
+    assert pickle.loads(pickle.dumps(env)).np_random.integers(2**40) == env.np_random.integers(
+        2**40
+    )
+
+
 def test_max_cycles_is_pettingzoos_name_of_the_horizon():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # importing it raises a deprecation warning of its own
@@ -285,12 +300,11 @@ def test_max_cycles_is_pettingzoos_name_of_the_horizon():
         sme_registry.make_parallel("Team4", max_cycles=0)
 
 
-def test_infos_of_an_aec_environment_are_empty_before_its_first_step():
-    # PettingZoo's seed_test compares them, and NaN equals nothing.
+def test_infos_of_an_aec_environment_are_zeros_before_its_first_step():
     env = sme_registry.make_aec("Team2")
     assert repr(env) == str(env) == "TurnBasedTeam(SMETeamEnv(SME/Team2-v1, 2 agents))"
     env.reset(seed=0)
-    assert env.infos == {"agent_0": {}, "agent_1": {}}
+    assert [info["regret"] for info in env.infos.values()] == [0.0, 0.0]
     for _ in env.possible_agents:
         env.step(env.action_space(env.agent_selection).sample())
     assert np.isfinite(env.last()[-1]["regret"])
