@@ -27,7 +27,10 @@ try:
     from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv
     from ray.tune.registry import register_env
 except ModuleNotFoundError as error:
-    sys.exit(f"{error.name} is not installed. docs/guides/frameworks.md has the command.")
+    sys.exit(
+        f"{error.name} is not installed. pip install 'ray[rllib]' has it, and all else that RLlib "
+        "needs; docs/guides/frameworks.md says what it replaces."
+    )
 
 ROLLOUT = 2048
 

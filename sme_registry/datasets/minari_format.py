@@ -170,6 +170,7 @@ def _read_hdf5(path: Path, visible: bool) -> Arrays:
             columns = _visible_columns(source, group)
             if not visible:
                 columns |= _hidden_columns(source, group)
+                _check_rest(group, number, len(columns["rewards"]))
                 columns["episodes"] = np.full(len(columns["rewards"]), number, np.int64)
             episodes.append(columns)
     if not episodes:
@@ -199,8 +200,17 @@ def _hidden_columns(source: _Source, group: Any) -> Arrays:
             column = source.array(infos, info)
             columns[after] = column[1:]
             columns[before] = column[:-1]  # last, for those of which `after` has no meaning
+            if after == before and column[-1:].tobytes() != column[-2:-1].tobytes():
+                raise ValueError(f"{group.name}: the last row of {info} is not the one before it")
     columns["components"] = np.full(len(columns["states"]), group.attrs["behaviour"], np.int64)
     return columns
+
+
+def _check_rest(group: Any, number: int, steps: int) -> None:
+    """Check what no digest of arrays is about, and Minari reads."""
+    for name, expected in (("id", number), ("total_steps", steps)):
+        if group.attrs[name] != expected:
+            raise ValueError(f"{group.name}: {name}={group.attrs[name]}: must be {expected}")
 
 
 class _Source:

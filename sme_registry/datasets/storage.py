@@ -394,7 +394,7 @@ def _open(path: Path) -> Dataset | None:
 
 
 def check_location(dataset: Dataset, folder: str | os.PathLike[str] | None = None) -> None:
-    """Raise SpecError if the path of a data set disagrees with its id, which would open another."""
+    """Check that the path of a data set agrees with its id, else SpecError; and its namespaces."""
     # Not resolved: a symbolic link in the right place is correct.
     path, root = Path(os.path.abspath(dataset.path)), Path(os.path.abspath(datasets_folder(folder)))
     inside = path.is_relative_to(root)
@@ -405,6 +405,12 @@ def check_location(dataset: Dataset, folder: str | os.PathLike[str] | None = Non
             f"{path}: contains the data set {dataset.id}. Move or copy it back to {home}, or "
             "remove it if that already exists. To change its name, generate it with --name."
         )
+    for namespace in path.parents[: len(id_parts) - 1]:
+        file = namespace / _NAMESPACE
+        if file.exists() and not isinstance(read_json(file), dict):
+            raise MalformedDocumentError(
+                f"{file}: must be a JSON object, such as {{}}: Minari reads it. Correct it."
+            )
 
 
 def list_datasets(

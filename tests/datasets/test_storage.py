@@ -367,6 +367,26 @@ class TestAChangedSet:
         with pytest.raises(DigestMismatchError, match=r"its arrays have sha256:.* as generated"):
             open_dataset(NAME, copied).transitions()
 
+    @pytest.mark.parametrize("attribute", ["id", "total_steps"])
+    def test_with_a_changed_attribute_is_rejected(self, attribute, copied):
+        with h5py.File(copied / NAME / "data" / "main_data.hdf5", "r+") as file:
+            file["episode_1"].attrs[attribute] += 1
+        with pytest.raises(MalformedDocumentError, match=f"episode_1: {attribute}="):
+            open_dataset(NAME, copied).transitions()
+
+    def test_with_a_changed_row_that_repeats_another_is_rejected(self, copied):
+        with h5py.File(copied / NAME / "data" / "main_data.hdf5", "r+") as file:
+            file["episode_1/infos/regret"][-1] += 1e-9
+        with pytest.raises(MalformedDocumentError, match="last row of regret"):
+            open_dataset(NAME, copied).transitions()
+
+    @pytest.mark.parametrize("content", ["", "[]", '{"a": '])
+    def test_with_a_broken_namespace_is_listed_as_broken(self, content, copied):
+        (copied / "sme" / "namespace_metadata.json").write_text(content)
+        datasets, broken = list_datasets(copied)
+        assert not datasets
+        assert "namespace_metadata.json" in broken[copied / NAME]
+
     def test_extended_by_minari_is_rejected_and_minari_can_read_it(self, copied):
         loaded = open_dataset(NAME, copied).minari()
         episode = loaded[0]
