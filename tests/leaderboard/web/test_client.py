@@ -15,11 +15,9 @@ from leaderboard.seasons.entrant import request_ticket
 from leaderboard.seasons.entry import TicketRequest
 from leaderboard.web import client
 from sme_registry.errors import OptionError
-from sme_registry.io import server_address
 from sme_registry.seasons import wire
 from sme_registry.spec import Setting
 from tests.leaderboard.conftest import tiny_submission
-from tests.leaderboard.serving import serving
 
 
 @pytest.fixture(autouse=True)
@@ -262,20 +260,6 @@ def test_what_is_signed_for_one_board_is_not_sent_to_another(tmp_path, store, ke
     ):
         client.submit(url, folder, key)
     assert asked == ["GET /definition.json"]
-
-
-def test_a_name_for_this_machine_and_the_usual_port_are_the_same_address(tmp_path, store, key):
-    folder, signed = bundle_of(tmp_path / "bundle", store, key)
-    seen = []
-    with serving(store.folder.path) as url:
-        here = url.replace("127.0.0.1", "LOCALHOST") + "/"
-        assert client.submit(here, folder, key, progress=lambda *at: seen.append(at)) == signed.id
-    assert seen == [(1, 1)]
-    for one, other in (
-        ("https://Board.example", "https://board.example:443/"),
-        ("http://board.example/b/", "http://board.example:80/b"),
-    ):
-        assert server_address(one, insecure=True).url == server_address(other, insecure=True).url
 
 
 def artefacts_of(signed):
