@@ -39,8 +39,7 @@ from leaderboard.documents.submission import (
 from leaderboard.errors import Rejection
 from leaderboard.gate.sandbox import inspect_own, widths
 from sme_registry import SMESpec, load, studies
-from sme_registry.errors import OptionError, PolicyError, SMEError, SpecError
-from sme_registry.evaluation import load_sb3
+from sme_registry.errors import OptionError, SMEError, SpecError
 from sme_registry.export import onnx_bytes
 from sme_registry.io import (
     build_folder,
@@ -272,15 +271,18 @@ def _put_artefact(run: SubmittedRun, bundle: Path) -> Artefact | None:
 
 def _policy_bytes(run: SubmittedRun, policy: Path) -> bytes:
     if policy.suffix == ".zip":
-        return _exported(policy, run.spec)
-    try:
-        with open_regular(policy, links=True) as stream:
-            data = stream.read(MAX_ARTEFACT_BYTES + 1)  # one more than is allowed
-    except OSError as error:
-        raise OptionError(
-            f"{run.source}: policy={str(policy)!r}: cannot be read: {error.strerror}. "
-            "Correct the path."
-        ) from None
+        libraries = {"stable_baselines3": "Stable-Baselines3", "torch": "PyTorch"}
+        require_packages("exporting a model", libraries, "train")
+        data = onnx_bytes(policy, run.spec)
+    else:
+        try:
+            with open_regular(policy, links=True) as stream:
+                data = stream.read(MAX_ARTEFACT_BYTES + 1)  # one more than is allowed
+        except OSError as error:
+            raise OptionError(
+                f"{run.source}: policy={str(policy)!r}: cannot be read: {error.strerror}. "
+                "Correct the path."
+            ) from None
     inspect_own(data, *widths(run.spec))
     return data
 
@@ -297,36 +299,6 @@ def _refuse_existing(folder: Path, force: bool) -> None:
             f"{folder}: is not a bundle, or contains other files, such as {min(others)!r}, and is "
             "not replaced. Give another folder."
         )
-
-
-def export_sb3(
-    model: Any,
-    path: str | os.PathLike[str],
-    *,
-    vec_normalize: Any = None,
-    spec: SMESpec | None = None,
-) -> Path:
-    """Write a model's deterministic policy as an ONNX file that boards accept; returns the path.
-
-    `model` is one of Stable-Baselines3 or sb3-contrib, or the path of its .zip; loading a .zip can
-    run its author's code. `vec_normalize` is as in `sme_registry.export_onnx`; with `spec`, the
-    widths are checked. An existing file is replaced.
-    """
-    return write_atomically(path, _exported(model, spec, vec_normalize))
-
-
-def _exported(model: Any, spec: SMESpec | None, vec_normalize: Any = None) -> bytes:
-    libraries = {"stable_baselines3": "Stable-Baselines3", "torch": "PyTorch"}
-    require_packages("exporting a model", libraries, "train")
-    if isinstance(model, str | os.PathLike):
-        model = load_sb3(model)
-    if not hasattr(model, "predict"):
-        raise PolicyError(
-            f"model={model!r:.80}: must be a Stable-Baselines3 model or the path of its .zip."
-        )
-    data = onnx_bytes(model, spec, vec_normalize=vec_normalize)
-    inspect_own(data, *(space.shape[0] for space in (model.observation_space, model.action_space)))
-    return data
 
 
 @dataclass(frozen=True)
