@@ -103,7 +103,8 @@ class Analysis:
 
     `cells`, `errors` and `models` are by the digests of cells, `classes` and `streams` by name, the
     first one first. `algorithms` have a finished run on a single task; `learners` are those of them
-    that learn. `reference_costs` are by class of streams and reference, one for each draw.
+    that learn; `coloured` are all that learn, so that a method has one colour in every figure of a
+    study. `reference_costs` are by class of streams and reference, one for each draw.
     """
 
     file: StudyFile
@@ -116,6 +117,7 @@ class Analysis:
     streams: Mapping[str, StreamInfo]
     algorithms: tuple[str, ...]
     learners: tuple[str, ...]
+    coloured: tuple[str, ...]
     groups: tuple[Group, ...]
     runs: pd.DataFrame
     offline_runs: pd.DataFrame

@@ -117,12 +117,14 @@ def analyse(
     *,
     requested: Collection[str] | None = None,
     models: Mapping[str, Path] | None = None,
+    coloured: Sequence[StudyAlgorithm] = (),
     draws: int = statistics.DRAWS,
 ) -> Analysis:
     """Every table of a study; equal for equal results.
 
     Results, errors and models are by the digests of their cells, of which those that are
-    `requested`, None for all, count as missing without a result.
+    `requested`, None for all, count as missing without a result. Colours go to the algorithms that
+    are `coloured`, by default the plan's, in order.
     """
     plan = file.plan
     results, curves = study_frames(plan, finished)
@@ -143,7 +145,8 @@ def analyse(
         classes=classes,
         streams=stream_infos(plan),
         algorithms=names,
-        learners=tuple(a.name for a in present if parse_uses(a.uses)[0] != "reference"),
+        learners=_learners(present),
+        coloured=_learners(coloured or plan.algorithms),
         groups=groups(classes, names, set(by_place(runs))),
         runs=runs,
         offline_runs=offline_runs(results, plan.algorithms),
@@ -153,6 +156,10 @@ def analyse(
         | {f"stream_{name}": rows for name, rows in life_frames.items()},
     )
     return with_tables(analysis)
+
+
+def _learners(algorithms: Sequence[StudyAlgorithm]) -> tuple[str, ...]:
+    return tuple(a.name for a in algorithms if parse_uses(a.uses)[0] != "reference")
 
 
 @table("missing", "", both=True)

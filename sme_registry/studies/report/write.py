@@ -374,7 +374,8 @@ def write_comparison(
     both = {"algorithms": (algorithms[first], algorithms[second])}
     plan = file.plan.model_copy(update=both)
     results = ledger.results(cell.cell.digest for cell in plan.cells)
-    analysis = analyse(file.model_copy(update={"plan": plan}), results)
+    both_alone = file.model_copy(update={"plan": plan})
+    analysis = analyse(both_alone, results, coloured=file.plan.algorithms)
     for picture in draw((draw_differences, draw_class_curves), analysis, WRITTEN)[0]:
         contents |= {f"{picture.name}.{ending}": picture.files[ending] for ending in WRITTEN}
     return [write_atomically(Path(out) / name, content) for name, content in contents.items()]

@@ -12,7 +12,8 @@ pytest.importorskip("matplotlib")
 
 from sme_registry.studies.report import figures
 from sme_registry.studies.report.figures import curves, draw_figures
-from sme_registry.studies.report.figures.panels import positions, spacing
+from sme_registry.studies.report.figures.panels import FEW, looks_of, positions, spacing
+from sme_registry.studies.report.tables import analyse
 from tests.geometry import assert_readable
 from tests.studies.report.test_report import FIGURES
 
@@ -137,3 +138,15 @@ def test_classes_have_equal_distances_on_their_scale():
     assert np.allclose(positions([1, 2, 4, 8], 4), np.log([1, 2, 4, 8]))
     assert list(positions([0.25, 0.5, 0.75], 3)) == [0.25, 0.5, 0.75]
     assert list(positions(["a", "b"], 2)) == [0.0, 1.0]
+
+
+def test_a_method_has_one_colour_in_every_figure_and_a_legend_explains_hollow_marks(analysis):
+    plan = analysis.file.plan
+    beta = plan.model_copy(update={"algorithms": plan.algorithms[1:]})
+    file = analysis.file.model_copy(update={"plan": beta})
+    alone = analyse(file, analysis.cells, coloured=plan.algorithms, draws=10)
+    assert looks_of(alone)["Beta"] == looks_of(analysis)["Beta"]
+    assert looks_of(alone)["Beta"]["color"] != looks_of(analysis)["Alpha"]["color"]
+    picture = figures.draw((figures.draw_contrasts,), analysis, ())[0][0]
+    texts = [text.get_text() for legend in picture.figure.legends for text in legend.get_texts()]
+    assert FEW.lower() in texts  # Beta has three pairs on k-25

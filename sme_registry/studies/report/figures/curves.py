@@ -447,9 +447,9 @@ def _finish_lifetime(axes: Axes, analysis: Analysis, name: str) -> None:
 
 def stream_looks(analysis: Analysis) -> dict[str, Look]:
     """The looks of the algorithms that have lives; as in the figures of single tasks."""
-    names = dict.fromkeys((*analysis.learners, *analysis.stream_algorithms))
-    looks = panels.numbered_looks(names)
-    return {name: looks[name] for name in names if name in analysis.stream_algorithms}
+    names = (*analysis.coloured, *analysis.learners, *analysis.stream_algorithms)
+    looks = panels.numbered_looks(dict.fromkeys(names))
+    return {name: look for name, look in looks.items() if name in analysis.stream_algorithms}
 
 
 def _within(rows: pd.DataFrame) -> pd.DataFrame:

@@ -72,7 +72,8 @@ CONSTANT = new_look(GREY, dash=REFERENCE_DASHES["constant"])
 
 def looks_of(analysis: Analysis, names: Iterable[str] | None = None) -> dict[str, Look]:
     """The look of each algorithm, or of these: colours for those that learn, grey for others."""
-    looks = numbered_looks(analysis.learners)
+    numbered = numbered_looks(dict.fromkeys((*analysis.coloured, *analysis.learners)))
+    looks = {name: numbered[name] for name in analysis.learners}
     references = [name for name in analysis.algorithms if name not in looks]
     for i, name in enumerate(references):
         looks[name] = new_look(GREY, "x+12"[i % 4], DASHES[1 + i % 4])
@@ -148,7 +149,17 @@ def legend(figure: Figure, looks: Mapping[str, Look], across: int = 6) -> None:
         first.plot([], [], label=literal(name), markersize=4.5, linewidth=1.4, **look)[0]
         for name, look in looks.items()
     ]
+    if any(map(_has_hollow_marks, figure.axes)):
+        hollow: Any = {"marker": "o", "linestyle": "none", "color": GREY, "markersize": 4.5}
+        handles += first.plot([], [], markerfacecolor="white", label=FEW.lower(), **hollow)
     legend_below(figure, handles, across)
+
+
+def _has_hollow_marks(axes: Axes) -> bool:
+    """Whether a panel has marks that rest on few runs."""
+    return any(
+        line.get_markerfacecolor() == "white" and np.size(line.get_xdata()) for line in axes.lines
+    )
 
 
 def colour_bar(figure: Figure, image: Any, label: str, ticks: Any = None) -> None:
