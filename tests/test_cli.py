@@ -629,11 +629,6 @@ class TestEvaluate:
         assert message in refused("evaluate", *arguments, *QUICK, "--out", "ev")
         assert [path.name for path in tmp_path.iterdir()] == ["life.json"]
 
-    def test_a_life_of_more_visits_than_are_evaluated_is_refused(self):
-        save(StreamSpec(phases=load("Cycle2").phases, cycles=10**6), "long.json")
-        message = "cycles × phases=2,000,000: must be at most 1,000"
-        assert message in refused("evaluate", "random", "random", "long.json", *QUICK)
-
     def test_a_zip_that_is_no_model_is_refused(self, tmp_path):
         (tmp_path / "a.zip").write_bytes(b"not a zip")
         assert "not a model" in refused("evaluate", "a.zip", "Default")
@@ -688,11 +683,8 @@ class TestTrain:
         assert (tmp_path / printed["folder"] / "model.zip").exists()
         assert "finished run of jax:PPO" in refused(*command)
         in_jax = ("train", "Plane1", "--agents", "jax")
-        assert "must be one of jax:PPO" in refused(*in_jax, "-a", "A2C")
-        assert "Did you mean 'gamma'" in refused(*in_jax, "--set", "gama=0.9")
         assert "num_envs=2" in refused(*in_jax, "--num-envs", "2")
         assert "device='abacus'" in refused(*in_jax, "--device", "abacus")
-        assert "this is the task of a team" in refused("train", "Team2", "--agents", "jax")
 
     @pytest.mark.parametrize(
         ("options", "message"),
@@ -793,7 +785,7 @@ class TestDemo:
         assert "demo: contains a finished run" in again.stderr
 
 
-@pytest.mark.parametrize("arguments", [("list",), ("show", "TeamBlind4"), ("show", "Défaut")])
+@pytest.mark.parametrize("arguments", [("show", "TeamBlind4"), ("show", "Défaut")])
 def test_output_is_utf8_where_the_system_has_another_encoding(arguments):
     environment = os.environ | {"PYTHONIOENCODING": "cp1252"}  # a pipe on Windows
     process = subprocess.run([*SME, *arguments], capture_output=True, check=False, env=environment)
@@ -824,9 +816,7 @@ def test_the_installed_command_prints_pure_json_or_one_line_and_its_exit_code():
     assert len(unknown.stderr.splitlines()) == 1
 
 
-@pytest.mark.parametrize(
-    "arguments", [("list",), ("show", "core", "--json"), ("show", "Default", "--json")]
-)
+@pytest.mark.parametrize("arguments", [("list",), ("show", "core", "--json")])
 def test_a_reader_that_leaves_early_is_no_error(arguments):
     read, write = os.pipe()
     process = subprocess.Popen([*SME, *arguments], stdout=write, stderr=subprocess.PIPE, text=True)

@@ -459,32 +459,12 @@ class TestAChangedSet:
                 open_dataset(NAME, copied).transitions()
 
 
-class TestAMisplacedSet:
-    """One whose folder is not where its id says: its id finds another set, or none."""
-
-    @pytest.fixture(params=["sme/copy-v0", "my/sme/tests-v0"])
-    def misplaced(self, request, copied):
-        shutil.copytree(copied / NAME, copied / request.param)
-        return request.param
-
-    def test_is_not_listed_as_minari_does_not_list_it(self, misplaced, copied, monkeypatch):
-        datasets, broken = list_datasets(copied)
-        assert [dataset.path for dataset in datasets] == [copied / NAME]
-        assert list(broken) == [copied / misplaced]
-        error = (
-            f"contains the data set {NAME}. Move or copy it back to {copied / NAME}, or remove it"
-        )
-        assert error in broken[copied / misplaced]
-        monkeypatch.setenv("MINARI_DATASETS_PATH", str(copied))
-        with pytest.warns(UserWarning, match=f"does not match id '{NAME}'"):
-            assert list(minari.list_local_datasets()) == [NAME]
-
-    def test_a_symbolic_link_in_the_right_place_is_correct(self, copied, tmp_path):
-        (copied / NAME).rename(tmp_path / "elsewhere")
-        (copied / NAME).symlink_to(tmp_path / "elsewhere")
-        datasets, broken = list_datasets(copied)
-        assert [dataset.id for dataset in datasets] == [NAME]
-        assert not broken
+def test_a_symbolic_link_in_the_place_of_a_set_is_followed(copied, tmp_path):
+    (copied / NAME).rename(tmp_path / "elsewhere")
+    (copied / NAME).symlink_to(tmp_path / "elsewhere")
+    datasets, broken = list_datasets(copied)
+    assert [dataset.id for dataset in datasets] == [NAME]
+    assert not broken
 
 
 def test_an_unknown_id_suggests_a_similar_one(root):

@@ -18,6 +18,8 @@ from sme_registry.jax.td3_sac import SAC, TD3, SACProgram, TD3Program
 from sme_registry.sb3 import SMEVecEnv
 from sme_registry.training.algorithms import load_algorithm, one_thread, quiet
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
 NET_ARCH = (96, 64)
 BATCH = 64
 COUNTS = (1, 10)

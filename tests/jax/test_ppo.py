@@ -24,6 +24,8 @@ from sme_registry.jax.task import task_params
 from sme_registry.sb3 import SMEVecEnv
 from sme_registry.training.models import silence
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
 Weights = dict[str, npt.NDArray[np.float32]]
 
 # Episodes end by D, by T, and by both on one step; payouts are delayed.
@@ -185,10 +187,10 @@ def test_collected_steps_are_those_of_the_environment(spec, separable, action_ra
     env = make(spec, action_range=action_range)
     observation, _ = env.reset(options={"state": starts[0]})
     low, high = env.action_space.low, env.action_space.high
+    mean = jax.jit(functools.partial(ppo.mean, SETTINGS))
     for i in range(n):
         np.testing.assert_array_equal(steps.observation[i], observation)
-        mean = ppo.mean(SETTINGS, weights, observation)
-        expected = mean + np.exp(np.float32(0.1)) * noise[:, i]
+        expected = mean(weights, observation) + np.exp(np.float32(0.1)) * noise[:, i]
         np.testing.assert_allclose(steps.action[i], expected, atol=1e-6)
         action = np.clip(steps.action[i], low, high)
         observation, reward, terminated, truncated, info = env.step(action)
@@ -239,7 +241,6 @@ def program():
     return ppo.PPOProgram(SMALL, specs, [4, 5], steps=96)
 
 
-@pytest.mark.usefixtures("quickly_compiled")  # and all that follow
 def test_a_program_collects_whole_rollouts_and_learns_between_them():
     agents = program()
     before, keys = agents.weights(0), [agents.state.key]

@@ -222,15 +222,8 @@ def test_a_damaged_checkpoint_is_refused_and_one_with_weights_that_are_not_finit
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"agents": "jaxx"}, r"agents='jaxx': must be 'sb3' or 'jax'\. Did you mean 'jax'"),
         ({"algorithm": "A2C"}, "algorithm='jax:A2C': must be one of jax:PPO, jax:TD3, jax:SAC"),
         ({"hyperparameters": {"use_sde": True}}, "use_sde: jax:PPO has no such.*batch_size"),
-        ({"num_envs": 2}, "num_envs=2: must be 1"),
-        ({"device": "abacus"}, "device='abacus': must be one of cpu"),
-        (
-            {"agents": "sb3", "algorithm": "PPO", "device": "cpu"},
-            r"device='cpu': is for agents in JAX.*--agents jax",
-        ),
     ],
 )
 def test_invalid_arguments_raise_typed_errors_and_create_no_folder(change, message, tmp_path):
